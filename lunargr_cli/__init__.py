@@ -1,0 +1,1 @@
+"""The lunargr command line."""

@@ -1,0 +1,1 @@
+"""One thin file per command: NAME, ORDER in the help, and `command` with its options."""

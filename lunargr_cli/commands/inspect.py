@@ -1,0 +1,53 @@
+"""`lunargr inspect FILE`: what an artefact is, who made it, from what."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import Json
+
+NAME, ORDER = "inspect", 90
+
+
+def command(
+    file: Annotated[Path, typer.Argument(help="Any artefact of lunargr.")],
+    json_file: Json = None,
+) -> None:
+    """Say what an artefact is, who made it and from what; check it against its schema."""
+    from lunargr_cli.console import Console
+    from schemas import atomic_path, open_artefact, read_kind
+
+    schema = read_kind(file)
+    with open_artefact(file, schema) as data:
+        attributes = {k: (v.item() if hasattr(v, "item") else v) for k, v in data.attrs.items()}
+        variables = {
+            name: {
+                "dims": list(schema[name].dims) if name in schema else [],
+                "shape": list(data[name].shape),
+                "dtype": str(data[name].dtype),
+            }
+            for name in data
+            if hasattr(data[name], "shape")
+            and not str(data[name].attrs.get("NAME", "")).startswith("This is a netCDF dim")
+        }
+    console = Console()
+    print(f"{file}: {schema.title} ('{schema.name}', version {schema.version}, written by 'lunargr {schema.stage}')\n")
+    console.table(
+        "variables",
+        ("name", "shape", "type"),
+        [(n, "x".join(map(str, v["shape"])) or "scalar", v["dtype"]) for n, v in variables.items()],
+    )
+    console.table("attributes", ("name", "value"), attributes.items())
+    if json_file is not None:
+        with atomic_path(json_file) as partial:
+            partial.write_text(
+                json.dumps(
+                    {"file": file.name, "schema": schema.name, "attributes": attributes, "variables": variables},
+                    indent=1,
+                    default=str,
+                )
+            )

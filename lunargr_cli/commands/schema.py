@@ -1,0 +1,34 @@
+"""`lunargr schema NAME`: what an artefact holds, from its one declaration."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+NAME, ORDER = "schema", 91
+
+
+def command(
+    name: Annotated[str | None, typer.Argument(help="scene, crops, pairs, ...; nothing lists them all.")] = None,
+) -> None:
+    """Print what an artefact holds: dimensions, variables, units, attributes."""
+    from lunargr_cli.console import Console
+    from schemas import SCHEMAS, get_schema
+
+    console = Console()
+    if name is None:
+        rows = [(s.name, f"lunargr {s.stage}", s.title) for s in SCHEMAS.values()]
+        console.table("artefacts", ("name", "written by", "what"), rows)
+        return
+    schema = get_schema(name)
+    print(f"{schema.name}, version {schema.version}, written by 'lunargr {schema.stage}': {schema.title}\n")
+    console.table("dimensions", ("name", "what"), schema.dims.items())
+    rows = []
+    for v in schema.variables:
+        text = v.description + ("" if v.required else " (optional)")
+        if v.flags:
+            text += "; " + ", ".join(f"{value} = {meaning}" for meaning, value in v.flags)
+        rows.append((v.name, ", ".join(v.dims), v.dtype, " or ".join((v.unit, *v.unit_choices)) or "-", text))
+    console.table("variables", ("name", "dims", "type", "unit", "what"), rows)
+    console.table("root attributes", ("name", "what"), [(a.name, a.description) for a in schema.attributes])

@@ -1,0 +1,49 @@
+"""The `lunargr` command: one sub-command per stage. Heavy imports happen inside the commands."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+
+import typer
+
+from lunargr_cli import commands
+from lunargr_cli.console import say_error
+from schemas.errors import EXIT_CODE, LunargrError
+
+app = typer.Typer(
+    name="lunargr",
+    help="Learn a spatially varying reflectance of the Moon from terrain alone, and show what the simulation gets wrong.\n\n"
+    "simulate -> ingest -> sample -> project -> train -> infer -> render -> evaluate / match, and diagnose",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+for _module in sorted(
+    (importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)),
+    key=lambda module: module.ORDER,
+):
+    app.command(name=_module.NAME)(_module.command)
+
+
+def main() -> None:
+    """Run the command line; a LunargrError is one line on standard error and exit code 3."""
+    try:
+        app()
+    except LunargrError as error:
+        say_error(str(error))
+        sys.exit(EXIT_CODE)
+    except KeyboardInterrupt:
+        say_error("interrupted; nothing half-written was kept.")
+        sys.exit(130)
+    except BrokenPipeError:  # `lunargr inspect file | head`
+        sys.stderr.close()
+        sys.exit(141)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,343 @@
+"""The artefacts of the pipeline. `lunargr schema NAME`, the writers, the checks and the docs all read this page."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from schemas.declaration import STRING, Attribute, Schema, Variable, declare
+
+SPLITS = (("train", 0), ("validation", 1), ("test", 2))
+VALIDITY = (("invalid", 0), ("valid", 1))
+UNITS = (("iof", 0), ("dn", 1))
+
+_GRID = (
+    Variable("y", ("y",), "f8", "m", "grid northing of the pixel centre; rows run south"),
+    Variable("x", ("x",), "f8", "m", "grid easting of the pixel centre"),
+)
+_PLACE = (
+    Attribute("gsd_m", "ground sample distance of the grid, m"),
+    Attribute("body_radius_m", "radius of the reference sphere, m"),
+)
+_FRAMES = (
+    Variable("image_id", ("frame",), STRING, "", "name of the source image"),
+    Variable("solar_distance_au", ("frame",), "f8", "au", "distance of the Sun", required=False),
+)
+_FRAME_TABLE = _FRAMES + (
+    Variable("path", ("frame",), STRING, "", "image file, relative to this artefact where possible"),
+    Variable("camera", ("frame",), STRING, "", "camera model file, empty for map-projected images"),
+    Variable("start_time", ("frame",), STRING, "", "UTC"),
+    Variable("units", ("frame",), "u1", "1", "radiometric units of the image", flags=UNITS),
+    Variable("subsolar_longitude_deg", ("frame",), "f8", "degree", "east longitude of the sub-solar point"),
+    Variable("subsolar_latitude_deg", ("frame",), "f8", "degree", "latitude of the sub-solar point"),
+    Variable("spacecraft_longitude_deg", ("frame",), "f8", "degree", "east longitude below the camera"),
+    Variable("spacecraft_latitude_deg", ("frame",), "f8", "degree", "latitude below the camera"),
+    Variable("spacecraft_altitude_m", ("frame",), "f8", "m", "camera height above the reference sphere"),
+)
+
+SCENE = declare(
+    Schema(
+        name="scene",
+        version=1,
+        stage="ingest",
+        title="A DEM on a metric grid, its images and where crops may be centred",
+        dims={
+            "frame": "source images",
+            "y": "grid rows, north to south",
+            "x": "grid columns, west to east",
+            "window": "row, column, height, width",
+        },
+        variables=_GRID
+        + (
+            Variable(
+                "elevation",
+                ("y", "x"),
+                "f4",
+                "m",
+                "height above the reference sphere",
+                chunks=(256, 256),
+                georeferenced=True,
+            ),
+            Variable(
+                "dem_valid",
+                ("y", "x"),
+                "u1",
+                "1",
+                "1 = the DEM is valid",
+                flags=VALIDITY,
+                chunks=(256, 256),
+                compress=True,
+                georeferenced=True,
+            ),
+            Variable(
+                "valid",
+                ("frame", "y", "x"),
+                "u1",
+                "1",
+                "1 = both DEM and image are valid",
+                flags=VALIDITY,
+                chunks=(1, 256, 256),
+                compress=True,
+                georeferenced=True,
+            ),
+            Variable(
+                "valid_position",
+                ("frame", "y", "x"),
+                "u1",
+                "1",
+                "1 = a crop centred here lies wholly in valid data",
+                flags=VALIDITY,
+                chunks=(1, 256, 256),
+                compress=True,
+                georeferenced=True,
+            ),
+            Variable(
+                "frame_window",
+                ("frame", "window"),
+                "i4",
+                "1",
+                "row, column, height, width of the box that holds the image's valid pixels",
+            ),
+            Variable("valid_area_m2", ("frame",), "f8", "m2", "ground covered by valid positions"),
+        )
+        + _FRAME_TABLE,
+        attributes=_PLACE
+        + (
+            Attribute("crop_px", "crop size that valid_position was eroded for"),
+            Attribute("elevation_source", "name of the DEM file"),
+        ),
+    )
+)
+
+_PAIR_PLACE = (
+    Variable("longitude_deg", ("pair",), "f8", "degree", "east longitude of the crop centre"),
+    Variable("latitude_deg", ("pair",), "f8", "degree", "planetocentric latitude of the crop centre"),
+    Variable(
+        "row",
+        ("pair",),
+        "i4",
+        "1",
+        "row of the crop centre on the scene grid: the crop spans row - size/2 .. row + size/2 - 1",
+    ),
+    Variable("col", ("pair",), "i4", "1", "column of the crop centre on the scene grid"),
+    Variable("image_index", ("pair",), "i4", "1", "index into the frame dimension"),
+    Variable("site", ("pair",), "i4", "1", "pairs with the same site show the same ground, pixel for pixel"),
+    Variable("tile", ("pair",), "i4", "1", "ground tile of the geographic split"),
+    Variable("split", ("pair",), "u1", "1", "which part of the geographic split", flags=SPLITS),
+)
+
+CROPS = declare(
+    Schema(
+        name="crops",
+        version=1,
+        stage="sample",
+        title="Crop centres and DEM crops with a geographic split",
+        dims={"pair": "one crop of one image", "y": "crop rows", "x": "crop columns", "frame": "source images"},
+        variables=(Variable("elevation", ("pair", "y", "x"), "f4", "m", "height above the reference sphere"),)
+        + _PAIR_PLACE
+        + _FRAME_TABLE,
+        attributes=_PLACE
+        + (
+            Attribute("scene", "the scene artefact, relative to this file"),
+            Attribute("scene_sha256", "its SHA-256"),
+            Attribute("tile_m", "edge of a ground tile, m"),
+        ),
+    )
+)
+
+
+def _optional(variables: tuple[Variable, ...], *names: str) -> tuple[Variable, ...]:
+    return tuple(replace(v, required=False) if v.name in names else v for v in variables)
+
+
+PAIRS = declare(
+    Schema(
+        name="pairs",
+        version=1,
+        stage="project",
+        title="DEM crops and the images orthorectified onto them, with Sun, camera and horizon",
+        dims={
+            "pair": "one crop of one image",
+            "y": "crop rows, north to south",
+            "x": "crop columns, west to east",
+            "enu": "east, north, up",
+            "frame": "source images",
+        },
+        foreign_writers=True,
+        variables=(
+            Variable("elevation", ("pair", "y", "x"), "f4", "m", "height above the reference sphere"),
+            Variable(
+                "image",
+                ("pair", "y", "x"),
+                "f4",
+                "1",
+                "orthorectified image: I/F where units = 1",
+                unit_choices=("dn",),
+            ),
+            Variable("valid", ("pair", "y", "x"), "u1", "1", "1 = both DEM and image are valid", flags=VALIDITY),
+            Variable(
+                "sun_horizon_deg",
+                ("pair", "y", "x"),
+                "f4",
+                "degree",
+                "elevation of the terrain horizon in the Sun's azimuth, from the whole DEM",
+                required=False,
+            ),
+            Variable(
+                "sky_view",
+                ("pair", "y", "x"),
+                "f4",
+                "1",
+                "share of the sky that terrain leaves free, cosine-weighted",
+                required=False,
+            ),
+            Variable(
+                "detector_sample",
+                ("pair", "y", "x"),
+                "f4",
+                "px",
+                "sample on the sensor that saw the pixel",
+                required=False,
+            ),
+            Variable(
+                "detector_line", ("pair", "y", "x"), "f4", "px", "line on the sensor that saw the pixel", required=False
+            ),
+            Variable(
+                "sun_direction_enu",
+                ("pair", "enu"),
+                "f8",
+                "1",
+                "unit vector towards the Sun at the crop centre, along the crop's columns, rows (north) and up",
+            ),
+            Variable(
+                "camera_position_enu",
+                ("pair", "enu"),
+                "f8",
+                "m",
+                "camera position from the crop centre at the crop's mean elevation, same axes",
+            ),
+            Variable(
+                "convergence_deg",
+                ("pair",),
+                "f8",
+                "degree",
+                "true north at the crop centre, clockwise from the crop's up-column direction",
+                required=False,
+            ),
+        )
+        + _optional(_PAIR_PLACE, "tile", "row", "col")
+        + _FRAMES,
+        attributes=_PLACE,
+    )
+)
+
+CHECKPOINT = declare(
+    Schema(
+        name="checkpoint",
+        version=1,
+        stage="train",
+        title="Weights, normalisation and history of a trained network",
+        dims={"epoch": "training epochs", "frame": "source images"},
+        variables=(
+            Variable("train_loss", ("epoch",), "f8", "1", "mean squared error on valid training pixels"),
+            Variable("validation_loss", ("epoch",), "f8", "1", "mean squared error on valid validation pixels"),
+            Variable("epoch_seconds", ("epoch",), "f8", "s", "wall time of the epoch"),
+            Variable("image_id", ("frame",), STRING, "", "name of the source image"),
+            Variable("gain", ("frame",), "f8", "1", "measured = gain x I/F + offset; 1 for calibrated images"),
+            Variable("offset", ("frame",), "f8", "1", "measured = gain x I/F + offset; 0 for calibrated images"),
+        ),
+        attributes=(
+            Attribute("model", "reflectance model whose coefficients the network predicts"),
+            Attribute("coefficients", "JSON list of coefficient names, in channel order"),
+            Attribute("elevation_scale_m", "std of the crop-centred training elevations, m"),
+            Attribute("gsd_m", "ground sample distance the network was trained at, m"),
+            Attribute("body_radius_m", "radius of the reference sphere, m"),
+            Attribute("image_units", "units of the training images: 'iof' or 'dn'"),
+            Attribute("best_epoch", "epoch whose weights are in /weights"),
+        ),
+    )
+)
+
+SVBRDF = declare(
+    Schema(
+        name="svbrdf",
+        version=1,
+        stage="infer",
+        title="Georeferenced maps of reflectance coefficients",
+        dims={
+            "coefficient": "coefficients of the reflectance model",
+            "y": "grid rows, north to south",
+            "x": "grid columns, west to east",
+        },
+        variables=_GRID
+        + (
+            Variable(
+                "coefficients",
+                ("coefficient", "y", "x"),
+                "f4",
+                "1",
+                "coefficients of the reflectance model, by name in coefficient_name",
+                chunks=(1, 256, 256),
+                georeferenced=True,
+            ),
+            Variable("coefficient_name", ("coefficient",), STRING, "", "names of the coefficients"),
+            Variable(
+                "elevation",
+                ("y", "x"),
+                "f4",
+                "m",
+                "height above the reference sphere",
+                chunks=(256, 256),
+                georeferenced=True,
+            ),
+            Variable(
+                "valid",
+                ("y", "x"),
+                "u1",
+                "1",
+                "1 = the map holds coefficients here",
+                flags=VALIDITY,
+                chunks=(256, 256),
+                compress=True,
+                georeferenced=True,
+            ),
+        ),
+        attributes=_PLACE
+        + (Attribute("model", "reflectance model"), Attribute("quantity", "what the model gives: I/F")),
+    )
+)
+
+EVALUATION = declare(
+    Schema(
+        name="evaluation",
+        version=1,
+        stage="evaluate",
+        title="Measured against rendered crops of one split, for every compared model",
+        dims={"model": "compared models", "pair": "crops of the split", "y": "crop rows", "x": "crop columns"},
+        variables=(
+            Variable("model_name", ("model",), STRING, "", "names of the compared models"),
+            Variable("pair_index", ("pair",), "i4", "1", "index of the crop in pairs.h5"),
+            Variable("tile", ("pair",), "i4", "1", "ground tile, the unit of the bootstrap"),
+            Variable("valid_pixels", ("pair",), "i4", "1", "pixels that count"),
+            Variable("mse", ("model", "pair"), "f8", "1", "mean squared error of the crop"),
+            Variable("ssim", ("model", "pair"), "f8", "1", "structural similarity of the crop"),
+            Variable("measured", ("pair", "y", "x"), "f4", "1", "measured crop"),
+            Variable("rendered", ("model", "pair", "y", "x"), "f4", "1", "rendered crop", required=False),
+        ),
+        attributes=(Attribute("split", "which split was evaluated"), Attribute("metrics", "the table as JSON")),
+    )
+)
+
+DIAGNOSIS = declare(
+    Schema(
+        name="diagnosis",
+        version=1,
+        stage="diagnose",
+        title="Named causes of the residual and the extended model that contains them",
+        dims={"frame": "source images"},
+        variables=(Variable("image_id", ("frame",), STRING, "", "name of the source image"),),
+        attributes=(
+            Attribute("report", "the diagnosis as JSON (docs: the output of diagnose)"),
+            Attribute("extension", "JSON list of the effects of the extended model with their parameters"),
+        ),
+    )
+)

@@ -1,0 +1,400 @@
+"""Writing and opening artefacts: HDF5 that is also valid netCDF-4 / CF, whole or absent, never half-written."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import errno
+import hashlib
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+
+from schemas.declaration import SCHEMAS, STRING, Schema, Variable
+from schemas.errors import ArtefactError, ConfigError, InputError, LunargrError
+
+CONVENTIONS = "CF-1.11"
+# The netCDF-4 format's marker for a dimension without a coordinate variable of its own.
+_BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable.%10d"
+_FILL = {"f": np.nan, "i": -2147483648, "u": 255}
+
+
+def silence_hdf5() -> None:
+    """Keep the HDF5 C library from printing its own error stack: our one line says it."""
+    h5py._errors.silence_errors()
+
+
+def sha256(path: Path) -> str:
+    """The SHA-256 of a file, read in blocks."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as stream:
+        while block := stream.read(1 << 22):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def check_output(path: Path, inputs: Sequence[Path] = (), overwrite: bool = False) -> None:
+    """Refuse, before any work is done, an output that would replace an input or an existing file.
+
+    Raises ConfigError; the folder is created where it is missing.
+    """
+    path = Path(path)
+    for source in inputs:
+        if path.resolve() == Path(source).resolve():
+            raise ConfigError(f"{path}: the output would replace the input of the same name; choose another --output.")
+    if path.is_dir():
+        raise ConfigError(f"{path}: expected a file name, found a folder; name the file in --output.")
+    if path.exists() and not overwrite:
+        raise ConfigError(f"{path}: exists already; add --overwrite to replace it or choose another --output.")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"{path.parent}: cannot be made a folder ({error.strerror}); choose another --output."
+        ) from None
+
+
+def _is_full_disk(error: BaseException) -> bool:
+    text = str(error).lower()
+    return (
+        getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        or "no space left" in text
+        or "disk quota" in text
+        or f"errno = {errno.ENOSPC}" in text
+        or f"errno = {errno.EFBIG}" in text
+    )
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary name beside ``path`` that becomes ``path`` when the block ends well and vanishes when it does not.
+
+    Also turns a full disk into one clear line (InputError).
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            partial.unlink()
+        if _is_full_disk(error):
+            raise InputError(
+                f"{path}: the disk is full or over quota; nothing was written. Free some space and run the command again."
+            ) from None
+        raise
+
+
+class ArtefactWriter:
+    """Writes one artefact under a temporary name; use as a context manager.
+
+    Dimensions are sized on entry; ``None`` is not allowed. Variables are created on first use, from their declaration.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        schema: Schema,
+        sizes: Mapping[str, int],
+        *,
+        config: Mapping[str, Any] | None = None,
+        inputs: Sequence[Path] = (),
+        seed: int | None = None,
+        attributes: Mapping[str, Any] | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        check_output(path, inputs, overwrite)
+        self.path = Path(path)
+        self.schema = schema
+        self.sizes = dict(sizes)
+        self._root_attributes = _provenance(schema, config or {}, inputs, seed) | dict(attributes or {})
+        self._stack = contextlib.ExitStack()
+        self.file: h5py.File
+
+    def __enter__(self) -> ArtefactWriter:
+        silence_hdf5()
+        self._stack.__enter__()
+        try:
+            partial = self._stack.enter_context(atomic_path(self.path))
+            self._stack.enter_context(_terminate_as_exception())
+            try:
+                self.file = self._stack.enter_context(
+                    h5py.File(partial, "w", track_order=True, libver=("earliest", "v110"))
+                )
+            except OSError as error:
+                if _is_full_disk(error):
+                    raise
+                raise ConfigError(f"{self.path}: cannot be written ({error}); choose another --output.") from None
+            for key, value in self._root_attributes.items():
+                self.file.attrs[key] = value
+            for order, (name, size) in enumerate(self.sizes.items()):
+                if name not in self.schema:  # a coordinate variable carries its own scale
+                    scale = self.file.create_dataset(name, shape=(size,), dtype=">f4")
+                    scale.make_scale(_BARE_DIMENSION % size)
+                    scale.attrs["_Netcdf4Dimid"] = np.int32(order)
+            for name, size in self.sizes.items():
+                if name in self.schema:
+                    self._create(self.schema[name], size_of_scale=size)
+        except BaseException:
+            if self._stack.__exit__(*sys.exc_info()):
+                raise RuntimeError("an artefact's error was swallowed") from None
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            missing = [v.name for v in self.schema.variables if v.required and v.name not in self.file]
+            missing += [a.name for a in self.schema.attributes if a.required and a.name not in self.file.attrs]
+            if missing:
+                error = RuntimeError(f"{self.schema.name}: written without {', '.join(missing)}")
+                self._stack.__exit__(type(error), error, None)
+                raise error
+        self._stack.__exit__(kind, error, trace)
+
+    def _create(self, variable: Variable, size_of_scale: int | None = None, unit: str | None = None) -> h5py.Dataset:
+        shape = tuple(self.sizes[d] for d in variable.dims)
+        options: dict[str, Any] = {}
+        if shape and 0 not in shape:
+            chunks = variable.chunks
+            if chunks is None and len(shape) >= 3:  # one record (a pair, a band) a chunk: random access stays fast
+                chunks = (1,) * (len(shape) - 2) + shape[-2:]
+            if chunks is not None:
+                options["chunks"] = tuple(min(c, s) for c, s in zip(chunks, shape, strict=True))
+            if variable.compress:
+                options |= {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+                options.setdefault("chunks", True)
+        if variable.dtype == STRING:
+            dtype: Any = h5py.string_dtype()
+        else:
+            dtype = np.dtype(variable.dtype)
+            if dtype.kind == "f":
+                options["fillvalue"] = np.nan
+        data = self.file.create_dataset(variable.name, shape=shape, dtype=dtype, track_order=True, **options)
+        if size_of_scale is not None:
+            data.make_scale(variable.name)
+            data.attrs["_Netcdf4Dimid"] = np.int32(list(self.sizes).index(variable.name))
+        else:
+            for axis, dim in enumerate(variable.dims):
+                data.dims[axis].attach_scale(self.file[dim])
+        if variable.dtype != STRING:
+            data.attrs["units"] = unit or variable.unit
+            if dtype.kind == "f":
+                data.attrs["_FillValue"] = np.array(np.nan, dtype)
+        data.attrs["long_name"] = variable.description
+        if variable.flags:
+            data.attrs["flag_values"] = np.array([value for _, value in variable.flags], dtype)
+            data.attrs["flag_meanings"] = " ".join(meaning for meaning, _ in variable.flags)
+        if variable.georeferenced:
+            data.attrs["grid_mapping"] = "crs"
+        return data
+
+    def dataset(self, name: str, unit: str | None = None) -> h5py.Dataset:
+        """The open dataset ``name``, created from its declaration on first use, for block-wise writing."""
+        if name not in self.file:
+            return self._create(self.schema[name], unit=unit)
+        return self.file[name]
+
+    def write(self, name: str, data: Any, unit: str | None = None) -> h5py.Dataset:
+        """Write a whole variable; shapes must match the declared dimensions."""
+        target = self.dataset(name, unit)
+        if self.schema[name].dtype == STRING:
+            target[...] = np.asarray(list(data), dtype=object) if target.shape else data
+        else:
+            target[...] = data
+        return target
+
+    def write_crs(self, wkt: str, transform: Sequence[float]) -> None:
+        """The scalar ``crs`` variable that CF and GDAL look for; ``transform`` is affine (a, b, c, d, e, f)."""
+        data = self.file.create_dataset("crs", shape=(), dtype="i4", data=0)
+        a, b, c, d, e, f = (float(v) for v in transform[:6])
+        data.attrs["crs_wkt"] = wkt
+        data.attrs["spatial_ref"] = wkt
+        data.attrs["GeoTransform"] = " ".join(repr(v) for v in (c, a, b, f, d, e))
+
+
+@contextlib.contextmanager
+def _terminate_as_exception() -> Iterator[None]:
+    """Let SIGTERM (a Slurm time limit, ``kill``) unwind like Ctrl-C, so that the partial file is removed."""
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    ):
+        yield
+        return
+
+    def stop(number: int, frame: Any) -> None:
+        raise SystemExit(128 + number)
+
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _provenance(schema: Schema, config: Mapping[str, Any], inputs: Sequence[Path], seed: int | None) -> dict[str, Any]:
+    from importlib.metadata import version
+
+    now = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    sources = [{"name": Path(p).name, "sha256": sha256(Path(p))} for p in inputs]
+    return {
+        "Conventions": CONVENTIONS,
+        "title": schema.title,
+        "lunargr_schema": schema.name,
+        "schema_version": np.int32(schema.version),
+        "lunargr_version": version("lunargr"),
+        "history": f"{now} lunargr {schema.stage}",
+        "config": json.dumps(config, default=str, sort_keys=True),
+        "inputs": json.dumps(sources),
+        "seed": np.int64(-1 if seed is None else seed),
+    }
+
+
+def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5py.File:
+    """Open an artefact for reading after checking that it is what it should be.
+
+    ``need`` names optional variables that this caller cannot do without. Raises ArtefactError.
+    """
+    path = Path(path)
+    file = _open_hdf5(path)
+    try:
+        _check_kind(path, file, schema)
+        for variable in schema.variables:
+            if variable.name in file:
+                _check_variable(path, file, variable)
+            elif variable.required or variable.name in need:
+                raise ArtefactError(
+                    f"{path}:/{variable.name}: expected a variable ({variable.description}), found none; "
+                    f"write it again with 'lunargr {schema.stage}'."
+                )
+        for attribute in schema.attributes:
+            if attribute.required and attribute.name not in file.attrs:
+                raise ArtefactError(
+                    f"{path}: expected the root attribute '{attribute.name}' ({attribute.description}), found none; "
+                    f"write it again with 'lunargr {schema.stage}'."
+                )
+        _check_sizes(path, file, schema)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def read_kind(path: Path) -> Schema:
+    """The schema that an artefact says it follows. Raises ArtefactError."""
+    with _open_hdf5(Path(path)) as file:
+        name = _text(file.attrs.get("lunargr_schema", ""))
+    if name not in SCHEMAS:
+        raise ArtefactError(
+            f"{path}: expected a lunargr artefact (root attribute 'lunargr_schema'), found '{name or 'none'}'; "
+            f"artefacts are: {', '.join(SCHEMAS)}."
+        )
+    return SCHEMAS[name]
+
+
+def _open_hdf5(path: Path) -> h5py.File:
+    silence_hdf5()
+    if not path.exists():
+        raise ArtefactError(f"{path}: no such file; check the path or run the stage that writes it.")
+    if path.is_dir():
+        raise ArtefactError(f"{path}: expected an HDF5 file, found a folder.")
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        kind = (
+            "a damaged or truncated HDF5 file"
+            if h5py.is_hdf5(path) or "truncated" in str(error)
+            else "another kind of file"
+        )
+        raise ArtefactError(f"{path}: expected an HDF5 artefact, found {kind}; write it again.") from None
+
+
+def _check_kind(path: Path, file: h5py.File, schema: Schema) -> None:
+    found = _text(file.attrs.get("lunargr_schema", ""))
+    if not found and schema.foreign_writers:
+        return
+    if found != schema.name:
+        what = f"a '{found}'" if found else "an HDF5 file without 'lunargr_schema'"
+        raise ArtefactError(
+            f"{path}: expected a '{schema.name}' artefact (from 'lunargr {schema.stage}'), found {what}; check the order of the files."
+        )
+    version = int(file.attrs.get("schema_version", schema.version))
+    if version != schema.version:
+        raise ArtefactError(
+            f"{path}: expected version {schema.version} of '{schema.name}', found {version}; write it again with 'lunargr {schema.stage}'."
+        )
+
+
+def _check_variable(path: Path, file: h5py.File, variable: Variable) -> None:
+    where = f"{path}:/{variable.name}"
+    data = file[variable.name]
+    if not isinstance(data, h5py.Dataset) or data.ndim != len(variable.dims):
+        found = f"{data.ndim}" if isinstance(data, h5py.Dataset) else "a group"
+        raise ArtefactError(
+            f"{where}: expected {len(variable.dims)} dimensions ({', '.join(variable.dims)}), found {found}."
+        )
+    if variable.dtype == STRING:
+        return
+    if data.dtype.kind not in "iufb":
+        raise ArtefactError(f"{where}: expected numbers ({variable.dtype}), found {data.dtype}.")
+    unit = _text(data.attrs.get("units", ""))
+    allowed = (variable.unit, *variable.unit_choices)
+    if unit and unit not in allowed:
+        expected = " or ".join(f"'{u}'" for u in dict.fromkeys(allowed))
+        stage = _text(file.attrs.get("lunargr_schema", "")) or "it"
+        writer = SCHEMAS[stage].stage if stage in SCHEMAS else None
+        advice = f"write it again with 'lunargr {writer}'." if writer else "mend the writer of the file."
+        raise ArtefactError(f"{where}: expected units {expected}, found '{unit}'; {advice}")
+
+
+def _check_sizes(path: Path, file: h5py.File, schema: Schema) -> None:
+    sizes: dict[str, tuple[int, str]] = {}
+    for variable in schema.variables:
+        if variable.name not in file:
+            continue
+        for dim, size in zip(variable.dims, file[variable.name].shape, strict=True):
+            first = sizes.setdefault(dim, (size, variable.name))
+            if first[0] != size:
+                raise ArtefactError(
+                    f"{path}:/{variable.name}: expected {first[0]} along '{dim}' as in /{first[1]}, found {size}; write it again."
+                )
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def read_strings(file: h5py.File, name: str) -> list[str]:
+    """A string variable as a list of ``str``."""
+    return [_text(v) for v in file[name][...]]
+
+
+def read_config(file: h5py.File) -> dict[str, Any]:
+    """The configuration that an artefact was made with."""
+    return json.loads(_text(file.attrs.get("config", "{}")))
+
+
+__all__ = [
+    "ArtefactWriter",
+    "LunargrError",
+    "atomic_path",
+    "check_output",
+    "open_artefact",
+    "read_config",
+    "read_kind",
+    "read_strings",
+    "sha256",
+    "silence_hdf5",
+]

@@ -1,0 +1,1 @@
+"""Networks: the U-Net, its input normalisation and the losses."""

@@ -1,0 +1,1 @@
+"""Physics: bodies, grids, geometry, light, photometry, cameras and the image-formation chain."""

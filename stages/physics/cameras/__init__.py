@@ -1,0 +1,1 @@
+"""Camera models, one file each, behind a registry."""

@@ -1,0 +1,151 @@
+"""How an image comes to be: the ordered chain geometry -> illumination -> reflectance -> radiance -> sensor.
+
+Every step is differentiable in the coefficients and, where the chain is smooth, in elevation, Sun and camera.
+Extensions (``stages/effects``) act at the slot that they name; the order of the slots fixes their composition.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from stages.physics import geometry
+from stages.physics.geometry import Angles
+from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
+
+SLOTS = ("geometry", "illumination", "reflectance", "radiance", "sensor")
+SUN_RADIUS = math.radians(0.2666)  # mean angular radius of the Sun at 1 au
+
+
+@dataclass
+class Observation:
+    """What is known about a batch of crops before any reflectance is chosen.
+
+    elevation : (B, H, W) float32, m
+    sun_direction : (B, 3), unit, ENU along the crop's axes
+    camera_position : (B, 3), m from the crop's centre
+    sun_horizon : (B, H, W), rad, or None where nothing casts shadows
+    sky_view : (B, H, W), 1, or None
+    detector_sample, detector_line : (B, H, W), px, or None
+    frame : (B,) int64, index of the source image, or None
+    """
+
+    elevation: Tensor
+    sun_direction: Tensor
+    camera_position: Tensor
+    gsd: float
+    body_radius: float
+    sun_horizon: Tensor | None = None
+    sky_view: Tensor | None = None
+    detector_sample: Tensor | None = None
+    detector_line: Tensor | None = None
+    frame: Tensor | None = None
+
+
+@dataclass
+class State:
+    """What the chain has made so far; an extension changes what its slot may change.
+
+    geometry      sees and may change: elevation, camera_position
+    illumination  sees also slopes, view; may change: sun_direction, sun_horizon, sun_radius
+    reflectance   sees also angles, sun_visibility; may change: coefficients, reflectance (I/F of a lit facet)
+    radiance      may change: radiance (I/F that reaches the camera)
+    sensor        may change: image
+    """
+
+    observation: Observation
+    elevation: Tensor
+    sun_direction: Tensor
+    camera_position: Tensor
+    sun_horizon: Tensor | None
+    sun_radius: float | Tensor = SUN_RADIUS
+    slopes: tuple[Tensor, Tensor] = field(default=None)  # type: ignore[assignment]
+    view: tuple[Tensor, Tensor, Tensor] = field(default=None)  # type: ignore[assignment]
+    angles: Angles = field(default=None)  # type: ignore[assignment]
+    sun_visibility: Tensor | None = None
+    reflectance: Tensor = field(default=None)  # type: ignore[assignment]
+    radiance: Tensor = field(default=None)  # type: ignore[assignment]
+    image: Tensor = field(default=None)  # type: ignore[assignment]
+
+
+class Extension(Protocol):
+    """A physical effect that extends the chain (``stages/effects``)."""
+
+    slot: str
+
+    def apply(self, state: State) -> None: ...
+
+
+def sun_visibility(sun_elevation: Tensor, horizon: Tensor, radius: float | Tensor = SUN_RADIUS) -> Tensor:
+    """Share of the Sun's light above a straight horizon, 0..1: penumbra makes cast shadows smooth.
+
+    sun_elevation, horizon : rad, broadcastable. For a disc of uniform brightness cut at height t radii above its centre
+    the share above is 1/2 - (t sqrt(1 - t^2) + asin t) / pi; linear limb darkening I = 1 - u (1 - mu) with u = 0.6
+    (Cox 2000, visible light) turns (1 - t^2)-slices from 2 sqrt(1 - t^2) into 2 (1 - u) sqrt(1 - t^2) + u pi/2 (1 - t^2).
+    """
+    u = 0.6
+    t = ((horizon - sun_elevation) / radius).clamp(-1 + 1e-6, 1 - 1e-6)
+    uniform = 0.5 - (t * torch.sqrt(1 - t * t) + torch.asin(t)) / math.pi
+    darkened = 0.5 - 0.75 * (t - t**3 / 3)  # the share for slices of weight (1 - t^2), by the same integral
+    weight = u * 2 / 3 / (1 - u / 3)  # flux of the mu-term over the whole disc's
+    return (1 - weight) * uniform + weight * darkened
+
+
+def form(
+    observation: Observation,
+    model: ReflectanceModel,
+    coefficients: Tensor,
+    extensions: Sequence[Extension] = (),
+) -> Tensor:
+    """The image, in I/F, of a batch of crops.
+
+    coefficients : (B, C, H, W) or anything that broadcasts to it, in the order of ``model.parameters``
+    returns (B, H, W)
+    """
+    state = illuminate(observation, extensions)
+    parameters = model.unpack(coefficients, dim=1)
+    state.reflectance = masked_radiance_factor(model, parameters, state.angles)
+    return expose(state, extensions)
+
+
+def illuminate(observation: Observation, extensions: Sequence[Extension] = ()) -> State:
+    """The first half of the chain, which no coefficient enters: slopes, angles and the visible share of the Sun."""
+    state = State(
+        observation,
+        observation.elevation,
+        observation.sun_direction,
+        observation.camera_position,
+        observation.sun_horizon,
+    )
+    _apply(state, extensions, "geometry")
+    gsd, radius = observation.gsd, observation.body_radius
+    state.slopes = geometry.curvature_slopes(*geometry.slopes(state.elevation, gsd), gsd, radius)
+    state.view = geometry.view_vectors(state.elevation, state.camera_position, gsd)
+    _apply(state, extensions, "illumination")
+    state.angles = geometry.photometric_angles(*state.slopes, state.sun_direction, state.view)
+    if state.sun_horizon is not None:
+        sun_elevation = torch.asin(state.sun_direction[:, 2].clamp(-1, 1)).to(state.elevation.dtype)
+        state.sun_visibility = sun_visibility(sun_elevation[:, None, None], state.sun_horizon, state.sun_radius)
+    return state
+
+
+def expose(state: State, extensions: Sequence[Extension] = ()) -> Tensor:
+    """The second half of the chain: from the I/F of lit facets to the image."""
+    _apply(state, extensions, "reflectance")
+    lit = state.sun_visibility
+    state.radiance = state.reflectance if lit is None else state.reflectance * lit
+    _apply(state, extensions, "radiance")
+    state.image = state.radiance
+    _apply(state, extensions, "sensor")
+    return state.image
+
+
+def _apply(state: State, extensions: Sequence[Extension], slot: str) -> None:
+    for extension in extensions:
+        if extension.slot == slot:
+            extension.apply(state)

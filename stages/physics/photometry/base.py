@@ -1,0 +1,89 @@
+"""What a reflectance model is: named, bounded, cited parameters and one differentiable formula for I/F."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from schemas.errors import RegistryError
+from stages.physics.geometry import Angles
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a model: bounds are physical limits, the default is a published lunar value where there is one."""
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    default: float
+    description: str
+
+
+class ReflectanceModel:
+    """Base of every reflectance model. Subclasses fill the class attributes and ``radiance_factor``."""
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    formula: ClassVar[str]
+    reference: ClassVar[str]
+    reciprocal: ClassVar[bool]
+    parameters: ClassVar[tuple[Parameter, ...]]
+    # I/F is a linear function of the parameters: a global set is then one least-squares solve.
+    linear: ClassVar[bool] = False
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        """I/F = pi r, including cos(incidence), wherever incidence and emission are below 90 deg.
+
+        parameters : tensors that broadcast with the angles. Callers use :func:`evaluate`, which masks the rest.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must define radiance_factor")
+
+    def constrain(self, raw: Tensor, dim: int) -> Tensor:
+        """Network outputs -> parameters within their bounds (sigmoid between lower and upper)."""
+        shape = [1] * raw.ndim
+        shape[dim] = len(self.parameters)
+        low = torch.tensor([p.lower for p in self.parameters], dtype=raw.dtype, device=raw.device).view(shape)
+        high = torch.tensor([p.upper for p in self.parameters], dtype=raw.dtype, device=raw.device).view(shape)
+        return low + (high - low) * torch.sigmoid(raw)
+
+    def unconstrain(self, value: Tensor, dim: int) -> Tensor:
+        """Inverse of :meth:`constrain`, for starting a network at known coefficients."""
+        shape = [1] * value.ndim
+        shape[dim] = len(self.parameters)
+        low = torch.tensor([p.lower for p in self.parameters], dtype=value.dtype, device=value.device).view(shape)
+        high = torch.tensor([p.upper for p in self.parameters], dtype=value.dtype, device=value.device).view(shape)
+        return torch.logit(((value - low) / (high - low)).clamp(1e-6, 1 - 1e-6))
+
+    def unpack(self, coefficients: Tensor, dim: int) -> dict[str, Tensor]:
+        """A stack of coefficients -> parameters by name; the order is that of ``parameters``."""
+        return {p.name: coefficients.select(dim, k) for k, p in enumerate(self.parameters)}
+
+    def defaults(self) -> dict[str, float]:
+        return {p.name: p.default for p in self.parameters}
+
+
+_MODELS: dict[str, ReflectanceModel] = {}
+
+
+def register(cls: type[ReflectanceModel]) -> type[ReflectanceModel]:
+    """Class decorator: make a model known under its name (case does not matter)."""
+    _MODELS[cls.name.lower()] = cls()
+    return cls
+
+
+def get_model(name: str) -> ReflectanceModel:
+    """The model called ``name``. Raises RegistryError with the choices."""
+    try:
+        return _MODELS[name.lower()]
+    except KeyError:
+        raise RegistryError.unknown("reflectance model", name, model_names()) from None
+
+
+def model_names() -> list[str]:
+    return [m.name for m in _MODELS.values()]

@@ -1,0 +1,24 @@
+"""Lambert's law: a surface equally bright from everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from stages.physics.geometry import Angles
+from stages.physics.photometry.base import Parameter, ReflectanceModel, register
+
+
+@register
+class Lambert(ReflectanceModel):
+    name = "lambert"
+    title = "Lambert"
+    formula = "A cos(i)"
+    reference = "Lambert, J. H. (1760), Photometria"
+    reciprocal = True
+    linear = True
+    parameters = (Parameter("albedo", "1", 0.0, 1.0, 0.12, "normal albedo"),)
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        return parameters["albedo"] * angles.cos_incidence
