@@ -1,0 +1,49 @@
+"""`lunargr ingest`: DEM and image table -> scene.h5."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import BodyOption, Output, Overwrite, Quiet
+
+NAME, ORDER = "ingest", 20
+
+
+def command(
+    dem: Annotated[Path, typer.Argument(help="DEM that GDAL reads: GeoTIFF, PDS IMG, ISIS cube; metres or degrees.")],
+    images: Annotated[
+        Path | None, typer.Option("--images", help="Image table: images.csv, or JSON with the same keys.")
+    ] = None,
+    gsd: Annotated[
+        float | None, typer.Option("--gsd", help="Working ground sample distance, m (default: the DEM's own).")
+    ] = None,
+    crop: Annotated[int, typer.Option("--crop", help="Crop size in pixels that valid positions are made for.")] = 128,
+    output: Output = Path("scene.h5"),
+    body: BodyOption = None,
+    skip_outside: Annotated[
+        bool, typer.Option("--skip-outside", help="Leave out images that do not touch the DEM.")
+    ] = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Bring a DEM to a metric grid and find where crops of each image may be centred."""
+    from lunargr_cli.console import Console
+    from stages import ingest
+
+    console = Console(quiet)
+    config = ingest.Config(gsd=gsd, crop=crop, body=body or "moon", skip_outside=skip_outside)
+    found = ingest.run(dem, images, output, config, overwrite, console.progress)
+    grid, (low, high) = found.grid, found.elevation_range
+    how = "reprojected to a local metric grid" if found.resampled else "area means of the DEM's own grid"
+    console.say(
+        f"{output}: {grid.height} x {grid.width} px at {grid.gsd:g} m, {how}; "
+        f"{found.dem_valid_share:.1%} valid, {low:.1f} to {high:.1f} m"
+    )
+    for name in found.skipped:
+        console.say(f"left out: image '{name}' does not touch the DEM")
+    if found.frames:
+        rows = [(f.image_id, f.units, f"{a:.2f}") for f, a in zip(found.frames, found.valid_area_km2, strict=True)]
+        console.table(f"images: where a crop of {crop} px fits", ("image", "units", "km2"), rows)

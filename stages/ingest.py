@@ -1,0 +1,405 @@
+"""ingest: a DEM on a metric grid at the working GSD, and where crops of each image may be centred.
+
+Everything streams in blocks: memory does not grow with the DEM.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.io import DatasetReader
+from rasterio.transform import Affine
+from rasterio.warp import Resampling, calculate_default_transform
+from rasterio.windows import Window
+
+from schemas import SCENE, ArtefactWriter, ConfigError, GeometryError, InputError
+from stages.physics import rasters
+from stages.physics.bodies import find_body
+from stages.physics.frames import Frame, read_frames, write_frames
+from stages.physics.grid import Grid, check_body, local_metric_crs, require_crs
+
+Progress = Callable[[int, int, str], None]
+
+# A map whose pixels are within this of square and of the working GSD counts as metric: no resampling, only means.
+METRIC_TOLERANCE = 0.01
+MINIMUM_COVERAGE = 0.5  # share of a coarse pixel that must be valid before its mean counts
+
+
+@dataclass(frozen=True)
+class Config:
+    """gsd : m, None for the DEM's own; crop : px; block : px, the unit of streaming."""
+
+    gsd: float | None = None
+    crop: int = 128
+    body: str = "moon"
+    block: int = 1024
+    skip_outside: bool = False
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What ingest found, for the table at the end."""
+
+    grid: Grid
+    dem_valid_share: float
+    elevation_range: tuple[float, float]
+    frames: tuple[Frame, ...]
+    valid_area_km2: tuple[float, ...]
+    resampled: bool
+    skipped: tuple[str, ...]
+
+
+def run(
+    dem: Path,
+    images: Path | None,
+    output: Path,
+    config: Config,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Summary:
+    """Write ``scene.h5``. Raises InputError, GeometryError or ConfigError; then nothing is written."""
+    if config.crop < 16 or config.crop % 2:
+        raise ConfigError(f"--crop: expected an even number of pixels, at least 16; found {config.crop}.")
+    body = find_body(config.body)
+    frames = read_frames(images) if images else []
+    with rasters.open_raster(dem, "a DEM") as dataset:
+        crs = require_crs(str(dem), dataset.crs, dataset.transform)
+        check_body(str(dem), crs, body)
+        plan = plan_grid(dem, dataset, config.gsd, body.radius)
+        frames, skipped = _check_frames(frames, plan.grid, config.skip_outside)
+        inputs = [dem] + ([images] if images else [])
+        sizes = {"frame": len(frames), "y": plan.grid.height, "x": plan.grid.width, "window": 4}
+        attributes = {
+            "gsd_m": plan.grid.gsd,
+            "body_radius_m": body.radius,
+            "crop_px": np.int32(config.crop),
+            "elevation_source": dem.name,
+        }
+        stored = asdict(config) | {"resampled": plan.factor is None}
+        with ArtefactWriter(
+            output, SCENE, sizes, config=stored, inputs=inputs, attributes=attributes, overwrite=overwrite
+        ) as writer:
+            _write_grid(writer, plan.grid)
+            share, extent = _write_elevation(dem, dataset, plan, writer, config, progress)
+            areas = [
+                _write_validity(frame, index, len(frames), plan.grid, writer, config, progress)
+                for index, frame in enumerate(frames)
+            ]
+            if frames and not any(areas):
+                raise GeometryError(
+                    f"{images}: a crop of {config.crop} px ({config.crop * plan.grid.gsd:g} m) is larger than any valid region "
+                    "of any image; choose a smaller --crop or a finer --gsd."
+                )
+            writer.write("valid_area_m2", np.array(areas))
+            write_frames(writer, frames)
+    return Summary(
+        plan.grid, share, extent, tuple(frames), tuple(a / 1e6 for a in areas), plan.factor is None, tuple(skipped)
+    )
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How the DEM reaches its grid: an integer ``factor``, or None for a reprojection."""
+
+    grid: Grid
+    factor: int | None
+    resampling: Resampling
+    radius_is_elevation: bool
+
+
+def plan_grid(dem: Path, dataset: DatasetReader, gsd: float | None, radius: float) -> Plan:
+    """Area means where the DEM's grid is metric and divides the GSD, otherwise a local metric grid."""
+    east, north = rasters.pixel_size_at(dataset, radius, dataset.height / 2, dataset.width / 2)
+    native = max(east, north)
+    if gsd is not None and not (math.isfinite(gsd) and gsd > 0):
+        raise ConfigError(f"--gsd: expected a positive number of metres, found {gsd}.")
+    if not (math.isfinite(native) and native > 0):
+        raise GeometryError(f"{dem}: its georeference puts the DEM off the body; check its CRS and transform.")
+    wanted = native if gsd is None else gsd
+    if wanted < 0.5 * native:
+        raise ConfigError(
+            f"--gsd: expected at least half the DEM's own {native:g} m, found {wanted:g}; detail cannot be invented."
+        )
+    holds_radii = _holds_radii(dem, dataset, radius)
+    t = dataset.transform
+    if dataset.crs.is_projected and t.b == t.d == 0 and t.a > 0 > t.e and _is_metre(dataset):
+        step = abs(t.a)
+        factor = max(1, round(wanted / step))
+        true_square = abs(east - north) <= METRIC_TOLERANCE * native and abs(-t.e - t.a) <= 1e-3 * step
+        true_scale = abs(east - step) <= METRIC_TOLERANCE * step
+        fits = gsd is None or abs(wanted - factor * step) <= 1e-3 * wanted
+        if true_square and true_scale and fits:
+            height, width = dataset.height // factor, dataset.width // factor
+            if min(height, width) < 1:
+                raise ConfigError(f"--gsd: {wanted:g} m is coarser than the whole DEM; choose a finer one.")
+            transform = t @ Affine.scale(factor)
+            return Plan(
+                Grid(dataset.crs.to_wkt(), transform, height, width, radius), factor, Resampling.average, holds_radii
+            )
+    whole = Grid(dataset.crs.to_wkt(), t, dataset.height, dataset.width, radius)
+    lon, lat = (float(v) for v in whole.lonlat(dataset.height / 2 - 0.5, dataset.width / 2 - 0.5))
+    crs = local_metric_crs(lon, lat, radius)
+    transform, width, height = calculate_default_transform(
+        dataset.crs, crs, dataset.width, dataset.height, *dataset.bounds, resolution=wanted
+    )
+    # Pixel corners at whole multiples of the GSD: two runs on overlapping DEMs then differ by whole pixels only.
+    transform = Affine(
+        wanted, 0, wanted * round(transform.c / wanted), 0, -wanted, wanted * round(transform.f / wanted)
+    )
+    coarser = wanted > 1.5 * native
+    return Plan(
+        Grid(crs.to_wkt(), transform, height, width, radius),
+        None,
+        Resampling.average if coarser else Resampling.cubic,
+        holds_radii,
+    )
+
+
+def _is_metre(dataset: DatasetReader) -> bool:
+    return abs((dataset.crs.linear_units_factor[1] if dataset.crs.is_projected else 0) - 1) < 1e-6
+
+
+def _holds_radii(dem: Path, dataset: DatasetReader, radius: float) -> bool:
+    """Whether the DEM counts from the body's centre; and whether its numbers can be metres at all."""
+    size = 256
+    windows = [
+        Window(c, r, min(size, dataset.width - c), min(size, dataset.height - r))
+        for r in np.unique(np.linspace(0, max(0, dataset.height - size), 5).astype(int))
+        for c in np.unique(np.linspace(0, max(0, dataset.width - size), 5).astype(int))
+    ]
+    samples = [rasters.read_window(dataset, w) for w in windows]
+    finite = np.concatenate([s[np.isfinite(s)] for s in samples])
+    if not finite.size and not _any_valid(dataset):
+        raise InputError(f"{dem}: expected elevations, found only nodata; is this the right band and file?")
+    if not finite.size:
+        return False
+    unit = (dataset.units[0] or "").strip().lower()
+    if unit in ("km", "kilometre", "kilometer", "kilometers", "kilometres"):
+        raise InputError(
+            f"{dem}: expected elevations in metres, found units '{unit}'; convert it (gdal_calc.py --calc='A*1000')."
+        )
+    middle = float(np.median(finite))
+    if abs(middle) > 0.5 * radius:
+        if abs(middle - radius) > 0.05 * radius:
+            raise InputError(
+                f"{dem}: expected metres above the sphere or radii near {radius:g} m, found values near {middle:g}; check units and --body."
+            )
+        return True
+    kilometres_radius = (
+        abs(middle - radius / 1000) < 0.05 * radius / 1000 and float(np.ptp(finite)) < 0.02 * radius / 1000
+    )
+    if kilometres_radius:
+        raise InputError(
+            f"{dem}: expected metres, found values near {middle:g}, the body's radius in kilometres; multiply by 1000."
+        )
+    east, north = rasters.pixel_size_at(dataset, radius, dataset.height / 2, dataset.width / 2)
+    rise = np.concatenate(
+        [np.abs(np.diff(s, axis=1)).ravel() for s in samples if s.shape[1] > 1] or [np.array([np.nan])]
+    )
+    rise = rise[np.isfinite(rise)]
+    if rise.size > 100:
+        slope = math.degrees(math.atan(float(np.sqrt(np.mean(rise**2))) / min(east, north)))
+        if slope > 80:
+            raise InputError(
+                f"{dem}: expected elevations in metres, found an rms slope of {slope:.1f} deg; are the units smaller than metres?"
+            )
+        if 0 < slope < 0.02:
+            raise InputError(
+                f"{dem}: expected elevations in metres, found an rms slope of {slope:.4f} deg; are they in kilometres?"
+            )
+    return False
+
+
+def _any_valid(dataset: DatasetReader) -> bool:
+    return any(np.isfinite(rasters.read_window(dataset, window)).any() for _, window in dataset.block_windows(1))
+
+
+def blocks(height: int, width: int, size: int) -> Iterator[tuple[int, int, int, int]]:
+    """(row, col, height, width) of the blocks that tile an array."""
+    for row in range(0, height, size):
+        for col in range(0, width, size):
+            yield row, col, min(size, height - row), min(size, width - col)
+
+
+def area_mean(fine: NDArray, factor: int) -> NDArray[np.float32]:
+    """Mean over factor x factor pixels, NaN where less than half is valid.
+
+    fine : (H * factor, W * factor), NaN = nodata -> (H, W)
+    """
+    if factor == 1:
+        return fine.astype(np.float32)
+    height, width = fine.shape[0] // factor, fine.shape[1] // factor
+    cells = fine[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    valid = np.isfinite(cells)
+    count = valid.sum(axis=(1, 3))
+    total = np.where(valid, cells, 0).sum(axis=(1, 3))
+    enough = count >= MINIMUM_COVERAGE * factor * factor
+    return np.where(enough, total / np.maximum(count, 1), np.nan).astype(np.float32)
+
+
+def _write_grid(writer: ArtefactWriter, grid: Grid) -> None:
+    writer.write_crs(grid.crs_wkt, grid.transform)
+    writer.write("x", grid.xy(0, np.arange(grid.width))[0])
+    writer.write("y", grid.xy(np.arange(grid.height), 0)[1])
+    writer.file["x"].attrs["standard_name"] = "projection_x_coordinate"
+    writer.file["y"].attrs["standard_name"] = "projection_y_coordinate"
+
+
+def _write_elevation(
+    dem: Path, dataset: DatasetReader, plan: Plan, writer: ArtefactWriter, config: Config, progress: Progress | None
+) -> tuple[float, tuple[float, float]]:
+    grid = plan.grid
+    elevation, dem_valid = writer.dataset("elevation"), writer.dataset("dem_valid")
+    todo = list(blocks(grid.height, grid.width, config.block))
+    seen, low, high = 0, math.inf, -math.inf
+    for number, (row, col, height, width) in enumerate(todo):
+        if progress:
+            progress(number, len(todo), "DEM blocks")
+        if plan.factor:
+            n = plan.factor
+            block = rasters.read_window(dataset, Window(col * n, row * n, width * n, height * n))
+            if plan.radius_is_elevation:
+                block -= grid.radius
+            values = area_mean(block, n)
+        else:
+            values, valid = rasters.warp(dataset, grid.window(row, col, height, width), plan.resampling)
+            values[~valid] = np.nan
+            if plan.radius_is_elevation:
+                values = (values.astype(np.float64) - grid.radius).astype(np.float32)
+        good = np.isfinite(values)
+        elevation[row : row + height, col : col + width] = values
+        dem_valid[row : row + height, col : col + width] = good
+        if good.any():
+            seen += int(good.sum())
+            low, high = min(low, float(values[good].min())), max(high, float(values[good].max()))
+    if progress:
+        progress(len(todo), len(todo), "DEM blocks")
+    if not seen:
+        raise InputError(f"{dem}: expected elevations, found only nodata on the grid at {grid.gsd:g} m.")
+    return seen / (grid.height * grid.width), (low, high)
+
+
+def _check_frames(frames: Sequence[Frame], grid: Grid, skip_outside: bool) -> tuple[list[Frame], list[str]]:
+    """Every image must be readable, lie on the DEM and be lit. Raises InputError or GeometryError."""
+    kept, skipped = [], []
+    for frame in frames:
+        if frame.camera is None:
+            with rasters.open_raster(frame.path, f"the image '{frame.image_id}'") as image:
+                require_crs(str(frame.path), image.crs, image.transform)
+                check_body(str(frame.path), image.crs, find_body(str(grid.radius)))
+                if rasters.source_window(image, grid, margin=0) is None:
+                    if not skip_outside:
+                        raise InputError(
+                            f"{frame.path}: image '{frame.image_id}' does not touch the DEM; remove it from the table or add --skip-outside."
+                        )
+                    skipped.append(frame.image_id)
+                    continue
+        kept.append(frame)
+    if frames and not kept:
+        raise InputError(
+            "no image touches the DEM; check that images and DEM show the same place (longitudes, body, CRS)."
+        )
+    return kept, skipped
+
+
+def _write_validity(
+    frame: Frame, index: int, count: int, grid: Grid, writer: ArtefactWriter, config: Config, progress: Progress | None
+) -> float:
+    """Write one image's masks; returns the ground area of its valid positions, m2."""
+    box = _footprint(frame, grid)
+    row0, col0, height, width = box
+    valid, position = writer.dataset("valid"), writer.dataset("valid_position")
+    todo = list(blocks(height, width, config.block))
+    dem_valid = writer.file["dem_valid"]
+    used: tuple[int, int, int, int] | None = None
+    with rasters.open_raster(frame.path, f"the image '{frame.image_id}'") as image:
+        for number, (r, c, h, w) in enumerate(todo):
+            if progress:
+                progress(
+                    index * 1000 + 1000 * number // max(1, len(todo)), count * 1000, f"image masks ({frame.image_id})"
+                )
+            r, c = row0 + r, col0 + c
+            part = grid.window(r, c, h, w)
+            _, seen = rasters.warp(image, part, rasters.choose_resampling(image, part)[0])
+            seen &= dem_valid[r : r + h, c : c + w].astype(bool)
+            if seen.any():
+                valid[index, r : r + h, c : c + w] = seen
+                rows, cols = np.flatnonzero(seen.any(1)), np.flatnonzero(seen.any(0))
+                used = _union(used, (r + rows[0], c + cols[0], r + rows[-1] + 1, c + cols[-1] + 1))
+    if used is None:
+        writer.dataset("frame_window")[index] = (row0, col0, 0, 0)
+        return 0.0
+    r0, c0, r1, c1 = used
+    writer.dataset("frame_window")[index] = (r0, c0, r1 - r0, c1 - c0)
+    area = 0.0
+    for r, c, h, w in blocks(r1 - r0, c1 - c0, config.block):
+        r, c = r0 + r, c0 + c
+        eroded = valid_positions(valid[index], grid.height, grid.width, (r, c, h, w), config.crop)
+        if eroded.any():
+            position[index, r : r + h, c : c + w] = eroded
+            pixel = grid.local_frames(r + h / 2, c + w / 2).pixel_size[0]
+            area += float(eroded.sum()) * float(pixel[0] * pixel[1])
+    _check_sun(frame, grid, (r0 + r1) / 2, (c0 + c1) / 2)
+    if progress and index == count - 1:
+        progress(count * 1000, count * 1000, "image masks")
+    return area
+
+
+def _footprint(frame: Frame, grid: Grid) -> tuple[int, int, int, int]:
+    """(row, col, height, width) on the grid that holds the whole image."""
+    with rasters.open_raster(frame.path, f"the image '{frame.image_id}'") as image:
+        own = Grid(image.crs.to_wkt(), image.transform, image.height, image.width, grid.radius)
+        rows = np.concatenate(
+            [np.linspace(-0.5, image.height - 0.5, 33)] * 2 + [np.full(33, -0.5), np.full(33, image.height - 0.5)]
+        )
+        cols = np.concatenate(
+            [np.full(33, -0.5), np.full(33, image.width - 0.5)] + [np.linspace(-0.5, image.width - 0.5, 33)] * 2
+        )
+        row, col = grid.rowcol_of_lonlat(*own.lonlat(rows, cols))
+    good = np.isfinite(row) & np.isfinite(col)
+    r0, c0 = max(0, math.floor(row[good].min())), max(0, math.floor(col[good].min()))
+    r1, c1 = min(grid.height, math.ceil(row[good].max()) + 1), min(grid.width, math.ceil(col[good].max()) + 1)
+    return r0, c0, max(0, r1 - r0), max(0, c1 - c0)
+
+
+def valid_positions(
+    valid: NDArray, height: int, width: int, block: tuple[int, int, int, int], crop: int
+) -> NDArray[np.bool_]:
+    """Where a crop may be centred: rows r - crop/2 .. r + crop/2 - 1 (columns alike) are valid, all of them.
+
+    valid : (H, W) array or dataset, read only around the block (row, col, height, width)
+    """
+    row, col, h, w = block
+    half = crop // 2
+    top, left, bottom, right = row - half, col - half, row + h + half - 1, col + w + half - 1
+    r0, c0, r1, c1 = max(0, top), max(0, left), min(height, bottom), min(width, right)
+    invalid = np.ones((bottom - top, right - left), np.uint8)
+    invalid[r0 - top : r1 - top, c0 - left : c1 - left] = valid[r0:r1, c0:c1] == 0
+    # The sum over the crop's square is zero exactly where nothing in it is invalid (faster than an erosion).
+    bad = cv2.boxFilter(
+        invalid, cv2.CV_32F, (crop, crop), anchor=(half, half), normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
+    return bad[half : half + h, half : half + w] < 0.5
+
+
+def _union(box: tuple[int, int, int, int] | None, other: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
+    if box is None:
+        return other
+    return min(box[0], other[0]), min(box[1], other[1]), max(box[2], other[2]), max(box[3], other[3])
+
+
+def _check_sun(frame: Frame, grid: Grid, row: float, col: float) -> None:
+    local = grid.local_frames(row, col)
+    sun = frame.sun_position() - grid.radius * local.up[0]
+    sine = float(local.up[0] @ sun / np.linalg.norm(sun))
+    if sine <= 0:
+        raise GeometryError(
+            f"image '{frame.image_id}': the Sun stands {-math.degrees(math.asin(sine)):.1f} deg below the horizon at the image's centre; "
+            "check its sub-solar longitude and latitude (degrees east)."
+        )
