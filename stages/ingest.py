@@ -6,11 +6,10 @@ Everything streams in blocks: memory does not grow with the DEM.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rasterio.io import DatasetReader
@@ -23,6 +22,7 @@ from stages.physics import rasters
 from stages.physics.bodies import find_body
 from stages.physics.frames import Frame, read_frames, write_frames
 from stages.physics.grid import Grid, check_body, local_metric_crs, require_crs
+from stages.physics.positions import blocks, valid_positions
 
 Progress = Callable[[int, int, str], None]
 
@@ -220,13 +220,6 @@ def _any_valid(dataset: DatasetReader) -> bool:
     return any(np.isfinite(rasters.read_window(dataset, window)).any() for _, window in dataset.block_windows(1))
 
 
-def blocks(height: int, width: int, size: int) -> Iterator[tuple[int, int, int, int]]:
-    """(row, col, height, width) of the blocks that tile an array."""
-    for row in range(0, height, size):
-        for col in range(0, width, size):
-            yield row, col, min(size, height - row), min(size, width - col)
-
-
 def area_mean(fine: NDArray, factor: int) -> NDArray[np.float32]:
     """Mean over factor x factor pixels, NaN where less than half is valid.
 
@@ -366,26 +359,6 @@ def _footprint(frame: Frame, grid: Grid) -> tuple[int, int, int, int]:
     r0, c0 = max(0, math.floor(row[good].min())), max(0, math.floor(col[good].min()))
     r1, c1 = min(grid.height, math.ceil(row[good].max()) + 1), min(grid.width, math.ceil(col[good].max()) + 1)
     return r0, c0, max(0, r1 - r0), max(0, c1 - c0)
-
-
-def valid_positions(
-    valid: NDArray, height: int, width: int, block: tuple[int, int, int, int], crop: int
-) -> NDArray[np.bool_]:
-    """Where a crop may be centred: rows r - crop/2 .. r + crop/2 - 1 (columns alike) are valid, all of them.
-
-    valid : (H, W) array or dataset, read only around the block (row, col, height, width)
-    """
-    row, col, h, w = block
-    half = crop // 2
-    top, left, bottom, right = row - half, col - half, row + h + half - 1, col + w + half - 1
-    r0, c0, r1, c1 = max(0, top), max(0, left), min(height, bottom), min(width, right)
-    invalid = np.ones((bottom - top, right - left), np.uint8)
-    invalid[r0 - top : r1 - top, c0 - left : c1 - left] = valid[r0:r1, c0:c1] == 0
-    # The sum over the crop's square is zero exactly where nothing in it is invalid (faster than an erosion).
-    bad = cv2.boxFilter(
-        invalid, cv2.CV_32F, (crop, crop), anchor=(half, half), normalize=False, borderType=cv2.BORDER_CONSTANT
-    )
-    return bad[half : half + h, half : half + w] < 0.5
 
 
 def _union(box: tuple[int, int, int, int] | None, other: tuple[int, int, int, int]) -> tuple[int, int, int, int]:

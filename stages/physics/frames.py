@@ -114,8 +114,8 @@ def write_frames(writer: ArtefactWriter, frames: Sequence[Frame]) -> None:
     """Write the frame table of a scene or crops artefact; paths become relative to it."""
     folder = writer.path.resolve().parent
     writer.write("image_id", [f.image_id for f in frames])
-    writer.write("path", [_relative(f.path, folder) for f in frames])
-    writer.write("camera", [_relative(f.camera, folder) if f.camera else "" for f in frames])
+    writer.write("path", [relative_path(f.path, folder) for f in frames])
+    writer.write("camera", [relative_path(f.camera, folder) if f.camera else "" for f in frames])
     writer.write("start_time", [f.start_time for f in frames])
     writer.write("units", np.array([0 if f.units == "iof" else 1 for f in frames], np.uint8))
     for key in _NUMBERS:
@@ -140,5 +140,6 @@ def load_frames(file: h5py.File, path: Path) -> list[Frame]:
     ]
 
 
-def _relative(path: Path, folder: Path) -> str:
+def relative_path(path: Path, folder: Path) -> str:
+    """``path`` as seen from ``folder``: artefacts name their sources so that a folder can move as a whole."""
     return os.path.relpath(path.resolve(), folder)

@@ -1,0 +1,63 @@
+"""`lunargr sample`: scene.h5 -> crops.h5."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import Output, Overwrite, Quiet, Seed, Shard, parse_shard
+
+NAME, ORDER = "sample", 30
+
+
+def command(
+    scene: Annotated[Path, typer.Argument(help="scene.h5 from 'lunargr ingest'.")],
+    crop: Annotated[
+        int | None, typer.Option("--crop", help="Crop size in pixels, a multiple of 16 (default: the scene's).")
+    ] = None,
+    count: Annotated[
+        int | None, typer.Option("--count", help="Crops in all; with --stack, places in all (default: 100 per image).")
+    ] = None,
+    density: Annotated[
+        float | None, typer.Option("--density", help="Crops per km2 of each image's valid positions.")
+    ] = None,
+    stack: Annotated[
+        bool, typer.Option("--stack", help="Crop every image that covers a chosen place: pairs share a 'site'.")
+    ] = False,
+    tile_m: Annotated[
+        float | None, typer.Option("--tile-m", help="Edge of a ground tile of the split, m (default: up to 4 crops).")
+    ] = None,
+    split: Annotated[str, typer.Option("--split", help="Shares of train/validation/test.")] = "80/10/10",
+    seed: Seed = 0,
+    shard: Shard = None,
+    output: Output = Path("crops.h5"),
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Choose crop centres per image and split them by ground tile, with no ground shared between the parts."""
+    from lunargr_cli.console import Console
+    from schemas import ConfigError
+    from stages import sample
+
+    try:
+        shares = [float(v) for v in split.split("/")]
+        total = sum(shares)
+        first, second, third = (v / total for v in shares)
+    except (ValueError, ZeroDivisionError):
+        raise ConfigError(f"--split: expected three shares like 80/10/10, found '{split}'.") from None
+    console = Console(quiet)
+    config = sample.Config(
+        crop=crop,
+        count=count,
+        density=density,
+        stack=stack,
+        tile_m=tile_m,
+        split=(first, second, third),
+        seed=seed,
+        shard=parse_shard(shard),
+    )
+    parts = sample.run(scene, output, config, overwrite, console.progress)
+    rows = [(p.name, p.pairs, p.images, p.tiles, f"{p.ground_km2:.2f}", f"{p.shared_km2:.2f}") for p in parts]
+    console.table("split by ground tile", ("part", "pairs", "images", "tiles", "ground km2", "shared km2"), rows)

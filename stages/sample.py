@@ -1,0 +1,410 @@
+"""sample: crop centres per image and a geographic split in which no pixel of ground is shared.
+
+The scene is divided into square ground tiles, each given to one part of the split. A crop is kept only where every tile
+that its footprint touches belongs to one part: footprints of different parts then cannot overlap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from geographiclib.geodesic import Geodesic
+from numpy.typing import NDArray
+
+from schemas import CROPS, SCENE, SPLITS, ArtefactWriter, ConfigError, GeometryError, open_artefact
+from schemas.hdf5 import sha256
+from stages.physics.frames import Frame, load_frames, relative_path, write_frames
+from stages.physics.grid import Grid, read_grid
+from stages.physics.positions import blocks, valid_positions
+
+Progress = Callable[[int, int, str], None]
+
+MINIMUM_TILES = 25  # where --tile-m is left to us: enough tiles for a test part that is not one odd place
+LARGEST_TILE = 4  # crops
+
+
+@dataclass(frozen=True)
+class Config:
+    """count : crops in all (sites with ``stack``); density : crops per km2 of an image; tile_m : None for automatic."""
+
+    crop: int | None = None
+    count: int | None = None
+    density: float | None = None
+    stack: bool = False
+    tile_m: float | None = None
+    split: tuple[float, float, float] = (0.8, 0.1, 0.1)
+    seed: int = 0
+    shard: tuple[int, int] = (0, 1)
+    block: int = 1024
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of the split, for the audit."""
+
+    name: str
+    pairs: int
+    images: int
+    tiles: int
+    ground_km2: float
+    shared_km2: float
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Square ground tiles on the scene grid: ``edge`` in pixels; ``part`` (rows, cols) int8, -1 where unused."""
+
+    edge: int
+    part: NDArray[np.int8]
+
+    def allowed(self, row: NDArray, col: NDArray, crop: int) -> NDArray[np.int8]:
+        """Part of the split of crops centred at row (n, 1) and col (m,), -1 where the footprint touches two parts."""
+        half = crop // 2
+        r0, r1 = (row - half) // self.edge, (row + half - 1) // self.edge
+        c0, c1 = (col - half) // self.edge, (col + half - 1) // self.edge
+        rows, cols = self.part.shape
+        # Centres near the scene's edge have no whole footprint and are not valid positions anyway.
+        r0, r1, c0, c1 = (
+            np.clip(r0, 0, rows - 1),
+            np.clip(r1, 0, rows - 1),
+            np.clip(c0, 0, cols - 1),
+            np.clip(c1, 0, cols - 1),
+        )
+        corner = self.part[r0, c0]
+        same = (corner == self.part[r0, c1]) & (corner == self.part[r1, c0]) & (corner == self.part[r1, c1])
+        return np.where(same, corner, -1).astype(np.int8)
+
+
+def run(
+    scene: Path, output: Path, config: Config, overwrite: bool = False, progress: Progress | None = None
+) -> list[Part]:
+    """Write ``crops.h5`` and return the audit of the split. Raises ConfigError or GeometryError."""
+    if config.count is not None and config.density is not None:
+        raise ConfigError("--count and --density: give one of the two.")
+    if (config.count is not None and config.count < 1) or (config.density is not None and not config.density > 0):
+        raise ConfigError("--count and --density: expected a positive number of crops.")
+    if len(config.split) != 3 or min(config.split) < 0 or not math.isclose(sum(config.split), 1, abs_tol=1e-6):
+        raise ConfigError(f"--split: expected three shares that sum to 1, found {config.split}.")
+    with open_artefact(scene, SCENE) as file:
+        grid = read_grid(file, scene)
+        frames = load_frames(file, scene)
+        crop = config.crop or int(file.attrs["crop_px"])
+        if crop % 16 or crop < 16:
+            raise ConfigError(f"--crop: expected a multiple of 16 px (the network halves it four times), found {crop}.")
+        if not frames:
+            raise ConfigError(f"{scene}: expected images, found none; run 'lunargr ingest' with --images.")
+        positions = PositionMasks(file, grid, crop, config.block)
+        rng = np.random.default_rng(config.seed)
+        edge = _tile_edge(grid, positions, crop, config.tile_m)
+        tiles = _split_tiles(positions, grid, edge, config.split, rng, progress)
+        chosen = _choose(positions, tiles, frames, grid, config, rng, progress)
+        if not len(chosen):
+            raise GeometryError(
+                f"{scene}: no crop of {crop} px fits into a tile of {edge * grid.gsd:g} m and valid data; choose a smaller --crop or other --tile-m."
+            )
+        parts = audit(chosen, tiles, grid, crop)
+        first, last = (len(chosen) * k // config.shard[1] for k in (config.shard[0], config.shard[0] + 1))
+        _write(scene, output, file, grid, frames, tiles, chosen, slice(first, last), crop, config, overwrite, progress)
+    return parts
+
+
+class PositionMasks:
+    """Valid positions of a scene, block by block, for any crop size."""
+
+    def __init__(self, file: h5py.File, grid: Grid, crop: int, block: int) -> None:
+        self.file, self.grid, self.crop = file, grid, crop
+        self.stored = int(file.attrs["crop_px"]) == crop
+        self.windows = file["frame_window"][...]
+        self.blocks = list(blocks(grid.height, grid.width, block))
+
+    def frames_of(self, block: tuple[int, int, int, int]) -> list[int]:
+        """Frames whose valid pixels meet a block."""
+        row, col, h, w = block
+        r, c, fh, fw = self.windows.T
+        meets = (fh > 0) & (r < row + h) & (r + fh > row) & (c < col + w) & (c + fw > col)
+        return [int(k) for k in np.flatnonzero(meets)]
+
+    def mask(self, frame: int, block: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+        row, col, h, w = block
+        if self.stored:
+            return self.file["valid_position"][frame, row : row + h, col : col + w].astype(bool)
+        # Two-dimensional view of one frame, sliced lazily.
+        return valid_positions(_Layer(self.file["valid"], frame), self.grid.height, self.grid.width, block, self.crop)
+
+
+class _Layer:
+    """One frame of a (frame, y, x) dataset that slices like a two-dimensional one."""
+
+    def __init__(self, data: h5py.Dataset, index: int) -> None:
+        self.data, self.index = data, index
+
+    def __getitem__(self, key: tuple[slice, slice]) -> NDArray:
+        return self.data[(self.index, *key)]
+
+
+def _tile_edge(grid: Grid, positions: PositionMasks, crop: int, tile_m: float | None) -> int:
+    """Edge of a ground tile in pixels; metres are measured along the body with a geodesic at the scene's centre."""
+    if tile_m is not None:
+        row, col = grid.height / 2, grid.width / 2
+        lon, lat = grid.lonlat([row, row], [col - 50, col + 50])
+        metres = Geodesic(grid.radius, 0).Inverse(lat[0], lon[0], lat[1], lon[1])["s12"] / 100
+        edge = round(tile_m / metres)
+        if edge < crop:
+            raise ConfigError(f"--tile-m: expected at least one crop ({crop * metres:g} m), found {tile_m:g} m.")
+        return edge
+    used = positions.windows[positions.windows[:, 2] > 0]
+    if not len(used):
+        return LARGEST_TILE * crop
+    height = int((used[:, 0] + used[:, 2]).max() - used[:, 0].min())
+    width = int((used[:, 1] + used[:, 3]).max() - used[:, 1].min())
+    edge = LARGEST_TILE * crop
+    while edge > 1.25 * crop and math.ceil(height / edge) * math.ceil(width / edge) < MINIMUM_TILES:
+        edge -= crop // 4
+    return edge
+
+
+def _split_tiles(
+    positions: PositionMasks,
+    grid: Grid,
+    edge: int,
+    shares: tuple[float, float, float],
+    rng: np.random.Generator,
+    progress: Progress | None,
+) -> Tiles:
+    """Give every tile with valid ground to a part, at random, so that the parts' ground is near their shares."""
+    shape = (math.ceil(grid.height / edge), math.ceil(grid.width / edge))
+    ground = np.zeros(shape)
+    for number, block in enumerate(positions.blocks):
+        if progress:
+            progress(number, len(positions.blocks), "tiles")
+        row, col, h, w = block
+        covered = np.zeros((h, w), bool)
+        for frame in positions.frames_of(block):
+            covered |= positions.file["valid"][frame, row : row + h, col : col + w].astype(bool)
+        r, c = np.nonzero(covered)
+        np.add.at(ground, ((r + row) // edge, (c + col) // edge), 1)
+    if progress:
+        progress(len(positions.blocks), len(positions.blocks), "tiles")
+    part = np.full(shape, -1, np.int8)
+    candidates = np.argwhere(ground > 0)
+    rng.shuffle(candidates)
+    # Whole tiles first: a sliver at the scene's edge can hold no crop and must not be all that a part gets.
+    candidates = candidates[np.argsort(-np.minimum(ground[tuple(candidates.T)], 0.5 * edge * edge), kind="stable")]
+    total = ground.sum()
+    filled = np.zeros(3)
+    for row, col in candidates:
+        deficit = np.array(shares) * total - filled
+        deficit[np.array(shares) <= 0] = -np.inf
+        # The emptiest part relative to its share: small parts get their first tile early.
+        k = int(np.argmax(deficit / np.maximum(np.array(shares) * total, 1)))
+        part[row, col] = k
+        filled[k] += ground[row, col]
+    return Tiles(edge, part)
+
+
+CHOSEN = np.dtype([("frame", "i4"), ("row", "i4"), ("col", "i4"), ("site", "i4"), ("tile", "i4"), ("split", "u1")])
+
+
+def _choose(
+    positions: PositionMasks,
+    tiles: Tiles,
+    frames: list[Frame],
+    grid: Grid,
+    config: Config,
+    rng: np.random.Generator,
+    progress: Progress | None,
+) -> NDArray:
+    """Crop centres, sorted by frame, row, column. Without replacement within an image (within the scene with ``stack``)."""
+    layers = [-1] if config.stack else list(range(len(frames)))
+    counts = np.zeros((len(layers), 3, len(positions.blocks)), np.int64)
+    for number, block in enumerate(positions.blocks):
+        if progress:
+            progress(number, 2 * len(positions.blocks), "counting positions")
+        here = positions.frames_of(block)
+        for index, layer in enumerate(layers):
+            if layer >= 0 and layer not in here:
+                continue
+            part = _allowed_parts(positions, tiles, layer, here, block)
+            counts[index, :, number] = [(part == k).sum() for k in range(3)]
+    wanted = _allocate(counts.sum(2), frames, grid, config)
+    picked = []
+    take = np.zeros_like(counts)
+    for index, k in np.ndindex(len(layers), 3):
+        if wanted[index, k]:
+            take[index, k] = _spread(rng, counts[index, k], int(wanted[index, k]))
+    for number, block in enumerate(positions.blocks):
+        if progress:
+            progress(len(positions.blocks) + number, 2 * len(positions.blocks), "choosing positions")
+        if not take[:, :, number].any():
+            continue
+        here = positions.frames_of(block)
+        for index, layer in enumerate(layers):
+            if not take[index, :, number].any():
+                continue
+            part = _allowed_parts(positions, tiles, layer, here, block)
+            for k in range(3):
+                flat = rng.choice(np.flatnonzero(part == k), int(take[index, k, number]), replace=False)
+                row, col = np.unravel_index(np.sort(flat), part.shape)
+                picked.append((layer, k, row + block[0], col + block[1], block, here))
+    if progress:
+        progress(2 * len(positions.blocks), 2 * len(positions.blocks), "choosing positions")
+    return _records(picked, positions, tiles, config.stack)
+
+
+def _allowed_parts(
+    positions: PositionMasks, tiles: Tiles, layer: int, here: list[int], block: tuple[int, int, int, int]
+) -> NDArray[np.int8]:
+    """Part of the split of every position of a block, -1 where no crop may be centred. Layer -1: any image."""
+    row, col, h, w = block
+    mask = np.zeros((h, w), bool)
+    for frame in here if layer < 0 else [layer]:
+        mask |= positions.mask(frame, block)
+    part = tiles.allowed(np.arange(row, row + h)[:, None], np.arange(col, col + w), positions.crop)
+    return np.where(mask, part, -1)
+
+
+def _allocate(available: NDArray, frames: list[Frame], grid: Grid, config: Config) -> NDArray[np.int64]:
+    """Crops per layer and part: each part its share, within a part in proportion to the layer's valid area."""
+    area = available * grid.gsd**2 / 1e6
+    if config.density is not None:
+        wanted = np.ceil(area * config.density)
+    else:
+        total = config.count or max(1, min(int(available.sum()), 100 * len(frames)))
+        within = area / np.maximum(area.sum(0, keepdims=True), 1e-12)
+        exact = within * np.array(config.split) * total
+        wanted = np.floor(exact)
+        rest = exact - wanted
+        for k in range(3):  # hand the rounding's remainder to the largest fractions
+            missing = round(float(exact[:, k].sum() - wanted[:, k].sum()))
+            wanted[np.argsort(-rest[:, k], kind="stable")[:missing], k] += 1
+    return np.minimum(wanted, available).astype(np.int64)
+
+
+def _spread(rng: np.random.Generator, counts: NDArray[np.int64], wanted: int) -> NDArray[np.int64]:
+    """How many of ``wanted`` draws without replacement fall into each block."""
+    if counts.sum() < 1_000_000_000:
+        return rng.multivariate_hypergeometric(counts, wanted, method="marginals")
+    result, left, remaining = np.zeros_like(counts), wanted, int(counts.sum())
+    for k, n in enumerate(counts):  # beyond numpy's limit draws hardly deplete a block: binomial, then cap
+        result[k] = min(int(n), rng.binomial(left, n / remaining)) if remaining else 0
+        left, remaining = left - int(result[k]), remaining - int(n)
+    return result
+
+
+def _records(picked: list, positions: PositionMasks, tiles: Tiles, stack: bool) -> NDArray:
+    rows = []
+    for layer, k, row, col, block, here in picked:
+        covering = here if stack else [layer]
+        for frame in covering:
+            keep = positions.mask(frame, block)[row - block[0], col - block[1]] if stack else np.ones(len(row), bool)
+            part = np.zeros(int(keep.sum()), CHOSEN)
+            part["frame"], part["row"], part["col"], part["split"] = frame, row[keep], col[keep], k
+            part["tile"] = (part["row"] // tiles.edge) * tiles.part.shape[1] + part["col"] // tiles.edge
+            rows.append(part)
+    if not rows:
+        return np.zeros(0, CHOSEN)
+    chosen = np.sort(np.concatenate(rows), order=["frame", "row", "col"])
+    _, chosen["site"] = np.unique(chosen["row"].astype(np.int64) << 32 | chosen["col"], return_inverse=True)
+    return chosen
+
+
+def audit(chosen: NDArray, tiles: Tiles, grid: Grid, crop: int) -> list[Part]:
+    """Count pairs, images, tiles and ground per part, and the ground that a part shares with another."""
+    size = max(2048, 4 * crop)
+    half = crop // 2
+    ground, shared = np.zeros(3), np.zeros(3)
+    for row, col, h, w in blocks(grid.height, grid.width, size):
+        near = (
+            (chosen["row"] + half > row)
+            & (chosen["row"] - half < row + h)
+            & (chosen["col"] + half > col)
+            & (chosen["col"] - half < col + w)
+        )
+        if not near.any():
+            continue
+        painted = np.zeros((h, w), np.uint8)
+        for r, c, k in zip(chosen["row"][near], chosen["col"][near], chosen["split"][near], strict=True):
+            painted[
+                max(0, r - half - row) : max(0, r + half - row), max(0, c - half - col) : max(0, c + half - col)
+            ] |= 1 << k
+        pixel = float(np.prod(grid.local_frames(row + h / 2, col + w / 2).pixel_size[0])) / 1e6
+        for k in range(3):
+            mine = (painted & (1 << k)) > 0
+            ground[k] += mine.sum() * pixel
+            shared[k] += (mine & (painted != (1 << k))).sum() * pixel
+    return [
+        Part(
+            name,
+            int((chosen["split"] == k).sum()),
+            len(np.unique(chosen["frame"][chosen["split"] == k])),
+            int((tiles.part == k).sum()),
+            float(ground[k]),
+            float(shared[k]),
+        )
+        for name, k in SPLITS
+    ]
+
+
+def _write(
+    scene: Path,
+    output: Path,
+    file: h5py.File,
+    grid: Grid,
+    frames: list[Frame],
+    tiles: Tiles,
+    chosen: NDArray,
+    part: slice,
+    crop: int,
+    config: Config,
+    overwrite: bool,
+    progress: Progress | None,
+) -> None:
+    mine = chosen[part]
+    sizes = {"pair": len(mine), "y": crop, "x": crop, "frame": len(frames)}
+    digest = sha256(scene)
+    attributes = {
+        "gsd_m": grid.gsd,
+        "body_radius_m": grid.radius,
+        "scene": relative_path(scene, output.resolve().parent),
+        "scene_sha256": digest,
+        "tile_m": tiles.edge * grid.gsd,
+        "pairs_in_all_shards": np.int64(len(chosen)),
+    }
+    stored = asdict(config) | {"crop": crop}
+    half = crop // 2
+    with ArtefactWriter(
+        output,
+        CROPS,
+        sizes,
+        config=stored,
+        inputs=[scene],
+        seed=config.seed,
+        attributes=attributes,
+        overwrite=overwrite,
+    ) as writer:
+        elevation, source = writer.dataset("elevation"), file["elevation"]
+        for k, (r, c) in enumerate(zip(mine["row"], mine["col"], strict=True)):
+            if progress and k % 100 == 0:
+                progress(k, len(mine), "crops")
+            elevation[k] = source[r - half : r + half, c - half : c + half]
+        if progress:
+            progress(len(mine), len(mine), "crops")
+        # The centre of an even crop is the corner shared by its four middle pixels.
+        lon, lat = grid.lonlat(mine["row"] - 0.5, mine["col"] - 0.5)
+        writer.write("longitude_deg", lon)
+        writer.write("latitude_deg", lat)
+        for name, key in (
+            ("row", "row"),
+            ("col", "col"),
+            ("image_index", "frame"),
+            ("site", "site"),
+            ("tile", "tile"),
+            ("split", "split"),
+        ):
+            writer.write(name, mine[key])
+        write_frames(writer, frames)
