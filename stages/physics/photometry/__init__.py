@@ -11,14 +11,17 @@ A new model is one new file in this folder: it subclasses ReflectanceModel and d
 from __future__ import annotations
 
 import importlib
+import math
 import pkgutil
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from schemas.errors import RegistryError
 from stages.physics.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, get_model, model_names, register
 
@@ -26,40 +29,59 @@ for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 
+def horizon_cosine(dtype: torch.dtype) -> float:
+    """Cosines at or under this count as 0: cos(90 deg) is 6e-17, not 0, in float64, and -4e-8 in float32."""
+    return 1e-12 if dtype == torch.float64 else 1e-7
+
+
 def masked_radiance_factor(model: ReflectanceModel, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
     """I/F, exactly 0 (with zero gradient, never NaN) where the Sun or the camera is behind the surface."""
-    lit = (angles.cos_incidence > 0) & (angles.cos_emission > 0)
-    return torch.where(
-        lit, model.radiance_factor(parameters, angles), torch.zeros((), dtype=angles.cos_incidence.dtype)
-    )
+    mu0, mu = angles.cos_incidence, angles.cos_emission
+    floor = horizon_cosine(mu0.dtype)
+    lit = (mu0 > floor) & (mu > floor)
+    if not model.finite:
+        # torch.where passes gradient 0 to the branch not taken, and 0 * inf is NaN: the formula must not see angles
+        # at which it or its slope is infinite.
+        angles = replace(angles, cos_incidence=mu0.clamp(min=floor), cos_emission=mu.clamp(min=floor))
+    value = model.radiance_factor(parameters, angles)
+    return torch.where(lit, value, torch.zeros((), dtype=value.dtype, device=value.device))
 
 
 def evaluate(model: str, parameters: Mapping[str, Any], incidence: Any, emission: Any, phase: Any) -> Any:
     """I/F of the model called ``model`` at angles in radians; arrays in, array out; tensors in, tensor out.
 
-    parameters : name -> number or array that broadcasts with the angles; missing names take their defaults.
+    parameters : name -> number or array that broadcasts with the angles; missing names take their defaults. A parameter
+        in radians is also taken in degrees under its name with ``_deg``.
+    Computes in float64 unless every array (or tensor) given is float32.
     Raises RegistryError for an unknown model or parameter.
     """
     reflectance = get_model(model)
-    names = [p.name for p in reflectance.parameters]
-    for name in parameters:
-        if name not in names:
-            from schemas.errors import RegistryError
-
-            raise RegistryError.unknown(f"parameter of {reflectance.name}", name, names)
-    given = [incidence, emission, phase, *parameters.values()]
-    as_tensor = any(isinstance(v, Tensor) for v in given)
-    full = {**reflectance.defaults(), **parameters}
-    tensors = {
-        k: torch.as_tensor(v) if isinstance(v, Tensor) else torch.as_tensor(np.asarray(v, float))
-        for k, v in full.items()
-    }
-    i, e, g = (
-        v if isinstance(v, Tensor) else torch.as_tensor(np.asarray(v, dtype=float))
-        for v in (incidence, emission, phase)
-    )
-    result = masked_radiance_factor(reflectance, tensors, Angles.from_angles(i, e, g))
+    full = {**reflectance.defaults(), **_in_radians(reflectance, parameters)}
+    given = {"incidence": incidence, "emission": emission, "phase": phase, **full}
+    as_tensor = any(isinstance(v, Tensor) for v in given.values())
+    tensors = {k: v if isinstance(v, Tensor) else torch.from_numpy(np.array(v)) for k, v in given.items()}
+    single = {t.dtype for t in tensors.values() if t.ndim} == {torch.float32}
+    dtype = torch.float32 if single else torch.float64
+    device = next((t.device for t in tensors.values() if t.device.type != "cpu"), torch.device("cpu"))
+    tensors = {k: t.to(device, dtype) for k, t in tensors.items()}
+    angles = Angles.from_angles(*(tensors.pop(k) for k in ("incidence", "emission", "phase")))
+    result = masked_radiance_factor(reflectance, tensors, angles)
     return result if as_tensor else result.numpy()[()]
+
+
+def _in_radians(model: ReflectanceModel, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters under their own names, with NAME_deg turned into NAME; RegistryError for a name not known."""
+    degrees = {f"{p.name}_deg": p.name for p in model.parameters if p.unit == "rad"}
+    names = [p.name for p in model.parameters]
+    known: dict[str, Any] = {}
+    for name, value in parameters.items():
+        if name in degrees:
+            known[degrees[name]] = value * (math.pi / 180) if isinstance(value, Tensor) else np.radians(value)
+        elif name in names:
+            known[name] = value
+        else:
+            raise RegistryError.unknown(f"parameter of {model.name}", name, [*names, *degrees])
+    return known
 
 
 __all__ = [

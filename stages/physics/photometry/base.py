@@ -36,6 +36,8 @@ class ReflectanceModel:
     parameters: ClassVar[tuple[Parameter, ...]]
     # I/F is a linear function of the parameters: a global set is then one least-squares solve.
     linear: ClassVar[bool] = False
+    # The formula and its gradients are finite for any cosines in [-1, 1]: no need to keep them from 0 first.
+    finite: ClassVar[bool] = False
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         """I/F = pi r, including cos(incidence), wherever incidence and emission are below 90 deg.
@@ -62,7 +64,8 @@ class ReflectanceModel:
 
     def unpack(self, coefficients: Tensor, dim: int) -> dict[str, Tensor]:
         """A stack of coefficients -> parameters by name; the order is that of ``parameters``."""
-        return {p.name: coefficients.select(dim, k) for k, p in enumerate(self.parameters)}
+        # unbind and not select: its backward is one stack, where select writes a full stack of zeros per parameter
+        return dict(zip((p.name for p in self.parameters), coefficients.unbind(dim), strict=True))
 
     def defaults(self) -> dict[str, float]:
         return {p.name: p.default for p in self.parameters}

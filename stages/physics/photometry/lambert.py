@@ -18,6 +18,7 @@ class Lambert(ReflectanceModel):
     reference = "Lambert, J. H. (1760), Photometria"
     reciprocal = True
     linear = True
+    finite = True
     parameters = (Parameter("albedo", "1", 0.0, 1.0, 0.12, "normal albedo"),)
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:

@@ -23,6 +23,7 @@ class CosinePolynomial(ReflectanceModel):
 
     reference = "Grethen et al., Lunar-G2R, table 1"
     linear = True
+    finite = True
 
     def constrain(self, raw: Tensor, dim: int) -> Tensor:
         return leaky_relu(raw, SLOPE)

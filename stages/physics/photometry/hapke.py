@@ -1,0 +1,133 @@
+"""Hapke's bidirectional reflectance in full, with a double Henyey-Greenstein phase function.
+
+    I/F = K w/4 mu0e / (mu0e + mue) [ p(g) (1 + Bs0 Bs(g)) + H(mu0e/K) H(mue/K) - 1 ] (1 + Bc0 Bc(g)) S(i, e, g)
+
+p        double Henyey-Greenstein, (1 + c)/2 of it scattered backward (Hapke 2012; the c of Sato et al. 2014)
+Bs, Bc   shadow hiding and coherent backscatter (Hapke 1986, 2002)
+H        Ambartsumian-Chandrasekhar function, the approximation of 2002 (default) or of 1981
+K        porosity: K = -ln(1 - 1.209 phi^(2/3)) / (1.209 phi^(2/3)) (Hapke 2008)
+S, mu0e, mue   macroscopic roughness of mean slope theta, complete (Hapke 1984): `roughness.py`
+
+The Legendre variant is in `hapke_legendre.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from stages.physics.geometry import Angles
+from stages.physics.photometry.base import Parameter, ReflectanceModel, register
+from stages.physics.photometry.roughness import rough_cosines
+
+# Defaults: Sato et al. (2014), 643 nm, mean over the Moon (set "sato2014_643nm" of `published.py`).
+COMMON = (
+    Parameter("Bs0", "1", 0.0, 4.0, 1.70638, "amplitude of the shadow-hiding opposition effect"),
+    Parameter("hs", "1", 0.001, 1.0, 0.05431, "angular width of shadow hiding, as tan(g/2)"),
+    Parameter("Bc0", "1", 0.0, 1.0, 0.0, "amplitude of the coherent-backscatter opposition effect"),
+    Parameter("hc", "1", 0.001, 1.0, 1.0, "angular width of coherent backscatter, as tan(g/2)"),
+    Parameter("theta", "rad", 0.0, math.radians(60), math.radians(23.6566), "mean slope of macroscopic roughness"),
+    Parameter("phi", "1", 0.0, 0.7, 0.0, "filling factor; 0 = no porosity correction (K = 1)"),
+)
+ALBEDO = Parameter("w", "1", 0.0, 1.0, 0.38138, "single-scattering albedo")
+
+
+def henyey_greenstein(cos_phase: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """Double Henyey-Greenstein phase function: (1 + c)/2 in the backward lobe (about g = 0), (1 - c)/2 forward."""
+    b2 = b * b
+    backward = (1 - 2 * b * cos_phase + b2).clamp(min=1e-12) ** -1.5
+    forward = (1 + 2 * b * cos_phase + b2).clamp(min=1e-12) ** -1.5
+    return (1 - b2) * 0.5 * ((1 + c) * backward + (1 - c) * forward)
+
+
+def shadow_hiding(tan_half_phase: Tensor, hs: Tensor) -> Tensor:
+    """Bs(g) = 1 / (1 + tan(g/2) / hs)."""
+    return hs / (hs + tan_half_phase).clamp(min=1e-12)
+
+
+def coherent_backscatter(tan_half_phase: Tensor, hc: Tensor) -> Tensor:
+    """Bc(g) = [1 + (1 - exp(-x)) / x] / [2 (1 + x)^2], x = tan(g/2) / hc; 1 at g = 0."""
+    x = tan_half_phase / hc.clamp(min=1e-9)
+    small = x < 1e-2
+    safe = torch.where(small, torch.ones_like(x), x)
+    series = 1 - x / 2 * (1 - x / 3 * (1 - x / 4 * (1 - x / 5)))  # of (1 - exp(-x)) / x, to x^4
+    mean = torch.where(small, series, -torch.expm1(-safe) / safe)
+    return (1 + mean) / (2 * (1 + x) ** 2)
+
+
+def porosity(phi: Tensor) -> Tensor:
+    """K of the filling factor; 1 at phi = 0, where its one-sided slope is infinite and 0 is returned for it."""
+    y = 1.209 * phi.clamp(min=1e-20, max=0.75) ** (2 / 3)
+    return -torch.log1p(-y) / y
+
+
+def h_1981(x: Tensor, w: Tensor) -> Tensor:
+    """H(x) = (1 + 2 x) / (1 + 2 x sqrt(1 - w)) (Hapke 1981)."""
+    gamma = (1 - w).clamp(min=1e-12).sqrt()
+    return (1 + 2 * x) / (1 + 2 * x * gamma)
+
+
+def h_2002(x: Tensor, w: Tensor) -> Tensor:
+    """H(x) = 1 / (1 - w x [r0 + (1 - 2 r0 x)/2 ln((1 + x)/x)]), r0 = (1 - sqrt(1-w)) / (1 + sqrt(1-w)) (Hapke 2002)."""
+    gamma = (1 - w).clamp(min=1e-12).sqrt()
+    r0 = (1 - gamma) / (1 + gamma)
+    x = x.clamp(min=1e-12)
+    return 1 / (1 - w * x * (r0 + (0.5 - r0 * x) * torch.log1p(1 / x)))
+
+
+class HapkeBase(ReflectanceModel):
+    """All of Hapke's model but the single-particle phase function."""
+
+    reference = (
+        "Hapke, B. (2012), Theory of Reflectance and Emittance Spectroscopy, 2nd ed.; roughness: (1984), Icarus 59, 41"
+    )
+    reciprocal = True
+    h_function: ClassVar[str] = "2002"
+
+    def phase_function(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        raise NotImplementedError(f"{type(self).__name__} must define phase_function")
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        w = parameters["w"]
+        mu0e, mue, shadowing = rough_cosines(angles, parameters["theta"])
+        half = 0.5 * angles.phase
+        tangent = torch.tan(half.clamp(max=math.pi / 2 - (1e-7 if half.dtype == torch.float64 else 1e-3)))
+        k = porosity(parameters["phi"])
+        h = h_2002 if self.h_function == "2002" else h_1981
+        single = self.phase_function(parameters, angles) * (
+            1 + parameters["Bs0"] * shadow_hiding(tangent, parameters["hs"])
+        )
+        multiple = h(mu0e / k, w) * h(mue / k, w) - 1
+        coherent = 1 + parameters["Bc0"] * coherent_backscatter(tangent, parameters["hc"])
+        return k * w / 4 * mu0e / (mu0e + mue) * (single + multiple) * coherent * shadowing
+
+
+class HapkeHenyeyGreenstein(HapkeBase):
+    parameters = (
+        ALBEDO,
+        Parameter("b", "1", 0.0, 0.95, 0.23066, "asymmetry of both lobes of the phase function"),
+        Parameter("c", "1", -1.0, 1.0, 0.40267, "backward minus forward share of the lobes (Hapke 2012, Sato 2014)"),
+        *COMMON,
+    )
+
+    def phase_function(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        return henyey_greenstein(angles.cos_phase, parameters["b"], parameters["c"])
+
+
+@register
+class Hapke(HapkeHenyeyGreenstein):
+    name = "hapke"
+    title = "Hapke, double Henyey-Greenstein, H of 2002"
+    formula = "K w/4 mu0e/(mu0e + mue) [p (1 + Bs0 Bs) + H(mu0e/K) H(mue/K) - 1] (1 + Bc0 Bc) S"
+
+
+@register
+class HapkeH1981(HapkeHenyeyGreenstein):
+    name = "hapke_h1981"
+    title = "Hapke, double Henyey-Greenstein, H of 1981"
+    formula = Hapke.formula
+    h_function = "1981"

@@ -1,0 +1,67 @@
+"""The Lunar-Lambert (McEwen) law: a mixture of Lommel-Seeliger and Lambert whose share L falls with phase.
+
+    I/F = albedo [ 2 L cos(i) / (cos(i) + cos(e)) + (1 - L) cos(i) ]
+
+`lunar_lambert` takes McEwen's L(g); `lunar_lambert_fixed` has L as a parameter, so that it may also be a map or a
+curve L(g) of the user's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from stages.physics.geometry import Angles
+from stages.physics.photometry.base import Parameter, ReflectanceModel, register
+
+# McEwen (1996): L(g) = 1 + A g + B g^2 + C g^3 with g in degrees; the cubic holds to 140 deg.
+MCEWEN = (1.0, -0.019, 2.42e-4, -1.46e-6)
+ALBEDO = Parameter("albedo", "1", 0.0, 1.0, 0.12, "normal albedo: I/F at incidence = emission = phase = 0")
+
+
+def lunar_share(phase: Tensor, coefficients: tuple = MCEWEN) -> Tensor:
+    """L(g) = O + A g + B g^2 + C g^3, the weight of the Lommel-Seeliger term.
+
+    phase : rad
+    coefficients : O, A, B, C for g in degrees, numbers or tensors
+    """
+    g = torch.rad2deg(phase)
+    constant, linear, quadratic, cubic = coefficients
+    return constant + g * (linear + g * (quadratic + g * cubic))
+
+
+def mixture(share: Tensor, angles: Angles) -> Tensor:
+    """2 L cos(i) / (cos(i) + cos(e)) + (1 - L) cos(i)."""
+    mu0 = angles.cos_incidence
+    return mu0 * (1 + share * (2 / (mu0 + angles.cos_emission) - 1))
+
+
+@register
+class LunarLambert(ReflectanceModel):
+    name = "lunar_lambert"
+    title = "Lunar-Lambert, L(g) of McEwen"
+    formula = (
+        "A [2 L cos(i) / (cos(i) + cos(e)) + (1 - L) cos(i)], L = 1 - 0.019 g + 2.42e-4 g^2 - 1.46e-6 g^3 (g in deg)"
+    )
+    reference = "McEwen, A. S. (1996), Lunar Planet. Sci. XXVII, 841; (1991), Icarus 92, 298"
+    reciprocal = True
+    linear = True
+    parameters = (ALBEDO,)
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        return parameters["albedo"] * mixture(lunar_share(angles.phase), angles)
+
+
+@register
+class LunarLambertFixed(ReflectanceModel):
+    name = "lunar_lambert_fixed"
+    title = "Lunar-Lambert, L given"
+    formula = "A [2 L cos(i) / (cos(i) + cos(e)) + (1 - L) cos(i)]"
+    reference = "McEwen, A. S. (1991), Icarus 92, 298"
+    reciprocal = True
+    parameters = (ALBEDO, Parameter("L", "1", 0.0, 1.0, 0.5, "share of the Lommel-Seeliger term"))
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        return parameters["albedo"] * mixture(parameters["L"], angles)
