@@ -1,0 +1,228 @@
+"""What a camera is: rays out of its pixels, places on its detector, and how both move with its pose.
+
+Image coordinates here are CSM's: (line, sample), the first pixel's centre at (0.5, 0.5), its outer corner at (0, 0).
+``grid.CSM_CENTRE`` converts to array indices. Body-fixed (``mcmf``) vectors are in metres.
+
+A pose has six parameters: the camera's shift in body-fixed metres (x, y, z), then a small rotation about its own
+three axes in radians.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from schemas.errors import GeometryError, InputError, RegistryError
+
+Floats = NDArray[np.float64]
+POSE = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
+
+
+class Camera(ABC):
+    """Base of every camera. ``lines`` x ``samples`` pixels; ``semi_axes`` of the body (equatorial, polar), m."""
+
+    kind: ClassVar[str]
+    # values of a document's "type" (ours) or "name_model" (CSM) that this class reads
+    answers_to: ClassVar[tuple[str, ...]]
+
+    lines: int
+    samples: int
+    semi_axes: tuple[float, float]
+
+    @classmethod
+    @abstractmethod
+    def from_document(cls, document: Mapping[str, Any], where: str) -> Camera:
+        """The camera that a JSON document describes. Raises InputError or GeometryError, naming ``where``."""
+
+    @abstractmethod
+    def rays(self, line: ArrayLike, sample: ArrayLike) -> tuple[Floats, Floats]:
+        """Origins and unit directions (out of the camera), each (..., 3), body-fixed."""
+
+    @abstractmethod
+    def ground_to_image(self, points: ArrayLike) -> tuple[Floats, Floats]:
+        """(line, sample) of body-fixed points (..., 3), m; NaN where no line of the image looks that way.
+
+        Places beside the detector have coordinates outside it: see :meth:`inside`.
+        """
+
+    @abstractmethod
+    def pose_derivatives(self, points: ArrayLike) -> Floats:
+        """d(line, sample) / d(pose) at points (..., 3): (..., 2, 6), px per m and px per rad."""
+
+    @abstractmethod
+    def moved(self, pose: ArrayLike) -> Camera:
+        """The same camera after a change of pose (6,)."""
+
+    def sun_position(self, line: ArrayLike) -> Floats | None:
+        """(..., 3) body-fixed place of the Sun while each line was taken, m; None where the model holds none."""
+        return None
+
+    def ephemeris_time(self, line: ArrayLike) -> Floats | None:
+        """Seconds of TDB since J2000 of each line; None where the model holds no time."""
+        return None
+
+    def position(self, line: ArrayLike, sample: ArrayLike | None = None) -> Floats:
+        """(..., 3) body-fixed place of the camera while each line was taken, m."""
+        line = np.asarray(line, float)
+        return self.rays(line, np.full(line.shape, self.samples / 2) if sample is None else sample)[0]
+
+    def inside(self, line: ArrayLike, sample: ArrayLike) -> NDArray[np.bool_]:
+        """Whether image coordinates lie on the detector."""
+        line, sample = np.asarray(line, float), np.asarray(sample, float)
+        return (line >= 0) & (line <= self.lines) & (sample >= 0) & (sample <= self.samples)
+
+    def image_to_ground(
+        self, line: ArrayLike, sample: ArrayLike, height: ArrayLike = 0.0, missing: str = "nan"
+    ) -> Floats:
+        """(..., 3) body-fixed points where the pixels' rays meet the body's ellipsoid raised by ``height`` metres.
+
+        missing : what a ray that passes the body gives: ``nan``, ``nearest`` (the ray's point closest to the
+            body, as CSM cameras answer) or ``error`` (GeometryError)
+        """
+        origin, direction = self.rays(line, sample)
+        equatorial, polar = self.semi_axes
+        points, hit = meet_ellipsoid(origin, direction, equatorial + np.asarray(height), polar + np.asarray(height))
+        if missing == "error" and not hit.all():
+            first = np.argwhere(~hit)[0] if hit.ndim else ()
+            at = np.broadcast_arrays(np.asarray(line, float), np.asarray(sample, float))
+            raise GeometryError(
+                f"{self.kind} camera: {int((~hit).sum())} of {hit.size} pixels look past the body, the first at line "
+                f"{at[0][tuple(first)]:g}, sample {at[1][tuple(first)]:g}; check its pointing and --body."
+            )
+        if missing != "nearest":
+            points = np.where(hit[..., None], points, np.nan)
+        return points
+
+    def image_to_terrain(
+        self,
+        line: ArrayLike,
+        sample: ArrayLike,
+        height_at: Callable[[Floats, Floats], Floats],
+        tolerance: float = 1e-3,
+        iterations: int = 50,
+    ) -> Floats:
+        """(..., 3) body-fixed points where the rays meet a terrain; NaN where they do not, or leave it.
+
+        height_at : (longitude, latitude in degrees) -> metres above the sphere of the equatorial radius, NaN outside
+        tolerance : m, between the ray and the terrain
+        Each step raises the sphere to the terrain under the last answer, with the secant's slope where two steps
+        give one; over terrain steeper than the ray the answer may be the second surface that it crosses.
+        """
+        origin, direction = self.rays(line, sample)
+        radius = self.semi_axes[0]
+        height = np.zeros(origin.shape[:-1])
+        previous_height = previous_gap = None
+        points = np.full_like(origin, np.nan)
+        done = np.zeros(height.shape, bool)
+        for _ in range(iterations):
+            trial, hit = meet_ellipsoid(origin, direction, radius + height, radius + height)
+            r = np.linalg.norm(trial, axis=-1)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                longitude = np.degrees(np.arctan2(trial[..., 1], trial[..., 0]))
+                latitude = np.degrees(np.arcsin(np.clip(trial[..., 2] / r, -1, 1)))
+                terrain = np.asarray(height_at(longitude, latitude), float)
+                gap = np.where(hit, terrain, np.nan) - height
+                found = np.abs(gap) < tolerance
+                points = np.where((found & ~done)[..., None], trial, points)
+                done |= found
+                if (done | ~np.isfinite(gap)).all():
+                    break
+                step = gap
+                if previous_gap is not None:
+                    slope = (gap - previous_gap) / (height - previous_height)
+                    secant = -gap / slope
+                    usable = np.isfinite(secant) & (slope < -0.2) & (np.abs(secant) < 10 * np.abs(gap) + 1)
+                    step = np.where(usable, secant, 0.5 * gap)
+            previous_height, previous_gap = height, gap
+            height = np.where(done | ~np.isfinite(step), height, height + step)
+        return points
+
+
+def meet_ellipsoid(
+    origin: Floats, direction: Floats, equatorial: ArrayLike, polar: ArrayLike
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """First points (..., 3) of rays on an ellipsoid of revolution, and whether each ray meets it ahead of the camera.
+
+    A ray that passes by gives its point closest to the ellipsoid.
+    """
+    stretch = (np.asarray(equatorial, float) / np.asarray(polar, float)) ** 2
+    weight = np.stack(np.broadcast_arrays(np.ones_like(stretch), np.ones_like(stretch), stretch), axis=-1)
+    a = (weight * direction * direction).sum(-1)
+    half_b = (weight * direction * origin).sum(-1)
+    # c as a difference of lengths keeps its digits where the camera is close to the ground
+    size = np.sqrt((weight * origin * origin).sum(-1))
+    c = (size - equatorial) * (size + equatorial)
+    discriminant = half_b * half_b - a * c
+    root = np.sqrt(np.maximum(discriminant, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = np.where(half_b < 0, c / (root - half_b), (-half_b - root) / a)
+        closest = -half_b / a
+    distance = np.where(discriminant < 0, closest, distance)
+    hit = (discriminant >= 0) & (distance >= 0)
+    return origin + distance[..., None] * direction, hit
+
+
+def cross_matrix(vectors: Floats) -> Floats:
+    """(..., 3, 3) matrices X with X @ w = vector x w."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def small_rotation(vector: ArrayLike) -> Floats:
+    """(3, 3) rotation by |vector| radians about ``vector`` (Rodrigues)."""
+    vector = np.asarray(vector, float)
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    k = cross_matrix(vector / angle)
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
+
+
+_CAMERAS: dict[str, type[Camera]] = {}
+
+
+def register(cls: type[Camera]) -> type[Camera]:
+    """Class decorator: make a camera known under its kind and under the names that it answers to."""
+    for name in {cls.kind, *cls.answers_to}:
+        _CAMERAS[name.lower()] = cls
+    return cls
+
+
+def camera_kinds() -> list[str]:
+    return sorted({cls.kind for cls in _CAMERAS.values()})
+
+
+def camera_from_document(document: Mapping[str, Any], where: str) -> Camera:
+    """The camera of a JSON document, ours (key ``type``) or an ISD (key ``name_model``). Raises LunargrError."""
+    name = document.get("type", document.get("name_model"))
+    if name is None:
+        raise InputError(
+            f"{where}: expected a camera with the key 'type' or 'name_model' (an ALE/CSM ISD), found neither."
+        )
+    cls = _CAMERAS.get(str(name).lower())
+    if cls is None:
+        raise RegistryError(f"{where}: {RegistryError.unknown('camera', str(name), _CAMERAS)}")
+    return cls.from_document(document, where)
+
+
+def read_document(path: Path) -> Mapping[str, Any]:
+    """A camera's JSON document. Raises InputError."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; expected a camera model (JSON).") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: expected a camera model in JSON, cannot read it ({error}).") from None
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}: expected a camera model in JSON, found something else ({error}).") from None
+    if not isinstance(document, Mapping):
+        raise InputError(f"{path}: expected a JSON object that describes a camera, found a {type(document).__name__}.")
+    return document

@@ -1,0 +1,124 @@
+"""Reading values out of a camera's document with one-line errors; shared by our own JSON cameras and ISDs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.errors import GeometryError, InputError
+from stages.physics.bodies import find_body
+
+Floats = NDArray[np.float64]
+ROTATION_TOLERANCE = 1e-6
+QUATERNION_TOLERANCE = 1e-3  # tables keep 8 digits; further off is not a rotation
+
+
+def value(document: Mapping[str, Any], key: str, where: str) -> Any:
+    """``document[key]``, where ``key`` may go down with dots. Raises InputError for a missing one."""
+    here: Any = document
+    for part in key.split("."):
+        if not isinstance(here, Mapping) or part not in here:
+            raise InputError(f"{where}: expected the key '{key}', found none; make the camera model again.")
+        here = here[part]
+    return here
+
+
+def number(document: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:
+    if default is not None and not has(document, key):
+        return default
+    found = value(document, key, where)
+    try:
+        result = float(found)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: expected a number in '{key}', found {_short(found)}.") from None
+    if not math.isfinite(result):
+        raise InputError(f"{where}: expected a finite number in '{key}', found {result}.")
+    return result
+
+
+def array(document: Mapping[str, Any], key: str, where: str, shape: tuple[int, ...] | None = None) -> Floats:
+    """Numbers of a fixed shape (-1: any length). Raises InputError."""
+    found = value(document, key, where)
+    try:
+        result = np.array(found, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: expected numbers in '{key}', found {_short(found)}.") from None
+    fits = shape is None or (
+        result.ndim == len(shape) and all(want in (-1, have) for want, have in zip(shape, result.shape, strict=True))
+    )
+    if not fits:
+        wanted = " x ".join("n" if n == -1 else str(n) for n in shape or ())
+        raise InputError(f"{where}: expected {wanted} numbers in '{key}', found shape {result.shape}.")
+    if not np.isfinite(result).all():
+        raise InputError(f"{where}: expected finite numbers in '{key}', found NaN or infinity.")
+    return result
+
+
+def has(document: Mapping[str, Any], key: str) -> bool:
+    here: Any = document
+    for part in key.split("."):
+        if not isinstance(here, Mapping) or part not in here:
+            return False
+        here = here[part]
+    return True
+
+
+def size(document: Mapping[str, Any], key: str, where: str) -> int:
+    result = number(document, key, where)
+    if result < 1 or result != int(result):
+        raise InputError(f"{where}: expected a whole number of pixels above 0 in '{key}', found {result:g}.")
+    return int(result)
+
+
+def rotation(document: Mapping[str, Any], key: str, where: str) -> Floats:
+    """(3, 3) rotation given as a matrix, as nine numbers by rows, or as a quaternion (x, y, z, w)."""
+    numbers = array(document, key, where)
+    if numbers.size == 9:
+        matrix = numbers.reshape(3, 3)
+    elif numbers.shape == (4,):
+        return quaternion_matrix(check_quaternions(numbers, f"{where}: '{key}'")[[3, 0, 1, 2]])
+    else:
+        raise InputError(f"{where}: expected a rotation of 3 x 3 or 4 numbers in '{key}', found shape {numbers.shape}.")
+    off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    if off > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
+        kind = "a reflection" if off <= ROTATION_TOLERANCE else f"rows that are not orthonormal (by {off:.2g})"
+        raise GeometryError(f"{where}: expected a rotation in '{key}', found {kind}.")
+    return matrix
+
+
+def check_quaternions(quaternions: Floats, where: str) -> Floats:
+    """Unit quaternions (..., 4), normalised; refuses what is not a rotation. Raises GeometryError."""
+    length = np.linalg.norm(quaternions, axis=-1)
+    bad = np.abs(length - 1) > QUATERNION_TOLERANCE
+    if bad.any():
+        first = int(np.flatnonzero(np.ravel(bad))[0])
+        raise GeometryError(
+            f"{where}: expected unit quaternions, found one of length {np.ravel(length)[first]:.6g} (number {first + 1})."
+        )
+    return quaternions / length[..., None]
+
+
+def quaternion_matrix(quaternions: Floats) -> Floats:
+    """(..., 3, 3) rotations of unit quaternions (..., 4), scalar first."""
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def body_axes(document: Mapping[str, Any], where: str) -> tuple[float, float]:
+    """The body of one of our own documents: ``body`` (name or metres), the Moon where absent."""
+    radius = find_body(str(document.get("body", "moon"))).radius
+    return radius, radius
+
+
+def _short(found: Any) -> str:
+    text = repr(found)
+    return text if len(text) < 60 else text[:57] + "..."
