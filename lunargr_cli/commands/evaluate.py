@@ -1,0 +1,79 @@
+"""`lunargr evaluate PAIRS CHECKPOINT`: how well the learned reflectance predicts images it has not seen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import Device, Json, Output, Overwrite, Quiet, Seed
+
+NAME, ORDER = "evaluate", 70
+
+
+def command(
+    pairs: Annotated[Path, typer.Argument(help="Pairs from 'lunargr project'.")],
+    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint from 'lunargr train'.")],
+    output: Output = Path("evaluation.h5"),
+    split: Annotated[str, typer.Option("--split", help="train, validation or test.")] = "test",
+    extend: Annotated[
+        Path | None,
+        typer.Option("--extend", metavar="FILE", help="Also score the extended model of 'lunargr diagnose'."),
+    ] = None,
+    figures: Annotated[
+        Path | None, typer.Option("--figures", metavar="DIR", help="Write training curves and example crops as PNG.")
+    ] = None,
+    bootstrap: Annotated[
+        int, typer.Option("--bootstrap", help="Resamples of the ground tiles for the intervals.")
+    ] = 2000,
+    fit_pairs: Annotated[
+        int, typer.Option("--fit-pairs", help="Most train pairs that baselines are fitted on (0: all).")
+    ] = 4096,
+    renderings: Annotated[
+        bool | None,
+        typer.Option(
+            "--renderings/--no-renderings", help="Keep every rendered crop in the output (default: below 512 MiB)."
+        ),
+    ] = None,
+    batch: Annotated[int, typer.Option("--batch", help="Crops in memory at a time.")] = 16,
+    seed: Seed = 0,
+    device: Device = "auto",
+    json_file: Json = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Score the learned model and its baselines on one split: MSE, PSNR, SSIM, LPIPS, with 95 % intervals.
+
+    The result also goes to a JSON file beside the output. Images in DN get a gain and an offset per image, fitted on
+    the train split in the same way for every model; their errors are shares of the full DN range.
+    """
+    from lunargr_cli.console import Console
+    from stages import evaluate
+    from stages.evaluate.table import gain_lines, result_lines
+
+    console = Console(quiet)
+    config = evaluate.Config(split, batch, bootstrap, fit_pairs, renderings, seed, device)
+    result = evaluate.run(
+        pairs,
+        checkpoint,
+        output,
+        config,
+        extend=extend,
+        json_file=json_file,
+        figures=figures,
+        overwrite=overwrite,
+        progress=console.progress,
+    )
+    columns, cells = result_lines(result)
+    unit = "I/F" if result["image_units"] == "iof" else f"shares of {result['dn_full_range']:.0f} DN"
+    console.table(
+        f"{result['pairs']} crops of split '{split}', {result['tiles']} ground tiles, errors in {unit}", columns, cells
+    )
+    columns, cells = gain_lines(result)
+    console.table("what the learned reflectance gains (paired over ground tiles)", columns, cells)
+    for warning in result["warnings"]:
+        console.say(f"note: {warning}.")
+    if result["lpips_unavailable"]:
+        console.say(f"LPIPS is not available: {result['lpips_unavailable']}.")
+    console.say(f"written: {output}, {output.with_suffix('.json')}" + (f", {figures}/" if figures else ""))

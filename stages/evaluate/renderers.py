@@ -1,0 +1,142 @@
+"""The compared models: each renders a batch of crops, brought to the images' scale in the same way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from schemas.errors import ArtefactError
+from stages.physics.formation import Extension, Observation, expose, form, illuminate
+from stages.physics.photometry import ReflectanceModel, get_model, masked_radiance_factor
+from stages.physics.radiometry import match_crops
+
+
+class Reader(Protocol):
+    """What evaluate needs of a pairs file (``stages.network.dataset.PairReader``)."""
+
+    split: np.ndarray
+    tile: np.ndarray
+    frame: np.ndarray
+
+    def observation(self, indices: Sequence[int]) -> Observation: ...
+    def image(self, indices: Sequence[int]) -> Tensor: ...
+    def valid(self, indices: Sequence[int]) -> Tensor: ...
+
+
+class Predictor(Protocol):
+    """What evaluate needs of a checkpoint (``stages.network.predictor``)."""
+
+    model: ReflectanceModel
+
+    def coefficients(self, elevation: Tensor) -> Tensor: ...
+
+
+@dataclass
+class Batch:
+    """A batch of crops as measured.
+
+    image : (B, H, W) float32, I/F or share of the full DN range; usable : (B, H, W) bool; frame : (B,)
+    """
+
+    observation: Observation
+    image: Tensor
+    usable: Tensor
+    frame: np.ndarray
+    memo: dict[str, Any] = field(default_factory=dict)
+
+
+def read_batch(reader: Reader, indices: Sequence[int], scale: float) -> Batch:
+    """Crops ``indices`` in ascending order; a pixel is usable where image and photometric geometry are known."""
+    observation = reader.observation(indices)
+    image = torch.as_tensor(reader.image(indices)).to(torch.float32) / scale
+    angles = illuminate(observation).angles
+    known = torch.isfinite(image) & torch.isfinite(angles.cos_incidence) & torch.isfinite(angles.cos_emission)
+    usable = torch.as_tensor(reader.valid(indices)).bool() & known
+    return Batch(observation, image, usable, np.asarray(reader.frame)[np.asarray(indices)])
+
+
+@dataclass
+class Renderer:
+    """One compared model, with gain and offset per frame (1 and 0 for calibrated images).
+
+    coefficients : batch -> tensor that broadcasts to (B, C, H, W), in the order of ``model.parameters``
+    """
+
+    name: str
+    model: ReflectanceModel
+    coefficients: Callable[[Batch], Tensor]
+    extensions: tuple[Extension, ...] = ()
+    scale: float = 1.0
+    gain: np.ndarray | None = None
+    offset: np.ndarray | None = None
+
+    def radiance_factor(self, batch: Batch) -> Tensor:
+        """I/F, (B, H, W), 0 on pixels that are not usable."""
+        if self.name in batch.memo:
+            return batch.memo[self.name]
+        rendered = form(batch.observation, self.model, self.coefficients(batch), self.extensions) * self.scale
+        rendered = torch.where(batch.usable, rendered, torch.zeros((), dtype=rendered.dtype))
+        if not torch.isfinite(rendered).all():
+            raise ArtefactError(
+                f"model '{self.name}': expected finite I/F on every valid pixel, found NaN or infinity; "
+                "the coefficients of the checkpoint are damaged, train again."
+            )
+        batch.memo[self.name] = rendered
+        return rendered
+
+    def image(self, batch: Batch, how: str | None = None) -> Tensor:
+        """The rendered crops on the scale of the images, matched per crop where ``how`` names a matching."""
+        rendered = self.radiance_factor(batch)
+        gain, offset = self._per_crop(self.gain, batch, 1.0), self._per_crop(self.offset, batch, 0.0)
+        rendered = rendered * gain
+        if how == "gain":  # a gain of the light: the sensor's offset stays out of it
+            return match_crops(rendered, batch.image - offset, batch.usable, how) + offset
+        rendered = rendered + offset
+        return rendered if how is None else match_crops(rendered, batch.image, batch.usable, how)
+
+    @staticmethod
+    def _per_crop(values: np.ndarray | None, batch: Batch, default: float) -> Tensor:
+        if values is None:
+            return torch.full((len(batch.frame), 1, 1), default)
+        return torch.as_tensor(values[batch.frame], dtype=torch.float32)[:, None, None]
+
+
+def unit_images(model: ReflectanceModel, batch: Batch) -> Tensor:
+    """The image of every unit coefficient of a linear model, (B, C, H, W): their weighted sum is the rendering."""
+    state = illuminate(batch.observation)
+    images = []
+    for k in range(len(model.parameters)):
+        unit = torch.zeros(1, len(model.parameters), 1, 1)
+        unit[0, k] = 1
+        state.reflectance = masked_radiance_factor(model, model.unpack(unit, dim=1), state.angles)
+        images.append(torch.where(batch.usable, expose(state), torch.zeros(())))
+    return torch.stack(images, dim=1)
+
+
+def constant(values: np.ndarray) -> Callable[[Batch], Tensor]:
+    """The same coefficients everywhere."""
+    tensor = torch.as_tensor(values, dtype=torch.float32)[None, :, None, None]
+    return lambda batch: tensor
+
+
+def learned(predictor: Predictor) -> Callable[[Batch], Tensor]:
+    """The network's coefficients from the crop's elevation; computed once per batch."""
+
+    def coefficients(batch: Batch) -> Tensor:
+        if "coefficients" not in batch.memo:
+            with torch.no_grad():
+                batch.memo["coefficients"] = predictor.coefficients(batch.observation.elevation).float().cpu()
+        return batch.memo["coefficients"]
+
+    return coefficients
+
+
+def published(name: str) -> tuple[ReflectanceModel, np.ndarray]:
+    """A registered model and its default parameters."""
+    model = get_model(name)
+    return model, np.array([p.default for p in model.parameters])

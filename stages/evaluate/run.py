@@ -1,0 +1,244 @@
+"""From files to files: pairs and checkpoint in, table, JSON, evaluation artefact and figures out."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from schemas import EVALUATION, PAIRS, SPLITS, ArtefactWriter, atomic_path, check_output, open_artefact, read_strings
+from schemas.errors import ArtefactError, ConfigError
+from stages.evaluate.bootstrap import TileBootstrap
+from stages.evaluate.core import Row, choose_fit_pairs, fit_renderers, score
+from stages.evaluate.perceptual import Perceptual
+from stages.evaluate.renderers import Predictor, Reader, read_batch
+from stages.evaluate.table import gain_table, metric_table
+from stages.physics.formation import Extension
+from stages.physics.radiometry import full_scale
+
+RENDERINGS_LIMIT = 512 * 2**20  # bytes of rendered crops that are kept without being asked for
+MANY_TILES = 10  # fewer make percentile intervals too narrow
+
+
+@dataclass
+class Config:
+    """Options of evaluate; ``fit_pairs`` bounds the pairs that baselines are fitted on (0: all)."""
+
+    split: str = "test"
+    batch: int = 16
+    bootstrap: int = 2000
+    fit_pairs: int = 4096
+    renderings: bool | None = None
+    seed: int = 0
+    device: str = "auto"
+
+
+def run(
+    pairs: Path,
+    checkpoint: Path,
+    output: Path,
+    config: Config,
+    *,
+    extend: Path | None = None,
+    json_file: Path | None = None,
+    figures: Path | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> dict[str, Any]:
+    """Evaluate a checkpoint on a split of a pairs file; returns what the JSON holds.
+
+    Writes ``output`` (evaluation artefact), the JSON beside it (and at ``json_file``), and figures where asked.
+    Raises ConfigError or ArtefactError before anything is written.
+    """
+    from stages.network.dataset import PairReader
+    from stages.network.predictor import load_predictor
+
+    inputs = [pairs, checkpoint, *([extend] if extend else [])]
+    reports = [output.with_suffix(".json"), *([json_file] if json_file else [])]
+    check_output(output, inputs, overwrite)
+    for report in reports:
+        check_output(report, [*inputs, output], overwrite)
+    wanted, frame_names, units = select(pairs, config)
+    predictor = load_predictor(checkpoint, config.device)
+    extensions: Sequence[Extension] = ()
+    if extend is not None:
+        from stages.effects import load_extension
+
+        extensions = load_extension(extend)
+    if units == "iof" and predictor.image_units == "dn":
+        raise ArtefactError(
+            f"{checkpoint}: expected a checkpoint trained on I/F images as in {pairs.name}, found one trained on DN, "
+            "whose brightness scale is arbitrary; train on these pairs."
+        )
+    reader = PairReader(pairs)
+    with contextlib.closing(reader) if hasattr(reader, "close") else contextlib.nullcontext():
+        return _evaluate(
+            reader, predictor, extensions, wanted, frame_names, units, config, inputs, output, reports, figures,
+            checkpoint, overwrite, progress,
+        )  # fmt: skip
+
+
+def select(pairs: Path, config: Config) -> tuple[np.ndarray, list[str], str]:
+    """Indices of the split's pairs, names of the frames and units of the images. Raises ConfigError, ArtefactError."""
+    names = dict(SPLITS)
+    if config.split not in names:
+        raise ConfigError(f"--split: expected one of {', '.join(names)}, found '{config.split}'.")
+    if config.batch < 1 or config.bootstrap < 0 or config.fit_pairs < 0:
+        raise ConfigError("--batch, --bootstrap and --fit-pairs: expected positive whole numbers; see --help.")
+    with open_artefact(pairs, PAIRS) as file:
+        split = file["split"][...]
+        unit = file["image"].attrs.get("units", "1")
+        frame_names = read_strings(file, "image_id")
+    wanted = np.flatnonzero(split == names[config.split])
+    counts = ", ".join(f"{n} {int((split == value).sum())}" for n, value in SPLITS)
+    if not len(wanted):
+        raise ArtefactError(f"{pairs}:/split: expected pairs of '{config.split}', found none ({counts}); sample more.")
+    if not (split == 0).any():
+        raise ArtefactError(
+            f"{pairs}:/split: expected train pairs to fit the baselines on, found none ({counts}); sample again."
+        )
+    return wanted, frame_names, "dn" if (unit.decode() if isinstance(unit, bytes) else unit) == "dn" else "iof"
+
+
+def evaluate_pairs(
+    reader: Reader,
+    predictor: Predictor,
+    wanted: np.ndarray,
+    frame_names: list[str],
+    units: str,
+    config: Config,
+    *,
+    extensions: Sequence[Extension] = (),
+    keep: Callable[[int, np.ndarray, list[np.ndarray]], Any] | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> tuple[dict[str, Any], list[Row], Any, float]:
+    """The pure comparison: (what the JSON holds, rows, scores, DN scale)."""
+    calibrated = units == "iof"
+    train, orphans = choose_fit_pairs(reader, wanted, config.fit_pairs, config.seed)
+    total = len(train) + len(orphans) + len(wanted)
+    done = 0
+
+    def tick(count: int) -> None:
+        nonlocal done
+        done += count
+        if progress is not None:
+            progress(done, total, "evaluate")
+
+    if progress is not None:
+        progress(0, total, "evaluate")
+    scale = 1.0 if calibrated else dn_scale(reader, np.concatenate([train, orphans, wanted]), config.batch)
+    orphans = np.empty(0, int) if calibrated else orphans
+    total = len(train) + len(orphans) + len(wanted)
+    rows = fit_renderers(
+        reader, predictor, extensions, train, orphans, len(frame_names), calibrated, scale, config.batch, config.seed,
+        tick,
+    )  # fmt: skip
+    perceptual = Perceptual()
+    scores = score(reader, rows, wanted, scale, config.batch, perceptual, keep, tick)
+    if not scores.pixels.any():
+        raise ArtefactError(f"split '{config.split}': expected valid pixels, found none; project the pairs again.")
+    tile = np.asarray(reader.tile)[wanted]
+    bootstrap = TileBootstrap(tile, config.bootstrap, config.seed)
+    frames = np.asarray(reader.frame)
+    result = {
+        "split": config.split,
+        "models": metric_table(scores, bootstrap),
+        "gains": gain_table(scores, bootstrap),
+        "pairs": len(wanted),
+        "valid_pixels": int(scores.pixels.sum()),
+        "tiles": bootstrap.tiles,
+        "bootstrap": config.bootstrap,
+        "image_units": units,
+        "dn_full_range": None if calibrated else scale,
+        "model": predictor.model.name,
+        "fitted_on_pairs": len(train),
+        "frames_fitted_on_split": sorted({frame_names[f] for f in frames[orphans]}),
+        "lpips_unavailable": None if perceptual.available else perceptual.reason,
+        "warnings": _warnings(bootstrap, frames, orphans),
+    }
+    return result, rows, scores, scale
+
+
+def dn_scale(reader: Reader, indices: np.ndarray, size: int) -> float:
+    """Full DN range of the images from their largest valid value."""
+    largest = 0.0
+    indices = np.unique(indices)
+    for start in range(0, len(indices), size):
+        chosen = indices[start : start + size]
+        batch = read_batch(reader, chosen, 1.0)
+        if batch.usable.any():
+            largest = max(largest, float(batch.image[batch.usable].max()))
+    return full_scale(largest)
+
+
+def _warnings(bootstrap: TileBootstrap, frames: np.ndarray, orphans: np.ndarray) -> list[str]:
+    found = []
+    if not bootstrap.enough:
+        found.append("one ground tile: there is nothing to resample, so no interval is given")
+    elif bootstrap.tiles < MANY_TILES:
+        found.append(f"only {bootstrap.tiles} ground tiles: the intervals are too narrow")
+    if len(orphans):
+        count = len(np.unique(frames[orphans]))
+        found.append(f"{count} image(s) without train pairs: gain and offset fitted on the evaluated pixels themselves")
+    return found
+
+
+def _evaluate(
+    reader: Reader,
+    predictor: Any,
+    extensions: Sequence[Extension],
+    wanted: np.ndarray,
+    frame_names: list[str],
+    units: str,
+    config: Config,
+    inputs: list[Path],
+    output: Path,
+    reports: list[Path],
+    figures: Path | None,
+    checkpoint: Path,
+    overwrite: bool,
+    progress: Callable[[int, int, str], None] | None,
+) -> dict[str, Any]:
+    height, width = np.asarray(reader.valid([int(wanted[0])])).shape[-2:]
+    names = 9 + (3 if extensions else 0)
+    size = names * len(wanted) * height * width * 4
+    renderings = size <= RENDERINGS_LIMIT if config.renderings is None else config.renderings
+    sizes = {"model": names, "pair": len(wanted), "y": height, "x": width}
+    settings = asdict(config) | {"renderings": renderings}
+    with ArtefactWriter(
+        output, EVALUATION, sizes, config=settings, inputs=inputs, seed=config.seed, overwrite=overwrite
+    ) as artefact:
+        measured = artefact.dataset("measured")
+        rendered = artefact.dataset("rendered") if renderings else None
+
+        def keep(position: int, crops: np.ndarray, images: list[np.ndarray]) -> None:
+            measured[position : position + len(crops)] = crops
+            if rendered is not None:
+                for k, image in enumerate(images):
+                    rendered[k, position : position + len(crops)] = image
+
+        result, rows, scores, scale = evaluate_pairs(
+            reader, predictor, wanted, frame_names, units, config, extensions=extensions, keep=keep, progress=progress
+        )  # fmt: skip
+        result |= {"pairs_file": inputs[0].name, "checkpoint": inputs[1].name, "config": settings}
+        artefact.write("model_name", scores.names)
+        artefact.write("pair_index", wanted)
+        artefact.write("tile", np.asarray(reader.tile)[wanted])
+        artefact.write("valid_pixels", scores.pixels)
+        artefact.write("mse", scores.mse)
+        artefact.write("ssim", scores.ssim)
+        artefact.file.attrs["split"] = config.split
+        artefact.file.attrs["metrics"] = json.dumps(result)
+    for report in reports:
+        with atomic_path(report) as partial:
+            partial.write_text(json.dumps(result, indent=1) + "\n")
+    if figures is not None:
+        from stages.evaluate.figures import write_figures
+
+        write_figures(figures, reader, rows, wanted, scores, scale, result, checkpoint)
+    return result

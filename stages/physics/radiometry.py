@@ -1,0 +1,62 @@
+"""Bringing a rendering onto a measured crop's scale, and the scale of uncalibrated images.
+
+Shared by every stage that compares rendered with measured images, so that each compares in the same way.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+MATCHINGS = ("minmax", "gain", "gain_offset")
+
+
+def match_crops(rendered: Tensor, measured: Tensor, valid: Tensor, how: str) -> Tensor:
+    """Rescale every rendered crop to its measured one, using valid pixels only.
+
+    rendered, measured, valid : (B, H, W); valid is bool
+    how : 'minmax': the gain that gives both the same min-max range, then the same mean (the Lunar-G2R paper's baseline);
+          'gain': the least-squares gain; 'gain_offset': the least-squares gain and offset
+    A crop whose rendering is constant gets gain 0 under 'minmax' and 'gain_offset', that is the measured mean.
+    """
+    n = valid.sum(dim=(-2, -1)).clamp(min=1).to(torch.float64)
+    r = torch.where(valid, rendered, 0).to(torch.float64)
+    m = torch.where(valid, measured, 0).to(torch.float64)
+    if how == "gain":
+        gain, offset = _ratio((r * m).sum(dim=(-2, -1)), (r * r).sum(dim=(-2, -1))), torch.zeros_like(n)
+    else:
+        mean_r, mean_m = r.sum(dim=(-2, -1)) / n, m.sum(dim=(-2, -1)) / n
+        if how == "minmax":
+            gain = _ratio(crop_range(measured, valid), crop_range(rendered, valid))
+        elif how == "gain_offset":
+            dr = torch.where(valid, r - mean_r[:, None, None], 0)
+            gain = _ratio((dr * m).sum(dim=(-2, -1)), (dr * dr).sum(dim=(-2, -1)))
+        else:
+            raise ValueError(f"matching must be one of {MATCHINGS}, not {how!r}")
+        offset = mean_m - gain * mean_r
+    return (rendered.to(torch.float64) * gain[:, None, None] + offset[:, None, None]).to(rendered.dtype)
+
+
+def crop_range(image: Tensor, valid: Tensor) -> Tensor:
+    """Largest minus smallest valid value of every crop, (B,) float64; 0 where nothing is valid."""
+    high = torch.where(valid, image, -torch.inf).amax(dim=(-2, -1))
+    low = torch.where(valid, image, torch.inf).amin(dim=(-2, -1))
+    return torch.where(valid.any(dim=-1).any(dim=-1), high - low, 0).to(torch.float64)
+
+
+def full_scale(largest: float) -> float:
+    """The full range of images in DN from their largest value: 255 for 8 bits, else the next 2^n - 1.
+
+    Images whose values stay within 0..1 are taken as scaled already.
+    """
+    if largest <= 1:
+        return 1.0
+    bits = 8
+    while 2**bits - 1 < largest:
+        bits += 1
+    return float(2**bits - 1)
+
+
+def _ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """numerator / denominator, 0 where the denominator vanishes."""
+    return torch.where(denominator > 0, numerator / denominator.clamp(min=1e-300), 0)

@@ -1,0 +1,105 @@
+"""A small measured scene with known reflectance for the tests of evaluate and match, rendered here in plain numpy.
+
+Nothing of ``stages.physics`` makes these images: slopes come from numpy.gradient and I/F from the formula of M2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import torch
+
+from stages.physics.formation import Observation
+from stages.physics.photometry import get_model
+
+GSD, RADIUS = 5.0, 1e9  # a body so large that crops are flat
+A, B, C = 0.09, 0.03, 0.01
+
+
+@dataclass
+class Scene:
+    """In-memory pairs with the reader's interface; ``truth`` holds the coefficient a of every crop."""
+
+    elevation: np.ndarray
+    images: np.ndarray
+    mask: np.ndarray
+    sun: np.ndarray
+    camera: np.ndarray
+    split: np.ndarray
+    tile: np.ndarray
+    frame: np.ndarray
+    a: np.ndarray
+    noise: float
+    frame_names: list[str] = field(default_factory=list)
+
+    def observation(self, indices) -> Observation:
+        pick = np.asarray(indices)
+        return Observation(
+            torch.from_numpy(self.elevation[pick]),
+            torch.from_numpy(self.sun[pick]),
+            torch.from_numpy(self.camera[pick]),
+            GSD,
+            RADIUS,
+            frame=torch.from_numpy(self.frame[pick]),
+        )
+
+    def image(self, indices):
+        return torch.from_numpy(self.images[np.asarray(indices)])
+
+    def valid(self, indices):
+        return torch.from_numpy(self.mask[np.asarray(indices)])
+
+
+def render(elevation: np.ndarray, sun: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """I/F of M2 under a camera at the zenith, infinitely far: cos(g) is then the Sun's height."""
+    north, east = np.gradient(elevation.astype(float), GSD)
+    normal = np.stack([-east, north, np.ones_like(east)])
+    normal /= np.linalg.norm(normal, axis=0)
+    incidence = np.tensordot(sun, normal, axes=1)
+    return np.where(incidence > 0, a * incidence + B * sun[2] + C, 0.0)
+
+
+def make_scene(rng: np.random.Generator, pairs: int = 60, size: int = 32, frames: int = 4, noise: float = 0.002):
+    """Crops of smooth random relief; coefficient a varies with elevation, as a network could know it."""
+    relief = rng.normal(size=(pairs, size, size))
+    relief = np.stack([cv2.GaussianBlur(r, (0, 0), size / 10) for r in relief])
+    relief *= 12.0 / relief.std(axis=(1, 2), keepdims=True)
+    elevation = relief.astype(np.float32)
+    frame = np.arange(pairs) % frames
+    angles = np.radians(np.linspace(25, 60, frames))
+    azimuth = np.radians(np.linspace(60, 200, frames))
+    sun = np.stack([np.sin(azimuth) * np.cos(angles), np.cos(azimuth) * np.cos(angles), np.sin(angles)], axis=1)[frame]
+    a = A + 0.02 * np.tanh(elevation.astype(float) / 12)
+    image = np.stack([render(e, s, t) for e, s, t in zip(elevation, sun, a, strict=True)])
+    image += noise * rng.normal(size=image.shape)
+    mask = np.ones(image.shape, bool)
+    mask[::5, :6, :4] = False
+    split = np.where(np.arange(pairs) < pairs // 2, 0, 2).astype(np.uint8)
+    return Scene(
+        elevation,
+        image.astype(np.float32),
+        mask,
+        sun,
+        np.tile([0.0, 0.0, 1e9], (pairs, 1)),
+        split,
+        np.arange(pairs) // 2,
+        frame,
+        a,
+        noise,
+        [f"frame{k}" for k in range(frames)],
+    )
+
+
+class KnowsTheTruth:
+    """A predictor that returns the planted coefficients: its error is the noise."""
+
+    image_units = "iof"
+
+    def __init__(self, model: str = "M2") -> None:
+        self.model = get_model(model)
+
+    def coefficients(self, elevation: torch.Tensor) -> torch.Tensor:
+        a = A + 0.02 * torch.tanh(elevation.double() / 12)
+        return torch.stack([a, torch.full_like(a, B), torch.full_like(a, C)], dim=1).float()

@@ -1,0 +1,215 @@
+"""The comparison of models on a scene whose reflectance is known."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from evaluation_scene import A, B, C, KnowsTheTruth, make_scene
+
+from stages.evaluate import fit
+from stages.evaluate.core import choose_fit_pairs
+from stages.evaluate.renderers import Renderer, constant, read_batch, unit_images
+from stages.evaluate.run import Config, evaluate_pairs
+from stages.physics.photometry import get_model
+
+REQUIRED = {
+    "learned", "global", "lunar_lambert", "hapke_raw", "hapke_minmax", "hapke_gain", "hapke_gain_offset"
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(np.random.default_rng(7))
+
+
+def _evaluate(scene, units="iof", predictor=None, **options):
+    wanted = np.flatnonzero(scene.split == 2)
+    config = Config(batch=7, bootstrap=300, **options)
+    return evaluate_pairs(scene, predictor or KnowsTheTruth(), wanted, scene.frame_names, units, config)
+
+
+def test_the_true_coefficients_leave_only_the_noise(scene):
+    result, _, scores, _ = _evaluate(scene)
+    models = result["models"]
+    assert set(models) >= REQUIRED
+    assert models["learned"]["mse"] == pytest.approx(scene.noise**2, rel=0.03)
+    assert models["learned"]["mse_low"] < scene.noise**2 * 1.01 < models["learned"]["mse_high"] * 1.01
+    assert models["learned"]["psnr"] == pytest.approx(-20 * np.log10(scene.noise), abs=0.1)
+    per_crop = scene.mask[scene.split == 2].sum(axis=(1, 2))
+    assert models["learned"]["mse_crop_sum"] == pytest.approx(models["learned"]["mse"] * per_crop.mean(), rel=1e-9)
+    assert (scores.pixels == per_crop).all()
+    for name in REQUIRED - {"learned"}:
+        assert models[name]["mse"] > 2 * models["learned"]["mse"], name
+        assert result["gains"]["learned"][name]["gain_percent_low"] > 50
+    json.dumps(result, allow_nan=False)
+
+
+def test_more_freedom_never_fits_a_crop_worse(scene):
+    _, _, scores, _ = _evaluate(scene)
+    mse = dict(zip(scores.names, scores.mse, strict=True))
+    assert (mse["hapke_gain_offset"] <= mse["hapke_gain"] * (1 + 1e-5)).all()
+    assert (mse["hapke_gain"] <= mse["hapke_raw"] * (1 + 1e-5)).all()
+    assert (mse["hapke_gain_offset"] <= mse["hapke_minmax"] * (1 + 1e-5)).all()
+    assert (mse["learned_gain_offset"] <= mse["learned"] * (1 + 1e-5)).all()
+
+
+def test_the_global_set_is_the_least_squares_solution(scene):
+    _, rows, _, _ = _evaluate(scene)
+    train = np.flatnonzero(scene.split == 0)
+    east, north = np.gradient(scene.elevation[train].astype(float), 5.0, axis=(2, 1))
+    sun = scene.sun[train]
+    incidence = (sun[:, 2, None, None] - east * sun[:, 0, None, None] + north * sun[:, 1, None, None]) / np.sqrt(
+        1 + east**2 + north**2
+    )
+    phase = np.broadcast_to(sun[:, 2, None, None], incidence.shape)
+    use = scene.mask[train]
+    lit = (incidence > 0).astype(float)
+    design = np.stack([incidence * lit, phase * lit, lit], axis=-1)[use]
+    expected = np.linalg.lstsq(design, scene.images[train][use].astype(float), rcond=None)[0]
+    found = next(r for r in rows if r.name == "global").renderer.coefficients(None)[0, :, 0, 0]
+    assert found.numpy() == pytest.approx(expected, abs=2e-5)
+
+
+def test_lunar_lambert_gets_the_least_squares_albedo(scene):
+    _, rows, _, _ = _evaluate(scene)
+    renderer = next(r for r in rows if r.name == "lunar_lambert").renderer
+    batch = read_batch(scene, np.flatnonzero(scene.split == 0), 1.0)
+    x, y = renderer.radiance_factor(batch)[batch.usable].double(), batch.image[batch.usable].double()
+    assert float((x * y).sum() / (x * x).sum()) == pytest.approx(1.0, abs=1e-6)  # no further gain lowers the error
+
+
+def test_a_model_that_is_not_linear_reaches_the_same_optimum(scene):
+    train = np.flatnonzero(scene.split == 0)
+    model = get_model("M2")
+    gram = fit.FrameGram(3, 4)
+    batch = read_batch(scene, train, 1.0)
+    gram.add(unit_images(model, batch), batch.image, batch.usable, batch.frame)
+    exact = fit.solve_coefficients(gram.gram)
+    from stages.evaluate.core import sample_pixels
+
+    sample = sample_pixels(batch, 10**6, np.random.default_rng(0))
+    assert fit.fit_nonlinear(model, sample, 4, calibrated=True) == pytest.approx(exact, abs=1e-6)
+
+
+def test_nonlinear_fit_finds_planted_hapke_parameters(scene):
+    model = get_model("hapke")
+    planted = np.array([p.default for p in model.parameters])
+    planted[0] = 0.8 * planted[0]
+    batch = read_batch(scene, np.flatnonzero(scene.split == 0), 1.0)
+    batch.image = Renderer("planted", model, constant(planted)).radiance_factor(batch)
+    from stages.evaluate.core import sample_pixels
+
+    sample = sample_pixels(batch, 500, np.random.default_rng(0))
+    found = fit.fit_nonlinear(model, sample, 4, calibrated=True)
+    batch.memo.clear()
+    refit = Renderer("refit", model, constant(found)).radiance_factor(batch)
+    spread = float(batch.image[batch.usable].std())
+    assert float((refit - batch.image)[batch.usable].square().mean().sqrt()) < 5e-3 * spread
+
+
+def _uncalibrated(scene, gain, offset):
+    """The same scene on film: DN with a gain and an offset per frame, not rounded."""
+    import dataclasses
+
+    images = gain[scene.frame][:, None, None] * scene.images + offset[scene.frame][:, None, None]
+    return dataclasses.replace(scene, images=images.astype(np.float32))
+
+
+def test_dn_images_are_scored_in_shares_of_the_full_range(scene):
+    gain, offset = np.array([900.0, 1200.0, 700.0, 1000.0]), np.array([20.0, -5.0, 40.0, 0.0])
+    film = _uncalibrated(scene, gain, offset)
+    result, rows, _, scale = _evaluate(film, "dn")
+    assert scale == result["dn_full_range"] == 255
+    learned = next(r for r in rows if r.name == "learned").renderer
+    assert learned.gain * 255 == pytest.approx(gain, rel=0.01)
+    assert learned.offset * 255 == pytest.approx(offset, abs=0.8)
+    expected = np.mean((gain[film.frame[film.split == 2]] * scene.noise / 255) ** 2)
+    assert result["models"]["learned"]["mse"] == pytest.approx(expected, rel=0.05)
+
+
+def test_every_model_gets_the_nuisances_that_suit_it_best(scene):
+    """Frame gains differ by 2 and yet no baseline is punished for it: its residual on train is orthogonal."""
+    film = _uncalibrated(scene, np.array([600.0, 1200.0, 800.0, 1000.0]), np.array([9.0, 30.0, 0.0, 5.0]))
+    _, rows, _, scale = _evaluate(film, "dn")
+    batch = read_batch(film, np.flatnonzero(film.split == 0), scale)
+    for row in rows:
+        if row.how is not None:
+            continue
+        rendered = row.renderer.image(batch)
+        for f in range(4):
+            use = batch.usable & torch.from_numpy(batch.frame == f)[:, None, None]
+            residual = (batch.image - rendered)[use].double()
+            assert abs(float(residual.mean())) < 1e-5, row.name
+            assert abs(float(np.corrcoef(residual.numpy(), rendered[use].numpy())[0, 1])) < 1e-3, row.name
+
+
+def test_the_shared_set_of_dn_frames_beats_any_neighbour(scene):
+    film = _uncalibrated(scene, np.array([600.0, 1200.0, 800.0, 1000.0]), np.array([9.0, 30.0, 0.0, 5.0]))
+    model = get_model("M2")
+    batch = read_batch(film, np.flatnonzero(film.split == 0), 255.0)
+    gram = fit.FrameGram(3, 4)
+    gram.add(unit_images(model, batch), batch.image, batch.usable, batch.frame)
+    solved = fit.solve_uncalibrated(gram.gram, np.array([A, B, C]))
+
+    def loss(coefficients):
+        gain, offset = fit.solve_gain_offset(gram.gram, coefficients)
+        total = 0.0
+        for f in range(4):
+            v = np.concatenate([-gain[f] * coefficients, [-offset[f], 1.0]])
+            total += v @ gram.gram[f] @ v
+        return total
+
+    best = loss(solved)
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        assert loss(solved * (1 + 0.1 * rng.normal(size=3))) >= best * (1 - 1e-7)
+
+
+def test_frames_without_train_pairs_are_flagged(scene):
+    import dataclasses
+
+    film = _uncalibrated(scene, np.array([900.0, 1200.0, 700.0, 1000.0]), np.zeros(4))
+    split = film.split.copy()
+    split[(film.frame == 3) & (split == 0)] = 1
+    film = dataclasses.replace(film, split=split)
+    result, rows, _, _ = _evaluate(film, "dn")
+    assert result["frames_fitted_on_split"] == ["frame3"]
+    assert any("without train pairs" in w for w in result["warnings"])
+    learned = next(r for r in rows if r.name == "learned").renderer
+    assert learned.gain[3] * 255 == pytest.approx(1000, rel=0.02)
+
+
+def test_fit_pairs_are_thinned_alike_over_frames(scene):
+    wanted = np.flatnonzero(scene.split == 2)
+    train, orphans = choose_fit_pairs(scene, wanted, 12, 0)
+    assert len(train) == 12 and not len(orphans)
+    assert (np.bincount(scene.frame[train], minlength=4) == 3).all()
+
+
+def test_a_perfect_rendering_has_no_finite_psnr_and_stays_valid_json(rng):
+    scene = make_scene(rng, pairs=12, size=16, noise=0.0)
+    wanted = np.flatnonzero(scene.split == 2)
+    scene.images[wanted] = 0.0
+    scene.mask[wanted] = True
+
+    class Black(KnowsTheTruth):
+        def coefficients(self, elevation):
+            return super().coefficients(elevation) * 0
+
+    result, *_ = _evaluate(scene, predictor=Black())
+    assert result["models"]["learned"]["mse"] == 0 and result["models"]["learned"]["psnr"] is None
+    json.dumps(result, allow_nan=False)
+
+
+def test_a_checkpoint_that_renders_nan_is_one_clear_error(scene):
+    from schemas import ArtefactError
+
+    class Broken(KnowsTheTruth):
+        def coefficients(self, elevation):
+            return super().coefficients(elevation) * float("nan")
+
+    with pytest.raises(ArtefactError, match="finite"):
+        _evaluate(scene, predictor=Broken())
