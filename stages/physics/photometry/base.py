@@ -25,6 +25,9 @@ class Parameter:
     description: str
 
 
+ALBEDO = Parameter("albedo", "1", 0.0, 1.0, 0.12, "normal albedo: I/F at incidence = emission = phase = 0")
+
+
 class ReflectanceModel:
     """Base of every reflectance model. Subclasses fill the class attributes and ``radiance_factor``."""
 

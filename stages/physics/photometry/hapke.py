@@ -25,7 +25,7 @@ from stages.physics.photometry.base import Parameter, ReflectanceModel, register
 from stages.physics.photometry.roughness import rough_cosines
 
 # Defaults: Sato et al. (2014), 643 nm, mean over the Moon (set "sato2014_643nm" of `published.py`).
-COMMON = (
+OPTIONAL = (
     Parameter("Bs0", "1", 0.0, 4.0, 1.70638, "amplitude of the shadow-hiding opposition effect"),
     Parameter("hs", "1", 0.001, 1.0, 0.05431, "angular width of shadow hiding, as tan(g/2)"),
     Parameter("Bc0", "1", 0.0, 1.0, 0.0, "amplitude of the coherent-backscatter opposition effect"),
@@ -33,7 +33,6 @@ COMMON = (
     Parameter("theta", "rad", 0.0, math.radians(60), math.radians(23.6566), "mean slope of macroscopic roughness"),
     Parameter("phi", "1", 0.0, 0.7, 0.0, "filling factor; 0 = no porosity correction (K = 1)"),
 )
-ALBEDO = Parameter("w", "1", 0.0, 1.0, 0.38138, "single-scattering albedo")
 
 
 def henyey_greenstein(cos_phase: Tensor, b: Tensor, c: Tensor) -> Tensor:
@@ -108,10 +107,10 @@ class HapkeBase(ReflectanceModel):
 
 class HapkeHenyeyGreenstein(HapkeBase):
     parameters = (
-        ALBEDO,
+        Parameter("w", "1", 0.0, 1.0, 0.38138, "single-scattering albedo"),
         Parameter("b", "1", 0.0, 0.95, 0.23066, "asymmetry of both lobes of the phase function"),
         Parameter("c", "1", -1.0, 1.0, 0.40267, "backward minus forward share of the lobes (Hapke 2012, Sato 2014)"),
-        *COMMON,
+        *OPTIONAL,
     )
 
     def phase_function(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from stages.physics.geometry import Angles
-from stages.physics.photometry.base import Parameter, ReflectanceModel, register
+from stages.physics.photometry.base import ALBEDO, ReflectanceModel, register
 
 
 @register
@@ -19,7 +19,7 @@ class Lambert(ReflectanceModel):
     reciprocal = True
     linear = True
     finite = True
-    parameters = (Parameter("albedo", "1", 0.0, 1.0, 0.12, "normal albedo"),)
+    parameters = (ALBEDO,)
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         return parameters["albedo"] * angles.cos_incidence

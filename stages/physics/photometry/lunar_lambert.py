@@ -14,11 +14,10 @@ import torch
 from torch import Tensor
 
 from stages.physics.geometry import Angles
-from stages.physics.photometry.base import Parameter, ReflectanceModel, register
+from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, register
 
-# McEwen (1996): L(g) = 1 + A g + B g^2 + C g^3 with g in degrees; the cubic holds to 140 deg.
+# McEwen (1996): L(g) = 1 + A g + B g^2 + C g^3 with g in degrees; negative beyond 105 deg.
 MCEWEN = (1.0, -0.019, 2.42e-4, -1.46e-6)
-ALBEDO = Parameter("albedo", "1", 0.0, 1.0, 0.12, "normal albedo: I/F at incidence = emission = phase = 0")
 
 
 def lunar_share(phase: Tensor, coefficients: tuple = MCEWEN) -> Tensor:
@@ -51,7 +50,8 @@ class LunarLambert(ReflectanceModel):
     parameters = (ALBEDO,)
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
-        return parameters["albedo"] * mixture(lunar_share(angles.phase), angles)
+        # The cubic makes I/F negative at large phase: 0 there, as in ISIS.
+        return parameters["albedo"] * mixture(lunar_share(angles.phase), angles).clamp(min=0)
 
 
 @register

@@ -32,7 +32,8 @@ class CosinePolynomial(ReflectanceModel):
         return torch.where(value >= 0, value, value / SLOPE)
 
 
-def _coefficient(name: str, of: str, default: float) -> Parameter:
+def coefficient(name: str, of: str, default: float) -> Parameter:
+    """A coefficient of a cosine: dimensionless, bounded only for display."""
     return Parameter(name, "1", -1.0, 2.0, default, f"coefficient of {of}")
 
 
@@ -42,7 +43,7 @@ class M1(CosinePolynomial):
     title = "Lunar-G2R M1"
     formula = "a cos(i) + b cos(g)"
     reciprocal = False
-    parameters = (_coefficient("a", "cos(i)", 0.06), _coefficient("b", "cos(g)", 0.02))
+    parameters = (coefficient("a", "cos(i)", 0.06), coefficient("b", "cos(g)", 0.02))
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         return parameters["a"] * angles.cos_incidence + parameters["b"] * angles.cos_phase
@@ -54,7 +55,7 @@ class M2(CosinePolynomial):
     title = "Lunar-G2R M2"
     formula = "a cos(i) + b cos(g) + c"
     reciprocal = False
-    parameters = (*M1.parameters, _coefficient("c", "1", 0.01))
+    parameters = (*M1.parameters, coefficient("c", "1", 0.01))
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         return parameters["a"] * angles.cos_incidence + parameters["b"] * angles.cos_phase + parameters["c"]
@@ -66,7 +67,7 @@ class M3(CosinePolynomial):
     title = "Lunar-G2R M3"
     formula = "a cos(i) + b cos(g) + c cos(i) cos(g) + d"
     reciprocal = False
-    parameters = (*M1.parameters, _coefficient("c", "cos(i) cos(g)", 0.01), _coefficient("d", "1", 0.01))
+    parameters = (*M1.parameters, coefficient("c", "cos(i) cos(g)", 0.01), coefficient("d", "1", 0.01))
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         mu0, cos_phase = angles.cos_incidence, angles.cos_phase
@@ -79,7 +80,7 @@ class M4(CosinePolynomial):
     title = "Lunar-G2R M4"
     formula = "a cos(i) + b cos(g) + c cos(i)^2 + d"
     reciprocal = False
-    parameters = (*M1.parameters, _coefficient("c", "cos(i)^2", 0.01), _coefficient("d", "1", 0.01))
+    parameters = (*M1.parameters, coefficient("c", "cos(i)^2", 0.01), coefficient("d", "1", 0.01))
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         mu0, cos_phase = angles.cos_incidence, angles.cos_phase
@@ -92,7 +93,7 @@ class M5(CosinePolynomial):
     title = "Lunar-G2R M5"
     formula = "a cos(i) + b cos(g) + c cos(g)^2 + d"
     reciprocal = False
-    parameters = (*M1.parameters, _coefficient("c", "cos(g)^2", 0.01), _coefficient("d", "1", 0.01))
+    parameters = (*M1.parameters, coefficient("c", "cos(g)^2", 0.01), coefficient("d", "1", 0.01))
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         mu0, cos_phase = angles.cos_incidence, angles.cos_phase

@@ -1,0 +1,53 @@
+"""Akimov's disk function: the brightness over the disk of an extremely rough surface, with no limb brightening.
+
+    D = cos(g/2) cos[pi/(pi - g) (L - g/2)] cos(B)^(eta g/(pi - g)) / cos(L)
+
+L and B are photometric longitude and latitude: cos(e) = cos(B) cos(L), cos(i) = cos(B) cos(g - L). D is 1 at the
+mirror point L = g/2, B = 0. With d = pi/2 - L and q = g/(pi - g) the two cosines of longitude become
+
+    cos[pi/(pi - g) (L - g/2)] / cos(L) = sin((1 + q) d) / sin(d) = cos(q d) + sin(q d) / tan(d)
+
+which has no 0/0 at the limb (d = 0), and tends to 1 as g goes to 0, where L is not defined.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from stages.physics.geometry import Angles
+from stages.physics.photometry.base import Parameter, ReflectanceModel, register
+
+
+@register
+class Akimov(ReflectanceModel):
+    name = "akimov"
+    title = "Akimov disk function"
+    formula = "A cos(g/2) cos[pi/(pi-g) (L - g/2)] cos(B)^(eta g/(pi-g)) / cos(L)"
+    reference = "Akimov, L. A. (1976), Sov. Astron. 19, 385; Shkuratov, Y. et al. (2011), Planet. Space Sci. 59, 1326"
+    reciprocal = True
+    parameters = (
+        Parameter("albedo", "1", 0.0, 1.0, 0.07, "equigonal albedo: I/F at the mirror point of the phase angle"),
+        Parameter("eta", "1", 0.0, 1.0, 1.0, "latitude exponent: 1 = theory, about 0.5 lunar highlands, 0.3 maria"),
+    )
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        mu0, mu = angles.cos_incidence, angles.cos_emission
+        double = mu0.dtype == torch.float64
+        # Nearer to 0 the longitude is noise, and D = 1 to the same precision; at pi the disk function ends.
+        phase = angles.phase.clamp(min=1e-7 if double else 1e-3, max=math.pi - (1e-6 if double else 1e-3))
+        sin_phase, cos_phase = phase.sin(), phase.cos()
+        floor = 1e-24 if double else 1e-12
+        across = mu0 - mu * cos_phase  # cos(B) sin(L) sin(g)
+        along = mu * sin_phase  # cos(B) cos(L) sin(g)
+        share = phase / (math.pi - phase)
+        d = torch.atan2(along, across)
+        # No direction above the horizon is within 1e-6 of d = 0 but where e = 90 deg; the floor keeps 1/tan finite.
+        d = d.clamp(min=1e-6, max=math.pi - (1e-7 if double else 1e-4))
+        longitude = torch.cos(share * d) + torch.sin(share * d) / torch.tan(d)
+        cos2_latitude = ((across * across + along * along) / (sin_phase * sin_phase)).clamp(min=floor, max=1.0)
+        latitude = torch.exp(0.5 * parameters["eta"] * share * cos2_latitude.log())
+        return parameters["albedo"] * torch.cos(0.5 * phase) * longitude.clamp(min=0.0) * latitude

@@ -1,0 +1,25 @@
+"""Lommel-Seeliger's law: light scattered once in a dark, deep layer. A good disk function for the full Moon."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from stages.physics.geometry import Angles
+from stages.physics.photometry.base import ALBEDO, ReflectanceModel, register
+
+
+@register
+class LommelSeeliger(ReflectanceModel):
+    name = "lommel_seeliger"
+    title = "Lommel-Seeliger"
+    formula = "A 2 cos(i) / (cos(i) + cos(e))"
+    reference = "Seeliger, H. (1887), Abh. Bayer. Akad. Wiss. 16, 405; with the normal albedo in front as in ISIS"
+    reciprocal = True
+    linear = True
+    parameters = (ALBEDO,)
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        mu0 = angles.cos_incidence
+        return parameters["albedo"] * (2 * mu0 / (mu0 + angles.cos_emission))

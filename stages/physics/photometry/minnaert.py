@@ -1,0 +1,25 @@
+"""Minnaert's law: limb darkening by one exponent; k = 1 is Lambert, the Moon at small phase has k = 0.5."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from stages.physics.geometry import Angles
+from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, register
+
+
+@register
+class Minnaert(ReflectanceModel):
+    name = "minnaert"
+    title = "Minnaert"
+    formula = "A cos(i)^k cos(e)^(k-1)"
+    reference = "Minnaert, M. (1941), Astrophys. J. 93, 403"
+    reciprocal = True
+    parameters = (ALBEDO, Parameter("k", "1", 0.0, 2.0, 0.6, "exponent; for k < 1 the law breaks down at the limb"))
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        mu0, mu = angles.cos_incidence, angles.cos_emission
+        # one logarithm and one exponential, where mu0^k mu^(k-1) would take two powers
+        return parameters["albedo"] * mu0 * ((mu0 * mu).log() * (parameters["k"] - 1)).exp()

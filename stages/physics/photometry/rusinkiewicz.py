@@ -1,0 +1,67 @@
+"""M6 of Lunar-G2R: a polynomial in Rusinkiewicz' half and difference angles.
+
+With s the direction of the Sun, v that of the camera, n the normal and h = (s + v)/|s + v|:
+
+    theta_h  angle between h and n            cos = (cos i + cos e) / (2 cos(g/2))
+    theta_d  angle between h and s            cos = cos(g/2)
+    phi_h    azimuth of h about n, from the tangent t = the Sun's direction projected on the surface
+    phi_d    azimuth of s about h, from the plane of n and h
+
+The frame follows the Sun, so that M6 is an isotropic function of (i, e, g). With D = (n . (s x v))^2, the squared
+volume of the three directions, and P = sin^2(i) + cos(g) - cos(i) cos(e):
+
+    cos(phi_h) = P / sqrt(P^2 + D)
+    cos(phi_d) = q / sqrt(q^2 + D),  q = cos(g/2) (cos e - cos i)
+
+An azimuth is not defined where its angle theta is 0; a term of machine precision under the root makes both cosines go
+smoothly to 0 there, with finite slopes.
+
+Supplement of Grethen et al., Lunar-G2R, section 2; Rusinkiewicz, S. (1998), Eurographics Workshop on Rendering, 11.
+Its authors' code differs: its h is not normalised and its tangent is the camera's direction, so its coefficients do not
+carry over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from stages.physics.geometry import Angles
+from stages.physics.photometry.base import register
+from stages.physics.photometry.polynomial import CosinePolynomial, coefficient
+
+
+def half_difference_cosines(angles: Angles) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """cos(theta_h), cos(theta_d), cos(phi_h), cos(phi_d) as in the module's text; finite for every input."""
+    mu0, mu, cos_phase = angles.cos_incidence, angles.cos_emission, angles.cos_phase
+    epsilon = torch.finfo(mu0.dtype).eps
+    cos_half = (0.5 + 0.5 * cos_phase).clamp(min=epsilon).sqrt()
+    mu0_squared = mu0 * mu0
+    cosine = cos_phase - mu0 * mu  # sin(i) sin(e) cos(azimuth)
+    volume = ((1 - mu0_squared) * (1 - mu * mu) - cosine * cosine).clamp(min=0) + epsilon
+    p = 1 - mu0_squared + cosine
+    q = cos_half * (mu - mu0)
+    cos_theta_h = ((mu0 + mu) * 0.5 / cos_half).clamp(max=1)  # over 1 only for angles that no directions have
+    return cos_theta_h, cos_half, p * torch.rsqrt(p * p + volume), q * torch.rsqrt(q * q + volume)
+
+
+@register
+class M6(CosinePolynomial):
+    name = "M6"
+    title = "Lunar-G2R M6"
+    formula = "a cos(theta_h) + b cos(theta_d) + c cos(phi_h) + d cos(phi_d)"
+    reference = "Grethen et al., Lunar-G2R, table 1 and supplement; angles: Rusinkiewicz (1998)"
+    reciprocal = False
+    parameters = (
+        coefficient("a", "cos(theta_h)", 0.04),
+        coefficient("b", "cos(theta_d)", 0.02),
+        coefficient("c", "cos(phi_h)", 0.005),
+        coefficient("d", "cos(phi_d)", 0.005),
+    )
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        theta_h, theta_d, phi_h, phi_d = half_difference_cosines(angles)
+        a, b, c, d = (parameters[p.name] for p in self.parameters)
+        return a * theta_h + b * theta_d + c * phi_h + d * phi_d
