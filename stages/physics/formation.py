@@ -7,7 +7,7 @@ Extensions (``stages/effects``) act at the slot that they name; the order of the
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -33,6 +33,7 @@ class Observation:
     sky_view : (B, H, W), 1, or None
     detector_sample, detector_line : (B, H, W), px, or None
     frame : (B,) int64, index of the source image, or None
+    site : (B,) int64, number of the ground site, or None
     """
 
     elevation: Tensor
@@ -45,15 +46,18 @@ class Observation:
     detector_sample: Tensor | None = None
     detector_line: Tensor | None = None
     frame: Tensor | None = None
+    site: Tensor | None = None
 
 
 @dataclass
 class State:
     """What the chain has made so far; an extension changes what its slot may change.
 
-    geometry      sees and may change: elevation, camera_position
-    illumination  sees also slopes, view; may change: sun_direction, sun_horizon, sun_radius
-    reflectance   sees also angles, sun_visibility; may change: coefficients, reflectance (I/F of a lit facet)
+    geometry      sees and may change: elevation, sun_horizon, camera_position, displacement (where the map projection
+                  looked: columns to the east, rows to the south, px, broadcastable to the image)
+    illumination  sees also slopes, view; may change: sun_direction, sun_horizon, sun_radius, further_light (functions
+                  of the state, run once the directly lit radiance is known; each adds to it)
+    reflectance   sees also angles, sun_visibility; may change: reflectance (I/F of a lit facet)
     radiance      may change: radiance (I/F that reaches the camera)
     sensor        may change: image
     """
@@ -64,6 +68,8 @@ class State:
     camera_position: Tensor
     sun_horizon: Tensor | None
     sun_radius: float | Tensor = SUN_RADIUS
+    displacement: tuple[Tensor, Tensor] | None = None
+    further_light: list[Callable[[State], None]] = field(default_factory=list)
     slopes: tuple[Tensor, Tensor] = field(default=None)  # type: ignore[assignment]
     view: tuple[Tensor, Tensor, Tensor] = field(default=None)  # type: ignore[assignment]
     angles: Angles = field(default=None)  # type: ignore[assignment]
@@ -139,10 +145,28 @@ def expose(state: State, extensions: Sequence[Extension] = ()) -> Tensor:
     _apply(state, extensions, "reflectance")
     lit = state.sun_visibility
     state.radiance = state.reflectance if lit is None else state.reflectance * lit
+    for add_light in state.further_light:
+        add_light(state)
     _apply(state, extensions, "radiance")
-    state.image = state.radiance
+    state.image = state.radiance if state.displacement is None else displace(state.radiance, *state.displacement)
     _apply(state, extensions, "sensor")
     return state.image
+
+
+def displace(image: Tensor, east: Tensor, south: Tensor) -> Tensor:
+    """The image as seen ``east`` columns and ``south`` rows further on, bilinear, edges repeated.
+
+    image : (B, H, W); east, south : px, broadcastable to it
+    """
+    height, width = image.shape[-2:]
+    columns = torch.arange(width, dtype=image.dtype, device=image.device) + east
+    rows = torch.arange(height, dtype=image.dtype, device=image.device)[:, None] + south
+    x, y = torch.broadcast_tensors(columns, rows)
+    grid = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], dim=-1).expand(len(image), -1, -1, -1)
+    sampled = torch.nn.functional.grid_sample(
+        image[:, None], grid, mode="bilinear", padding_mode="border", align_corners=False
+    )
+    return sampled[:, 0]
 
 
 def _apply(state: State, extensions: Sequence[Extension], slot: str) -> None:

@@ -1,0 +1,34 @@
+"""Reflectance depends on where the light comes from."""
+
+from __future__ import annotations
+
+import torch
+
+from stages.effects.base import Effect, register
+from stages.physics.formation import State
+from stages.physics.photometry import Parameter
+
+
+@register
+class AzimuthalAnisotropy(Effect):
+    name = "azimuthal_anisotropy"
+    slot = "reflectance"
+    title = "dependence on the Sun's azimuth"
+    mechanism = (
+        "Unresolved ripples, ejecta lineations or cliffs of one orientation reflect more when lit from one side: reflectance is "
+        "multiplied by 1 + east sin(azimuth) + north cos(azimuth) of the Sun."
+    )
+    reference = "Shkuratov et al. (2011), Planet. Space Sci. 59, 1326 (photometric anisotropy of the lunar surface)"
+    confused_with = ("sun_azimuth", "image_gain")
+    separate = "an image of the same ground with the Sun on the opposite side"
+    parameters = (
+        Parameter("east", "1", -0.5, 0.5, 0.0, "relative change when lit from the east"),
+        Parameter("north", "1", -0.5, 0.5, 0.0, "relative change when lit from the north"),
+    )
+    strong = {"east": 0.05, "north": 0.05}
+
+    def apply(self, state: State) -> None:
+        sun = state.sun_direction.to(state.elevation.dtype)
+        level = torch.sqrt(sun[:, 0] ** 2 + sun[:, 1] ** 2).clamp(min=1e-6)
+        east, north = (sun[:, 0] / level)[:, None, None], (sun[:, 1] / level)[:, None, None]
+        state.reflectance = state.reflectance * (1 + self.value("east", state) * east + self.value("north", state) * north)

@@ -1,0 +1,156 @@
+"""What an effect is: a small parametric extension of the forward model, with a null value at which it does nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from schemas.errors import ConfigError, RegistryError
+from stages.physics.formation import SLOTS, State
+from stages.physics.photometry import Parameter
+
+Values = dict[str, Any]  # coordinate -> float (scene), or tensor (frames,) or (sites,)
+
+
+@dataclass
+class Survey:
+    """What the effects need to know about a data set as a whole; filled once, stored with the extended model.
+
+    The means and standard deviations are over valid pixels of all crops; brightness is that of the measured I/F.
+    """
+
+    crop_px: int = 128
+    gsd: float = 1.0
+    brightness: float = 0.05
+    brightness_quantiles: tuple[float, float, float, float] = (0.07, 0.08, 0.09, 0.1)  # .9 .97 .99 .998
+    slope: tuple[float, float] = (0.0, 1.0)  # mean, std of the slope, as tangent
+    elevation: tuple[float, float] = (0.0, 1.0)  # of the height, m
+    curvature: tuple[float, float] = (0.0, 1.0)  # of the Laplacian after a 2 px blur, 1/m
+    relief: float = 100.0  # largest range of heights in a crop, m
+    columns: tuple[float, float] = (0.0, 127.0)  # first and last detector sample
+    has_detector: bool = False
+    frames: int = 1
+    sites: int = 1
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Survey:
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One way an effect may look: ``fixed`` coordinates, and the columns that are fitted together.
+
+    Every column is a displacement from the null value: coordinate -> value at which the effect is realistic.
+    """
+
+    columns: tuple[Mapping[str, float], ...]
+    fixed: Mapping[str, float] = field(default_factory=dict)
+
+
+class Effect:
+    """Base of every effect. Subclasses fill the class attributes and ``apply``; the default trial is one per parameter.
+
+    slot         where in the chain it acts: geometry, illumination, reflectance, radiance or sensor
+    scope        'scene': one set of values; 'image': one per source image; 'site': one per ground site
+    parameters   what the report gives; ``default`` is the null value
+    coordinates  what is fitted, where that is not the parameters themselves
+    strong       a size that anybody would want to be told about: data that cannot show this much are blind to it
+    tolerance    a size that every real data set has; smaller effects are a nuisance and no cause
+    """
+
+    name: ClassVar[str]
+    slot: ClassVar[str]
+    title: ClassVar[str]
+    mechanism: ClassVar[str]
+    reference: ClassVar[str]
+    confused_with: ClassVar[tuple[str, ...]] = ()
+    separate: ClassVar[str] = ""
+    scope: ClassVar[str] = "scene"
+    parameters: ClassVar[tuple[Parameter, ...]]
+    coordinates: ClassVar[tuple[Parameter, ...]] = ()
+    strong: ClassVar[Mapping[str, float]] = {}
+    tolerance: ClassVar[Mapping[str, float]] = {}
+
+    def __init__(self, values: Mapping[str, Any] | None = None, survey: Survey | None = None) -> None:
+        self.values: Values = {**self.null(), **(values or {})}
+        self.survey = survey or Survey()
+        for name in self.values:
+            if name not in self.null():
+                raise RegistryError.unknown(f"parameter of effect {self.name}", name, self.null())
+
+    @classmethod
+    def fitted(cls) -> tuple[Parameter, ...]:
+        return cls.coordinates or cls.parameters
+
+    @classmethod
+    def null(cls) -> dict[str, float]:
+        """The values at which the effect does nothing."""
+        return {p.name: p.default for p in cls.fitted()}
+
+    @classmethod
+    def trials(cls, survey: Survey) -> Sequence[Trial]:
+        """Alternative templates; the default is one joint trial with a column per coordinate at ``strong``."""
+        return [Trial(tuple({p.name: cls.strong[p.name]} for p in cls.fitted()))]
+
+    @classmethod
+    def visible(cls, survey: Survey, has: frozenset[str]) -> bool:
+        """Whether files with these optional variables can show the effect at all."""
+        return True
+
+    @classmethod
+    def report(cls, values: Mapping[str, float], errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        """Reported parameter -> (value, standard error), from the fitted coordinates (of scene scope)."""
+        return {p.name: (values[p.name], errors.get(p.name, 0.0)) for p in cls.parameters}
+
+    @classmethod
+    def bounds(cls, name: str) -> tuple[float, float]:
+        return next((p.lower, p.upper) for p in cls.fitted() if p.name == name)
+
+    def apply(self, state: State) -> None:
+        """Change what the slot may change (see ``formation.State``), differentiable in the values."""
+        raise NotImplementedError(f"{type(self).__name__} must define apply")
+
+    def value(self, name: str, state: State) -> Tensor:
+        """A coordinate ready to multiply images: scalar, or (B, 1, 1) by image or site; null where not known."""
+        given = self.values[name]
+        like = state.elevation
+        if not isinstance(given, Tensor) or given.ndim == 0:
+            return torch.as_tensor(given, dtype=like.dtype, device=like.device)
+        index = state.observation.frame if self.scope == "image" else state.observation.site
+        if index is None:
+            return torch.as_tensor(self.null()[name], dtype=like.dtype, device=like.device)
+        known = (index >= 0) & (index < len(given))
+        picked = given.to(like)[index.clamp(0, len(given) - 1)]
+        return torch.where(known, picked, torch.full_like(picked, self.null()[name]))[:, None, None]
+
+
+_EFFECTS: dict[str, type[Effect]] = {}
+
+
+def register(cls: type[Effect]) -> type[Effect]:
+    """Class decorator: make an effect known under its name."""
+    if cls.slot not in SLOTS:
+        raise ConfigError(f"effect {cls.name}: expected a slot out of {', '.join(SLOTS)}, found '{cls.slot}'.")
+    _EFFECTS[cls.name] = cls
+    return cls
+
+
+def get_effect(name: str) -> type[Effect]:
+    """The effect called ``name``. Raises RegistryError with the choices."""
+    try:
+        return _EFFECTS[name]
+    except KeyError:
+        raise RegistryError.unknown("effect", name, effect_names()) from None
+
+
+def effect_names() -> list[str]:
+    """All effects, in the order of their slots."""
+    return sorted(_EFFECTS, key=lambda n: (SLOTS.index(_EFFECTS[n].slot), n))

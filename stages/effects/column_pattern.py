@@ -1,0 +1,45 @@
+"""The detector's columns respond unequally."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from stages.effects.base import Effect, register
+from stages.physics.formation import State
+from stages.physics.photometry import Parameter
+
+ORDERS = tuple(range(1, 9))
+
+
+@register
+class ColumnPattern(Effect):
+    name = "column_pattern"
+    slot = "sensor"
+    title = "flat field over detector columns"
+    mechanism = (
+        "Vignetting, dust and an old flat field change the response smoothly along the detector's row of pixels, the same in every "
+        "image: cosines over the samples. Files without `detector_sample` take the crop's columns."
+    )
+    reference = "Humm et al. (2016), Space Sci. Rev. 200, 431 (flat field of the LROC NACs)"
+    confused_with = ("albedo_map",)
+    separate = "an image of the same ground with the detector's row lying across it in another direction"
+    parameters = (Parameter("rms", "1", 0.0, 1.0, 0.0, "rms of the response about 1"),)
+    coordinates = tuple(Parameter(f"c{k}", "1", -0.5, 0.5, 0.0, f"cosine {k} over the columns") for k in ORDERS)
+    strong = {p.name: 0.02 for p in coordinates}
+
+    def columns(self, state: State) -> Tensor:
+        sample = state.observation.detector_sample
+        if sample is None:
+            return torch.arange(state.elevation.shape[-1], dtype=state.elevation.dtype)
+        return torch.nan_to_num(sample)
+
+    def apply(self, state: State) -> None:
+        first, last = self.survey.columns
+        u = ((self.columns(state) - first + 0.5) / max(last - first + 1, 1)).clamp(0, 1)
+        factor = 1.0
+        for k in ORDERS:
+            factor = factor + self.value(f"c{k}", state) * (math.sqrt(2) * torch.cos(math.pi * k * u))
+        state.image = state.image * factor

@@ -1,0 +1,29 @@
+"""A pedestal under every image."""
+
+from __future__ import annotations
+
+from stages.effects.base import Effect, Survey, Trial, register
+from stages.physics.formation import State
+from stages.physics.photometry import Parameter
+
+
+@register
+class DarkBias(Effect):
+    name = "dark_bias"
+    slot = "sensor"
+    title = "dark level and stray light"
+    mechanism = (
+        "Dark current, electronic offset and veiling stray light add the same amount to every pixel, in shadow as in light."
+    )
+    reference = "Humm et al. (2016), Space Sci. Rev. 200, 431; stray light: Mahanti et al. (2016), Space Sci. Rev. 200, 393"
+    confused_with = ("earthshine", "interreflection", "nonlinearity")
+    separate = "an image with deep shadow, where nothing else is bright"
+    parameters = (Parameter("iof", "1", -0.1, 0.1, 0.0, "added I/F, truth minus given"),)
+    strong = {"iof": 0.004}
+
+    @classmethod
+    def trials(cls, survey: Survey) -> list[Trial]:
+        return [Trial(({"iof": 0.02 * survey.brightness},))]
+
+    def apply(self, state: State) -> None:
+        state.image = state.image + self.value("iof", state)

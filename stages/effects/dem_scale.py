@@ -1,0 +1,36 @@
+"""The DEM's heights are wrong by a factor."""
+
+from __future__ import annotations
+
+import torch
+
+from stages.effects.base import Effect, Survey, Trial, register
+from stages.physics.formation import State
+from stages.physics.photometry import Parameter
+
+
+@register
+class DemScale(Effect):
+    name = "dem_scale"
+    slot = "geometry"
+    title = "vertical scale of the DEM"
+    mechanism = (
+        "A wrong base-to-height ratio in stereo, or shape from shading with a wrong albedo, scales all heights: every slope, "
+        "every shaded contrast and every shadow length is off by the same factor."
+    )
+    reference = "Kirk et al. (2003), ISPRS WG IV/9 (vertical precision of photogrammetric DEMs)"
+    confused_with = ("dem_smoothing", "sun_elevation")
+    separate = "an image with the Sun much lower, where shadow lengths give heights"
+    parameters = (Parameter("relative", "1", -0.5, 1.0, 0.0, "relative error of heights, truth minus given"),)
+    strong = {"relative": 0.1}
+
+    @classmethod
+    def trials(cls, survey: Survey) -> list[Trial]:
+        return [Trial(({"relative": 0.05},))]
+
+    def apply(self, state: State) -> None:
+        factor = 1 + self.value("relative", state)
+        mean = state.elevation.mean(dim=(-2, -1), keepdim=True)
+        state.elevation = mean + factor * (state.elevation - mean)
+        if state.sun_horizon is not None:
+            state.sun_horizon = torch.atan(factor * torch.tan(state.sun_horizon.clamp(-1.5, 1.5)))

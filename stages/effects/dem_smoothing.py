@@ -1,0 +1,34 @@
+"""The DEM is smoother than the ground."""
+
+from __future__ import annotations
+
+from stages.effects.base import Effect, Survey, Trial, register
+from stages.effects.filters import gaussian
+from stages.physics.formation import State
+from stages.physics.photometry import Parameter
+
+
+@register
+class DemSmoothing(Effect):
+    name = "dem_smoothing"
+    slot = "geometry"
+    title = "DEM smoother (or rougher) than the ground"
+    mechanism = (
+        "Stereo correlation windows, laser footprints and interpolation blur relief: shading from the DEM lacks the contrast "
+        "of short slopes. Undone by a Gaussian of the opposite variance, each frequency raised at most fourfold."
+    )
+    reference = "Henriksen et al. (2017), Icarus 283, 122 (resolution of LROC NAC DTMs)"
+    confused_with = ("psf_blur", "dem_scale")
+    separate = "an image at incidence above 60 deg, where shading is linear in slope but optics blur albedo as well"
+    parameters = (Parameter("sigma2_px2", "px2", -2.0, 4.0, 0.0, "variance by which the DEM is smoother than the truth"),)
+    strong = {"sigma2_px2": 1.0}
+    tolerance = {"sigma2_px2": 0.35}
+
+    @classmethod
+    def trials(cls, survey: Survey) -> list[Trial]:
+        return [Trial(({"sigma2_px2": 0.5},))]
+
+    def apply(self, state: State) -> None:
+        z = state.elevation
+        mean = z.mean(dim=(-2, -1), keepdim=True)
+        state.elevation = mean + gaussian(z - mean, -self.value("sigma2_px2", state))

@@ -1,0 +1,74 @@
+"""Terrain outside the DEM casts its shadow into it."""
+
+from __future__ import annotations
+
+import torch
+
+from stages.effects.base import Effect, Survey, Trial, register
+from stages.physics.formation import State
+from stages.physics.geometry import crop_axes
+from stages.physics.photometry import Parameter
+
+SIDES = ("any", "north", "east", "south", "west")
+
+
+@register
+class DistantShadow(Effect):
+    name = "distant_shadow"
+    slot = "illumination"
+    title = "shadow of terrain outside the DEM"
+    mechanism = (
+        "The horizon is computed from the DEM; a mountain beyond its edge still hides the Sun. Modelled as a straight ridge "
+        "along a side of the crop (or along all sides), a given distance outside its border."
+    )
+    reference = "Mazarico et al. (2011), Icarus 211, 1066 (horizons of the lunar poles need far terrain)"
+    confused_with = ("penumbra", "saturation")
+    separate = "an image with the Sun below 10 deg of elevation on the same side"
+    parameters = (Parameter("height_m", "m", 0.0, 20000.0, 0.0, "height of the ridge above the crop's mean height"),)
+    coordinates = (
+        *parameters,
+        Parameter("distance_px", "px", 0.0, 4000.0, 1.0, "distance of the ridge from the crop's border"),
+        Parameter("side", "1", 0.0, 4.0, 0.0, "0 any side, 1 north, 2 east, 3 south, 4 west"),
+    )
+    strong = {"height_m": 0.0}  # set by the trials: it depends on the Sun's elevation
+
+    @classmethod
+    def trials(cls, survey: Survey) -> list[Trial]:
+        size = survey.crop_px * survey.gsd
+        heights = (0.05, 0.1, 0.2, 0.4, 0.8)
+        return [
+            Trial(({"height_m": h * size},), {"distance_px": d * survey.crop_px, "side": float(s)})
+            for d in (0.02, 0.5)
+            for s in range(len(SIDES))
+            for h in heights
+        ]
+
+    @classmethod
+    def visible(cls, survey: Survey, has: frozenset[str]) -> bool:
+        return "sun_horizon" in has
+
+    def apply(self, state: State) -> None:
+        if state.sun_horizon is None:
+            return
+        height = self.value("height_m", state)
+        gsd = state.observation.gsd
+        rows, columns = state.elevation.shape[-2:]
+        east, north = crop_axes(rows, columns, gsd)
+        half_x, half_y = columns * gsd / 2, rows * gsd / 2
+        far = self.value("distance_px", state) * gsd
+        sun = state.sun_direction.to(state.elevation.dtype)
+        level = torch.sqrt(sun[:, 0] ** 2 + sun[:, 1] ** 2).clamp(min=1e-6)
+        sx, sy = (sun[:, 0] / level)[:, None, None], (sun[:, 1] / level)[:, None, None]
+        never = torch.full((), 1e9)
+        north_d = torch.where(sy > 1e-3, (half_y + far - north[:, None]) / sy.clamp(min=1e-3), never)
+        south_d = torch.where(sy < -1e-3, (half_y + far + north[:, None]) / (-sy).clamp(min=1e-3), never)
+        east_d = torch.where(sx > 1e-3, (half_x + far - east) / sx.clamp(min=1e-3), never)
+        west_d = torch.where(sx < -1e-3, (half_x + far + east) / (-sx).clamp(min=1e-3), never)
+        side = int(self.values["side"])
+        if side == 0:
+            distance = torch.minimum(torch.minimum(north_d, south_d), torch.minimum(east_d, west_d))
+        else:
+            distance = (north_d, east_d, south_d, west_d)[side - 1]
+        above = state.elevation - state.elevation.mean(dim=(-2, -1), keepdim=True)
+        ridge = torch.atan2(height - above, distance.expand_as(above))
+        state.sun_horizon = torch.where(height > 0, torch.maximum(state.sun_horizon, ridge), state.sun_horizon)

@@ -1,0 +1,70 @@
+"""A second, faint, distant source of light."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+
+from stages.effects.base import Effect, Survey, Trial, register
+from stages.physics.formation import State
+from stages.physics.photometry import Parameter
+
+
+@register
+class Earthshine(Effect):
+    name = "earthshine"
+    slot = "illumination"
+    title = "light from the Earth or the sky"
+    mechanism = (
+        "The full Earth lights the near side with up to 1e-4 of the Sun; other distant sources act alike. Facets that face it "
+        "gain radiance in proportion to the cosine, also in shadow."
+    )
+    reference = "Glenar et al. (2019), Icarus 321, 841 (earthshine as a light source for the lunar poles)"
+    confused_with = ("dark_bias", "interreflection")
+    separate = "an image in which shadows cover slopes of several directions"
+    parameters = (
+        Parameter("irradiance", "1", 0.0, 0.1, 0.0, "I/F of a facet that faces the source"),
+        Parameter("elevation_deg", "degree", 0.0, 90.0, 90.0, "direction of the source"),
+        Parameter("azimuth_deg", "degree", 0.0, 360.0, 0.0, "direction of the source, clockwise from north"),
+    )
+    coordinates = (
+        Parameter("east", "1", -0.1, 0.1, 0.0, "irradiance times the direction's east component"),
+        Parameter("north", "1", -0.1, 0.1, 0.0, "irradiance times the direction's north component"),
+        Parameter("up", "1", -0.1, 0.1, 0.0, "irradiance times the direction's up component"),
+    )
+    strong = {"east": 0.004, "north": 0.004, "up": 0.004}
+
+    @classmethod
+    def trials(cls, survey: Survey) -> list[Trial]:
+        size = 0.02 * survey.brightness
+        return [Trial(({"up": size}, {"east": size}, {"north": size}))]
+
+    @classmethod
+    def report(cls, values: Mapping[str, float], errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        vector = [values["east"], values["north"], values["up"]]
+        spread = [errors.get(k, 0.0) for k in ("east", "north", "up")]
+        size = math.sqrt(sum(v * v for v in vector))
+        level = math.hypot(vector[0], vector[1])
+        safe = max(size, 1e-12)
+        error = math.sqrt(sum((v * s) ** 2 for v, s in zip(vector, spread, strict=True))) / safe
+        turn = math.degrees(max(spread) / safe)
+        return {
+            "irradiance": (size, error),
+            "elevation_deg": (math.degrees(math.atan2(vector[2], level)), turn),
+            "azimuth_deg": (math.degrees(math.atan2(vector[0], vector[1])) % 360, turn * safe / max(level, 1e-12)),
+        }
+
+    def apply(self, state: State) -> None:
+        state.further_light.append(self._shine)
+
+    def _shine(self, state: State) -> None:
+        slope_east, slope_north = state.slopes
+        facing = self.value("up", state) - slope_east * self.value("east", state)
+        facing = (facing - slope_north * self.value("north", state)) * torch.rsqrt(1 + slope_east**2 + slope_north**2)
+        dark = all(not torch.is_tensor(v) and v == 0 for v in self.values.values())
+        if not dark:
+            # a facet turned away gets nothing; the sign of a single trial column is kept so that columns stay linear
+            up = torch.as_tensor(self.values["up"])
+            state.radiance = state.radiance + (facing.clamp(min=0) if float(up) > 0 else facing)

@@ -1,0 +1,48 @@
+"""A faint second image, displaced."""
+
+from __future__ import annotations
+
+import torch
+
+from stages.effects.base import Effect, Survey, Trial, register
+from stages.effects.fields import detector_axes
+from stages.physics.formation import State, displace
+from stages.physics.photometry import Parameter
+
+
+@register
+class Echo(Effect):
+    name = "echo"
+    slot = "sensor"
+    title = "electronic or optical echo"
+    mechanism = (
+        "Cross-talk between channels, charge left behind at transfer and reflections in the optics repeat the image faintly, some "
+        "pixels away along the detector's samples or lines."
+    )
+    reference = "Humm et al. (2016), Space Sci. Rev. 200, 431 (echo of the LROC NACs)"
+    confused_with = ("psf_blur", "misregistration")
+    separate = "an image turned against the others, or one with sharp shadow edges"
+    parameters = (
+        Parameter("fraction", "1", -0.3, 0.5, 0.0, "share of the signal that is repeated"),
+        Parameter("lag_px", "px", -64.0, 64.0, 4.0, "how much later the echo appears"),
+    )
+    coordinates = (*parameters, Parameter("axis", "1", 0.0, 1.0, 0.0, "0 along samples, 1 along lines"))
+    strong = {"fraction": 0.05}
+
+    @classmethod
+    def trials(cls, survey: Survey) -> list[Trial]:
+        lags = [k for k in (2, 3, 4, 6, 8, 12, 16, 24) if k < survey.crop_px / 3]
+        return [
+            Trial(({"fraction": 0.03},), {"lag_px": float(sign * lag), "axis": float(axis)})
+            for axis in (0, 1)
+            for lag in lags
+            for sign in (1, -1)
+        ]
+
+    def apply(self, state: State) -> None:
+        observation = state.observation
+        axes = detector_axes(observation.detector_sample, observation.detector_line, len(state.image))
+        step = axes[int(self.values["axis"])]
+        lag = torch.as_tensor(self.values["lag_px"], dtype=state.image.dtype)
+        repeated = displace(state.image, -(lag * step[:, 0])[:, None, None], -(lag * step[:, 1])[:, None, None])
+        state.image = state.image + self.value("fraction", state) * repeated

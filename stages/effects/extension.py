@@ -1,0 +1,45 @@
+"""The extended model of a diagnosis, read back so that training, rendering and evaluation can apply it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from schemas import DIAGNOSIS, open_artefact, read_strings
+from stages.effects.base import Effect, Survey, get_effect
+
+
+def load_extension(path: Path, image_ids: Sequence[str] | None = None) -> list[Effect]:
+    """The effects that `lunargr diagnose` named, ready for ``formation.form``.
+
+    image_ids : names behind ``Observation.frame`` in the file at hand. Values per image go with the name; images that
+        the diagnosis did not see get the null value. None: the frames are those of the diagnosed file.
+    Raises ArtefactError, RegistryError.
+    """
+    with open_artefact(Path(path), DIAGNOSIS) as file:
+        entries = json.loads(file.attrs["extension"])
+        known = {name: k for k, name in enumerate(read_strings(file, "image_id"))}
+        tables = {name: torch.from_numpy(np.asarray(file[name][...], np.float32)) for name in _tables(entries, file)}
+    order = None if image_ids is None else [known.get(str(name), -1) for name in image_ids]
+    effects = []
+    for entry in entries:
+        cls = get_effect(entry["effect"])
+        values = dict(entry["values"])
+        for coordinate, table in entry.get("tables", {}).items():
+            column = tables[table["variable"]][:, table["column"]]
+            if order is not None and cls.scope == "image":
+                null = cls.null()[coordinate]
+                column = torch.tensor([float(column[k]) if k >= 0 else null for k in order], dtype=torch.float32)
+            values[coordinate] = column
+        if cls.scope == "site":
+            continue  # a pattern of the diagnosed ground says nothing about other ground
+        effects.append(cls(values, Survey.from_json(entry["survey"])))
+    return effects
+
+
+def _tables(entries: list[dict], file) -> set[str]:
+    return {t["variable"] for e in entries for t in e.get("tables", {}).values() if t["variable"] in file}

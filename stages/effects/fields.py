@@ -1,0 +1,57 @@
+"""Terrain fields that albedo may follow, and low-order cosine fields."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from stages.effects.filters import gaussian, laplacian
+from stages.physics import geometry
+
+CURVATURE_SIGMA2 = 4.0  # px^2: curvature of the raw DEM is mostly its noise
+
+
+def slope(elevation: Tensor, gsd: float) -> Tensor:
+    """Tangent of the slope; elevation : (B, H, W), m."""
+    east, north = geometry.slopes(elevation, gsd)
+    return torch.sqrt(east * east + north * north + 1e-12)
+
+
+def curvature(elevation: Tensor, gsd: float) -> Tensor:
+    """Laplacian of the height after a blur of 2 px, 1/m."""
+    level = elevation - elevation.mean(dim=(-2, -1), keepdim=True)
+    return laplacian(gaussian(level, CURVATURE_SIGMA2), gsd)
+
+
+def cosine_field(order: tuple[int, int], height: int, width: int) -> Tensor:
+    """cos(pi m y) cos(pi n x) over the crop with unit rms; order = (m, n)."""
+    y = (torch.arange(height, dtype=torch.float32) + 0.5) / height
+    x = (torch.arange(width, dtype=torch.float32) + 0.5) / width
+    norm = math.sqrt(2.0) ** ((order[0] > 0) + (order[1] > 0))
+    return norm * torch.cos(math.pi * order[0] * y)[:, None] * torch.cos(math.pi * order[1] * x)
+
+
+def detector_axes(sample: Tensor | None, line: Tensor | None, batch: int) -> tuple[Tensor, Tensor]:
+    """Crop pixels (columns, rows) per detector sample and per detector line, each (B, 2); the crop's own without them."""
+    identity = torch.eye(2)
+    if sample is None or line is None:
+        return identity[0].expand(batch, 2), identity[1].expand(batch, 2)
+    jacobian = torch.stack(
+        [
+            torch.stack([_mean_step(sample, -1), _mean_step(sample, -2)], -1),
+            torch.stack([_mean_step(line, -1), _mean_step(line, -2)], -1),
+        ],
+        -2,
+    )  # d(sample, line) / d(column, row)
+    determinant = torch.linalg.det(jacobian)
+    safe = torch.where((determinant.abs() > 1e-6)[:, None, None], jacobian, identity.to(jacobian))
+    inverse = torch.linalg.inv(safe)
+    return inverse[:, :, 0], inverse[:, :, 1]
+
+
+def _mean_step(field: Tensor, dim: int) -> Tensor:
+    step = torch.diff(field, dim=dim)
+    good = torch.isfinite(step)
+    return torch.where(good, step, 0.0).sum((-2, -1)) / good.sum((-2, -1)).clamp(min=1)

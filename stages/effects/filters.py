@@ -1,0 +1,34 @@
+"""Gaussian filtering with a signed variance, and the standardised terrain fields that albedo may follow."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+MARGIN = 12  # px of mirrored border, over 3 sigma of anything that the effects ask for
+
+
+def gaussian(image: Tensor, sigma2: Tensor | float, limit: float = 4.0) -> Tensor:
+    """Blur by a Gaussian of variance ``sigma2`` px^2; negative: sharpen, each frequency at most ``limit`` times.
+
+    image : (B, H, W); sigma2 : scalar. Differentiable in both.
+    """
+    margin = min(MARGIN, image.shape[-1] - 1, image.shape[-2] - 1)
+    wide = pad(image[:, None], (margin,) * 4, mode="reflect")[:, 0]
+    height, width = wide.shape[-2:]
+    ky = torch.fft.fftfreq(height, device=image.device)[:, None] * (2 * math.pi)
+    kx = torch.fft.rfftfreq(width, device=image.device) * (2 * math.pi)
+    gain = torch.exp(-0.5 * torch.as_tensor(sigma2, dtype=image.dtype) * (kx * kx + ky * ky)).clamp(max=limit)
+    blurred = torch.fft.irfft2(torch.fft.rfft2(wide) * gain, s=(height, width))
+    return blurred[:, margin : height - margin, margin : width - margin]
+
+
+def laplacian(image: Tensor, gsd: float) -> Tensor:
+    """Five-point Laplacian, edges repeated; image : (B, H, W)."""
+    wide = pad(image[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
+    centre = wide[:, 1:-1, 1:-1]
+    ring = wide[:, :-2, 1:-1] + wide[:, 2:, 1:-1] + wide[:, 1:-1, :-2] + wide[:, 1:-1, 2:]
+    return (ring - 4 * centre) / (gsd * gsd)

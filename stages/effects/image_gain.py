@@ -1,0 +1,28 @@
+"""Each image has its own scale."""
+
+from __future__ import annotations
+
+from stages.effects.base import Effect, register
+from stages.physics.formation import State
+from stages.physics.photometry import Parameter
+
+
+@register
+class ImageGain(Effect):
+    name = "image_gain"
+    slot = "radiance"
+    scope = "image"
+    title = "calibration scale of single images"
+    mechanism = (
+        "Exposure, temperature and decay of the detector leave every image with its own scale error. Images in dn have a free "
+        "gain anyway, so they cannot show it."
+    )
+    reference = "Humm et al. (2016), Space Sci. Rev. 200, 431 (radiometric calibration of the LROC NACs)"
+    confused_with = ("phase_slope", "opposition_surge", "azimuthal_anisotropy")
+    separate = "more images than there are phase angles and Sun azimuths in play"
+    parameters = (Parameter("rms", "1", 0.0, 1.0, 0.0, "rms of the gains about their mean"),)
+    coordinates = (Parameter("gain", "1", -0.9, 4.0, 0.0, "relative gain of an image"),)
+    strong = {"gain": 0.02}
+
+    def apply(self, state: State) -> None:
+        state.radiance = state.radiance * (1 + self.value("gain", state))

@@ -1,0 +1,39 @@
+"""Slopes below the resolution of the DEM."""
+
+from __future__ import annotations
+
+import torch
+
+from stages.effects.base import Effect, Survey, Trial, register
+from stages.physics.formation import State
+from stages.physics.photometry import Parameter
+from stages.physics.photometry.roughness import rough_cosines
+
+
+@register
+class MacroscopicRoughness(Effect):
+    name = "macroscopic_roughness"
+    slot = "reflectance"
+    title = "roughness below the DEM's resolution"
+    mechanism = (
+        "Unresolved slopes shadow and tilt: at low Sun the surface is darker than a smooth one. Hapke's shadowing function and "
+        "effective cosines for a mean slope theta-bar, relative to a smooth Lommel-Seeliger surface."
+    )
+    reference = "Hapke (1984), Icarus 59, 41; lunar values: Sato et al. (2014), JGR 119, 1775"
+    confused_with = ("limb_darkening", "phase_slope", "sun_elevation")
+    separate = "images of the same ground at incidence 30 and 80 deg, one of them oblique"
+    parameters = (Parameter("theta_bar_deg", "degree", 0.0, 45.0, 0.0, "mean slope angle"),)
+    strong = {"theta_bar_deg": 20.0}
+
+    @classmethod
+    def trials(cls, survey: Survey) -> list[Trial]:
+        return [Trial(({"theta_bar_deg": t},)) for t in (4.0, 10.0, 23.0)]
+
+    def apply(self, state: State) -> None:
+        theta = torch.deg2rad(self.value("theta_bar_deg", state))
+        mu0, mu = state.angles.cos_incidence, state.angles.cos_emission
+        mu0e, mue, shadowing = rough_cosines(state.angles, theta)
+        smooth = mu0 / (mu0 + mu)
+        ratio = shadowing * (mu0e / (mu0e + mue)) / smooth
+        up = (mu0 > 1e-3) & (mu > 1e-3)
+        state.reflectance = torch.where(up, state.reflectance * torch.where(up, ratio, 1.0), state.reflectance)

@@ -1,0 +1,32 @@
+"""The optics are less sharp than assumed."""
+
+from __future__ import annotations
+
+from stages.effects.base import Effect, Survey, Trial, register
+from stages.effects.filters import gaussian
+from stages.physics.formation import State
+from stages.physics.photometry import Parameter
+
+
+@register
+class PsfBlur(Effect):
+    name = "psf_blur"
+    slot = "sensor"
+    title = "blur beyond the nominal optics"
+    mechanism = (
+        "Defocus, diffraction, smear by motion and the resampling of map projection widen the point-spread function by a Gaussian. "
+        "Resampling alone adds up to a sixth of a squared pixel and is not reported."
+    )
+    reference = "Humm et al. (2016), Space Sci. Rev. 200, 431 (point-spread function of the LROC NACs)"
+    confused_with = ("dem_smoothing", "misregistration")
+    separate = "an image with cast shadows, whose edges the DEM's resolution does not soften"
+    parameters = (Parameter("sigma2_px2", "px2", -0.5, 6.0, 0.0, "variance added to the point-spread function"),)
+    strong = {"sigma2_px2": 1.0}
+    tolerance = {"sigma2_px2": 0.2}
+
+    @classmethod
+    def trials(cls, survey: Survey) -> list[Trial]:
+        return [Trial(({"sigma2_px2": 0.5},))]
+
+    def apply(self, state: State) -> None:
+        state.image = gaussian(state.image, self.value("sigma2_px2", state))

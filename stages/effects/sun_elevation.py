@@ -1,0 +1,39 @@
+"""The Sun stands elsewhere in elevation than the metadata say."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from stages.effects.base import Effect, Survey, Trial, register
+from stages.physics.formation import State
+from stages.physics.photometry import Parameter
+
+
+@register
+class SunElevation(Effect):
+    name = "sun_elevation"
+    slot = "illumination"
+    title = "elevation of the Sun"
+    mechanism = (
+        "A wrong time, a wrong latitude or a local frame that is not level raises or lowers the Sun in every image alike: "
+        "all shading contrast and all shadow edges move together."
+    )
+    reference = "Acton (1996), Planet. Space Sci. 44, 65 (ephemerides); Archinal et al. (2018), CMDA 130, 22 (body frames)"
+    confused_with = ("penumbra", "dem_scale")
+    separate = "an image of the same ground with the Sun at least 20 deg higher or lower"
+    parameters = (Parameter("error_deg", "degree", -10.0, 10.0, 0.0, "truth minus given, the same for all images"),)
+    strong = {"error_deg": 0.5}
+
+    @classmethod
+    def trials(cls, survey: Survey) -> list[Trial]:
+        return [Trial(({"error_deg": 0.2},))]
+
+    def apply(self, state: State) -> None:
+        east, north, up = state.sun_direction.to(state.elevation.dtype).unbind(-1)
+        angle = torch.deg2rad(self.value("error_deg", state))
+        raised = (torch.asin(up.clamp(-1, 1)) + angle).clamp(max=math.pi / 2 - 1e-4)
+        level = torch.sqrt(east * east + north * north).clamp(min=1e-9)
+        across = torch.cos(raised) / level
+        state.sun_direction = torch.stack([east * across, north * across, torch.sin(raised)], -1)
