@@ -1,0 +1,40 @@
+"""Losses on valid pixels, and the per-image gain and offset of uncalibrated images."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+
+def masked_mse(predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
+    """Mean squared error over valid pixels; 0 where there are none."""
+    residual = (predicted - measured) * valid
+    return (residual * residual).sum() / valid.sum().clamp(min=1)
+
+
+class Radiometry(nn.Module):
+    """measured = gain x I/F + offset, per image; the identity for calibrated images.
+
+    Gains keep their geometric mean: the scale of all of them together cannot be told from the albedo's.
+    """
+
+    def __init__(self, gain: Tensor, offset: Tensor, calibrated: bool) -> None:
+        super().__init__()
+        self.calibrated = calibrated
+        scale = torch.ones(()) if calibrated else gain.log().mean().exp()
+        self.scale: Tensor
+        self.register_buffer("scale", scale)
+        self.log_gain = nn.Parameter((gain / scale).log(), requires_grad=not calibrated)
+        self.shift = nn.Parameter(offset / scale, requires_grad=not calibrated)
+
+    def gain(self) -> Tensor:
+        return self.scale * (self.log_gain - self.log_gain.mean()).exp()
+
+    def offset(self) -> Tensor:
+        return self.scale * self.shift
+
+    def forward(self, radiance_factor: Tensor, frame: Tensor) -> Tensor:
+        """I/F (B, H, W) of frames (B,) -> measured units over ``scale``: residuals then read like I/F."""
+        if self.calibrated:
+            return radiance_factor
+        gain = (self.log_gain - self.log_gain.mean()).exp()
+        return gain[frame, None, None] * radiance_factor + self.shift[frame, None, None]

@@ -1,0 +1,38 @@
+"""From elevations to the network's input: one scale for a whole data set, and holes filled from their surroundings."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+FILL_RADII = (2, 8, 32)  # px; what lies farther from any valid pixel takes the mean of the window
+FILL_REACH = 2 * sum(FILL_RADII)
+
+
+def scale_elevation(elevation: Tensor, scale: float) -> Tensor:
+    """(B, H, W) m -> (B, 1, H, W), centred and scaled. The centre only saves digits: the first layer ignores it."""
+    centred = elevation - elevation.mean(dim=(-2, -1), keepdim=True)
+    return (centred / scale).unsqueeze(1)
+
+
+def fill_holes(elevation: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Continue the terrain into holes, (H, W): means over ever larger squares of valid pixels.
+
+    Depends only on pixels within FILL_REACH, so that two windows fill the same hole alike.
+    """
+    if valid.all():
+        return elevation
+    filled = np.where(valid, elevation, 0).astype(np.float32)
+    base = float(filled[valid].mean()) if valid.any() else 0.0
+    filled = np.where(valid, filled - base, 0).astype(np.float32)
+    known = valid.astype(np.float32)
+    for radius in FILL_RADII:
+        size = (2 * radius + 1, 2 * radius + 1)
+        weight = cv2.boxFilter(known, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        total = cv2.boxFilter(filled * known, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        new = (known == 0) & (weight > 0.5)
+        filled[new] = total[new] / weight[new]
+        known[new] = 1
+    return filled + np.float32(base)
