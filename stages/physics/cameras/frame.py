@@ -1,0 +1,81 @@
+"""Framing camera from an ALE/CSM ISD: one exposure for the whole image (LROC WAC frames, Apollo Metric, Dawn FC, ...)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stages.physics.cameras.base import Camera, Floats, cross_matrix, register, small_rotation
+from stages.physics.cameras.isd import Detector, Exposure
+from stages.physics.cameras.tables import check_times
+
+
+@register
+@dataclass(frozen=True, eq=False)
+class Frame(Camera):
+    """Lens, distortion and detector of an ISD at its centre time.
+
+    centre : (3,) place of the camera, body-fixed, m; rotation : (3, 3), takes camera vectors to body-fixed ones
+    """
+
+    kind: ClassVar[str] = "frame"
+    answers_to: ClassVar[tuple[str, ...]] = ("USGS_ASTRO_FRAME_SENSOR_MODEL",)
+
+    lines: int
+    samples: int
+    semi_axes: tuple[float, float]
+    detector: Detector
+    centre: Floats
+    rotation: Floats
+    sun: Floats
+    time: float
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], where: str) -> Frame:
+        exposure = Exposure.from_document(document, where)
+        now = np.zeros(1)
+        for key, times in (
+            ("instrument_position", exposure.positions.times),
+            ("instrument_pointing", exposure.pointing.times),
+            ("body_rotation", exposure.body.times),
+        ):
+            check_times(where, key, times, 0.0, 0.0)
+        body = exposure.body.at(now)[0]
+        camera = cls(
+            lines=exposure.lines,
+            samples=exposure.samples,
+            semi_axes=exposure.semi_axes,
+            detector=Detector.from_document(document, where),
+            centre=body @ exposure.positions.at(now)[0],
+            rotation=body @ exposure.pointing.at(now)[0].T,
+            sun=exposure.sun_body_fixed(now)[0],
+            time=exposure.centre_time,
+        )
+        origin, axis = camera.rays(camera.lines / 2, camera.samples / 2)
+        return replace(camera, detector=camera.detector.facing(origin, axis, camera.semi_axes[0]))
+
+    def rays(self, line: ArrayLike, sample: ArrayLike) -> tuple[Floats, Floats]:
+        direction = self.detector.directions(line, sample) @ self.rotation.T
+        return np.broadcast_to(self.centre, direction.shape), direction
+
+    def ground_to_image(self, points: ArrayLike) -> tuple[Floats, Floats]:
+        return self.detector.places((np.asarray(points, float) - self.centre) @ self.rotation)
+
+    def pose_derivatives(self, points: ArrayLike) -> Floats:
+        camera = (np.asarray(points, float) - self.centre) @ self.rotation
+        shift = np.broadcast_to(-self.rotation.T, camera.shape[:-1] + (3, 3))
+        return self.detector.place_derivatives(camera) @ np.concatenate([shift, cross_matrix(camera)], axis=-1)
+
+    def moved(self, pose: ArrayLike) -> Frame:
+        pose = np.asarray(pose, float)
+        return replace(self, centre=self.centre + pose[:3], rotation=self.rotation @ small_rotation(pose[3:]))
+
+    def sun_position(self, line: ArrayLike) -> Floats:
+        return np.broadcast_to(self.sun, np.shape(line) + (3,))
+
+    def ephemeris_time(self, line: ArrayLike) -> Floats:
+        return np.full(np.shape(line), self.time)

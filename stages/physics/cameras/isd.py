@@ -1,0 +1,152 @@
+"""What frame and line-scan ISDs share: the detector, its optics and the tables around the exposure.
+
+An ISD (image support data) is the JSON that ALE writes and CSM cameras read. Focal-plane lengths are in mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from schemas.errors import GeometryError
+from stages.physics.cameras import document as read
+from stages.physics.cameras.base import meet_ellipsoid
+from stages.physics.cameras.distortion import distort_arrays, read_distortion, undistort_arrays
+from stages.physics.cameras.tables import Rotations, States, read_rotations, read_states
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Detector:
+    """From image pixels to the directions behind the lens.
+
+    to_line, to_sample : (3,), detector px = c0 + c1 x + c2 y of focal-plane mm, about ``centre`` = (line, sample)
+    start, summing : (line, sample) of the image's first pixel on the detector, and detector px per image px
+    """
+
+    focal_length: float
+    to_line: Floats
+    to_sample: Floats
+    centre: tuple[float, float]
+    start: tuple[float, float]
+    summing: tuple[float, float]
+    distortion: int
+    coefficients: Floats
+    sense: float = 1.0  # -1: the optical axis points out of the back, as :meth:`facing` finds out
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], where: str) -> Detector:
+        focal_length = read.number(document, "focal_length_model.focal_length", where)
+        to_line = read.array(document, "focal2pixel_lines", where, (3,))
+        to_sample = read.array(document, "focal2pixel_samples", where, (3,))
+        determinant = to_line[1] * to_sample[2] - to_line[2] * to_sample[1]
+        if not determinant or not focal_length:
+            raise GeometryError(
+                f"{where}: expected 'focal2pixel_lines' and 'focal2pixel_samples' that span the detector and a focal "
+                f"length other than 0, found determinant {determinant:g} and {focal_length:g} mm."
+            )
+        summing = tuple(read.number(document, f"detector_{axis}_summing", where) for axis in ("line", "sample"))
+        if min(summing) <= 0:
+            raise GeometryError(f"{where}: expected detector summing above 0, found {summing}.")
+        code, coefficients = read_distortion(document, where)
+        return cls(
+            focal_length=focal_length,
+            to_line=to_line,
+            to_sample=to_sample,
+            centre=tuple(read.number(document, f"detector_center.{axis}", where) for axis in ("line", "sample")),
+            start=tuple(read.number(document, f"starting_detector_{axis}", where) for axis in ("line", "sample")),
+            summing=summing,
+            distortion=code,
+            coefficients=coefficients,
+        )
+
+    def directions(self, line: ArrayLike, sample: ArrayLike) -> Floats:
+        """(..., 3) camera vectors, unit, of image coordinates; a line-scan camera has line 0 only."""
+        line, sample = np.broadcast_arrays(np.asarray(line, float), np.asarray(sample, float))
+        down = line * self.summing[0] + self.start[0] - self.centre[0] - self.to_line[0]
+        right = sample * self.summing[1] + self.start[1] - self.centre[1] - self.to_sample[0]
+        (a, b), (c, d) = self.to_line[1:], self.to_sample[1:]
+        determinant = a * d - b * c
+        x, y = undistort_arrays(
+            self.distortion,
+            self.coefficients,
+            (d * down - b * right) / determinant,
+            (a * right - c * down) / determinant,
+        )
+        vectors = np.stack([x, y, np.full_like(x, self.focal_length)], axis=-1)
+        return vectors * (self.sense / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+    def facing(self, origin: Floats, axis: Floats, radius: float) -> Detector:
+        """The detector turned towards the body, where the ISD's axis (3,) points straight away from it.
+
+        CSM cameras take the nearer of the two places where a line of sight meets the body, before or behind the camera;
+        ISDs exist that rely on it.
+        """
+        behind, ahead = (meet_ellipsoid(origin, sign * axis, radius, radius)[1] for sign in (-1.0, 1.0))
+        return replace(self, sense=-self.sense) if behind and not ahead else self
+
+    def places(self, vectors: Floats) -> tuple[Floats, Floats]:
+        """(line, sample) in the image of camera vectors (..., 3); NaN behind the camera."""
+        x, y, z = np.moveaxis(vectors, -1, 0)
+        scale = self.focal_length / np.where(z * self.focal_length * self.sense > 0, z, np.nan)
+        dx, dy = distort_arrays(self.distortion, self.coefficients, x * scale, y * scale)
+        line = self.to_line[0] + self.to_line[1] * dx + self.to_line[2] * dy + self.centre[0] - self.start[0]
+        sample = self.to_sample[0] + self.to_sample[1] * dx + self.to_sample[2] * dy + self.centre[1] - self.start[1]
+        return line / self.summing[0], sample / self.summing[1]
+
+    def place_derivatives(self, vectors: Floats) -> Floats:
+        """(..., 2, 3): d(line, sample) / d(camera vector), central differences over a millionth of the depth."""
+        step = 1e-6 * np.abs(vectors[..., 2])
+        columns = []
+        for k in range(3):
+            change = np.zeros_like(vectors)
+            change[..., k] = step
+            ahead, behind = self.places(vectors + change), self.places(vectors - change)
+            columns.append(np.stack([(ahead[i] - behind[i]) / (2 * step) for i in (0, 1)], axis=-1))
+        return np.stack(columns, axis=-1)
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Everything of an ISD that is not the detector; times in s from ``centre_time`` (TDB since J2000)."""
+
+    lines: int
+    samples: int
+    semi_axes: tuple[float, float]
+    centre_time: float
+    positions: States
+    pointing: Rotations
+    body: Rotations
+    sun: States
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], where: str) -> Exposure:
+        unit = (
+            str(document.get("radii", {}).get("unit", "km")).lower()
+            if isinstance(document.get("radii"), Mapping)
+            else "km"
+        )
+        metres = 1000.0 if unit == "km" else 1.0
+        axes = tuple(read.number(document, f"radii.{axis}", where) * metres for axis in ("semimajor", "semiminor"))
+        if min(axes) <= 0:
+            raise GeometryError(f"{where}: expected radii above 0, found {axes} m.")
+        centre = read.number(document, "center_ephemeris_time", where)
+        return cls(
+            lines=read.size(document, "image_lines", where),
+            samples=read.size(document, "image_samples", where),
+            semi_axes=axes,
+            centre_time=centre,
+            positions=read_states(document, "instrument_position", where, centre),
+            pointing=read_rotations(document, "instrument_pointing", where, centre),
+            body=read_rotations(document, "body_rotation", where, centre),
+            sun=read_states(document, "sun_position", where, centre),
+        )
+
+    def sun_body_fixed(self, times: Floats) -> Floats:
+        """(n, 3) place of the Sun, body-fixed, m, at times (n,)."""
+        return (self.body.at(times) @ self.sun.at(times)[..., None])[..., 0]

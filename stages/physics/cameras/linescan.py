@@ -1,0 +1,395 @@
+"""Line-scan camera from an ALE/CSM ISD (LROC NAC, Kaguya TC, CTX, HRSC, ...): every line has its own time and pose."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike
+
+from schemas.errors import GeometryError, InputError
+from stages.physics.cameras import document as read
+from stages.physics.cameras.base import Camera, Floats, cross_matrix, register
+from stages.physics.cameras.distortion import distort
+from stages.physics.cameras.isd import Detector, Exposure
+from stages.physics.cameras.tables import EvenTable, check_times, even_pointing, even_positions, lagrange
+
+ISD_FIRST_LINE = 0.5  # 'line_scan_rate' counts its lines from 0.5 where the image begins
+COARSE_NODES = (2048, 131072)
+CHUNK = 8192  # points per parallel piece
+
+
+@register
+@dataclass(frozen=True, eq=False)
+class LineScan(Camera):
+    """One line at a time through the lens of ``detector``; times in s from ``centre_time`` (TDB since J2000).
+
+    line_starts, line_times, line_rates : (k,) image line, time and seconds per line of each stretch of constant rate
+    positions : camera, body-fixed, m; pointing : quaternions (scalar first), camera to body-fixed; sun : body-fixed, m
+    """
+
+    kind: ClassVar[str] = "line-scan"
+    answers_to: ClassVar[tuple[str, ...]] = ("USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL",)
+
+    lines: int
+    samples: int
+    semi_axes: tuple[float, float]
+    detector: Detector
+    centre_time: float
+    line_starts: Floats
+    line_times: Floats
+    line_rates: Floats
+    positions: EvenTable
+    pointing: EvenTable
+    sun: EvenTable
+    _search: _Search | None = field(default=None, repr=False)
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], where: str) -> LineScan:
+        exposure = Exposure.from_document(document, where)
+        detector = Detector.from_document(document, where)
+        rates = read.array(document, "line_scan_rate", where, (-1, 3))
+        if len(rates) == 0 or (np.diff(rates[:, 0]) <= 0).any() or (rates[:, 2] == 0).any():
+            raise InputError(
+                f"{where}: expected rising lines and line times other than 0 in 'line_scan_rate', found "
+                f"{rates.tolist()!r:.80}."
+            )
+        if (rates[:, 2] > 0).any() and (rates[:, 2] < 0).any():
+            raise InputError(f"{where}: expected 'line_scan_rate' to run one way in time, found both signs.")
+        camera = cls(
+            lines=exposure.lines,
+            samples=exposure.samples,
+            semi_axes=exposure.semi_axes,
+            detector=detector,
+            centre_time=exposure.centre_time,
+            line_starts=rates[:, 0] - ISD_FIRST_LINE,
+            line_times=rates[:, 1].copy(),
+            line_rates=rates[:, 2].copy(),
+            positions=even_positions(exposure.positions, exposure.positions.times, exposure.body),
+            pointing=even_pointing(exposure.pointing, exposure.body),
+            sun=even_positions(exposure.sun, exposure.positions.times, exposure.body),
+        )
+        ends = camera.times(np.array([0.0, camera.lines]))
+        for key, times in (
+            ("instrument_position", exposure.positions.times),
+            ("instrument_pointing", exposure.pointing.times),
+            ("body_rotation", exposure.body.times),
+        ):
+            check_times(where, key, times, float(ends.min()), float(ends.max()))
+        origin, axis = camera.rays(camera.lines / 2, camera.samples / 2)
+        object.__setattr__(camera, "detector", detector.facing(origin, axis, camera.semi_axes[0]))
+        object.__setattr__(camera, "_search", _Search.of(camera, where))
+        return camera
+
+    def times(self, line: ArrayLike) -> Floats:
+        """Seconds from ``centre_time`` of image lines."""
+        line = np.asarray(line, float)
+        k = np.clip(np.searchsorted(self.line_starts, line, side="right") - 1, 0, None)
+        return self.line_times[k] + self.line_rates[k] * (line - self.line_starts[k])
+
+    def rotations(self, times: ArrayLike) -> Floats:
+        """(..., 3, 3) camera to body-fixed."""
+        quaternions = self.pointing.at(times)
+        return read.quaternion_matrix(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True))
+
+    def rays(self, line: ArrayLike, sample: ArrayLike) -> tuple[Floats, Floats]:
+        line, sample = np.broadcast_arrays(np.asarray(line, float), np.asarray(sample, float))
+        times = self.times(line)
+        camera = self.detector.directions(np.zeros_like(sample), sample)
+        return self.positions.at(times), (self.rotations(times) @ camera[..., None])[..., 0]
+
+    def position(self, line: ArrayLike, sample: ArrayLike | None = None) -> Floats:
+        return self.positions.at(self.times(line))
+
+    def sun_position(self, line: ArrayLike) -> Floats:
+        return self.sun.at(self.times(line))
+
+    def ephemeris_time(self, line: ArrayLike) -> Floats:
+        return self.centre_time + self.times(line)
+
+    def ground_to_image(self, points: ArrayLike) -> tuple[Floats, Floats]:
+        points = np.asarray(points, float)
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        line, sample = np.empty(len(flat)), np.empty(len(flat))
+        d, s = self.detector, self._search
+        assert s is not None  # built with every camera
+        _find(
+            flat,
+            s.coarse,
+            s.start,
+            s.step,
+            s.guess,
+            s.slope,
+            self.positions.values,
+            self.positions.start,
+            self.positions.step,
+            self.pointing.values,
+            self.pointing.start,
+            self.pointing.step,
+            d.focal_length,
+            d.sense,
+            d.to_line,
+            d.to_sample,
+            d.centre[0] - d.start[0],
+            d.centre[1] - d.start[1],
+            d.summing[1],
+            d.distortion,
+            d.coefficients,
+            self.line_starts,
+            self.line_times,
+            self.line_rates,
+            line,
+            sample,
+        )
+        return line.reshape(points.shape[:-1]), sample.reshape(points.shape[:-1])
+
+    def pose_derivatives(self, points: ArrayLike) -> Floats:
+        points = np.asarray(points, float)
+        line, _ = self.ground_to_image(points)
+        known = np.isfinite(line)
+        at = np.where(known, line, self.lines / 2)
+        times = self.times(at)
+        rotation = self.rotations(times)
+        camera = _into(rotation, points - self.positions.at(times))
+        by_vector = self.detector.place_derivatives(camera)
+        by_pose = by_vector @ np.concatenate([-np.swapaxes(rotation, -1, -2), cross_matrix(camera)], axis=-1)
+        # As time passes the point crosses the detector; a pose changes the line until it is back on it.
+        step = 0.5
+        ahead, behind = (
+            self.detector.places(_into(self.rotations(t), points - self.positions.at(t)))
+            for t in (self.times(at + step), self.times(at - step))
+        )
+        by_line = np.stack([(ahead[i] - behind[i]) / (2 * step) for i in (0, 1)], axis=-1)
+        d_line = -by_pose[..., 0, :] / by_line[..., 0, None]
+        d_sample = by_pose[..., 1, :] + by_line[..., 1, None] * d_line
+        return np.where(known[..., None, None], np.stack([d_line, d_sample], axis=-2), np.nan)
+
+    def moved(self, pose: ArrayLike) -> LineScan:
+        pose = np.asarray(pose, float)
+        turn = _quaternion_of(pose[3:])
+        camera = replace(
+            self,
+            positions=self.positions.shifted(self.positions.values + pose[:3]),
+            pointing=self.pointing.shifted(_quaternion_product(self.pointing.values, turn)),
+            _search=None,
+        )
+        object.__setattr__(camera, "_search", _Search.of(camera, "moved camera"))
+        return camera
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What makes the search for a point's line fast: a table that needs no polynomials, and a first guess.
+
+    coarse : (n, 12) position and rows of the body-to-camera rotation at times start + k step
+    guess : (4,) time of a point = g0 + g1 x + g2 y + g3 z; slope : detector lines per second
+    """
+
+    coarse: Floats
+    start: float
+    step: float
+    guess: Floats
+    slope: float
+
+    @classmethod
+    def of(cls, camera: LineScan, where: str) -> _Search:
+        margin = max(2.0, 0.01 * camera.lines)
+        ends = camera.times(np.array([-margin, camera.lines + margin]))
+        wanted = 4 * max(len(camera.positions.values), len(camera.pointing.values))
+        nodes = int(np.clip(wanted, *COARSE_NODES))
+        times = np.linspace(ends.min(), ends.max(), nodes)
+        rotation = camera.rotations(times)
+        coarse = np.concatenate([camera.positions.at(times), np.swapaxes(rotation, -1, -2).reshape(nodes, 9)], axis=1)
+        line, sample, height = (
+            v.ravel()
+            for v in np.meshgrid(
+                np.linspace(0, camera.lines, 9), np.linspace(0, camera.samples, 3), [0.0, 1000.0], indexing="ij"
+            )
+        )
+        points = camera.image_to_ground(line, sample, height)
+        seen = np.isfinite(points).all(-1)
+        if not seen.any():
+            points, seen = camera.image_to_ground(line, sample, height, missing="nearest"), np.ones(line.shape, bool)
+        matrix = np.concatenate([np.ones((seen.sum(), 1)), points[seen]], axis=1)
+        scale = np.abs(matrix).max(axis=0)
+        scale[scale == 0] = 1.0
+        guess = np.linalg.lstsq(matrix / scale, camera.times(line[seen]), rcond=1e-12)[0] / scale
+        # how fast points cross the detector, at the middle of what is seen
+        k = np.flatnonzero(seen)[seen.sum() // 2]
+        half = 0.5 * abs(float(np.median(camera.line_rates)))
+        middle = camera.times(line[k])
+        rows = [
+            camera.detector.places(_into(camera.rotations(t), points[k] - camera.positions.at(t)))[0]
+            * camera.detector.summing[0]
+            for t in (middle - half, middle + half)
+        ]
+        slope = float(rows[1] - rows[0]) / (2 * half)
+        if not math.isfinite(slope) or slope == 0:
+            raise GeometryError(
+                f"{where}: expected a camera that moves over the ground, found none; check its tables of position and "
+                "pointing."
+            )
+        return cls(np.ascontiguousarray(coarse), float(times[0]), float(times[1] - times[0]), guess, slope)
+
+
+def _into(rotation: Floats, vectors: Floats) -> Floats:
+    """Camera vectors of body-fixed ones."""
+    return (np.swapaxes(rotation, -1, -2) @ vectors[..., None])[..., 0]
+
+
+def _quaternion_of(vector: Floats) -> Floats:
+    angle = float(np.linalg.norm(vector))
+    half_sinc = 0.5 * float(np.sinc(angle / (2 * np.pi)))
+    return np.array([math.cos(angle / 2), *(half_sinc * vector)])
+
+
+def _quaternion_product(a: Floats, b: Floats) -> Floats:
+    """(n, 4) times (4,): first b, then a."""
+    w, x, y, z = a.T
+    p, q, r, s = b
+    return np.stack(
+        [
+            w * p - x * q - y * r - z * s,
+            w * q + x * p + y * s - z * r,
+            w * r - x * s + y * p + z * q,
+            w * s + x * r - y * q + z * p,
+        ],
+        axis=1,
+    )
+
+
+@numba.njit(cache=True)
+def _detector_place(x, y, z, focal, sense, to_line, to_sample, model, coefficients):
+    """Detector (line, sample) from the principal point of a camera vector; NaN behind the camera."""
+    if z * focal * sense <= 0:
+        return math.nan, math.nan
+    scale = focal / z
+    dx, dy = distort(model, coefficients, x * scale, y * scale)
+    return (
+        to_line[0] + to_line[1] * dx + to_line[2] * dy,
+        to_sample[0] + to_sample[1] * dx + to_sample[2] * dy,
+    )
+
+
+@numba.njit(cache=True)
+def _line_of_time(time, line_starts, line_times, line_rates):
+    k = line_starts.size - 1
+    while k > 0 and (time - line_times[k]) * line_rates[k] < 0:  # not there yet, whichever way time runs
+        k -= 1
+    return line_starts[k] + (time - line_times[k]) / line_rates[k]
+
+
+@numba.njit(cache=True, parallel=True, fastmath=False)
+def _find(
+    points,
+    coarse,
+    start,
+    step,
+    guess,
+    slope,
+    positions,
+    position_start,
+    position_step,
+    pointing,
+    pointing_start,
+    pointing_step,
+    focal,
+    sense,
+    to_line,
+    to_sample,
+    line_offset,
+    sample_offset,
+    sample_summing,
+    model,
+    coefficients,
+    line_starts,
+    line_times,
+    line_rates,
+    out_line,
+    out_sample,
+):
+    """For each point the time at which it lies on the detector's line.
+
+    A secant search in the coarse table comes within a small part of a pixel; the last step is taken on the polynomials
+    themselves, so that the answer does not depend on the coarse table.
+    """
+    n = points.shape[0]
+    last = coarse.shape[0] - 1
+    first_time, last_time = start, start + last * step
+    for chunk in numba.prange((n + CHUNK - 1) // CHUNK):
+        place, turn = np.empty(3), np.empty(4)
+        correction = 0.0  # what the guess was off by for the point before: neighbours are alike
+        for i in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
+            px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+            out_line[i] = math.nan
+            out_sample[i] = math.nan
+            affine = guess[0] + guess[1] * px + guess[2] * py + guess[3] * pz
+            if not math.isfinite(affine):
+                correction = 0.0
+                continue
+            time = min(max(affine + correction, first_time), last_time)
+            gradient = slope
+            before_time, before_row, before_column = math.nan, math.nan, math.nan
+            row, column = math.nan, math.nan
+            sideways = 0.0  # columns per row as time passes
+            good = False
+            for _ in range(40):
+                x = (time - start) / step
+                j = min(max(int(x), 0), last - 1)
+                f = x - j
+                g = 1.0 - f
+                a, b = coarse[j], coarse[j + 1]
+                vx = px - (g * a[0] + f * b[0])
+                vy = py - (g * a[1] + f * b[1])
+                vz = pz - (g * a[2] + f * b[2])
+                cx = (g * a[3] + f * b[3]) * vx + (g * a[4] + f * b[4]) * vy + (g * a[5] + f * b[5]) * vz
+                cy = (g * a[6] + f * b[6]) * vx + (g * a[7] + f * b[7]) * vy + (g * a[8] + f * b[8]) * vz
+                cz = (g * a[9] + f * b[9]) * vx + (g * a[10] + f * b[10]) * vy + (g * a[11] + f * b[11]) * vz
+                row, column = _detector_place(cx, cy, cz, focal, sense, to_line, to_sample, model, coefficients)
+                row += line_offset
+                if not math.isfinite(row):
+                    break
+                if before_time == before_time and time != before_time:
+                    secant = (row - before_row) / (time - before_time)
+                    if secant * slope > 0:
+                        gradient = secant
+                        if row != before_row:
+                            sideways = (column - before_column) / (row - before_row)
+                if abs(row) < 1e-5:
+                    good = True
+                    break
+                before_time, before_row, before_column = time, row, column
+                wanted = time - row / gradient
+                time = min(max(wanted, first_time), last_time)
+                if time == before_time:  # held at the end of the table: the image never looks there
+                    break
+            if not good:
+                correction = 0.0
+                continue
+            for _ in range(8):
+                lagrange(positions, position_start, position_step, time, place)
+                lagrange(pointing, pointing_start, pointing_step, time, turn)
+                vx, vy, vz = px - place[0], py - place[1], pz - place[2]
+                w, qx, qy, qz = turn[0], -turn[1], -turn[2], -turn[3]
+                norm = w * w + qx * qx + qy * qy + qz * qz
+                tx = 2.0 * (qy * vz - qz * vy) / norm
+                ty = 2.0 * (qz * vx - qx * vz) / norm
+                tz = 2.0 * (qx * vy - qy * vx) / norm
+                cx = vx + w * tx + qy * tz - qz * ty
+                cy = vy + w * ty + qz * tx - qx * tz
+                cz = vz + w * tz + qx * ty - qy * tx
+                row, column = _detector_place(cx, cy, cz, focal, sense, to_line, to_sample, model, coefficients)
+                row += line_offset
+                time -= row / gradient
+                if not abs(row) > 1e-4:
+                    break
+            if abs(row) <= 1e-4:
+                correction = time - affine
+                out_line[i] = _line_of_time(time, line_starts, line_times, line_rates)
+                out_sample[i] = (column - sideways * row + sample_offset) / sample_summing
+            else:
+                correction = 0.0
