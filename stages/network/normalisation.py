@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-FILL_RADII = (2, 8, 32)  # px; what lies farther from any valid pixel takes the mean of the window
-FILL_REACH = 2 * sum(FILL_RADII)
+# px. The largest is beyond the network's reach: what no square fills takes the window's mean and reaches no valid pixel.
+FILL_RADII = (2, 8, 32, 128)
+FILL_REACH = sum(FILL_RADII)
 
 
 def scale_elevation(elevation: Tensor, scale: float) -> Tensor:
@@ -26,8 +27,8 @@ def fill_holes(elevation: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDAr
         return elevation
     filled = np.where(valid, elevation, 0).astype(np.float32)
     base = float(filled[valid].mean()) if valid.any() else 0.0
-    filled = np.where(valid, filled - base, 0).astype(np.float32)
-    known = valid.astype(np.float32)
+    filled = np.where(valid, filled - base, 0).astype(np.float64)
+    known = valid.astype(np.float64)
     for radius in FILL_RADII:
         size = (2 * radius + 1, 2 * radius + 1)
         weight = cv2.boxFilter(known, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT)
@@ -35,4 +36,4 @@ def fill_holes(elevation: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDAr
         new = (known == 0) & (weight > 0.5)
         filled[new] = total[new] / weight[new]
         known[new] = 1
-    return filled + np.float32(base)
+    return (filled + base).astype(np.float32)

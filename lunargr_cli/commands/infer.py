@@ -1,0 +1,70 @@
+"""`lunargr infer`: scene.h5 or a DEM, and checkpoint.h5 -> svbrdf.h5 and a GeoTIFF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import BodyOption, Device, Output, Overwrite, Quiet, Shard, parse_shard
+
+NAME, ORDER = "infer", 60
+
+
+def command(
+    terrain: Annotated[Path, typer.Argument(metavar="SCENE|DEM", help="scene.h5, or a DEM that GDAL reads.")],
+    checkpoint: Annotated[Path, typer.Argument(help="checkpoint.h5 from 'lunargr train'.")],
+    window: Annotated[int, typer.Option("--window", help="Window size, px; context around it is added.")] = 512,
+    stride: Annotated[
+        int | None, typer.Option("--stride", help="Step between windows, px (default: half a window).")
+    ] = None,
+    window_offset: Annotated[int, typer.Option("--window-offset", metavar="PX", help="Shift the grid of windows.")] = 0,
+    precision: Annotated[str, typer.Option("--precision", help="fp32 or bf16.")] = "fp32",
+    any_gsd: Annotated[bool, typer.Option("--any-gsd", help="Allow a DEM at another GSD than the training's.")] = False,
+    geotiff: Annotated[
+        Path | None, typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif).")
+    ] = None,
+    body: BodyOption = None,
+    device: Device = "auto",
+    shard: Shard = None,
+    output: Output = Path("svbrdf.h5"),
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Predict georeferenced maps of reflectance coefficients for a DEM of any size."""
+    import tempfile
+
+    from lunargr_cli.console import Console
+    from schemas import ConfigError, check_output
+    from stages import infer
+
+    if precision not in ("fp32", "bf16"):
+        raise ConfigError(f"--precision: expected fp32 or bf16, found '{precision}'.")
+    console = Console(quiet)
+    config = infer.Config(
+        window=window,
+        stride=stride,
+        offset=window_offset,
+        device=device,
+        precision=precision,
+        any_gsd=any_gsd,
+        shard=parse_shard(shard),
+    )
+    check_output(output, [terrain, checkpoint], overwrite)
+    with tempfile.TemporaryDirectory(dir=output.parent, prefix=".infer-") as folder:
+        if not infer.open_terrain(terrain):
+            from stages import ingest
+            from stages.network.predictor import load_predictor
+
+            gsd = None if any_gsd else load_predictor(checkpoint).gsd
+            scene = Path(folder) / "scene.h5"
+            ingest.run(terrain, None, scene, ingest.Config(gsd=gsd, body=body or "moon"), progress=console.progress)
+        else:
+            scene = terrain
+        found = infer.run(scene, checkpoint, output, config, geotiff, overwrite, console.progress)
+    console.say(
+        f"{output}: {found.grid.height} x {found.grid.width} px at {found.grid.gsd:g} m, {found.windows} windows, {found.valid_share:.1%} valid"
+    )
+    rows = [(name, *(f"{v:.5f}" for v in values)) for name, values in found.coefficients.items()]
+    console.table(f"coefficients of {found.model}", ("name", "mean", "std", "1 %", "99 %"), rows)
