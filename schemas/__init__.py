@@ -15,6 +15,7 @@ from schemas.errors import (
     LunargrError,
     RegistryError,
 )
+from schemas.truth import TRUTH
 
 _HDF5 = ("ArtefactWriter", "atomic_path", "check_output", "open_artefact", "read_config", "read_kind", "read_strings")
 
@@ -50,6 +51,7 @@ __all__ = [
     "SCHEMAS",
     "SPLITS",
     "SVBRDF",
+    "TRUTH",
     "UNITS",
     "ArtefactError",
     "ArtefactWriter",

@@ -1,0 +1,138 @@
+"""`lunargr simulate`: a scene with known truth, written like real data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lunargr_cli.options import Json, Overwrite, Quiet
+
+NAME, ORDER = "simulate", 10
+
+_HIDDEN_HELP = (
+    "Effect that the pipeline is not told of: none, NAME, NAME:PARAMETER=VALUE,... or several joined by '+'. "
+    "Names: dark_bias, nonlinearity, opposition_surge, phase_slope, psf_blur, sun_azimuth, sun_elevation, penumbra, "
+    "earthshine, echo, column_pattern, image_gain, saturation, misregistration, line_jitter, dem_scale, dem_smoothing. "
+    "[default: dark_bias]"
+)
+
+
+def command(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write the scene into.")] = Path("scene"),
+    recipe: Annotated[Path | None, typer.Option("--recipe", help="JSON recipe; the options below override it.")] = None,
+    print_recipe: Annotated[bool, typer.Option("--print-recipe", help="Print the full recipe and stop.")] = False,
+    size_px: Annotated[
+        int | None, typer.Option("--size-px", help="Edge of the scene in pixels at --gsd. [default: 1536]")
+    ] = None,
+    extent_m: Annotated[
+        float | None, typer.Option("--extent-m", help="Edge of the scene in metres, instead of --size-px.")
+    ] = None,
+    gsd: Annotated[
+        float | None,
+        typer.Option(
+            "--gsd", help="GSD in metres that the pipeline will work at; the DEM is twice as fine. [default: 5]"
+        ),
+    ] = None,
+    images: Annotated[int | None, typer.Option("--images", help="Number of images. [default: 16]")] = None,
+    units: Annotated[
+        str | None, typer.Option("--units", help="iof, or dn: an unknown gain and offset per image. [default: iof]")
+    ] = None,
+    hidden: Annotated[str | None, typer.Option("--hidden", help=_HIDDEN_HELP)] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random choice. [default: 1]")] = None,
+    overwrite: Overwrite = False,
+    json_file: Json = None,
+    quiet: Quiet = False,
+) -> None:
+    """Make a lunar-looking scene with known truth: DEM, map-projected images, images.csv, truth.h5, truth.tif.
+
+    Everything downstream treats it as real data. What the pipeline must find out is in truth.h5 alone.
+    """
+    from stages.simulate.recipe import make_config, read_recipe, recipe_json
+
+    values: dict[str, Any] = read_recipe(recipe) if recipe else {}
+    where = str(recipe) if recipe else "options"
+    config = make_config(_override(values, size_px, extent_m, gsd, images, units, hidden, seed), where)
+    if print_recipe:
+        print(recipe_json(config))
+        return
+    from lunargr_cli.console import Console
+    from stages.simulate.run import run
+
+    console = Console(quiet)
+    summary = run(output, config, overwrite, console.progress)
+    rows = [
+        (
+            i.shot.image_id,
+            i.shot.start_time,
+            f"{i.shot.gsd:.2f}",
+            f"{i.shot.incidence_deg:.1f}",
+            f"{i.shot.sun_azimuth_deg:.1f}",
+            f"{i.shot.emission_deg:.1f}",
+            f"{i.shot.phase_deg:.1f}",
+            f"{100 * share:.0f}",
+            f"{i.mean_iof:.4f}",
+            f"{i.mean_iof / i.noise_iof:.0f}",
+        )
+        for i, share in zip(summary.images, summary.covered, strict=True)
+    ]
+    columns = (
+        "image",
+        "start (UTC)",
+        "GSD m",
+        "inc deg",
+        "Sun az deg",
+        "em deg",
+        "phase deg",
+        "% of scene",
+        "mean I/F",
+        "SNR",
+    )
+    console.table(f"{config.extent / 1000:.2f} km scene in {output}", columns, rows)
+    planted = " + ".join(h.effect for h in summary.hidden) or "none"
+    console.say(
+        f"{summary.craters} craters, DEM valid {100 * summary.dem_valid:.1f} %, planted: {planted} (recorded in {output / 'truth.h5'})"
+    )
+    console.say(f"next: lunargr ingest {output / 'dem.tif'} --images {output / 'images.csv'} --gsd {config.gsd:g}")
+    if json_file is not None:
+        _write_json(json_file, rows, columns)
+
+
+def _override(
+    values: dict[str, Any],
+    size_px: int | None,
+    extent_m: float | None,
+    gsd: float | None,
+    images: int | None,
+    units: str | None,
+    hidden: str | None,
+    seed: int | None,
+) -> dict[str, Any]:
+    from schemas.errors import ConfigError
+    from stages.simulate.hidden import hidden_from_option
+    from stages.simulate.recipe import Config
+
+    values = dict(values)
+    if size_px is not None and extent_m is not None:
+        raise ConfigError("--size-px and --extent-m both set the size; give one of them.")
+    if gsd is not None:
+        values["gsd"] = gsd
+        values["dem_gsd"] = gsd / 2
+    for key, value in (("size_px", size_px), ("images", images), ("units", units), ("seed", seed)):
+        if value is not None:
+            values[key] = value
+    if extent_m is not None:
+        values["size_px"] = round(extent_m / float(values.get("gsd", Config.gsd)))
+    if hidden is not None:
+        values["hidden"] = hidden_from_option(hidden)
+    return values
+
+
+def _write_json(path: Path, rows: list[tuple[str, ...]], columns: tuple[str, ...]) -> None:
+    import json
+
+    from schemas import atomic_path
+
+    with atomic_path(path) as partial:
+        partial.write_text(json.dumps([dict(zip(columns, row, strict=True)) for row in rows], indent=1))

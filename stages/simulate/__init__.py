@@ -1,0 +1,14 @@
+"""`lunargr simulate`: a lunar-looking scene with known truth, written as if it were real data.
+
+recipe.py       every number of a scene                     noise.py     fractal noise as a function of place
+craters.py      population, profiles, decay                 terrain.py   the ground, block by block
+reflectance.py  the truth's albedo and other parameters     orbits.py    times, Sun, spacecraft, strips
+render.py       light from each DEM pixel                   sensor.py    optics, response, noise, footprints
+hidden.py       what the pipeline is not told               write.py     DEM, images, table, truth
+run.py          the stage: all of it in order
+"""
+
+from stages.simulate.recipe import Config, make_config, read_recipe, recipe_json
+from stages.simulate.run import Summary, run
+
+__all__ = ["Config", "Summary", "make_config", "read_recipe", "recipe_json", "run"]

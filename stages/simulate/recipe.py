@@ -1,0 +1,212 @@
+"""The recipe of a scene: every number of the simulation, as a JSON file with the same keys."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from schemas.errors import ConfigError, InputError
+from stages.simulate.hidden import Hidden, parse_hidden
+
+Range = tuple[float, float]
+
+
+@dataclass
+class Config:
+    """A scene. Lengths in metres, angles in degrees (``_deg``); ranges are (low, high).
+
+    The defaults are a mare-highland border like the Taurus-Littrow valley seen by a narrow-angle camera in orbit.
+    """
+
+    # place and size
+    seed: int = 1
+    size_px: int = 1536  # edge of the scene at the working GSD
+    gsd: float = 5.0  # the GSD that the pipeline will work at
+    dem_gsd: float = 2.5  # the GSD that the truth is made and the DEM is given at
+    longitude_deg: float = 30.77
+    latitude_deg: float = 20.19
+    base_elevation: float = -2600.0
+
+    # terrain
+    relief: float = 26.0  # standard deviation of the longest octave of the fractal relief
+    relief_wavelength: float = 5000.0
+    hurst: float = 0.92
+    crater_density: float = 1.0  # of the lunar equilibrium density
+    crater_transition: float = 200.0  # diameter below which craters are in equilibrium (a surface of some 3 Gyr)
+    crater_largest: float = 1400.0
+    boulders_per_km2: float = 40.0
+    dem_error: float = 0.05  # white error of the DEM's heights
+    dem_holes: int = 3
+
+    # truth reflectance
+    model: str = "hapke"
+    parameters: dict[str, float] = field(default_factory=dict)  # where they differ from the model's defaults
+    albedo_parameter: str = ""  # the parameter that the albedo map multiplies; '' = the model's own
+    geometry_contrast: float = 1.0  # strength of what follows the terrain: fresh walls and rims, steep slopes
+    free_contrast: float = 1.0  # strength of what does not: rays, patches, texture
+
+    # images
+    images: int = 16
+    units: str = "iof"
+    image_gsd: Range = (2.8, 4.4)
+    altitude: Range = (50e3, 100e3)
+    oblique_share: float = 0.3
+    oblique_deg: Range = (12.0, 35.0)
+    incidence_deg: Range = (20.0, 80.0)
+    swath: Range = (0.5, 0.9)  # width of the strips, of the scene's edge
+    image_holes: int = 1
+
+    # sensor
+    psf_sigma_px: float = 0.55  # optics, Gaussian, in image pixels, beside the pixel's own area
+    full_well: float = 30000.0  # electrons at twice the image's mean
+    read_noise: float = 60.0  # electrons
+    registration_error: float = 0.0  # standard deviation of the planted shift of each image
+
+    # what the pipeline is not told
+    hidden: list[dict[str, Any]] = field(default_factory=lambda: [{"effect": "dark_bias"}])
+
+    def hidden_effects(self) -> list[Hidden]:
+        return parse_hidden(self.hidden)
+
+    @property
+    def factor(self) -> int:
+        """DEM pixels along a working pixel."""
+        return max(1, round(self.gsd / self.dem_gsd))
+
+    @property
+    def extent(self) -> float:
+        return self.size_px * self.gsd
+
+    @property
+    def dem_size(self) -> int:
+        return self.size_px * self.factor
+
+
+_POSITIVE = ("gsd", "dem_gsd", "relief_wavelength", "hurst", "crater_transition", "crater_largest", "full_well")
+_NOT_NEGATIVE = (
+    "relief",
+    "crater_density",
+    "boulders_per_km2",
+    "dem_error",
+    "dem_holes",
+    "geometry_contrast",
+    "free_contrast",
+    "image_holes",
+    "psf_sigma_px",
+    "read_noise",
+    "registration_error",
+)
+_RANGES: dict[str, Range] = {
+    "image_gsd": (0.1, 1e4),
+    "altitude": (1e3, 1e7),
+    "oblique_deg": (0.0, 60.0),
+    "incidence_deg": (0.0, 88.0),
+    "swath": (0.05, 3.0),
+}
+
+
+def make_config(values: dict[str, Any], where: str = "recipe") -> Config:
+    """A checked Config from recipe keys; missing keys take their defaults. Raises ConfigError."""
+    fields = {f.name: f for f in dataclasses.fields(Config)}
+    for key in values:
+        if key not in fields:
+            raise ConfigError(f"{where}: unknown key '{key}'; the keys are: {', '.join(fields)}.")
+    default = Config()
+    clean: dict[str, Any] = {}
+    for key, value in values.items():
+        like = getattr(default, key)
+        try:
+            clean[key] = _coerce(value, like)
+        except (TypeError, ValueError):
+            raise ConfigError(f"{where}: '{key}': expected a value like {json.dumps(like)}, found {value!r}.") from None
+    config = Config(**clean)
+    _check(config, where)
+    return config
+
+
+def _coerce(value: Any, like: Any) -> Any:
+    if isinstance(like, bool) or isinstance(value, bool):
+        raise TypeError
+    if isinstance(like, int):
+        if int(value) != float(value):
+            raise ValueError
+        return int(value)
+    if isinstance(like, float):
+        number = float(value)
+        if not math.isfinite(number):
+            raise ValueError
+        return number
+    if isinstance(like, tuple):
+        low, high = (float(v) for v in value)
+        return (low, high)
+    if isinstance(like, dict):
+        return {str(k): float(v) for k, v in value.items()}
+    if isinstance(like, list):
+        if not isinstance(value, list):
+            raise TypeError
+        return value
+    if not isinstance(value, str):
+        raise TypeError
+    return value
+
+
+def _check(config: Config, where: str) -> None:
+    for key in _POSITIVE:
+        if not getattr(config, key) > 0:
+            raise ConfigError(f"{where}: '{key}': expected a number above 0, found {getattr(config, key):g}.")
+    for key in _NOT_NEGATIVE:
+        if getattr(config, key) < 0:
+            raise ConfigError(f"{where}: '{key}': expected a number of at least 0, found {getattr(config, key):g}.")
+    for key, (low, high) in _RANGES.items():
+        first, last = getattr(config, key)
+        if not low <= first <= last <= high:
+            raise ConfigError(
+                f"{where}: '{key}': expected low <= high within {low:g}..{high:g}, found {first:g}, {last:g}."
+            )
+    if config.size_px < 64:
+        raise ConfigError(f"{where}: 'size_px': expected at least 64 pixels, found {config.size_px}.")
+    if config.images < 1:
+        raise ConfigError(f"{where}: 'images': expected at least 1, found {config.images}.")
+    if config.units not in ("iof", "dn"):
+        raise ConfigError(f"{where}: 'units': expected 'iof' or 'dn', found '{config.units}'.")
+    if config.seed < 0:
+        raise ConfigError(f"{where}: 'seed': expected at least 0, found {config.seed}.")
+    if not 0 <= config.oblique_share <= 1:
+        raise ConfigError(f"{where}: 'oblique_share': expected 0..1, found {config.oblique_share:g}.")
+    if abs(config.latitude_deg) > 89 or abs(config.longitude_deg) > 360:
+        raise ConfigError(
+            f"{where}: expected a place with |latitude| <= 89, found {config.longitude_deg:g}, {config.latitude_deg:g}."
+        )
+    if abs(config.gsd / config.dem_gsd - config.factor) > 1e-9 * config.factor:
+        raise ConfigError(
+            f"{where}: expected 'gsd' to be a whole multiple of 'dem_gsd', found {config.gsd:g} and {config.dem_gsd:g}."
+        )
+    # the Sun climbs no higher than this at the place
+    highest = max(0.0, abs(config.latitude_deg) - 1.6)
+    if config.incidence_deg[1] < highest + 3:
+        raise ConfigError(
+            f"{where}: 'incidence_deg': at latitude {config.latitude_deg:g} incidence is never below {highest:.1f} deg, "
+            f"found a range up to {config.incidence_deg[1]:g}; raise it or move the scene."
+        )
+    config.hidden_effects()
+
+
+def read_recipe(path: Path) -> dict[str, Any]:
+    """The keys of a recipe file. Raises InputError."""
+    if not path.exists():
+        raise InputError(f"{path}: no such file; expected a recipe ('lunargr simulate --print-recipe' writes one).")
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{path}: expected a recipe in JSON, found something else ({error}).") from None
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: expected a JSON object of recipe keys, found {type(values).__name__}.")
+    return values
+
+
+def recipe_json(config: Config) -> str:
+    return json.dumps(dataclasses.asdict(config), indent=1)

@@ -1,0 +1,255 @@
+"""The stage: make the ground, then each image, then the truth. Blocks of rows throughout."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.transform import Affine
+from rasterio.windows import Window
+
+from schemas import atomic_path, check_output
+from stages.physics.frames import ASTRONOMICAL_UNIT
+from stages.physics.grid import Grid, local_metric_crs, unit_vectors
+from stages.simulate import sensor
+from stages.simulate.hidden import Hidden, find
+from stages.simulate.orbits import RADIUS, Pass, plan_passes
+from stages.simulate.recipe import Config
+from stages.simulate.reflectance import MARGIN, Truth, albedo
+from stages.simulate.render import Scene, View, blur, point_spread, radiance
+from stages.simulate.terrain import Terrain
+from stages.simulate.write import NODATA_FLOAT, ImageFile, ImageTruth, geotiff, table_row, write_table, write_truth
+
+Progress = Callable[[int, int, str], None]
+
+GROUND_ROWS = 512  # DEM rows made at once
+IN_MEMORY = 1.2e9  # bytes of truth kept in memory; more is mapped from a temporary file
+WINDOW_PIXELS = 12e6  # DEM pixels rendered at once
+
+
+@dataclass
+class Summary:
+    """What was made."""
+
+    folder: Path
+    images: list[ImageTruth]
+    covered: list[float]  # share of the scene that each image covers
+    dem_valid: float  # share of the DEM with data
+    craters: int
+    hidden: list[Hidden]
+
+
+def run(folder: Path, config: Config, overwrite: bool = False, progress: Progress | None = None) -> Summary:
+    """Simulate a scene into ``folder``: dem.tif, images/*.tif, images.csv, truth.h5, truth.tif.
+
+    Raises ConfigError where files exist and ``overwrite`` is not given.
+    """
+    folder = Path(folder)
+    hidden = config.hidden_effects()
+    truth = Truth(config)
+    shots = plan_passes(config)
+    names = [f"images/{shot.image_id}.tif" for shot in shots]
+    for name in ("dem.tif", "images.csv", "truth.h5", "truth.tif", *names):
+        check_output(folder / name, overwrite=overwrite)
+    say = progress or (lambda done, total, what: None)
+
+    terrain = Terrain(config)
+    grid = scene_grid(config, config.dem_gsd, config.dem_size)
+    with _truth_arrays(folder, config.dem_size) as arrays:
+        scene = Scene(grid, *arrays, truth)
+        _make_ground(config, terrain, scene, say)
+        dem_valid = _write_dem(folder / "dem.tif", config, scene, hidden)
+        images, covered, rows = [], [], []
+        for k, (shot, name) in enumerate(zip(shots, names, strict=True)):
+            say(k, len(shots), "images")
+            image, share = _make_image(folder / name, config, scene, shot, k, hidden)
+            images.append(image)
+            covered.append(share)
+            rows.append(table_row(config, shot, name, hidden))
+        say(len(shots), len(shots), "images")
+        working = scene_grid(config, config.gsd, config.size_px)
+        write_truth(folder / "truth.h5", config, scene, working, terrain.craters, images, hidden, overwrite)
+    write_table(folder / "images.csv", rows)
+    return Summary(folder, images, covered, dem_valid, len(terrain.craters), hidden)
+
+
+def scene_grid(config: Config, gsd: float, size: int) -> Grid:
+    """A square grid about the scene's centre in a local stereographic projection."""
+    half = config.extent / 2
+    crs = local_metric_crs(config.longitude_deg, config.latitude_deg, RADIUS)
+    return Grid(crs.to_wkt(), Affine(gsd, 0, -half, 0, -gsd, half), size, size, RADIUS)
+
+
+@contextlib.contextmanager
+def _truth_arrays(folder: Path, size: int) -> Iterator[list[NDArray[np.float32]]]:
+    """Elevation and the two albedo factors, in memory or, for large scenes, in a temporary file of the folder."""
+    shape = (size, size)
+    if 12 * size * size <= IN_MEMORY:
+        yield [np.empty(shape, np.float32) for _ in range(3)]
+        return
+    with tempfile.TemporaryDirectory(prefix=".truth-", dir=folder) as scratch:
+        yield [np.memmap(Path(scratch) / f"{k}.f4", np.float32, "w+", shape=shape) for k in range(3)]
+
+
+def _make_ground(config: Config, terrain: Terrain, scene: Scene, say: Progress) -> None:
+    size = config.dem_size
+    for first in range(0, size, GROUND_ROWS):
+        say(first, size, "terrain rows")
+        count = min(GROUND_ROWS, size - first)
+        ground = terrain.block(first - MARGIN, -MARGIN, count + 2 * MARGIN, size + 2 * MARGIN)
+        logs = albedo(config, ground, first, 0)
+        rows = slice(first, first + count)
+        scene.elevation[rows] = ground.elevation[MARGIN:-MARGIN, MARGIN:-MARGIN]
+        scene.log_geometry[rows] = logs.geometry
+        scene.log_free[rows] = logs.free
+    say(size, size, "terrain rows")
+
+
+def _write_dem(path: Path, config: Config, scene: Scene, hidden: list[Hidden]) -> float:
+    """The DEM that the pipeline is given: the truth with its error, holes and ragged edge. Returns its valid share."""
+    rng = np.random.default_rng([config.seed, 4])
+    size, half, step = config.dem_size, config.extent / 2, config.dem_gsd
+    holes = [
+        (rng.uniform(-0.45, 0.45, 2) * config.extent, rng.uniform(0.006, 0.018, 2) * config.extent)
+        for _ in range(config.dem_holes)
+    ]
+    phases = rng.uniform(0, 2 * np.pi, 4)
+    x = (np.arange(size) + 0.5) * step - half
+    scale, smooth = find(hidden, "dem_scale"), find(hidden, "dem_smoothing")
+    relative = 1 + scale["relative"] if scale else 1.0
+    kernel = point_spread(1.0, 1.0, 0.0, smooth["sigma2_px2"]) if smooth else None
+    reach = len(kernel) // 2 if kernel is not None else 0
+    datum = config.base_elevation
+    valid = 0
+    with (
+        atomic_path(path) as partial,
+        geotiff(partial, scene.grid, "float32", NODATA_FLOAT, compress="deflate", zlevel=1, predictor=3) as file,
+    ):
+        for first in range(0, size, GROUND_ROWS):
+            count = min(GROUND_ROWS, size - first)
+            low, high = max(0, first - reach), min(size, first + count + reach)
+            heights = np.array(scene.elevation[low:high])
+            if kernel is not None:
+                heights = blur(heights, kernel)
+            heights = heights[first - low : first - low + count]
+            heights = np.float32(datum) + (heights - np.float32(datum)) / np.float32(relative)
+            heights += np.float32(config.dem_error) * rng.standard_normal(heights.shape, dtype=np.float32)
+            y = half - (np.arange(first, first + count) + 0.5)[:, None] * step
+            inside = _dem_inside(config, x[None], y, phases)
+            for (cx, cy), (a, b) in holes:
+                inside &= ((x[None] - cx) / a) ** 2 + ((y - cy) / b) ** 2 > 1
+            valid += int(inside.sum())
+            file.write(np.where(inside, heights, np.float32(NODATA_FLOAT)), 1, window=Window(0, first, size, count))
+        file.set_band_description(1, "elevation above the sphere")
+        file.units = ("m",)
+    return valid / size**2
+
+
+def _dem_inside(config: Config, x: NDArray, y: NDArray, phases: NDArray) -> NDArray[np.bool_]:
+    """Stereo models overlap raggedly: the edge wanders by about a hundredth of the scene."""
+    half = config.extent / 2
+    wander = 0.008 * config.extent
+
+    def edge(t: NDArray, phase: float) -> NDArray:
+        return half - wander * (1.1 + np.sin(9 * t / half + phase) * 0.7 + 0.3 * np.sin(41 * t / half + 2 * phase))
+
+    return (x < edge(y, phases[0])) & (-x < edge(y, phases[1])) & (y < edge(x, phases[2])) & (-y < edge(x, phases[3]))
+
+
+def _make_image(
+    path: Path, config: Config, scene: Scene, shot: Pass, number: int, hidden: list[Hidden]
+) -> tuple[ImageTruth, float]:
+    """Render, blur, resample, expose and write one image, in bands of rows."""
+    rng = np.random.default_rng([config.seed, 6, number])
+    step = config.dem_gsd
+    view = View(
+        shot,
+        unit_vectors(shot.sun.longitude_deg, shot.sun.latitude_deg) * shot.sun.distance_au * ASTRONOMICAL_UNIT,
+        unit_vectors(shot.spacecraft_longitude_deg, shot.spacecraft_latitude_deg) * (RADIUS + shot.spacecraft_altitude),
+    )
+    image = sensor.image_grid(config, scene.grid, shot, number)
+    extra = find(hidden, "psf_blur")
+    kernel = point_spread(step, shot.gsd, config.psf_sigma_px, extra["sigma2_px2"] if extra else 0.0)
+    expected = expected_iof(scene, shot)
+    detector = sensor.make_detector(config, shot, hidden, expected, rng)
+    echo = find(hidden, "echo")
+    reach = len(kernel) // 2 + 4 + (int(echo["lag_px"] * shot.gsd / step) + 2 if echo else 0)
+    band = int(max(64, min(image.height, WINDOW_PIXELS * (step / shot.gsd) ** 2 / image.width)))
+    total, count = 0.0, 0
+    with atomic_path(path) as partial:
+        out = ImageFile(partial, image, config.units, number % 2 == 1, shot)
+        with out.file:
+            for first in range(0, image.height, band):
+                rows = min(band, image.height - first)
+                lattice = sensor.Lattice.of(image, first, rows, scene.grid)
+                inside = sensor.footprint(config, shot, lattice.x, lattice.y, number)
+                signal = np.zeros(inside.shape, np.float32)
+                if inside.any():
+                    signal = _signal(config, scene, view, lattice, inside, kernel, detector, hidden, reach)
+                    total += float(signal[inside].sum(dtype=np.float64))
+                    count += int(inside.sum())
+                    signal = sensor.add_noise(signal, config, detector, rng)
+                out.write(first, signal, inside, detector)
+    mean = total / max(count, 1)
+    noise = np.sqrt(max(mean, 0) * detector.electrons + config.read_noise**2) / detector.electrons
+    return ImageTruth(shot, detector, mean, float(noise)), count * shot.gsd**2 / config.extent**2
+
+
+def _signal(
+    config: Config,
+    scene: Scene,
+    view: View,
+    lattice: sensor.Lattice,
+    inside: NDArray[np.bool_],
+    kernel: NDArray[np.float32],
+    detector: sensor.Detector,
+    hidden: list[Hidden],
+    reach: int,
+) -> NDArray[np.float32]:
+    """The noise-free signal, I/F, of a band of an image."""
+    size = config.dem_size
+    row, col = sensor.move(config, view.shot, detector, lattice, scene.grid.gsd)
+    r0, r1 = int(row[inside].min()) - reach, int(row[inside].max()) + reach + 1
+    c0, c1 = int(col[inside].min()) - reach, int(col[inside].max()) + reach + 1
+    r0, c0, r1, c1 = max(0, r0), max(0, c0), min(size, r1), min(size, c1)
+    window = (r0, c0, r1 - r0, c1 - c0)
+    wanted = _wanted(row[inside], col[inside], window, reach)
+    light = blur(radiance(scene, view, window, wanted, hidden), kernel)
+    signal = sensor.resample(light, row, col, window)
+    late = None
+    if echo := find(hidden, "echo"):
+        # lines run across the track: the echo of what was read ``lag`` pixels earlier
+        lag = echo["lag_px"] * view.shot.gsd / scene.grid.gsd
+        heading = np.radians(view.shot.strip.heading_deg)
+        late = sensor.resample(light, row + lag * np.sin(heading), col - lag * np.cos(heading), window)
+    return sensor.respond(signal, late, lattice, view.shot, detector, hidden)
+
+
+def _wanted(row: NDArray, col: NDArray, window: tuple[int, int, int, int], reach: int) -> NDArray[np.bool_]:
+    """Which DEM pixels of a window the image needs, on a coarse mesh grown by the reach of the optics."""
+    mesh = 32
+    height, width = -(-window[2] // mesh), -(-window[3] // mesh)
+    cells = np.zeros((height, width), bool)
+    r = np.clip((row - window[0]) // mesh, 0, height - 1).astype(int)
+    c = np.clip((col - window[1]) // mesh, 0, width - 1).astype(int)
+    cells[r, c] = True
+    grow = -(-reach // mesh)
+    padded = np.pad(cells, grow)
+    grown = np.zeros_like(cells)
+    for dr in range(2 * grow + 1):
+        for dc in range(2 * grow + 1):
+            grown |= padded[dr : dr + height, dc : dc + width]
+    return np.repeat(np.repeat(grown, mesh, 0), mesh, 1)[: window[2], : window[3]]
+
+
+def expected_iof(scene: Scene, shot: Pass) -> float:
+    """I/F of level ground in this image: what auto-exposure aims at."""
+    from stages.physics.photometry import evaluate
+
+    angles = np.radians([shot.incidence_deg, shot.emission_deg, shot.phase_deg])
+    return float(evaluate(scene.truth.model.name, scene.truth.constants, *angles))

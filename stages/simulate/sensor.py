@@ -1,0 +1,208 @@
+"""From radiance on the ground to a digital image: resampling, the detector's response, noise, footprints, gaps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import rasterio.warp
+from numpy.typing import NDArray
+from rasterio.crs import CRS
+from rasterio.transform import Affine
+
+from stages.physics.grid import Grid
+from stages.simulate.hidden import Hidden, find
+from stages.simulate.orbits import Pass, Strip
+from stages.simulate.recipe import Config
+
+Array = NDArray[np.float32]
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Detector:
+    """What one image's detector does to the signal, all drawn once per image.
+
+    gain, offset : DN = gain x I/F + offset; 1 and 0 for calibrated images
+    shift : (east, north) m by which the image lies from where its georeference says; jitter : amplitude, m, and phases
+    response : gain error of the image; electrons : per I/F
+    """
+
+    gain: float
+    offset: float
+    shift: tuple[float, float]
+    jitter: tuple[float, float, float]
+    response: float
+    column_phases: Floats
+    electrons: float
+
+
+def make_detector(
+    config: Config, shot: Pass, hidden: list[Hidden], mean_iof: float, rng: np.random.Generator
+) -> Detector:
+    shift_rms, jitter, response = config.registration_error, 0.0, 1.0
+    if effect := find(hidden, "misregistration"):
+        shift_rms = math.hypot(shift_rms, effect["rms_px"] * shot.gsd / math.sqrt(2))
+    if effect := find(hidden, "line_jitter"):
+        jitter = effect["rms_px"] * shot.gsd * math.sqrt(2)
+    if effect := find(hidden, "image_gain"):
+        response = 1 + effect["rms"] * float(rng.normal())
+    gain, offset = 1.0, 0.0
+    if config.units == "dn":  # 12 bits, auto-exposed, with a pedestal
+        gain, offset = 900.0 / max(mean_iof, 1e-3) * float(rng.uniform(0.8, 1.25)), float(rng.uniform(40, 120))
+    shift = rng.normal(0, 1, 2) * shift_rms
+    return Detector(
+        gain,
+        offset,
+        (float(shift[0]), float(shift[1])),
+        (jitter, float(rng.uniform(0, 2 * math.pi)), float(rng.uniform(0.6, 1.6))),
+        response,
+        rng.uniform(0, 2 * math.pi, 3),
+        config.full_well / (2 * max(mean_iof, 1e-3)),
+    )
+
+
+def image_grid(config: Config, scene: Grid, shot: Pass, number: int) -> Grid:
+    """The image's own map grid: another projection, resolution and extent than the DEM's, whole pixels of its own."""
+    radius = scene.radius
+    if number % 3 == 2:
+        projection = f"+proj=sinu +lon_0={config.longitude_deg - 0.4:.4f}"
+    else:
+        projection = f"+proj=eqc +lat_ts={config.latitude_deg:.4f} +lat_0=0 +lon_0={round(config.longitude_deg)}"
+    crs = CRS.from_proj4(f"{projection} +x_0=0 +y_0=0 +R={radius!r} +units=m +no_defs")
+    x, y = _outline(shot.strip, scene.bounds())
+    u, v = (np.asarray(a) for a in rasterio.warp.transform(scene.crs, crs, x, y))
+    g = shot.gsd
+    left, top = math.floor(u.min() / g) * g, math.ceil(v.max() / g) * g
+    width, height = math.ceil((u.max() - left) / g), math.ceil((top - v.min()) / g)
+    return Grid(crs.to_wkt(), Affine(g, 0, left, 0, -g, top), height, width, radius)
+
+
+def _outline(strip: Strip, bounds: tuple[float, float, float, float]) -> tuple[Floats, Floats]:
+    """Points along the edge of what the strip and the scene share, map metres."""
+    left, bottom, right, top = bounds
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(left, right, 129), np.linspace(bottom, top, 129)))
+    along, across = strip.along_across(x, y)
+    inside = (np.abs(along) < strip.length / 2 * 1.03) & (np.abs(across) < strip.width / 2 * 1.05)
+    return (x[inside], y[inside]) if inside.any() else (x, y)
+
+
+@dataclass
+class Lattice:
+    """Where each pixel of a band of an image lies on the DEM's grid, by a cubic through exact points.
+
+    row, col : (H, W) float64, DEM pixels; x, y : map metres from the scene's centre
+    """
+
+    row: Floats
+    col: Floats
+    x: Floats
+    y: Floats
+
+    @classmethod
+    def of(cls, image: Grid, first: int, height: int, scene: Grid) -> Lattice:
+        rows = np.linspace(first, first + height - 1, 9)
+        cols = np.linspace(0, image.width - 1, 9)
+        rr, cc = np.meshgrid(rows, cols, indexing="ij")
+        x, y = image.xy(rr, cc)
+        tx, ty = rasterio.warp.transform(image.crs, scene.crs, x.ravel(), y.ravel())
+        s = _scaled(rr.ravel(), first, height)
+        t = _scaled(cc.ravel(), 0, image.width)
+        powers = [(i, j) for i in range(4) for j in range(4 - i)]
+        design = np.stack([s**i * t**j for i, j in powers], axis=1)
+        solution, *_ = np.linalg.lstsq(design, np.stack([tx, ty], axis=1), rcond=None)
+        si = _scaled(np.arange(first, first + height), first, height)[:, None]
+        ti = _scaled(np.arange(image.width), 0, image.width)[None]
+        gx = sum(k * (si**i * ti**j) for k, (i, j) in zip(solution[:, 0], powers, strict=True))
+        gy = sum(k * (si**i * ti**j) for k, (i, j) in zip(solution[:, 1], powers, strict=True))
+        row, col = scene.rowcol(gx, gy)
+        return cls(row, col, gx, gy)
+
+
+def _scaled(values: Floats, first: float, count: int) -> Floats:
+    return (np.asarray(values, float) - first) / max(count - 1, 1) * 2 - 1
+
+
+def footprint(config: Config, shot: Pass, x: Floats, y: Floats, number: int) -> NDArray[np.bool_]:
+    """Where the image has data: a strip with ragged edges, lost lines and holes, inside the scene."""
+    strip, half = shot.strip, config.extent / 2
+    along, across = strip.along_across(x, y)
+    rng = np.random.default_rng([config.seed, 5, number])
+    phases = rng.uniform(0, 2 * math.pi, 4)
+    drift = (
+        0.006
+        * strip.width
+        * (
+            np.sin(along / (0.11 * config.extent) + phases[0])
+            + 0.6 * np.sin(along / (0.031 * config.extent) + phases[1])
+        )
+    )
+    inside = np.abs(across + drift) < strip.width / 2
+    # the first and last line are cut at a slant, as a map projection of a turning camera leaves them
+    slant = float(rng.uniform(-0.12, 0.12))
+    inside &= np.abs(along + slant * across) < strip.length / 2
+    inside &= (np.abs(x) < half - 2 * config.dem_gsd) & (np.abs(y) < half - 2 * config.dem_gsd)
+    for _ in range(config.image_holes):
+        ca, cu = rng.uniform(-0.45, 0.45) * strip.length, rng.uniform(-0.5, 0.5) * strip.width
+        if rng.random() < 0.5:  # lost lines
+            inside &= ~((np.abs(along - ca) < rng.uniform(1.5, 5) * shot.gsd) & (across > cu))
+        else:  # a patch that the calibration rejected
+            a, b = rng.uniform(0.008, 0.02, 2) * config.extent
+            inside &= ((along - ca) / a) ** 2 + ((across - cu) / b) ** 2 > 1
+    return inside
+
+
+def resample(radiance: Array, row: Floats, col: Floats, window: tuple[int, int, int, int]) -> Array:
+    """Cubic interpolation of a window of the blurred radiance at DEM pixel coordinates."""
+    u, v = (col - window[1]).astype(np.float32), (row - window[0]).astype(np.float32)
+    return cv2.remap(radiance, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+
+def move(config: Config, shot: Pass, detector: Detector, lattice: Lattice, step: float) -> tuple[Floats, Floats]:
+    """Where the camera really looked, in DEM pixels: the georeference's place plus planted shift and jitter."""
+    east, north = detector.shift
+    row, col = lattice.row - north / step, lattice.col + east / step
+    amplitude, phase, waves = detector.jitter
+    if amplitude:
+        along, _ = shot.strip.along_across(lattice.x, lattice.y)
+        drift = amplitude / step * np.sin(2 * math.pi * waves * along / shot.strip.length + phase)
+        heading = math.radians(shot.strip.heading_deg)
+        row, col = row + drift * math.sin(heading), col + drift * math.cos(heading)
+    return row, col
+
+
+def respond(
+    image: Array,
+    echo: Array | None,
+    lattice: Lattice,
+    shot: Pass,
+    detector: Detector,
+    hidden: list[Hidden],
+) -> Array:
+    """The hidden detector effects, in the order of the hardware: echo, dark signal, columns, gain, response, clipping."""
+    if (effect := find(hidden, "echo")) and echo is not None:
+        image = image + np.float32(effect["fraction"]) * echo
+    if effect := find(hidden, "dark_bias"):
+        image = image + np.float32(effect["iof"])
+    if effect := find(hidden, "column_pattern"):
+        _, across = shot.strip.along_across(lattice.x, lattice.y)
+        t = across / shot.strip.width
+        a, b, c = detector.column_phases
+        pattern = np.cos(2 * math.pi * t + a) + 0.7 * np.cos(4 * math.pi * t + b) + 0.5 * np.cos(8 * math.pi * t + c)
+        image = image * (1 + effect["rms"] * pattern / math.sqrt(0.5 * (1 + 0.49 + 0.25))).astype(np.float32)
+    image = image * np.float32(detector.response)
+    if effect := find(hidden, "nonlinearity"):
+        image = image * (1 + np.float32(effect["quadratic"]) * image)
+    if effect := find(hidden, "saturation"):
+        image = np.minimum(image, np.float32(effect["iof"]))
+    return image
+
+
+def add_noise(image: Array, config: Config, detector: Detector, rng: np.random.Generator) -> Array:
+    """Shot and read noise, in electrons."""
+    electrons = image * np.float32(detector.electrons)
+    sigma = np.sqrt(np.maximum(electrons, 0) + np.float32(config.read_noise**2))
+    noise = rng.standard_normal(image.shape, dtype=np.float32)
+    return image + noise * sigma / np.float32(detector.electrons)
