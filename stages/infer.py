@@ -38,7 +38,7 @@ GSD_TOLERANCE = 0.05  # relative; beyond it the network would meet terrain at a 
 class Config:
     """window, stride : px; windows overlap by their difference and are blended; offset : px, shifts their grid."""
 
-    window: int = 512
+    window: int = 1024
     stride: int | None = None
     offset: int = 0
     device: str = "auto"
@@ -68,7 +68,7 @@ def run(
     progress: Progress | None = None,
 ) -> Summary:
     """Write ``svbrdf.h5`` and, beside it or at ``geotiff``, a cloud-optimised GeoTIFF. Raises ConfigError, ArtefactError."""
-    stride = config.stride or config.window // 2
+    stride = config.stride or max(1, config.window - config.window // 16)
     if config.window < 16 or not 1 <= stride <= config.window:
         raise ConfigError(
             f"--window and --stride: expected 1 <= stride <= window and window >= 16, found {stride} and {config.window}."

@@ -15,9 +15,9 @@ NAME, ORDER = "infer", 60
 def command(
     terrain: Annotated[Path, typer.Argument(metavar="SCENE|DEM", help="scene.h5, or a DEM that GDAL reads.")],
     checkpoint: Annotated[Path, typer.Argument(help="checkpoint.h5 from 'lunargr train'.")],
-    window: Annotated[int, typer.Option("--window", help="Window size, px; context around it is added.")] = 512,
+    window: Annotated[int, typer.Option("--window", help="Window size, px; context around it is added.")] = 1024,
     stride: Annotated[
-        int | None, typer.Option("--stride", help="Step between windows, px (default: half a window).")
+        int | None, typer.Option("--stride", help="Step between windows, px (default: 15/16 of a window).")
     ] = None,
     window_offset: Annotated[int, typer.Option("--window-offset", metavar="PX", help="Shift the grid of windows.")] = 0,
     precision: Annotated[str, typer.Option("--precision", help="fp32 or bf16.")] = "fp32",
