@@ -69,7 +69,7 @@ class Console:
         for row in cells:
             table.add_row(*row)
         width = None if sys.stdout.isatty() else 160
-        RichConsole(file=sys.stdout, width=width, highlight=False).print(table)
+        RichConsole(file=sys.stdout, width=width, highlight=False, markup=False).print(table)
 
     def _end_line(self) -> None:
         if self._open_line:

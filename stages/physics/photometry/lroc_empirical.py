@@ -74,7 +74,7 @@ class LrocEmpirical2019(ReflectanceModel):
         b0, b1, b2, b3, b4, b5, b6 = (parameters[p.name] for p in self.parameters)
         mu0, mu = angles.cos_incidence, angles.cos_emission
         g = torch.rad2deg(angles.phase)
-        # the slope of sqrt(g) is infinite at 0; nearer than 1e-12 deg it is given as 0
-        root = g.clamp(min=1e-12).sqrt()
+        # the slope of sqrt(g) is infinite at 0; at 0 itself it is given as 0
+        root = g.clamp(min=1e-20).sqrt()
         exponent = b0 + g * (b2 + b1 * g) + b3 * root + b4 * mu + mu0 * (b5 + b6 * mu0)
         return mu0 / (mu0 + mu) * torch.exp(exponent)

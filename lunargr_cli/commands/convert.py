@@ -1,0 +1,46 @@
+"""`lunargr convert`: coefficient GeoTIFFs between the conventions of ISIS, ASP, Sato et al. and others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import Output, Overwrite, Quiet
+
+NAME, ORDER = "convert", 86
+
+
+def command(
+    source: Annotated[Path, typer.Argument(help="GeoTIFF of coefficient maps, one band each.")],
+    start: Annotated[
+        str, typer.Option("--from", metavar="SYSTEM:MODEL", help="Convention of the input, e.g. sato:Hapke.")
+    ],
+    end: Annotated[
+        str, typer.Option("--to", metavar="SYSTEM:MODEL", help="Convention of the output, e.g. lunargr:hapke.")
+    ],
+    output: Output,
+    bands: Annotated[
+        str | None,
+        typer.Option("--bands", metavar="NAME,NAME", help="The input's bands in order, if the file names none."),
+    ] = None,
+    approximate: Annotated[
+        bool, typer.Option("--approximate", help="Convert although the target cannot hold everything.")
+    ] = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write coefficient maps in another program's convention; 'lunargr models --conventions' lists them."""
+    from lunargr_cli.console import Console
+    from stages import convert
+
+    console = Console(quiet)
+    names = None if bands is None else [name.strip() for name in bands.split(",")]
+    config = convert.Config(start, end, names, approximate)
+    report = convert.run(source, output, config, overwrite, console.progress)
+    for loss in report.losses:
+        console.say(f"lost: {loss}")
+    title = f"{output}: {report.target.name}, which gives {report.target.returns}; {report.valid_pixels} valid pixels"
+    rows = [(k, name, unit) for k, (name, unit) in enumerate(report.target.quantities, start=1)]
+    console.table(title, ("band", "quantity", "unit"), rows)

@@ -1,0 +1,103 @@
+"""`lunargr models`: the reflectance models, their parameters, published sets and other programs' conventions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import Json
+
+NAME, ORDER = "models", 85
+
+
+def command(
+    name: Annotated[str | None, typer.Argument(help="A model for its parameters; nothing lists all models.")] = None,
+    sets: Annotated[bool, typer.Option("--sets", help="List the published parameter sets.")] = False,
+    conventions: Annotated[
+        bool, typer.Option("--conventions", help="List the conventions that 'lunargr convert' knows.")
+    ] = False,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Print the reference part of docs/photometry.md.")
+    ] = False,
+    json_file: Json = None,
+) -> None:
+    """List the reflectance models: parameters, bounds, units, defaults, reference, reciprocal or not."""
+    from stages.physics.photometry import catalogue, get_model
+
+    chosen = None if name is None else get_model(name)
+    if json_file is not None:
+        _write_json(json_file, catalogue.as_dict())
+    if markdown:
+        print(catalogue.markdown())
+    elif sets:
+        _print_sets(catalogue.parameter_sets(None if chosen is None else chosen.name))
+    elif conventions:
+        _print_conventions(None if chosen is None else chosen.name)
+    elif chosen is None:
+        _print_all()
+    else:
+        _print_model(chosen)
+
+
+def _print_all() -> None:
+    from lunargr_cli.console import Console
+    from stages.physics.photometry import get_model, model_names
+
+    models = [get_model(n) for n in model_names()]
+    rows = [(m.name, len(m.parameters), "yes" if m.reciprocal else "no", m.formula, m.reference) for m in models]
+    Console().table("reflectance models, in I/F", ("name", "params", "reciprocal", "formula", "reference"), rows)
+    print(
+        "lunargr models NAME shows bounds, units and defaults; --sets published values, --conventions other programs."
+    )
+
+
+def _print_model(model) -> None:  # type: ignore[no-untyped-def]
+    from lunargr_cli.console import Console
+    from stages.physics.photometry import catalogue
+
+    print(f"{model.name}: {model.title}\n")
+    print(f"I/F = {model.formula}")
+    print(f"source: {model.reference}")
+    print(
+        f"reciprocal: {'yes' if model.reciprocal else 'no'}; linear in its parameters: {'yes' if model.linear else 'no'}"
+    )
+    console = Console()
+    rows = [
+        (p.name, p.unit, f"{p.lower:.6g}", f"{p.upper:.6g}", f"{p.default:.6g}", p.description)
+        for p in model.parameters
+    ]
+    console.table("parameters", ("name", "unit", "lower", "upper", "default", "what"), rows)
+    if catalogue.parameter_sets(model.name):
+        _print_sets(catalogue.parameter_sets(model.name))
+    if len(catalogue.related_conventions(model.name)) > 1:
+        _print_conventions(model.name)
+
+
+def _print_sets(sets) -> None:  # type: ignore[no-untyped-def]
+    from lunargr_cli.console import Console
+    from stages.physics.photometry import catalogue
+
+    rows = [(s.name, s.model, catalogue.values_text(s), s.description, s.reference) for s in sets]
+    Console().table("published sets", ("name", "model", "values", "what", "source"), rows)
+
+
+def _print_conventions(model: str | None) -> None:
+    from lunargr_cli.console import Console
+    from stages.physics.photometry import catalogue
+
+    rows = [
+        (c.name, c.model, ", ".join(f"{n} [{u}]" if u != "1" else n for n, u in c.quantities), c.returns)
+        for c in catalogue.related_conventions(model)
+    ]
+    Console().table("conventions", ("name", "model here", "bands", "formula gives"), rows)
+
+
+def _write_json(path: Path, content: dict[str, object]) -> None:
+    import json
+
+    from schemas import atomic_path
+
+    with atomic_path(path) as partial:
+        partial.write_text(json.dumps(content, indent=1))

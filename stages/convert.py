@@ -1,0 +1,128 @@
+"""`lunargr convert`: coefficient maps in a GeoTIFF, from one program's convention to another's.
+
+Bands are known by their descriptions, never by their position: programs order the same coefficients differently.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning
+from rasterio.io import DatasetReader
+from rasterio.windows import Window
+
+from schemas import ConfigError, InputError, atomic_path, check_output
+from stages.physics.photometry.conventions import Convention, convert_maps, get_convention, model_difference
+from stages.physics.rasters import open_raster, read_window
+
+BLOCK_VALUES = 1 << 23  # values of all bands held at a time, in float64: 64 MB
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass
+class Config:
+    """source, target : conventions, SYSTEM:MODEL
+    bands : names of the input's bands in their order, where the file does not carry them as descriptions
+    approximate : convert although the target cannot hold everything
+    """
+
+    source: str
+    target: str
+    bands: Sequence[str] | None = None
+    approximate: bool = False
+
+
+@dataclass
+class Report:
+    """What was written: the target's quantities and, in words, what was lost on the way."""
+
+    target: Convention
+    losses: list[str]
+    valid_pixels: int
+
+
+def run(
+    source: Path, output: Path, config: Config, overwrite: bool = False, progress: Progress | None = None
+) -> Report:
+    """Convert the coefficient maps of ``source`` into ``output``, a float32 GeoTIFF on the same grid, NaN as nodata.
+
+    Raises InputError for a file without the needed bands, ConfigError for conventions that have no conversion or would
+    lose something, RegistryError for an unknown convention.
+    """
+    start, end = get_convention(config.source), get_convention(config.target)
+    model_difference(start, end)
+    check_output(output, [source], overwrite)
+    losses: dict[str, None] = {}
+    valid = 0
+    with open_raster(source, "a GeoTIFF of coefficient maps") as data:
+        indices = band_indices(data, start, config.bands)
+        profile = {
+            "driver": "GTiff",
+            "height": data.height,
+            "width": data.width,
+            "count": len(end.quantities),
+            "dtype": "float32",
+            "crs": data.crs,
+            "transform": data.transform,
+            "nodata": float("nan"),
+            "tiled": True,
+            "compress": "deflate",
+            "predictor": 3,
+            "interleave": "band",
+            "BIGTIFF": "IF_SAFER",
+        }
+        with atomic_path(output) as partial, warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(partial, "w", **profile) as target:
+                target.descriptions = tuple(end.names)
+                target.units = tuple(unit for _, unit in end.quantities)
+                target.update_tags(CONVENTION=end.name, RETURNS=end.returns, CONVERTED_FROM=start.name)
+                for window in _strips(data, len(indices)):
+                    maps = {name: read_window(data, window, band) for name, band in indices.items()}
+                    result, lost = convert_maps(maps, start.name, end.name, config.approximate)
+                    losses.update(dict.fromkeys(lost))
+                    stack = np.stack([np.broadcast_to(v, maps[start.names[0]].shape) for v in result.values()])
+                    valid += int(np.isfinite(stack).all(axis=0).sum())
+                    target.write(stack.astype(np.float32), window=window)
+                    if progress is not None:
+                        progress(int(window.row_off + window.height), data.height, "convert")
+    return Report(end, list(losses), valid)
+
+
+def band_indices(data: DatasetReader, convention: Convention, names: Sequence[str] | None = None) -> dict[str, int]:
+    """Quantity -> 1-based band. Raises InputError or ConfigError with the names that are missing."""
+    wanted = ",".join(convention.names)
+    if names is not None and len(names) != data.count:
+        raise ConfigError(
+            f"--bands: expected {data.count} names for the {data.count} bands of {data.name}, found {len(names)}."
+        )
+    found = list(names) if names is not None else [(d or "").strip() for d in data.descriptions]
+    if not any(found):
+        raise InputError(
+            f"{data.name}: expected band descriptions {wanted} for {convention.name}, found none; "
+            f"name the bands in their order in the file, as in --bands {wanted}."
+        )
+    indices = {}
+    for name in convention.names:
+        bands = [k for k, have in enumerate(found, start=1) if have == name]
+        bands = bands or [k for k, have in enumerate(found, start=1) if have.lower() == name.lower()]
+        if len(bands) != 1:
+            raise InputError(
+                f"{data.name}: expected one band '{name}' for {convention.name}, found {len(bands)} among "
+                f"'{', '.join(found)}'; name the bands in their order in the file with --bands."
+            )
+        indices[name] = bands[0]
+    return indices
+
+
+def _strips(data: DatasetReader, bands: int) -> Iterator[Window]:
+    """Windows of whole rows, a multiple of the output's tile height where that fits the memory."""
+    rows = max(1, BLOCK_VALUES // max(1, data.width * bands))
+    rows = rows // 256 * 256 or rows
+    for row in range(0, data.height, rows):
+        yield Window(0, row, data.width, min(rows, data.height - row))
