@@ -79,6 +79,8 @@ def run(
     device = choose_device(config.device)
     keep_freed_memory()
     predictor = load_predictor(checkpoint, device)
+    # A shard holds some rows only; the GeoTIFF is made of the merged whole.
+    whole = config.shard[1] == 1
     with open_artefact(scene, SCENE) as file:
         grid = read_grid(file, scene)
         if not config.any_gsd and abs(grid.gsd - predictor.gsd) > GSD_TOLERANCE * predictor.gsd:
@@ -109,8 +111,9 @@ def run(
             writer.write("coefficient_name", names)
             windows = _predict(file, writer, predictor, config, stride, device, progress)
             share, ranges = _statistics(writer.file, names)
-            with atomic_path(tiff) as partial:
-                write_geotiff(partial, writer.file, grid, names, predictor.model.name, attributes)
+            if whole:
+                with atomic_path(tiff) as partial:
+                    write_geotiff(partial, writer.file, grid, names, attributes)
     return Summary(grid, predictor.model.name, share, windows, ranges)
 
 
@@ -289,9 +292,7 @@ def _strips(height: int, rows: int = 512) -> Iterator[tuple[int, int]]:
         yield first, min(height, first + rows)
 
 
-def write_geotiff(
-    path: Path, file: h5py.File, grid: Grid, names: list[str], model: str, attributes: dict[str, Any]
-) -> None:
+def write_geotiff(path: Path, file: h5py.File, grid: Grid, names: list[str], attributes: dict[str, Any]) -> None:
     """The maps as a cloud-optimised GeoTIFF: one band per coefficient, named; nodata NaN; model and quantity as tags."""
     plain = path.with_name(path.name + ".plain.tif")
     profile = {

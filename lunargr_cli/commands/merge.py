@@ -1,0 +1,29 @@
+"""`lunargr merge`: the parts of a sharded stage -> one artefact."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import Overwrite, Quiet
+
+NAME, ORDER = "merge", 89
+
+
+def command(
+    parts: Annotated[
+        list[Path], typer.Argument(metavar="PART...", help="Every part that --shard I/N wrote, in any order.")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Join the parts that shards wrote into the artefact that one run would have written."""
+    from lunargr_cli.console import Console
+    from stages import merge
+
+    console = Console(quiet)
+    schema = merge.run(parts, output, overwrite, console.progress)
+    console.say(f"{output}: {len(parts)} parts of '{schema.name}' merged")

@@ -1,0 +1,156 @@
+"""merge: join the parts that shards of one stage wrote into the artefact that one run would have written."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from schemas import ArtefactError, ArtefactWriter, Schema, open_artefact, read_config, read_kind
+
+Progress = Callable[[int, int, str], None]
+
+# The dimension along which the shards of a stage are laid end to end; maps are joined pixel by pixel instead.
+RECORD = {"scene": "frame", "crops": "pair", "pairs": "pair", "evaluation": "pair"}
+MAPS = ("svbrdf",)
+# Root attributes that may differ between the parts of one whole.
+_OWN = {"history", "inputs", "config", "lunargr_version", "metrics"}
+
+
+def run(parts: Sequence[Path], output: Path, overwrite: bool = False, progress: Progress | None = None) -> Schema:
+    """Join ``parts``, in the order of their shards. Raises ArtefactError where they are not parts of one whole."""
+    schema = read_kind(parts[0])
+    if schema.name not in (*RECORD, *MAPS):
+        raise ArtefactError(
+            f"{parts[0]}: a '{schema.name}' has no parts to merge; parts are: {', '.join((*RECORD, *MAPS))}."
+        )
+    with contextlib.ExitStack() as stack:
+        files = [stack.enter_context(open_artefact(p, schema)) for p in parts]
+        order = sorted(range(len(files)), key=lambda k: _shard(files[k])[0])
+        parts, files = [parts[k] for k in order], [files[k] for k in order]
+        _check_complete(parts, files)
+        _check_alike(parts, files)
+        record = RECORD.get(schema.name)
+        sizes = _sizes(schema, files, record)
+        attributes = {k: v for k, v in files[0].attrs.items() if k not in _standard(files[0])}
+        config = read_config(files[0]) | {"shard": [0, 1]}
+        seed = int(files[0].attrs.get("seed", -1))
+        with ArtefactWriter(
+            output,
+            schema,
+            sizes,
+            config=config,
+            inputs=list(parts),
+            seed=None if seed < 0 else seed,
+            attributes=attributes,
+            overwrite=overwrite,
+        ) as writer:
+            if "crs" in files[0]:
+                files[0].copy("crs", writer.file, "crs")
+            names = [v.name for v in schema.variables if v.name in files[0]]
+            for number, name in enumerate(names):
+                if progress:
+                    progress(number, len(names), f"merging {name}")
+                dims = schema[name].dims
+                unit = files[0][name].attrs.get("units")
+                target = writer.dataset(
+                    name, unit=str(unit) if unit is not None and schema[name].unit_choices else None
+                )
+                if record in dims:
+                    _concatenate(files, name, target, dims.index(record))
+                elif schema.name in MAPS and dims[-2:] == ("y", "x"):
+                    _overlay(files, name, target)
+                elif target.shape == () or 0 not in target.shape:
+                    target[...] = files[0][name][...]
+            if progress:
+                progress(len(names), len(names), "merging")
+    return schema
+
+
+def _standard(file: h5py.File) -> set[str]:
+    return {
+        "Conventions",
+        "title",
+        "lunargr_schema",
+        "schema_version",
+        "lunargr_version",
+        "history",
+        "config",
+        "inputs",
+        "seed",
+    }
+
+
+def _shard(file: h5py.File) -> tuple[int, int]:
+    index, count = read_config(file).get("shard") or (0, 1)
+    return int(index), int(count)
+
+
+def _check_complete(parts: Sequence[Path], files: Sequence[h5py.File]) -> None:
+    found = [_shard(f) for f in files]
+    counts = {count for _, count in found}
+    if counts == {1}:  # parts made without --shard, such as two sites: their order is the caller's
+        return
+    expected = [(k, len(files)) for k in range(len(files))]
+    if found != expected:
+        names = ", ".join(f"{i + 1}/{n} ({p.name})" for p, (i, n) in zip(parts, found, strict=True))
+        raise ArtefactError(f"{parts[0]}: expected every shard of one run once, found {names}; name all parts.")
+
+
+def _check_alike(parts: Sequence[Path], files: Sequence[h5py.File]) -> None:
+    first = files[0]
+    for path, file in zip(parts[1:], files[1:], strict=True):
+        for key, value in first.attrs.items():
+            if key not in _OWN and str(file.attrs.get(key)) != str(value):
+                raise ArtefactError(
+                    f"{path}: expected {key} = {value} as in {parts[0]}, found {file.attrs.get(key)}; these are not parts of one whole."
+                )
+        mine, other = (json.loads(str(f.attrs["config"])) for f in (first, file))
+        if any(mine.get(k) != other.get(k) for k in {*mine, *other} - {"shard", "device"}):
+            raise ArtefactError(
+                f"{path}: expected the options that {parts[0]} was made with, found others; run the shard again."
+            )
+
+
+def _sizes(schema: Schema, files: Sequence[h5py.File], record: str | None) -> dict[str, int]:
+    sizes: dict[str, int] = {}
+    for variable in schema.variables:
+        if variable.name in files[0]:
+            for dim, size in zip(variable.dims, files[0][variable.name].shape, strict=True):
+                whole = size
+                if dim == record:
+                    whole = sum(f[variable.name].shape[variable.dims.index(dim)] for f in files)
+                sizes.setdefault(dim, whole)
+    return {dim: sizes[dim] for dim in schema.dims if dim in sizes}
+
+
+def _concatenate(files: Sequence[h5py.File], name: str, target: h5py.Dataset, axis: int) -> None:
+    place = 0
+    for file in files:
+        source = file[name]
+        for k in range(source.shape[axis]):
+            key: tuple[Any, ...] = (slice(None),) * axis
+            if source.ndim >= 2:
+                target[(*key, place + k)] = source[(*key, k)]
+        if source.ndim == 1:
+            target[place : place + source.shape[0]] = source[...]
+        place += source.shape[axis]
+
+
+def _overlay(files: Sequence[h5py.File], name: str, target: h5py.Dataset, rows: int = 256) -> None:
+    """Rows that a shard did not own hold fill values (NaN, or 0 for masks): take what any part knows."""
+    height = target.shape[-2]
+    for first in range(0, height, rows):
+        part = (..., slice(first, min(height, first + rows)), slice(None))
+        joined = files[0][name][part]
+        for file in files[1:]:
+            other = file[name][part]
+            joined = (
+                np.where(np.isnan(joined), other, joined) if joined.dtype.kind == "f" else np.maximum(joined, other)
+            )
+        target[part] = joined
