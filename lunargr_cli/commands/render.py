@@ -1,0 +1,258 @@
+"""`lunargr render`: images of a reflectance map, or of a DEM with one reflectance, for any Sun and camera."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lunargr_cli.options import BodyOption, Json, Overwrite, Quiet, Resume, Shard, parse_shard
+from schemas.errors import ConfigError
+
+NAME, ORDER = "render", 60
+
+
+def command(
+    source: Annotated[
+        Path | None, typer.Argument(metavar="[SVBRDF.h5]", help="Reflectance map from 'lunargr infer'.")
+    ] = None,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="NAME.exr: EXR, PNG and, for ortho, GeoTIFF; .tif or .png: without the EXR. A folder with --trajectory.",
+        ),
+    ] = Path("render.exr"),
+    dem: Annotated[
+        Path | None,
+        typer.Option(
+            "--dem", metavar="DEM", help="Render a DEM (GeoTIFF, ..., scene.h5) with --model the same everywhere."
+        ),
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option("--model", help="With --dem: reflectance model ('lunargr models' lists them).")
+    ] = None,
+    parameters: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--parameters",
+            metavar="NAME=VALUE,...",
+            help="With --dem: parameters of the model; the rest take their defaults.",
+        ),
+    ] = None,
+    view: Annotated[
+        str, typer.Option("--view", metavar="ortho|pinhole", help="The map's own grid, or a camera.")
+    ] = "ortho",
+    sun_azimuth: Annotated[
+        float | None, typer.Option(metavar="DEG", help="Sun over the map's middle: clockwise from north ...")
+    ] = None,
+    sun_elevation: Annotated[float | None, typer.Option(metavar="DEG", help="... and above the horizon.")] = None,
+    subsolar_longitude: Annotated[
+        float | None, typer.Option(metavar="DEG", help="Or the sub-solar point: east longitude ...")
+    ] = None,
+    subsolar_latitude: Annotated[float | None, typer.Option(metavar="DEG", help="... and latitude.")] = None,
+    solar_distance: Annotated[
+        float | None, typer.Option(metavar="AU", help="Distance of the Sun (widens the penumbra; default 1).")
+    ] = None,
+    time: Annotated[
+        str | None, typer.Option("--time", metavar="UTC", help="Or the time, such as 2010-11-09T13:06:40.")
+    ] = None,
+    position: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LON,LAT,ALT",
+            help="Camera: degrees, and metres above the reference sphere. In ortho: where light goes.",
+        ),
+    ] = None,
+    look_at: Annotated[
+        str | None,
+        typer.Option(
+            "--look-at", metavar="LON,LAT[,ALT]", help="Place in the image's middle (default: straight down)."
+        ),
+    ] = None,
+    quaternion: Annotated[
+        str | None, typer.Option(metavar="W,X,Y,Z", help="Instead: camera axes (right, down, forward) to body-fixed.")
+    ] = None,
+    roll: Annotated[
+        float, typer.Option(metavar="DEG", help="Turn the camera clockwise about its line of sight.")
+    ] = 0.0,
+    fov: Annotated[float, typer.Option(metavar="DEG", help="Field of view across the image's width.")] = 20.0,
+    size: Annotated[str, typer.Option(metavar="W,H", help="Image size in pixels.")] = "1024,1024",
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Camera model (pinhole JSON, ALE/CSM ISD, ...) in place of the options above."
+        ),
+    ] = None,
+    samples: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="N x N rays per pixel (default: as many as the ground in a pixel asks for)."),
+    ] = None,
+    trajectory: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="One view per row; see docs/render.md. --output names a folder.")
+    ] = None,
+    extend: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="diagnosis.h5: add the effects that 'lunargr diagnose' found.")
+    ] = None,
+    shadows: Annotated[bool, typer.Option("--shadows/--no-shadows", help="Cast shadows, with the Sun's disc.")] = True,
+    backplanes: Annotated[
+        bool, typer.Option("--backplanes", help="Ortho: put the backplanes into the GeoTIFF, too.")
+    ] = False,
+    png_only: Annotated[bool, typer.Option("--png-only", help="With --trajectory: write no EXR files.")] = False,
+    body: BodyOption = None,
+    shard: Shard = None,
+    resume: Resume = False,
+    json_file: Json = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Render a reflectance map for any Sun and camera: EXR with backplanes, PNG preview, GeoTIFF.
+
+    \b
+    lunargr render svbrdf.h5 --sun-azimuth 90 --sun-elevation 30 -o morning.exr
+    lunargr render svbrdf.h5 --view pinhole --position 3.6,25.8,60000 --look-at 3.6,26.1 --fov 15 \\
+        --time 1971-07-31T12:00:00 -o oblique.exr
+    lunargr render --dem dem.tif --model hapke --parameters w=0.25 --sun-azimuth 90 --sun-elevation 30 -o hapke.exr
+    lunargr render svbrdf.h5 --trajectory descent.csv --sun-azimuth 90 --sun-elevation 30 -o views/
+    """
+    if (source is None) == (dem is None):
+        raise ConfigError("render: expected a reflectance map (svbrdf.h5) or --dem DEM, one of the two.")
+    if parameters and dem is None:
+        raise ConfigError("--parameters: expected together with --dem; an svbrdf.h5 holds its own coefficients.")
+    from lunargr_cli.console import Console
+    from stages import render
+
+    given = _parameters(parameters or [])
+    config = render.Config(
+        view="pinhole" if camera or trajectory else view,
+        sun_azimuth_deg=sun_azimuth,
+        sun_elevation_deg=sun_elevation,
+        subsolar_longitude_deg=subsolar_longitude,
+        subsolar_latitude_deg=subsolar_latitude,
+        solar_distance_au=solar_distance,
+        time=time,
+        position=_numbers(position, "--position", (3,)),
+        look_at=_numbers(look_at, "--look-at", (2, 3)),
+        quaternion=_numbers(quaternion, "--quaternion", (4,)),
+        roll_deg=roll,
+        fov_deg=fov,
+        size_px=_size(size),
+        camera=str(camera) if camera else None,
+        samples=samples,
+        shadows=shadows,
+        model=model,
+        parameters=given,
+        terrain_only=dem is not None,
+        extension=str(extend) if extend else None,
+        body=body or "moon",
+        backplanes_in_tif=backplanes,
+    )
+    console = Console(quiet)
+    path = source or dem
+    assert path is not None
+    if trajectory is not None:
+        results = render.run_trajectory(
+            path,
+            trajectory,
+            output,
+            config,
+            shard=parse_shard(shard),
+            resume=resume,
+            overwrite=overwrite,
+            suffix=".png" if png_only else ".exr",
+            progress=console.progress,
+        )
+    else:
+        if shard is not None or resume:
+            raise ConfigError(
+                "--shard and --resume: expected together with --trajectory; a single view is one piece of work."
+            )
+        results = [render.run(path, output, config, overwrite=overwrite, progress=console.progress)]
+    console.table(
+        "rendered",
+        ("view", "pixels", "known", "mean I/F", "shadow", "incidence", "rays/px", "files"),
+        map(_row, results),
+    )
+    if json_file is not None:
+        _write_json(json_file, results)
+
+
+def _row(result: Any) -> tuple[str, ...]:
+    size = f"{result.size_px[0]} x {result.size_px[1]}"
+    files = " ".join(p.name for p in result.files)
+    if result.skipped:
+        return result.view_id, size, "-", "-", "-", "-", "-", f"{files} (there already)"
+    low, high = result.incidence_deg
+    return (
+        result.view_id,
+        size,
+        f"{100 * result.known_share:.1f} %",
+        f"{result.mean:.5f}",
+        f"{100 * result.shadow_share:.1f} %",
+        f"{low:.1f}..{high:.1f} deg",
+        str(result.samples**2),
+        files,
+    )
+
+
+def _write_json(path: Path, results: list[Any]) -> None:
+    import json
+
+    from schemas import atomic_path
+
+    def finite(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    views = [
+        {
+            "view_id": r.view_id,
+            "files": [str(p) for p in r.files],
+            "size_px": list(r.size_px),
+            "known_share": finite(r.known_share),
+            "mean_iof": finite(r.mean),
+            "shadow_share": finite(r.shadow_share),
+            "incidence_deg": [finite(v) for v in r.incidence_deg],
+            "samples": r.samples,
+            "skipped": r.skipped,
+        }
+        for r in results
+    ]
+    with atomic_path(path) as partial:
+        partial.write_text(json.dumps({"views": views}, indent=1))
+
+
+def _numbers(text: str | None, option: str, counts: tuple[int, ...]) -> tuple[float, ...] | None:
+    if text is None:
+        return None
+    try:
+        values = tuple(float(v) for v in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) not in counts or not all(math.isfinite(v) for v in values):
+        raise ConfigError(
+            f"{option}: expected {' or '.join(map(str, counts))} numbers separated by commas, found '{text}'."
+        )
+    return values
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.replace("x", ",").partition(",")
+    if not (width.strip().isdigit() and height.strip().isdigit() and int(width) > 0 and int(height) > 0):
+        raise ConfigError(f"--size: expected W,H in pixels, found '{text}'.")
+    return int(width), int(height)
+
+
+def _parameters(items: list[str]) -> dict[str, float]:
+    result: dict[str, float] = {}
+    for item in (part for text in items for part in text.split(",") if part.strip()):
+        name, equals, value = item.partition("=")
+        try:
+            result[name.strip()] = float(value)
+        except ValueError:
+            raise ConfigError(f"--parameters: expected NAME=VALUE with a number, found '{item}'.") from None
+        if not equals:
+            raise ConfigError(f"--parameters: expected NAME=VALUE, found '{item}'.")
+    return result

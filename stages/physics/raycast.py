@@ -1,0 +1,471 @@
+"""Ray casting of a height field: the first point of a DEM's bilinear surface that a camera's ray meets.
+
+The surface is exact (bilinear between pixel centres, on the curved body); a pyramid of maxima lets a ray skip what
+lies wholly below it (Tevs, Ihrke, Seidel 2008, "Maximum mipmaps for fast, accurate, and scalable dynamic height field
+rendering"). A ray is straight in space; in grid coordinates it is followed in short steps over which it is a straight
+line whose height above the sphere is a parabola.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.errors import GeometryError
+from stages.physics.chart import Chart, chart_gradient, chart_position, fit_chart, step_length
+from stages.physics.grid import Grid
+
+Floats = NDArray[np.float64]
+
+MISS, HIT, BELOW = 0, 1, 2  # a ray left the scene, met the surface, or came in under it (a hole or the scene's edge)
+
+
+@dataclass(frozen=True)
+class HeightField:
+    """A DEM ready for rays.
+
+    elevation : (H, W) float32, m above the sphere, NaN where unknown
+    pyramid, offsets, shapes : maxima over 2^k x 2^k cells, k = 1.., in one array
+    lowest, highest : m
+    """
+
+    elevation: NDArray[np.float32]
+    pyramid: NDArray[np.float32]
+    offsets: NDArray[np.int64]
+    shapes: NDArray[np.int64]
+    lowest: float
+    highest: float
+    chart: Chart
+    step: float
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where rays met the surface.
+
+    status : (N,) uint8: MISS, HIT, BELOW
+    depth : (N,), m along the ray, NaN where it met nothing; row, col : (N,), px on the grid
+    """
+
+    status: NDArray[np.uint8]
+    depth: Floats
+    row: Floats
+    col: Floats
+
+
+def build_height_field(elevation: NDArray[np.float32], grid: Grid) -> HeightField:
+    """Prepare a DEM for rays: one pass over it. Raises GeometryError where it holds no cell of four known heights."""
+    elevation = np.ascontiguousarray(elevation, np.float32)
+    height, width = elevation.shape
+    if height < 2 or width < 2:
+        raise GeometryError(f"a DEM of {height} x {width} px has no surface; expected at least 2 x 2 px.")
+    shapes = [(height - 1, width - 1)]  # level 0: the patches between pixel centres
+    while max(shapes[-1]) > 1:
+        shapes.append(((shapes[-1][0] + 1) // 2, (shapes[-1][1] + 1) // 2))
+    if len(shapes) == 1:
+        shapes.append((1, 1))
+    sizes = np.array([0] + [h * w for h, w in shapes[1:]], np.int64)
+    offsets = np.concatenate([[0], np.cumsum(sizes[1:])[:-1], [0]])[: len(shapes) - 1]
+    offsets = np.concatenate([[0], offsets]).astype(np.int64)
+    shape_array = np.array(shapes, np.int64)
+    pyramid = np.empty(int(sizes.sum()), np.float32)
+    _build_first(elevation, pyramid, shape_array)
+    for level in range(2, len(shapes)):
+        _build_next(pyramid, offsets, shape_array, level)
+    highest = float(pyramid[-1])
+    if not math.isfinite(highest):
+        raise GeometryError("the DEM holds no valid elevation where the camera looks; check its nodata.")
+    lowest = float(_lowest(elevation))
+    return HeightField(elevation, pyramid, offsets, shape_array, lowest, highest, fit_chart(grid), step_length(grid))
+
+
+def cast(field: HeightField, origins: Floats, directions: Floats) -> Hits:
+    """Follow rays to the surface.
+
+    origins : (N, 3) or (1, 3), m, body-fixed; directions : (N, 3), body-fixed, unit
+    """
+    chart = field.chart
+    origins = np.ascontiguousarray(chart.to_local(np.atleast_2d(origins)))
+    directions = np.ascontiguousarray(chart.to_local(directions))
+    count = len(directions)
+    status = np.empty(count, np.uint8)
+    depth, row, col = np.empty(count), np.empty(count), np.empty(count)
+    _cast(
+        field.elevation, field.pyramid, field.offsets, field.shapes, field.lowest, field.highest, chart.forward,
+        chart.scale, chart.reach, chart.radius, field.step, origins, directions, status, depth, row, col,
+    )  # fmt: skip
+    return Hits(status, depth, row, col)
+
+
+@numba.njit(cache=True, parallel=True)
+def _build_first(z, pyramid, shapes):
+    """Level 1: maxima over 2 x 2 patches, which are 3 x 3 heights. NaN counts as nothing."""
+    height, width = z.shape
+    rows, cols = shapes[1, 0], shapes[1, 1]
+    for j in numba.prange(rows):
+        for i in range(cols):
+            best = np.float32(-np.inf)
+            for r in range(2 * j, min(2 * j + 3, height)):
+                for c in range(2 * i, min(2 * i + 3, width)):
+                    if z[r, c] > best:
+                        best = z[r, c]
+            pyramid[j * cols + i] = best
+
+
+@numba.njit(cache=True, parallel=True)
+def _build_next(pyramid, offsets, shapes, level):
+    rows, cols = shapes[level, 0], shapes[level, 1]
+    below_rows, below_cols = shapes[level - 1, 0], shapes[level - 1, 1]
+    source, target = offsets[level - 1], offsets[level]
+    for j in numba.prange(rows):
+        for i in range(cols):
+            best = np.float32(-np.inf)
+            for r in range(2 * j, min(2 * j + 2, below_rows)):
+                for c in range(2 * i, min(2 * i + 2, below_cols)):
+                    value = pyramid[source + r * below_cols + c]
+                    if value > best:
+                        best = value
+            pyramid[target + j * cols + i] = best
+
+
+@numba.njit(cache=True)
+def _lowest(z):
+    best = np.float32(np.inf)
+    for j in range(z.shape[0]):
+        for i in range(z.shape[1]):
+            if z[j, i] < best:
+                best = z[j, i]
+    return best
+
+
+@numba.njit(cache=True)
+def _smallest_root(a, b, c, limit):
+    """Smallest root of a t^2 + b t + c in [0, limit], or -1."""
+    if c <= 0.0:
+        return 0.0
+    if abs(a) < 1e-300:
+        if b >= 0.0:
+            return -1.0
+        t = -c / b
+        return t if t <= limit else -1.0
+    disc = b * b - 4.0 * a * c
+    if disc < 0.0:
+        return -1.0
+    q = -0.5 * (b + math.copysign(math.sqrt(disc), b))
+    first = q / a
+    second = c / q if q != 0.0 else first
+    if first > second:
+        first, second = second, first
+    if 0.0 <= first <= limit:
+        return first
+    if 0.0 <= second <= limit:
+        return second
+    return -1.0
+
+
+@numba.njit(cache=True)
+def _trace_step(z, pyramid, offsets, shapes, c0, r0, h0, c1, r1, h1, bulge, level, above):
+    """One step of a ray over the grid, from (c0, r0, h0) to (c1, r1, h1), s = 0..1.
+
+    bulge : m, how far the ray's height sags below the chord: h(s) = h0 + (h1 - h0) s - bulge s (1 - s)
+    level : where in the pyramid to start; above : whether the ray is known to be above the surface
+    returns (status or -1 to go on, s, level, above)
+    """
+    height, width = z.shape
+    top = shapes.shape[0] - 1
+    dc, dr = c1 - c0, r1 - r0
+    # the part of the step that lies over the grid
+    s, end = 0.0, 1.0
+    if dc != 0.0:
+        a, b = -c0 / dc, (width - 1 - c0) / dc
+        s, end = max(s, min(a, b)), min(end, max(a, b))
+    elif c0 < 0.0 or c0 > width - 1:
+        return -1, 1.0, level, False
+    if dr != 0.0:
+        a, b = -r0 / dr, (height - 1 - r0) / dr
+        s, end = max(s, min(a, b)), min(end, max(a, b))
+    elif r0 < 0.0 or r0 > height - 1:
+        return -1, 1.0, level, False
+    if s >= end:
+        return -1, 1.0, level, False
+    if s > 0.0:
+        above = False  # it comes in over the scene's edge here
+    i = min(max(int(math.floor(c0 + dc * s)), 0), width - 2)
+    j = min(max(int(math.floor(r0 + dr * s)), 0), height - 2)
+    linear = h1 - h0 - bulge
+    while True:
+        size = 1 << level
+        ci, cj = i >> level, j >> level
+        sx, sy = np.inf, np.inf
+        if dc > 0.0:
+            sx = ((ci + 1) * size - c0) / dc
+        elif dc < 0.0:
+            sx = (ci * size - c0) / dc
+        if dr > 0.0:
+            sy = ((cj + 1) * size - r0) / dr
+        elif dr < 0.0:
+            sy = (cj * size - r0) / dr
+        out = max(min(sx, sy, end), s)
+        ha = h0 + (linear + bulge * s) * s
+        hb = h0 + (linear + bulge * out) * out
+        span = out - s
+        low = min(ha, hb) - 0.25 * bulge * span * span
+        if level > 0:
+            if low <= pyramid[offsets[level] + cj * shapes[level, 1] + ci]:
+                level -= 1
+                continue
+            above = True
+        else:
+            z00, z01, z10, z11 = z[j, i], z[j, i + 1], z[j + 1, i], z[j + 1, i + 1]
+            if z00 + z01 + z10 + z11 != z00 + z01 + z10 + z11:
+                above = False  # a hole: what happens in it is not known
+            elif low > max(max(z00, z01), max(z10, z11)):
+                above = True
+            else:
+                bx, by = float(z01) - z00, float(z10) - z00
+                d = float(z00) - z01 - z10 + z11
+                u, v = c0 + dc * s - i, r0 + dr * s - j
+                c = ha - (z00 + bx * u + by * v + d * u * v)
+                if c <= 0.0 and not above:
+                    if c < -1e-6 * (1.0 + abs(ha)):
+                        return 2, s, level, above
+                    c = 0.0
+                b = linear + 2.0 * bulge * s - (bx * dc + by * dr + d * (u * dr + v * dc))
+                a = bulge - d * dc * dr
+                t = _smallest_root(a, b, c, span)
+                if t < 0.0 and (a * span + b) * span + c <= 0.0:
+                    t = span
+                if t >= 0.0:
+                    return 1, s + t, level, above
+                above = True
+        if out >= end:
+            return -1, 1.0, level, above
+        s = out
+        if sx <= sy:
+            i = (ci + 1) * size if dc > 0.0 else ci * size - 1
+            j = min(max(int(math.floor(r0 + dr * s)), cj * size), (cj + 1) * size - 1, height - 2)
+        else:
+            j = (cj + 1) * size if dr > 0.0 else cj * size - 1
+            i = min(max(int(math.floor(c0 + dc * s)), ci * size), (ci + 1) * size - 1, width - 2)
+        if i < 0 or j < 0 or i > width - 2 or j > height - 2:
+            return -1, 1.0, level, above
+        if level < top:
+            level += 1
+
+
+@numba.njit(cache=True, parallel=True)
+def _cast(
+    z, pyramid, offsets, shapes, lowest, highest, forward, scale, reach, radius, step, origins, directions, status,
+    depth, row, col,
+):  # fmt: skip
+    stride = 0 if origins.shape[0] == 1 else 1
+    for n in numba.prange(directions.shape[0]):
+        status[n], depth[n], row[n], col[n] = _cast_one(
+            z, pyramid, offsets, shapes, lowest, highest, forward, scale, reach, radius, step,
+            origins[n * stride], directions[n],
+        )  # fmt: skip
+
+
+@numba.njit(cache=True)
+def _cast_one(
+    z, pyramid, offsets, shapes, lowest, highest, forward, scale, reach, radius, step, origin, direction
+):  # fmt: skip
+    """(status, depth, row, col) of one ray in the local frame."""
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    dx, dy, dz = direction[0], direction[1], direction[2]
+    # between the spheres through the highest and the lowest point
+    b = ox * dx + oy * dy + oz * dz
+    px, py, pz = ox - b * dx, oy - b * dy, oz - b * dz
+    closest = px * px + py * py + pz * pz  # squared distance of the ray's line from the body's centre
+    outer = (radius + highest + 0.01) ** 2 - closest
+    if outer <= 0.0:
+        return 0, np.nan, np.nan, np.nan
+    outer = math.sqrt(outer)
+    t, last = max(-b - outer, 0.0), -b + outer
+    inner = (radius + lowest - 0.01) ** 2 - closest
+    if inner > 0.0 and -b - math.sqrt(inner) > 0.0:
+        last = min(last, -b - math.sqrt(inner))
+    if last <= t:
+        return 0, np.nan, np.nan, np.nan
+    pieces = int(math.ceil((last - t) / step))
+    length = (last - t) / pieces
+    level, above = max(shapes.shape[0] - 3, 0), False
+    known, c0, r0, h0 = False, 0.0, 0.0, 0.0
+    for _ in range(pieces + 1):
+        x, y, w = ox + t * dx, oy + t * dy, oz + t * dz
+        inside = w > 0.0 and abs(x) <= reach * w and abs(y) <= reach * w
+        c1, r1, h1 = 0.0, 0.0, 0.0
+        if inside:
+            c1, r1 = chart_position(forward, x / w / scale, y / w / scale)
+            # |P| as hypotenuse of the closest distance and the distance along the ray keeps millimetres
+            h1 = math.sqrt(closest + (b + t) * (b + t)) - radius
+        if inside and known:
+            middle = radius + 0.5 * (h0 + h1)
+            bulge = 0.5 * length * length * closest / (middle * middle * middle)
+            result, s, level, above = _trace_step(
+                z, pyramid, offsets, shapes, c0, r0, h0, c1, r1, h1, bulge, level, above
+            )
+            if result == 1:
+                return 1, t - length + s * length, r0 + (r1 - r0) * s, c0 + (c1 - c0) * s
+            if result == 2:
+                return 2, np.nan, np.nan, np.nan
+        else:
+            above = False
+        known, c0, r0, h0 = inside, c1, r1, h1
+        t += length
+    return 0, np.nan, np.nan, np.nan
+
+
+def hit_points(hits: Hits, origins: Floats, directions: Floats) -> Floats:
+    """(N, 3) body-fixed points where the rays met the surface, NaN where they did not."""
+    return np.atleast_2d(origins) + hits.depth[:, None] * directions
+
+
+@dataclass(frozen=True)
+class HitAngles:
+    """Per hit (N,) float64, NaN where there is none: cosines of incidence and emission, phase, the Sun's elevation, rad."""
+
+    cos_incidence: Floats
+    cos_emission: Floats
+    phase: Floats
+    sun_elevation: Floats
+
+
+def hit_angles(field: HeightField, origins: Floats, directions: Floats, hits: Hits, sun_position: Floats) -> HitAngles:
+    """Photometric angles where rays met the surface.
+
+    The normal there is interpolated between central differences at the four pixels around, as a mesh with vertex
+    normals would have it. sun_position : (3,), body-fixed, m
+    """
+    chart = field.chart
+    origins = np.ascontiguousarray(chart.to_local(np.atleast_2d(origins)))
+    directions = np.ascontiguousarray(chart.to_local(directions))
+    out = np.empty((4, len(directions)))
+    _angles(
+        field.elevation, chart.forward, chart.scale, origins, directions, hits.depth, hits.row, hits.col,
+        chart.to_local(sun_position), out,
+    )  # fmt: skip
+    return HitAngles(*out)
+
+
+def surface_normals(field: HeightField, points: Floats, hits: Hits) -> Floats:
+    """(N, 3) body-fixed unit normals at body-fixed points (N, 3) from :func:`hit_points`."""
+    chart = field.chart
+    local = np.ascontiguousarray(chart.to_local(points))
+    normals = np.empty_like(local)
+    _normals(field.elevation, chart.forward, chart.scale, local, hits.row, hits.col, normals)
+    return chart.to_body(normals)
+
+
+@numba.njit(cache=True, inline="always")
+def _difference(before, here, after):
+    """Central where both neighbours are known, one-sided where one is, 0 where none is."""
+    central = 0.5 * (after - before)
+    if central == central:
+        return central
+    if after == after:
+        return after - here
+    if before == before:
+        return here - before
+    return 0.0
+
+
+@numba.njit(cache=True)
+def _normal(z, forward, scale, x, y, w, row, col):
+    """Unit normal at the local point (x, y, w) over (row, col)."""
+    height, width = z.shape
+    i = min(max(int(math.floor(col)), 0), width - 2)
+    j = min(max(int(math.floor(row)), 0), height - 2)
+    u, v = col - i, row - j
+    slope_col, slope_row = 0.0, 0.0
+    for dj in range(2):
+        for di in range(2):
+            r, c = j + dj, i + di
+            weight = (u if di else 1.0 - u) * (v if dj else 1.0 - v)
+            here = float(z[r, c])
+            west = float(z[r, c - 1]) if c > 0 else np.nan
+            east = float(z[r, c + 1]) if c < width - 1 else np.nan
+            north = float(z[r - 1, c]) if r > 0 else np.nan
+            south = float(z[r + 1, c]) if r < height - 1 else np.nan
+            slope_col += weight * _difference(west, here, east)
+            slope_row += weight * _difference(north, here, south)
+    gx, gy = x / w, y / w
+    col_x, col_y, row_x, row_y = chart_gradient(forward, gx / scale, gy / scale)
+    # dh / d(gnomonic), then the gnomonic coordinates' own gradient in space
+    hx = (slope_col * col_x + slope_row * row_x) / scale
+    hy = (slope_col * col_y + slope_row * row_y) / scale
+    inverse = 1.0 / math.sqrt(x * x + y * y + w * w)
+    nx = x * inverse - hx / w
+    ny = y * inverse - hy / w
+    nw = w * inverse + (hx * gx + hy * gy) / w
+    norm = 1.0 / math.sqrt(nx * nx + ny * ny + nw * nw)
+    return nx * norm, ny * norm, nw * norm
+
+
+@numba.njit(cache=True, parallel=True)
+def _normals(z, forward, scale, points, row, col, normals):
+    for n in numba.prange(points.shape[0]):
+        if row[n] == row[n]:
+            normals[n, 0], normals[n, 1], normals[n, 2] = _normal(
+                z, forward, scale, points[n, 0], points[n, 1], points[n, 2], row[n], col[n]
+            )
+        else:
+            normals[n, 0], normals[n, 1], normals[n, 2] = np.nan, np.nan, np.nan
+
+
+@numba.njit(cache=True, parallel=True)
+def _angles(z, forward, scale, origins, directions, depth, row, col, sun, out):
+    stride = 0 if origins.shape[0] == 1 else 1
+    for n in numba.prange(directions.shape[0]):
+        if depth[n] != depth[n]:
+            out[0, n], out[1, n], out[2, n], out[3, n] = np.nan, np.nan, np.nan, np.nan
+            continue
+        o = origins[n * stride]
+        dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
+        x, y, w = o[0] + depth[n] * dx, o[1] + depth[n] * dy, o[2] + depth[n] * dz
+        nx, ny, nw = _normal(z, forward, scale, x, y, w, row[n], col[n])
+        sx, sy, sw = sun[0] - x, sun[1] - y, sun[2] - w
+        norm = 1.0 / math.sqrt(sx * sx + sy * sy + sw * sw)
+        sx, sy, sw = sx * norm, sy * norm, sw * norm
+        out[0, n] = nx * sx + ny * sy + nw * sw
+        out[1, n] = -(nx * dx + ny * dy + nw * dz)
+        # half-angle form: exact near opposition
+        difference = math.sqrt((sx + dx) ** 2 + (sy + dy) ** 2 + (sw + dz) ** 2)
+        total = math.sqrt((sx - dx) ** 2 + (sy - dy) ** 2 + (sw - dz) ** 2)
+        out[2, n] = 2.0 * math.atan2(difference, total)
+        out[3, n] = math.asin(min(1.0, max(-1.0, (x * sx + y * sy + w * sw) / math.sqrt(x * x + y * y + w * w))))
+
+
+def sample_maps(maps: NDArray[np.float32], hits: Hits) -> NDArray[np.float32]:
+    """(C, N) bilinear samples of (C, H, W) maps at the hits; unknown pixels (NaN) carry no weight, all unknown is NaN."""
+    maps = np.ascontiguousarray(maps, np.float32)
+    result = np.empty((maps.shape[0], len(hits.row)), np.float32)
+    _sample(maps, hits.row, hits.col, result)
+    return result
+
+
+@numba.njit(cache=True, parallel=True)
+def _sample(maps, row, col, result):
+    channels, height, width = maps.shape
+    for n in numba.prange(row.shape[0]):
+        if row[n] != row[n]:
+            for k in range(channels):
+                result[k, n] = np.nan
+            continue
+        i = min(max(int(math.floor(col[n])), 0), width - 2)
+        j = min(max(int(math.floor(row[n])), 0), height - 2)
+        u, v = col[n] - i, row[n] - j
+        for k in range(channels):
+            total, weights = 0.0, 0.0
+            for dj in range(2):
+                for di in range(2):
+                    value = maps[k, j + dj, i + di]
+                    if value == value:
+                        weight = (u if di else 1.0 - u) * (v if dj else 1.0 - v)
+                        total += weight * value
+                        weights += weight
+            result[k, n] = total / weights if weights > 1e-9 else np.nan

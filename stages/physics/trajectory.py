@@ -1,0 +1,131 @@
+"""A table of views: one row per camera position, nadir or oblique, each with its own Sun where it names one."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from schemas.errors import InputError
+
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_NUMBERS = (
+    "longitude_deg",
+    "latitude_deg",
+    "altitude_m",
+    "look_longitude_deg",
+    "look_latitude_deg",
+    "look_altitude_m",
+    *_QUATERNION,
+    "roll_deg",
+    "fov_deg",
+    "subsolar_longitude_deg",
+    "subsolar_latitude_deg",
+    "sun_azimuth_deg",
+    "sun_elevation_deg",
+    "solar_distance_au",
+)
+_KNOWN = ("view_id", "time", *_NUMBERS)
+
+
+@dataclass(frozen=True)
+class ViewRow:
+    """One row: place (degrees, metres above the sphere), attitude by target or quaternion, and what replaces the command's own options."""
+
+    view_id: str
+    position: tuple[float, float, float]
+    look_at: tuple[float, float, float] | None
+    quaternion: tuple[float, float, float, float] | None
+    roll_deg: float
+    fov_deg: float | None
+    sun: dict[str, float | str]
+
+
+def read_trajectory(path: Path) -> list[ViewRow]:
+    """Read and check a trajectory table. Raises InputError naming the row and column."""
+    if not path.exists():
+        raise InputError(f"{path}: no such file; expected a trajectory (CSV, one row per view).")
+    try:
+        lines = [
+            line for line in path.read_text(encoding="utf-8-sig").splitlines() if not line.lstrip().startswith("#")
+        ]
+    except (OSError, UnicodeDecodeError):
+        raise InputError(f"{path}: expected a CSV table of views, found something else.") from None
+    reader = csv.DictReader(lines)
+    names = [name.strip() for name in reader.fieldnames or []]
+    for name in ("longitude_deg", "latitude_deg", "altitude_m"):
+        if name not in names:
+            raise InputError(f"{path}: expected a column '{name}', found {', '.join(names) or 'nothing'}.")
+    unknown = [name for name in names if name not in _KNOWN]
+    if unknown:
+        raise InputError(f"{path}: unknown column '{unknown[0]}'; known are: {', '.join(_KNOWN)}.")
+    reader.fieldnames = names
+    rows = [_row(path, number, record) for number, record in enumerate(reader, start=1)]
+    if not rows:
+        raise InputError(f"{path}: expected at least one view, found none.")
+    seen: set[str] = set()
+    for row in rows:
+        if row.view_id in seen:
+            raise InputError(f"{path}: expected each view_id once, found '{row.view_id}' twice.")
+        seen.add(row.view_id)
+    return rows
+
+
+def _row(path: Path, number: int, record: dict[str, str | None]) -> ViewRow:
+    where = f"{path}: view {number}"
+    text = {k: (v or "").strip() for k, v in record.items() if k is not None and not isinstance(v, list)}
+    value: dict[str, float] = {}
+    for name in _NUMBERS:
+        if not text.get(name):
+            continue
+        try:
+            value[name] = float(text[name])
+        except ValueError:
+            value[name] = math.nan
+        if not math.isfinite(value[name]):
+            raise InputError(f"{where}: expected a number in column '{name}', found '{text[name]}'.")
+    for name in ("longitude_deg", "latitude_deg", "altitude_m"):
+        if name not in value:
+            raise InputError(f"{where}: expected a number in column '{name}', found nothing.")
+    look_at = None
+    if "look_longitude_deg" in value or "look_latitude_deg" in value:
+        if "look_longitude_deg" not in value or "look_latitude_deg" not in value:
+            raise InputError(f"{where}: expected both look_longitude_deg and look_latitude_deg, found one.")
+        look_at = (value["look_longitude_deg"], value["look_latitude_deg"], value.get("look_altitude_m", math.nan))
+    quaternion = None
+    given = [q for q in _QUATERNION if q in value]
+    if given:
+        if len(given) < 4 or look_at is not None:
+            raise InputError(
+                f"{where}: expected either a place to look at or all of qw, qx, qy, qz, found both or too few."
+            )
+        quaternion = tuple(value[q] for q in _QUATERNION)
+    sun: dict[str, float | str] = {
+        name: value[name]
+        for name in (
+            "subsolar_longitude_deg",
+            "subsolar_latitude_deg",
+            "sun_azimuth_deg",
+            "sun_elevation_deg",
+            "solar_distance_au",
+        )
+        if name in value
+    }
+    if text.get("time"):
+        sun["time"] = text["time"]
+    view_id = text.get("view_id") or f"view_{number:04d}"
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", view_id):
+        raise InputError(
+            f"{where}: expected a view_id that can name a file (letters, digits, . _ -), found '{view_id}'."
+        )
+    return ViewRow(
+        view_id=view_id,
+        position=(value["longitude_deg"], value["latitude_deg"], value["altitude_m"]),
+        look_at=look_at,
+        quaternion=quaternion,  # type: ignore[arg-type]
+        roll_deg=value.get("roll_deg", 0.0),
+        fov_deg=value.get("fov_deg"),
+        sun=sun,
+    )
