@@ -100,6 +100,32 @@ class KnowsTheTruth:
     def __init__(self, model: str = "M2") -> None:
         self.model = get_model(model)
 
+    def parameters(self):
+        return iter(())
+
     def coefficients(self, elevation: torch.Tensor) -> torch.Tensor:
         a = A + 0.02 * torch.tanh(elevation.double() / 12)
         return torch.stack([a, torch.full_like(a, B), torch.full_like(a, C)], dim=1).float()
+
+
+def write_pairs(path, scene: Scene, units: str = "1"):
+    """The scene as a pairs.h5."""
+    from schemas import PAIRS, ArtefactWriter
+
+    count, height, width = scene.images.shape
+    sizes = {"pair": count, "y": height, "x": width, "enu": 3, "frame": len(scene.frame_names)}
+    places = {"gsd_m": GSD, "body_radius_m": RADIUS}
+    with ArtefactWriter(path, PAIRS, sizes, attributes=places, seed=0) as out:
+        out.write("elevation", np.where(scene.mask, scene.elevation, np.nan))
+        out.write("image", scene.images, unit=units)
+        out.write("valid", scene.mask)
+        out.write("sun_direction_enu", scene.sun)
+        out.write("camera_position_enu", scene.camera)
+        for name in ("longitude_deg", "latitude_deg", "row", "col"):
+            out.write(name, np.arange(count))
+        out.write("image_index", scene.frame)
+        out.write("site", np.arange(count))
+        out.write("tile", scene.tile)
+        out.write("split", scene.split)
+        out.write("image_id", scene.frame_names)
+    return path

@@ -102,7 +102,7 @@ def test_nonlinear_fit_finds_planted_hapke_parameters(scene):
     batch.image = Renderer("planted", model, constant(planted)).radiance_factor(batch)
     from stages.evaluate.core import sample_pixels
 
-    sample = sample_pixels(batch, 500, np.random.default_rng(0))
+    sample = sample_pixels(batch, 100, np.random.default_rng(0))
     found = fit.fit_nonlinear(model, sample, 4, calibrated=True)
     batch.memo.clear()
     refit = Renderer("refit", model, constant(found)).radiance_factor(batch)

@@ -182,21 +182,29 @@ def fit_renderers(
         for renderer in late:
             _calibrate(renderer, again[renderer.name], np.ones(1))
 
-    rows = [Row("learned", network), Row("learned_gain_offset", network, "gain_offset")]
+    renderers = {"learned": network, "global": everywhere, "lunar_lambert": baseline, "hapke": raw}
     if extensions:
-        rows += [
-            Row("learned_extended", extended),
-            Row("learned_extended_gain_offset", extended, "gain_offset"),
-            Row("global_extended", late[0]),
-        ]
+        renderers |= {"learned_extended": extended, "global_extended": late[0]}
+    return [Row(name, renderers[source], how) for name, source, how in layout(bool(extensions))]
+
+
+def layout(extended: bool) -> list[tuple[str, str, str | None]]:
+    """The rows of the table: (name, renderer, matching per crop)."""
+    more: list[tuple[str, str, str | None]] = [
+        ("learned_extended", "learned_extended", None),
+        ("learned_extended_gain_offset", "learned_extended", "gain_offset"),
+        ("global_extended", "global_extended", None),
+    ]
     return [
-        *rows,
-        Row("global", everywhere),
-        Row("lunar_lambert", baseline),
-        Row("hapke_raw", raw),
-        Row("hapke_minmax", raw, "minmax"),
-        Row("hapke_gain", raw, "gain"),
-        Row("hapke_gain_offset", raw, "gain_offset"),
+        ("learned", "learned", None),
+        ("learned_gain_offset", "learned", "gain_offset"),
+        *(more if extended else []),
+        ("global", "global", None),
+        ("lunar_lambert", "lunar_lambert", None),
+        ("hapke_raw", "hapke", None),
+        ("hapke_minmax", "hapke", "minmax"),
+        ("hapke_gain", "hapke", "gain"),
+        ("hapke_gain_offset", "hapke", "gain_offset"),
     ]
 
 

@@ -64,7 +64,7 @@ def training_curves(checkpoint: Path) -> Any:
 
     with open_artefact(checkpoint, CHECKPOINT) as file:
         train, validation = file["train_loss"][...], file["validation_loss"][...]
-        best, model = int(file.attrs["best_epoch"]), file.attrs["model"]
+        best, model = int(file.attrs["best_epoch"]) + 1, file.attrs["model"]
     epochs = np.arange(1, len(train) + 1)
     figure, axes = plt.subplots(figsize=(6, 3.6))
     axes.plot(epochs, train, color="#8a8f98", label="training")
@@ -110,9 +110,7 @@ def crop_figure(batch: Batch, rows: list[Row], scores: Scores, position: int, la
     spread = float(np.nanpercentile(np.abs(learned), 99)) or 1e-6
     columns = len(rows) + 1
     figure, axes = plt.subplots(2, columns, figsize=(1.75 * columns + 0.6, 4.4), layout="constrained")
-    greys, differences = plt.get_cmap("gray").copy(), plt.get_cmap("RdBu_r").copy()
-    for colours in (greys, differences):
-        colours.set_bad("#d9c9a3")
+    greys, differences = (plt.get_cmap(name).with_extremes(bad="#d9c9a3") for name in ("gray", "RdBu_r"))
     picture = axes[0, 0].imshow(measured, cmap=greys, vmin=low, vmax=high)
     axes[0, 0].set_title("measured", fontsize=8)
     axes[1, 0].imshow(np.where(usable, batch.observation.elevation[0].numpy(), np.nan), cmap="cividis")

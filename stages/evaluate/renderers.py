@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -34,6 +34,7 @@ class Predictor(Protocol):
     model: ReflectanceModel
 
     def coefficients(self, elevation: Tensor) -> Tensor: ...
+    def parameters(self) -> Iterator[Tensor]: ...
 
 
 @dataclass
@@ -126,11 +127,13 @@ def constant(values: np.ndarray) -> Callable[[Batch], Tensor]:
 
 def learned(predictor: Predictor) -> Callable[[Batch], Tensor]:
     """The network's coefficients from the crop's elevation; computed once per batch."""
+    device = next((p.device for p in predictor.parameters()), torch.device("cpu"))
 
     def coefficients(batch: Batch) -> Tensor:
         if "coefficients" not in batch.memo:
             with torch.no_grad():
-                batch.memo["coefficients"] = predictor.coefficients(batch.observation.elevation).float().cpu()
+                elevation = batch.observation.elevation.to(device)
+                batch.memo["coefficients"] = predictor.coefficients(elevation).float().cpu()
         return batch.memo["coefficients"]
 
     return coefficients

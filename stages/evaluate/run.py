@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -11,13 +10,27 @@ from typing import Any
 
 import numpy as np
 
-from schemas import EVALUATION, PAIRS, SPLITS, ArtefactWriter, atomic_path, check_output, open_artefact, read_strings
-from schemas.errors import ArtefactError, ConfigError
+from schemas import (
+    CHECKPOINT,
+    EVALUATION,
+    SPLITS,
+    ArtefactError,
+    ArtefactWriter,
+    ConfigError,
+    atomic_path,
+    check_output,
+    open_artefact,
+    read_config,
+)
+from stages.effects import load_extension
 from stages.evaluate.bootstrap import TileBootstrap
-from stages.evaluate.core import Row, choose_fit_pairs, fit_renderers, score
+from stages.evaluate.core import Row, choose_fit_pairs, fit_renderers, layout, score
 from stages.evaluate.perceptual import Perceptual
 from stages.evaluate.renderers import Predictor, Reader, read_batch
 from stages.evaluate.table import gain_table, metric_table
+from stages.network.dataset import PairReader
+from stages.network.predictor import Predictor as Network
+from stages.network.predictor import choose_device, load_predictor
 from stages.physics.formation import Extension
 from stages.physics.radiometry import full_scale
 
@@ -55,54 +68,58 @@ def run(
     Writes ``output`` (evaluation artefact), the JSON beside it (and at ``json_file``), and figures where asked.
     Raises ConfigError or ArtefactError before anything is written.
     """
-    from stages.network.dataset import PairReader
-    from stages.network.predictor import load_predictor
-
     inputs = [pairs, checkpoint, *([extend] if extend else [])]
     reports = [output.with_suffix(".json"), *([json_file] if json_file else [])]
     check_output(output, inputs, overwrite)
     for report in reports:
         check_output(report, [*inputs, output], overwrite)
-    wanted, frame_names, units = select(pairs, config)
-    predictor = load_predictor(checkpoint, config.device)
-    extensions: Sequence[Extension] = ()
-    if extend is not None:
-        from stages.effects import load_extension
-
-        extensions = load_extension(extend)
-    if units == "iof" and predictor.image_units == "dn":
-        raise ArtefactError(
-            f"{checkpoint}: expected a checkpoint trained on I/F images as in {pairs.name}, found one trained on DN, "
-            "whose brightness scale is arbitrary; train on these pairs."
-        )
-    reader = PairReader(pairs)
-    with contextlib.closing(reader) if hasattr(reader, "close") else contextlib.nullcontext():
+    _check(config)
+    device = choose_device(config.device)
+    with PairReader(pairs) as reader:
+        wanted = select(reader, config.split)
+        predictor = load_predictor(checkpoint, device)
+        if reader.units == "iof" and predictor.image_units == "dn":
+            raise ArtefactError(
+                f"{checkpoint}: expected a checkpoint trained on I/F images as in {pairs.name}, found one trained on "
+                "DN, whose brightness scale is arbitrary; train on these pairs."
+            )
+        extensions = load_extension(extend, reader.image_ids) if extend else []
+        notes = _notes(checkpoint, predictor.gsd, reader.gsd, extend)
         return _evaluate(
-            reader, predictor, extensions, wanted, frame_names, units, config, inputs, output, reports, figures,
-            checkpoint, overwrite, progress,
-        )  # fmt: skip
-
-
-def select(pairs: Path, config: Config) -> tuple[np.ndarray, list[str], str]:
-    """Indices of the split's pairs, names of the frames and units of the images. Raises ConfigError, ArtefactError."""
-    names = dict(SPLITS)
-    if config.split not in names:
-        raise ConfigError(f"--split: expected one of {', '.join(names)}, found '{config.split}'.")
-    if config.batch < 1 or config.bootstrap < 0 or config.fit_pairs < 0:
-        raise ConfigError("--batch, --bootstrap and --fit-pairs: expected positive whole numbers; see --help.")
-    with open_artefact(pairs, PAIRS) as file:
-        split = file["split"][...]
-        unit = file["image"].attrs.get("units", "1")
-        frame_names = read_strings(file, "image_id")
-    wanted = np.flatnonzero(split == names[config.split])
-    counts = ", ".join(f"{n} {int((split == value).sum())}" for n, value in SPLITS)
-    if not len(wanted):
-        raise ArtefactError(f"{pairs}:/split: expected pairs of '{config.split}', found none ({counts}); sample more.")
-    if not (split == 0).any():
-        raise ArtefactError(
-            f"{pairs}:/split: expected train pairs to fit the baselines on, found none ({counts}); sample again."
+            reader, predictor, extensions, wanted, config, notes, inputs, output, reports, figures, overwrite, progress
         )
-    return wanted, frame_names, "dn" if (unit.decode() if isinstance(unit, bytes) else unit) == "dn" else "iof"
+
+
+def _check(config: Config) -> None:
+    if config.split not in dict(SPLITS):
+        raise ConfigError(f"--split: expected one of {', '.join(dict(SPLITS))}, found '{config.split}'.")
+    if config.batch < 1 or config.bootstrap < 0 or config.fit_pairs < 0:
+        raise ConfigError(
+            "--batch, --bootstrap, --fit-pairs: expected at least 1, 0 and 0, "
+            f"found {config.batch}, {config.bootstrap} and {config.fit_pairs}."
+        )
+
+
+def select(reader: PairReader, split: str) -> np.ndarray:
+    """Indices of the split's pairs. Raises ArtefactError where there are none, or none to fit the baselines on."""
+    counts = ", ".join(f"{name} {int((reader.split == value).sum())}" for name, value in SPLITS)
+    for part, purpose in ((split, "to evaluate"), ("train", "to fit the baselines on")):
+        if not len(reader.indices(part)):
+            raise ArtefactError(
+                f"{reader.path}:/split: expected '{part}' pairs {purpose}, found none ({counts}); sample more crops."
+            )
+    return reader.indices(split)
+
+
+def _notes(checkpoint: Path, trained_gsd: float, gsd: float, extend: Path | None) -> list[str]:
+    notes = []
+    if abs(trained_gsd / gsd - 1) > 0.01:
+        notes.append(f"the checkpoint was trained at {trained_gsd:g} m per pixel, these pairs have {gsd:g} m")
+    with open_artefact(checkpoint, CHECKPOINT) as file:
+        trained_with = read_config(file).get("extend")
+    if trained_with and extend is None:
+        notes.append(f"the checkpoint was trained with the effects of '{Path(trained_with).name}': add --extend")
+    return notes
 
 
 def evaluate_pairs(
@@ -189,23 +206,21 @@ def _warnings(bootstrap: TileBootstrap, frames: np.ndarray, orphans: np.ndarray)
 
 
 def _evaluate(
-    reader: Reader,
-    predictor: Any,
+    reader: PairReader,
+    predictor: Network,
     extensions: Sequence[Extension],
     wanted: np.ndarray,
-    frame_names: list[str],
-    units: str,
     config: Config,
+    notes: list[str],
     inputs: list[Path],
     output: Path,
     reports: list[Path],
     figures: Path | None,
-    checkpoint: Path,
     overwrite: bool,
     progress: Callable[[int, int, str], None] | None,
 ) -> dict[str, Any]:
-    height, width = np.asarray(reader.valid([int(wanted[0])])).shape[-2:]
-    names = 9 + (3 if extensions else 0)
+    height, width = reader.size
+    names = len(layout(bool(extensions)))
     size = names * len(wanted) * height * width * 4
     renderings = size <= RENDERINGS_LIMIT if config.renderings is None else config.renderings
     sizes = {"model": names, "pair": len(wanted), "y": height, "x": width}
@@ -223,9 +238,11 @@ def _evaluate(
                     rendered[k, position : position + len(crops)] = image
 
         result, rows, scores, scale = evaluate_pairs(
-            reader, predictor, wanted, frame_names, units, config, extensions=extensions, keep=keep, progress=progress
+            reader, predictor, wanted, reader.image_ids, reader.units, config,
+            extensions=extensions, keep=keep, progress=progress,
         )  # fmt: skip
         result |= {"pairs_file": inputs[0].name, "checkpoint": inputs[1].name, "config": settings}
+        result["warnings"] = notes + result["warnings"]
         artefact.write("model_name", scores.names)
         artefact.write("pair_index", wanted)
         artefact.write("tile", np.asarray(reader.tile)[wanted])
@@ -240,5 +257,5 @@ def _evaluate(
     if figures is not None:
         from stages.evaluate.figures import write_figures
 
-        write_figures(figures, reader, rows, wanted, scores, scale, result, checkpoint)
+        write_figures(figures, reader, rows, wanted, scores, scale, result, inputs[1])
     return result

@@ -1,0 +1,124 @@
+"""`lunargr evaluate` from files to files, with a network trained for a moment."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from evaluation_scene import make_scene, write_pairs
+
+from lunargr_cli.main import main
+from schemas import EVALUATION, open_artefact
+from stages import train
+
+WIDTHS = (4, 8, 8)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder with pairs.h5 and checkpoint.h5, and the same on film (pairs_dn.h5, checkpoint_dn.h5)."""
+    folder = tmp_path_factory.mktemp("evaluate")
+    rng = np.random.default_rng(11)
+    scene = make_scene(rng)
+    scene.split[::7] = 1
+    write_pairs(folder / "pairs.h5", scene)
+    scene.images = np.float32([600, 900, 800, 700])[scene.frame][:, None, None] * scene.images + 12
+    write_pairs(folder / "pairs_dn.h5", scene, "dn")
+    config = train.Config(epochs=3, batch=8, widths=WIDTHS, dropout=(0.0,) * 3, device="cpu", precision="fp32")
+    for suffix in ("", "_dn"):
+        train.run(folder / f"pairs{suffix}.h5", folder / f"checkpoint{suffix}.h5", config)
+    return folder
+
+
+def run(monkeypatch, *arguments):
+    """Exit code of the command line."""
+    monkeypatch.setattr("sys.argv", ["lunargr", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    return int(stop.value.code or 0)
+
+
+@pytest.mark.parametrize("suffix", ["", "_dn"])
+def test_evaluate_writes_table_json_artefact_and_figures(trained, tmp_path, monkeypatch, capsys, suffix):
+    output, copy = tmp_path / "evaluation.h5", tmp_path / "copy.json"
+    files = (trained / f"pairs{suffix}.h5", trained / f"checkpoint{suffix}.h5")
+    options = ("-o", output, "--json", copy, "--figures", tmp_path / "figures", "--device", "cpu")
+    assert run(monkeypatch, "evaluate", *files, *options) == 0
+    result = json.loads(copy.read_text())
+    assert result == json.loads((tmp_path / "evaluation.json").read_text())
+    assert result["split"] == "test"
+    keys = {"mse", "mse_low", "mse_high", "mse_crop_sum", "psnr", "psnr_crop_range", "ssim", "lpips"}
+    for name in ("learned", "global", "lunar_lambert", "hapke_raw", "hapke_minmax", "hapke_gain", "hapke_gain_offset"):
+        assert keys <= set(result["models"][name])
+        assert name in capsys.readouterr().out or name != "learned"
+    assert result["models"]["learned"]["lpips"] is None and result["lpips_unavailable"]
+    with open_artefact(output, EVALUATION) as file:
+        names = [n.decode() for n in file["model_name"][...]]
+        measured, rendered = file["measured"][...], file["rendered"][names.index("learned")]
+        mse, pixels = file["mse"][names.index("learned")], file["valid_pixels"][...]
+    errors = np.nanmean((measured.astype(float) - rendered) ** 2, axis=(1, 2))
+    assert mse == pytest.approx(errors, rel=1e-4)
+    assert result["models"]["learned"]["mse"] == pytest.approx((errors * pixels).sum() / pixels.sum(), rel=1e-4)
+    for name in ("training_curves", "errors", "crop_best", "crop_median", "crop_worst"):
+        picture = cv2.imread(str(tmp_path / "figures" / f"{name}.png"))
+        assert picture.std() > 5, name
+
+
+def test_results_do_not_hang_on_the_batch_size(trained, tmp_path, monkeypatch):
+    found = []
+    for batch in (1, 16):
+        files = (trained / "pairs.h5", trained / "checkpoint.h5", "-o", tmp_path / f"{batch}.h5")
+        assert run(monkeypatch, "evaluate", *files, "--batch", batch, "--device", "cpu", "-q") == 0
+        found.append(json.loads((tmp_path / f"{batch}.json").read_text())["models"])
+    for name, row in found[0].items():
+        assert row["mse"] == pytest.approx(found[1][name]["mse"], rel=1e-5)
+
+
+def _spoil(trained, tmp_path, case):
+    pairs, checkpoint, options = trained / "pairs.h5", trained / "checkpoint.h5", ["-o", tmp_path / "out.h5"]
+    if case == "a missing file":
+        pairs = tmp_path / "absent.h5"
+    elif case == "a checkpoint in place of pairs":
+        pairs = checkpoint
+    elif case == "a truncated checkpoint":
+        (tmp_path / "short.h5").write_bytes(checkpoint.read_bytes()[:9000])
+        checkpoint = tmp_path / "short.h5"
+    elif case == "a checkpoint on DN":
+        checkpoint = trained / "checkpoint_dn.h5"
+    elif case == "an unknown split":
+        options += ["--split", "tests"]
+    elif case == "a split without pairs":
+        pairs = tmp_path / "pairs.h5"
+        pairs.write_bytes((trained / "pairs.h5").read_bytes())
+        with h5py.File(pairs, "a") as file:
+            file["split"][...] = 0
+    elif case == "an existing output":
+        (tmp_path / "out.h5").write_text("mine")
+    elif case == "the input as output":
+        options = ["-o", pairs, "--overwrite"]
+    return "evaluate", pairs, checkpoint, *options, "--device", "cpu"
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        "a missing file",
+        "a checkpoint in place of pairs",
+        "a truncated checkpoint",
+        "a checkpoint on DN",
+        "an unknown split",
+        "a split without pairs",
+        "an existing output",
+        "the input as output",
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(trained, tmp_path, monkeypatch, capsys, case):
+    arguments = _spoil(trained, tmp_path, case)
+    before = {p: p.stat().st_size for p in (*tmp_path.iterdir(), *trained.iterdir())}
+    assert run(monkeypatch, *arguments) == 3
+    message = capsys.readouterr().err.strip()
+    assert message.startswith("lunargr: ") and "\n" not in message
+    assert {p: p.stat().st_size for p in (*tmp_path.iterdir(), *trained.iterdir())} == before
