@@ -11,14 +11,17 @@ import pkgutil
 from pathlib import Path
 
 from stages.physics.cameras.base import Camera, camera_from_document, camera_kinds, read_document, register
+from stages.physics.cameras.isis_cube import cube_document, is_cube
 
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
 
 
 def open_camera(path: str | Path) -> Camera:
-    """The camera in a file: our JSON or an ALE/CSM ISD. Raises LunargrError."""
+    """The camera in a file: our JSON, an ALE/CSM ISD, or an LROC NAC cube with SPICE attached. Raises LunargrError."""
     path = Path(path)
+    if path.is_file() and is_cube(path):
+        return camera_from_document(cube_document(path), str(path))
     return camera_from_document(read_document(path), str(path))
 
 

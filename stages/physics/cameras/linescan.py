@@ -158,7 +158,7 @@ class LineScan(Camera):
         by_vector = self.detector.place_derivatives(camera)
         by_pose = by_vector @ np.concatenate([-np.swapaxes(rotation, -1, -2), cross_matrix(camera)], axis=-1)
         # As time passes the point crosses the detector; a pose changes the line until it is back on it.
-        step = 0.5
+        step = 0.02
         ahead, behind = (
             self.detector.places(_into(self.rotations(t), points - self.positions.at(t)))
             for t in (self.times(at + step), self.times(at - step))
@@ -228,7 +228,7 @@ class _Search:
             for t in (middle - half, middle + half)
         ]
         slope = float(rows[1] - rows[0]) / (2 * half)
-        if not math.isfinite(slope) or slope == 0:
+        if not abs(slope) * 2 * half > 1e-6:  # detector px per line
             raise GeometryError(
                 f"{where}: expected a camera that moves over the ground, found none; check its tables of position and "
                 "pointing."
@@ -320,9 +320,12 @@ def _find(
     n = points.shape[0]
     last = coarse.shape[0] - 1
     first_time, last_time = start, start + last * step
+    tolerance = 1e-5 * abs(slope * line_rates[0])  # of a line
     for chunk in numba.prange((n + CHUNK - 1) // CHUNK):
         place, turn = np.empty(3), np.empty(4)
-        correction = 0.0  # what the guess was off by for the point before: neighbours are alike
+        # Neighbours are alike: what the guess was off by for the point before, how fast that one crossed the line, and
+        # how far it went sideways meanwhile.
+        correction, gradient, sideways = 0.0, slope, 0.0
         for i in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             px, py, pz = points[i, 0], points[i, 1], points[i, 2]
             out_line[i] = math.nan
@@ -332,10 +335,8 @@ def _find(
                 correction = 0.0
                 continue
             time = min(max(affine + correction, first_time), last_time)
-            gradient = slope
             before_time, before_row, before_column = math.nan, math.nan, math.nan
             row, column = math.nan, math.nan
-            sideways = 0.0  # columns per row as time passes
             good = False
             for _ in range(40):
                 x = (time - start) / step
@@ -355,11 +356,10 @@ def _find(
                     break
                 if before_time == before_time and time != before_time:
                     secant = (row - before_row) / (time - before_time)
-                    if secant * slope > 0:
+                    if abs(before_row) > tolerance and secant * slope > 0:
                         gradient = secant
-                        if row != before_row:
-                            sideways = (column - before_column) / (row - before_row)
-                if abs(row) < 1e-5:
+                        sideways = (column - before_column) / (row - before_row)
+                if abs(row) < tolerance:
                     good = True
                     break
                 before_time, before_row, before_column = time, row, column
@@ -368,7 +368,7 @@ def _find(
                 if time == before_time:  # held at the end of the table: the image never looks there
                     break
             if not good:
-                correction = 0.0
+                correction, gradient = 0.0, slope
                 continue
             for _ in range(8):
                 lagrange(positions, position_start, position_step, time, place)
@@ -385,11 +385,11 @@ def _find(
                 row, column = _detector_place(cx, cy, cz, focal, sense, to_line, to_sample, model, coefficients)
                 row += line_offset
                 time -= row / gradient
-                if not abs(row) > 1e-4:
+                if not abs(row) > tolerance:
                     break
-            if abs(row) <= 1e-4:
+            if abs(row) <= tolerance:
                 correction = time - affine
                 out_line[i] = _line_of_time(time, line_starts, line_times, line_rates)
                 out_sample[i] = (column - sideways * row + sample_offset) / sample_summing
             else:
-                correction = 0.0
+                correction, gradient = 0.0, slope

@@ -1,0 +1,334 @@
+"""ISD cameras against USGSCSM's own numbers and an LROC NAC frame that ISIS went over."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+
+from schemas.errors import GeometryError, InputError, LunargrError, RegistryError
+from stages.physics import photometry
+from stages.physics.cameras import camera_from_document, distortion, open_camera
+
+LINE_SCAN = {
+    "tough": ("usgscsm_toughLroNacLineScan.isd.json", "usgscsm_lro_nac_tough_image_ground.csv"),
+    "M103595705LE": ("ale_lrolroc_M103595705LE.isd.json", "usgscsm_lro_nac_M103595705LE_image_ground.csv"),
+}
+
+
+@pytest.fixture(scope="module", params=LINE_SCAN)
+def nac(request, shared):
+    isd, table = LINE_SCAN[request.param]
+    return open_camera(shared / "oracles" / isd), np.genfromtxt(shared / "oracles" / table, delimiter=",", names=True)
+
+
+def columns(table, *names):
+    return np.stack([table[n] for n in names], axis=-1)
+
+
+def test_image_to_ground_agrees_with_usgscsm(nac):
+    camera, table = nac
+    ground = camera.image_to_ground(table["line"], table["samp"], table["height_m"])
+    error = np.linalg.norm(ground - columns(table, "X_m", "Y_m", "Z_m"), axis=-1)
+    assert error.max() < 5e-3
+
+
+def test_ground_to_image_agrees_with_usgscsm(nac):
+    camera, table = nac
+    line, sample = camera.ground_to_image(columns(table, "X_m", "Y_m", "Z_m"))
+    np.testing.assert_allclose(line, table["g2i_line"], atol=1e-3)
+    np.testing.assert_allclose(sample, table["g2i_samp"], atol=1e-3)
+
+
+def test_time_position_and_sun_agree_with_usgscsm(nac):
+    camera, table = nac
+    np.testing.assert_allclose(camera.times(table["line"]), table["time_s"], atol=1e-9)
+    np.testing.assert_allclose(
+        camera.position(table["line"]), columns(table, "sensor_X_m", "sensor_Y_m", "sensor_Z_m"), atol=5e-3
+    )
+    to_ground = columns(table, "X_m", "Y_m", "Z_m") - camera.sun_position(table["line"])
+    to_ground /= np.linalg.norm(to_ground, axis=-1, keepdims=True)
+    expected = columns(table, "sun_to_ground_x", "sun_to_ground_y", "sun_to_ground_z")
+    np.testing.assert_allclose(to_ground, expected, atol=1e-8)
+
+
+def test_round_trip_is_exact(nac, rng):
+    camera, _ = nac
+    line, sample = rng.uniform(0, camera.lines, 20000), rng.uniform(0, camera.samples, 20000)
+    back = camera.ground_to_image(camera.image_to_ground(line, sample, rng.uniform(-4000, 4000, 20000)))
+    np.testing.assert_allclose(back[0], line, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(back[1], sample, rtol=0, atol=1e-6)
+
+
+def test_pose_derivatives_match_differences(nac, rng):
+    camera, _ = nac
+    points = camera.image_to_ground(rng.uniform(0.1, 0.9, 12) * camera.lines, rng.uniform(0, camera.samples, 12), 500.0)
+    analytic = camera.pose_derivatives(points)
+    for k, step in enumerate([1e-2] * 3 + [1e-7] * 3):
+        pose = np.zeros(6)
+        pose[k] = step
+        ahead, behind = camera.moved(pose).ground_to_image(points), camera.moved(-pose).ground_to_image(points)
+        numeric = np.stack([(ahead[i] - behind[i]) / (2 * step) for i in (0, 1)], axis=-1)
+        np.testing.assert_allclose(analytic[..., k], numeric, rtol=2e-4, atol=2e-5 * np.abs(analytic[..., k]).max())
+
+
+def test_no_line_looks_at_other_places(nac):
+    camera, _ = nac
+    far = camera.image_to_ground(camera.lines / 2, camera.samples / 2) * -1.0
+    line, sample = camera.ground_to_image(np.stack([far, np.full(3, np.nan)]))
+    assert not camera.inside(line, sample).any()
+
+
+def test_both_scan_directions_are_the_same_camera_upside_down(shared, rng):
+    """Lines counted against time (a negative line time) must see what the forward camera sees in the mirrored line."""
+    document = json.loads((shared / "oracles/ale_lrolroc_M103595705LE.isd.json").read_text())
+    forward = camera_from_document(document, "forward")
+    first, start, rate = document["line_scan_rate"][0]
+    document["line_scan_rate"] = [[first, start + document["image_lines"] * rate, -rate]]
+    backward = camera_from_document(document, "backward")
+    line, sample = rng.uniform(0, 400, 500), rng.uniform(0, 5064, 500)
+    points = forward.image_to_ground(line, sample, 100.0)
+    np.testing.assert_allclose(backward.image_to_ground(400 - line, sample, 100.0), points, atol=1e-6)
+    back = backward.ground_to_image(points)
+    np.testing.assert_allclose(back, [400 - line, sample], atol=1e-6)
+
+
+def test_line_times_may_change_within_the_image(shared, rng):
+    document = json.loads((shared / "oracles/ale_lrolroc_M103595705LE.isd.json").read_text())
+    first, start, rate = document["line_scan_rate"][0]
+    plain = camera_from_document(document, "plain")
+    document["line_scan_rate"] = [[first, start, rate], [first + 100, start + 100 * rate, rate / 2]]
+    camera = camera_from_document(document, "two rates")
+    line, sample = rng.uniform(100, 400, 200), rng.uniform(0, 5064, 200)
+    points = camera.image_to_ground(line, sample)
+    np.testing.assert_allclose(points, plain.image_to_ground(100 + (line - 100) / 2, sample), atol=1e-6)
+    np.testing.assert_allclose(camera.ground_to_image(points), [line, sample], atol=1e-6)
+
+
+# --- USGSCSM's unit tests -------------------------------------------------------------------------------------------
+
+
+def unit_tests(shared):
+    with (shared / "oracles/usgscsm_unit_test_expected.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def expected_ground(shared, name):
+    rows = [r for r in unit_tests(shared) if r["test"] == name]
+    assert len(rows) == 3
+    return [float(r["expected"]) for r in rows], float(rows[0]["tolerance"])
+
+
+def test_nac_distortion_is_usgscsms(shared):
+    rows = {
+        (r["test"].split()[-1], r["quantity"]): float(r["expected"]) for r in unit_tests(shared) if "Nac" in r["test"]
+    }
+    k = np.array([1.81e-5])
+    ux, uy = distortion.undistort_arrays(distortion.LRO_NAC, k, np.array(0.0), np.array(17.724))
+    assert ux == rows["removeDistortion", "ux"]
+    assert uy == pytest.approx(rows["removeDistortion", "uy"], abs=1e-8)
+    _, dy = distortion.distort_arrays(distortion.LRO_NAC, k, np.array(0.0), np.array(17.6237922244))
+    assert dy == pytest.approx(rows["applyDistortion", "dy"], abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("name", "isd", "line", "sample", "focal_length"),
+    [
+        ("ConstVelocityLineScan.Center", "constVelocityLineScan", 8, 8, None),
+        ("ConstVelocityLineScan.OffBody", "constVelocityLineScan", 0, 4, None),
+        ("OrbitalLineScan.Center", "orbitalLineScan", 8.5, 8, None),
+        ("Frame.Center", "simpleFramerISD", 7.5, 7.5, None),
+        ("Frame.SlightlyOffCenter", "simpleFramerISD", 7.5, 6.5, None),
+        ("Frame.OffBody1", "simpleFramerISD", 15, 0, None),
+        ("Frame.OffBody2", "simpleFramerISD", 0, 15, None),
+        ("Frame.OffBody3", "simpleFramerISD", 0, 0, None),
+        ("Frame.OffBody4", "simpleFramerISD", 15, 15, None),
+        ("OrbitalFrame.Center", "orbitalFramer", 8, 8, None),
+        ("FrameState.FL500_OffBody4", "simpleFramerISD", 15, 15, 500),
+        ("FrameState.FL500_OffBody3", "simpleFramerISD", 0, 0, 500),
+    ],
+)
+def test_usgscsm_unit_tests(shared, name, isd, line, sample, focal_length):
+    document = json.loads((shared / f"oracles/usgscsm_{isd}.isd.json").read_text())
+    if focal_length is not None:
+        document["focal_length_model"]["focal_length"] = focal_length
+    camera = camera_from_document(document, isd)
+    expected, tolerance = expected_ground(shared, name)
+    ground = camera.image_to_ground(line, sample, missing="nearest")
+    np.testing.assert_allclose(ground, expected, rtol=0, atol=max(tolerance, 1e-8))
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        (distortion.RADIAL, [1e-3, 2e-5, -3e-9]),
+        (
+            distortion.TRANSVERSE,
+            [0.01, 1, 1e-3, 1e-5, 2e-5, 0, 1e-7, 0, 0, 2e-7, -0.02, 0, 1, 0, 1e-5, 0, 0, 0, 1e-7, 0],
+        ),
+        (distortion.LRO_NAC, [1.81e-5]),
+        (distortion.DAWN_FC, [8.4e-6]),
+        (distortion.KAGUYA_LISM, [0.01, -9.6e-4, 1e-4, 2e-6, 1e-8, -0.02, 1e-3, 2e-5, 3e-7, 0]),
+        (distortion.NONE, [0.0]),
+    ],
+)
+def test_distortion_comes_back(model, coefficients, rng):
+    k = np.array(coefficients, float)
+    x, y = rng.uniform(-18, 18, (2, 200))
+    back = distortion.undistort_arrays(model, k, *distortion.distort_arrays(model, k, x, y))
+    np.testing.assert_allclose(back, [x, y], atol=1e-11)
+
+
+# --- the NAC frame that ISIS went over ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def crop(shared):
+    camera = open_camera(shared / "data/formats/M143947267L.cal.echo.crop.cub")
+    expected = json.loads((shared / "oracles/nac_M143947267LE_crop_geometry_and_expected.json").read_text())
+    return camera, expected, np.load(shared / "oracles/nac_M143947267LE_crop_iof_400x400.npy")
+
+
+def crop_geometry(camera):
+    line, sample = 299.5, 300.5  # ISIS line 300, and the sample of index 300
+    point = camera.image_to_ground(line, sample)
+    up = point / np.linalg.norm(point)
+    to_sun = camera.sun_position(line) - point
+    to_camera = camera.position(line) - point
+    to_sun, distance = to_sun / np.linalg.norm(to_sun), np.linalg.norm(to_camera)
+    to_camera = to_camera / distance
+    angles = np.arccos([up @ to_sun, up @ to_camera, to_sun @ to_camera])
+    return point, angles, distance
+
+
+def test_the_nac_cubes_own_tables_make_its_camera(crop):
+    camera, expected, _ = crop
+    truth = expected["independent_check"]["geometry"]
+    point, angles, distance = crop_geometry(camera)
+    assert math.degrees(math.asin(point[2] / np.linalg.norm(point))) == pytest.approx(truth["lat"], abs=1e-6)
+    assert math.degrees(math.atan2(point[1], point[0])) == pytest.approx(truth["lon"], abs=1e-6)
+    np.testing.assert_allclose(np.degrees(angles), [truth["inc"], truth["ema"], truth["phase"]], atol=1e-5)
+    assert distance / 1000 == pytest.approx(truth["range"], abs=1e-5)
+    assert camera.ephemeris_time(299.5) == pytest.approx(truth["et"], abs=1e-6)
+
+
+@pytest.mark.parametrize(("number", "model"), [(0, "lroc_empirical_2019"), (1, "lroc_empirical_2014")])
+def test_isis_photometric_correction_of_the_crop(crop, number, model):
+    """ISIS lronacpho: the pixel, normalised to incidence 30, emission 0, phase 30 deg."""
+    camera, expected, image = crop
+    truth = expected["expected"][number]
+    assert f"{model[-4:]}" in truth["algorithm"]
+    _, (incidence, emission, phase), _ = crop_geometry(camera)
+    standard = photometry.evaluate(model, {}, math.radians(30), 0.0, math.radians(30))
+    seen = photometry.evaluate(model, {}, incidence, emission, phase)
+    value = image[truth["pixel_line_1based"] - 1, truth["pixel_sample_0based_index"]] * standard / seen
+    assert value == pytest.approx(truth["value"], abs=truth["tol"])
+
+
+# --- what is refused ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def isd(shared):
+    return json.loads((shared / "oracles/ale_lrolroc_M103595705LE.isd.json").read_text())
+
+
+NEEDED = (
+    "image_lines",
+    "image_samples",
+    "center_ephemeris_time",
+    "line_scan_rate",
+    "focal_length_model.focal_length",
+    "focal2pixel_lines",
+    "detector_center.sample",
+    "detector_sample_summing",
+    "starting_detector_sample",
+    "optical_distortion",
+    "radii.semimajor",
+    "instrument_position.positions",
+    "instrument_pointing.quaternions",
+    "body_rotation.ephemeris_times",
+    "sun_position.positions",
+)
+
+
+@pytest.mark.parametrize("key", NEEDED)
+def test_a_missing_key_is_named(isd, key):
+    document = copy.deepcopy(isd)
+    *parents, last = key.split(".")
+    here = document
+    for parent in parents:
+        here = here[parent]
+    del here[last]
+    with pytest.raises(InputError, match=rf"nac.json: expected the key '{key}'") as caught:
+        camera_from_document(document, "nac.json")
+    assert "\n" not in str(caught.value)
+
+
+def broken(name):
+    def cut(d, table):
+        for key in ("ephemeris_times", "positions", "velocities", "quaternions", "angular_velocities"):
+            if key in d[table]:
+                d[table][key] = d[table][key][:200]
+
+    def edit(d):
+        if name == "quaternion":
+            d["instrument_pointing"]["quaternions"][7] = [0.5, 0.5, 0.5, 0.9]
+        elif name == "times":
+            d["line_scan_rate"] = [[0.5, 3.0, 0.001]]
+        elif name == "positions":
+            cut(d, "instrument_position")
+        elif name == "pointing":
+            cut(d, "instrument_pointing")
+        elif name == "lengths":
+            d["instrument_position"]["positions"] = d["instrument_position"]["positions"][:-1]
+        elif name == "order":
+            d["body_rotation"]["ephemeris_times"] = d["body_rotation"]["ephemeris_times"][::-1]
+        elif name == "rate":
+            d["line_scan_rate"] = [[0.5, -0.2, 0.0]]
+        elif name == "distortion":
+            d["optical_distortion"] = {"cahvor": {"coefficients": [0]}}
+        elif name == "model":
+            d["name_model"] = "USGS_ASTRO_SAR_SENSOR_MODEL"
+        elif name == "nan":
+            d["focal_length_model"]["focal_length"] = float("nan")
+        elif name == "still":
+            d["instrument_position"]["positions"] = [d["instrument_position"]["positions"][0]] * 401
+            d["instrument_position"].pop("velocities")
+            for table in ("instrument_pointing", "body_rotation"):
+                d[table]["quaternions"] = [d[table]["quaternions"][0]] * len(d[table]["quaternions"])
+        return d
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [
+        ("quaternion", GeometryError, r"'instrument_pointing.quaternions': expected unit quaternions.*number 8"),
+        ("times", InputError, "expected 'instrument_position' to cover the image's times"),
+        ("positions", InputError, "expected 'instrument_position' to cover the image's times"),
+        ("pointing", InputError, "expected 'instrument_pointing' to cover the image's times"),
+        ("lengths", InputError, "expected 401 entries in 'instrument_position.positions'"),
+        ("order", InputError, "expected rising times in 'body_rotation.ephemeris_times'"),
+        ("rate", InputError, "line times other than 0"),
+        ("distortion", RegistryError, "unknown distortion model 'cahvor'; choose one of: dawnfc"),
+        ("model", RegistryError, "unknown camera 'USGS_ASTRO_SAR_SENSOR_MODEL'"),
+        ("nan", InputError, "finite number in 'focal_length_model.focal_length'"),
+        ("still", GeometryError, "expected a camera that moves over the ground"),
+    ],
+)
+def test_broken_isds_are_refused_in_one_line(isd, name, error, message):
+    with pytest.raises(error, match=message) as caught:
+        camera_from_document(broken(name)(copy.deepcopy(isd)), "nac.json")
+    assert str(caught.value).startswith("nac.json") and "\n" not in str(caught.value)
+
+
+def test_cubes_without_a_camera_are_told(shared):
+    for name, message in (("ldem_4.cub", "found instrument 'LOLA'"), ("wac_backplanes.reduced.cub", "'WAC-VIS'")):
+        with pytest.raises(LunargrError, match=message):
+            open_camera(shared / "data/formats" / name)
