@@ -57,7 +57,7 @@ def run(
     start, end = get_convention(config.source), get_convention(config.target)
     model_difference(start, end)
     check_output(output, [source], overwrite)
-    losses: dict[str, None] = {}
+    losses: dict[str, str] = {}
     valid = 0
     with open_raster(source, "a GeoTIFF of coefficient maps") as data:
         indices = band_indices(data, start, config.bands)
@@ -85,13 +85,13 @@ def run(
                 for window in _strips(data, len(indices)):
                     maps = {name: read_window(data, window, band) for name, band in indices.items()}
                     result, lost = convert_maps(maps, start.name, end.name, config.approximate)
-                    losses.update(dict.fromkeys(lost))
+                    losses = {**lost, **losses}  # the first example of each
                     stack = np.stack([np.broadcast_to(v, maps[start.names[0]].shape) for v in result.values()])
                     valid += int(np.isfinite(stack).all(axis=0).sum())
                     target.write(stack.astype(np.float32), window=window)
                     if progress is not None:
                         progress(int(window.row_off + window.height), data.height, "convert")
-    return Report(end, list(losses), valid)
+    return Report(end, list(losses.values()), valid)
 
 
 def band_indices(data: DatasetReader, convention: Convention, names: Sequence[str] | None = None) -> dict[str, int]:

@@ -41,6 +41,8 @@ def command(
     report = convert.run(source, output, config, overwrite, console.progress)
     for loss in report.losses:
         console.say(f"lost: {loss}")
-    title = f"{output}: {report.target.name}, which gives {report.target.returns}; {report.valid_pixels} valid pixels"
+    console.say(
+        f"{output}: {report.target.name}, {report.valid_pixels} valid pixels; its formula gives {report.target.returns}"
+    )
     rows = [(k, name, unit) for k, (name, unit) in enumerate(report.target.quantities, start=1)]
-    console.table(title, ("band", "quantity", "unit"), rows)
+    console.table("bands", ("band", "quantity", "unit"), rows)

@@ -263,11 +263,14 @@ def get_convention(name: str) -> Convention:
         raise RegistryError.unknown("convention", name, [c.name for c in known.values()]) from None
 
 
-def convert_maps(maps: Maps, source: str, target: str, approximate: bool = False) -> tuple[dict[str, np.ndarray], list]:
+def convert_maps(
+    maps: Maps, source: str, target: str, approximate: bool = False
+) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Parameters written in one convention, in another.
 
     maps : name -> array or number, one for each quantity of ``source``; NaN stays NaN
-    returns the arrays by name in the order of ``target``, and what was lost, in words (empty unless ``approximate``)
+    returns the arrays by name in the order of ``target``, and what was lost: subject -> words (empty unless
+    ``approximate``)
     Raises ConfigError where the two describe different models, or where ``target`` cannot hold a value.
     """
     start, end = get_convention(source), get_convention(target)
@@ -281,23 +284,23 @@ def convert_maps(maps: Maps, source: str, target: str, approximate: bool = False
         for name, value in end.implied.items():
             wrong = np.isfinite(ours[name]) & ~np.isclose(ours[name], value, rtol=1e-6, atol=1e-9)
             if wrong.any():
-                losses.append(f"{name} = {float(ours[name][wrong].flat[0]):g} becomes {value:g}")
+                losses[name] = f"{name} = {float(ours[name][wrong].flat[0]):g} becomes {value:g}"
         if losses and not approximate:
             raise ConfigError(
-                f"{start.name} -> {end.name}: the target cannot hold all of the source: {'; '.join(losses)}; "
+                f"{start.name} -> {end.name}: the target cannot hold all of the source: {'; '.join(losses.values())}; "
                 "give --approximate to convert all the same."
             )
         result = end.from_ours(ours)
     return {name: result[name] for name in end.names}, losses
 
 
-def model_difference(start: Convention, end: Convention) -> list[str]:
-    """What changes between two conventions' models, in words; ConfigError if they cannot be converted at all."""
+def model_difference(start: Convention, end: Convention) -> dict[str, str]:
+    """What changes between two conventions' models: subject -> words; ConfigError if they cannot be converted at all."""
     if start.model == end.model:
-        return []
+        return {}
     pair = frozenset((start.model, end.model))
     if pair in RELATED:
-        return [f"{RELATED[pair]} changes from {start.model} to {end.model}"]
+        return {"model": f"{RELATED[pair]} changes from {start.model} to {end.model}"}
     reachable = [
         c.name for c in conventions() if c.model == start.model or frozenset((c.model, start.model)) in RELATED
     ]
