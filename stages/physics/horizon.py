@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError
-from stages.physics import sweeps
+from stages.physics.hulls import sweep_horizon
 from stages.physics.scene_horizon import Overview, horizon_in_scene, make_overview
+from stages.physics.shadow import sweep_shadow
 
 __all__ = ["Overview", "cast_shadow", "horizon", "horizon_in_scene", "make_overview"]
-
-SMALL = 512 * 512  # px; smaller grids are swept by the calling thread alone
 
 
 def _as_grid(elevation: ArrayLike, gsd: float, body_radius: float | None, **angles: float) -> NDArray[np.float32]:
@@ -45,8 +44,7 @@ def horizon(elevation: ArrayLike, gsd: float, azimuth: float, body_radius: float
     returns (H, W) float32, rad: -pi/2 where no terrain lies in that azimuth, NaN where the elevation is NaN
     """
     grid = _as_grid(elevation, gsd, body_radius, azimuth=azimuth)
-    slope = sweeps.horizon_slope(grid, gsd, azimuth, body_radius, parallel=grid.size > SMALL)
-    return np.arctan(slope, out=slope)
+    return sweep_horizon(grid, gsd, azimuth, body_radius)
 
 
 def cast_shadow(
@@ -63,4 +61,4 @@ def cast_shadow(
     grid = _as_grid(elevation, gsd, body_radius, azimuth=azimuth, sun_elevation=sun_elevation)
     if abs(sun_elevation) > math.pi / 2 + 1e-6:
         raise GeometryError(f"sun_elevation: expected radians between -pi/2 and pi/2, found {sun_elevation:g}.")
-    return sweeps.shadow(grid, gsd, azimuth, sun_elevation, body_radius)
+    return sweep_shadow(grid, gsd, azimuth, sun_elevation, body_radius)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import GeometryError
-from stages.physics import sweeps
+from stages.physics.hulls import sweep_horizon
 
 CELLS_PER_DISTANCE = 64  # a ridge with slopes of +-0.3 is then rounded by less than 0.1 deg
 NODE = 4  # the far horizon is searched from every fourth pixel
@@ -131,8 +131,8 @@ def horizon_in_scene(
     left = max(0, col - reach_east) if east < 0 else col
     right = min(columns, col + width + reach_east) if east > 0 else col + width
     window = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)
-    near = sweeps.horizon_slope(window, gsd, azimuth, body_radius, parallel=False)
-    slope = np.ascontiguousarray(near[row - top : row - top + height, col - left : col - left + width])
+    slope = np.tan(sweep_horizon(window, gsd, azimuth, body_radius, (row - top, col - left, height, width)))
+    slope[slope < -1e6] = -np.inf  # nothing there: the tangent of float32's -pi/2 is finite
     crop = window[row - top : row - top + height, col - left : col - left + width]
     enough = -math.inf if sun_elevation is None else math.tan(max(sun_elevation - math.radians(1), -1.5))
     bend = 0.0 if body_radius is None else 0.5 / body_radius
