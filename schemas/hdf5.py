@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -23,6 +23,7 @@ from schemas.declaration import SCHEMAS, STRING, Schema, Variable
 from schemas.errors import ArtefactError, ConfigError, InputError, LunargrError
 
 CONVENTIONS = "CF-1.11"
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # The netCDF-4 format's marker for a dimension without a coordinate variable of its own.
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable.%10d"
 _FILL = {"f": np.nan, "i": -2147483648, "u": 255}
@@ -63,15 +64,26 @@ def check_output(path: Path, inputs: Sequence[Path] = (), overwrite: bool = Fals
         ) from None
 
 
-def _is_full_disk(error: BaseException) -> bool:
-    text = str(error).lower()
-    return (
-        getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        or "no space left" in text
-        or "disk quota" in text
-        or f"errno = {errno.ENOSPC}" in text
-        or f"errno = {errno.EFBIG}" in text
-    )
+def _is_full_disk(error: BaseException | None) -> bool:
+    """HDF5 reports the system's error in words, and a failed close hides the failed write behind itself."""
+    while error is not None:
+        text = str(error).lower()
+        if getattr(error, "errno", None) in _FULL or any(f"errno = {number}," in text for number in _FULL):
+            return True
+        if "no space left" in text or "disk quota" in text:
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def _quiet_about_h5py(hook: Callable[[Any], Any]) -> Callable[[Any], None]:
+    """On a full disk every HDF5 object that is let go of fails again; the one line has been said already."""
+
+    def quiet(unraisable: Any) -> None:
+        if not isinstance(unraisable.exc_value, OSError):
+            hook(unraisable)
+
+    return quiet
 
 
 @contextlib.contextmanager
@@ -89,6 +101,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         with contextlib.suppress(OSError):
             partial.unlink()
         if _is_full_disk(error):
+            sys.unraisablehook = _quiet_about_h5py(sys.unraisablehook)
             raise InputError(
                 f"{path}: the disk is full or over quota; nothing was written. Free some space and run the command again."
             ) from None

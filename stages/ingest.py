@@ -28,6 +28,7 @@ Progress = Callable[[int, int, str], None]
 
 # A map whose pixels are within this of square and of the working GSD counts as metric: no resampling, only means.
 METRIC_TOLERANCE = 0.01
+LARGEST_REACH = math.radians(30)  # a local stereographic map's scale is 7 % too large there
 MINIMUM_COVERAGE = 0.5  # share of a coarse pixel that must be valid before its mean counts
 
 
@@ -87,6 +88,8 @@ def run(
         ) as writer:
             _write_grid(writer, plan.grid)
             share, extent = _write_elevation(dem, dataset, plan, writer, config, progress)
+            for name in ("valid", "valid_position", "frame_window"):  # also where there is no image at all
+                writer.dataset(name)
             areas = [
                 _write_validity(frame, index, len(frames), plan.grid, writer, config, progress)
                 for index, frame in enumerate(frames)
@@ -131,8 +134,16 @@ def plan_grid(dem: Path, dataset: DatasetReader, gsd: float | None, radius: floa
     if dataset.crs.is_projected and t.b == t.d == 0 and t.a > 0 > t.e and _is_metre(dataset):
         step = abs(t.a)
         factor = max(1, round(wanted / step))
-        true_square = abs(east - north) <= METRIC_TOLERANCE * native and abs(-t.e - t.a) <= 1e-3 * step
-        true_scale = abs(east - step) <= METRIC_TOLERANCE * step
+        # At the centre and near the corners: an equirectangular map is true on one parallel only.
+        places = [(v, u) for v in (0.1, 0.5, 0.9) for u in (0.1, 0.5, 0.9)]
+        true = np.array(
+            [rasters.pixel_size_at(dataset, radius, v * dataset.height, u * dataset.width) for v, u in places]
+        )
+        true_square = (
+            bool((np.abs(true[:, 0] - true[:, 1]) <= METRIC_TOLERANCE * native).all())
+            and abs(-t.e - t.a) <= 1e-3 * step
+        )
+        true_scale = bool((np.abs(true - step) <= 2 * METRIC_TOLERANCE * step).all())
         fits = gsd is None or abs(wanted - factor * step) <= 1e-3 * wanted
         if true_square and true_scale and fits:
             height, width = dataset.height // factor, dataset.width // factor
@@ -144,6 +155,12 @@ def plan_grid(dem: Path, dataset: DatasetReader, gsd: float | None, radius: floa
             )
     whole = Grid(dataset.crs.to_wkt(), t, dataset.height, dataset.width, radius)
     lon, lat = (float(v) for v in whole.lonlat(dataset.height / 2 - 0.5, dataset.width / 2 - 0.5))
+    reach = np.hypot(dataset.height * north, dataset.width * east) / 2 / radius
+    if not reach < LARGEST_REACH:
+        raise GeometryError(
+            f"{dem}: expected a region that one local map can hold (up to {math.degrees(2 * LARGEST_REACH):.0f} deg across), "
+            f"found {math.degrees(2 * reach):.0f} deg; cut a region out first (gdal_translate -projwin)."
+        )
     crs = local_metric_crs(lon, lat, radius)
     transform, width, height = calculate_default_transform(
         dataset.crs, crs, dataset.width, dataset.height, *dataset.bounds, resolution=wanted

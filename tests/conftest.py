@@ -23,3 +23,24 @@ def shared() -> Path:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20261121)
+
+
+@pytest.fixture(scope="session")
+def small_files(tmp_path_factory):
+    """The user's files of the small analytic scene."""
+    from small_scene import write_scene
+
+    return write_scene(tmp_path_factory.mktemp("files"))
+
+
+@pytest.fixture(scope="session")
+def small_artefacts(small_files, tmp_path_factory):
+    """scene.h5, crops.h5 and pairs.h5 of the small scene, made once: a dict of paths."""
+    from stages import ingest, project, sample
+
+    folder = tmp_path_factory.mktemp("artefacts")
+    paths = {name: folder / f"{name}.h5" for name in ("scene", "crops", "pairs")}
+    ingest.run(small_files.dem, small_files.images, paths["scene"], ingest.Config(gsd=20, crop=32, block=100))
+    sample.run(paths["scene"], paths["crops"], sample.Config(count=90, tile_m=1280, seed=3, block=100))
+    project.run(paths["crops"], paths["pairs"], project.Config())
+    return paths

@@ -1,0 +1,176 @@
+"""Artefacts: valid netCDF-4, checked on opening, whole or absent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+
+import h5py
+import numpy as np
+import pytest
+
+from schemas import PAIRS, SCHEMAS, ArtefactError, ArtefactWriter, ConfigError, open_artefact, read_kind
+
+
+def write_pairs(path, **change):
+    sizes = {"pair": 2, "y": 4, "x": 4, "enu": 3, "frame": 1}
+    with ArtefactWriter(path, PAIRS, sizes, attributes={"gsd_m": 5.0, "body_radius_m": 1737400.0}, **change) as writer:
+        for v in PAIRS.variables:
+            if v.required:
+                shape = [sizes[d] for d in v.dims]
+                writer.write(v.name, ["A"] if v.dtype == "string" else np.arange(np.prod(shape)).reshape(shape))
+    return path
+
+
+@pytest.mark.parametrize("engine", ["h5netcdf"])
+def test_pairs_open_in_xarray_with_names_units_and_flags(tmp_path, engine):
+    xarray = pytest.importorskip("xarray")
+    with xarray.open_dataset(write_pairs(tmp_path / "pairs.h5"), engine=engine) as data:
+        assert data["elevation"].dims == ("pair", "y", "x")
+        assert data["elevation"].attrs["units"] == "m"
+        assert data["split"].attrs["flag_meanings"] == "train validation test"
+        assert list(data["image_id"].values) == ["A"]
+        assert data.attrs["Conventions"].startswith("CF")
+        np.testing.assert_array_equal(data["elevation"].values.ravel(), np.arange(32))
+
+
+def test_every_dimension_has_a_scale(tmp_path):
+    with h5py.File(write_pairs(tmp_path / "pairs.h5")) as file:
+        for v in PAIRS.variables:
+            if v.name in file and v.name not in PAIRS.dims:
+                for axis, dim in enumerate(v.dims):
+                    assert file[v.name].dims[axis][0].name == f"/{dim}"
+
+
+def test_declared_schemas_are_consistent():
+    for schema in SCHEMAS.values():
+        for v in schema.variables:
+            assert set(v.dims) <= set(schema.dims), (schema.name, v.name)
+            assert v.dtype == "string" or v.unit, (schema.name, v.name)
+            assert v.dtype not in ("f2", "float16")
+
+
+def test_a_failed_stage_leaves_nothing(tmp_path):
+    path = tmp_path / "pairs.h5"
+    with (
+        pytest.raises(ValueError, match="in the middle"),
+        ArtefactWriter(path, PAIRS, {"pair": 1, "y": 2, "x": 2, "enu": 3, "frame": 1}) as w,
+    ):
+        w.dataset("elevation")
+        raise ValueError("in the middle")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_incomplete_artefact_is_a_bug_and_leaves_nothing(tmp_path):
+    with (
+        pytest.raises(RuntimeError, match="written without"),
+        ArtefactWriter(tmp_path / "p.h5", PAIRS, {"pair": 1, "y": 2, "x": 2, "enu": 3, "frame": 1}),
+    ):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_killed_stage_leaves_nothing(tmp_path, number):
+    code = textwrap.dedent(
+        """
+        import sys, time
+        from pathlib import Path
+        from schemas import PAIRS, ArtefactWriter
+        with ArtefactWriter(Path(sys.argv[1]), PAIRS, {"pair": 1, "y": 2, "x": 2, "enu": 3, "frame": 1}) as w:
+            print("open", flush=True)
+            time.sleep(60)
+        """
+    )
+    child = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path / "p.h5")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == "open\n"
+    child.send_signal(number)
+    assert child.wait(20) != 0
+    child.stdout.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_clear_line_and_leaves_nothing(tmp_path):
+    resource = pytest.importorskip("resource")
+    code = textwrap.dedent(
+        f"""
+        import resource, signal, sys
+        from pathlib import Path
+        import numpy as np
+        from schemas import PAIRS, ArtefactWriter, InputError
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200000, {resource.RLIM_INFINITY}))
+        try:
+            with ArtefactWriter(Path(sys.argv[1]), PAIRS, {{"pair": 8, "y": 256, "x": 256, "enu": 3, "frame": 1}}) as w:
+                w.write("elevation", np.random.rand(8, 256, 256))
+                w.file.flush()
+        except InputError as error:
+            print(error)
+        """
+    )
+    out = subprocess.run([sys.executable, "-c", code, str(tmp_path / "p.h5")], capture_output=True, text=True)
+    assert "disk is full" in out.stdout, out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_output_never_replaces_an_input_nor_an_existing_file(tmp_path):
+    path = write_pairs(tmp_path / "pairs.h5")
+    with pytest.raises(ConfigError, match="--overwrite"):
+        write_pairs(path)
+    before = path.read_bytes()
+    with pytest.raises(ConfigError, match="replace the input"):
+        write_pairs(path, inputs=[path], overwrite=True)
+    assert path.read_bytes() == before
+
+
+def test_wrong_unit_missing_variable_and_wrong_size_are_named(tmp_path):
+    path = write_pairs(tmp_path / "pairs.h5")
+    with h5py.File(path, "r+") as file:
+        file["elevation"].attrs["units"] = "km"
+    with pytest.raises(ArtefactError, match=r"/elevation: expected units 'm', found 'km'; write it again"):
+        open_artefact(path, PAIRS)
+    with h5py.File(path, "r+") as file:
+        file["elevation"].attrs["units"] = "m"
+        del file["valid"]
+    with pytest.raises(ArtefactError, match="/valid"):
+        open_artefact(path, PAIRS)
+    with h5py.File(path, "r+") as file:
+        file["valid"] = np.zeros((3, 4, 4), "u1")
+    with pytest.raises(ArtefactError, match="expected 2 along 'pair'"):
+        open_artefact(path, PAIRS)
+
+
+def test_another_stage_version_or_kind_of_file_is_refused(tmp_path):
+    path = write_pairs(tmp_path / "pairs.h5")
+    with pytest.raises(ArtefactError, match="expected a 'scene'"):
+        open_artefact(path, SCHEMAS["scene"])
+    with h5py.File(path, "r+") as file:
+        file.attrs["schema_version"] = 99
+    with pytest.raises(ArtefactError, match="expected version 1"):
+        open_artefact(path, PAIRS)
+    text = tmp_path / "text.h5"
+    text.write_text("not HDF5")
+    with pytest.raises(ArtefactError, match="another kind of file"):
+        read_kind(text)
+    os.truncate(path, path.stat().st_size // 2)
+    with pytest.raises(ArtefactError, match="truncated"):
+        open_artefact(path, PAIRS)
+    with pytest.raises(ArtefactError, match="no such file"):
+        open_artefact(tmp_path / "absent.h5", PAIRS)
+
+
+def test_pairs_of_other_programs_need_no_lunargr_attributes(tmp_path):
+    path = write_pairs(tmp_path / "pairs.h5")
+    with h5py.File(path, "r+") as file:
+        for name in ("lunargr_schema", "schema_version", "lunargr_version"):
+            del file.attrs[name]
+    open_artefact(path, PAIRS).close()
