@@ -20,7 +20,7 @@ from schemas.errors import InputError
 from stages.physics.grid import Grid, sphere_crs
 
 # ISIS special pixels of 32-bit cubes (NULL, LRS, LIS, HIS, HRS) all lie beyond this; so do -3.4028e38 in its spellings.
-_SPECIAL = 3.4e38
+SPECIAL = 3.4e38
 # 16-bit and 8-bit cubes keep their specials at the ends of the range.
 _SPECIAL_INT16 = (-32768, -32767, -32766, -32765, -32764)
 
@@ -63,7 +63,7 @@ def read_window(dataset: DatasetReader, window: Window, band: int = 1) -> NDArra
     invalid = np.ma.getmaskarray(raw)
     values = np.ma.getdata(raw)
     if values.dtype.kind == "f":
-        invalid = invalid | ~np.isfinite(values) | (np.abs(values) >= _SPECIAL)
+        invalid = invalid | ~np.isfinite(values) | (np.abs(values) >= SPECIAL)
     elif dataset.driver in ("ISIS3", "PDS", "PDS4", "VICAR") and values.dtype == np.int16:
         invalid = invalid | np.isin(values, _SPECIAL_INT16)
     elif values.dtype == np.int16 and dataset.nodata is None:
