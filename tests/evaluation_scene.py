@@ -129,3 +129,18 @@ def write_pairs(path, scene: Scene, units: str = "1"):
         out.write("split", scene.split)
         out.write("image_id", scene.frame_names)
     return path
+
+
+def run_command(*arguments) -> tuple[int, str]:
+    """Exit code of the command line and what it printed: the result, or the one line of an error."""
+    from typer.testing import CliRunner
+
+    from lunargr_cli.main import app
+    from schemas.errors import EXIT_CODE, LunargrError
+
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    if isinstance(result.exception, LunargrError):
+        return EXIT_CODE, str(result.exception)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.stdout

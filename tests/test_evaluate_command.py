@@ -8,9 +8,8 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from evaluation_scene import make_scene, write_pairs
+from evaluation_scene import make_scene, run_command, write_pairs
 
-from lunargr_cli.main import main
 from schemas import EVALUATION, open_artefact
 from stages import train
 
@@ -33,27 +32,20 @@ def trained(tmp_path_factory):
     return folder
 
 
-def run(monkeypatch, *arguments):
-    """Exit code of the command line."""
-    monkeypatch.setattr("sys.argv", ["lunargr", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    return int(stop.value.code or 0)
-
-
 @pytest.mark.parametrize("suffix", ["", "_dn"])
-def test_evaluate_writes_table_json_artefact_and_figures(trained, tmp_path, monkeypatch, capsys, suffix):
+def test_evaluate_writes_table_json_artefact_and_figures(trained, tmp_path, suffix):
     output, copy = tmp_path / "evaluation.h5", tmp_path / "copy.json"
     files = (trained / f"pairs{suffix}.h5", trained / f"checkpoint{suffix}.h5")
     options = ("-o", output, "--json", copy, "--figures", tmp_path / "figures", "--device", "cpu")
-    assert run(monkeypatch, "evaluate", *files, *options) == 0
+    code, printed = run_command("evaluate", *files, *options)
+    assert code == 0
     result = json.loads(copy.read_text())
     assert result == json.loads((tmp_path / "evaluation.json").read_text())
     assert result["split"] == "test"
     keys = {"mse", "mse_low", "mse_high", "mse_crop_sum", "psnr", "psnr_crop_range", "ssim", "lpips"}
     for name in ("learned", "global", "lunar_lambert", "hapke_raw", "hapke_minmax", "hapke_gain", "hapke_gain_offset"):
         assert keys <= set(result["models"][name])
-        assert name in capsys.readouterr().out or name != "learned"
+        assert name in printed
     assert result["models"]["learned"]["lpips"] is None and result["lpips_unavailable"]
     with open_artefact(output, EVALUATION) as file:
         names = [n.decode() for n in file["model_name"][...]]
@@ -67,11 +59,11 @@ def test_evaluate_writes_table_json_artefact_and_figures(trained, tmp_path, monk
         assert picture.std() > 5, name
 
 
-def test_results_do_not_hang_on_the_batch_size(trained, tmp_path, monkeypatch):
+def test_results_do_not_hang_on_the_batch_size(trained, tmp_path):
     found = []
     for batch in (1, 16):
         files = (trained / "pairs.h5", trained / "checkpoint.h5", "-o", tmp_path / f"{batch}.h5")
-        assert run(monkeypatch, "evaluate", *files, "--batch", batch, "--device", "cpu", "-q") == 0
+        assert run_command("evaluate", *files, "--batch", batch, "--device", "cpu", "-q")[0] == 0
         found.append(json.loads((tmp_path / f"{batch}.json").read_text())["models"])
     for name, row in found[0].items():
         assert row["mse"] == pytest.approx(found[1][name]["mse"], rel=1e-5)
@@ -115,10 +107,9 @@ def _spoil(trained, tmp_path, case):
         "the input as output",
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(trained, tmp_path, monkeypatch, capsys, case):
+def test_bad_input_is_one_line_and_leaves_nothing(trained, tmp_path, case):
     arguments = _spoil(trained, tmp_path, case)
     before = {p: p.stat().st_size for p in (*tmp_path.iterdir(), *trained.iterdir())}
-    assert run(monkeypatch, *arguments) == 3
-    message = capsys.readouterr().err.strip()
-    assert message.startswith("lunargr: ") and "\n" not in message
+    code, message = run_command(*arguments)
+    assert code == 3 and message and "\n" not in message
     assert {p: p.stat().st_size for p in (*tmp_path.iterdir(), *trained.iterdir())} == before

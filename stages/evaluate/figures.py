@@ -72,6 +72,7 @@ def training_curves(checkpoint: Path) -> Any:
     axes.axvline(best, color="#c08a2e", linewidth=1, linestyle=":", label=f"kept: epoch {best}")
     if np.all(np.concatenate([train, validation]) > 0):
         axes.set_yscale("log")
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set(xlabel="epoch", ylabel="mean squared error", title=f"Training of {model}")
     axes.grid(alpha=0.25, which="both", linewidth=0.5)
     axes.legend(frameon=False)
@@ -94,7 +95,9 @@ def error_chart(result: dict[str, Any]) -> Any:
     axes.invert_yaxis()
     unit = "I/F" if result["image_units"] == "iof" else "share of the DN range"
     axes.set(xlabel=f"root mean squared error, {unit}", title=f"Split '{result['split']}', {result['pairs']} crops")
-    axes.set_xscale("log")
+    errors = [row["rmse"] for row in result["models"].values() if row["rmse"]]
+    if errors and max(errors) > 8 * min(errors):
+        axes.set_xscale("log")
     axes.grid(axis="x", which="both", alpha=0.25, linewidth=0.5)
     return figure
 

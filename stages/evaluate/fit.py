@@ -147,7 +147,7 @@ def fit_nonlinear(
                 damping, improved = max(damping / 5, 1e-12), True
                 break
             damping *= 5
-        if not improved or gained < 1e-10:
+        if not improved or gained < 1e-8:
             break
     return model.constrain(raw[None], 1)[0].numpy()
 

@@ -73,6 +73,13 @@ def gain_table(scores: Scores, bootstrap: TileBootstrap) -> dict[str, dict[str, 
     return table
 
 
+def verdict(low: float | None, high: float | None) -> str:
+    """What a paired interval says in one word or two."""
+    if low is None or high is None:
+        return "unknown"
+    return "better" if low > 0 else "worse" if high < 0 else "no difference"
+
+
 def _mean(values: np.ndarray) -> float:
     known = values[np.isfinite(values)]
     return float(known.mean()) if len(known) else float("nan")
@@ -105,8 +112,8 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 
 def gain_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """What the learned model gains over each baseline; a gain whose interval holds 0 is not significant."""
-    columns = ["model", "against", "lower MSE by", "95 % interval", "significant"]
+    """What the learned model gains over each baseline; a gain whose interval holds 0 is no difference."""
+    columns = ["model", "against", "lower MSE by", "95 % interval", "verdict"]
     cells = []
     for ours, others in result["gains"].items():
         for other, gain in others.items():
@@ -123,7 +130,7 @@ def gain_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
                     other,
                     f"{gain['gain_percent']:+.1f} %",
                     f"{low:+.1f} .. {high:+.1f} %" if known else "-",
-                    ("yes" if low * high > 0 else "no") if known else "-",
+                    verdict(low, high),
                 ]
             )
     return columns, cells

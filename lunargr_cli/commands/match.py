@@ -1,0 +1,63 @@
+"""`lunargr match FILES`: do features of the renderings lie where those of the measured images lie?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import Device, Json, Overwrite, Quiet, Seed
+
+NAME, ORDER = "match", 71
+
+
+def command(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILES",
+            help="PAIRS CHECKPOINT; or an EVALUATION with renderings; or a measured image and rendered ones.",
+        ),
+    ],
+    matcher: Annotated[
+        list[str] | None,
+        typer.Option("--matcher", help="daisy, sift, aliked or disk; may be repeated (default: daisy and sift)."),
+    ] = None,
+    split: Annotated[str, typer.Option("--split", help="train, validation or test (for pairs).")] = "test",
+    count: Annotated[int, typer.Option("--count", help="Crops to match, drawn at random.")] = 24,
+    features_model: Annotated[
+        Path | None, typer.Option("--features-model", metavar="ONNX", help="Network of aliked or disk.")
+    ] = None,
+    lightglue_model: Annotated[
+        Path | None, typer.Option("--lightglue-model", metavar="ONNX", help="LightGlue's network for these features.")
+    ] = None,
+    figures: Annotated[
+        Path | None, typer.Option("--figures", metavar="DIR", help="Write match pictures, coloured by error, as PNG.")
+    ] = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    json_file: Json = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Match measured with rendered images at 512 x 384 and count the matches within 1, 3 and 5 px of the truth.
+
+    Both show the same ground, pixel for pixel, so every match should end where it began: the learned reflectance
+    beside Hapke matched to each crop's range, as in the Lunar-G2R paper.
+    """
+    from lunargr_cli.console import Console
+    from stages import match
+    from stages.match.run import result_lines
+
+    console = Console(quiet)
+    config = match.Config(
+        tuple(matcher or ("daisy", "sift")), split, count, features_model, lightglue_model, seed, device
+    )
+    result = match.run(
+        files, config, json_file=json_file, figures=figures, overwrite=overwrite, progress=console.progress
+    )
+    columns, cells = result_lines(result)
+    console.table(f"matching consistency over {result['crops']} picture(s) of 512 x 384", columns, cells)
+    if figures is not None:
+        console.say(f"written: {figures}/")

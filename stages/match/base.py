@@ -1,0 +1,92 @@
+"""What a matcher is: a name and one function from two pictures of the same place to corresponding points."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from schemas.errors import ConfigError, RegistryError
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Corresponding points, (N, 2) each as (x, y) in pixels; pixel centres are whole numbers."""
+
+    measured: np.ndarray
+    rendered: np.ndarray
+
+    @property
+    def errors(self) -> np.ndarray:
+        """(N,) px: how far each match is from the truth, for pictures that agree pixel for pixel."""
+        return np.linalg.norm(self.measured - self.rendered, axis=1)
+
+
+@dataclass(frozen=True)
+class Models:
+    """Network files of the user: ``features`` detects and describes, ``lightglue`` matches."""
+
+    features: Path | None = None
+    lightglue: Path | None = None
+
+
+class Matcher:
+    """Base of every matcher. One file in this folder per matcher; it decorates itself with @register."""
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    reference: ClassVar[str]
+    needs_models: ClassVar[bool] = False
+
+    def __init__(self, models: Models) -> None:
+        if models.features is not None and not self.needs_models:
+            raise ConfigError(f"--features-model: the matcher '{self.name}' takes no network; choose aliked or disk.")
+
+    def match(self, measured: np.ndarray, rendered: np.ndarray) -> Matches:
+        """Correspondences between two (H, W) uint8 pictures."""
+        raise NotImplementedError(f"{type(self).__name__} must define match")
+
+
+_MATCHERS: dict[str, type[Matcher]] = {}
+
+
+def register(cls: type[Matcher]) -> type[Matcher]:
+    """Class decorator: make a matcher known under its name."""
+    _MATCHERS[cls.name] = cls
+    return cls
+
+
+def _load_all() -> None:
+    import stages.match as package
+
+    for module in pkgutil.iter_modules(package.__path__):
+        importlib.import_module(f"stages.match.{module.name}")
+
+
+def matcher_names() -> list[str]:
+    _load_all()
+    return sorted(_MATCHERS)
+
+
+def get_matcher(name: str, models: Models = Models()) -> Matcher:
+    """The matcher called ``name``, ready to use. Raises RegistryError with the choices, ConfigError."""
+    _load_all()
+    try:
+        cls = _MATCHERS[name.lower()]
+    except KeyError:
+        raise RegistryError.unknown("matcher", name, _MATCHERS) from None
+    return cls(models)
+
+
+def mutual_nearest(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of reciprocal nearest neighbours between descriptors (N, D) and (M, D), by Euclidean distance."""
+    if not len(first) or not len(second):
+        return np.empty(0, int), np.empty(0, int)
+    import cv2
+
+    pairs = cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(first, second)
+    return np.array([p.queryIdx for p in pairs], int), np.array([p.trainIdx for p in pairs], int)

@@ -1,0 +1,128 @@
+"""From files to files: measured and rendered pictures in, shares of consistent matches and coloured pictures out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from schemas import ConfigError, atomic_path, check_output
+from stages.match.base import Matches, Models, get_matcher
+from stages.match.consistency import summarise
+from stages.match.pictures import inside, match_figure, stretch_limits, to_grey
+from stages.match.sources import comparisons
+
+FIGURES = 4  # comparisons that are drawn
+
+
+@dataclass
+class Config:
+    """Options of match; ``count`` crops of ``split`` are drawn with ``seed``."""
+
+    matchers: tuple[str, ...] = ("daisy", "sift")
+    split: str = "test"
+    count: int = 24
+    features_model: Path | None = None
+    lightglue_model: Path | None = None
+    seed: int = 0
+    device: str = "auto"
+
+
+def run(
+    files: list[Path],
+    config: Config,
+    *,
+    json_file: Path | None = None,
+    figures: Path | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> dict[str, Any]:
+    """Match every comparison with every matcher; returns what the JSON holds. Raises LunargrError."""
+    if config.count < 1:
+        raise ConfigError(f"--count: expected at least 1, found {config.count}.")
+    if json_file is not None:
+        check_output(json_file, files, overwrite)
+    models = Models(config.features_model, config.lightglue_model)
+    matchers = [get_matcher(name, models) for name in config.matchers]
+    total, source = comparisons(files, config.split, config.count, config.seed, config.device)
+    if figures is not None:
+        try:
+            figures.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"{figures}: cannot be made a folder ({error.strerror}); choose another.") from None
+    collected: dict[str, dict[str, list[Matches]]] = {m.name: {} for m in matchers}
+    if progress is not None:
+        progress(0, total, "match")
+    for number, comparison in enumerate(source):
+        limits = stretch_limits(comparison.measured)
+        measured, known = to_grey(comparison.measured, limits)
+        pictures = {}
+        for name, image in comparison.rendered.items():
+            pictures[name], also_known = to_grey(image, limits if comparison.common_scale else stretch_limits(image))
+            known = known & also_known
+        for matcher in matchers:
+            found = {name: inside(matcher.match(measured, picture), known) for name, picture in pictures.items()}
+            for name, matches in found.items():
+                collected[matcher.name].setdefault(name, []).append(matches)
+            if figures is not None and number < FIGURES:
+                _save(
+                    match_figure(measured, pictures, found, f"{comparison.label}, {matcher.title}"),
+                    figures / f"match_{matcher.name}_{number + 1}.png",
+                )
+        if progress is not None:
+            progress(number + 1, total, "match")
+    result = {
+        "size_px": [512, 384],
+        "crops": total,
+        "files": [f.name for f in files],
+        "matchers": {
+            m.name: {name: summarise(found, config.seed) for name, found in collected[m.name].items()} for m in matchers
+        },
+    }
+    if json_file is not None:
+        with atomic_path(json_file) as partial:
+            partial.write_text(json.dumps(result, indent=1) + "\n")
+    return result
+
+
+def _save(figure: Any, path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    figure.savefig(path, dpi=110, facecolor="white")
+    plt.close(figure)
+
+
+def _shift(row: dict[str, Any]) -> tuple[float, float]:
+    return row["median_shift_right_px"], row["median_shift_down_px"]
+
+
+def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Columns and cells of the table on the terminal."""
+
+    def share(row: dict[str, Any], threshold: int) -> str:
+        key = f"within_{threshold}_px_percent"
+        if row[key] is None:
+            return "-"
+        low, high = row[f"{key}_low"], row[f"{key}_high"]
+        return f"{row[key]:.1f}" + ("" if low is None else f" ({low:.1f} .. {high:.1f})")
+
+    cells = [
+        [matcher, name, str(row["matches"]), *(share(row, t) for t in (1, 3, 5))]
+        + ["-" if row[k] is None else f"{row[k]:.2f}" for k in ("mean_error_px", "median_error_px")]
+        + ["-" if row["median_shift_right_px"] is None else "{:+.1f}, {:+.1f}".format(*_shift(row))]
+        for matcher, rows in result["matchers"].items()
+        for name, row in rows.items()
+    ]
+    return [
+        "matcher",
+        "rendering",
+        "matches",
+        "< 1 px, %",
+        "< 3 px, %",
+        "< 5 px, %",
+        "mean, px",
+        "median, px",
+        "shift, px",
+    ], cells
