@@ -2,13 +2,25 @@
 
     I/F = K w/4 mu0e / (mu0e + mue) [ p(g) (1 + Bs0 Bs(g)) + H(mu0e/K) H(mue/K) - 1 ] (1 + Bc0 Bc(g)) S(i, e, g)
 
-p        double Henyey-Greenstein, (1 + c)/2 of it scattered backward (Hapke 2012; the c of Sato et al. 2014)
-Bs, Bc   shadow hiding and coherent backscatter (Hapke 1986, 2002)
-H        Ambartsumian-Chandrasekhar function, the approximation of 2002 (default) or of 1981
-K        porosity: K = -ln(1 - 1.209 phi^(2/3)) / (1.209 phi^(2/3)) (Hapke 2008)
-S, mu0e, mue   macroscopic roughness of mean slope theta, complete (Hapke 1984): `roughness.py`
+Single-particle phase function (Hapke 2012; c as in Sato et al. 2014, its first lobe scatters backward):
 
-The Legendre variant is in `hapke_legendre.py`.
+    p(g) = (1 + c)/2 (1 - b^2) / (1 - 2 b cos g + b^2)^(3/2) + (1 - c)/2 (1 - b^2) / (1 + 2 b cos g + b^2)^(3/2)
+
+Opposition effect by shadow hiding (Hapke 1986) and coherent backscatter (Hapke 2002), each with its own width:
+
+    Bs(g) = 1 / (1 + tan(g/2)/hs)
+    Bc(g) = [1 + (1 - exp(-x))/x] / [2 (1 + x)^2],  x = tan(g/2)/hc
+
+Multiple scattering, by the approximation of 2002 (default) or of 1981 (models named h1981):
+
+    H(x) = 1 / (1 - w x [r0 + (1 - 2 r0 x)/2 ln((1 + x)/x)]),  r0 = (1 - sqrt(1 - w)) / (1 + sqrt(1 - w))
+    H(x) = (1 + 2 x) / (1 + 2 x sqrt(1 - w))
+
+Porosity (Hapke 2008), with phi the filling factor; K = 1 at phi = 0:
+
+    K = -ln(1 - 1.209 phi^(2/3)) / (1.209 phi^(2/3))
+
+Effective cosines mu0e, mue and shadowing S: macroscopic roughness of mean slope theta, see `roughness.py`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """Hapke's model with the single-particle phase function as two Legendre terms (ISIS HapkeLeg).
 
-p(g) = 1 + b cos(g) + c (3/2 cos^2(g) - 1/2); all else as in `hapke.py`.
+    p(g) = 1 + b cos(g) + c (3/2 cos^2(g) - 1/2)
+
+and all else as in `hapke.py`.
 """
 
 from __future__ import annotations

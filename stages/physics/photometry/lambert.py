@@ -1,4 +1,7 @@
-"""Lambert's law: a surface equally bright from everywhere."""
+"""Lambert's law: a surface equally bright from everywhere.
+
+I/F = albedo cos(i)
+"""
 
 from __future__ import annotations
 

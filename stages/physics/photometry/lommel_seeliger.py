@@ -1,4 +1,7 @@
-"""Lommel-Seeliger's law: light scattered once in a dark, deep layer. A good disk function for the full Moon."""
+"""Lommel-Seeliger's law: light scattered once in a dark, deep layer. A good disk function for the full Moon.
+
+I/F = albedo 2 cos(i) / (cos(i) + cos(e))
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Minnaert's law: limb darkening by one exponent; k = 1 is Lambert, the Moon at small phase has k = 0.5."""
+"""Minnaert's law: limb darkening by one exponent; k = 1 is Lambert, the Moon at small phase has k = 0.5.
+
+I/F = albedo cos(i)^k cos(e)^(k-1)
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,13 @@
 """The cosine polynomials M1..M5 of Lunar-G2R: I/F as a low-order polynomial in cos(i) and cos(g).
 
 Grethen et al., "Lunar-G2R: Geometry-to-Reflectance Learning for High-Fidelity Lunar BRDF Estimation", table 1. The
-paper's polynomials give r up to a constant factor and contain cos(incidence) already, so here they are I/F.
+paper's polynomials give r up to a constant factor and contain cos(incidence) already, so here they are I/F:
+
+    M1  a cos(i) + b cos(g)
+    M2  a cos(i) + b cos(g) + c
+    M3  a cos(i) + b cos(g) + c cos(i) cos(g) + d
+    M4  a cos(i) + b cos(g) + c cos(i)^2 + d
+    M5  a cos(i) + b cos(g) + c cos(g)^2 + d
 """
 
 from __future__ import annotations

@@ -1,7 +1,17 @@
 """Hapke's correction for macroscopic roughness, complete: effective cosines and shadowing function.
 
-Hapke, B. (1984), Icarus 59, 41-59; as chapter 12 of Hapke (2012). Both cases (incidence below or above emission) are
-one formula in the smaller and the larger of the two angles, which is how it is written here.
+Hapke, B. (1984), Icarus 59, 41-59; as chapter 12 of Hapke (2012). Both his cases (incidence below or above emission) are
+one formula in the smaller angle x and the larger angle y of the two, which is how it is written here. With psi the
+azimuth between Sun and camera, cos(psi) = (cos g - cos i cos e) / (sin i sin e):
+
+    chi   = 1 / sqrt(1 + pi tan^2(theta)),  f = exp(-2 tan(psi/2))
+    E1(x) = exp(-2/pi cot(theta) cot(x)),   E2(x) = exp(-1/pi cot^2(theta) cot^2(x))
+    eta(x) = chi [ cos x + sin x tan(theta) E2(x) / (2 - E1(x)) ]
+    mu_x  = chi [ cos x + sin x tan(theta) (cos(psi) E2(y) + sin^2(psi/2) E2(x)) / (2 - E1(y) - psi/pi E1(x)) ]
+    mu_y  = chi [ cos y + sin y tan(theta) (E2(y) - sin^2(psi/2) E2(x)) / (2 - E1(y) - psi/pi E1(x)) ]
+    S     = mue/eta(e) cos(i)/eta(i) chi / (1 - f + f chi cos(x)/eta(x))
+
+mu0e and mue are the mu of whichever angle is incidence and emission.
 """
 
 from __future__ import annotations
