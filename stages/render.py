@@ -16,7 +16,6 @@ from schemas.hdf5 import check_output
 from stages.effects import load_extension
 from stages.physics.bodies import Body, find_body
 from stages.physics.cameras.base import Camera, camera_from_document, read_document
-from stages.physics.formation import Extension
 from stages.physics.light import SunHorizon
 from stages.physics.mapview import BACKPLANES, Light, shade_block
 from stages.physics.perspective import apply_sensor, make_scene, render_view
@@ -252,11 +251,12 @@ def _light(surface: Surface, config: Config, body: Body, relief: tuple[float, fl
     span = relief[1] - relief[0]
     check_sun_is_up(sun, surface.grid, span)
     horizon = SunHorizon(surface.elevation, surface.grid, sun, span) if config.shadows else None
-    extensions: Sequence[Extension] = load_extension(Path(config.extension), ["rendered"]) if config.extension else ()
+    # the diagnosed images are not this one: their own values must not be taken for it
+    extensions = load_extension(Path(config.extension), ["rendered"]) if config.extension else []
     position = None
     if config.position is not None:
         position = place(*_three(config.position, "--position"), surface.grid.radius)
-    return Light(sun, horizon, position, extensions)
+    return Light(sun, horizon, position, extensions)  # type: ignore[arg-type]
 
 
 def _three(values: Sequence[float], option: str) -> tuple[float, float, float]:

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stages.physics.formation import Extension, Observation, form, sun_visibility
+from stages.physics.formation import Extension, Observation, form
 from stages.physics.geometry import Angles
 from stages.physics.ground import block_geometry
-from stages.physics.light import SunHorizon
+from stages.physics.light import SunHorizon, visible_share
 from stages.physics.photometry import masked_radiance_factor
 from stages.physics.sun import Sun
 from stages.physics.surface import Surface
@@ -46,28 +46,28 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
     """``image`` (I/F) and the backplanes of a window, each (height, width), NaN where the map is unknown."""
     elevation = read_padded(surface, row, col, height, width, 1)
     geometry = block_geometry(surface.grid, row, col, elevation, light.sun.position, light.camera_position)
-    visible = torch.ones(height, width)
+    visible = np.ones((height, width), np.float32)
     if light.horizon is not None:
-        horizon = torch.from_numpy(np.ascontiguousarray(light.horizon.window(row, col, height, width)))
-        sun_elevation = torch.asin(torch.from_numpy(geometry.sun[2]).clamp(-1, 1))
-        visible = sun_visibility(sun_elevation, horizon, light.sun.radius)
-    angles = Angles(*(torch.from_numpy(v) for v in (geometry.cos_incidence, geometry.cos_emission, geometry.cos_phase)))
+        sun_elevation = np.arcsin(np.clip(geometry.sun[2], -1.0, 1.0))
+        visible = visible_share(sun_elevation, light.horizon.window(row, col, height, width), light.sun.radius)
     if light.extensions:
         image = form_window(surface, light, row, col, height, width)
     else:
         coefficients = torch.from_numpy(np.ascontiguousarray(surface.read_coefficients(row, col, height, width)))
         parameters = surface.model.unpack(coefficients, dim=0)
-        lit = masked_radiance_factor(surface.model, parameters, angles) * visible
-        known = torch.isfinite(coefficients).all(dim=0) & torch.isfinite(angles.cos_incidence)
-        image = torch.where(known, lit, torch.nan).expand(height, width).numpy()
-    shadow = torch.where(angles.cos_incidence > 0, 1 - visible, torch.ones(()))
-    shadow = torch.where(torch.isfinite(angles.cos_incidence), shadow, torch.nan)
+        cosines = (geometry.cos_incidence, geometry.cos_emission, geometry.cos_phase)
+        angles = Angles(*(torch.from_numpy(v) for v in cosines))
+        image = masked_radiance_factor(surface.model, parameters, angles).numpy() * visible
+        unknown = np.isnan(geometry.cos_incidence) | ~np.isfinite(coefficients.numpy()).all(axis=0)
+        image[unknown] = np.nan
+    shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
+    shadow[np.isnan(geometry.cos_incidence)] = np.nan
     return {
         "image": image,
         "incidence_deg": _degrees(geometry.cos_incidence),
         "emission_deg": _degrees(geometry.cos_emission),
         "phase_deg": _degrees(geometry.cos_phase),
-        "shadow": shadow.numpy(),
+        "shadow": shadow,
         "depth": geometry.depth,
         "longitude_deg": geometry.longitude_deg,
         "latitude_deg": geometry.latitude_deg,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,15 +14,18 @@ from rasterio.transform import Affine
 
 from schemas.errors import GeometryError
 from stages.physics.cameras.base import Camera
-from stages.physics.formation import Observation, State, sun_visibility
+from stages.physics.cameras.pinhole import Pinhole
+from stages.physics.formation import Observation, State
 from stages.physics.geometry import Angles
 from stages.physics.grid import CSM_CENTRE, Grid
+from stages.physics.light import visible_share
 from stages.physics.mapview import BACKPLANES, Light, form_window
 from stages.physics.photometry import masked_radiance_factor
 from stages.physics.raycast import (
     HIT,
     MISS,
     HeightField,
+    HitAngles,
     Hits,
     build_height_field,
     cast,
@@ -166,11 +170,13 @@ def make_scene(
     else:
         maps = surface.read_coefficients(row, col, height, width)
     if factor > 1:
-        elevation, horizon, lit = (v if v is None else coarsen(v, factor) for v in (elevation, horizon, lit))
+        elevation = coarsen(elevation, factor)
+        horizon = None if horizon is None else coarsen(horizon, factor)
+        lit = None if lit is None else coarsen(lit, factor)
         if maps.shape[1] > 1:
             maps = np.stack([coarsen(m, factor) for m in maps])
         coarse = grid.transform @ Affine.scale(factor)
-        grid = Grid(grid.crs_wkt, coarse, *elevation.shape, grid.radius)
+        grid = Grid(grid.crs_wkt, coarse, elevation.shape[0], elevation.shape[1], grid.radius)
     return Scene(grid, build_height_field(elevation, grid), maps, horizon, lit, samples, distance)
 
 
@@ -213,24 +219,35 @@ def _trace(camera: Camera, scene: Scene, first: int, count: int, samples: int) -
     lines = (first + np.arange(count)[:, None] + offset).ravel()
     columns = (np.arange(camera.samples)[:, None] + offset).ravel()
     line, sample = np.meshgrid(lines, columns, indexing="ij")
-    origins, directions = camera.rays(line.ravel(), sample.ravel())
-    if origins.strides[0] == 0:
-        origins = origins[:1]
+    origins, directions = _rays(camera, line.ravel(), sample.ravel())
     return _Rays(origins, directions, cast(scene.field, origins, directions))
 
 
-def _light_at(light: Light, scene: Scene, rays: _Rays) -> tuple[Angles, torch.Tensor]:
-    """Angles and visible share of the Sun at the hits, (N,) float32."""
-    found = hit_angles(scene.field, rays.origins, rays.directions, rays.hits, light.sun.position)
-    cos_incidence, cos_emission, phase, sun_elevation = (
-        torch.from_numpy(v.astype(np.float32))
-        for v in (found.cos_incidence, found.cos_emission, found.phase, found.sun_elevation)
-    )
-    visible = torch.ones(())
-    if scene.horizon is not None:
-        horizon = torch.from_numpy(sample_maps(scene.horizon[None], rays.hits)[0])
-        visible = sun_visibility(sun_elevation, horizon, light.sun.radius)
-    return Angles(cos_incidence, cos_emission, phase.cos(), phase_given=phase), visible
+def _rays(camera: Camera, line: Floats, sample: Floats) -> tuple[Floats, Floats]:
+    """Like ``camera.rays``, with one origin where all rays leave one point."""
+    if isinstance(camera, Pinhole):  # by far the most common, and drawing rays should not take longer than casting them
+        directions = np.empty((len(line), 3))
+        _pinhole_rays(camera.focal_px, camera.principal_point_px, camera.rotation, line, sample, directions)
+        return camera.centre[None], directions
+    return camera.rays(line, sample)
+
+
+@numba.njit(cache=True, parallel=True)
+def _pinhole_rays(focal, point, rotation, line, sample, directions):
+    for n in numba.prange(len(line)):
+        x, y = (sample[n] - point[0]) / focal[0], (line[n] - point[1]) / focal[1]
+        inverse = 1.0 / math.sqrt(x * x + y * y + 1.0)
+        for k in range(3):
+            directions[n, k] = (rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2]) * inverse
+
+
+def _light_at(light: Light, scene: Scene, rays: _Rays) -> tuple[HitAngles, Floats32]:
+    """Angles and visible share of the Sun at the hits, (N,)."""
+    angles = hit_angles(scene.field, rays.origins, rays.directions, rays.hits, light.sun.position)
+    if scene.horizon is None:
+        return angles, np.ones(len(rays.directions), np.float32)
+    horizon = sample_maps(scene.horizon[None], rays.hits)[0]
+    return angles, visible_share(angles.sun_elevation, horizon, light.sun.radius)
 
 
 def _radiance(surface: Surface, light: Light, scene: Scene, rays: _Rays) -> Floats32:
@@ -238,14 +255,17 @@ def _radiance(surface: Surface, light: Light, scene: Scene, rays: _Rays) -> Floa
     if scene.lit is not None:
         image = sample_maps(scene.lit[None], rays.hits)[0]
     else:
-        angles, visible = _light_at(light, scene, rays)
+        found, visible = _light_at(light, scene, rays)
+        cosines = (torch.from_numpy(found.cos_incidence), torch.from_numpy(found.cos_emission))
+        phase = torch.from_numpy(found.phase)
+        angles = Angles(*cosines, phase.cos(), phase_given=phase)
         if scene.maps.shape[1] > 1:
-            coefficients = torch.from_numpy(sample_maps(scene.maps, rays.hits))
+            coefficients = sample_maps(scene.maps, rays.hits)
         else:
-            coefficients = torch.from_numpy(np.ascontiguousarray(scene.maps[:, :, 0]))
-        reflectance = masked_radiance_factor(surface.model, surface.model.unpack(coefficients, dim=0), angles)
-        known = torch.from_numpy(rays.hits.status == HIT) & torch.isfinite(coefficients).all(dim=0)
-        image = torch.where(known, reflectance * visible, torch.nan).numpy()
+            coefficients = np.ascontiguousarray(scene.maps[:, :, 0])
+        parameters = surface.model.unpack(torch.from_numpy(coefficients), dim=0)
+        image = masked_radiance_factor(surface.model, parameters, angles).numpy() * visible
+        image[(rays.hits.status != HIT) | ~np.isfinite(coefficients).all(axis=0)] = np.nan
     image[_in_space(scene, rays)] = 0.0
     return image
 
@@ -255,10 +275,12 @@ def _in_space(scene: Scene, rays: _Rays) -> NDArray[np.bool_]:
     missed = rays.hits.status == MISS
     if not missed.any():
         return missed
-    along = (rays.origins * rays.directions).sum(-1)
-    closest2 = (rays.origins * rays.origins).sum(-1) - along**2
-    passes = (closest2 > (scene.grid.radius + scene.field.lowest) ** 2) | (along > 0)
-    return missed & passes
+    single = len(rays.origins) == 1
+    origins = rays.origins if single else rays.origins[missed]
+    along = (origins * rays.directions[missed]).sum(-1)
+    closest2 = (origins * origins).sum(-1) - along**2
+    missed[missed] = (closest2 > (scene.grid.radius + scene.field.lowest) ** 2) | (along > 0)
+    return missed
 
 
 def _mean(values: Floats32, lines: int, width: int, samples: int) -> Floats32:
@@ -278,20 +300,17 @@ def _mean(values: Floats32, lines: int, width: int, samples: int) -> Floats32:
 def _backplanes(surface: Surface, light: Light, scene: Scene, rays: _Rays) -> dict[str, Floats32]:
     angles, visible = _light_at(light, scene, rays)
     points = hit_points(rays.hits, rays.origins, rays.directions)
-    mu0 = angles.cos_incidence
-    shadow = torch.where(mu0 > 0, 1 - visible, torch.ones(()))
-    shadow = torch.where(torch.isfinite(mu0), shadow, torch.nan)
-    with np.errstate(invalid="ignore"):
-        radius = np.linalg.norm(points, axis=1)
-        planes = (
-            np.degrees(np.arccos(np.clip(mu0.numpy(), -1, 1))),
-            np.degrees(np.arccos(np.clip(angles.cos_emission.numpy(), -1, 1))),
-            np.degrees(angles.phase.numpy()),
-            shadow.numpy(),
-            rays.hits.depth,
-            np.degrees(np.arctan2(points[:, 1], points[:, 0])),
-            np.degrees(np.arcsin(points[:, 2] / radius)),
-        )
+    shadow = np.where(angles.cos_incidence > 0, 1 - visible, np.float32(1))
+    shadow[np.isnan(angles.cos_incidence)] = np.nan
+    planes = (
+        np.degrees(np.arccos(np.clip(angles.cos_incidence, -1, 1))),
+        np.degrees(np.arccos(np.clip(angles.cos_emission, -1, 1))),
+        np.degrees(angles.phase),
+        shadow,
+        rays.hits.depth,
+        np.degrees(np.arctan2(points[:, 1], points[:, 0])),
+        np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))),
+    )
     return {name: plane.astype(np.float32) for name, plane in zip(BACKPLANES, planes, strict=True)}
 
 
