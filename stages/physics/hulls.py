@@ -12,83 +12,122 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.physics.sweeps import FLAGS, Sweep, Taps, arctangent, sink, transpose_in, transpose_out
+from stages.physics.sweeps import FLAGS, NOTHING, Sweep, Taps, arctangent, sink, transpose_in, transpose_out
 
-NEAR = 4  # rows
-LINES = 256  # lines per strip
+NEAR = 16  # rows
+SPACING = 2  # columns from line to line
+WINDOW = 12  # rows to either side that can hide a sample from everything behind
+RING = 2 * WINDOW + 1
+LINES = 1024  # lines per strip
 BLOCK = 64  # columns per transposed block
 SMALL = 512 * 512  # px; smaller grids are swept by the calling thread alone
 NOWHERE = np.float32(1e30)  # row of a point that is not there
 
 
-@numba.njit(fastmath=FLAGS)
-def _push(hull, count, s, h):
-    """Add the nearest point so far, row s and height h, to an upper hull; drop what its chord hides."""
-    while count > 1:
-        near, far = hull[count - 1], hull[count - 2]
-        if (far[1] - h) * (s - near[0]) < (near[1] - h) * (s - far[0]):
-            break
-        count -= 1
-    hull[count, 0] = s
-    hull[count, 1] = h
-    return count + 1
+@numba.njit(fastmath=FLAGS, error_model="numpy")
+def _sample_lines(z, row, shift, z_column, first, lines, columns, f, lowered, out):
+    """Heights where the lines cross one row, NOTHING outside the grid and beside NaN."""
+    back = 1 if f > 0 else 0
+    base = first - shift  # column right of line k is base + SPACING k
+    lo = min(max(0, -((base - back) // SPACING)), lines)
+    hi = max(min(lines, (columns - base + SPACING - 1) // SPACING), lo)
+    out[:lo] = NOTHING
+    out[hi:] = NOTHING
+    one = np.float32(1.0)
+    right = z[row, lo * SPACING + base - z_column : columns - z_column]
+    left = z[row, lo * SPACING + base - back - z_column : columns - back - z_column]
+    middle = out[lo:hi]
+    for k in range(hi - lo):
+        h = (one - f) * right[SPACING * k] + (f * left[SPACING * k] - lowered)
+        middle[k] = h if h > NOTHING else NOTHING
 
 
-@numba.njit(fastmath=FLAGS)
-def _tangent(hull, count, s, h):
-    """Index of the hull point that stands highest seen from row s, height h: slopes rise, then fall, going outwards."""
-    k = count - 1
-    rise, run = hull[k, 1] - h, s - hull[k, 0]
-    while k > 0:
-        next_rise, next_run = hull[k - 1, 1] - h, s - hull[k - 1, 0]
-        if next_rise * run <= rise * next_run:
-            break
-        rise, run = next_rise, next_run
-        k -= 1
-    return k
+@numba.njit(fastmath=FLAGS, error_model="numpy")
+def _could_be_seen(samples, r, visible):
+    """1 where row r of the samples stands above every chord between a nearer and a farther sample within WINDOW."""
+    here = samples[r % RING]
+    steepest, shallowest = samples[RING], samples[RING + 1]
+    steepest[:] = NOTHING
+    shallowest[:] = -NOTHING
+    for a in range(1, WINDOW + 1):
+        nearer, farther = samples[(r + a) % RING], samples[(r - a) % RING]
+        d = np.float32(1 / a)
+        for k in range(visible.size):
+            rise = (nearer[k] - here[k]) * d
+            fall = (here[k] - farther[k]) * d
+            if rise > steepest[k]:
+                steepest[k] = rise
+            if fall < shallowest[k]:
+                shallowest[k] = fall
+    for k in range(visible.size):
+        visible[k] = (steepest[k] < shallowest[k]) & (here[k] > NOTHING)
 
 
-@numba.njit(fastmath=FLAGS)
+@numba.njit(fastmath=FLAGS, error_model="numpy")
+def _push(hull, depth, s, heights, visible, chosen):
+    """Add the nearest samples, row s, to the upper hulls of their lines; drop what the new chords hide."""
+    count = 0
+    for k in range(visible.size):  # a list of the few that are visible spares a mispredicted branch for each
+        chosen[count] = k
+        count += visible[k]
+    for q in range(count):
+        k = chosen[q]
+        h = heights[k]
+        p = depth[k] - 1
+        while p > 0:
+            if (hull[p - 1, k, 1] - h) * (s - hull[p, k, 0]) < (hull[p, k, 1] - h) * (s - hull[p - 1, k, 0]):
+                break
+            p -= 1
+        p += 1
+        hull[p, k, 0] = s
+        hull[p, k, 1] = h
+        depth[k] = p + 1
+
+
+@numba.njit(fastmath=FLAGS, error_model="numpy")
+def _find_tangents(hull, depth, s, heights, seen_s, seen_h):
+    """What each line sees highest from row s: along a hull, going outwards, slopes rise and then fall."""
+    for k in range(depth.size):
+        p = depth[k] - 1
+        h = heights[k]
+        if p < 0 or h == NOTHING:
+            seen_s[k] = NOWHERE
+            continue
+        rise, run = hull[p, k, 1] - h, s - hull[p, k, 0]
+        while p > 0:
+            next_rise, next_run = hull[p - 1, k, 1] - h, s - hull[p - 1, k, 0]
+            if next_rise * run <= rise * next_run:
+                break
+            rise, run = next_rise, next_run
+            p -= 1
+        seen_s[k] = hull[p, k, 0]
+        seen_h[k] = hull[p, k, 1]
+
+
+@numba.njit(fastmath=FLAGS, error_model="numpy")
 def _horizon_rows(
     z, z_row, z_step, z_column, out, out_row, out_step, out_column, start, stop, first, count, columns,
-    whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step, sinks,
-    hulls, depth, seen_s, seen_h, height, angle,
+    whole, fraction, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step, sinks,
+    hull, depth, samples, visible, chosen, observers, seen_s, seen_h, angle,
 ):  # fmt: skip
     """Sweep rows start..stop of one strip of lines; arguments as for the cast shadow's ``_shadow_rows``.
 
-    hulls : (count + 1, 2 rows, 2) row and height of hull points; depth : (count + 1,) points in use
-    seen_s, seen_h : (count + 1,) scratch: the point each line sees highest; height, angle : scratch
+    hull : (rows, lines, 2) row and height of hull points, farthest first; depth : (lines,) points in use
+    samples : (RING + 2, lines), the lines' heights over the last rows; the rest is scratch
     """
     one = np.float32(1.0)
+    lines = depth.size
     for i in range(start, stop):
         r = i - near
+        newest = r + WINDOW
+        if newest >= 0:
+            _sample_lines(
+                z, z_row + z_step * newest, whole[newest], z_column, first, lines, columns, fraction[newest],
+                np.float32(sink(sinks, float(newest))), samples[newest % RING],
+            )  # fmt: skip
         if r >= 0:
-            base = first - whole[r]
-            u = crossing[r]
-            if u > 0:
-                cross = first - crossed[r]
-                lo, hi = min(max(0, -cross), count + 1), min(count + 1, columns - cross)
-                if hi > lo:
-                    a = z[z_row + z_step * (r - 1), lo + cross - z_column : hi + cross - z_column]
-                    b = z[z_row + z_step * r, lo + cross - z_column : hi + cross - z_column]
-                    s, c = np.float32(r - 1 + u), np.float32(sink(sinks, r - 1 + u))
-                    for k in range(hi - lo):
-                        height[k] = (one - u) * a[k] + (u * b[k] - c)
-                    for k in range(hi - lo):
-                        if height[k] == height[k]:
-                            depth[lo + k] = _push(hulls[lo + k], depth[lo + k], s, height[k])
-            f = fraction[r]
-            back = 1 if f > 0 else 0
-            lo = min(max(0, back - base), count + 1)
-            hi = max(min(count + 1, columns - base), lo)
-            a = z[z_row + z_step * r, lo + base - z_column : hi + base - z_column]
-            b = z[z_row + z_step * r, lo + base - back - z_column : hi + base - back - z_column]
-            s, c = np.float32(r), np.float32(sink(sinks, float(r)))
-            for k in range(hi - lo):
-                height[k] = (one - f) * a[k] + (f * b[k] - c)
-            for k in range(hi - lo):
-                if height[k] == height[k]:
-                    depth[lo + k] = _push(hulls[lo + k], depth[lo + k], s, height[k])
+            _could_be_seen(samples, r, visible)
+            _push(hull, depth, np.float32(r), samples[r % RING], visible, chosen)
         j0, j1 = max(0, first - whole[i]), min(columns, first + count - whole[i])
         if j1 <= j0:
             continue
@@ -130,37 +169,27 @@ def _horizon_rows(
                         low[k] = h
         if r >= 0:
             f = fraction[i]
-            # what each line sees highest from where it crosses row i
-            row = z_row + z_step * i
-            at = j0 + whole[i] - first
-            for k in range(n + 1):
-                seen_s[k] = NOWHERE
-                if depth[at + k] == 0 or (k == n and f == 0):
-                    continue
-                right = here[k] if k < n else (z[row, j1 - z_column] if j1 < columns else np.float32(np.nan))
-                left = here[k - 1] if k > 0 else (z[row, j0 - 1 - z_column] if j0 > 0 else np.float32(np.nan))
-                if right != right:
-                    right = left
-                elif left != left:
-                    left = right
-                if right != right:
-                    continue
-                p = _tangent(
-                    hulls[at + k], depth[at + k], np.float32(i), (one - f) * right + f * left - np.float32(here_sink)
-                )
-                seen_s[k] = hulls[at + k, p, 0]
-                seen_h[k] = hulls[at + k, p, 1]
             c, row_i = np.float32(here_sink), np.float32(i)
-            for k in range(n):
-                mine = here[k] - c
-                left_slope = (seen_h[k] - mine) / (row_i - seen_s[k])
-                right_slope = (seen_h[k + 1] - mine) / (row_i - seen_s[k + 1])
-                no_left, no_right = seen_s[k] == NOWHERE, seen_s[k + 1] == NOWHERE
-                left_slope = right_slope if no_left else left_slope
-                right_slope = left_slope if no_right else right_slope
-                far = left_slope + f * (right_slope - left_slope)
-                if far > best[k] and not (no_left and no_right):
-                    best[k] = far
+            _sample_lines(z, z_row + z_step * i, whole[i], z_column, first, lines, columns, f, c, observers)
+            _find_tangents(hull, depth, row_i, observers, seen_s, seen_h)
+            at = j0 + whole[i] - first
+            for phase in range(SPACING):
+                # pixels whose left line is (at + phase) // SPACING, + 1 for every SPACING columns
+                k0 = (at + phase) // SPACING
+                g = ((at + phase) % SPACING + f) / np.float32(SPACING)
+                left_s, left_h = seen_s[k0:], seen_h[k0:]
+                right_s, right_h = seen_s[k0 + 1 :], seen_h[k0 + 1 :]
+                low, z_here = best[phase:], here[phase:]
+                for k in range((n - phase + SPACING - 1) // SPACING):
+                    mine = z_here[SPACING * k] - c
+                    left_slope = (left_h[k] - mine) / (row_i - left_s[k])
+                    right_slope = (right_h[k] - mine) / (row_i - right_s[k])
+                    no_left, no_right = left_s[k] == NOWHERE, right_s[k] == NOWHERE
+                    left_slope = right_slope if no_left else left_slope
+                    right_slope = left_slope if no_right else right_slope
+                    far = left_slope + g * (right_slope - left_slope)
+                    if far > low[SPACING * k] and not (no_left and no_right):
+                        low[SPACING * k] = far
         scale, tilt = np.float32(1 / step), np.float32(-2 * sinks[0] * (i - sinks[1]) / step)
         result = out[out_row + out_step * i, j0 - out_column : j1 - out_column]
         for k in range(n):
@@ -168,39 +197,52 @@ def _horizon_rows(
             result[k] = arctangent(slope) if here[k] == here[k] else np.float32(np.nan)
 
 
+@numba.njit
+def _workspace(count, rows):
+    """Hulls and scratch of one strip: hull, depth, samples, visible, chosen, observers, seen_s, seen_h, angle."""
+    lines = (count + SPACING - 1) // SPACING + 1
+    return (
+        np.empty((rows + 1, lines // 16 * 16 + 24, 2), dtype=np.float32),  # an odd number of cache lines: no aliasing
+        np.zeros(lines, dtype=np.int64),
+        np.full((RING + 2, lines), NOTHING, dtype=np.float32),
+        np.zeros(lines, dtype=np.bool_),
+        np.empty(lines + 1, dtype=np.int64),
+        np.empty(lines, dtype=np.float32),
+        np.empty(lines, dtype=np.float32),
+        np.empty(lines, dtype=np.float32),
+        np.empty(count, dtype=np.float32),
+    )
+
+
 def _by_rows(
     z, z_row, z_step, out, start, stop, columns, first_line, line_count, width,
-    whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step, sinks,
+    whole, fraction, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step, sinks,
 ):  # fmt: skip
     """Sweep whose rows are the grid's rows, over some of its lines: straight from the grid."""
     strips = (line_count + width - 1) // width
     for strip in numba.prange(strips):
         first = first_line + strip * width
         count = min(width, first_line + line_count - first)
-        hulls = np.empty((count + 1, 2 * stop + 2, 2), dtype=np.float32)
-        depth = np.zeros(count + 1, dtype=np.int64)
-        scratch = np.empty((4, count + 1), dtype=np.float32)
+        work = _workspace(count, stop)
         _horizon_rows(
             z, z_row, z_step, 0, out, z_row, z_step, 0, start, stop, first, count, columns,
-            whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step,
-            sinks, hulls, depth, scratch[0], scratch[1], scratch[2], scratch[3],
+            whole, fraction, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step,
+            sinks, *work,
         )  # fmt: skip
 
 
 def _by_columns(
     z, z_column, z_step, out, start, stop, columns, first_line, line_count, width,
-    whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step, sinks,
+    whole, fraction, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step, sinks,
 ):  # fmt: skip
     """Sweep whose rows are the grid's columns: through blocks transposed into a buffer."""
     strips = (line_count + width - 1) // width
     for strip in numba.prange(strips):
         first = first_line + strip * width
         count = min(width, first_line + line_count - first)
-        hulls = np.empty((count + 1, 2 * stop + 2, 2), dtype=np.float32)
-        depth = np.zeros(count + 1, dtype=np.int64)
-        scratch = np.empty((4, count + 1), dtype=np.float32)
+        work = _workspace(count, stop)
         margin = near + 1
-        pitch = count + BLOCK + 3 * margin + 24
+        pitch = count + BLOCK + 3 * margin + 2 * SPACING + 24
         rows = np.empty((BLOCK + margin, pitch), dtype=np.float32)
         angle = np.empty((BLOCK, pitch), dtype=np.float32)
         for begin in range(start, stop, BLOCK):
@@ -210,14 +252,14 @@ def _by_columns(
             if low > high:
                 low, high = high, low
             j0 = max(0, first - high - margin - 1)
-            j1 = min(columns, first + count + 1 - low + margin + 1)
+            j1 = min(columns, first + count + SPACING - low + margin + 1)
             if j1 <= j0:
                 continue
             transpose_in(z, z_column + z_step * from_row, z_step, end - from_row, j0, j1, rows)
             _horizon_rows(
                 rows, -from_row, 1, j0, angle, -begin, 1, j0, begin, end, first, count, columns,
-                whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step,
-                sinks, hulls, depth, scratch[0], scratch[1], scratch[2], scratch[3],
+                whole, fraction, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step,
+                sinks, *work,
             )  # fmt: skip
             transpose_out(
                 angle, j0, out, z_column, z_step, begin, end, whole, first, count,
@@ -261,7 +303,7 @@ def sweep_horizon(
     origin, step = (sweep.rows - 1, -1) if sweep.reverse else (0, 1)
     _KERNELS[sweep.by_columns, parallel](
         grid, origin, step, out, 0, i1, sweep.columns, first_line, line_count, LINES if parallel else line_count,
-        sweep.whole, sweep.fraction, sweep.crossing, sweep.crossed, taps.rows, taps.columns, taps.weight,
+        sweep.whole, sweep.fraction, taps.rows, taps.columns, taps.weight,
         taps.distance, NEAR, sweep.shear, sweep.step, (bend, 0.5 * (sweep.rows - 1)),
     )  # fmt: skip
     return out[row : row + height, column : column + width]

@@ -172,7 +172,7 @@ def transpose_out(shade, j0, out, column, step, begin, end, whole, first, count,
                 target[i] = shade[b - 1 - begin - i, j - j0]
 
 
-@numba.njit(fastmath=FLAGS, inline="always")
+@numba.njit(fastmath=FLAGS, inline="always", error_model="numpy")
 def arctangent(x):
     """atan of a float32, vectorised: odd polynomial on [0, 1] fitted at Chebyshev nodes, error below 2e-7 rad."""
     one = np.float32(1.0)
