@@ -23,12 +23,14 @@ from stages.physics.bodies import find_body
 from stages.physics.frames import Frame, read_frames, write_frames
 from stages.physics.grid import Grid, check_body, local_metric_crs, require_crs
 from stages.physics.positions import blocks, valid_positions
+from stages.physics.sources import open_source
 
 Progress = Callable[[int, int, str], None]
 
 # A map whose pixels are within this of square and of the working GSD counts as metric: no resampling, only means.
 METRIC_TOLERANCE = 0.01
 LARGEST_REACH = math.radians(30)  # a local stereographic map's scale is 7 % too large there
+ANY_RELIEF = 0.006  # of the radius: Olympus Mons; Vesta's and Phobos' shapes go beyond, their DEMs' datum does not
 MINIMUM_COVERAGE = 0.5  # share of a coarse pixel that must be valid before its mean counts
 
 
@@ -68,7 +70,7 @@ def run(
     if config.crop < 16 or config.crop % 2:
         raise ConfigError(f"--crop: expected an even number of pixels, at least 16; found {config.crop}.")
     body = find_body(config.body)
-    frames = read_frames(images) if images else []
+    frames = read_frames(images, body) if images else []
     with rasters.open_raster(dem, "a DEM") as dataset:
         crs = require_crs(str(dem), dataset.crs, dataset.transform)
         check_body(str(dem), crs, body)
@@ -91,7 +93,7 @@ def run(
             for name in ("valid", "valid_position", "frame_window"):  # also where there is no image at all
                 writer.dataset(name)
             areas = [
-                _write_validity(frame, index, len(frames), plan.grid, writer, config, progress)
+                _write_validity(frame, index, len(frames), plan.grid, extent, writer, config, progress)
                 for index, frame in enumerate(frames)
             ]
             if frames and not any(areas):
@@ -299,17 +301,16 @@ def _check_frames(frames: Sequence[Frame], grid: Grid, skip_outside: bool) -> tu
     """Every image must be readable, lie on the DEM and be lit. Raises InputError or GeometryError."""
     kept, skipped = [], []
     for frame in frames:
-        if frame.camera is None:
-            with rasters.open_raster(frame.path, f"the image '{frame.image_id}'") as image:
-                require_crs(str(frame.path), image.crs, image.transform)
-                check_body(str(frame.path), image.crs, find_body(str(grid.radius)))
-                if rasters.source_window(image, grid, margin=0) is None:
-                    if not skip_outside:
-                        raise InputError(
-                            f"{frame.path}: image '{frame.image_id}' does not touch the DEM; remove it from the table or add --skip-outside."
-                        )
-                    skipped.append(frame.image_id)
-                    continue
+        # The DEM is not read yet: camera images are looked for at the heights that relief can have on any body.
+        relief = ANY_RELIEF * grid.radius
+        with open_source(frame, grid, None, (-relief, relief)) as source:
+            if source.box() is None:
+                if not skip_outside:
+                    raise InputError(
+                        f"{frame.path}: image '{frame.image_id}' does not touch the DEM; remove it from the table or add --skip-outside."
+                    )
+                skipped.append(frame.image_id)
+                continue
         kept.append(frame)
     if frames and not kept:
         raise InputError(
@@ -319,25 +320,29 @@ def _check_frames(frames: Sequence[Frame], grid: Grid, skip_outside: bool) -> tu
 
 
 def _write_validity(
-    frame: Frame, index: int, count: int, grid: Grid, writer: ArtefactWriter, config: Config, progress: Progress | None
+    frame: Frame,
+    index: int,
+    count: int,
+    grid: Grid,
+    heights: tuple[float, float],
+    writer: ArtefactWriter,
+    config: Config,
+    progress: Progress | None,
 ) -> float:
     """Write one image's masks; returns the ground area of its valid positions, m2."""
-    box = _footprint(frame, grid)
-    row0, col0, height, width = box
     valid, position = writer.dataset("valid"), writer.dataset("valid_position")
-    todo = list(blocks(height, width, config.block))
     dem_valid = writer.file["dem_valid"]
     used: tuple[int, int, int, int] | None = None
-    with rasters.open_raster(frame.path, f"the image '{frame.image_id}'") as image:
+    with open_source(frame, grid, writer.file["elevation"], heights) as source:
+        row0, col0, height, width = source.box() or (0, 0, 0, 0)
+        todo = list(blocks(height, width, config.block))
         for number, (r, c, h, w) in enumerate(todo):
             if progress:
                 progress(
                     index * 1000 + 1000 * number // max(1, len(todo)), count * 1000, f"image masks ({frame.image_id})"
                 )
             r, c = row0 + r, col0 + c
-            part = grid.window(r, c, h, w)
-            _, seen = rasters.warp(image, part, rasters.choose_resampling(image, part)[0])
-            seen &= dem_valid[r : r + h, c : c + w].astype(bool)
+            seen = source.read(r, c, h, w).valid & dem_valid[r : r + h, c : c + w].astype(bool)
             if seen.any():
                 valid[index, r : r + h, c : c + w] = seen
                 rows, cols = np.flatnonzero(seen.any(1)), np.flatnonzero(seen.any(0))
@@ -359,23 +364,6 @@ def _write_validity(
     if progress and index == count - 1:
         progress(count * 1000, count * 1000, "image masks")
     return area
-
-
-def _footprint(frame: Frame, grid: Grid) -> tuple[int, int, int, int]:
-    """(row, col, height, width) on the grid that holds the whole image."""
-    with rasters.open_raster(frame.path, f"the image '{frame.image_id}'") as image:
-        own = Grid(image.crs.to_wkt(), image.transform, image.height, image.width, grid.radius)
-        rows = np.concatenate(
-            [np.linspace(-0.5, image.height - 0.5, 33)] * 2 + [np.full(33, -0.5), np.full(33, image.height - 0.5)]
-        )
-        cols = np.concatenate(
-            [np.full(33, -0.5), np.full(33, image.width - 0.5)] + [np.linspace(-0.5, image.width - 0.5, 33)] * 2
-        )
-        row, col = grid.rowcol_of_lonlat(*own.lonlat(rows, cols))
-    good = np.isfinite(row) & np.isfinite(col)
-    r0, c0 = max(0, math.floor(row[good].min())), max(0, math.floor(col[good].min()))
-    r1, c1 = min(grid.height, math.ceil(row[good].max()) + 1), min(grid.width, math.ceil(col[good].max()) + 1)
-    return r0, c0, max(0, r1 - r0), max(0, c1 - c0)
 
 
 def _union(box: tuple[int, int, int, int] | None, other: tuple[int, int, int, int]) -> tuple[int, int, int, int]:

@@ -16,7 +16,10 @@ import numpy as np
 
 from schemas.errors import InputError
 from schemas.hdf5 import ArtefactWriter, read_strings
+from stages.physics.bodies import Body, find_body
+from stages.physics.frame_geometry import complete_row
 from stages.physics.grid import unit_vectors
+from stages.physics.labels import index_images
 
 ASTRONOMICAL_UNIT = 149597870700.0  # m, IAU 2012
 
@@ -57,11 +60,17 @@ class Frame:
         return direction * (radius + self.spacecraft_altitude_m)
 
 
-def read_frames(table: Path) -> list[Frame]:
-    """Read and check an image table. Raises InputError naming the row and column."""
+def read_frames(table: Path, body: Body | None = None) -> list[Frame]:
+    """Read and check an image table, or a PDS3 index (CUMINDEX.TAB) in its place.
+
+    What the table leaves empty is taken from the camera model, the image's label or its time: see frame_geometry.
+    Raises InputError naming the row and column.
+    """
     if not table.exists():
         raise InputError(f"{table}: no such file; expected the image table (images.csv or JSON).")
     try:
+        if table.suffix.lower() in (".tab", ".lbl"):
+            return _frames(table, index_images(table), body)
         text = table.read_text(encoding="utf-8-sig")
         rows = json.loads(text) if table.suffix.lower() == ".json" else list(csv.DictReader(text.splitlines()))
     except (UnicodeDecodeError, json.JSONDecodeError, csv.Error) as error:
@@ -70,7 +79,12 @@ def read_frames(table: Path) -> list[Frame]:
         rows = rows.get("images", [])
     if not rows:
         raise InputError(f"{table}: expected at least one image, found none.")
-    frames = [_frame(table, number, row) for number, row in enumerate(rows, start=1)]
+    return _frames(table, rows, body)
+
+
+def _frames(table: Path, rows: Sequence[Mapping[str, Any]], body: Body | None) -> list[Frame]:
+    body = body or find_body("moon")
+    frames = [_frame(table, number, row, body) for number, row in enumerate(rows, start=1)]
     seen: set[str] = set()
     for frame in frames:
         if frame.image_id in seen:
@@ -79,7 +93,7 @@ def read_frames(table: Path) -> list[Frame]:
     return frames
 
 
-def _frame(table: Path, number: int, row: Mapping[str, Any]) -> Frame:
+def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Frame:
     where = f"{table}: image {number}"
     text = {k: ("" if v is None else str(v).strip()) for k, v in row.items() if k is not None}
     for key in ("image_id", "path"):
@@ -88,6 +102,10 @@ def _frame(table: Path, number: int, row: Mapping[str, Any]) -> Frame:
     units = text.get("units", "").lower()
     if units not in ("iof", "dn"):
         raise InputError(f"{where} ({text['image_id']}): expected units 'iof' or 'dn', found '{units or 'nothing'}'.")
+    camera = text.get("camera", "")
+    text = complete_row(
+        text, table.parent / text["path"], table.parent / camera if camera else None, body, f"{where} ({text['image_id']})"
+    )
     numbers = {}
     for key, (low, high) in _NUMBERS.items():
         try:
@@ -99,7 +117,6 @@ def _frame(table: Path, number: int, row: Mapping[str, Any]) -> Frame:
         if not (math.isfinite(value) and low <= value <= high):
             raise InputError(f"{where} ({text['image_id']}): expected '{key}' in {low:g}..{high:g}, found {value:g}.")
         numbers[key] = value
-    camera = text.get("camera", "")
     return Frame(
         image_id=text["image_id"],
         path=(table.parent / text["path"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
@@ -288,8 +289,8 @@ def index_images(path: Path) -> list[dict[str, str]]:
         camera = next((p for p in candidates if p.suffix.lower() == ".json"), None)
         ours = {
             "image_id": product,
-            "path": str(image),
-            "camera": str(camera) if camera else "",
+            "path": os.path.relpath(image.resolve(), folder.resolve()),
+            "camera": camera.name if camera else "",
             "units": "iof" if ".cal" in image.name.lower() or ".iof" in image.name.lower() else "dn",
             "start_time": row.get("START_TIME", ""),
         }

@@ -20,6 +20,8 @@ from stages.physics.grid import CSM_CENTRE, Grid, unit_vectors
 
 Floats = NDArray[np.float64]
 ReadWindow = Callable[[int, int, int, int], NDArray[np.float32]]
+# (row, col) arrays -> (dx, dy) px along columns and rows, as registration finds them
+Displacement = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]
 
 MAX_SAMPLES = 64  # per side of a ground pixel
 WINDOW_PX = 1 << 23  # image pixels in memory at a time
@@ -63,15 +65,19 @@ def orthorectify(
     terrain: Terrain,
     box: tuple[int, int, int, int],
     sun_position: Floats | None = None,
+    displacement: Displacement | None = None,
 ) -> Ortho:
     """What ``camera`` saw of the pixels ``box`` = (row, col, height, width) of ``terrain``.
 
     read_window : (line, sample, lines, samples) -> pixels, NaN = nodata; only asked for windows inside the image
     sun_position : (3,) body-fixed, m; the camera model's own where None
+    displacement : what the image is off by: a pixel is looked up where the camera model believes (row + dy, col + dx)
+        to be, at the height that it has
     """
     row, col, height, width = box
-    centres = _ground(terrain, *np.meshgrid(np.arange(row, row + height), np.arange(col, col + width), indexing="ij"))
-    line, sample = camera.ground_to_image(centres)
+    pixels = np.meshgrid(np.arange(row, row + height), np.arange(col, col + width), indexing="ij")
+    centres = _ground(terrain, *pixels)
+    line, sample = camera.ground_to_image(centres if displacement is None else _ground(terrain, *pixels, displacement))
     seen = camera.inside(line, sample)
     axes = _axes(terrain.grid, box)
     view, view_position = _view(camera, centres, line, sample, seen)
@@ -90,7 +96,7 @@ def orthorectify(
             part = np.s_[r : r + BLOCK, c : c + BLOCK]
             h, w = wanted[part].shape
             if wanted[part].any():
-                corners = _corners(terrain, camera, (row + r, col + c, h, w))
+                corners = _corners(terrain, camera, (row + r, col + c, h, w), displacement)
                 image[part], complete[part] = _resample(read_window, camera, corners, wanted[part])
     known = seen & np.isfinite(centres[..., 0])
     return Ortho(
@@ -144,9 +150,12 @@ def reach_px(relief: float, emission: float, gsd: float, limit: int = 2048) -> i
 # --- ground ---------------------------------------------------------------------------------------------------------
 
 
-def _ground(terrain: Terrain, row: NDArray, col: NDArray) -> Floats:
+def _ground(terrain: Terrain, row: NDArray, col: NDArray, displacement: Displacement | None = None) -> Floats:
     """(..., 3) body-fixed points of the terrain at fractional (row, col), NaN where it is unknown."""
     height = _bilinear(terrain.elevation, row, col)
+    if displacement is not None:
+        dx, dy = displacement(np.asarray(row, float), np.asarray(col, float))
+        row, col = row + dy, col + dx
     return unit_vectors(*terrain.grid.lonlat(row, col)) * (terrain.grid.radius + height)[..., None]
 
 
@@ -280,11 +289,13 @@ def _sun(camera: Camera, line: Floats, seen: NDArray[np.bool_], given: Floats | 
 # --- image ----------------------------------------------------------------------------------------------------------
 
 
-def _corners(terrain: Terrain, camera: Camera, box: tuple[int, int, int, int]) -> tuple[Floats, Floats]:
+def _corners(
+    terrain: Terrain, camera: Camera, box: tuple[int, int, int, int], displacement: Displacement | None
+) -> tuple[Floats, Floats]:
     """(line, sample), each (h + 1, w + 1), of the corners between pixels, CSM coordinates."""
     row, col, height, width = box
     r, c = np.meshgrid(np.arange(height + 1) + row - 0.5, np.arange(width + 1) + col - 0.5, indexing="ij")
-    return camera.ground_to_image(_ground(terrain, r, c))
+    return camera.ground_to_image(_ground(terrain, r, c, displacement))
 
 
 def _resample(
