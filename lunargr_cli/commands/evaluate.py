@@ -36,6 +36,10 @@ def command(
             "--renderings/--no-renderings", help="Keep every rendered crop in the output (default: below 512 MiB)."
         ),
     ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", metavar="ROW", help="Score only this row of the table; may be repeated."),
+    ] = None,
     batch: Annotated[int, typer.Option("--batch", help="Crops in memory at a time.")] = 16,
     seed: Seed = 0,
     device: Device = "auto",
@@ -53,7 +57,7 @@ def command(
     from stages.evaluate.table import gain_lines, result_lines
 
     console = Console(quiet)
-    config = evaluate.Config(split, batch, bootstrap, fit_pairs, renderings, seed, device)
+    config = evaluate.Config(split, batch, bootstrap, fit_pairs, renderings, seed, device, tuple(only or ()))
     result = evaluate.run(
         pairs,
         checkpoint,
@@ -71,7 +75,8 @@ def command(
         f"{result['pairs']} crops of split '{split}', {result['tiles']} ground tiles, errors in {unit}", columns, cells
     )
     columns, cells = gain_lines(result)
-    console.table("what the learned reflectance gains (paired over ground tiles)", columns, cells)
+    if cells:
+        console.table("what the learned reflectance gains (paired over ground tiles)", columns, cells)
     for warning in result["warnings"]:
         console.say(f"note: {warning}.")
     if result["lpips_unavailable"]:

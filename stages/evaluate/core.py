@@ -119,8 +119,9 @@ def fit_renderers(
     size: int,
     seed: int,
     tick: Callable[[int], None],
+    only: Sequence[str] = (),
 ) -> list[Row]:
-    """The rows of the table, with everything that is free fitted on ``train``.
+    """The rows of the table (or those in ``only``), with everything that is free fitted on ``train``.
 
     Frames without train pairs get their gain and offset from ``orphans``, which no shared coefficient sees.
     """
@@ -131,46 +132,49 @@ def fit_renderers(
     raw = Renderer("hapke", hapke[0], constant(hapke[1]))
     model = predictor.model
     start = np.array([p.default for p in model.parameters])
-    fixed = [baseline] if calibrated else [network, baseline, raw]
-    if extensions:
-        extended = Renderer("learned_extended", model, from_network, tuple(extensions))
-        fixed += [] if calibrated else [extended]
+    wanted = [row for row in layout(bool(extensions)) if not only or row[0] in only]
+    needed = {source for _, source, _ in wanted}
+    extended = Renderer("learned_extended", model, from_network, tuple(extensions))
+    fixed = [r for r in ([baseline] if calibrated else [network, baseline, raw, extended]) if r.name in needed]
+    fit_global = not needed.isdisjoint({"global", "global_extended"})
 
     grams = {r.name: (fit.FrameGram(1, frames), fit.FrameGram(1, frames)) for r in fixed}
-    if model.linear:
+    if fit_global and model.linear:
         grams["global"] = (fit.FrameGram(len(start), frames), fit.FrameGram(len(start), frames))
     samples: list[fit.PixelSample] = []
     rng = np.random.default_rng(seed)
     per_crop = max(1, SAMPLE_PIXELS // max(1, len(train)))
-    for part, indices in enumerate((train, orphans)):
+    for part, indices in enumerate((train, orphans) if fixed or fit_global else ()):
         for chosen in batches(indices, size):
             batch = read_batch(reader, chosen, scale)
             for renderer in fixed:
                 features = renderer.radiance_factor(batch)[:, None]
                 grams[renderer.name][part].add(features, batch.image, batch.usable, batch.frame)
-            if model.linear:
+            if fit_global and model.linear:
                 grams["global"][part].add(unit_images(model, batch), batch.image, batch.usable, batch.frame)
-            elif part == 0:
+            elif fit_global and part == 0:
                 samples.append(sample_pixels(batch, per_crop, rng))
             tick(len(chosen))
 
-    if model.linear:
+    solved = start
+    if fit_global and model.linear:
         known = grams["global"][0].gram
         solved = fit.solve_coefficients(known) if calibrated else fit.solve_uncalibrated(known, start)
-    else:
+    elif fit_global:
         solved = fit.fit_nonlinear(model, _join(samples), frames, calibrated)
     everywhere = Renderer("global", model, constant(solved))
     late = []
-    if extensions:
-        late.append(Renderer("global_extended", model, constant(solved), tuple(extensions)))
-    if calibrated:
+    everywhere_extended = Renderer("global_extended", model, constant(solved), tuple(extensions))
+    if "global_extended" in needed:
+        late.append(everywhere_extended)
+    if calibrated and baseline in fixed:
         baseline.scale = float(fit.solve_coefficients(grams["lunar_lambert"][0].gram)[0])
-    else:
+    elif not calibrated:
         for renderer in fixed:
             _calibrate(renderer, grams[renderer.name], np.ones(1))
-        if model.linear:
+        if fit_global and model.linear:
             _calibrate(everywhere, grams["global"], solved)
-        else:
+        elif fit_global:
             late.append(everywhere)
         again = {r.name: (fit.FrameGram(1, frames), fit.FrameGram(1, frames)) for r in late}
         for part, indices in enumerate((train, orphans) if late else ()):
@@ -182,10 +186,8 @@ def fit_renderers(
         for renderer in late:
             _calibrate(renderer, again[renderer.name], np.ones(1))
 
-    renderers = {"learned": network, "global": everywhere, "lunar_lambert": baseline, "hapke": raw}
-    if extensions:
-        renderers |= {"learned_extended": extended, "global_extended": late[0]}
-    return [Row(name, renderers[source], how) for name, source, how in layout(bool(extensions))]
+    renderers = {r.name: r for r in (network, extended, everywhere, everywhere_extended, baseline, raw)}
+    return [Row(name, renderers[source], how) for name, source, how in wanted]
 
 
 def layout(extended: bool) -> list[tuple[str, str, str | None]]:

@@ -52,8 +52,8 @@ def write_figures(
 
 
 def exemplary_crops(scores: Scores) -> dict[str, int]:
-    """Positions of the learned model's best, median and worst crop by MSE."""
-    mse = scores.mse[scores.names.index("learned")]
+    """Positions of the first model's (the learned one's) best, median and worst crop by MSE."""
+    mse = scores.mse[0]
     order = np.argsort(np.where(np.isfinite(mse), mse, np.inf))[: int(np.isfinite(mse).sum())]
     return {"best": int(order[0]), "median": int(order[len(order) // 2]), "worst": int(order[-1])}
 
@@ -128,5 +128,5 @@ def crop_figure(batch: Batch, rows: list[Row], scores: Scores, position: int, la
         axis.set_axis_off()
     figure.colorbar(picture, ax=axes[0], fraction=0.02, pad=0.01, label=units)
     figure.colorbar(residual, ax=axes[1], fraction=0.02, pad=0.01, label="measured - rendered")
-    figure.suptitle(f"The learned model's {label} crop", fontsize=10)
+    figure.suptitle(f"The {label} crop of '{rows[0].name}'", fontsize=10)
     return figure

@@ -17,6 +17,7 @@ from schemas import (
     ArtefactError,
     ArtefactWriter,
     ConfigError,
+    RegistryError,
     atomic_path,
     check_output,
     open_artefact,
@@ -40,7 +41,7 @@ MANY_TILES = 10  # fewer make percentile intervals too narrow
 
 @dataclass
 class Config:
-    """Options of evaluate; ``fit_pairs`` bounds the pairs that baselines are fitted on (0: all)."""
+    """Options of evaluate; ``fit_pairs`` bounds the pairs that baselines are fitted on (0: all); ``only``: these rows."""
 
     split: str = "test"
     batch: int = 16
@@ -49,6 +50,7 @@ class Config:
     renderings: bool | None = None
     seed: int = 0
     device: str = "auto"
+    only: tuple[str, ...] = ()
 
 
 def run(
@@ -153,7 +155,7 @@ def evaluate_pairs(
     total = len(train) + len(orphans) + len(wanted)
     rows = fit_renderers(
         reader, predictor, extensions, train, orphans, len(frame_names), calibrated, scale, config.batch, config.seed,
-        tick,
+        tick, config.only,
     )  # fmt: skip
     perceptual = Perceptual()
     scores = score(reader, rows, wanted, scale, config.batch, perceptual, keep, tick)
@@ -220,7 +222,11 @@ def _evaluate(
     progress: Callable[[int, int, str], None] | None,
 ) -> dict[str, Any]:
     height, width = reader.size
-    names = len(layout(bool(extensions)))
+    rows_known = [name for name, _, _ in layout(bool(extensions))]
+    for name in config.only:
+        if name not in rows_known:
+            raise RegistryError.unknown("row of the evaluation", name, rows_known)
+    names = len(set(config.only)) or len(rows_known)
     size = names * len(wanted) * height * width * 4
     renderings = size <= RENDERINGS_LIMIT if config.renderings is None else config.renderings
     sizes = {"model": names, "pair": len(wanted), "y": height, "x": width}
