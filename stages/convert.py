@@ -27,7 +27,8 @@ Progress = Callable[[int, int, str], None]
 @dataclass
 class Config:
     """source, target : conventions, SYSTEM:MODEL
-    bands : names of the input's bands in their order, where the file does not carry them as descriptions
+    bands : where the file's descriptions do not name its quantities: names of all its bands in their order, or
+        'NAME=INDEX' (from 1) for those that are wanted, as in a file with several wavelengths
     approximate : convert although the target cannot hold everything
     """
 
@@ -97,11 +98,7 @@ def run(
 def band_indices(data: DatasetReader, convention: Convention, names: Sequence[str] | None = None) -> dict[str, int]:
     """Quantity -> 1-based band. Raises InputError or ConfigError with the names that are missing."""
     wanted = ",".join(convention.names)
-    if names is not None and len(names) != data.count:
-        raise ConfigError(
-            f"--bands: expected {data.count} names for the {data.count} bands of {data.name}, found {len(names)}."
-        )
-    found = list(names) if names is not None else [(d or "").strip() for d in data.descriptions]
+    found = [(d or "").strip() for d in data.descriptions] if names is None else _named(data, names)
     if not any(found):
         raise InputError(
             f"{data.name}: expected band descriptions {wanted} for {convention.name}, found none; "
@@ -118,6 +115,24 @@ def band_indices(data: DatasetReader, convention: Convention, names: Sequence[st
             )
         indices[name] = bands[0]
     return indices
+
+
+def _named(data: DatasetReader, names: Sequence[str]) -> list[str]:
+    """The user's names by band, '' for bands without one. Raises ConfigError."""
+    if not any("=" in name for name in names):
+        if len(names) != data.count:
+            raise ConfigError(
+                f"--bands: expected {data.count} names for the {data.count} bands of {data.name}, found {len(names)}; "
+                "give only those that are wanted as NAME=INDEX."
+            )
+        return list(names)
+    found = [""] * data.count
+    for item in names:
+        name, _, index = item.partition("=")
+        if not index.strip().isdigit() or not 1 <= int(index) <= data.count:
+            raise ConfigError(f"--bands: expected NAME=INDEX with an index from 1 to {data.count}, found '{item}'.")
+        found[int(index) - 1] = name.strip()
+    return found
 
 
 def _strips(data: DatasetReader, bands: int) -> Iterator[Window]:

@@ -191,6 +191,12 @@ def test_bands_are_found_by_name_only(tmp_path, rng):
     convert.run(unnamed, tmp_path / "out.tif", named)
     with rasterio.open(tmp_path / "out.tif") as data:
         assert data.read(1) == pytest.approx(maps["omega"], rel=1e-6)
+    swapped = ["h=5", "B0=4", "c=3", "b=1", "omega=2"]
+    convert.run(unnamed, tmp_path / "swap.tif", convert.Config("asp:Hapke", "lunargr:hapke_h1981", bands=swapped))
+    with rasterio.open(tmp_path / "swap.tif") as data:
+        assert data.read(1) == pytest.approx(maps["b"], rel=1e-6)
+    with pytest.raises(ConfigError, match="--bands: expected NAME=INDEX with an index from 1 to 5, found 'omega=6'"):
+        convert.run(unnamed, tmp_path / "x.tif", convert.Config("asp:Hapke", "lunargr:hapke_h1981", bands=["omega=6"]))
     with pytest.raises(ConfigError, match="--bands: expected 5 names"):
         convert.run(unnamed, tmp_path / "x.tif", convert.Config("asp:Hapke", "lunargr:hapke_h1981", bands=["omega"]))
     partial = write_maps(tmp_path / "partial.tif", {k: maps[k] for k in ("omega", "b", "c", "B0")})

@@ -23,7 +23,11 @@ def command(
     output: Output,
     bands: Annotated[
         str | None,
-        typer.Option("--bands", metavar="NAME,NAME", help="The input's bands in order, if the file names none."),
+        typer.Option(
+            "--bands",
+            metavar="NAME,...|NAME=INDEX,...",
+            help="The input's bands, if its descriptions do not name them.",
+        ),
     ] = None,
     approximate: Annotated[
         bool, typer.Option("--approximate", help="Convert although the target cannot hold everything.")
