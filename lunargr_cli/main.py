@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import pkgutil
 import sys
 
@@ -36,7 +37,9 @@ def main() -> None:
         app()
     except LunargrError as error:
         say_error(str(error))
-        sys.exit(EXIT_CODE)
+        sys.stdout.flush()
+        # Not sys.exit: after a full disk HDF5 would try, and fail, to flush its files once more while Python ends.
+        os._exit(EXIT_CODE)
     except KeyboardInterrupt:
         say_error("interrupted; nothing half-written was kept.")
         sys.exit(130)

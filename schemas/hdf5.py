@@ -26,12 +26,36 @@ CONVENTIONS = "CF-1.11"
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # The netCDF-4 format's marker for a dimension without a coordinate variable of its own.
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable.%10d"
-_FILL = {"f": np.nan, "i": -2147483648, "u": 255}
 
 
 def silence_hdf5() -> None:
-    """Keep the HDF5 C library from printing its own error stack: our one line says it."""
+    """Keep the HDF5 C library from printing its own error stack: our one line says it.
+
+    After a full disk every HDF5 object that is let go of fails once more, where no one can catch it, and Cython reports
+    that through both hooks of ``sys``: these reports, and no others, are dropped.
+    """
     h5py._errors.silence_errors()
+    if sys.excepthook is not _except_h5py_release:
+        _hooks.append((sys.excepthook, sys.unraisablehook))
+        sys.excepthook, sys.unraisablehook = _except_h5py_release, _except_h5py_unraisable
+
+
+_hooks: list[tuple[Callable[..., Any], Callable[[Any], Any]]] = []
+
+
+def _is_release(trace: TracebackType | None) -> bool:
+    """Whether a traceback is that of h5py letting go of an object."""
+    return trace is not None and trace.tb_frame.f_code.co_filename.endswith("h5py/_objects.pyx")
+
+
+def _except_h5py_release(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    if not _is_release(trace):
+        _hooks[-1][0](kind, error, trace)
+
+
+def _except_h5py_unraisable(unraisable: Any) -> None:
+    if not _is_release(unraisable.exc_traceback):
+        _hooks[-1][1](unraisable)
 
 
 def sha256(path: Path) -> str:
@@ -76,16 +100,6 @@ def _is_full_disk(error: BaseException | None) -> bool:
     return False
 
 
-def _quiet_about_h5py(hook: Callable[[Any], Any]) -> Callable[[Any], None]:
-    """On a full disk every HDF5 object that is let go of fails again; the one line has been said already."""
-
-    def quiet(unraisable: Any) -> None:
-        if not isinstance(unraisable.exc_value, OSError):
-            hook(unraisable)
-
-    return quiet
-
-
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """A temporary name beside ``path`` that becomes ``path`` when the block ends well and vanishes when it does not.
@@ -101,7 +115,6 @@ def atomic_path(path: Path) -> Iterator[Path]:
         with contextlib.suppress(OSError):
             partial.unlink()
         if _is_full_disk(error):
-            sys.unraisablehook = _quiet_about_h5py(sys.unraisablehook)
             raise InputError(
                 f"{path}: the disk is full or over quota; nothing was written. Free some space and run the command again."
             ) from None
@@ -138,7 +151,7 @@ class ArtefactWriter:
         silence_hdf5()
         self._stack.__enter__()
         try:
-            partial = self._stack.enter_context(atomic_path(self.path))
+            partial = self._partial = self._stack.enter_context(atomic_path(self.path))
             self._stack.enter_context(_terminate_as_exception())
             try:
                 self.file = self._stack.enter_context(
@@ -174,6 +187,9 @@ class ArtefactWriter:
                 error = RuntimeError(f"{self.schema.name}: written without {', '.join(missing)}")
                 self._stack.__exit__(type(error), error, None)
                 raise error
+        if _is_full_disk(error):
+            # Give back the room that the partial file took: HDF5 can then flush and close without failing once more.
+            os.truncate(self._partial, 0)
         self._stack.__exit__(kind, error, trace)
 
     def _create(self, variable: Variable, size_of_scale: int | None = None, unit: str | None = None) -> h5py.Dataset:

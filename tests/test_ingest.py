@@ -65,7 +65,7 @@ def test_degrees_become_a_metric_grid_true_to_the_terrain(tmp_path):
 def test_radii_become_elevations(shared, tmp_path):
     """ldem_4.cub stores radii through a scale and an offset; Mare Tranquillitatis lies 1 to 2 km below the sphere."""
     with rasterio.open(shared / "data/formats/ldem_4.cub") as cube:
-        row, col = cube.index(*(np.radians(v) * 1737400 for v in (31.0, 8.0)))
+        row, col = cube.index(*(np.radians(v) * 1737400 for v in (31.0 - 180.0, 8.0)))
         window = rasterio.windows.Window(col - 16, row - 16, 32, 32)
         cut = cube.read(1, window=window)
         path = small_scene.write_raster(

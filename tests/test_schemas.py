@@ -103,7 +103,7 @@ def test_a_full_disk_is_one_clear_line_and_leaves_nothing(tmp_path):
     resource = pytest.importorskip("resource")
     code = textwrap.dedent(
         f"""
-        import resource, signal, sys
+        import os, resource, signal, sys
         from pathlib import Path
         import numpy as np
         from schemas import PAIRS, ArtefactWriter, InputError
@@ -114,11 +114,13 @@ def test_a_full_disk_is_one_clear_line_and_leaves_nothing(tmp_path):
                 w.write("elevation", np.random.rand(8, 256, 256))
                 w.file.flush()
         except InputError as error:
-            print(error)
+            print(error, flush=True)
+            os._exit(3)  # as the command line does
         """
     )
     out = subprocess.run([sys.executable, "-c", code, str(tmp_path / "p.h5")], capture_output=True, text=True)
     assert "disk is full" in out.stdout, out
+    assert (out.returncode, out.stderr) == (3, "")
     assert list(tmp_path.iterdir()) == []
 
 
