@@ -1,0 +1,1 @@
+"""`lunargr diagnose`."""

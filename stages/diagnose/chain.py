@@ -1,0 +1,108 @@
+"""The forward model of one site, rendered again and again with small changes: what does not change is kept."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from stages.diagnose.data import Site
+from stages.effects import Effect
+from stages.physics import formation, geometry
+from stages.physics.formation import State
+from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
+
+STEP = 0.02  # of a slope, as tangent
+SCATTER = 0.14  # 8 deg: rms slope of relief below a typical DEM's resolution
+
+
+class Chain:
+    """Renders a site with the effects named so far (``base``) plus one more.
+
+    coefficients : broadcastable to (n, C, H, W). Templates carry the site's albedo texture; predictions do not.
+    """
+
+    def __init__(self, site: Site, model: ReflectanceModel, coefficients: Tensor, base: Sequence[Effect]) -> None:
+        self.site, self.model, self.coefficients, self.base = site, model, coefficients, list(base)
+        self._state = formation.illuminate(site.observation, self.base)
+        self._state.reflectance = self._surface(self._state)
+        self.textured = self.render()
+
+    @property
+    def state(self) -> State:
+        """Angles and visibility under the base effects; not to be changed."""
+        return self._state
+
+    def _surface(self, state: State, coefficients: Tensor | None = None) -> Tensor:
+        c = self.coefficients if coefficients is None else coefficients
+        return masked_radiance_factor(self.model, self.model.unpack(c, dim=1), state.angles)
+
+    def _expose(self, state: State, reflectance: Tensor, effects: list[Effect], texture: bool = True) -> Tensor:
+        state = copy.copy(state)
+        state.further_light = list(state.further_light)
+        state.reflectance = reflectance * self.site.texture if texture else reflectance
+        return formation.expose(state, effects)
+
+    def predict(self) -> Tensor:
+        """(n, H, W) I/F without the texture."""
+        return self._expose(self._state, self._state.reflectance, self.base, texture=False)
+
+    def render(self, extra: Effect | None = None) -> Tensor:
+        """(n, H, W) I/F with the texture and one more effect."""
+        if extra is None:
+            return self._expose(self._state, self._state.reflectance, self.base)
+        effects = [*self.base, extra]
+        if extra.slot in ("geometry", "illumination"):
+            state = formation.illuminate(self.site.observation, effects)
+            same = state.angles.cos_incidence is self._state.angles.cos_incidence
+            return self._expose(state, self._state.reflectance if same else self._surface(state), effects)
+        return self._expose(self._state, self._state.reflectance, effects)
+
+    def replace(self, k: int, effect: Effect) -> Tensor:
+        """As ``render`` with base effect ``k`` exchanged."""
+        effects = [effect if j == k else e for j, e in enumerate(self.base)]
+        if effect.slot in ("geometry", "illumination"):
+            state = formation.illuminate(self.site.observation, effects)
+            return self._expose(state, self._surface(state), effects)
+        return self._expose(self._state, self._state.reflectance, effects)
+
+    def surface_tangents(self) -> list[Tensor]:
+        """d image / d coefficient, one (n, H, W) per coefficient: the nominal model's own freedom."""
+        columns = []
+        for k in range(self.coefficients.shape[1]):
+            c = self.coefficients.clone()
+            step = 0.05 * float(c[:, k].abs().mean()) + 1e-4
+            c[:, k] += step
+            shifted = self._expose(self._state, self._surface(self._state, c), self.base)
+            columns.append((shifted - self.textured) / step)
+        return columns
+
+    def slope_tangents(self) -> tuple[Tensor, Tensor]:
+        """d image / d slope to the east and to the north: how an error of the DEM shows in every image."""
+        east, north = self._state.slopes
+        out = []
+        for de, dn in ((STEP, 0.0), (0.0, STEP)):
+            state = copy.copy(self._state)
+            state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
+            out.append((self._expose(state, self._surface(state), self.base) - self.textured) / STEP)
+        return out[0], out[1]
+
+    def unresolved_slopes(self) -> Tensor:
+        """What a scatter of slopes within a pixel, or of the DEM's own slopes, does to the mean: its second order."""
+        east, north = self._state.slopes
+        out = -self.textured.clone()
+        for de, dn in ((SCATTER, 0.0), (-SCATTER, 0.0), (0.0, SCATTER), (0.0, -SCATTER)):
+            state = copy.copy(self._state)
+            state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
+            out += 0.25 * self._expose(state, self._surface(state), self.base)
+        return out
+
+    def height_above_horizon(self) -> Tensor | None:
+        """rad, (n, H, W): the Sun's centre above the terrain horizon."""
+        state = self._state
+        if state.sun_horizon is None:
+            return None
+        sun = torch.asin(state.sun_direction[:, 2].clamp(-1, 1))
+        return sun[:, None, None] - state.sun_horizon

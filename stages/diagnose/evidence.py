@@ -1,0 +1,135 @@
+"""Evidence for each candidate: held-out gain, cluster-robust significance, size against the noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stages.diagnose.numbers import f_tail
+from stages.diagnose.statistics import Candidate, Statistics
+
+
+@dataclass
+class Evidence:
+    """What speaks for one candidate.
+
+    amount : (K,) multiples of the trial's columns; covariance robust (K, K)
+    gain, gain_error : held-out gain, nats; gain_image, gain_place : its two halves
+    p : of the larger of two cluster-robust tests; fid : rms effect over rms noise
+    share : (C,) contributions of clusters to the gain, for paired comparisons
+    """
+
+    candidate: Candidate
+    amount: Tensor
+    covariance: Tensor
+    gain: float
+    gain_error: float
+    gain_image: float
+    gain_place: float
+    p: float
+    statistic: float
+    fid: float
+    share: Tensor
+    left: float  # share of the template's energy that the nuisances leave
+
+    @property
+    def effect(self) -> str:
+        return self.candidate.effect
+
+
+def weigh(data: Statistics) -> list[Evidence]:
+    """Evidence for every candidate, the nuisance columns fitted along."""
+    m = data.nuisance.shape[1] - 1
+    sums = data.nuisance.sum(0)
+    ridge = 1e-9 * sums[:m, :m].diagonal().clamp(min=1e-12)
+    normal = sums[:m, :m] + torch.diag(ridge)
+    cross = data.cross.sum(0)
+    gamma = torch.linalg.solve(normal, cross[:, :m].T) if m else torch.zeros(0, len(cross), dtype=torch.float64)
+    delta = torch.linalg.solve(normal, sums[:m, m]) if m else torch.zeros(0, dtype=torch.float64)
+    score = data.cross[:, :, m] - torch.einsum("me,cm->ce", gamma, data.nuisance[:, :m, m])
+    residual_n = torch.einsum("cmk,k->cm", data.nuisance[:, :m, :m], delta)
+    score = score - torch.einsum("cem,m->ce", data.cross[:, :, :m], delta) + residual_n @ gamma
+    places = _groups(data.place)
+    images = _groups(data.image)
+    out = []
+    for k, candidate in enumerate(data.candidates):
+        part = candidate.columns
+        g = gamma[:, part]
+        zn = data.cross[:, part, :m]
+        half = torch.einsum("ckm,ml->ckl", zn, g)
+        gram = data.grams[k] - half - half.transpose(1, 2)
+        gram = gram + torch.einsum("mk,cmn,nl->ckl", g, data.nuisance[:, :m, :m], g)
+        raw = float(data.grams[k].sum(0).diagonal().sum())
+        out.append(_weigh_one(candidate, score[:, part], gram, places, images, data.rows, raw))
+    return out
+
+
+def _groups(labels: np.ndarray) -> tuple[Tensor, int]:
+    _, index = np.unique(labels, return_inverse=True)
+    return torch.from_numpy(index), int(index.max()) + 1 if len(index) else 0
+
+
+def _weigh_one(candidate, score: Tensor, gram: Tensor, places, images, rows: float, raw: float) -> Evidence:
+    k = candidate.size
+    total_u, total_g = score.sum(0), gram.sum(0)
+    scale = float(total_g.diagonal().mean())
+    if not scale > 1e-9 * max(raw, 1e-12) or scale < 1e-6:
+        zero = torch.zeros(k, dtype=torch.float64)
+        return Evidence(candidate, zero, torch.eye(k).double() * 1e12, 0, 0, 0, 0, 1.0, 0.0, 0.0, score[:, 0] * 0, 0.0)
+    ridge = 1e-6 * torch.diag(total_g.diagonal().clamp(min=1e-9 * scale))
+    inverse = torch.linalg.inv(total_g + ridge)
+    amount = inverse @ total_u
+    halves, p, statistic, covariance = [], 0.0, math.inf, None
+    share = torch.zeros(len(score), dtype=torch.float64)
+    for labels, count in (images, places):
+        u = torch.zeros(count, k, dtype=torch.float64).index_add_(0, labels, score)
+        g = torch.zeros(count, k, k, dtype=torch.float64).index_add_(0, labels, gram)
+        if count < 3:
+            continue
+        left_out = torch.linalg.solve(total_g + ridge - g, (total_u - u)[..., None])[..., 0]
+        gain = (left_out * u).sum(1) - 0.5 * torch.einsum("ck,ckl,cl->c", left_out, g, left_out)
+        halves.append((float(gain.sum()), float(gain.std()) * math.sqrt(count)))
+        energy = torch.diagonal(g, dim1=1, dim2=2).sum(1)
+        own = torch.diagonal(gram, dim1=1, dim2=2).sum(1)
+        share += 0.5 * gain[labels] * own / energy[labels].clamp(min=1e-30)
+        deleted = u - torch.einsum("ckl,cl->ck", g, left_out)
+        meat = deleted.T @ deleted
+        effective = float(energy.sum() ** 2 / energy.square().sum().clamp(min=1e-30))
+        robust = inverse @ meat @ inverse
+        wald = float(amount @ torch.linalg.solve(robust + 1e-12 * torch.diag(robust.diagonal()), amount)) / k
+        freedom = max(effective - k, 0.5)
+        tail = f_tail(wald, k, freedom)
+        if tail >= p:
+            p, statistic, covariance = tail, wald, robust
+    if not halves:
+        return Evidence(candidate, amount, inverse, 0, 0, 0, 0, 1.0, 0.0, 0.0, share, 0.0)
+    size = math.sqrt(max(float(amount @ total_g @ amount), 0.0) / max(rows, 1.0))
+    gains = [h[0] for h in halves]
+    left = float(total_g.diagonal().sum()) / max(raw, 1e-30)
+    return Evidence(
+        candidate,
+        amount,
+        covariance,
+        float(np.mean(gains)),
+        max(h[1] for h in halves),
+        gains[0],
+        gains[-1],
+        p,
+        statistic,
+        size,
+        share,
+        left,
+    )
+
+
+def best_guises(evidence: list[Evidence]) -> dict[str, Evidence]:
+    """Per effect the guise with the largest held-out gain."""
+    best: dict[str, Evidence] = {}
+    for item in evidence:
+        if item.effect not in best or item.gain > best[item.effect].gain:
+            best[item.effect] = item
+    return best

@@ -1,0 +1,115 @@
+"""The nominal simulation: a checkpoint's coefficient maps, or one smooth set of coefficients fitted to the data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from schemas.errors import ArtefactError
+from stages.diagnose.chain import Chain
+from stages.diagnose.data import GRAZING, MARGIN, Site
+from stages.effects import Effect
+from stages.physics.photometry import ReflectanceModel, get_model
+
+ROUNDS = 6
+
+
+@dataclass
+class Nominal:
+    """``source`` is 'fitted' or 'checkpoint'. ``vector`` (C,) scales maps (checkpoint) or is the set itself (fitted)."""
+
+    model: ReflectanceModel
+    vector: Tensor
+    predictor: object = None
+    source: str = "fitted"
+
+    def coefficients(self, site: Site) -> Tensor:
+        """(1 or n, C, 1 or H, 1 or W)"""
+        vector = self.vector[None, :, None, None]
+        if self.predictor is None:
+            return vector
+        return self.predictor.coefficients(site.observation.elevation[:1]) * vector
+
+    def chain(self, site: Site, base: list[Effect]) -> Chain:
+        return Chain(site, self.model, self.coefficients(site), base)
+
+
+def load_nominal(checkpoint: Path | None, model: str, units: str) -> Nominal:
+    """From a checkpoint, or with default coefficients that :func:`fit` improves. Raises ArtefactError, RegistryError."""
+    if checkpoint is None:
+        reflectance = get_model(model)
+        return Nominal(reflectance, torch.tensor([p.default for p in reflectance.parameters]))
+    from stages.network.predictor import load_predictor
+
+    predictor = load_predictor(checkpoint, "cpu")
+    if predictor.image_units != units:
+        raise ArtefactError(
+            f"{checkpoint}: expected a checkpoint for images in '{units}', found one for '{predictor.image_units}'; "
+            "train on the pairs that are to be diagnosed, or use --model."
+        )
+    count = len(predictor.model.parameters)
+    return Nominal(predictor.model, torch.ones(count), predictor, "checkpoint")
+
+
+def lit_mask(chain: Chain) -> Tensor:
+    """Pixels in full light, clear of the horizon and of grazing incidence, (n, H, W) bool."""
+    angles = chain.state.angles
+    lit = chain.site.valid & (angles.cos_incidence > GRAZING) & (angles.cos_emission > 0.15)
+    above = chain.height_above_horizon()
+    return lit if above is None else lit & (above > MARGIN)
+
+
+def fit(nominal: Nominal, sites: list[Site], base: list[Effect], units: str, measured: list[Tensor]) -> None:
+    """Least squares of the coefficients (and of gain and offset per pair where images are in dn), in place.
+
+    measured : the images as read, one (n, H, W) per site; ``site.image`` becomes I/F
+    """
+    fitted = nominal.predictor is None
+    rounds = (ROUNDS if units == "dn" or not nominal.model.linear else 2) if fitted else (1 if units == "dn" else 0)
+    for _ in range(rounds):
+        gram = torch.zeros(len(nominal.vector), len(nominal.vector), dtype=torch.float64)
+        score = torch.zeros(len(nominal.vector), dtype=torch.float64)
+        for site, raw in zip(sites, measured, strict=True):
+            chain = nominal.chain(site, base)
+            mask = lit_mask(chain)
+            predicted = chain.textured
+            if units == "dn":
+                _scale(site, raw, predicted, mask)
+            if not fitted:
+                continue
+            # relative weights: every image counts alike, however low its Sun
+            level = (predicted * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
+            weight = (mask / level.clamp(min=1e-6)[:, None, None]).double()
+            columns = torch.stack(chain.surface_tangents()).double() * weight
+            residual = (site.image - predicted).double() * weight
+            flat = columns.flatten(1)
+            gram += flat @ flat.T
+            score += flat @ residual.flatten()
+        if fitted and float(gram.diagonal().min()) > 0:
+            scale = gram.diagonal().rsqrt()
+            ridge = 1e-7 if units == "iof" else 1e-3
+            normal = gram * scale[:, None] * scale + ridge * torch.eye(len(scale), dtype=torch.float64)
+            step = torch.linalg.solve(normal, score * scale) * scale
+            nominal.vector = nominal.vector + step.float()
+            if not nominal.model.linear:
+                low = torch.tensor([p.lower for p in nominal.model.parameters])
+                high = torch.tensor([p.upper for p in nominal.model.parameters])
+                nominal.vector = nominal.vector.clamp(min=low, max=high)
+
+
+def _scale(site: Site, raw: Tensor, predicted: Tensor, mask: Tensor) -> None:
+    """Gain and offset per pair by least squares; the image in I/F follows."""
+    weight = mask.double()
+    n = weight.sum((-2, -1)).clamp(min=1)
+    mx = (predicted * weight).sum((-2, -1)) / n
+    my = (raw * weight).sum((-2, -1)) / n
+    dx = (predicted - mx[:, None, None]) * weight
+    gain = (dx * raw).sum((-2, -1)) / (dx * dx).sum((-2, -1)).clamp(min=1e-12)
+    usable = gain.abs() > 1e-9
+    gain = torch.where(usable, gain, my / mx.clamp(min=1e-9))
+    site.gain = gain.float()
+    site.offset = torch.where(usable, my - gain * mx, 0.0).float()
+    site.image = ((raw - site.offset[:, None, None]) / site.gain[:, None, None]).float()
