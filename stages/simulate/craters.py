@@ -8,6 +8,7 @@ after topographic diffusion (Soderblom 1970; Fassett & Thomson 2014), here in un
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,6 +24,7 @@ Array = NDArray[np.float32]
 EQUILIBRIUM_PER_KM2 = 10**-1.1  # craters > 1 km per km2, cumulative slope -2
 PRODUCTION_SLOPE, EQUILIBRIUM_SLOPE = 3.0, 2.0
 DEPTH, RIM = 0.196, 0.036  # of the diameter, fresh
+FLOOR, WALL = 0.10, 1.70  # radius of the flat floor; slope of the wall, in depths per radius
 WORN_OUT = 0.30  # K at which a crater no longer counts: a fresh bowl is then about 0.02 D deep
 REACH = 4.0  # radii that topography extends to
 EJECTA_REACH = 9.0  # radii that bright ejecta of young craters extends to
@@ -77,12 +79,10 @@ def populate(
     left, bottom, right, top = bounds
     sizes = []
     n_transition = float(cumulative_density(transition, density, transition))
-    n_small = float(cumulative_density(min(smallest, transition), density, transition))
-    n_large = float(cumulative_density(largest, density, transition))
     # the margin outside grows with the size, so that small craters are not drawn where nobody sees them
     edges = np.geomspace(smallest, largest, 25)
     xs, ys = [], []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         margin = REACH * high / 2
         area = (right - left + 2 * margin) * (top - bottom + 2 * margin)
         many, few = (float(cumulative_density(d, density, transition)) for d in (low, high))
@@ -95,7 +95,6 @@ def populate(
         sizes.append(d)
         xs.append(rng.uniform(left - margin, right + margin, count))
         ys.append(rng.uniform(bottom - margin, top + margin, count))
-    del n_small, n_large
     diameter, x, y = np.concatenate(sizes), np.concatenate(xs), np.concatenate(ys)
     order = np.argsort(-diameter, kind="stable")
     diameter, x, y = diameter[order], x[order], y[order]
@@ -110,8 +109,6 @@ def populate(
 
 def _buried(x: NDArray, y: NDArray, diameter: NDArray, time: NDArray, luck: NDArray) -> NDArray:
     """Which craters an at least twice larger, younger one has erased (inside it) or its ejecta covered (near it)."""
-    from numba.typed import List  # noqa: F401  (numba must be importable; kept local: cheap calls only)
-
     cell = 100.0
     if len(x) == 0:
         return np.zeros(0, bool)
@@ -148,8 +145,12 @@ def _bury(x, y, diameter, time, luck, order, start, rows, columns, cell, x0, y0)
 def fresh_profile(r: NDArray) -> NDArray:
     """Height over diameter of a fresh simple crater at r radii from its centre."""
     r = np.asarray(r, float)
-    floor = RIM - DEPTH
-    bowl = floor + DEPTH * np.clip((r - 0.12) / 0.88, 0, None) ** 2 * (1 + 0.0 * r)
+    # flat floor, parabolic foot, straight wall at the angle of repose (tan = 2 DEPTH WALL = 0.67)
+    foot = FLOOR + 2 * (1 - FLOOR - 1 / WALL)
+    a = WALL / (2 * (foot - FLOOR))
+    t = np.clip(r - FLOOR, 0, None)
+    rise = np.where(t < foot - FLOOR, a * t * t, WALL * (t - (foot - FLOOR) / 2))
+    bowl = RIM - DEPTH + DEPTH * rise
     ejecta = RIM * np.maximum(r, 1e-6) ** -3.0
     # thins to nothing at REACH instead of ending in a step
     fade = np.clip((REACH - r) / (REACH - 1.0), 0.0, 1.0)
@@ -185,7 +186,7 @@ def _stamp(
 ):
     """Add every crater to the block, by bands of rows: threads never share a pixel."""
     height, width = elevation.shape
-    states, samples = table.shape
+    states = table.shape[0]
     bands = len(start) - 1
     for band in prange(bands):
         first, last = band * height // bands, (band + 1) * height // bands
@@ -193,7 +194,8 @@ def _stamp(
             k = order[m]
             radius = 0.5 * diameter[k]
             young = max(0.0, 1.0 - age[k] / 0.12)
-            reach = radius * (9.0 if young > 0 else 4.0)
+            big = radius > 12.0 * step
+            reach = radius * (9.0 if young > 0 and big else 4.0)
             r0 = max(first, int(math.ceil((gy - y[k] - reach) / step)))
             r1 = min(last, int(math.floor((gy - y[k] + reach) / step)) + 1)
             c0 = max(0, int(math.ceil((x[k] - reach - gx) / step)))
@@ -209,7 +211,7 @@ def _stamp(
             phase = (seed[k] & 1023) * 0.006135923
             oval = 0.015 + 0.035 * ((seed[k] >> 10) & 255) / 255.0
             scale = diameter[k] * depth_factor[k]
-            big = radius > 12.0 * step
+            fresh = young**1.5
             for r in range(r0, r1):
                 dy = gy - r * step - y[k]
                 for c in range(c0, c1):
@@ -244,14 +246,24 @@ def _stamp(
                             )
                         elevation[r, c] += np.float32(scale * h)
                     if young > 0 and d > 0.02:
-                        inner = 1.0 if stretched < 1.1 else max(0.0, (1.1 / stretched) ** 2.2)
-                        freshness[r, c] = max(freshness[r, c], np.float32(young * inner * (stretched < 2.2)))
+                        inner = 1.0
+                        if stretched > 1.05:
+                            fade = max(0.0, 1.0 - (stretched - 1.05) / 1.6)
+                            inner = fade * fade
+                        elif stretched < 0.5:  # floors fill with mixed debris
+                            inner = 0.55 + 0.45 * stretched / 0.5
+                        freshness[r, c] = max(freshness[r, c], np.float32(fresh * inner))
                         if stretched >= 1.0 and big:
                             ca, sa = dx / (d * radius), dy / (d * radius)
-                            streak = 0.5 + 1.6 * gradient_noise(9.0 * ca, 9.0 * sa, (seed[k] >> 5) & 65535)
-                            streak += 0.8 * gradient_noise(21.0 * ca, 21.0 * sa, (seed[k] >> 7) & 65535)
-                            fade = stretched**-1.3 * max(0.0, 1.0 - stretched / 9.0)
-                            ejecta[r, c] += np.float32(young * fade * max(0.0, streak))
+                            # broad lobes, some of them empty, broken into narrower streaks and patches
+                            lobe = 0.25 + 2.2 * gradient_noise(2.3 * ca, 2.3 * sa, (seed[k] >> 5) & 65535)
+                            streak = gradient_noise(8.0 * ca + 0.15 * d, 8.0 * sa, (seed[k] >> 7) & 65535)
+                            streak += 0.7 * gradient_noise(19.0 * ca, 19.0 * sa + 0.3 * d, (seed[k] >> 9) & 65535)
+                            streak += 0.8 * gradient_noise(1.7 * d * ca, 1.7 * d * sa, (seed[k] >> 4) & 65535)
+                            streak = max(0.0, lobe + 0.9 * streak)
+                            fade = stretched**-1.15 * max(0.0, 1.0 - stretched / 9.0)
+                            fade *= min(1.0, (stretched - 1.0) / 0.3)
+                            ejecta[r, c] += np.float32(fresh * fade * streak)
 
 
 def stamp(craters: Craters, x0: float, y0: float, step: float, shape: tuple[int, int]) -> tuple[Array, Array, Array]:
@@ -264,7 +276,8 @@ def stamp(craters: Craters, x0: float, y0: float, step: float, shape: tuple[int,
     freshness = np.zeros(shape, np.float32)
     ejecta = np.zeros(shape, np.float32)
     height, width = shape
-    reach = 0.5 * craters.diameter * np.where(craters.age < YOUNG, EJECTA_REACH, REACH)
+    rayed = (craters.age < YOUNG) & (craters.diameter > 24.0 * step)
+    reach = 0.5 * craters.diameter * np.where(rayed, EJECTA_REACH, REACH)
     near = (
         (craters.x + reach >= x0)
         & (craters.x - reach <= x0 + (width - 1) * step)
@@ -278,7 +291,7 @@ def stamp(craters: Craters, x0: float, y0: float, step: float, shape: tuple[int,
         edges = np.arange(bands + 1) * height // bands
         top = (y0 - craters.y[index] - reach[index]) / step
         end = (y0 - craters.y[index] + reach[index]) / step
-        lists = [index[(end >= a) & (top <= b)] for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        lists = [index[(end >= a) & (top <= b)] for a, b in itertools.pairwise(edges)]
         start = np.concatenate([[0], np.cumsum([len(v) for v in lists])])
         _stamp(
             elevation,

@@ -32,8 +32,8 @@ class Config:
     base_elevation: float = -2600.0
 
     # terrain
-    relief: float = 26.0  # standard deviation of the longest octave of the fractal relief
-    relief_wavelength: float = 5000.0
+    relief: float = 40.0  # standard deviation of the longest octave of the fractal relief
+    relief_wavelength: float = 7000.0
     hurst: float = 0.92
     crater_density: float = 1.0  # of the lunar equilibrium density
     crater_transition: float = 200.0  # diameter below which craters are in equilibrium (a surface of some 3 Gyr)

@@ -69,7 +69,7 @@ def albedo(config: Config, ground: Ground, row: int, col: int) -> Albedo:
     wasting = np.clip((slope - 14.0) / 18.0, 0, 1)
     wasting = wasting * wasting * (3 - 2 * wasting)
     bend = (shifted(0, k) + shifted(0, -k) + shifted(k, 0) + shifted(-k, 0) - 4 * centre) / (k * step)
-    geometry = 0.42 * ground.freshness[inner] + 0.28 * wasting - 0.06 * np.tanh(bend / 0.25)
+    geometry = 0.34 * ground.freshness[inner] + 0.24 * wasting - 0.05 * np.tanh(bend / 0.25)
 
     shape = centre.shape
     x0 = -config.extent / 2 + (col + 0.5) * step
@@ -81,7 +81,7 @@ def albedo(config: Config, ground: Ground, row: int, col: int) -> Albedo:
     for number, (distance, azimuth) in enumerate(FAR_CRATERS):
         sx, sy = config.extent * distance * math.sin(azimuth), config.extent * distance * math.cos(azimuth)
         _far_rays(far, x0, y0, step, sx, sy, max(config.extent, 5000.0), seed + 20 + number)
-    free = 0.10 * np.tanh(1.3 * patches) + 0.018 * texture + 0.16 * far + 0.22 * np.minimum(ground.rays[inner], 1.2)
+    free = 0.10 * np.tanh(1.3 * patches) + 0.018 * texture + 0.16 * far + 0.26 * np.tanh(ground.rays[inner])
     return Albedo(
         (config.geometry_contrast * geometry).astype(np.float32), (config.free_contrast * free).astype(np.float32)
     )

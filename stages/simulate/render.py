@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -61,14 +62,26 @@ def radiance(
     skyline = _horizon(scene, window, azimuth, elevation_angle)
     penumbra = find(hidden, "penumbra")
     sun_radius = math.radians(penumbra["radius_deg"]) if penumbra else formation.SUN_RADIUS
-    for r in range(0, height, BLOCK):
-        for c in range(0, width, BLOCK):
-            h, w = min(BLOCK, height - r), min(BLOCK, width - c)
-            if not wanted[r : r + h, c : c + w].any():
-                continue
-            out[r : r + h, c : c + w] = _block(
-                scene, view, row + r, col + c, skyline[r : r + h, c : c + w], sun_radius, hidden
-            )
+    blocks = [
+        (r, c, min(BLOCK, height - r), min(BLOCK, width - c))
+        for r in range(0, height, BLOCK)
+        for c in range(0, width, BLOCK)
+    ]
+
+    def fill(block: tuple[int, int, int, int]) -> None:
+        r, c, h, w = block
+        if wanted[r : r + h, c : c + w].any():
+            part = skyline[r : r + h, c : c + w]
+            out[r : r + h, c : c + w] = _block(scene, view, row + r, col + c, part, sun_radius, hidden)
+
+    # blocks side by side, each in one thread: they fit the cache, and nobody waits at every operation
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(fill, blocks))
+    finally:
+        torch.set_num_threads(threads)
     return out
 
 
@@ -83,7 +96,9 @@ def _horizon(scene: Scene, window: tuple[int, int, int, int], azimuth: float, su
         reach_px = math.ceil(reach / scene.grid.gsd) + 8
         r0, c0 = max(0, row - reach_px), max(0, col - reach_px)
         r1, c1 = min(total_height, row + height + reach_px), min(total_width, col + width + reach_px)
-    skyline = horizon(np.asarray(scene.elevation[r0:r1, c0:c1]), scene.grid.gsd, azimuth, scene.grid.radius)
+    # about a middle height: float32 then resolves the small differences that near horizons are made of
+    part = np.asarray(scene.elevation[r0:r1, c0:c1])
+    skyline = horizon(part - np.float32(part[::16, ::16].mean()), scene.grid.gsd, azimuth, scene.grid.radius)
     return skyline[row - r0 : row - r0 + height, col - c0 : col - c0 + width]
 
 
@@ -109,11 +124,11 @@ def _block(
         camera_position=torch.from_numpy(camera)[None],
         gsd=scene.grid.gsd,
         body_radius=scene.grid.radius,
-        sun_horizon=torch.from_numpy(np.pad(skyline, 1, mode="edge"))[None],
     )
     state = formation.illuminate(observation)
+    sun_elevation = math.asin(float(observation.sun_direction[0, 2]))
     visible = formation.sun_visibility(
-        torch.asin(observation.sun_direction[:, 2]).float()[:, None, None], observation.sun_horizon, sun_radius
+        torch.tensor(sun_elevation), torch.from_numpy(np.pad(skyline, 1, mode="edge"))[None], sun_radius
     )
     window = (slice(row, row + height), slice(col, col + width))
     maps = scene.truth.maps(np.asarray(scene.log_geometry[window]), np.asarray(scene.log_free[window]))
