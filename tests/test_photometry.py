@@ -353,3 +353,16 @@ def test_sato_sets_are_the_mean_of_the_map(shared, band):
 def test_unknown_set_lists_the_choices():
     with pytest.raises(RegistryError, match=r"unknown parameter set 'sato'; choose one of: .*sato2014_643nm"):
         get_set("sato")
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_models_stay_on_the_device_of_their_inputs(name):
+    """The meta device computes nothing, but like a GPU it refuses to meet tensors of the CPU."""
+    model = get_model(name)
+    angles = Angles(*(torch.empty(2, 3, 4, device="meta") for _ in range(3)))
+    raw = torch.empty(2, len(model.parameters), 3, 4, device="meta", requires_grad=True)
+    image = masked_radiance_factor(model, model.unpack(model.constrain(raw, 1), 1), angles)
+    (gradient,) = torch.autograd.grad(image.sum(), raw)
+    assert image.shape == (2, 3, 4)
+    assert gradient.device.type == "meta"
+    assert model.unconstrain(raw.detach(), 1).device.type == "meta"

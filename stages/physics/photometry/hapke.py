@@ -34,7 +34,7 @@ from torch import Tensor
 
 from stages.physics.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
-from stages.physics.photometry.roughness import rough_cosines
+from stages.physics.photometry.roughness import rough_surface
 
 # Defaults: Sato et al. (2014), 643 nm, mean over the Moon (set "sato2014_643nm" of `published.py`).
 OPTIONAL = (
@@ -104,17 +104,24 @@ class HapkeBase(ReflectanceModel):
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         w = parameters["w"]
-        mu0e, mue, shadowing = rough_cosines(angles, parameters["theta"])
+        mu_x, mu_y, shadowing = rough_surface(angles, parameters["theta"])
         half = 0.5 * angles.phase
         tangent = torch.tan(half.clamp(max=math.pi / 2 - (1e-7 if half.dtype == torch.float64 else 1e-3)))
+        surge = shadow_hiding(tangent, parameters["hs"])
+        single = self.phase_function(parameters, angles) * (1 + parameters["Bs0"] * surge)
         k = porosity(parameters["phi"])
         h = h_2002 if self.h_function == "2002" else h_1981
-        single = self.phase_function(parameters, angles) * (
-            1 + parameters["Bs0"] * shadow_hiding(tangent, parameters["hs"])
-        )
-        multiple = h(mu0e / k, w) * h(mue / k, w) - 1
-        coherent = 1 + parameters["Bc0"] * coherent_backscatter(tangent, parameters["hc"])
-        return k * w / 4 * mu0e / (mu0e + mue) * (single + multiple) * coherent * shadowing
+        multiple = h(mu_x / k, w) * h(mu_y / k, w) - 1
+        # mu0e / (mu0e + mue) S, in which mu0e and mue may change places
+        image = (single + multiple) * (mu_x * mu_y / (mu_x + mu_y) * shadowing) * (k * w / 4)
+        if _is_off(parameters["Bc0"]):
+            return image
+        return image * (1 + parameters["Bc0"] * coherent_backscatter(tangent, parameters["hc"]))
+
+
+def _is_off(amplitude: Tensor) -> bool:
+    """A single 0 that nothing is learnt about: its term need not be computed."""
+    return amplitude.numel() == 1 and not amplitude.requires_grad and float(amplitude) == 0.0
 
 
 class HapkeHenyeyGreenstein(HapkeBase):

@@ -24,12 +24,13 @@ from torch import Tensor
 from stages.physics.geometry import Angles
 
 
-def rough_cosines(angles: Angles, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Effective cosines of incidence and emission, and the shadowing function S.
+def rough_surface(angles: Angles, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Effective cosines of the smaller and of the larger of incidence and emission, and S / mue.
 
     theta : mean slope angle, rad; 0 gives the true cosines and S = 1
-    returns mu0e, mue, S; finite, with finite gradients, wherever both cosines are above 0
+    returns mu_x, mu_y, S / mue; finite, with finite gradients, wherever both cosines are above 0
 
+    Hapke's reflectance needs no more: mu0e mue / (mu0e + mue) and H(mu0e) H(mue) are the same for (mu_x, mu_y).
     S is not differentiable in the azimuth psi at psi = 0 (f = exp(-2 tan(psi/2)) has a cusp there): the slope returned
     at that point is 0, the mean of both sides.
     """
@@ -41,35 +42,30 @@ def rough_cosines(angles: Angles, theta: Tensor) -> tuple[Tensor, Tensor, Tensor
     cot_theta = 1 / tan_theta.clamp(min=1e-6 if double else 1e-4)
     chi = torch.rsqrt(1 + math.pi * tan_theta * tan_theta)
 
-    sun_higher = mu0 >= mu
-    small_cos, large_cos = torch.maximum(mu0, mu), torch.minimum(mu0, mu)  # of the smaller and the larger angle
-    small_sin = (1 - small_cos * small_cos).clamp(min=floor).sqrt()
-    large_sin = (1 - large_cos * large_cos).clamp(min=floor).sqrt()
+    cos_x, cos_y = torch.maximum(mu0, mu), torch.minimum(mu0, mu)
+    sin_x = (1 - cos_x * cos_x).clamp(min=floor).sqrt()
+    sin_y = (1 - cos_y * cos_y).clamp(min=floor).sqrt()
 
-    product = small_sin * large_sin
-    cosine = angles.cos_phase - mu0 * mu
-    sin2 = (0.5 * (product - cosine) / product).clamp(min=tiny, max=1.0)  # sin^2(psi / 2)
-    cos2 = (0.5 * (product + cosine) / product).clamp(min=tiny, max=1.0)
-    half_sin, half_cos = sin2.sqrt(), cos2.sqrt()
-    psi_over_pi = torch.atan2(half_sin, half_cos) * (2 / math.pi)
-    shade = torch.exp(-2 * half_sin / half_cos)
+    half_cosine = (angles.cos_phase - mu0 * mu) / (2 * sin_x * sin_y)  # cos(psi) / 2
+    sin2 = (0.5 - half_cosine).clamp(min=tiny, max=1.0)  # sin^2(psi / 2)
+    cos2 = (0.5 + half_cosine).clamp(min=tiny, max=1.0)
+    tan_half = (sin2 / cos2).sqrt()
+    psi_over_pi = torch.atan(tan_half) * (2 / math.pi)
+    f = torch.exp(-2 * tan_half)
 
-    e1_small, e2_small = _facets(small_cos / small_sin, cot_theta)
-    e1_large, e2_large = _facets(large_cos / large_sin, cot_theta)
-    eta_small = chi * (small_cos + small_sin * tan_theta * e2_small / (2 - e1_small))
-    eta_large = chi * (large_cos + large_sin * tan_theta * e2_large / (2 - e1_large))
-    tilt = tan_theta / (2 - e1_large - psi_over_pi * e1_small).clamp(min=1e-6)
-    effective_small = chi * (small_cos + small_sin * tilt * ((cos2 - sin2) * e2_large + sin2 * e2_small))
-    effective_large = chi * (large_cos + large_sin * tilt * (e2_large - sin2 * e2_small))
-    effective_small = effective_small.clamp(min=1e-12)
-    effective_large = effective_large.clamp(min=1e-12)
-
-    mu0e = torch.where(sun_higher, effective_small, effective_large)
-    mue = torch.where(sun_higher, effective_large, effective_small)
-    eta0 = torch.where(sun_higher, eta_small, eta_large)
-    eta = torch.where(sun_higher, eta_large, eta_small)
-    visible = 1 - shade + shade * chi * small_cos / eta_small
-    return mu0e, mue, mue * mu0 * chi / (eta * eta0 * visible)
+    e1_x, e2_x = _facets(cos_x / sin_x, cot_theta)
+    e1_y, e2_y = _facets(cos_y / sin_y, cot_theta)
+    tilt_x, tilt_y = sin_x * tan_theta, sin_y * tan_theta
+    hidden = sin2 * e2_x
+    between = (2 - e1_y - psi_over_pi * e1_x).clamp(min=1e-6)
+    # chi is taken out of all four: mu_x, mu_y and both eta have it as a factor
+    mu_x = (cos_x + tilt_x * ((cos2 - sin2) * e2_y + hidden) / between).clamp(min=1e-12)
+    mu_y = (cos_y + tilt_y * (e2_y - hidden) / between).clamp(min=1e-12)
+    eta_x = cos_x + tilt_x * e2_x / (2 - e1_x)
+    eta_y = cos_y + tilt_y * e2_y / (2 - e1_y)
+    # S / mue = cos(i) chi / (eta(e) eta(i) (1 - f + f chi cos(x)/eta(x)))
+    visible = eta_x * (1 - f) + f * cos_x
+    return chi * mu_x, chi * mu_y, mu0 / (chi * eta_y * visible)
 
 
 def _facets(cot_angle: Tensor, cot_theta: Tensor) -> tuple[Tensor, Tensor]:
