@@ -1,0 +1,134 @@
+"""sample: seeded, without replacement, in proportion to valid area, and no ground shared between parts."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+from geographiclib.geodesic import Geodesic
+
+from schemas import ConfigError, GeometryError
+from stages import sample
+
+
+def crops(small_artefacts, tmp_path, **options):
+    path = tmp_path / f"crops{len(list(tmp_path.iterdir()))}.h5"
+    parts = sample.run(
+        small_artefacts["scene"], path, sample.Config(**({"count": 60, "tile_m": 1280, "block": 100} | options))
+    )
+    with h5py.File(path) as file:
+        return parts, {
+            name: file[name][...] for name in file if name not in ("y", "x", "pair", "frame", "camera", "start_time")
+        }
+
+
+def paint(data, crop, part):
+    ground = np.zeros((384, 384), bool)
+    for r, c in zip(data["row"][data["split"] == part], data["col"][data["split"] == part], strict=True):
+        ground[r - crop // 2 : r + crop // 2, c - crop // 2 : c + crop // 2] = True
+    return ground
+
+
+@pytest.mark.parametrize("stack", [False, True])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_parts_share_no_pixel_of_ground(small_artefacts, tmp_path, seed, stack):
+    parts, data = crops(small_artefacts, tmp_path, seed=seed, stack=stack)
+    ground = [paint(data, 32, part) for part in range(3)]
+    for a in range(3):
+        assert ground[a].any()
+        for b in range(a):
+            assert not (ground[a] & ground[b]).any()
+    assert [p.pairs for p in parts] == [(data["split"] == k).sum() for k in range(3)]
+    for k in range(3):  # pixels of 20 m; map scale within 1e-5 of one here
+        assert parts[k].ground_km2 == pytest.approx(ground[k].sum() * 20**2 / 1e6, rel=1e-3)
+        assert parts[k].shared_km2 == 0
+
+
+def test_every_crop_lies_in_valid_data_of_its_own_image(small_artefacts, tmp_path):
+    _, data = crops(small_artefacts, tmp_path)
+    with h5py.File(small_artefacts["scene"]) as scene:
+        for k, (r, c, image) in enumerate(zip(data["row"], data["col"], data["image_index"], strict=True)):
+            window = np.s_[r - 16 : r + 16, c - 16 : c + 16]
+            assert scene["valid"][image][window].all()
+            np.testing.assert_array_equal(data["elevation"][k], scene["elevation"][window])
+
+
+def test_same_seed_same_crops_and_no_crop_twice(small_artefacts, tmp_path):
+    _, first = crops(small_artefacts, tmp_path, seed=5)
+    _, again = crops(small_artefacts, tmp_path, seed=5)
+    _, other = crops(small_artefacts, tmp_path, seed=6)
+    np.testing.assert_array_equal(first["row"], again["row"])
+    assert not np.array_equal(first["row"], other["row"])
+    keys = set(zip(first["image_index"].tolist(), first["row"].tolist(), first["col"].tolist(), strict=True))
+    assert len(keys) == len(first["row"]) == 60
+
+
+def test_shares_of_the_split_and_of_the_images(small_artefacts, tmp_path):
+    _, data = crops(small_artefacts, tmp_path, count=300)
+    counts = np.bincount(data["split"], minlength=3)
+    np.testing.assert_array_equal(counts, [240, 30, 30])
+    with h5py.File(small_artefacts["scene"]) as scene:
+        area = scene["valid_area_m2"][...]
+    share = np.bincount(data["image_index"], minlength=3) / 300
+    np.testing.assert_allclose(share, area / area.sum(), atol=0.12)  # the guard between tiles takes some of each
+
+
+def test_stack_crops_every_image_that_covers_a_place(small_artefacts, tmp_path):
+    _, data = crops(small_artefacts, tmp_path, stack=True, count=40)
+    with h5py.File(small_artefacts["scene"]) as scene:
+        positions = scene["valid_position"][...].astype(bool)
+    for site in np.unique(data["site"]):
+        mine = data["site"] == site
+        r, c = data["row"][mine][0], data["col"][mine][0]
+        assert set(data["row"][mine]) == {r}
+        assert set(data["col"][mine]) == {c}
+        np.testing.assert_array_equal(np.sort(data["image_index"][mine]), np.flatnonzero(positions[:, r, c]))
+    assert len(np.unique(data["site"])) == 40
+    assert len(data["site"]) > 40
+
+
+def test_tiles_are_metres_on_the_body(small_artefacts, tmp_path):
+    """1280 m at 20 m a pixel is 64 pixels; a geodesic along a row of the scene says the same."""
+    _, data = crops(small_artefacts, tmp_path)
+    with h5py.File(small_artefacts["scene"]) as scene:
+        width = scene["x"].shape[0]
+    tiles_per_row = -(-width // 64)
+    np.testing.assert_array_equal(data["tile"], data["row"] // 64 * tiles_per_row + data["col"] // 64)
+    far = np.argmax(data["col"])
+    near = np.argmin(data["col"])
+    line = Geodesic(1737400, 0).Inverse(
+        data["latitude_deg"][near], data["longitude_deg"][near], data["latitude_deg"][far], data["longitude_deg"][far]
+    )
+    pixels = np.hypot(data["row"][far] - data["row"][near], data["col"][far] - data["col"][near])
+    assert line["s12"] == pytest.approx(20 * pixels, rel=1e-5)
+
+
+def test_shards_make_one_whole(small_artefacts, tmp_path):
+    from stages import merge
+
+    whole = tmp_path / "whole.h5"
+    config = {"count": 50, "tile_m": 1280.0, "seed": 2, "block": 100}
+    sample.run(small_artefacts["scene"], whole, sample.Config(**config))
+    parts = []
+    for k in range(3):
+        parts.append(tmp_path / f"part{k}.h5")
+        sample.run(small_artefacts["scene"], parts[-1], sample.Config(**config, shard=(k, 3)))
+    merge.run([parts[2], parts[0], parts[1]], tmp_path / "merged.h5")
+    with h5py.File(whole) as a, h5py.File(tmp_path / "merged.h5") as b:
+        for name in a:
+            if a[name].dtype.kind != "O":
+                np.testing.assert_array_equal(a[name][...], b[name][...], err_msg=name)
+
+
+def test_impossible_requests_are_refused(small_artefacts, tmp_path):
+    scene, out = small_artefacts["scene"], tmp_path / "c.h5"
+    for options, kind, words in [
+        ({"tile_m": 100.0}, ConfigError, "at least one crop"),
+        ({"crop": 40}, ConfigError, "multiple of 16"),
+        ({"count": 5, "density": 1.0}, ConfigError, "one of the two"),
+        ({"count": 0}, ConfigError, "positive"),
+        ({"crop": 320, "tile_m": 6400.0}, GeometryError, "no crop"),
+    ]:
+        with pytest.raises(kind, match=words):
+            sample.run(scene, out, sample.Config(**options))
+        assert not out.exists()
