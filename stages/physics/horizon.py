@@ -9,6 +9,8 @@ height, are interpolated.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,23 +18,24 @@ from numpy.typing import ArrayLike, NDArray
 from schemas.errors import GeometryError
 from stages.physics.hulls import sweep_horizon
 from stages.physics.scene_horizon import Overview, horizon_in_scene, make_overview
-from stages.physics.shadow import sweep_shadow
+from stages.physics.shadow import sweep_shadow, sweep_shadow_bands
 
-__all__ = ["Overview", "cast_shadow", "horizon", "horizon_in_scene", "make_overview"]
+__all__ = ["Overview", "cast_shadow", "cast_shadow_bands", "horizon", "horizon_in_scene", "make_overview"]
 
 
-def _as_grid(elevation: ArrayLike, gsd: float, body_radius: float | None, **angles: float) -> NDArray[np.float32]:
-    grid = np.asarray(elevation, dtype=np.float32)
-    if grid.ndim != 2:
-        raise GeometryError(f"elevation: expected a grid (rows, columns), found shape {grid.shape}.")
+def _check(
+    shape: tuple[int, ...], gsd: float, body_radius: float | None, azimuth: float, sun_elevation: float = 0.0
+) -> None:
+    if len(shape) != 2:
+        raise GeometryError(f"elevation: expected a grid (rows, columns), found shape {shape}.")
     if not (math.isfinite(gsd) and gsd > 0):
         raise GeometryError(f"gsd: expected a pixel size in metres above 0, found {gsd}.")
     if body_radius is not None and not body_radius > 0:
         raise GeometryError(f"body_radius: expected metres above 0 or None, found {body_radius}.")
-    for name, value in angles.items():
-        if not math.isfinite(value):
-            raise GeometryError(f"{name}: expected radians, found {value}.")
-    return grid
+    if not math.isfinite(azimuth):
+        raise GeometryError(f"azimuth: expected radians, found {azimuth}.")
+    if not abs(sun_elevation) <= math.pi / 2 + 1e-6:
+        raise GeometryError(f"sun_elevation: expected radians between -pi/2 and pi/2, found {sun_elevation}.")
 
 
 def horizon(elevation: ArrayLike, gsd: float, azimuth: float, body_radius: float | None = None) -> NDArray[np.float32]:
@@ -43,7 +46,8 @@ def horizon(elevation: ArrayLike, gsd: float, azimuth: float, body_radius: float
     body_radius : m; terrain at distance d sinks by d^2 / 2R (None: flat)
     returns (H, W) float32, rad: -pi/2 where no terrain lies in that azimuth, NaN where the elevation is NaN
     """
-    grid = _as_grid(elevation, gsd, body_radius, azimuth=azimuth)
+    grid = np.ascontiguousarray(elevation, dtype=np.float32)
+    _check(grid.shape, gsd, body_radius, azimuth)
     return sweep_horizon(grid, gsd, azimuth, body_radius)
 
 
@@ -58,7 +62,26 @@ def cast_shadow(
         towards the Sun by 1 rad per radius (None: flat, the same everywhere)
     returns (H, W) bool, True = in shadow; False where the elevation is NaN
     """
-    grid = _as_grid(elevation, gsd, body_radius, azimuth=azimuth, sun_elevation=sun_elevation)
-    if abs(sun_elevation) > math.pi / 2 + 1e-6:
-        raise GeometryError(f"sun_elevation: expected radians between -pi/2 and pi/2, found {sun_elevation:g}.")
+    grid = np.ascontiguousarray(elevation, dtype=np.float32)
+    _check(grid.shape, gsd, body_radius, azimuth, sun_elevation)
     return sweep_shadow(grid, gsd, azimuth, sun_elevation, body_radius)
+
+
+def cast_shadow_bands(
+    elevation: Any,
+    gsd: float,
+    azimuth: float,
+    sun_elevation: float,
+    body_radius: float | None = None,
+    band: int = 512,
+) -> Iterator[tuple[slice, slice, NDArray[np.bool_]]]:
+    """:func:`cast_shadow` of a grid that does not fit into memory, in bands of rows or columns from the Sun's side.
+
+    elevation : (H, W), anything that slices [r0:r1, c0:c1] (array, h5py dataset), m
+    band : rows (columns where the Sun stands nearer to east or west) that are in memory at a time
+    yields (rows, columns, shadow): slices of the grid and the bool array that belongs there; together the whole grid
+    """
+    _check(tuple(elevation.shape), gsd, body_radius, azimuth, sun_elevation)
+    if band < 1:
+        raise GeometryError(f"band: expected at least 1 row, found {band}.")
+    return sweep_shadow_bands(elevation, gsd, azimuth, sun_elevation, body_radius, band)

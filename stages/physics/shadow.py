@@ -9,6 +9,8 @@ the lines carry only what lies beyond.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import Any
 
 import numba
 import numpy as np
@@ -20,6 +22,7 @@ NEAR = 4  # rows; 2 rows double the disagreement with a ray tracer, 8 halve it a
 LINES = 1024  # lines per strip of a sweep by rows: the rows in use then stay in the first-level cache
 LINES_TURNED = 512  # and by columns, where blocks of the grid are transposed into a buffer
 BLOCK = 64  # columns per transposed block: 4 cache lines of elevation, one of shadow
+SMALL = 512 * 512  # px; smaller grids are swept by the calling thread alone
 
 
 @numba.njit(fastmath=FLAGS, inline="always")
@@ -186,26 +189,60 @@ _KERNELS = {
 }
 
 
+def _tables(
+    shape: tuple[int, int], gsd: float, azimuth: float, sun_elevation: float, body_radius: float | None
+) -> tuple[Sweep, tuple[Any, ...]]:
+    """The sweep and the arguments that every kernel call of it shares."""
+    sweep = Sweep.towards(azimuth, gsd, shape)
+    taps = Taps.near(sweep.shear, NEAR)
+    drop = min(max(math.tan(sun_elevation), -1e9), 1e9) * sweep.step
+    bend = 0.0 if body_radius is None else 0.5 * sweep.step**2 / body_radius
+    return sweep, (
+        sweep.whole, sweep.fraction, sweep.crossing, sweep.crossed, taps.rows, taps.columns, taps.weight,
+        taps.distance, NEAR, drop, sweep.shear, (bend, 0.5 * (sweep.rows - 1)),
+    )  # fmt: skip
+
+
+def _state(sweep: Sweep, width: int) -> NDArray[np.float32]:
+    """(strips, width + 1), m: the highest ray over every line so far."""
+    return np.full((-(-sweep.line_count // width), width + 1), NOTHING, dtype=np.float32)
+
+
 def sweep_shadow(
     grid: NDArray[np.float32], gsd: float, azimuth: float, sun_elevation: float, body_radius: float | None
 ) -> NDArray[np.bool_]:
     """True where terrain hides a Sun at this azimuth and elevation (rad); see ``horizon.cast_shadow``."""
-    sweep = Sweep.towards(azimuth, gsd, grid.shape)
-    taps = Taps.near(sweep.shear, NEAR)
+    sweep, tables = _tables(grid.shape, gsd, azimuth, sun_elevation, body_radius)
     out = np.empty(grid.shape, dtype=np.bool_)
-    width = LINES_TURNED if sweep.by_columns else LINES
-    if grid.size <= SMALL:
-        width = sweep.line_count
-    state = np.full((-(-sweep.line_count // width), width + 1), NOTHING, dtype=np.float32)
-    drop = min(max(math.tan(sun_elevation), -1e9), 1e9) * sweep.step
-    bend = 0.0 if body_radius is None else 0.5 * sweep.step**2 / body_radius
+    parallel = grid.size > SMALL
+    state = _state(sweep, (LINES_TURNED if sweep.by_columns else LINES) if parallel else sweep.line_count)
     origin, step = (sweep.rows - 1, -1) if sweep.reverse else (0, 1)
-    _KERNELS[sweep.by_columns, grid.size > SMALL](
+    _KERNELS[sweep.by_columns, parallel](
         grid, origin, step, out, origin, step, 0, sweep.rows, sweep.columns, sweep.first_line, sweep.line_count, state,
-        sweep.whole, sweep.fraction, sweep.crossing, sweep.crossed, taps.rows, taps.columns, taps.weight,
-        taps.distance, NEAR, drop, sweep.shear, (bend, 0.5 * (sweep.rows - 1)),
+        *tables,
     )  # fmt: skip
     return out
 
 
-SMALL = 512 * 512  # px
+def sweep_shadow_bands(
+    elevation: Any, gsd: float, azimuth: float, sun_elevation: float, body_radius: float | None, band: int
+) -> Iterator[tuple[slice, slice, NDArray[np.bool_]]]:
+    """The same, band by band from the Sun's side; only the rays' heights go from one band to the next."""
+    shape = (int(elevation.shape[0]), int(elevation.shape[1]))
+    sweep, tables = _tables(shape, gsd, azimuth, sun_elevation, body_radius)
+    state = _state(sweep, LINES_TURNED if sweep.by_columns else LINES)
+    for start in range(0, sweep.rows, band):
+        stop = min(start + band, sweep.rows)
+        before = max(0, start - NEAR - 1)  # the nearest rows are looked at again
+        low, high, inner = before, stop, slice(start, stop)
+        if sweep.reverse:
+            low, high, inner = sweep.rows - stop, sweep.rows - before, slice(sweep.rows - stop, sweep.rows - start)
+        z = elevation[:, low:high] if sweep.by_columns else elevation[low:high, :]
+        z = np.ascontiguousarray(z, dtype=np.float32)
+        out = np.empty((shape[0], stop - start) if sweep.by_columns else (stop - start, shape[1]), dtype=np.bool_)
+        z_row, out_row, step = (stop - 1, stop - 1, -1) if sweep.reverse else (-before, -start, 1)
+        _KERNELS[sweep.by_columns, z.size > SMALL](
+            z, z_row, step, out, out_row, step, start, stop, sweep.columns, sweep.first_line, sweep.line_count, state,
+            *tables,
+        )  # fmt: skip
+        yield (slice(0, shape[0]), inner, out) if sweep.by_columns else (inner, slice(0, shape[1]), out)
