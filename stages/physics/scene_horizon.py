@@ -132,7 +132,7 @@ def horizon_in_scene(
     right = min(columns, col + width + reach_east) if east > 0 else col + width
     window = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)
     slope = np.tan(sweep_horizon(window, gsd, azimuth, body_radius, (row - top, col - left, height, width)))
-    slope[slope < -1e6] = -np.inf  # nothing there: the tangent of float32's -pi/2 is finite
+    slope[np.abs(slope) > 1e6] = -np.inf  # nothing there: float32's -pi/2 lies beyond the pole, its tangent is +2e7
     crop = window[row - top : row - top + height, col - left : col - left + width]
     enough = -math.inf if sun_elevation is None else math.tan(max(sun_elevation - math.radians(1), -1.5))
     bend = 0.0 if body_radius is None else 0.5 / body_radius
