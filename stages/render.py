@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
 from schemas.hdf5 import check_output
-from stages.effects import load_extension
 from stages.physics.bodies import Body, find_body
 from stages.physics.cameras.base import Camera, camera_from_document, read_document
 from stages.physics.light import SunHorizon
@@ -251,12 +250,16 @@ def _light(surface: Surface, config: Config, body: Body, relief: tuple[float, fl
     span = relief[1] - relief[0]
     check_sun_is_up(sun, surface.grid, span)
     horizon = SunHorizon(surface.elevation, surface.grid, sun, span) if config.shadows else None
-    # the diagnosed images are not this one: their own values must not be taken for it
-    extensions = load_extension(Path(config.extension), ["rendered"]) if config.extension else []
+    extensions: list = []
+    if config.extension:
+        from stages.effects import load_extension
+
+        # the diagnosed images are not this one: their own values must not be taken for it
+        extensions = load_extension(Path(config.extension), ["rendered"])
     position = None
     if config.position is not None:
         position = place(*_three(config.position, "--position"), surface.grid.radius)
-    return Light(sun, horizon, position, extensions)  # type: ignore[arg-type]
+    return Light(sun, horizon, position, extensions)
 
 
 def _three(values: Sequence[float], option: str) -> tuple[float, float, float]:
@@ -355,6 +358,7 @@ def _render_map(
     channels = ["image", *BACKPLANES, "elevation"]
     bands = channels if config.backplanes_in_tif else ["image"]
     named = {path.suffix.lower(): path for path in files}
+    wanted = channels if ".exr" in named else list(dict.fromkeys([*bands, "shadow", "incidence_deg"]))
     preview, tally = Preview(grid.height, grid.width), _Tally()
     metadata = _metadata(surface, config, light)
     with contextlib.ExitStack() as stack:
@@ -369,13 +373,13 @@ def _render_map(
             if progress:
                 progress(row, grid.height, "rows")
             height = min(BAND_ROWS, grid.height - row)
-            parts = [
-                shade_block(surface, light, row, col, height, min(BAND_COLUMNS, grid.width - col))
-                for col in range(0, grid.width, BAND_COLUMNS)
-            ]
-            band = {c: np.concatenate([part[c] for part in parts], axis=1) for c in channels}
-            if light.camera_position is None:
-                band["depth"] = relief[1] - band["elevation"]  # from a plane of sight through the highest point
+            band = {c: np.empty((height, grid.width), np.float32) for c in wanted}
+            for col in range(0, grid.width, BAND_COLUMNS):
+                block = shade_block(surface, light, row, col, height, min(BAND_COLUMNS, grid.width - col))
+                if light.camera_position is None:
+                    block["depth"] = relief[1] - block["elevation"]  # from a plane of sight through the highest point
+                for name in wanted:
+                    band[name][:, col : col + BAND_COLUMNS] = block[name]
             if exr:
                 exr.write(band)
             if tif:

@@ -11,17 +11,8 @@ from rasterio.transform import Affine
 from schemas.errors import GeometryError
 from stages.physics.chart import TOLERANCE, chart_position, fit_chart
 from stages.physics.grid import Grid, local_metric_crs, sphere_crs, unit_vectors
-from stages.physics.raycast import (
-    BELOW,
-    HIT,
-    MISS,
-    build_height_field,
-    cast,
-    hit_angles,
-    hit_points,
-    sample_maps,
-    surface_normals,
-)
+from stages.physics.hits import hit_angles, hit_points, sample_maps, surface_normals
+from stages.physics.raycast import BELOW, HIT, MISS, build_height_field, cast
 
 RADIUS = 1737400.0
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.physics.grid import Grid
-from stages.physics.raycast import _difference
+from stages.physics.hits import slope_difference
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -90,8 +90,8 @@ def _geometry(z, fields, step_row, step_col, radius, above, out):
                 )
             here = float(z[r + 1, c + 1])
             stretch = radius / (radius + here)  # a pixel is wider at height
-            east = _difference(float(z[r + 1, c]), here, float(z[r + 1, c + 2])) * values[6] * stretch
-            north = _difference(float(z[r + 2, c + 1]), here, float(z[r, c + 1])) * values[7] * stretch
+            east = slope_difference(float(z[r + 1, c]), here, float(z[r + 1, c + 2])) * values[6] * stretch
+            north = slope_difference(float(z[r + 2, c + 1]), here, float(z[r, c + 1])) * values[7] * stretch
             sx, sy, sz = values[0], values[1], values[2]
             norm = 1.0 / np.sqrt(sx * sx + sy * sy + sz * sz)
             sx, sy, sz = sx * norm, sy * norm, sz * norm

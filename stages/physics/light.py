@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from stages.physics.sun import Sun
 WHOLE_PX = 32 << 20  # up to this many pixels one sweep over everything is cheaper than blocks
 OVERVIEW_PX = 2048
 BLOCK_PX = 1024
+NEAR_FACTOR = 4  # terrain within 256 px is always swept at full resolution
 
 
 def visible_share(sun_elevation: NDArray, horizon: NDArray, radius: float) -> NDArray[np.float32]:
@@ -45,12 +47,13 @@ class SunHorizon:
     def __init__(self, elevation: Any, grid: Grid, sun: Sun, relief: float) -> None:
         self._elevation, self._grid, self._sun = elevation, grid, sun
         self._reference: NDArray[np.float32] | Overview
+        self._blocks: OrderedDict[tuple[int, int], NDArray[np.float32]] = OrderedDict()
         if grid.height * grid.width <= WHOLE_PX and self._azimuth_is_even(relief):
             azimuth, _ = sun.over(grid, (grid.height - 1) / 2, (grid.width - 1) / 2)
             terrain = np.asarray(elevation[0 : grid.height, 0 : grid.width], np.float32)
             self._reference = horizon(terrain, grid.gsd, azimuth, grid.radius)
         else:
-            factor = max(1, math.ceil(max(grid.height, grid.width) / OVERVIEW_PX))
+            factor = max(NEAR_FACTOR, math.ceil(max(grid.height, grid.width) / OVERVIEW_PX))
             self._reference = make_overview(elevation, factor)
 
     def _azimuth_is_even(self, relief: float) -> bool:
@@ -71,12 +74,25 @@ class SunHorizon:
         if not isinstance(self._reference, Overview):
             return self._reference[row : row + height, col : col + width]
         result = np.empty((height, width), np.float32)
-        for r in range(0, height, BLOCK_PX):
-            for c in range(0, width, BLOCK_PX):
-                h, w = min(BLOCK_PX, height - r), min(BLOCK_PX, width - c)
-                azimuth, elevation = self._sun.over(self._grid, row + r + (h - 1) / 2, col + c + (w - 1) / 2)
-                result[r : r + h, c : c + w] = horizon_in_scene(
-                    self._elevation, self._reference, row + r, col + c, h, w, self._grid.gsd, azimuth,
-                    sun_elevation=elevation, body_radius=self._grid.radius,
-                )  # fmt: skip
+        for r in range(row - row % BLOCK_PX, row + height, BLOCK_PX):
+            for c in range(col - col % BLOCK_PX, col + width, BLOCK_PX):
+                block = self._block(self._reference, r, c)
+                top, left = max(r, row), max(c, col)
+                bottom, right = min(r + BLOCK_PX, row + height), min(c + BLOCK_PX, col + width)
+                result[top - row : bottom - row, left - col : right - col] = block[
+                    top - r : bottom - r, left - c : right - c
+                ]
         return result
+
+    def _block(self, overview: Overview, row: int, col: int) -> NDArray[np.float32]:
+        """One block of the map, kept until two rows of blocks have passed: bands of a map ask for it again."""
+        if (row, col) not in self._blocks:
+            height, width = min(BLOCK_PX, self._grid.height - row), min(BLOCK_PX, self._grid.width - col)
+            azimuth, elevation = self._sun.over(self._grid, row + (height - 1) / 2, col + (width - 1) / 2)
+            while len(self._blocks) >= 2 * (self._grid.width // BLOCK_PX + 1):
+                self._blocks.popitem(last=False)
+            self._blocks[row, col] = horizon_in_scene(
+                self._elevation, overview, row, col, height, width, self._grid.gsd, azimuth,
+                sun_elevation=elevation, body_radius=self._grid.radius,
+            )  # fmt: skip
+        return self._blocks[row, col]

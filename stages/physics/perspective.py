@@ -18,21 +18,11 @@ from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.formation import Observation, State
 from stages.physics.geometry import Angles
 from stages.physics.grid import CSM_CENTRE, Grid
+from stages.physics.hits import HitAngles, hit_angles, hit_points, sample_maps
 from stages.physics.light import visible_share
 from stages.physics.mapview import BACKPLANES, Light, form_window
 from stages.physics.photometry import masked_radiance_factor
-from stages.physics.raycast import (
-    HIT,
-    MISS,
-    HeightField,
-    HitAngles,
-    Hits,
-    build_height_field,
-    cast,
-    hit_angles,
-    hit_points,
-    sample_maps,
-)
+from stages.physics.raycast import HIT, MISS, HeightField, Hits, build_height_field, cast
 from stages.physics.surface import Surface
 from stages.physics.view import pixel_footprint
 
