@@ -1,6 +1,8 @@
 """Lambert's law: a surface equally bright from everywhere.
 
-I/F = albedo cos(i)
+    I/F = albedo cos(i)
+
+The albedo is that of a perfectly diffuse surface: 1 reflects all light.
 """
 
 from __future__ import annotations

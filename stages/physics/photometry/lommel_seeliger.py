@@ -1,6 +1,8 @@
 """Lommel-Seeliger's law: light scattered once in a dark, deep layer. A good disk function for the full Moon.
 
-I/F = albedo 2 cos(i) / (cos(i) + cos(e))
+    I/F = albedo 2 cos(i) / (cos(i) + cos(e))
+
+The factor 2 makes the albedo the normal albedo, as in ISIS; in Hapke's terms it is w/8 for isotropic particles.
 """
 
 from __future__ import annotations

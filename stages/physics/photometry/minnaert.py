@@ -1,6 +1,8 @@
 """Minnaert's law: limb darkening by one exponent; k = 1 is Lambert, the Moon at small phase has k = 0.5.
 
-I/F = albedo cos(i)^k cos(e)^(k-1)
+    I/F = albedo cos(i)^k cos(e)^(k-1)
+
+The albedo is the normal albedo; k rises with phase, and with k < 1 the law is infinite at the limb.
 """
 
 from __future__ import annotations
