@@ -14,9 +14,15 @@ from photometry_samples import directions, interior, reciprocity_error
 
 from schemas import RegistryError
 from stages.physics.geometry import Angles
-from stages.physics.photometry import evaluate, get_model, masked_radiance_factor, model_names
+from stages.physics.photometry import (
+    evaluate,
+    get_model,
+    get_set,
+    masked_radiance_factor,
+    model_names,
+    published_sets,
+)
 from stages.physics.photometry.hapke import coherent_backscatter, h_1981, h_2002, porosity
-from stages.physics.photometry.published import get_set, published_sets
 from stages.physics.photometry.quantities import (
     from_bidirectional_reflectance,
     from_brdf,

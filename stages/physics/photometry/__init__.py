@@ -24,6 +24,7 @@ from torch import Tensor
 from schemas.errors import RegistryError
 from stages.physics.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, get_model, model_names, register
+from stages.physics.photometry.published import ParameterSet, get_set, published_sets
 
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
@@ -86,10 +87,13 @@ def _in_radians(model: ReflectanceModel, parameters: Mapping[str, Any]) -> dict[
 
 __all__ = [
     "Parameter",
+    "ParameterSet",
     "ReflectanceModel",
     "evaluate",
     "get_model",
+    "get_set",
     "masked_radiance_factor",
     "model_names",
+    "published_sets",
     "register",
 ]
