@@ -83,6 +83,8 @@ def test_the_command_trains_compares_and_resumes(tmp_path):
         1,
         "--batch",
         8,
+        "--widths",
+        "4-8-8-8-8",
         "--device",
         "cpu",
         "-o",

@@ -25,7 +25,7 @@ from schemas import (
 )
 from stages.effects import load_extension
 from stages.evaluate.bootstrap import TileBootstrap
-from stages.evaluate.core import Row, choose_fit_pairs, fit_renderers, layout, score
+from stages.evaluate.core import TITLES, Row, choose_fit_pairs, fit_renderers, layout, score
 from stages.evaluate.perceptual import Perceptual
 from stages.evaluate.renderers import Predictor, Reader, read_batch
 from stages.evaluate.table import gain_table, metric_table
@@ -168,6 +168,7 @@ def evaluate_pairs(
         "split": config.split,
         "models": metric_table(scores, bootstrap),
         "gains": gain_table(scores, bootstrap),
+        "titles": {row.name: TITLES[row.name] for row in rows},
         "pairs": len(wanted),
         "valid_pixels": int(scores.pixels.sum()),
         "tiles": bootstrap.tiles,

@@ -1,0 +1,36 @@
+"""`lunargr report FILES`: everything a run has produced, on one self-contained page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import Output, Overwrite, Quiet
+
+NAME, ORDER = "report", 85
+
+
+def command(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILES",
+            help="Artefacts (.h5), JSON results of match, compare or diagnose, and pictures (.png, .jpg).",
+        ),
+    ],
+    output: Output = Path("report.html"),
+    title: Annotated[
+        str, typer.Option("--title", help="Title of the page.")
+    ] = "Lunar reflectance learned from terrain",
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Put maps, tables, curves and pictures of a run on one HTML page that needs nothing else, in light or dark."""
+    from lunargr_cli.console import Console
+    from stages import report
+
+    console = Console(quiet)
+    titles = report.run(files, output, report.Config(title), overwrite=overwrite, progress=console.progress)
+    console.say(f"{output}: {', '.join(titles)}")

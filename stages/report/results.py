@@ -1,0 +1,265 @@
+"""Evaluation, matching, model comparison and diagnosis: one function per result, from numbers to a section."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import h5py
+import numpy as np
+
+from stages.report import page, pictures
+
+COLOURS = {"learned": "#3b8ecb", "global": "#4f9d69", "lunar_lambert": "#c08a2e", "hapke": "#c25b63"}
+FAIREST = "hapke_gain_offset"
+
+
+def headline(result: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """The cards on top of the page, from evaluate's result."""
+    models, gains = result["models"], result["gains"]
+    unit = "I/F" if result["image_units"] == "iof" else "of the DN range"
+    cards = []
+    if "learned" in models:
+        cards.append((f"{models['learned']['rmse']:.4f}", f"rms error of the learned reflectance, {unit}", ""))
+    for ours, other, what in (
+        ("learned", "hapke_minmax", "MSE than Hapke matched as in the paper"),
+        ("learned", "global", "MSE than the same model without spatial variation"),
+        ("learned_gain_offset", FAIREST, "MSE than Hapke, both with least-squares gain and offset per crop"),
+    ):
+        gain = gains.get(ours, {}).get(other)
+        if gain and gain["gain_percent"] is not None:
+            word = verdict(gain)
+            kind = {"better": "good", "worse": "bad"}.get(word, "")
+            way = "lower" if gain["gain_percent"] >= 0 else "higher"
+            cards.append((f"{abs(gain['gain_percent']):.1f} % {way}", f"{what} (gain, {_bounds(gain)} %)", kind))
+    return cards
+
+
+def verdict(gain: dict[str, Any]) -> str:
+    """What a paired interval says."""
+    low, high = gain["gain_percent_low"], gain["gain_percent_high"]
+    if low is None or high is None:
+        return "unknown"
+    return "better" if low > 0 else "worse" if high < 0 else "no difference"
+
+
+def _bounds(gain: dict[str, Any]) -> str:
+    if gain["gain_percent_low"] is None:
+        return "no interval"
+    return f"95 %: {gain['gain_percent_low']:+.1f} .. {gain['gain_percent_high']:+.1f}"
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
+    """The table of models, what the learned one gains, and example crops where the file kept renderings."""
+    section = page.Section("Evaluation on unseen ground")
+    models, titles = result["models"], result.get("titles", {})
+    unit = "I/F" if result["image_units"] == "iof" else f"shares of the full range of {result['dn_full_range']:.0f} DN"
+    rows = [
+        [
+            titles.get(name, name), f"{m['mse']:.3e}",
+            "-" if m["mse_low"] is None else f"{m['mse_low']:.2e} .. {m['mse_high']:.2e}",
+            _cell(m["mse_crop_sum"], ".3f"), _cell(m["psnr"], ".2f"), _cell(m["psnr_crop_range"], ".2f"),
+            _cell(m["ssim"], ".3f"), _cell(m["lpips"], ".3f"),
+        ]
+        for name, m in models.items()
+    ]  # fmt: skip
+    best = int(np.argmin([m["mse"] for m in models.values()]))
+    header = ["model", "MSE", "95 % interval", "MSE per crop", "PSNR, dB", "PSNR of crop range, dB", "SSIM", "LPIPS"]
+    section.add(
+        page.paragraph(
+            f"{result['pairs']:,} crops of the split '{result['split']}' on {result['tiles']} ground tiles; errors in {unit}. "
+            "Intervals come from resampling ground tiles."
+        ),
+        page.table("Lowest MSE in bold", header, rows, best),
+        page.chart(_errors(result), "Root mean squared error with 95 % intervals"),
+    )
+    rows = [
+        [
+            ours.replace("_", " "),
+            other.replace("_", " "),
+            _cell(gain["gain_percent"], "+.1f"),
+            _bounds(gain),
+            verdict(gain).replace(" ", "\u00a0"),
+        ]
+        for ours, others in result["gains"].items()
+        for other, gain in others.items()
+        if not (other.startswith("learned") and not ours.startswith("learned_extended"))
+    ]
+    if rows:
+        section.add(
+            page.table(
+                "What the learned reflectance gains",
+                ["model", "against", "MSE lowered by, %", "interval", "verdict"],
+                rows,
+            )
+        )
+    for note in result.get("warnings", []):
+        section.add(page.paragraph(f"Note: {note}.", "soft"))
+    if result.get("lpips_unavailable"):
+        section.add(page.paragraph(f"LPIPS is not available: {result['lpips_unavailable']}.", "soft"))
+    if file is not None and "rendered" in file:
+        section.add(*_examples(file, list(models), unit))
+    return section
+
+
+def _errors(result: dict[str, Any]) -> str:
+    names = list(result["models"])
+    figure, axes = pictures.new_chart(7.2, 0.36 * len(names) + 0.8)
+    for k, name in enumerate(names):
+        row = result["models"][name]
+        colour = next((c for key, c in COLOURS.items() if name.startswith(key)), "#888888")
+        if row["mse_low"] is not None:
+            axes.plot(np.sqrt([row["mse_low"], row["mse_high"]]), [k, k], color=colour, linewidth=3, alpha=0.5)
+        axes.plot(row["rmse"], k, "o", color=colour, markersize=6)
+    axes.set_yticks(range(len(names)), [n.replace("_", " ") for n in names], fontsize=8)
+    axes.invert_yaxis()
+    values = [m["rmse"] for m in result["models"].values() if m["rmse"] > 0]
+    if values and max(values) > 8 * min(values):
+        axes.set_xscale("log")
+    axes.set_xlabel("root mean squared error")
+    return pictures.chart_svg(figure, "errors")
+
+
+def _examples(file: h5py.File, names: list[str], unit: str) -> list[str]:
+    """Measured, rendered and residual for the first model's best, median and worst crop."""
+    mse = file["mse"][0]
+    order = np.argsort(mse)[: int(np.isfinite(mse).sum())]
+    if not len(order):
+        return []
+    parts = ["<h3>Example crops: rendered above, measured - rendered below</h3>"]
+    for label, k in (("best", order[0]), ("median", order[len(order) // 2]), ("worst", order[-1])):
+        measured = file["measured"][k]
+        low, high = pictures.limits(measured)
+        rendered = [file["rendered"][m, k] for m in range(len(names))]
+        spread = pictures.limits(np.abs(measured - rendered[0]), 1.0)[1]
+        figures = [page.picture(pictures.data_uri(pictures.coloured(measured, low, high, "gray")), "measured")]
+        for m, name in enumerate(names):
+            difference = pictures.coloured(measured - rendered[m], -spread, spread, "RdBu_r")
+            above = pictures.data_uri(pictures.coloured(rendered[m], low, high, "gray"))
+            text = name.replace("_", " ")
+            residual = f'<img src="{pictures.data_uri(difference)}" alt="residual of {text}" style="margin-top:.3rem">'
+            figures.append(page.picture(above, f"{text}: rms {math.sqrt(file['mse'][m, k]):.4f}", bar=residual))
+        parts.append(
+            f"<h3>The {label} crop of '{names[0]}' (pair {file['pair_index'][k]})</h3>"
+            + page.crops(figures)
+            + '<div class="grid"><div>'
+            + pictures.colour_bar(low, high, "gray", "")
+            + f'<span class="soft">brightness, {unit}</span></div><div>'
+            + pictures.colour_bar(-spread, spread, "RdBu_r", "")
+            + '<span class="soft">measured - rendered</span></div></div>'
+        )
+    return parts
+
+
+def matching(result: dict[str, Any]) -> page.Section:
+    """Matching consistency."""
+    section = page.Section("Feature matching")
+    rows = []
+    for matcher, renderings in result["matchers"].items():
+        for name, m in renderings.items():
+            shift = m.get("median_shift_right_px")
+            rows.append(
+                [matcher, name.replace("_", " "), str(m["matches"])]
+                + [_cell(m[f"within_{t}_px_percent"], ".1f") for t in (1, 3, 5)]
+                + [_cell(m["mean_error_px"], ".2f"), _cell(m["median_error_px"], ".2f")]
+                + ["-" if shift is None else f"{shift:+.1f}, {m['median_shift_down_px']:+.1f}"]
+            )
+    header = [
+        "matcher",
+        "rendering",
+        "matches",
+        "within 1 px, %",
+        "3 px, %",
+        "5 px, %",
+        "mean, px",
+        "median, px",
+        "shift, px",
+    ]
+    section.add(
+        page.paragraph(
+            "Measured and rendered images show the same ground, so every match should end where it began. "
+            "A median shift far from zero is misregistration, which no reflectance can mend."
+        ),
+        page.table(f"{result['crops']} pictures at {result['size_px'][0]} x {result['size_px'][1]} px", header, rows),
+    )
+    return section
+
+
+def comparison(result: dict[str, Any]) -> page.Section:
+    """Several models from several seeds."""
+    section = page.Section("Comparison of reflectance models")
+    rows = [
+        [
+            name, _cell(m["mse_crop_sum"], ".4f"), _cell(m["mse_crop_sum_seed_std"], ".4f"), _cell(m["mse"], ".4e"),
+            "-" if m["mse_low"] is None else f"{m['mse_low']:.3e} .. {m['mse_high']:.3e}",
+            ", ".join(map(str, m["best_epoch"])), _cell(m["paper_mse_crop_sum"], ".2f"),
+        ]
+        for name, m in result["models"].items()
+    ]  # fmt: skip
+    header = [
+        "model",
+        "MSE per crop",
+        "spread of seeds",
+        "MSE",
+        "95 % over tiles",
+        "best epochs",
+        "paper's MSE per crop",
+    ]
+    section.add(page.table(f"{result['crops']} crops, {result['tiles']} ground tiles", header, rows, 0))
+    words = {True: "yes", False: "no", None: "needs two seeds and two tiles"}
+    rows = [
+        [
+            f"{p['better']} < {p['worse']}", f"{p['difference_percent']:.1f}", _cell(p["noise_of_seeds"], ".1e"),
+            _cell(p["noise_of_tiles"], ".1e"), _cell(p["p_adjusted"], ".3f"), words[p["larger_than_noise"]],
+        ]
+        for p in result["differences"]
+    ]  # fmt: skip
+    header = ["pair", "difference, %", "noise of seeds", "noise of tiles", "p (Holm)", "larger than its noise"]
+    section.add(page.table("Which differences are larger than their noise", header, rows))
+    return section
+
+
+VERDICTS = {
+    "named": "The simulation lacks the causes below.",
+    "nothing_significant": "Nothing significant is missing.",
+    "unexplained": "Something is missing that nothing in the catalogue explains.",
+    "cannot_tell": "These data cannot tell.",
+}
+
+
+def diagnosis(result: dict[str, Any]) -> page.Section:
+    """What the simulation still gets wrong."""
+    section = page.Section("Diagnosis")
+    section.add(page.paragraph(VERDICTS.get(result["verdict"], result["verdict"])))
+    rows = []
+    for cause in result.get("causes", []):
+        values = "; ".join(
+            f"{name} = {_cell(v['value'], '.4g')} +- {_cell(v['error'], '.2g')} {v['unit']}".rstrip(" 1")
+            if v["unit"] == "1"
+            else f"{name} = {_cell(v['value'], '.4g')} +- {_cell(v['error'], '.2g')} {v['unit']}"
+            for name, v in cause["parameters"].items()
+        )
+        rows.append(
+            [cause["effect"].replace("_", " "), values, _cell(cause["p_family_wise"], ".2g"), _cell(cause["gain_nats"], ".1f"),
+             f"{_cell(cause['residual_rms_before'], '.3g')} to {_cell(cause['residual_rms_after'], '.3g')}",
+             ", ".join(cause["group"]).replace("_", " ") or "-"]
+        )  # fmt: skip
+    if rows:
+        header = ["cause", "parameters", "p (family-wise)", "gain, nats", "residual rms", "not to be told apart from"]
+        section.add(page.table("Causes", header, rows))
+    held_out = result.get("held_out") or {}
+    if held_out.get("gain_percent") is not None:
+        section.add(
+            page.paragraph(
+                f"On held-out pairs the extended model lowers the MSE by {held_out['gain_percent']:.1f} % "
+                f"(95 %: {_cell(held_out['gain_percent_low'], '.1f')} .. {_cell(held_out['gain_percent_high'], '.1f')})."
+            )
+        )
+    if result.get("blind"):
+        names = ", ".join(result["blind"]).replace("_", " ")
+        section.add(page.paragraph(f"These data could not show: {names}.", "soft"))
+    return section

@@ -1,0 +1,223 @@
+"""The report is one file, complete, valid and true to the numbers it was given."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+from evaluation_scene import make_scene, run_command, write_pairs
+
+from schemas import DIAGNOSIS, SCENE, SVBRDF, ArtefactWriter
+from stages import evaluate, match, report, train
+
+WKT = "LOCAL_CS[moon]"
+VOID = {"meta", "img", "br", "link", "hr"}
+
+
+def _write_maps(folder, rng):
+    """A scene and its coefficient maps with a hole in the DEM."""
+    elevation = cv2.GaussianBlur(rng.normal(size=(90, 140)), (0, 0), 6).astype(np.float32) * 900
+    valid = np.ones(elevation.shape, bool)
+    valid[10:30, 20:50] = False
+    place = {"gsd_m": 5.0, "body_radius_m": 1737400.0}
+    grid = {"y": np.arange(90)[::-1] * 5.0, "x": np.arange(140) * 5.0}
+    sizes = {"frame": 2, "y": 90, "x": 140, "window": 4}
+    more = {"crop_px": 32, "elevation_source": "dem.tif"}
+    with ArtefactWriter(folder / "scene.h5", SCENE, sizes, attributes=place | more, seed=0) as out:
+        for name, values in grid.items():
+            out.write(name, values)
+        out.write_crs(WKT, (5, 0, 0, 0, -5, 450))
+        out.write("elevation", np.where(valid, elevation, np.nan))
+        out.write("dem_valid", valid)
+        out.write("valid", np.stack([valid, valid & (np.arange(140) < 70)]))
+        out.write("valid_position", np.stack([valid, valid]))
+        out.write("frame_window", np.tile([0, 0, 90, 140], (2, 1)))
+        out.write("valid_area_m2", [1e6, 2e6])
+        out.write("image_id", ["first", "<second>"])
+        for name in ("path", "camera", "start_time"):
+            out.write(name, ["", ""])
+        out.write("units", [0, 0])
+        for name in SCENE.variables:
+            if name.name.startswith(("subsolar", "spacecraft", "solar_distance")):
+                out.write(name.name, [1.0, 2.0])
+    sizes = {"coefficient": 3, "y": 90, "x": 140}
+    more = {"model": "M2", "quantity": "I/F"}
+    with ArtefactWriter(folder / "svbrdf.h5", SVBRDF, sizes, attributes=place | more, seed=0) as out:
+        for name, values in grid.items():
+            out.write(name, values)
+        out.write_crs(WKT, (5, 0, 0, 0, -5, 450))
+        out.write("coefficients", np.where(valid, np.stack([elevation * s + s for s in (1, 2, 3)]), np.nan))
+        out.write("coefficient_name", ["a", "b", "c"])
+        out.write("elevation", elevation)
+        out.write("valid", valid)
+
+
+FOUND = {
+    "verdict": "named",
+    "causes": [
+        {
+            "effect": "sun_elevation",
+            "parameters": {"error_deg": {"value": 1.25, "error": 0.1, "unit": "degree"}},
+            "p_family_wise": 0.002,
+            "gain_nats": 321.0,
+            "gain_error": 9.0,
+            "residual_rms_before": 0.01,
+            "residual_rms_after": 0.008,
+            "group": ["sun_elevation"],
+            "to_separate": "",
+        }
+    ],
+    "unexplained_fraction": 0.1,
+    "blind": ["earthshine"],
+    "held_out": {"mse_nominal": 1, "mse_extended": 0.9, "gain_percent": 10.0, "gain_percent_low": 8.0, "gain_percent_high": 12.0},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """One file of every kind that the report shows."""
+    folder = tmp_path_factory.mktemp("report")
+    rng = np.random.default_rng(4)
+    write_pairs(folder / "pairs.h5", make_scene(rng, pairs=24))
+    config = train.Config(epochs=2, batch=8, widths=(4, 8), dropout=(0.0, 0.0), device="cpu", precision="fp32")
+    train.run(folder / "pairs.h5", folder / "checkpoint.h5", config)
+    files = (folder / "pairs.h5", folder / "checkpoint.h5")
+    evaluate.run(*files, folder / "evaluation.h5", evaluate.Config(bootstrap=50, device="cpu"))
+    settings = match.Config(("sift",), count=2, device="cpu")
+    match.run(list(files), settings, json_file=folder / "match.json", figures=folder)
+    _write_maps(folder, rng)
+    extra = {"report": json.dumps(FOUND), "extension": "[]"}
+    with ArtefactWriter(folder / "diagnosis.h5", DIAGNOSIS, {"frame": 1}, attributes=extra, seed=0) as out:
+        out.write("image_id", ["first"])
+    return folder
+
+
+class Outline(HTMLParser):
+    """Checks that tags are balanced and collects what the page refers to."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.ids, self.sources, self.tags = [], [], [], set()
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.add(tag)
+        for name, value in attributes:
+            if name == "id":
+                self.ids.append(value)
+            if name in ("src", "href", "xlink:href"):
+                self.sources.append(value)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.handle_starttag(tag, attributes)
+        if tag not in VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def page(folder):
+    files = [*folder.glob("*.h5"), *folder.glob("*.json"), *folder.glob("*.png")]
+    titles = report.run(files, folder / "report.html", report.Config("A <title> & more"))
+    return (folder / "report.html").read_text(), titles
+
+
+def test_the_page_needs_nothing_else(page):
+    text, _ = page
+    outline = Outline()
+    outline.feed(text)
+    assert not outline.open
+    assert len(outline.ids) == len(set(outline.ids)) > 10
+    for source in outline.sources:
+        assert source.startswith("data:") or (source.startswith("#") and source[1:] in outline.ids), source[:80]
+    assert outline.tags.isdisjoint({"script", "link", "iframe", "object"})
+    assert "http" not in re.sub(r"data:[^\"]*", "", text)
+    assert "prefers-color-scheme: dark" in text
+
+
+def test_every_picture_shows_something(page):
+    pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', page[0])
+    assert len(pictures) > 3 + 8 + 3 * 17
+    for content in pictures:
+        image = cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_UNCHANGED)
+        assert image is not None and image.std() > 1
+
+
+def test_all_parts_are_there_in_order(page):
+    assert page[1] == [
+        "Terrain and images", "Pairs of terrain and image", "Training", "Reflectance maps",
+        "Evaluation on unseen ground", "Feature matching", "Diagnosis", "Pictures", "Provenance",
+    ]  # fmt: skip
+
+
+def test_numbers_are_those_of_the_files(page, folder):
+    text = page[0]
+    result = json.loads((folder / "evaluation.json").read_text())
+    for row in result["models"].values():
+        assert f"{row['mse']:.3e}" in text and f"{row['ssim']:.3f}" in text
+    gain = result["gains"]["learned_gain_offset"]["hapke_gain_offset"]["gain_percent"]
+    assert f"{gain:+.1f}" in text
+    matching = json.loads((folder / "match.json").read_text())["matchers"]["sift"]["learned"]
+    assert f"{matching['within_3_px_percent']:.1f}" in text
+    assert "sun elevation" in text and "1.25 +- 0.1 degree" in text and "earthshine" in text
+
+
+def test_text_of_the_user_is_escaped(page):
+    assert "A &lt;title&gt; &amp; more" in page[0] and "&lt;second&gt;" in page[0] and "<second>" not in page[0]
+
+
+def test_the_hole_in_the_dem_stays_a_hole(folder):
+    from stages.report.pictures import coloured, shaded_relief
+
+    elevation = np.linspace(0, 50, 400).reshape(20, 20)
+    elevation[3:6, 3:6] = np.nan
+    for picture in (shaded_relief(elevation, 5.0)[0], coloured(elevation, 0, 50, "magma")):
+        assert (picture[..., 3] == 0).sum() == 9 and (picture[0, 0, 3], picture[4, 4, 3]) == (255, 0)
+
+
+def test_the_hillshade_is_lit_from_the_upper_left():
+    from stages.report.pictures import shaded_relief
+
+    rows, cols = np.mgrid[:60, :60]
+    cone = 30.0 - np.hypot(rows - 29.5, cols - 29.5)
+    picture = shaded_relief(cone, 1.0)[0][..., :3].sum(axis=2).astype(float)
+    assert picture[15:25, 15:25].mean() > 1.3 * picture[35:45, 35:45].mean()
+
+
+def test_large_maps_are_thinned(tmp_path):
+    import h5py
+
+    from stages.report.pictures import read_thinned
+
+    with h5py.File(tmp_path / "map.h5", "w") as file:
+        file["map"] = np.add.outer(np.arange(2000.0), np.zeros(150))
+        small, step = read_thinned(file["map"], longest=900)
+    assert step == 3 and small.shape == (667, 50) and np.array_equal(small[:, 0], np.arange(0, 2000, 3))
+
+
+@pytest.mark.parametrize("case", ["missing", "other json", "not a picture", "existing output", "nothing to show"])
+def test_bad_input_is_one_line_and_leaves_nothing(folder, tmp_path, case):
+    (tmp_path / "other.json").write_text('{"a": 1}')
+    (tmp_path / "false.png").write_text("no picture")
+    output = tmp_path / "out.html"
+    files = {
+        "missing": tmp_path / "absent.h5",
+        "other json": tmp_path / "other.json",
+        "not a picture": tmp_path / "false.png",
+        "existing output": folder / "match.json",
+        "nothing to show": folder / "absent.json",
+    }
+    if case == "existing output":
+        output.write_text("mine")
+    before = sorted(tmp_path.iterdir())
+    code, message = run_command("report", files[case], "-o", output)
+    assert code == 3 and message and "\n" not in message
+    assert sorted(tmp_path.iterdir()) == before
