@@ -21,9 +21,15 @@ from lunargr_cli import main as cli
 from schemas import DIAGNOSIS, SVBRDF, ArtefactWriter
 from stages import render
 from stages.physics import light
+from stages.physics.bodies import Body
+from stages.physics.cameras import camera_from_document, read_document
 from stages.physics.grid import Grid, local_metric_crs, read_grid, unit_vectors
+from stages.physics.hits import hit_points
 from stages.physics.photometry import evaluate
 from stages.physics.pictures import read_exr
+from stages.physics.raycast import HIT, build_height_field, cast
+from stages.physics.surface import open_surface
+from stages.render import maps
 
 RADIUS = 1737400.0
 LON, LAT = -42.0, 17.0
@@ -61,7 +67,7 @@ def write_dem(path, grid: Grid, elevation: np.ndarray, **changes):
     return path
 
 
-def maps(rng, shape, count=3):
+def smooth_maps(rng, shape, count=3):
     smooth = np.stack([hills(rng, max(shape), 1.0)[: shape[0], : shape[1]] for _ in range(count)])
     return 0.05 + 0.01 * smooth / np.abs(smooth).max()
 
@@ -71,7 +77,7 @@ def scene(rng, tmp_path):
     """A hilly 160 x 200 map with varying M2 coefficients and a hole."""
     grid = make_grid(160, 200, 5.0)
     elevation = hills(rng, 200, 5.0)[:160]
-    coefficients = maps(rng, (160, 200))
+    coefficients = smooth_maps(rng, (160, 200))
     coefficients[:, 20:40, 60:90] = np.nan
     return write_svbrdf(tmp_path / "svbrdf.h5", grid, elevation, coefficients), grid, elevation, coefficients
 
@@ -158,8 +164,8 @@ def test_blocks_make_no_difference(scene, tmp_path, monkeypatch):
     path, *_ = scene
     config = render.Config(sun_azimuth_deg=100.0, sun_elevation_deg=20.0)
     render.run(path, tmp_path / "whole.exr", config)
-    monkeypatch.setattr(render, "BAND_ROWS", 33)
-    monkeypatch.setattr(render, "BAND_COLUMNS", 71)
+    monkeypatch.setattr(maps, "BAND_ROWS", 33)
+    monkeypatch.setattr(maps, "BAND_COLUMNS", 71)
     render.run(path, tmp_path / "blocks.exr", config)
     whole, blocks = read_exr(tmp_path / "whole.exr"), read_exr(tmp_path / "blocks.exr")
     for name in whole:
@@ -402,6 +408,40 @@ def test_files_that_cannot_be_rendered(rng, scene, tmp_path, monkeypatch, capsys
     assert not [p.name for p in tmp_path.iterdir() if "partial" in p.name]
 
 
+def test_a_line_scan_camera_sees_ground_that_its_own_model_projects_back(shared, tmp_path):
+    """LROC NAC: rays onto hills, and the hits through the camera's ground-to-image, which knows nothing of rays."""
+    path = shared / "oracles" / "ale_lrolroc_M103595705LE.isd.json"
+    camera = camera_from_document(read_document(path), str(path))
+    centre = camera.image_to_ground(camera.lines / 2, camera.samples / 2)
+    lon, lat = (
+        math.degrees(math.atan2(centre[1], centre[0])),
+        math.degrees(math.asin(centre[2] / np.linalg.norm(centre))),
+    )
+    crs = local_metric_crs(lon, lat, RADIUS)
+    size, gsd = 1000, 10.0
+    grid = Grid(crs.to_wkt(), Affine(gsd, 0, -size * gsd / 2, 0, -gsd, size * gsd / 2), size, size, RADIUS)
+    dem = write_dem(tmp_path / "dem.tif", grid, hills(np.random.default_rng(3), size, gsd))
+    with open_surface(dem, "lambert", {}, Body("moon", RADIUS)) as surface:
+        field = build_height_field(surface.elevation[0:size, 0:size], grid)
+        line, sample = (v.ravel() for v in np.meshgrid(np.linspace(1, 399, 12), np.linspace(1200, 3800, 17)))
+        origins, directions = camera.rays(line, sample)
+        hits = cast(field, origins, directions)
+        assert (hits.status == HIT).mean() > 0.9
+        back = camera.ground_to_image(hit_points(hits, origins, directions))
+        met = hits.status == HIT
+        np.testing.assert_allclose(back[0][met], line[met], atol=1e-3)
+        np.testing.assert_allclose(back[1][met], sample[met], atol=1e-3)
+    # the whole command, with the Sun that the camera model knows
+    config = render.Config(view="pinhole", camera=str(path), samples=1, shadows=False)
+    small = tmp_path / "strip.exr"
+    summary = render.run(tmp_path / "dem.tif", small, config)
+    assert summary.size_px == (5064, 400)
+    view = read_exr(small)
+    sun = camera.sun_position(np.array([200.0]))[0] - centre
+    incidence = math.degrees(math.acos(sun @ centre / np.linalg.norm(sun) / np.linalg.norm(centre)))
+    assert np.nanmean(view["incidence_deg"]) == pytest.approx(incidence, abs=5.0)
+
+
 def test_an_interrupted_render_leaves_nothing(scene, tmp_path, monkeypatch):
     path, *_ = scene
     calls = []
@@ -412,9 +452,9 @@ def test_an_interrupted_render_leaves_nothing(scene, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return original(*arguments)
 
-    original = render.shade_block
-    monkeypatch.setattr(render, "shade_block", stop)
-    monkeypatch.setattr(render, "BAND_ROWS", 40)
+    original = maps.shade_block
+    monkeypatch.setattr(maps, "shade_block", stop)
+    monkeypatch.setattr(maps, "BAND_ROWS", 40)
     with pytest.raises(KeyboardInterrupt):
         render.run(path, tmp_path / "o.exr", render.Config(sun_azimuth_deg=1.0, sun_elevation_deg=40.0))
     assert [p.name for p in tmp_path.iterdir()] == ["svbrdf.h5"]

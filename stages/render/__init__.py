@@ -1,0 +1,40 @@
+"""render: images of a terrain with its reflectance, for any Sun and camera, with backplanes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from schemas.hdf5 import check_output
+from stages.physics.bodies import find_body
+from stages.render.config import Config, Summary, check, inputs, output_files
+from stages.render.maps import render_map
+from stages.render.setting import find_camera, make_light, open_source
+from stages.render.views import render_camera, run_trajectory
+
+Progress = Callable[[int, int, str], None]
+
+
+def run(
+    source: Path, output: Path, config: Config, overwrite: bool = False, progress: Progress | None = None
+) -> Summary:
+    """Render one view of ``source`` (svbrdf.h5, scene.h5 or a DEM). Raises LunargrError.
+
+    output : NAME.exr writes NAME.exr, NAME.png and, for ortho views, NAME.tif; NAME.tif and NAME.png leave the EXR out
+    """
+    check(config)
+    body = find_body(config.body)
+    files = output_files(output, config.view)
+    for path in files:
+        check_output(path, inputs(source, config), overwrite)
+    with open_source(source, config, body) as surface:
+        relief = surface.height_range()
+        if config.view == "ortho":
+            light = make_light(surface, config, body, relief)
+            return render_map(surface, light, relief, files, config, progress)
+        camera = find_camera(surface, config)
+        light = make_light(surface, config, body, relief, camera)
+        return render_camera(surface, camera, light, relief, files, config, output.stem, progress)
+
+
+__all__ = ["Config", "Summary", "run", "run_trajectory"]

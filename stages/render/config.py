@@ -1,0 +1,150 @@
+"""What to render, what came out, and the files behind one --output."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.errors import ConfigError
+
+Floats32 = NDArray[np.float32]
+
+VIEWS = ("ortho", "pinhole")
+SUN = (
+    "sun_azimuth_deg",
+    "sun_elevation_deg",
+    "subsolar_longitude_deg",
+    "subsolar_latitude_deg",
+    "solar_distance_au",
+    "time",
+)
+
+
+@dataclass(frozen=True)
+class Config:
+    """What to render. The Sun by exactly one of its three descriptions; angles in degrees.
+
+    position : longitude, latitude, metres above the sphere; in an ortho view the place that light is reflected to
+    look_at : longitude, latitude (and metres above the sphere; the ground's own height where that is absent)
+    quaternion : w, x, y, z, camera axes (right, down, forward) to body-fixed, instead of look_at
+    camera : path of a camera model (JSON), instead of position, attitude, fov and size
+    samples : rays per pixel and axis (None: as many as the pixel's footprint asks for)
+    model, parameters : a reflectance that is the same everywhere, where the source holds none
+    terrain_only : of svbrdf.h5 use the terrain, with ``model``
+    """
+
+    view: str = "ortho"
+    sun_azimuth_deg: float | None = None
+    sun_elevation_deg: float | None = None
+    subsolar_longitude_deg: float | None = None
+    subsolar_latitude_deg: float | None = None
+    solar_distance_au: float | None = None
+    time: str | None = None
+    position: tuple[float, ...] | None = None
+    look_at: tuple[float, ...] | None = None
+    quaternion: tuple[float, ...] | None = None
+    roll_deg: float = 0.0
+    fov_deg: float = 20.0
+    size_px: tuple[int, int] = (1024, 1024)
+    camera: str | None = None
+    samples: int | None = None
+    shadows: bool = True
+    model: str | None = None
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    terrain_only: bool = False
+    extension: str | None = None
+    body: str = "moon"
+    backplanes_in_tif: bool = False
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What was rendered, for the line at the end."""
+
+    view_id: str
+    files: tuple[Path, ...]
+    size_px: tuple[int, int]
+    known_share: float
+    mean: float
+    shadow_share: float
+    incidence_deg: tuple[float, float]
+    samples: int
+    skipped: bool = False
+
+
+def inputs(source: Path, config: Config) -> list[Path]:
+    """The files that no output may replace."""
+    return [source, *(Path(p) for p in (config.camera, config.extension) if p)]
+
+
+def output_files(output: Path, view: str) -> list[Path]:
+    """The files behind one --output. Raises ConfigError."""
+    suffix = output.suffix.lower()
+    png, tif = output.with_suffix(".png"), output.with_suffix(".tif")
+    if suffix in (".exr", ""):
+        exr = output.with_suffix(".exr")
+        return [exr, png, tif] if view == "ortho" else [exr, png]
+    if suffix in (".tif", ".tiff"):
+        if view != "ortho":
+            raise ConfigError(f"{output}: a pinhole view has no map grid for a GeoTIFF; name a .exr or .png file.")
+        return [output, png]
+    if suffix == ".png":
+        return [output]
+    raise ConfigError(f"{output}: expected a name that ends in .exr, .tif or .png; choose another --output.")
+
+
+def check(config: Config, trajectory: bool = False) -> None:
+    """Refuse options that cannot go together. Raises ConfigError."""
+    if config.view not in VIEWS:
+        raise ConfigError(f"--view: expected one of {', '.join(VIEWS)}; found '{config.view}'.")
+    if config.samples is not None and not 1 <= config.samples <= 32:
+        raise ConfigError(f"--samples: expected rays per pixel and axis in 1..32, found {config.samples}.")
+    if config.view == "ortho" or config.camera or trajectory:
+        return
+    if config.position is None:
+        raise ConfigError("--view pinhole: expected --position LON,LAT,ALT or --camera FILE; found neither.")
+    if config.look_at is not None and config.quaternion is not None:
+        raise ConfigError("--view pinhole: expected --look-at or --quaternion, found both.")
+
+
+def skipped(view_id: str, files: Sequence[Path], size: tuple[int, int]) -> Summary:
+    """The line of a view that was there already."""
+    nothing = (math.nan, math.nan)
+    return Summary(view_id, tuple(files), size, math.nan, math.nan, math.nan, nothing, 0, skipped=True)
+
+
+class Tally:
+    """Shares and means gathered from bands."""
+
+    def __init__(self) -> None:
+        self.pixels = self.known = 0
+        self.total = self.dark = 0.0
+        self.low, self.high = math.inf, -math.inf
+
+    def add(self, band: Mapping[str, Floats32]) -> None:
+        image, known = band["image"], np.isfinite(band["image"])
+        self.pixels += image.size
+        self.known += int(known.sum())
+        self.total += float(image[known].sum(dtype=np.float64))
+        self.dark += float(np.nansum(np.where(known, band["shadow"], np.nan), dtype=np.float64))
+        incidence = band["incidence_deg"][np.isfinite(band["incidence_deg"])]
+        if incidence.size:
+            self.low, self.high = min(self.low, float(incidence.min())), max(self.high, float(incidence.max()))
+
+    def summary(self, view_id: str, files: Sequence[Path], size: tuple[int, int], samples: int) -> Summary:
+        n = max(self.known, 1)
+        return Summary(
+            view_id,
+            tuple(files),
+            size,
+            self.known / max(self.pixels, 1),
+            self.total / n,
+            self.dark / n,
+            (self.low, self.high),
+            samples,
+        )

@@ -1,0 +1,72 @@
+"""Ortho views: bands of a map from the top down, however large it is."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from schemas.errors import GeometryError
+from stages.physics.mapview import BACKPLANES, Light, shade_block
+from stages.physics.pictures import Preview, write_exr, write_geotiff, write_png
+from stages.physics.surface import Surface
+from stages.render.config import Config, Summary, Tally
+from stages.render.setting import metadata
+
+Progress = Callable[[int, int, str], None]
+BAND_ROWS = 256
+BAND_COLUMNS = 1024
+UNITS = {"image": "1", "shadow": "1", "depth": "m", "elevation": "m"}
+
+
+def render_map(
+    surface: Surface,
+    light: Light,
+    relief: tuple[float, float],
+    files: Sequence[Path],
+    config: Config,
+    progress: Progress | None,
+) -> Summary:
+    """The whole map, streamed to its files band by band."""
+    grid = surface.grid
+    channels = ["image", *BACKPLANES, "elevation"]
+    bands = channels if config.backplanes_in_tif else ["image"]
+    named = {path.suffix.lower(): path for path in files}
+    wanted = channels if ".exr" in named else list(dict.fromkeys([*bands, "shadow", "incidence_deg"]))
+    preview, tally = Preview(grid.height, grid.width), Tally()
+    told = metadata(surface, config, light)
+    with contextlib.ExitStack() as stack:
+        exr = tif = None
+        if ".exr" in named:
+            exr = stack.enter_context(write_exr(named[".exr"], grid.height, grid.width, channels, told))
+        for suffix in (".tif", ".tiff"):
+            if suffix in named:
+                units = [UNITS.get(b, "degree") for b in bands]
+                tif = stack.enter_context(write_geotiff(named[suffix], grid, bands, told, units))
+        for row in range(0, grid.height, BAND_ROWS):
+            if progress:
+                progress(row, grid.height, "rows")
+            height = min(BAND_ROWS, grid.height - row)
+            band = {c: np.empty((height, grid.width), np.float32) for c in wanted}
+            for col in range(0, grid.width, BAND_COLUMNS):
+                block = shade_block(surface, light, row, col, height, min(BAND_COLUMNS, grid.width - col))
+                if light.camera_position is None:
+                    block["depth"] = relief[1] - block["elevation"]  # from a plane of sight through the highest point
+                for name in wanted:
+                    band[name][:, col : col + BAND_COLUMNS] = block[name]
+            if exr:
+                exr.write(band)
+            if tif:
+                tif.write(np.stack([band[b] for b in bands]))
+            preview.add(band["image"])
+            tally.add(band)
+        if tally.known == 0:
+            raise GeometryError(
+                f"{surface.path}: expected valid coefficients and elevations, found none; nothing to render."
+            )
+        write_png(named[".png"], preview.image())
+    if progress:
+        progress(grid.height, grid.height, "rows")
+    return tally.summary(files[0].stem, files, (grid.width, grid.height), 1)

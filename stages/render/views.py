@@ -1,0 +1,146 @@
+"""Camera views: one, or a trajectory of them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.errors import ConfigError, GeometryError
+from schemas.hdf5 import check_output
+from stages.physics.bodies import find_body
+from stages.physics.cameras.base import Camera
+from stages.physics.grid import Grid
+from stages.physics.mapview import BACKPLANES, Light
+from stages.physics.perspective import apply_sensor, make_scene, render_view
+from stages.physics.pictures import Preview, write_exr, write_png
+from stages.physics.surface import Surface
+from stages.physics.trajectory import ViewRow, read_trajectory
+from stages.render.config import SUN, Config, Summary, Tally, check, inputs, output_files, skipped
+from stages.render.setting import camera_place, find_camera, make_light, metadata, open_source
+
+Floats32 = NDArray[np.float32]
+Progress = Callable[[int, int, str], None]
+
+
+def run_trajectory(
+    source: Path,
+    table: Path,
+    folder: Path,
+    config: Config,
+    *,
+    shard: tuple[int, int] = (0, 1),
+    resume: bool = False,
+    overwrite: bool = False,
+    suffix: str = ".exr",
+    progress: Progress | None = None,
+) -> list[Summary]:
+    """Render the views of a trajectory table into a folder, one EXR and PNG per row. Raises LunargrError.
+
+    resume : leave alone what is there already; shard : only every n-th view
+    """
+    if config.camera:
+        raise ConfigError("--trajectory: expected no --camera; each row places its own pinhole camera.")
+    config = replace(config, view="pinhole")
+    check(config, trajectory=True)
+    body = find_body(config.body)
+    views = read_trajectory(table)[shard[0] :: shard[1]]
+    outputs = {view.view_id: output_files(folder / f"{view.view_id}{suffix}", "pinhole") for view in views}
+    done = {v.view_id for v in views if resume and all(p.exists() for p in outputs[v.view_id])}
+    for view in views:
+        if view.view_id not in done:
+            for path in outputs[view.view_id]:
+                check_output(path, [table, *inputs(source, config)], overwrite or resume)
+    results: list[Summary] = []
+    with open_source(source, config, body) as surface:
+        relief = surface.height_range()
+        lights: dict[str, Light] = {}  # a Sun that stays serves many views with one horizon
+        for number, view in enumerate(views):
+            if progress:
+                progress(number, len(views), "views")
+            if view.view_id in done:
+                results.append(skipped(view.view_id, outputs[view.view_id], config.size_px))
+                continue
+            own = _with_row(config, view)
+            key = repr([getattr(own, k) for k in SUN])
+            try:
+                if key not in lights:
+                    lights = {key: make_light(surface, own, body, relief)}
+                camera = find_camera(surface, own)
+                light = replace(lights[key], camera_position=camera_place(camera))
+                results.append(
+                    render_camera(surface, camera, light, relief, outputs[view.view_id], own, view.view_id, None)
+                )
+            except GeometryError as error:
+                raise GeometryError(f"{table.name}, {view.view_id}: {error}") from None
+    if progress:
+        progress(len(views), len(views), "views")
+    return results
+
+
+def _with_row(config: Config, view: ViewRow) -> Config:
+    """The command's options with what a row of the table says in their place; a row's Sun replaces the whole Sun."""
+    own = replace(
+        config,
+        position=view.position,
+        look_at=view.look_at if view.look_at is not None or view.quaternion is not None else config.look_at,
+        quaternion=view.quaternion,
+        roll_deg=view.roll_deg,
+        fov_deg=view.fov_deg if view.fov_deg is not None else config.fov_deg,
+    )
+    if view.sun:
+        own = replace(own, **{**dict.fromkeys(SUN), **view.sun})  # type: ignore[arg-type]
+    return own
+
+
+def render_camera(
+    surface: Surface,
+    camera: Camera,
+    light: Light,
+    relief: tuple[float, float],
+    files: Sequence[Path],
+    config: Config,
+    view_id: str,
+    progress: Progress | None,
+) -> Summary:
+    """One view, streamed to its files band by band."""
+    light = replace(light, camera_position=camera_place(camera))
+    scene = make_scene(surface, camera, light, relief, config.samples)
+    channels = ["image", *BACKPLANES]
+    bands: Iterable[dict[str, Floats32]] = render_view(surface, camera, light, scene)
+    if any(effect.slot == "sensor" for effect in light.extensions):  # these need the whole image
+        bands = [_whole(bands, light, scene.grid)]
+    named = {path.suffix.lower(): path for path in files}
+    preview, tally, done, ground = Preview(camera.lines, camera.samples), Tally(), 0, False
+    with contextlib.ExitStack() as stack:
+        exr = None
+        if ".exr" in named:
+            told = metadata(surface, config, light)
+            exr = stack.enter_context(write_exr(named[".exr"], camera.lines, camera.samples, channels, told))
+        for band in bands:
+            if exr:
+                exr.write(band)
+            preview.add(band["image"])
+            tally.add(band)
+            ground |= bool(np.isfinite(band["depth"]).any())
+            done += len(band["image"])
+            if progress:
+                progress(done, camera.lines, "lines")
+        if not ground:
+            raise GeometryError(
+                f"the view misses {surface.path.name}: no pixel sees valid ground; check the camera's place, --look-at (or --quaternion) and --fov."
+            )
+        write_png(named[".png"], preview.image())
+    return tally.summary(view_id, files, (camera.samples, camera.lines), scene.samples)
+
+
+def _whole(bands: Iterable[dict[str, Floats32]], light: Light, grid: Grid) -> dict[str, Floats32]:
+    """All lines at once, as the sensor's own effects need them."""
+    parts = list(bands)
+    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    whole["image"] = apply_sensor(whole["image"], light, grid)
+    return whole
