@@ -20,6 +20,7 @@ def load_network(factory: str, path: Path, *arguments: Any) -> Any:
         )
     if not path.is_file():
         raise InputError(f"{path}: no such file; give the ONNX file of the network.")
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # its remarks on targets are none of the user's
     try:
         return getattr(cv2, factory)(str(path), *arguments)
     except cv2.error as error:

@@ -10,7 +10,7 @@ import numpy as np
 from schemas import SPLITS, UNITS, read_strings
 from stages.report import page, pictures
 
-SPLIT_COLOURS = {"train": "#7f8a97", "validation": "#c08a2e", "test": "#1b6ca8"}
+SPLIT_COLOURS = {"train": "#7f8a97", "validation": "#c08a2e", "test": "#3b8ecb"}
 
 
 def scene(file: h5py.File) -> page.Section:
