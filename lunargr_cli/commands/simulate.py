@@ -58,7 +58,7 @@ def command(
         print(recipe_json(config))
         return
     from lunargr_cli.console import Console
-    from stages.simulate.run import run
+    from stages.simulate.stage import run
 
     console = Console(quiet)
     summary = run(output, config, overwrite, console.progress)

@@ -9,6 +9,6 @@ run.py          the stage: all of it in order
 """
 
 from stages.simulate.recipe import Config, make_config, read_recipe, recipe_json
-from stages.simulate.run import Summary, run
+from stages.simulate.stage import Summary, run
 
 __all__ = ["Config", "Summary", "make_config", "read_recipe", "recipe_json", "run"]

@@ -25,7 +25,7 @@ EQUILIBRIUM_PER_KM2 = 10**-1.1  # craters > 1 km per km2, cumulative slope -2
 PRODUCTION_SLOPE, EQUILIBRIUM_SLOPE = 3.0, 2.0
 DEPTH, RIM = 0.196, 0.036  # of the diameter, fresh
 FLOOR, WALL = 0.10, 1.70  # radius of the flat floor; slope of the wall, in depths per radius
-WORN_OUT = 0.30  # K at which a crater no longer counts: a fresh bowl is then about 0.02 D deep
+WORN_OUT = 0.38  # K at which a crater no longer counts: a fresh bowl is then about 0.03 D deep
 REACH = 4.0  # radii that topography extends to
 EJECTA_REACH = 9.0  # radii that bright ejecta of young craters extends to
 YOUNG = 0.12  # share of the lifetime during which ejecta stays bright
@@ -204,7 +204,7 @@ def _stamp(
                 continue
             # nothing is sharper than the grid resolves
             state = math.sqrt(min(1.0, age[k])) * (states - 1)
-            blur = math.sqrt(0.5 * (0.6 * step / radius) ** 2 / 0.30) * (states - 1)
+            blur = math.sqrt(0.5 * (0.6 * step / radius) ** 2 / WORN_OUT) * (states - 1)
             state = min(states - 1.001, math.sqrt(state * state + blur * blur))
             low = int(state)
             share = state - low
@@ -245,7 +245,7 @@ def _stamp(
                                 5.0 * dx / (d * radius) + 0.8 * d, 5.0 * dy / (d * radius), seed[k] & 32767
                             )
                         elevation[r, c] += np.float32(scale * h)
-                    if young > 0 and d > 0.02:
+                    if young > 0:
                         inner = 1.0
                         if stretched > 1.05:
                             fade = max(0.0, 1.0 - (stretched - 1.05) / 1.6)

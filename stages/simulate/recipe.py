@@ -32,12 +32,12 @@ class Config:
     base_elevation: float = -2600.0
 
     # terrain
-    relief: float = 40.0  # standard deviation of the longest octave of the fractal relief
+    relief: float = 30.0  # standard deviation of the longest octave of the fractal relief
     relief_wavelength: float = 7000.0
     hurst: float = 0.92
     crater_density: float = 1.0  # of the lunar equilibrium density
     crater_transition: float = 200.0  # diameter below which craters are in equilibrium (a surface of some 3 Gyr)
-    crater_largest: float = 1400.0
+    crater_largest: float = 1100.0
     boulders_per_km2: float = 40.0
     dem_error: float = 0.05  # white error of the DEM's heights
     dem_holes: int = 3

@@ -193,7 +193,8 @@ def _make_image(
                     signal = _signal(config, scene, view, lattice, inside, kernel, detector, hidden, reach)
                     total += float(signal[inside].sum(dtype=np.float64))
                     count += int(inside.sum())
-                    signal = sensor.add_noise(signal, config, detector, rng)
+                # drawn for every pixel: the noise is then the same however the image is cut into bands
+                signal = sensor.add_noise(signal, config, detector, rng)
                 out.write(first, signal, inside, detector)
     mean = total / max(count, 1)
     noise = np.sqrt(max(mean, 0) * detector.electrons + config.read_noise**2) / detector.electrons
