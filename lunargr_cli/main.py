@@ -28,7 +28,7 @@ for _module in sorted(
     (importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)),
     key=lambda module: module.ORDER,
 ):
-    app.command(name=_module.NAME)(_module.command)
+    app.command(name=_module.NAME, cls=getattr(_module, "CLASS", None))(_module.command)
 
 
 def main() -> None:

@@ -195,11 +195,32 @@ PAIRS = declare(
                 ("pair", "y", "x"),
                 "f4",
                 "px",
-                "sample on the sensor that saw the pixel",
+                "sample of the camera's image that saw the pixel, first centre at 0",
                 required=False,
             ),
             Variable(
-                "detector_line", ("pair", "y", "x"), "f4", "px", "line on the sensor that saw the pixel", required=False
+                "detector_line",
+                ("pair", "y", "x"),
+                "f4",
+                "px",
+                "line of the camera's image that saw the pixel, first centre at 0",
+                required=False,
+            ),
+            Variable(
+                "emission_deg",
+                ("pair", "y", "x"),
+                "f4",
+                "degree",
+                "between the true ray to the camera and the terrain's normal; camera images only",
+                required=False,
+            ),
+            Variable(
+                "phase_deg",
+                ("pair", "y", "x"),
+                "f4",
+                "degree",
+                "between the true ray to the camera and the Sun; camera images only",
+                required=False,
             ),
             Variable(
                 "sun_direction_enu",
@@ -225,7 +246,27 @@ PAIRS = declare(
             ),
         )
         + _optional(_PAIR_PLACE, "tile", "row", "col")
-        + _FRAMES,
+        + _FRAMES
+        + (
+            Variable(
+                "shift_col_px",
+                ("frame",),
+                "f8",
+                "px",
+                "how far the image lay to the east of its rendering, taken off; NaN where refused or not asked for",
+                required=False,
+            ),
+            Variable("shift_row_px", ("frame",), "f8", "px", "likewise to the south", required=False),
+            Variable("shift_sigma_px", ("frame",), "f8", "px", "standard error of that shift", required=False),
+            Variable(
+                "shift_correlation",
+                ("frame",),
+                "f8",
+                "1",
+                "median correlation of the image's regions with their renderings",
+                required=False,
+            ),
+        ),
         attributes=_PLACE,
     )
 )

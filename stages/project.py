@@ -11,25 +11,40 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import CROPS, PAIRS, SCENE, ArtefactError, ArtefactWriter, GeometryError, InputError, open_artefact
+from schemas import (
+    CROPS,
+    PAIRS,
+    SCENE,
+    ArtefactError,
+    ArtefactWriter,
+    ConfigError,
+    GeometryError,
+    InputError,
+    open_artefact,
+)
 from schemas.hdf5 import sha256
-from stages.physics import rasters
 from stages.physics.frames import Frame, load_frames
-from stages.physics.grid import LocalFrames, read_grid
-from stages.physics.scene_horizon import horizon_in_scene, make_overview
+from stages.physics.grid import Grid, LocalFrames, read_grid
+from stages.physics.orthorectify import Ortho
+from stages.physics.register_frame import choose_regions, register_frame
+from stages.physics.registration import Field, Shift
+from stages.physics.scene_horizon import Overview, horizon_in_scene, make_overview
+from stages.physics.sources import Source, open_source
 
 Progress = Callable[[int, int, str], None]
 
-SEARCH_BELOW_SUN = math.radians(5)  # terrain surely lower than this casts no shadow even with a wrong Sun
+RAY_VARIABLES = ("detector_line", "detector_sample", "emission_deg", "phase_deg")
 OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
 
 
 @dataclass(frozen=True)
 class Config:
-    """scene : overrides the scene that crops.h5 names."""
+    """scene : overrides the scene that crops.h5 names; register : None, 'shift' or 'affine'; max_shift : px searched."""
 
     scene: str | None = None
     shard: tuple[int, int] = (0, 1)
+    register: str | None = None
+    max_shift: float = 8.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +57,15 @@ class Geometry:
 
 
 @dataclass(frozen=True)
+class Registered:
+    """How one image lay against its rendering: the displacement that was taken off, and each region's own answer."""
+
+    image_id: str
+    field: Field
+    regions: tuple[tuple[float, float, Shift], ...]  # row and column of the middle, and the shift there
+
+
+@dataclass(frozen=True)
 class Summary:
     """What project wrote, for the line at the end."""
 
@@ -50,6 +74,7 @@ class Summary:
     incidence_deg: tuple[float, float]
     emission_deg: tuple[float, float]
     shadowed_share: float
+    registered: tuple[Registered, ...] = ()
 
 
 def crop_geometry(
@@ -67,7 +92,11 @@ def crop_geometry(
 def run(
     crops: Path, output: Path, config: Config, overwrite: bool = False, progress: Progress | None = None
 ) -> Summary:
-    """Write ``pairs.h5``. Raises ArtefactError, InputError or GeometryError; then nothing is written."""
+    """Write ``pairs.h5``. Raises ArtefactError, ConfigError, InputError or GeometryError; then nothing is written."""
+    if config.register not in (None, "shift", "affine"):
+        raise ConfigError(f"--register: expected 'shift' or 'affine', found '{config.register}'.")
+    if not 1.0 <= config.max_shift <= 32.0:
+        raise ConfigError(f"--max-shift: expected 1 to 32 px, found {config.max_shift:g}.")
     with open_artefact(crops, CROPS) as file:
         scene = Path(config.scene) if config.scene else crops.resolve().parent / str(file.attrs["scene"])
         if not scene.exists():
@@ -132,32 +161,40 @@ def _project(
         images = writer.dataset("image", unit=unit)
         names = ("elevation", "valid", "sun_horizon_deg", "sun_direction_enu", "camera_position_enu", "convergence_deg")
         elevation, valid, horizon, sun_out, camera_out, convergence = (writer.dataset(n) for n in names)
+        chosen = sorted({int(k) for k in image_index})
+        by_camera = any(frames[k].camera for k in chosen)
+        rays = [writer.dataset(n) for n in RAY_VARIABLES] if by_camera else []
+        known = overview_extremes(scene_file["elevation"], overview)
+        registered: list[Registered] = []
         done = 0
-        for index in sorted({int(k) for k in image_index}):
+        for index in chosen:
             frame = frames[index]
             mine = np.flatnonzero(image_index == index)
             heights = np.stack([file["elevation"][part.start + k] for k in mine])
             # Even crops are centred on the corner shared by their four middle pixels.
             local = grid.local_frames(row[mine] - 0.5, col[mine] - 0.5)
-            geometry = crop_geometry(
-                local,
-                heights.mean(axis=(1, 2), dtype=float),
-                grid.radius,
-                frame.sun_position(),
-                frame.camera_position(grid.radius),
-            )
+            mean = heights.mean(axis=(1, 2), dtype=float)
+            geometry = crop_geometry(local, mean, grid.radius, frame.sun_position(), frame.camera_position(grid.radius))
             _check_directions(frame, geometry)
-            with rasters.open_raster(frame.path, f"the image '{frame.image_id}'") as image:
-                resampling, _ = rasters.choose_resampling(
-                    image, grid.window(int(row[mine[0]]), int(col[mine[0]]), 1, 1)
-                )
+            with open_source(frame, grid, scene_file["elevation"], known) as source:
+                field = None
+                if config.register:
+                    if progress:
+                        progress(done, pairs, f"registration ({frame.image_id})")
+                    registered.append(_register(frame, index, source, file, scene_file, overview, grid, config))
+                    field = registered[-1].field
                 for place, k in enumerate(mine):
                     if progress and done % 20 == 0:
                         progress(done, pairs, f"pairs ({frame.image_id})")
                     done += 1
                     corner = int(row[k]) - half, int(col[k]) - half
-                    values, seen = rasters.warp(image, grid.window(*corner, size, size), resampling)
-                    seen &= np.isfinite(heights[place])
+                    pixels = source.read(*corner, size, size, field)
+                    seen = pixels.valid & np.isfinite(heights[place])
+                    if pixels.ortho is not None:
+                        # the line-scan camera's own place for this crop, not the one for the middle of its image
+                        centre = local.up[place] * (grid.radius + mean[place])
+                        geometry.camera[place] = local.axes[place] @ (pixels.ortho.camera_position - centre)
+                        _write_rays(rays, k, pixels.ortho)
                     east, north, up = geometry.sun[place]
                     angle = horizon_in_scene(
                         scene_file["elevation"],
@@ -167,10 +204,9 @@ def _project(
                         size,
                         grid.gsd,
                         math.atan2(east, north) % (2 * math.pi),
-                        sun_elevation=math.asin(up) - SEARCH_BELOW_SUN,
                         body_radius=grid.radius,
                     )
-                    images[k], valid[k], elevation[k] = np.where(seen, values, np.nan), seen, heights[place]
+                    images[k], valid[k], elevation[k] = np.where(seen, pixels.values, np.nan), seen, heights[place]
                     horizon[k] = np.degrees(angle)
                     sun_out[k], camera_out[k] = geometry.sun[place], geometry.camera[place]
                     convergence[k] = geometry.convergence_deg[place]
@@ -186,13 +222,62 @@ def _project(
             writer.write(name, file[name][part])
         writer.write("image_id", [f.image_id for f in frames])
         writer.write("solar_distance_au", np.array([f.solar_distance_au for f in frames]))
+        if config.register:
+            _write_shifts(writer, frames, registered)
     return Summary(
         pairs,
         valid_pixels / max(1, pairs * size * size),
         (min(incidence, default=math.nan), max(incidence, default=math.nan)),
         (min(emission, default=math.nan), max(emission, default=math.nan)),
         shadowed / max(1, valid_pixels),
+        tuple(registered),
     )
+
+
+def overview_extremes(elevation: h5py.Dataset, overview: Overview) -> tuple[float, float]:
+    """Least and largest elevation of a scene, m: the largest is exact, the least that of block means less their relief."""
+    cells = overview.cells[np.isfinite(overview.cells)]
+    low = float(cells.min()) if cells.size else 0.0
+    return low - 0.5 * max(0.0, overview.highest - low), overview.highest
+
+
+def _register(
+    frame: Frame,
+    index: int,
+    source: Source,
+    crops: h5py.File,
+    scene: h5py.File,
+    overview: Overview,
+    grid: Grid,
+    config: Config,
+) -> Registered:
+    """Register one image by regions about all of its crops, whatever the shard: every shard takes off the same."""
+    all_of_it = crops["image_index"][...] == index
+    regions = choose_regions(crops["row"][...][all_of_it], crops["col"][...][all_of_it], grid)
+    field, shifts = register_frame(
+        frame, source, scene["elevation"], overview, grid, regions, str(config.register), config.max_shift
+    )
+    places = [(r + (h - 1) / 2, c + (w - 1) / 2) for r, c, h, w in regions]
+    return Registered(frame.image_id, field, tuple((r, c, s) for (r, c), s in zip(places, shifts, strict=True)))
+
+
+def _write_rays(rays: list[h5py.Dataset], k: int, ortho: Ortho) -> None:
+    line, sample, emission, phase = rays
+    line[k], sample[k] = ortho.detector_line, ortho.detector_sample
+    emission[k], phase[k] = np.degrees(ortho.emission), np.degrees(ortho.phase)
+
+
+def _write_shifts(writer: ArtefactWriter, frames: list[Frame], registered: list[Registered]) -> None:
+    found = {r.image_id: r.field for r in registered}
+    columns = np.full((4, len(frames)), np.nan)
+    for k, frame in enumerate(frames):
+        field = found.get(frame.image_id)
+        if field is not None and field.accepted:
+            columns[:, k] = (*field.coefficients[:, 0], field.sigma, field.correlation)
+    for name, values in zip(
+        ("shift_col_px", "shift_row_px", "shift_sigma_px", "shift_correlation"), columns, strict=True
+    ):
+        writer.write(name, values)
 
 
 def _check_directions(frame: Frame, geometry: Geometry) -> None:

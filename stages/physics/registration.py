@@ -6,6 +6,10 @@ image and a gain and offset of the rendering, with the gradient of the rendering
 2004, Int. J. Comput. Vis. 56:221). Both see only structure of up to a few tens of pixels: albedo and haze that vary
 slowly say nothing about the place.
 
+Albedo that follows the terrain must be allowed for: shading is a slope towards the Sun, so that bright rims and dark
+floors added to it look like the same shading a part of a pixel away. Further ``patterns`` (elevation, curvature) are
+fitted beside the rendering for that.
+
 Shifts are (dx, dy) in pixels along columns and rows: image[row + dy, col + dx] shows what rendering[row, col] shows.
 """
 
@@ -66,10 +70,12 @@ def estimate_shift(
     valid: ArrayLike | None = None,
     weights: ArrayLike | None = None,
     max_shift: float = 8.0,
+    patterns: Sequence[ArrayLike] = (),
 ) -> Shift:
     """The shift of ``image`` against ``rendering``, both (H, W); gain and offset between them are free.
 
     valid : (H, W) bool, pixels that count in both; NaN never count. weights : (H, W) >= 0, for example less in shadow
+    patterns : (H, W) each, what else the surface may show in place with the rendering, in unknown strength
     max_shift : px, how far to search
     Never raises for poor evidence: see ``Shift.refused``. Raises GeometryError for shapes that differ.
     """
@@ -90,15 +96,23 @@ def estimate_shift(
     if not (a[good_image].std() > 0 and b[good_rendering].std() > 0):
         return replace(nothing, refused="one of the two shows no structure")
     weight = good_rendering.astype(float) * (1.0 if weights is None else np.asarray(weights, float))
+    templates = [b]
+    for pattern in patterns:
+        extra = _small_structure(np.where(good_rendering, np.asarray(pattern, float), 0.0), good_rendering)
+        if extra[good_rendering].std() > 0:
+            templates.append(extra / extra[good_rendering].std() * b[good_rendering].std())
     reach = math.ceil(max_shift)
-    scores = masked_correlation(a, good_image, b, good_rendering, reach)
+    scores = _combined(
+        [masked_correlation(a, good_image, t, good_rendering, reach) for t in templates],
+        np.corrcoef([t[good_rendering] for t in templates]) if len(templates) > 1 else np.eye(1),
+    )
     peak = np.unravel_index(int(np.nanargmax(scores)), scores.shape)
     rows, cols = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1), indexing="ij")
     far = np.hypot(rows - rows[peak], cols - cols[peak]) > NEAR_PX
     others = scores[far & np.isfinite(scores)]
     lead = float(scores[peak] - others.max()) if others.size else math.nan
     start = float(cols[peak]), float(rows[peak])
-    dx, dy, sigma, correlation = _refine(a, good_image, b, weight, start)
+    dx, dy, sigma, correlation = _refine(a, good_image, templates, weight, start)
     found = Shift(dx, dy, sigma, correlation, lead)
     return replace(found, refused=_why_not(found, start, max_shift))
 
@@ -164,55 +178,80 @@ def masked_correlation(
     return np.where((overlap >= LEAST_SHARE * image.size) & np.isfinite(score), score, -1.0)
 
 
+def _combined(scores: Sequence[Floats], among: Floats) -> Floats:
+    """Multiple correlation of the image with several templates, from its correlation with each and theirs among them.
+
+    The sign is the first one's: a negative of the rendering is no match.
+    """
+    if len(scores) == 1:
+        return scores[0]
+    stack = np.stack(scores, axis=-1)
+    known = (stack > -1).all(-1)
+    inverse = np.linalg.inv(among + 1e-6 * np.eye(len(scores)))
+    square = np.einsum("...i,ij,...j->...", stack, inverse, stack)
+    gain = stack @ inverse[0]
+    return np.where(known, np.sqrt(np.clip(square, 0, 1)) * np.sign(gain), -1.0)
+
+
 def _refine(
-    image: Floats, good: NDArray[np.bool_], rendering: Floats, weight: Floats, start: tuple[float, float]
+    image: Floats, good: NDArray[np.bool_], templates: Sequence[Floats], weight: Floats, start: tuple[float, float]
 ) -> tuple[float, float, float, float]:
     """Gauss-Newton from ``start``; (dx, dy, standard error, correlation)."""
     height, width = image.shape
     cols, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    slope_x, slope_y = np.gradient(rendering, axis=1), np.gradient(rendering, axis=0)
-    solid = cv2.erode(good.astype(np.uint8), np.ones((5, 5), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    whole = cv2.erode(
-        (weight > 0).astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0
-    )
+    solid = _eroded(good, 5).astype(np.float32)
+    whole = _eroded(weight > 0, 3)
+    small = image.astype(np.float32)
     dx, dy = start
-    settled = False
+    change = np.full(2, np.inf)
     for step in range(ITERATIONS):
         x, y = cols + np.float32(dx), rows + np.float32(dy)
-        moved = cv2.remap(image.astype(np.float32), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT).astype(float)
-        seen = cv2.remap(solid.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) > 0.999
-        use = seen & (whole > 0)
+        moved = cv2.remap(small, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT).astype(float)
+        use = (cv2.remap(solid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) > 0.999) & whole
         if use.sum() < LEAST_PIXELS / 2:
             return math.nan, math.nan, math.inf, 0.0
         w = weight[use]
-        design = np.stack([rendering[use], np.ones(w.size)], axis=1)
-        gain, offset = np.linalg.lstsq(design * np.sqrt(w)[:, None], moved[use] * np.sqrt(w), rcond=None)[0]
-        residual = moved[use] - gain * rendering[use] - offset
+        design = np.stack([t[use] for t in templates] + [np.ones(w.size)], axis=1)
+        strength = np.linalg.lstsq(design * np.sqrt(w)[:, None], moved[use] * np.sqrt(w), rcond=None)[0]
+        fitted = sum(k * t for k, t in zip(strength, templates, strict=False))
+        residual = moved[use] - fitted[use] - strength[-1]
         scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-12
         robust = w / (1 + (residual / (3 * scale)) ** 2)  # Cauchy: craters that the DEM lacks must not pull
-        slopes = gain * np.stack([slope_x[use], slope_y[use]], axis=1)
-        normal = (slopes * robust[:, None]).T @ slopes
-        if not np.linalg.cond(normal) < 1e8:
+        # Shift and strengths together: image[x + d + e] = fitted(x) leaves image[x + d] = fitted - slopes . e
+        slopes = np.stack([np.gradient(fitted, axis=1)[use], np.gradient(fitted, axis=0)[use]], axis=1)
+        full = np.concatenate([slopes, design], axis=1)
+        full_scale = np.sqrt((full**2).mean(axis=0)) + 1e-300
+        full = full / full_scale
+        normal = (full * robust[:, None]).T @ full
+        if not np.linalg.cond(normal) < 1e10:
             return math.nan, math.nan, math.inf, 0.0
-        change = np.linalg.solve(normal, (slopes * robust[:, None]).T @ residual)
+        solved = np.linalg.solve(normal, (full * robust[:, None]).T @ residual) / full_scale
+        change = -solved[:2]
         change *= min(1.0, 1.0 / max(1e-12, float(np.abs(change).max())))
-        dx, dy = dx - float(change[0]), dy - float(change[1])
+        dx, dy = dx + float(change[0]), dy + float(change[1])
         if np.abs(change).max() < 1e-4 and step >= 2:
-            settled = True
             break
-    if not settled and np.abs(change).max() > 0.02:
+    if np.abs(change).max() > 0.02:
         return math.nan, math.nan, math.inf, 0.0
     # Neighbouring residuals are alike: as many count as one as the smoothing and the terrain's grain make so.
-    full = np.zeros(image.shape)
-    full[use] = residual
-    alike = _grain(full, use)
-    inverse = np.linalg.inv(normal) @ ((slopes * (robust**2 * residual**2)[:, None]).T @ slopes) @ np.linalg.inv(normal)
-    sigma = math.sqrt(max(0.0, float(np.diag(inverse).max())) * alike)
-    centred = moved[use] - np.average(moved[use], weights=w), rendering[use] - np.average(rendering[use], weights=w)
-    correlation = float((w * centred[0] * centred[1]).sum()) / math.sqrt(
-        float((w * centred[0] ** 2).sum()) * float((w * centred[1] ** 2).sum()) + 1e-300
+    spread = np.zeros(image.shape)
+    spread[use] = residual
+    inverse = np.linalg.inv(normal)
+    errors = (
+        inverse @ ((full * (robust**2 * residual**2)[:, None]).T @ full) @ inverse / np.outer(full_scale, full_scale)
     )
-    return dx, dy, sigma, correlation if gain > 0 else -abs(correlation)
+    sigma = math.sqrt(max(0.0, float(np.diag(errors)[:2].max())) * _grain(spread, use))
+    model = fitted[use] - np.average(fitted[use], weights=w)
+    seen = moved[use] - np.average(moved[use], weights=w)
+    correlation = float((w * model * seen).sum()) / math.sqrt(
+        float((w * model**2).sum()) * float((w * seen**2).sum()) + 1e-300
+    )
+    return dx, dy, sigma, correlation if strength[0] > 0 else -abs(correlation)
+
+
+def _eroded(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
+    kernel = np.ones((size, size), np.uint8)
+    return cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
 
 
 def _grain(residual: Floats, use: NDArray[np.bool_]) -> float:
