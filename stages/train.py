@@ -32,7 +32,7 @@ from stages.network.losses import Radiometry, masked_mse
 from stages.network.predictor import Predictor, choose_device, read_state, write_state
 from stages.network.runtime import choose_precision, keep_freed_memory
 from stages.network.unet import DROPOUT, WIDTHS, UNet
-from stages.network.uniform import elevation_scale, fit_radiometry, fit_uniform
+from stages.network.uniform import elevation_scale, fit_start
 from stages.physics.formation import Extension, form
 from stages.physics.photometry import get_model
 
@@ -113,8 +113,7 @@ def run(
 
         torch.manual_seed(config.seed)
         model = get_model(config.model)
-        radiometry = fit_radiometry(reader, train)
-        start = fit_uniform(reader, train, model, radiometry)
+        start, radiometry = fit_start(reader, train, model)
         raw_start = model.unconstrain(start[None], dim=1)[0]
         output_scale = float(start.abs().mean()) if model.linear else 0.3
         scale = elevation_scale(reader, train)

@@ -29,16 +29,35 @@ def _uniform(values: Tensor) -> Tensor:
     return values.view(1, -1, 1, 1)
 
 
-def fit_radiometry(reader: PairReader, indices: NDArray[np.int64]) -> Radiometry:
-    """Gain and offset of each image against the reference surface, by least squares over ``indices``.
+def fit_start(reader: PairReader, indices: NDArray[np.int64], model: ReflectanceModel) -> tuple[Tensor, Radiometry]:
+    """Uniform coefficients (C,) and the radiometry that go with them.
+
+    Gains are first fitted against the reference surface, then in turn with the coefficients: a surface of another
+    shape would give images of steep and of flat ground gains that do not belong together.
+    """
+    radiometry = fit_radiometry(reader, indices)
+    start = fit_uniform(reader, indices, model, radiometry)
+    if reader.units == "dn" and model.linear:
+        for _ in range(4):
+            radiometry = fit_radiometry(reader, indices, model, start)
+            start = fit_uniform(reader, indices, model, radiometry)
+    return start, radiometry
+
+
+def fit_radiometry(
+    reader: PairReader, indices: NDArray[np.int64], model: ReflectanceModel | None = None, uniform: Tensor | None = None
+) -> Radiometry:
+    """Gain and offset of each image against a uniform surface (default: the reference), by least squares over ``indices``.
 
     Images without pairs there take the mean gain and offset; calibrated images keep 1 and 0.
     """
     frames = len(reader.image_ids)
     if reader.units == "iof":
         return Radiometry(torch.ones(frames), torch.zeros(frames), calibrated=True)
-    model = get_model(REFERENCE)
-    defaults = _uniform(torch.tensor([p.default for p in model.parameters]))
+    if model is None or uniform is None:
+        model = get_model(REFERENCE)
+        uniform = torch.tensor([p.default for p in model.parameters])
+    defaults = _uniform(uniform)
     moments = torch.zeros(frames, 5, dtype=torch.float64)  # n, sum x, sum y, sum xx, sum xy
     for batch in _batches(reader, indices):
         x = form(batch.observation, model, defaults).double() * batch.valid

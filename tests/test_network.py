@@ -1,0 +1,113 @@
+"""The network sees height differences only, turns with the ground, and is the paper's in size."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from stages.network.losses import Radiometry, masked_mse
+from stages.network.normalisation import FILL_REACH, fill_holes, scale_elevation
+from stages.network.symmetries import COUNT, turn_field, turn_vector
+from stages.network.unet import UNet
+from stages.physics.formation import Observation, form
+from stages.physics.photometry import get_model, model_names
+
+
+def test_the_network_has_the_papers_size():
+    """2.16 M parameters and 2.05 GFLOP forward at 128 x 128 with three outputs (the authors' public code)."""
+    net = UNet(3)
+    assert sum(p.numel() for p in net.parameters()) == pytest.approx(2.16e6, rel=5e-3)
+    with FlopCounterMode(display=False) as counter:
+        net(torch.zeros(1, 1, 128, 128))
+    assert counter.get_total_flops() == pytest.approx(2.05e9, rel=0.02)
+
+
+def test_height_itself_does_not_matter():
+    torch.manual_seed(0)
+    net = UNet(3).eval()
+    z = torch.randn(2, 64, 64) * 10
+    with torch.no_grad():
+        low, high = net(scale_elevation(z, 30.0)), net(z.unsqueeze(1) / 30 + 1.0)
+    torch.testing.assert_close(low, high, atol=2e-5, rtol=1e-4)
+
+
+def test_outputs_depend_on_nothing_beyond_reach():
+    """A change at one pixel moves outputs only within ``reach``; and shifts by ``stride`` shift the output."""
+    torch.manual_seed(0)
+    net = UNet(2, widths=(4, 4, 4, 4, 4), dropout=(0.0,) * 5).eval()
+    z = torch.randn(1, 1, 512, 512)
+    changed = z.clone()
+    changed[0, 0, 256, 256] += 5
+    with torch.no_grad():
+        difference = (net(z) - net(changed)).abs().amax(dim=(0, 1))
+        rolled = net(torch.roll(z, (net.stride, 2 * net.stride), (2, 3)))
+        original = torch.roll(net(z), (net.stride, 2 * net.stride), (2, 3))
+    rows = torch.nonzero(difference > 0)
+    assert (rows - 256).abs().max() <= net.reach
+    assert (rows - 256).abs().max() > net.reach // 2
+    inner = slice(net.reach + 32, 512 - net.reach - 32)
+    torch.testing.assert_close(rolled[..., inner, inner], original[..., inner, inner], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("symmetry", range(COUNT))
+@pytest.mark.parametrize("name", ["M2", "M6", "lunar_lambert", "hapke"])
+def test_rendering_commutes_with_the_symmetries(symmetry, name, rng):
+    """Turning terrain, Sun and camera, then rendering, is rendering, then turning."""
+    if name not in model_names():
+        pytest.fail(f"{name} is not registered")
+    model = get_model(name)
+    z = torch.from_numpy(rng.normal(size=(1, 32, 32)).cumsum(1).cumsum(2).astype(np.float32)) * 0.3
+    sun = torch.tensor([[0.5, 0.3, 0.6]])
+    sun = sun / sun.norm()
+    camera = torch.tensor([[2e4, -3e4, 8e4]])
+    horizon = torch.from_numpy(rng.uniform(0.3, 1.2, (1, 32, 32)).astype(np.float32))
+    coefficients = torch.tensor([p.default for p in model.parameters]).view(1, -1, 1, 1)
+
+    def render(z, sun, camera, horizon):
+        return form(Observation(z, sun, camera, 5.0, 1737400.0, sun_horizon=horizon), model, coefficients)
+
+    turned = render(
+        turn_field(z, symmetry),
+        turn_vector(sun, symmetry),
+        turn_vector(camera, symmetry),
+        turn_field(horizon, symmetry),
+    )
+    torch.testing.assert_close(turned, turn_field(render(z, sun, camera, horizon), symmetry), atol=2e-6, rtol=2e-4)
+
+
+def test_the_eight_symmetries_are_eight():
+    field = torch.arange(16.0).view(4, 4)
+    assert len({tuple(turn_field(field, k).flatten().tolist()) for k in range(COUNT)}) == COUNT
+
+
+def test_holes_are_filled_alike_in_every_window(rng):
+    z = rng.normal(size=(700, 700)).cumsum(0).cumsum(1).astype(np.float32)
+    valid = np.ones(z.shape, bool)
+    valid[330:420, 300:420] = False
+    whole = fill_holes(np.where(valid, z, np.nan), valid)
+    window = np.s_[120:640, 100:660]
+    part = fill_holes(np.where(valid, z, np.nan)[window], valid[window])
+    inner = np.s_[FILL_REACH:-FILL_REACH, FILL_REACH:-FILL_REACH]
+    np.testing.assert_allclose(part[inner], whole[window][inner], rtol=1e-5, atol=1e-3)
+    assert np.isfinite(whole).all()
+    np.testing.assert_allclose(whole[valid], z[valid], rtol=1e-6, atol=1e-2)
+
+
+def test_loss_counts_valid_pixels_only():
+    predicted, measured = torch.zeros(1, 2, 2), torch.tensor([[[1.0, 2.0], [1e9, 3.0]]])
+    valid = torch.tensor([[[True, True], [False, False]]])
+    assert masked_mse(predicted, measured, valid).item() == pytest.approx(2.5)
+    assert masked_mse(predicted, measured, torch.zeros_like(valid)).item() == 0
+
+
+def test_radiometry_is_gain_and_offset_and_leaves_calibrated_images_alone():
+    gain, offset = torch.tensor([100.0, 400.0]), torch.tensor([3.0, -5.0])
+    radiometry = Radiometry(gain, offset, calibrated=False)
+    torch.testing.assert_close(radiometry.gain(), gain)
+    torch.testing.assert_close(radiometry.offset(), offset)
+    out = radiometry(torch.full((2, 1, 1), 0.1), torch.tensor([0, 1])) * radiometry.scale
+    torch.testing.assert_close(out.flatten(), torch.tensor([13.0, 35.0]))
+    iof = Radiometry(torch.ones(2), torch.zeros(2), calibrated=True)
+    assert not any(p.requires_grad for p in iof.parameters())
