@@ -98,8 +98,9 @@ def compare(runs: Sequence[Trained], seed: int = 0) -> dict[str, Any]:
         difference = mean[b] - mean[a]
         tile_variance = float(np.var(draws[b] - draws[a])) if draws[a].size else math.nan
         p = None
-        if spread[a] is not None and spread[b] is not None and math.isfinite(tile_variance):
-            va, vb = spread[a] ** 2 / len(groups[a]), spread[b] ** 2 / len(groups[b])
+        of_a, of_b = spread[a], spread[b]
+        if of_a is not None and of_b is not None and math.isfinite(tile_variance):
+            va, vb = of_a**2 / len(groups[a]), of_b**2 / len(groups[b])
             noise = math.sqrt(va + vb + tile_variance)
             p = two_sided_p(difference / noise, _welch(va, vb, len(groups[a]), len(groups[b]))) if noise > 0 else 0.0
             seeds_noise, tiles_noise = math.sqrt(va + vb), math.sqrt(tile_variance)
@@ -198,7 +199,7 @@ def write_curves(runs: Sequence[Trained], path: Path) -> None:
         axes.fill_between(epochs, stack.min(axis=0), stack.max(axis=0), color=f"C{k}", alpha=0.15, linewidth=0)
     axes.set(xlabel="epoch", ylabel="validation mean squared error", yscale="log")
     axes.set_title("mean over seeds; the band is their range", fontsize=9)
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.locator_params(axis="x", integer=True)
     axes.grid(alpha=0.25, which="both", linewidth=0.5)
     axes.legend(frameon=False, ncols=2)
     with atomic_path(path) as partial:

@@ -61,7 +61,7 @@ def command(
     except ValueError:
         raise ConfigError(f"--widths: expected numbers like 16-32-64-128-256, found '{widths}'.") from None
     settings: dict[str, Any] = {"epochs": epochs, "batch": batch, "lr": lr, "schedule": schedule, "widths": channels}
-    files = []
+    files: list[tuple[Path, Path]] = []
     for seed in range(seeds):
         for name in names:
             checkpoint = output / f"{name}_seed{seed}.checkpoint.h5"

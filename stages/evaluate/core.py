@@ -23,7 +23,7 @@ from stages.evaluate.renderers import (
     read_batch,
     unit_images,
 )
-from stages.physics.formation import Extension, illuminate
+from stages.physics.formation import Extension
 from stages.physics.radiometry import crop_range
 
 SAMPLE_PIXELS = 400_000  # for models that are not linear in their parameters
@@ -218,7 +218,7 @@ def _calibrate(renderer: Renderer, grams: tuple[fit.FrameGram, fit.FrameGram], c
 
 def sample_pixels(batch: Batch, per_crop: int, rng: np.random.Generator) -> fit.PixelSample:
     """Up to ``per_crop`` usable pixels of every crop."""
-    state = illuminate(batch.observation)
+    state = batch.state
     visibility = torch.ones_like(batch.image) if state.sun_visibility is None else state.sun_visibility
     width = batch.image[0].numel()
     chosen = []
@@ -265,10 +265,13 @@ def score(
     """
     m, n = len(rows), len(indices)
     scores = Scores(
-        [r.name for r in rows],
-        *(np.full((m, n), np.nan) for _ in range(4)),
-        np.zeros(n, np.int64),
-        np.zeros(n),
+        names=[r.name for r in rows],
+        squared_error=np.full((m, n), np.nan),
+        ssim=np.full((m, n), np.nan),
+        ssim_range_1=np.full((m, n), np.nan),
+        lpips=np.full((m, n), np.nan),
+        pixels=np.zeros(n, np.int64),
+        data_range=np.zeros(n),
     )
     done = 0
     for chosen in batches(indices, size):

@@ -72,7 +72,7 @@ def training_curves(checkpoint: Path) -> Any:
     axes.axvline(best, color="#c08a2e", linewidth=1, linestyle=":", label=f"kept: epoch {best}")
     if np.all(np.concatenate([train, validation]) > 0):
         axes.set_yscale("log")
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.locator_params(axis="x", integer=True)
     axes.set(xlabel="epoch", ylabel="mean squared error", title=f"Training of {model}")
     axes.grid(alpha=0.25, which="both", linewidth=0.5)
     axes.legend(frameon=False)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from schemas.errors import ArtefactError
-from stages.physics.formation import Extension, Observation, expose, form, illuminate
+from stages.physics.formation import Extension, Observation, State, expose, form, illuminate
 from stages.physics.photometry import ReflectanceModel, get_model, masked_radiance_factor
 from stages.physics.radiometry import match_crops
 
@@ -23,9 +23,9 @@ class Reader(Protocol):
     tile: np.ndarray
     frame: np.ndarray
 
-    def observation(self, indices: Sequence[int]) -> Observation: ...
-    def image(self, indices: Sequence[int]) -> Tensor: ...
-    def valid(self, indices: Sequence[int]) -> Tensor: ...
+    def observation(self, indices: np.ndarray) -> Observation: ...
+    def image(self, indices: np.ndarray) -> Tensor: ...
+    def valid(self, indices: np.ndarray) -> Tensor: ...
 
 
 class Predictor(Protocol):
@@ -41,24 +41,27 @@ class Predictor(Protocol):
 class Batch:
     """A batch of crops as measured.
 
+    state : geometry and illumination, which all models without extensions share
     image : (B, H, W) float32, I/F or share of the full DN range; usable : (B, H, W) bool; frame : (B,)
     """
 
     observation: Observation
+    state: State
     image: Tensor
     usable: Tensor
     frame: np.ndarray
     memo: dict[str, Any] = field(default_factory=dict)
 
 
-def read_batch(reader: Reader, indices: Sequence[int], scale: float) -> Batch:
+def read_batch(reader: Reader, indices: np.ndarray, scale: float) -> Batch:
     """Crops ``indices`` in ascending order; a pixel is usable where image and photometric geometry are known."""
     observation = reader.observation(indices)
     image = torch.as_tensor(reader.image(indices)).to(torch.float32) / scale
-    angles = illuminate(observation).angles
+    state = illuminate(observation)
+    angles = state.angles
     known = torch.isfinite(image) & torch.isfinite(angles.cos_incidence) & torch.isfinite(angles.cos_emission)
     usable = torch.as_tensor(reader.valid(indices)).bool() & known
-    return Batch(observation, image, usable, np.asarray(reader.frame)[np.asarray(indices)])
+    return Batch(observation, state, image, usable, np.asarray(reader.frame)[np.asarray(indices)])
 
 
 @dataclass
@@ -80,7 +83,12 @@ class Renderer:
         """I/F, (B, H, W), 0 on pixels that are not usable."""
         if self.name in batch.memo:
             return batch.memo[self.name]
-        rendered = form(batch.observation, self.model, self.coefficients(batch), self.extensions) * self.scale
+        coefficients = self.coefficients(batch)
+        if self.extensions:
+            rendered = form(batch.observation, self.model, coefficients, self.extensions)
+        else:
+            rendered = shade(batch.state, self.model, coefficients)
+        rendered = rendered * self.scale
         rendered = torch.where(batch.usable, rendered, torch.zeros((), dtype=rendered.dtype))
         if not torch.isfinite(rendered).all():
             raise ArtefactError(
@@ -107,15 +115,19 @@ class Renderer:
         return torch.as_tensor(values[batch.frame], dtype=torch.float32)[:, None, None]
 
 
+def shade(state: State, model: ReflectanceModel, coefficients: Tensor) -> Tensor:
+    """What ``formation.form`` gives without extensions, from geometry that is known already."""
+    reflectance = masked_radiance_factor(model, model.unpack(coefficients, dim=1), state.angles)
+    return expose(replace(state, reflectance=reflectance))
+
+
 def unit_images(model: ReflectanceModel, batch: Batch) -> Tensor:
     """The image of every unit coefficient of a linear model, (B, C, H, W): their weighted sum is the rendering."""
-    state = illuminate(batch.observation)
     images = []
     for k in range(len(model.parameters)):
         unit = torch.zeros(1, len(model.parameters), 1, 1)
         unit[0, k] = 1
-        state.reflectance = masked_radiance_factor(model, model.unpack(unit, dim=1), state.angles)
-        images.append(torch.where(batch.usable, expose(state), torch.zeros(())))
+        images.append(torch.where(batch.usable, shade(batch.state, model, unit), torch.zeros(())))
     return torch.stack(images, dim=1)
 
 

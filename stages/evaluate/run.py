@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from schemas import (
     CHECKPOINT,
@@ -27,7 +28,7 @@ from stages.effects import load_extension
 from stages.evaluate.bootstrap import TileBootstrap
 from stages.evaluate.core import TITLES, Row, choose_fit_pairs, fit_renderers, layout, score
 from stages.evaluate.perceptual import Perceptual
-from stages.evaluate.renderers import Predictor, Reader, read_batch
+from stages.evaluate.renderers import Predictor, Reader
 from stages.evaluate.table import gain_table, metric_table
 from stages.network.dataset import PairReader
 from stages.network.predictor import Predictor as Network
@@ -190,9 +191,9 @@ def dn_scale(reader: Reader, indices: np.ndarray, size: int) -> float:
     indices = np.unique(indices)
     for start in range(0, len(indices), size):
         chosen = indices[start : start + size]
-        batch = read_batch(reader, chosen, 1.0)
-        if batch.usable.any():
-            largest = max(largest, float(batch.image[batch.usable].max()))
+        valid = torch.as_tensor(reader.valid(chosen)).bool()
+        if valid.any():
+            largest = max(largest, float(torch.as_tensor(reader.image(chosen))[valid].max()))
     return full_scale(largest)
 
 
@@ -211,7 +212,7 @@ def _warnings(bootstrap: TileBootstrap, frames: np.ndarray, orphans: np.ndarray)
 def _evaluate(
     reader: PairReader,
     predictor: Network,
-    extensions: Sequence[Extension],
+    extensions: Sequence[Any],
     wanted: np.ndarray,
     config: Config,
     notes: list[str],

@@ -70,7 +70,7 @@ class Field:
 def dense_descriptors(picture: np.ndarray) -> torch.Tensor:
     """(H W, D) float32 of unit length, one per pixel in row-major order; 0 where the picture is flat."""
     height, width = picture.shape
-    daisy = cv2.xfeatures2d.DAISY_create(
+    daisy = cv2.xfeatures2d.DAISY.create(
         radius=RADIUS, q_radius=3, q_theta=4, q_hist=8, norm=cv2.xfeatures2d.DAISY_NRM_NONE
     )
     points = [cv2.KeyPoint(float(x), float(y), 1.0) for y in range(height) for x in range(width)]

@@ -76,4 +76,4 @@ class NetworkMatcher(Matcher):
                 f"{self.files.features}: expected a {self.name} network as OpenCV's {self.factory} uses it, {_reason(error)}."
             ) from None
         places = np.array([k.pt for k in points], np.float32).reshape(-1, 2)
-        return places, np.empty((0, 1), np.float32) if descriptors is None else np.float32(descriptors)
+        return places, np.empty((0, 1), np.float32) if descriptors is None else descriptors.astype(np.float32)

@@ -17,7 +17,7 @@ class Sift(Matcher):
     reference = "Lowe (2004), Int. J. Comput. Vis. 60, 91"
 
     def match(self, measured: np.ndarray, rendered: np.ndarray) -> Matches:
-        detector = cv2.SIFT_create(contrastThreshold=0.01)
+        detector = cv2.SIFT.create(contrastThreshold=0.01)
         points, descriptors = zip(*(detector.detectAndCompute(p, None) for p in (measured, rendered)), strict=True)
         if any(d is None for d in descriptors):
             return Matches(np.empty((0, 2)), np.empty((0, 2)))

@@ -139,7 +139,7 @@ def checkpoint(file: h5py.File) -> page.Section:
     axes.plot(epochs, train, color="#8a929c", label="training", marker="o", markersize=2.5)
     axes.plot(epochs, validation, color="#3b8ecb", label="validation", marker="o", markersize=2.5)
     axes.axvline(best + 1, color="#c08a2e", linewidth=1, linestyle=":", label=f"kept: epoch {best + 1}")
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.locator_params(axis="x", integer=True)
     positive = np.concatenate([train, validation])
     if np.all(positive[np.isfinite(positive)] > 0):
         axes.set_yscale("log")
