@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from stages.physics.sweeps import FLAGS, NOTHING, Sweep, Taps, arctangent, sink, transpose_in, transpose_out
 
 NEAR = 16  # rows
+NEAR_COLUMNS = 8  # rows within which crossings of columns are looked at too
 SPACING = 2  # columns from line to line
 WINDOW = 12  # rows to either side that can hide a sample from everything behind
 RING = 2 * WINDOW + 1
@@ -140,7 +141,7 @@ def _horizon_rows(
             ra, rb = i - tap_rows[tap, 0], i - tap_rows[tap, 1]
             ca, cb = tap_columns[tap, 0], tap_columns[tap, 1]
             if rb < 0:
-                continue
+                break  # and so are all that follow
             lo = max(0, -(j0 + min(ca, cb)))
             hi = max(min(n, columns - j0 - max(ca, cb)), lo)
             w = tap_weight[tap]
@@ -171,7 +172,8 @@ def _horizon_rows(
             f = fraction[i]
             c, row_i = np.float32(here_sink), np.float32(i)
             _sample_lines(z, z_row + z_step * i, whole[i], z_column, first, lines, columns, f, c, observers)
-            _find_tangents(hull, depth, row_i, observers, seen_s, seen_h)
+            if i % 2 == 0:  # from 16 rows away, the next row sees the same points highest
+                _find_tangents(hull, depth, row_i, observers, seen_s, seen_h)
             at = j0 + whole[i] - first
             for phase in range(SPACING):
                 # pixels whose left line is (at + phase) // SPACING, + 1 for every SPACING columns
@@ -287,7 +289,7 @@ def sweep_horizon(
     target : row, column, height, width of the part of the grid whose horizon is wanted (None: all of it)
     """
     sweep = Sweep.towards(azimuth, gsd, grid.shape)
-    taps = Taps.near(sweep.shear, NEAR)
+    taps = Taps.near(sweep.shear, NEAR, NEAR_COLUMNS)
     row, column, height, width = target or (0, 0, *grid.shape)
     i0, i1, j0, j1 = (row, row + height, column, column + width)
     if sweep.by_columns:

@@ -20,8 +20,10 @@ from stages.physics.sweeps import FLAGS, NOTHING, Sweep, Taps, sink, transpose_i
 
 NEAR = 4  # rows; 2 rows double the disagreement with a ray tracer, 8 halve it again
 LINES = 1024  # lines per strip of a sweep by rows: the rows in use then stay in the first-level cache
-LINES_TURNED = 512  # and by columns, where blocks of the grid are transposed into a buffer
-BLOCK = 64  # columns per transposed block: 4 cache lines of elevation, one of shadow
+LINES_TURNED = 1024  # and by columns, where blocks of the grid are transposed into a buffer
+BLOCK = (
+    128  # columns per transposed block: 8 cache lines of elevation, 2 of shadow; all stays in the second-level cache
+)
 SMALL = 512 * 512  # px; smaller grids are swept by the calling thread alone
 
 
@@ -194,7 +196,7 @@ def _tables(
 ) -> tuple[Sweep, tuple[Any, ...]]:
     """The sweep and the arguments that every kernel call of it shares."""
     sweep = Sweep.towards(azimuth, gsd, shape)
-    taps = Taps.near(sweep.shear, NEAR)
+    taps = Taps.near(sweep.shear, NEAR, NEAR)
     drop = min(max(math.tan(sun_elevation), -1e9), 1e9) * sweep.step
     bend = 0.0 if body_radius is None else 0.5 * sweep.step**2 / body_radius
     return sweep, (

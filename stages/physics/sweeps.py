@@ -100,14 +100,14 @@ class Taps:
     distance: NDArray[np.float64]
 
     @classmethod
-    def near(cls, shear: float, reach: int) -> Taps:
-        """All crossings up to ``reach`` rows, nearest first."""
+    def near(cls, shear: float, reach: int, columns_reach: int) -> Taps:
+        """Crossings of rows up to ``reach`` rows away and of columns up to ``columns_reach``, nearest first."""
         found: list[tuple[float, int, int, int, int, float]] = []
         for k in range(1, reach + 1):
             low, f = _split(k * shear)
             found.append((float(k), k, k, low, low + (f > 0), f))
         n = 1
-        while shear and n / abs(shear) < reach:
+        while shear and n / abs(shear) < columns_reach:
             low, f = _split(n / abs(shear))
             column = n if shear > 0 else -n
             if f > 0:
