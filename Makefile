@@ -11,7 +11,7 @@ LUNARGR := $(BIN)/lunargr
 STAMP := $(VENV)/.installed
 SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 
-.PHONY: help install demo test test-slow lint bench campaign reproduce-apollo15 reproduce-models docs clean
+.PHONY: help install demo test test-slow lint bench campaign docs reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -26,6 +26,23 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet $$(grep '^torch==' constraints.txt)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test,lint]'
 	@touch $@
+
+test: $(STAMP) ## the tests that every change must pass (under 10 minutes on two cores)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+
+test-slow: $(STAMP) ## the longer checks
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow
+
+lint: $(STAMP) ## ruff, formatting and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(STAMP) ## speed and memory, each beside a named peer in the same run
+	for script in tests/benchmarks/bench_*.py; do echo "== $$script"; $(BIN)/python $$script; done
+
+docs: $(STAMP) ## write the generated parts of docs/ again
+	$(BIN)/python examples/photometry_page.py
 
 # --- the embedded scene --------------------------------------------------------------------------------------------
 
@@ -53,26 +70,75 @@ $(D)/checkpoint.h5: $(D)/pairs.h5
 $(D)/svbrdf.h5: $(D)/scene.h5 $(D)/checkpoint.h5
 	$(LUNARGR) infer $^ -o $@ --overwrite
 
+$(D)/render.exr: $(D)/svbrdf.h5
+	$(LUNARGR) render $< --sun-azimuth 270 --sun-elevation 25 -o $@ --overwrite
+
+$(D)/evaluation.h5: $(D)/pairs.h5 $(D)/checkpoint.h5
+	$(LUNARGR) evaluate $^ -o $@ --figures $(D)/figures --overwrite
+
+$(D)/match.json: $(D)/pairs.h5 $(D)/checkpoint.h5
+	$(LUNARGR) match $^ --count 8 --json $@ --figures $(D)/figures --overwrite
+
+# Places that every image covers: what the images disagree on there cannot be the ground.
+$(D)/stack.h5: $(D)/scene.h5
+	$(LUNARGR) sample $< --stack --count 6 -o $(D)/stack_crops.h5 --overwrite
+	$(LUNARGR) project $(D)/stack_crops.h5 -o $@ --overwrite
+
+$(D)/diagnosis.h5: $(D)/stack.h5
+	$(LUNARGR) diagnose $< --model M2 -o $@ --json $(D)/diagnosis.json --report $(D)/diagnosis.html --overwrite
+
+$(D)/report.html: $(D)/evaluation.h5 $(D)/match.json $(D)/render.exr $(D)/diagnosis.h5
+	$(LUNARGR) report $(D)/scene.h5 $(D)/crops.h5 $(D)/pairs.h5 $(D)/checkpoint.h5 $(D)/svbrdf.h5 $(D)/evaluation.h5 $(D)/match.json \
+	    $(D)/diagnosis.json $(D)/render.png -o $@ --title "lunargr demo: the embedded scene" --overwrite
+
 # --- real photographs: Apollo 15 metric camera frames over the GLD100 elevation model ------------------------------
 
 A := results/apollo15
 A_DATA := $(SHARED)/data/apollo15
+
+reproduce-apollo15: $(A)/report.html ## the same stages on five real Apollo 15 frames (needs the reference data)
+	@echo; echo "Open $(abspath $(A)/report.html)"
 
 $(A)/scene.h5: | $(STAMP)
 	@test -f $(A_DATA)/images.csv || { echo "reproduce-apollo15: no data at $(A_DATA); set LUNARGR_SHARED to the folder that holds data/apollo15"; exit 3; }
 	$(LUNARGR) ingest $(A_DATA)/gld100_64ppd.tif --images $(A_DATA)/images.csv --gsd 474 --crop 64 -o $@ --overwrite
 
 $(A)/crops.h5: $(A)/scene.h5
-	$(LUNARGR) sample $< --count 2500 --tile-m 45000 -o $@ --overwrite
+	$(LUNARGR) sample $< --count 2000 --tile-m 45000 -o $@ --overwrite
 
 $(A)/pairs.h5: $(A)/crops.h5
 	$(LUNARGR) project $< -o $@ --overwrite
 
 $(A)/checkpoint.h5: $(A)/pairs.h5
-	$(LUNARGR) train $< --model M2 --epochs 40 --batch 32 --lr 5e-4 --schedule cosine -o $@ --overwrite --resume
+	$(LUNARGR) train $< --model M2 --epochs 15 --batch 32 --lr 5e-4 --schedule cosine -o $@ --overwrite --resume
 
 $(A)/svbrdf.h5: $(A)/scene.h5 $(A)/checkpoint.h5
 	$(LUNARGR) infer $^ -o $@ --overwrite
+
+$(A)/render.exr: $(A)/svbrdf.h5
+	$(LUNARGR) render $< --subsolar-longitude 79 --subsolar-latitude 0.243 -o $@ --overwrite
+
+$(A)/evaluation.h5: $(A)/pairs.h5 $(A)/checkpoint.h5
+	$(LUNARGR) evaluate $^ -o $@ --figures $(A)/figures --overwrite
+
+$(A)/match.json: $(A)/pairs.h5 $(A)/checkpoint.h5
+	$(LUNARGR) match $^ --count 12 --json $@ --figures $(A)/figures --overwrite
+
+$(A)/diagnosis.h5: $(A)/scene.h5
+	$(LUNARGR) sample $< --stack --count 12 --tile-m 45000 -o $(A)/stack_crops.h5 --overwrite
+	$(LUNARGR) project $(A)/stack_crops.h5 -o $(A)/stack.h5 --overwrite
+	$(LUNARGR) diagnose $(A)/stack.h5 --model M2 -o $@ --json $(A)/diagnosis.json --report $(A)/diagnosis.html --overwrite
+
+$(A)/report.html: $(A)/evaluation.h5 $(A)/match.json $(A)/render.exr $(A)/diagnosis.h5
+	$(LUNARGR) report $(A)/scene.h5 $(A)/crops.h5 $(A)/pairs.h5 $(A)/checkpoint.h5 $(A)/svbrdf.h5 $(A)/evaluation.h5 $(A)/match.json \
+	    $(A)/diagnosis.json $(A)/render.png -o $@ --title "Apollo 15 metric camera over GLD100" --overwrite
+
+# --- the paper's model comparison ----------------------------------------------------------------------------------
+
+MODELS_PAIRS ?= $(D)/pairs.h5
+
+reproduce-models: $(MODELS_PAIRS) ## train M1..M6 from several seeds on the same pairs; the paper's table with spreads
+	$(LUNARGR) compare $< -o results/models --seeds 3 --epochs 8 --batch 32 --lr 1e-3 --schedule cosine --json results/models.json --resume
 
 clean: ## remove what the targets made, except .venv
 	rm -rf demo results build *.egg-info .pytest_cache .ruff_cache .mypy_cache
