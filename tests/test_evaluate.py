@@ -213,3 +213,19 @@ def test_a_checkpoint_that_renders_nan_is_one_clear_error(scene):
 
     with pytest.raises(ArtefactError, match="finite"):
         _evaluate(scene, predictor=Broken())
+
+
+def test_shared_illumination_gives_what_the_formation_chain_gives(scene):
+    import dataclasses
+
+    from stages.evaluate.renderers import shade
+    from stages.physics.formation import form, illuminate
+
+    observation = scene.observation(np.arange(6))
+    horizon = torch.linspace(0.0, 1.2, 32).expand(6, 32, 32)
+    observation = dataclasses.replace(observation, sun_horizon=horizon)  # from full light to full shadow
+    model = get_model("hapke")
+    values = torch.tensor([p.default for p in model.parameters])[None, :, None, None]
+    expected = form(observation, model, values)
+    assert torch.equal(shade(illuminate(observation), model, values), expected)
+    assert (expected == 0).any() and (expected > 0).any()

@@ -26,7 +26,7 @@ from stages.evaluate.renderers import (
 from stages.physics.formation import Extension
 from stages.physics.radiometry import crop_range
 
-SAMPLE_PIXELS = 400_000  # for models that are not linear in their parameters
+SAMPLE_PIXELS = 100_000  # for models that are not linear in their parameters
 TITLES = {
     "learned": "learned reflectance",
     "learned_gain_offset": "learned, least-squares gain + offset per crop",
