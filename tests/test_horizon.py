@@ -38,7 +38,7 @@ def test_wall(azimuth_deg):
     """Behind a thin straight wall of height h the horizon is atan(h / distance along the ray)."""
     azimuth = math.radians(azimuth_deg)
     n, wall, h = 121, 20, 30.0
-    across = abs(math.sin(azimuth)) > abs(math.cos(azimuth))  # wall along the columns or along the rows
+    across = abs(math.sin(azimuth) / GSD) > abs(math.cos(azimuth) / GSD)  # wall along the columns or along the rows
     sign = math.sin(azimuth) if across else -math.cos(azimuth)
     at = n - 1 - wall if sign > 0 else wall
     z = np.zeros((n, n), np.float32)
@@ -102,6 +102,27 @@ def test_bowl(azimuth_deg):
     assert np.abs(found - expected).max() < 0.08
     area = cast_shadow(z, GSD, azimuth, math.radians(25))[inside].mean()
     assert area == pytest.approx((expected > math.radians(25)).mean(), abs=8e-3)
+
+
+@pytest.mark.parametrize("azimuth_deg", AZIMUTHS_DEG)
+def test_pixels_that_are_not_square(azimuth_deg):
+    """An equirectangular map at 60 deg: columns are half as far apart as rows, azimuths and distances are true."""
+    azimuth, gsd = math.radians(azimuth_deg), (5.0, 2.5)
+    radius, base = 1500.0, 1450.0
+    row, col = np.mgrid[:181, :361]
+    x, y = (col - 180) * gsd[1], (90 - row) * gsd[0]
+    z = np.maximum(np.sqrt(radius**2 - x**2 - y**2) - base, 0).astype(np.float32)
+    distance = -(x * math.sin(azimuth) + y * math.cos(azimuth))
+    aside = x * math.cos(azimuth) - y * math.sin(azimuth)
+    foot = math.sqrt(radius**2 - base**2)
+    in_front = (np.abs(aside) < 0.9 * foot) & (distance > 15 + np.sqrt(np.maximum(foot**2 - aside**2, 0)))
+    distance, circle = distance[in_front], np.sqrt(radius**2 - aside[in_front] ** 2)
+    expected = np.arcsin(circle / np.hypot(distance, base)) - np.arctan2(base, distance)
+    error = horizon(z, gsd, azimuth)[in_front] - expected
+    assert np.abs(error).max() < 1.2e-2
+    assert np.abs(error).mean() < 3e-4
+    dark = cast_shadow(z, gsd, azimuth, 0.1)[in_front]
+    assert (dark != (expected > 0.1)).mean() < 0.01
 
 
 @pytest.mark.usefixtures("_strips")

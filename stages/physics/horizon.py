@@ -19,16 +19,18 @@ from schemas.errors import GeometryError
 from stages.physics.hulls import sweep_horizon
 from stages.physics.scene_horizon import Overview, horizon_in_scene, make_overview
 from stages.physics.shadow import sweep_shadow, sweep_shadow_bands
+from stages.physics.sweeps import PixelSize
 
 __all__ = ["Overview", "cast_shadow", "cast_shadow_bands", "horizon", "horizon_in_scene", "make_overview"]
 
 
 def _check(
-    shape: tuple[int, ...], gsd: float, body_radius: float | None, azimuth: float, sun_elevation: float = 0.0
+    shape: tuple[int, ...], gsd: PixelSize, body_radius: float | None, azimuth: float, sun_elevation: float = 0.0
 ) -> None:
     if len(shape) != 2:
         raise GeometryError(f"elevation: expected a grid (rows, columns), found shape {shape}.")
-    if not (math.isfinite(gsd) and gsd > 0):
+    sizes = gsd if isinstance(gsd, tuple) else (gsd,)
+    if len(sizes) > 2 or not all(math.isfinite(size) and size > 0 for size in sizes):
         raise GeometryError(f"gsd: expected a pixel size in metres above 0, found {gsd}.")
     if body_radius is not None and not body_radius > 0:
         raise GeometryError(f"body_radius: expected metres above 0 or None, found {body_radius}.")
@@ -38,11 +40,14 @@ def _check(
         raise GeometryError(f"sun_elevation: expected radians between -pi/2 and pi/2, found {sun_elevation}.")
 
 
-def horizon(elevation: ArrayLike, gsd: float, azimuth: float, body_radius: float | None = None) -> NDArray[np.float32]:
+def horizon(
+    elevation: ArrayLike, gsd: PixelSize, azimuth: float, body_radius: float | None = None
+) -> NDArray[np.float32]:
     """Elevation angle of the highest terrain in one azimuth, seen from every pixel's surface point.
 
     elevation : (H, W), m; NaN = nothing there; rows run south
-    gsd : m per pixel; azimuth : rad, clockwise from north
+    gsd : m per pixel, or (from row to row, from column to column) where pixels are not square on the ground, as on
+        equirectangular maps (``Grid.local_frames(...).pixel_size``); azimuth : rad, clockwise from the grid's north
     body_radius : m; terrain at distance d sinks by d^2 / 2R (None: flat)
     returns (H, W) float32, rad: -pi/2 where no terrain lies in that azimuth, NaN where the elevation is NaN
     """
@@ -52,12 +57,13 @@ def horizon(elevation: ArrayLike, gsd: float, azimuth: float, body_radius: float
 
 
 def cast_shadow(
-    elevation: ArrayLike, gsd: float, azimuth: float, sun_elevation: float, body_radius: float | None = None
+    elevation: ArrayLike, gsd: PixelSize, azimuth: float, sun_elevation: float, body_radius: float | None = None
 ) -> NDArray[np.bool_]:
     """Where terrain hides the Sun's centre.
 
     elevation : (H, W), m; NaN = nothing there; rows run south
-    gsd : m per pixel; azimuth, sun_elevation : rad, azimuth clockwise from north
+    gsd : m per pixel, one number or two as in :func:`horizon`
+    azimuth, sun_elevation : rad, azimuth clockwise from the grid's north
     body_radius : m; the Sun's rays are then parallel in space: ``sun_elevation`` holds at the grid's centre and grows
         towards the Sun by 1 rad per radius (None: flat, the same everywhere)
     returns (H, W) bool, True = in shadow; False where the elevation is NaN
@@ -69,7 +75,7 @@ def cast_shadow(
 
 def cast_shadow_bands(
     elevation: Any,
-    gsd: float,
+    gsd: PixelSize,
     azimuth: float,
     sun_elevation: float,
     body_radius: float | None = None,

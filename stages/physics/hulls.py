@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.physics.sweeps import FLAGS, NOTHING, Sweep, Taps, arctangent, sink, transpose_in, transpose_out
+from stages.physics.sweeps import FLAGS, NOTHING, PixelSize, Sweep, Taps, arctangent, sink, transpose_in, transpose_out
 
 NEAR = 16  # rows
 NEAR_COLUMNS = 8  # rows within which crossings of columns are looked at too
@@ -279,7 +279,7 @@ _KERNELS = {
 
 def sweep_horizon(
     grid: NDArray[np.float32],
-    gsd: float,
+    gsd: PixelSize,
     azimuth: float,
     body_radius: float | None,
     target: tuple[int, int, int, int] | None = None,

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.physics.sweeps import FLAGS, NOTHING, Sweep, Taps, sink, transpose_in, transpose_out
+from stages.physics.sweeps import FLAGS, NOTHING, PixelSize, Sweep, Taps, sink, transpose_in, transpose_out
 
 NEAR = 4  # rows; 2 rows double the disagreement with a ray tracer, 8 halve it again
 LINES = 1024  # lines per strip of a sweep by rows: the rows in use then stay in the first-level cache
@@ -192,7 +192,7 @@ _KERNELS = {
 
 
 def _tables(
-    shape: tuple[int, int], gsd: float, azimuth: float, sun_elevation: float, body_radius: float | None
+    shape: tuple[int, int], gsd: PixelSize, azimuth: float, sun_elevation: float, body_radius: float | None
 ) -> tuple[Sweep, tuple[Any, ...]]:
     """The sweep and the arguments that every kernel call of it shares."""
     sweep = Sweep.towards(azimuth, gsd, shape)
@@ -211,7 +211,7 @@ def _state(sweep: Sweep, width: int) -> NDArray[np.float32]:
 
 
 def sweep_shadow(
-    grid: NDArray[np.float32], gsd: float, azimuth: float, sun_elevation: float, body_radius: float | None
+    grid: NDArray[np.float32], gsd: PixelSize, azimuth: float, sun_elevation: float, body_radius: float | None
 ) -> NDArray[np.bool_]:
     """True where terrain hides a Sun at this azimuth and elevation (rad); see ``horizon.cast_shadow``."""
     sweep, tables = _tables(grid.shape, gsd, azimuth, sun_elevation, body_radius)
@@ -227,7 +227,7 @@ def sweep_shadow(
 
 
 def sweep_shadow_bands(
-    elevation: Any, gsd: float, azimuth: float, sun_elevation: float, body_radius: float | None, band: int
+    elevation: Any, gsd: PixelSize, azimuth: float, sun_elevation: float, body_radius: float | None, band: int
 ) -> Iterator[tuple[slice, slice, NDArray[np.bool_]]]:
     """The same, band by band from the Sun's side; only the rays' heights go from one band to the next."""
     shape = (int(elevation.shape[0]), int(elevation.shape[1]))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FLAGS = {"contract", "nsz", "arcp", "reassoc"}  # fast floats, but not "nnan": NaN marks where there is no terrain
+PixelSize = float | tuple[float, float]  # m; a pair is (from row to row, from column to column)
 NOTHING = np.float32(-1e30)  # height of "no terrain": finite, so that interpolation with it stays below everything
 
 
@@ -45,9 +46,10 @@ class Sweep:
     crossed: NDArray[np.int64]
 
     @classmethod
-    def towards(cls, azimuth: float, gsd: float, shape: tuple[int, int]) -> Sweep:
+    def towards(cls, azimuth: float, gsd: PixelSize, shape: tuple[int, int]) -> Sweep:
         """azimuth : rad, clockwise from north; gsd : m; shape : (H, W) of the grid, rows run south."""
-        east, north = math.sin(azimuth), math.cos(azimuth)
+        south_size, east_size = gsd if isinstance(gsd, tuple) else (gsd, gsd)
+        east, north = math.sin(azimuth) / east_size, math.cos(azimuth) / south_size  # px per m
         by_columns = abs(east) > abs(north)
         rows, columns = shape[::-1] if by_columns else shape
         shear = -north / abs(east) if by_columns else east / abs(north)
@@ -70,7 +72,7 @@ class Sweep:
             rows,
             columns,
             shear,
-            gsd * math.hypot(1.0, shear),
+            1 / max(abs(east), abs(north)),
             whole.astype(np.int64),
             fraction.astype(np.float32),
             crossing.astype(np.float32),
