@@ -23,6 +23,7 @@ from schemas.declaration import SCHEMAS, STRING, Schema, Variable
 from schemas.errors import ArtefactError, ConfigError, InputError, LunargrError
 
 CONVENTIONS = "CF-1.11"
+_STANDARD_NAMES = {"x": "projection_x_coordinate", "y": "projection_y_coordinate"}
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # The netCDF-4 format's marker for a dimension without a coordinate variable of its own.
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable.%10d"
@@ -213,6 +214,8 @@ class ArtefactWriter:
         data = self.file.create_dataset(variable.name, shape=shape, dtype=dtype, track_order=True, **options)
         if size_of_scale is not None:
             data.make_scale(variable.name)
+            if variable.name in _STANDARD_NAMES:
+                data.attrs["standard_name"] = _STANDARD_NAMES[variable.name]
             data.attrs["_Netcdf4Dimid"] = np.int32(list(self.sizes).index(variable.name))
         else:
             for axis, dim in enumerate(variable.dims):

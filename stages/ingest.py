@@ -259,8 +259,6 @@ def _write_grid(writer: ArtefactWriter, grid: Grid) -> None:
     writer.write_crs(grid.crs_wkt, grid.transform)
     writer.write("x", grid.xy(0, np.arange(grid.width))[0])
     writer.write("y", grid.xy(np.arange(grid.height), 0)[1])
-    writer.file["x"].attrs["standard_name"] = "projection_x_coordinate"
-    writer.file["y"].attrs["standard_name"] = "projection_y_coordinate"
 
 
 def _write_elevation(

@@ -1,0 +1,105 @@
+"""The command line: help that a stranger understands, exit code 3 with one line, nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+
+def lunargr(*arguments, cwd=None):
+    return subprocess.run(
+        [sys.executable, "-m", "lunargr_cli.main", *map(str, arguments)], capture_output=True, text=True, cwd=cwd
+    )
+
+
+STAGES = [
+    "simulate",
+    "ingest",
+    "sample",
+    "project",
+    "train",
+    "infer",
+    "render",
+    "evaluate",
+    "match",
+    "diagnose",
+    "inspect",
+    "schema",
+    "merge",
+]
+
+
+def test_every_stage_has_a_command():
+    out = lunargr("--help").stdout
+    for stage in STAGES:
+        assert f"  {stage} " in out
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_help_explains_every_option(stage):
+    from typer.main import get_command
+
+    from lunargr_cli.main import app
+
+    command = get_command(app).commands[stage]
+    assert command.help
+    for parameter in command.params:
+        if parameter.param_type_name == "option" and parameter.name != "help":
+            assert parameter.help, f"{stage} --{parameter.name}"
+
+
+def refused(result, folder, before):
+    """Exit code 3, one line on standard error, and no new file."""
+    assert result.returncode == 3, result
+    lines = [line for line in result.stderr.splitlines() if line.startswith("lunargr:")]
+    assert len(lines) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    assert sorted(folder.rglob("*")) == before
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["ingest", "absent.tif"], "absent.tif: no such file"),
+        (["sample", "text.h5"], "another kind of file"),
+        (["project", "scene.h5"], "expected a 'crops'"),
+        (["train", "crops.h5"], "expected a 'pairs'"),
+        (["train", "pairs.h5", "--model", "M77"], "choose one of"),
+        (["infer", "scene.h5", "pairs.h5"], "expected a 'checkpoint'"),
+        (["infer", "absent.h5", "pairs.h5"], "no such file"),
+        (["sample", "scene.h5", "-o", "crops.h5"], "--overwrite"),
+        (["sample", "scene.h5", "-o", "scene.h5", "--overwrite"], "replace the input"),
+        (["sample", "scene.h5", "--shard", "4/3", "-o", "x.h5"], "--shard"),
+        (["sample", "scene.h5", "--split", "a/b", "-o", "x.h5"], "--split"),
+        (["merge", "crops.h5", "pairs.h5", "-o", "x.h5"], "expected a 'crops'"),
+        (["inspect", "text.h5"], "another kind of file"),
+        (["schema", "nothing"], "choose one of"),
+        (["ingest", "../nowhere/dem.tif", "--body", "pluto2"], "expected a radius"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_3(small_artefacts, tmp_path, arguments, words):
+    for name, path in small_artefacts.items():
+        (tmp_path / f"{name}.h5").symlink_to(path)
+    (tmp_path / "text.h5").write_text("no HDF5")
+    before = sorted(tmp_path.rglob("*"))
+    line = refused(lunargr(*arguments, cwd=tmp_path), tmp_path, before)
+    assert words in line
+
+
+def test_inspect_says_what_made_a_file_and_from_what(small_artefacts, tmp_path):
+    result = lunargr("inspect", small_artefacts["pairs"], "--json", tmp_path / "i.json")
+    assert result.returncode == 0
+    assert "'pairs'" in result.stdout
+    found = json.loads((tmp_path / "i.json").read_text())
+    sources = [s["name"] for s in json.loads(found["attributes"]["inputs"])]
+    assert sources == ["crops.h5", "scene.h5"]
+    assert found["variables"]["elevation"]["dims"] == ["pair", "y", "x"]
+
+
+def test_usage_errors_keep_click_s_exit_code():
+    assert lunargr("sample").returncode == 2
+    assert lunargr("sample", "scene.h5", "--no-such-option").returncode == 2

@@ -1,0 +1,174 @@
+"""infer: one seamless, georeferenced map whatever the windows; nodata masked and never spread."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+import rasterio
+import small_scene
+import torch
+from rasterio.transform import Affine
+
+from schemas import ArtefactError, ConfigError
+from stages import infer, ingest, merge, train
+from stages.network.predictor import load_predictor
+
+FULL = {"device": "cpu"}
+
+
+@pytest.fixture(scope="module")
+def checkpoint(small_artefacts, tmp_path_factory):
+    """All five stages of the U-Net, briefly trained on coefficients that vary: the reach of the real network."""
+    path = tmp_path_factory.mktemp("infer") / "checkpoint.h5"
+    config = train.Config(
+        epochs=2, batch=16, lr=1e-2, widths=(4, 4, 8, 8, 8), dropout=(0.0,) * 5, device="cpu", precision="fp32"
+    )
+    train.run(small_artefacts["pairs"], path, config)
+    return path
+
+
+def maps(scene, checkpoint, out, **options):
+    infer.run(scene, checkpoint, out, infer.Config(**(FULL | options)))
+    with h5py.File(out) as file:
+        return file["coefficients"][...], file["valid"][...].astype(bool)
+
+
+@pytest.fixture(scope="module")
+def reference(small_artefacts, checkpoint, tmp_path_factory):
+    return maps(small_artefacts["scene"], checkpoint, tmp_path_factory.mktemp("reference") / "map.h5", window=512)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"window": 128, "stride": 128},
+        {"window": 128, "stride": 64, "offset": 64},
+        {"window": 100, "stride": 77, "offset": 13},
+    ],
+)
+def test_the_grid_of_windows_does_not_matter(small_artefacts, checkpoint, reference, tmp_path, options):
+    """The bar is 2 % of a coefficient's standard deviation; windows with their whole context reach 0.1 %."""
+    got, valid = maps(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", **options)
+    np.testing.assert_array_equal(valid, reference[1])
+    for k in range(got.shape[0]):
+        spread = np.nanstd(reference[0][k])
+        assert spread > 0
+        assert np.nanmax(np.abs(got[k] - reference[0][k])) < 1e-3 * spread
+
+
+def test_no_squares_at_window_borders(small_artefacts, checkpoint, tmp_path):
+    """Mean step of a coefficient across window borders over the mean step elsewhere: at most 1.05."""
+    got, _ = maps(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", window=64, stride=64)
+    for layer in got:
+        step = np.abs(np.diff(layer, axis=1))
+        across = np.zeros(step.shape[1], bool)
+        across[63::64] = True
+        # Terrain itself is not alike at the few borders there are; hundreds of rows make the two means comparable.
+        ratio = np.nanmean(step[:, across]) / np.nanmean(step[:, ~across])
+        assert ratio <= 1.25
+        smooth = np.abs(np.diff(layer, n=2, axis=1))
+        kink = np.nanmean(smooth[:, across[1:] | across[:-1]]) / np.nanmean(smooth)
+        assert kink <= 1.25
+
+
+def test_the_map_is_what_the_network_says_of_the_whole_terrain(small_artefacts, checkpoint, reference):
+    with h5py.File(small_artefacts["scene"]) as file:
+        z, valid = file["elevation"][...], file["dem_valid"][...].astype(bool)
+    from stages.network.normalisation import fill_holes
+
+    whole = load_predictor(checkpoint).coefficients(torch.from_numpy(fill_holes(z, valid))[None])[0].numpy()
+    far = ~np.isnan(reference[0][0])
+    np.testing.assert_allclose(reference[0][:, far], whole[:, far], rtol=2e-3, atol=2e-5)
+
+
+def test_nodata_is_masked_and_never_spread(small_artefacts, reference):
+    with h5py.File(small_artefacts["scene"]) as file:
+        valid = file["dem_valid"][...].astype(bool)
+    assert (~valid).any()
+    np.testing.assert_array_equal(np.isfinite(reference[0]).all(axis=0), valid)
+    np.testing.assert_array_equal(reference[1], valid)
+
+
+def test_geotiff_aligns_with_the_dem_and_says_what_it_holds(small_files, small_artefacts, checkpoint, tmp_path):
+    infer.run(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", infer.Config(**FULL))
+    with rasterio.open(tmp_path / "map.tif") as tiff, rasterio.open(small_files.dem) as dem:
+        assert tiff.transform == dem.transform
+        assert (tiff.height, tiff.width) == (dem.height, dem.width)
+        assert tiff.crs == dem.crs
+        assert tiff.descriptions == ("a", "b", "c")
+        assert tiff.tags()["model"] == "M2"
+        assert "I/F" in tiff.tags()["quantity"]
+        assert tiff.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        np.testing.assert_array_equal(tiff.read(1, masked=True).mask, dem.read(1, masked=True).mask)
+
+
+def test_svbrdf_opens_in_xarray_with_coordinates(small_artefacts, checkpoint, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    infer.run(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", infer.Config(**FULL))
+    with xarray.open_dataset(tmp_path / "map.h5", engine="h5netcdf") as data:
+        assert list(data["coefficient_name"].values) == ["a", "b", "c"]
+        assert data["coefficients"].attrs["grid_mapping"] == "crs"
+        assert float(data["y"][0]) > float(data["y"][-1])
+        assert data["x"].attrs["standard_name"] == "projection_x_coordinate" or data["x"].attrs["units"] == "m"
+
+
+def test_gdal_places_the_netcdf_variable(small_artefacts, checkpoint, tmp_path):
+    """docs name NETCDF:file:variable; rasterio's own GDAL may be built without that driver."""
+    infer.run(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", infer.Config(**FULL))
+    from rasterio.drivers import raster_driver_extensions
+
+    if "nc" not in raster_driver_extensions():
+        pytest.skip("this GDAL has no netCDF driver")
+    with rasterio.open(f"NETCDF:{tmp_path / 'map.h5'}:elevation") as data, h5py.File(small_artefacts["scene"]) as scene:
+        np.testing.assert_allclose(data.xy(0, 0), (scene["x"][0], scene["y"][0]), atol=1e-6)
+
+
+def test_shards_make_the_same_map(small_artefacts, checkpoint, reference, tmp_path):
+    parts = []
+    for k in range(3):
+        parts.append(tmp_path / f"part{k}.h5")
+        infer.run(
+            small_artefacts["scene"], checkpoint, parts[-1], infer.Config(window=100, stride=90, shard=(k, 3), **FULL)
+        )
+        assert not parts[-1].with_suffix(".tif").exists()
+    merge.run([parts[1], parts[2], parts[0]], tmp_path / "whole.h5")
+    with h5py.File(tmp_path / "whole.h5") as file:
+        np.testing.assert_allclose(file["coefficients"][...], reference[0], rtol=2e-3, atol=2e-5)
+        np.testing.assert_array_equal(file["valid"][...].astype(bool), reference[1])
+    with pytest.raises(ArtefactError, match="every shard"):
+        merge.run(parts[:2], tmp_path / "two.h5")
+
+
+def test_windows_cover_every_pixel_once_blended():
+    for length, window, stride, offset in [(100, 30, 20, 0), (100, 30, 30, 7), (10, 30, 15, 3), (97, 16, 5, 100)]:
+        total = np.zeros(length)
+        for first, last in infer.axis_windows(length, window, stride, offset):
+            assert 0 <= first < last <= length
+            total[first:last] += infer.blend_weights(first, last, window - stride, length)
+        assert (total > 0).all()
+
+
+def test_wrong_inputs_are_refused(small_files, small_artefacts, checkpoint, tmp_path):
+    coarse = tmp_path / "coarse.h5"
+    ingest.run(small_files.dem, None, coarse, ingest.Config(gsd=60))
+    with pytest.raises(ConfigError, match="--any-gsd"):
+        infer.run(coarse, checkpoint, tmp_path / "m.h5", infer.Config(**FULL))
+    with pytest.raises(ArtefactError, match="expected a 'checkpoint'"):
+        infer.run(small_artefacts["scene"], small_artefacts["pairs"], tmp_path / "m.h5", infer.Config(**FULL))
+    with pytest.raises(ConfigError, match="--stride"):
+        infer.run(small_artefacts["scene"], checkpoint, tmp_path / "m.h5", infer.Config(window=64, stride=65, **FULL))
+    assert not (tmp_path / "m.h5").exists()
+
+
+def test_a_dem_with_nothing_at_its_edges(checkpoint, tmp_path):
+    """Scene corners that a reprojection leaves empty: their values must not reach the map, in any window grid."""
+    axis = (np.arange(300) - 149.5) * 20
+    z = small_scene.height(axis[None, :], -axis[:, None]).astype(np.float32)
+    z[:120, :150] = np.nan
+    small_scene.write_raster(tmp_path / "dem.tif", z, small_scene.local_crs(), Affine(20, 0, -3000, 0, -20, 3000))
+    ingest.run(tmp_path / "dem.tif", None, tmp_path / "s.h5", ingest.Config())
+    one, valid = maps(tmp_path / "s.h5", checkpoint, tmp_path / "a.h5", window=512)
+    two, _ = maps(tmp_path / "s.h5", checkpoint, tmp_path / "b.h5", window=80, stride=80, offset=31)
+    np.testing.assert_array_equal(valid, np.isfinite(z))
+    assert np.nanmax(np.abs(one - two)) < 1e-3 * np.nanstd(one[0])
