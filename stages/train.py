@@ -119,7 +119,8 @@ def run(
         scale = elevation_scale(reader, train)
         predictor = Predictor(model, UNet(len(start), config.widths, config.dropout), scale, raw_start, output_scale)
         predictor.gsd, predictor.image_units = reader.gsd, reader.units
-        predictor.to(device, memory_format=torch.channels_last)
+        predictor.to(device)
+        predictor.to(memory_format=torch.channels_last)
         radiometry.to(device)
         parameters = [p for p in (*predictor.parameters(), *radiometry.parameters()) if p.requires_grad]
         optimizer = torch.optim.Adam(parameters, lr=config.lr)
