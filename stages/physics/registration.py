@@ -212,7 +212,10 @@ def _refine(
             return math.nan, math.nan, math.inf, 0.0
         w = weight[use]
         design = np.stack([t[use] for t in templates] + [np.ones(w.size)], axis=1)
-        strength = np.linalg.lstsq(design * np.sqrt(w)[:, None], moved[use] * np.sqrt(w), rcond=None)[0]
+        weighted = design * w[:, None]
+        # all templates have one size, so that the normal equations are good enough
+        ridge = 1e-10 * np.trace(weighted.T @ design) * np.eye(design.shape[1])
+        strength = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ moved[use])
         fitted = sum(k * t for k, t in zip(strength, templates, strict=False))
         residual = moved[use] - fitted[use] - strength[-1]
         scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-12
