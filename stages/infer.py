@@ -279,11 +279,11 @@ def _statistics(file: h5py.File, names: list[str]) -> tuple[float, dict[str, tup
     for k, name in enumerate(names):
         sample = np.concatenate([file["coefficients"][k, r, ::step] for r in range(0, height, step)])
         sample = sample[np.isfinite(sample)]
-        ranges[name] = (
-            (float(sample.mean()), float(sample.std()), *(float(v) for v in np.percentile(sample, [1, 99])))
-            if sample.size
-            else (math.nan,) * 4
-        )
+        if sample.size:
+            low, high = np.percentile(sample, [1, 99])
+            ranges[name] = (float(sample.mean()), float(sample.std()), float(low), float(high))
+        else:
+            ranges[name] = (math.nan, math.nan, math.nan, math.nan)
     return share, ranges
 
 

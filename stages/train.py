@@ -13,23 +13,23 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
 import torch
 import torch.distributed as dist
 from numpy.typing import NDArray
 from torch import Tensor
 
-from schemas import CHECKPOINT, ArtefactError, ArtefactWriter, ConfigError, InputError, atomic_path, check_output
-from schemas.hdf5 import sha256, silence_hdf5
+from schemas import CHECKPOINT, ArtefactWriter, ConfigError, InputError, check_output
+from schemas.hdf5 import sha256
 from stages.network import symmetries
 from stages.network.dataset import Batch, PairReader
 from stages.network.losses import Radiometry, masked_mse
-from stages.network.predictor import Predictor, choose_device, read_state, write_state
+from stages.network.predictor import Predictor, choose_device, write_state
+from stages.network.processes import average_buffers, average_gradients, join_group, mean_over_ranks, same_everywhere
+from stages.network.resume import History, restore, save, snapshot
 from stages.network.runtime import choose_precision, keep_freed_memory
 from stages.network.unet import DROPOUT, WIDTHS, UNet
 from stages.network.uniform import elevation_scale, fit_start
@@ -58,16 +58,6 @@ class Config:
     extend: str | None = None
 
 
-@dataclass
-class History:
-    """One entry per finished epoch."""
-
-    train_loss: list[float] = field(default_factory=list)
-    validation_loss: list[float] = field(default_factory=list)
-    epoch_seconds: list[float] = field(default_factory=list)
-    best_epoch: int = -1
-
-
 @dataclass(frozen=True)
 class Summary:
     """What training reached."""
@@ -93,7 +83,7 @@ def run(
     """
     _check(config)
     check_output(output, [pairs], overwrite)
-    rank, ranks = _join_group()
+    rank, ranks = join_group()
     device = choose_device(config.device)
     if device.type == "cuda" and ranks > 1:
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
@@ -120,7 +110,7 @@ def run(
         predictor = Predictor(model, UNet(len(start), config.widths, config.dropout), scale, raw_start, output_scale)
         predictor.gsd, predictor.image_units = reader.gsd, reader.units
         predictor.to(device)
-        predictor.to(memory_format=torch.channels_last)
+        predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         radiometry.to(device)
         parameters = [p for p in (*predictor.parameters(), *radiometry.parameters()) if p.requires_grad]
         optimizer = torch.optim.Adam(parameters, lr=config.lr)
@@ -133,11 +123,11 @@ def run(
         )
         precision = config.precision
         if resume and sidecar.exists():
-            precision = _restore(sidecar, identity, predictor, radiometry, optimizer, history, best, device)
+            precision = restore(sidecar, identity, predictor, radiometry, optimizer, history, best, device)
             say(f"resumed after epoch {len(history.train_loss)}/{config.epochs}")
         elif precision == "auto":
             precision = choose_precision(predictor, reader.size, device) if rank == 0 else "fp32"
-            precision = _same_everywhere(precision, ranks)
+            precision = same_everywhere(precision, ranks)
         if rank == 0:
             say(
                 f"model {model.name}, {sum(p.numel() for p in predictor.net.parameters()):,} weights, {len(train)} training and "
@@ -169,7 +159,7 @@ def run(
                 optimizer.zero_grad(set_to_none=True)
                 loss.backward()
                 if ranks > 1:
-                    _average_gradients(parameters, ranks)
+                    average_gradients(parameters, ranks)
                 optimizer.step()
                 pixels = float(batch.valid.sum())
                 loss_sum, pixel_sum, seen = (
@@ -181,8 +171,8 @@ def run(
                     progress(number + 1, len(steps), f"epoch {epoch + 1}/{config.epochs}")
             training_seconds = time.monotonic() - began
             if ranks > 1:
-                _average_buffers(predictor, ranks)
-            train_loss = _mean_over_ranks(loss_sum, pixel_sum, ranks, device)
+                average_buffers(predictor, ranks)
+            train_loss = mean_over_ranks(loss_sum, pixel_sum, ranks, device)
             validation_loss = evaluate_loss(
                 reader, validation, predictor, radiometry, extensions, config.batch, device, rank, ranks
             )
@@ -196,9 +186,9 @@ def run(
             ]
             if criterion <= min(earlier, default=math.inf):
                 history.best_epoch = epoch
-                best = _snapshot(predictor, radiometry)
+                best = snapshot(predictor, radiometry)
             if rank == 0:
-                _save(sidecar, identity, predictor, radiometry, optimizer, history, best, precision)
+                save(sidecar, identity, predictor, radiometry, optimizer, history, best, precision)
                 speed = seen / training_seconds
                 left = (config.epochs - epoch - 1) * history.epoch_seconds[-1]
                 say(
@@ -239,7 +229,7 @@ def evaluate_loss(
         count = float(batch.valid.sum())
         loss = masked_mse(radiometry(rendered, batch.observation.frame), batch.image / radiometry.scale, batch.valid)
         total, pixels = total + loss.item() * count, pixels + count
-    return _mean_over_ranks(total, pixels, ranks, device)
+    return mean_over_ranks(total, pixels, ranks, device)
 
 
 def _check(config: Config) -> None:
@@ -302,71 +292,6 @@ def _arrive(batch: Batch, device: torch.device) -> Batch:
     return batch if device.type == "cpu" else batch.to(device)
 
 
-def _snapshot(predictor: Predictor, radiometry: Radiometry) -> dict[str, Tensor]:
-    state = {f"predictor/{k}": v.detach().clone() for k, v in predictor.state_dict().items()}
-    return state | {f"radiometry/{k}": v.detach().clone() for k, v in radiometry.state_dict().items()}
-
-
-def _save(
-    sidecar: Path,
-    identity: str,
-    predictor: Predictor,
-    radiometry: Radiometry,
-    optimizer: torch.optim.Optimizer,
-    history: History,
-    best: dict[str, Tensor],
-    precision: str,
-) -> None:
-    state = optimizer.state_dict()
-    with atomic_path(sidecar) as partial, h5py.File(partial, "w", track_order=True) as file:
-        file.attrs["identity"] = identity
-        file.attrs["history"] = json.dumps(asdict(history))
-        file.attrs["precision"] = precision
-        write_state(file.create_group("predictor"), predictor.state_dict())
-        write_state(file.create_group("radiometry"), radiometry.state_dict())
-        for part in ("predictor", "radiometry"):
-            write_state(
-                file.create_group(f"best/{part}"),
-                {k.split("/", 1)[1]: v for k, v in best.items() if k.startswith(part)},
-            )
-        for index, moments in state["state"].items():
-            write_state(file.create_group(f"optimizer/{index}"), {k: torch.as_tensor(v) for k, v in moments.items()})
-
-
-def _restore(
-    sidecar: Path,
-    identity: str,
-    predictor: Predictor,
-    radiometry: Radiometry,
-    optimizer: torch.optim.Optimizer,
-    history: History,
-    best: dict[str, Tensor],
-    device: torch.device,
-) -> str:
-    """Load the state of an interrupted run; returns its precision. Raises ArtefactError where it was another run's."""
-    silence_hdf5()
-    try:
-        with h5py.File(sidecar, "r") as file:
-            if file.attrs["identity"] != identity:
-                raise ArtefactError(
-                    f"{sidecar}: the interrupted run had other options or other pairs; repeat its options or remove the file."
-                )
-            predictor.load_state_dict(read_state(file["predictor"]))
-            radiometry.load_state_dict(read_state(file["radiometry"]))
-            for part in ("predictor", "radiometry"):
-                best.update({f"{part}/{k}": v.to(device) for k, v in read_state(file[f"best/{part}"]).items()})
-            state: dict[str, Any] = optimizer.state_dict()
-            state["state"] = {int(k): read_state(group) for k, group in file["optimizer"].items()}
-            optimizer.load_state_dict(state)
-            for key, value in json.loads(str(file.attrs["history"])).items():
-                setattr(history, key, value)
-            return str(file.attrs["precision"])
-    except (OSError, KeyError, RuntimeError) as error:
-        raise ArtefactError(
-            f"{sidecar}: cannot be resumed from ({str(error).splitlines()[0]}); remove it and train again."
-        ) from None
-
-
 def _write_checkpoint(
     pairs: Path,
     output: Path,
@@ -418,46 +343,3 @@ def _write_checkpoint(
         writer.write("offset", np.where(known, radiometry.offset().detach().numpy(), np.nan))
         state = {k.split("/", 1)[1]: v for k, v in best.items() if k.startswith("predictor/")}
         write_state(writer.file.create_group("weights", track_order=True), state)
-
-
-def _join_group() -> tuple[int, int]:
-    """(rank, number of processes); starts the process group under torchrun."""
-    ranks = int(os.environ.get("WORLD_SIZE", 1))
-    if ranks == 1:
-        return 0, 1
-    if not dist.is_initialized():
-        dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
-    return dist.get_rank(), ranks
-
-
-def _average_gradients(parameters: Sequence[Tensor], ranks: int) -> None:
-    flat = torch.cat([(p.grad if p.grad is not None else torch.zeros_like(p)).reshape(-1) for p in parameters])
-    dist.all_reduce(flat)
-    flat /= ranks
-    offset = 0
-    for p in parameters:
-        p.grad = flat[offset : offset + p.numel()].view_as(p).clone()
-        offset += p.numel()
-
-
-def _average_buffers(predictor: Predictor, ranks: int) -> None:
-    """Each process saw other crops: share BatchNorm's running statistics."""
-    for buffer in predictor.buffers():
-        if buffer.is_floating_point():
-            dist.all_reduce(buffer)
-            buffer /= ranks
-
-
-def _mean_over_ranks(total: float, weight: float, ranks: int, device: torch.device) -> float:
-    sums = torch.tensor([total, weight], dtype=torch.float64, device=device)
-    if ranks > 1:
-        dist.all_reduce(sums)
-    return float(sums[0] / sums[1]) if sums[1] > 0 else math.nan
-
-
-def _same_everywhere(precision: str, ranks: int) -> str:
-    if ranks == 1:
-        return precision
-    box = [precision]
-    dist.broadcast_object_list(box, src=0)
-    return box[0]

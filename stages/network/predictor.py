@@ -34,6 +34,7 @@ class Predictor(torch.nn.Module):
         self.net = net
         self.elevation_scale = elevation_scale
         self.output_scale = output_scale
+        self.start: Tensor
         self.register_buffer("start", start.clone())
         self.gain: dict[str, float] = {}
         self.offset: dict[str, float] = {}
@@ -128,5 +129,5 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
         predictor.gsd = float(file.attrs["gsd_m"])
     predictor.to(device)
     if torch.device(device).type == "cpu":
-        predictor.to(memory_format=torch.channels_last)
+        predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return predictor.eval()

@@ -65,7 +65,7 @@ class UNet(nn.Module):
         self.up = nn.ModuleList(_block(2 * widths[k], widths[k], dropout[k]) for k in reversed(range(len(widths) - 1)))
         self.head = nn.Conv2d(widths[0], outputs, 1)
         nn.init.zeros_(self.head.weight)  # training starts from the uniform surface, not from noise around it
-        nn.init.zeros_(self.head.bias)
+        self.head.bias = nn.Parameter(torch.zeros(outputs))
 
     @property
     def stride(self) -> int:

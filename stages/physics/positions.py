@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ def blocks(height: int, width: int, size: int) -> Iterator[tuple[int, int, int, 
 
 
 def valid_positions(
-    valid: NDArray, height: int, width: int, block: tuple[int, int, int, int], crop: int
+    valid: Any, height: int, width: int, block: tuple[int, int, int, int], crop: int
 ) -> NDArray[np.bool_]:
     """Where a crop may be centred: rows r - crop/2 .. r + crop/2 - 1 (columns alike) are valid, all of them.
 

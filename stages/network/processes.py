@@ -1,0 +1,54 @@
+"""Several processes that train one network together, started by ``torchrun``; alone, everything here is the identity."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+
+def join_group() -> tuple[int, int]:
+    """(rank, number of processes); starts the process group under torchrun."""
+    ranks = int(os.environ.get("WORLD_SIZE", 1))
+    if ranks == 1:
+        return 0, 1
+    if not dist.is_initialized():
+        dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    return dist.get_rank(), ranks
+
+
+def average_gradients(parameters: Sequence[Tensor], ranks: int) -> None:
+    flat = torch.cat([(p.grad if p.grad is not None else torch.zeros_like(p)).reshape(-1) for p in parameters])
+    dist.all_reduce(flat)
+    flat /= ranks
+    offset = 0
+    for p in parameters:
+        p.grad = flat[offset : offset + p.numel()].view_as(p).clone()
+        offset += p.numel()
+
+
+def average_buffers(network: nn.Module, ranks: int) -> None:
+    """Each process saw other crops: share BatchNorm's running statistics."""
+    for buffer in network.buffers():
+        if buffer.is_floating_point():
+            dist.all_reduce(buffer)
+            buffer /= ranks
+
+
+def mean_over_ranks(total: float, weight: float, ranks: int, device: torch.device) -> float:
+    sums = torch.tensor([total, weight], dtype=torch.float64, device=device)
+    if ranks > 1:
+        dist.all_reduce(sums)
+    return float(sums[0] / sums[1]) if sums[1] > 0 else math.nan
+
+
+def same_everywhere(precision: str, ranks: int) -> str:
+    if ranks == 1:
+        return precision
+    box = [precision]
+    dist.broadcast_object_list(box, src=0)
+    return box[0]
