@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -129,7 +130,7 @@ def _override(
     return values
 
 
-def _write_json(path: Path, rows: list[tuple[str, ...]], columns: tuple[str, ...]) -> None:
+def _write_json(path: Path, rows: Sequence[Sequence[str]], columns: Sequence[str]) -> None:
     import json
 
     from schemas import atomic_path

@@ -193,9 +193,9 @@ def _stamp(
         for m in range(start[band], start[band + 1]):
             k = order[m]
             radius = 0.5 * diameter[k]
-            young = max(0.0, 1.0 - age[k] / 0.12)
+            young = max(0.0, 1.0 - age[k] / YOUNG)
             big = radius > 12.0 * step
-            reach = radius * (9.0 if young > 0 and big else 4.0)
+            reach = radius * (EJECTA_REACH if young > 0 and big else REACH)
             r0 = max(first, int(math.ceil((gy - y[k] - reach) / step)))
             r1 = min(last, int(math.floor((gy - y[k] + reach) / step)) + 1)
             c0 = max(0, int(math.ceil((x[k] - reach - gx) / step)))

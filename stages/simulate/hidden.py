@@ -61,7 +61,7 @@ class Hidden:
 
 def parse_hidden(items: Iterable[Mapping[str, Any]]) -> list[Hidden]:
     """Check recipe entries such as {"effect": "dark_bias", "iof": 0.004}. Raises ConfigError or RegistryError."""
-    result = []
+    result: list[Hidden] = []
     for item in items:
         if not isinstance(item, Mapping) or "effect" not in item:
             raise ConfigError(

@@ -69,9 +69,9 @@ def _fractal(out, x0, y0, step, longest, shortest, hurst, seed):
         wavelength, turn, octave = longest, 0.0, 0
         while wavelength >= shortest:
             ct, st = math.cos(turn), math.sin(turn)
-            amplitude = (wavelength / longest) ** hurst / 0.26
+            amplitude = (wavelength / longest) ** hurst / UNIT_STD
             # the last octaves fade instead of ending, so that a finer grid adds nothing to a coarser one abruptly
-            amplitude *= min(1.0, (wavelength / shortest - 1.0) / 0.87)
+            amplitude *= min(1.0, (wavelength / shortest - 1.0) / (LACUNARITY - 1.0))
             key = seed * 131 + octave
             ox, oy = 17.31 * (octave + 1), -9.77 * (octave + 1)
             y = y0 - r * step
@@ -80,8 +80,8 @@ def _fractal(out, x0, y0, step, longest, shortest, hurst, seed):
                 u = (ct * x - st * y) / wavelength + ox
                 v = (st * x + ct * y) / wavelength + oy
                 out[r, c] += np.float32(amplitude * gradient_noise(u, v, key))
-            wavelength /= 1.87
-            turn += 0.655
+            wavelength /= LACUNARITY
+            turn += TURN
             octave += 1
 
 

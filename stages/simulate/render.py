@@ -23,7 +23,7 @@ Array = NDArray[np.float32]
 
 BLOCK = 256  # DEM pixels; the Sun's and the camera's directions are exact at each block's centre
 SHADOW_REACH = 20e3  # m; terrain farther off casts no shadow here
-WHOLE = 40_000_000  # pixels of a scene whose horizon is swept at once
+WHOLE = 20_000_000  # pixels of a scene whose horizon is swept at once
 
 
 @dataclass
@@ -176,4 +176,4 @@ def point_spread(step: float, image_gsd: float, sigma_px: float, extra_sigma2_px
 
 
 def blur(image: Array, kernel: Array) -> Array:
-    return cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE), np.float32)

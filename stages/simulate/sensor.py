@@ -121,7 +121,7 @@ class Lattice:
         return cls(row, col, gx, gy)
 
 
-def _scaled(values: Floats, first: float, count: int) -> Floats:
+def _scaled(values: NDArray, first: float, count: int) -> Floats:
     return (np.asarray(values, float) - first) / max(count - 1, 1) * 2 - 1
 
 
@@ -157,7 +157,7 @@ def footprint(config: Config, shot: Pass, x: Floats, y: Floats, number: int) -> 
 def resample(radiance: Array, row: Floats, col: Floats, window: tuple[int, int, int, int]) -> Array:
     """Cubic interpolation of a window of the blurred radiance at DEM pixel coordinates."""
     u, v = (col - window[1]).astype(np.float32), (row - window[0]).astype(np.float32)
-    return cv2.remap(radiance, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.remap(radiance, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
 def move(config: Config, shot: Pass, detector: Detector, lattice: Lattice, step: float) -> tuple[Floats, Floats]:

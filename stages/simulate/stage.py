@@ -28,7 +28,7 @@ from stages.simulate.write import NODATA_FLOAT, ImageFile, ImageTruth, geotiff, 
 Progress = Callable[[int, int, str], None]
 
 GROUND_ROWS = 512  # DEM rows made at once
-IN_MEMORY = 1.2e9  # bytes of truth kept in memory; more is mapped from a temporary file
+IN_MEMORY = 6e8  # bytes of truth kept in memory; more is mapped from a temporary file
 WINDOW_PIXELS = 12e6  # DEM pixels rendered at once
 
 
@@ -60,8 +60,8 @@ def run(folder: Path, config: Config, overwrite: bool = False, progress: Progres
 
     terrain = Terrain(config)
     grid = scene_grid(config, config.dem_gsd, config.dem_size)
-    with _truth_arrays(folder, config.dem_size) as arrays:
-        scene = Scene(grid, *arrays, truth)
+    with _truth_arrays(folder, config.dem_size) as (elevation, log_geometry, log_free):
+        scene = Scene(grid, elevation, log_geometry, log_free, truth)
         _make_ground(config, terrain, scene, say)
         dem_valid = _write_dem(folder / "dem.tif", config, scene, hidden)
         images, covered, rows = [], [], []

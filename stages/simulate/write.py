@@ -71,6 +71,7 @@ class ImageFile:
 
     def __init__(self, path: Path, grid: Grid, units: str, packed: bool, shot: Pass) -> None:
         self.units, self.packed, self.grid = units, packed, grid
+        nodata: float
         dtype, nodata = ("uint16", NODATA_DN) if units == "dn" else ("int16", NODATA_INT16)
         if units == "iof" and not packed:
             dtype, nodata = "float32", NODATA_FLOAT
