@@ -91,6 +91,7 @@ def match_figure(measured: np.ndarray, rendered: dict[str, np.ndarray], matches:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.collections import LineCollection
 
     colours = plt.get_cmap("RdYlGn_r")
     figure, axes = plt.subplots(
@@ -105,8 +106,8 @@ def match_figure(measured: np.ndarray, rendered: dict[str, np.ndarray], matches:
         right.imshow(picture, cmap="gray", vmin=0, vmax=255)
         dots = left.scatter(*found.measured[order].T, c=shade * 5, cmap=colours, vmin=0, vmax=5, s=9)
         right.scatter(*found.rendered[order].T, c=shade * 5, cmap=colours, vmin=0, vmax=5, s=9)
-        for here, there, value in zip(found.measured[order], found.rendered[order], shade, strict=True):
-            right.plot([here[0], there[0]], [here[1], there[1]], color=colours(value), linewidth=0.8)
+        ends = np.stack([found.measured[order], found.rendered[order]], axis=1)
+        right.add_collection(LineCollection(list(ends), colors=colours(shade), linewidths=0.8))
         mean = f"{found.errors.mean():.1f} px" if len(found.errors) else "-"
         left.set_title("measured", fontsize=9)
         right.set_title(f"{name.replace('_', ' ')}: {len(found.errors)} matches, mean error {mean}", fontsize=9)
