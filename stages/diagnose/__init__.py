@@ -1,1 +1,186 @@
-"""`lunargr diagnose`."""
+"""`lunargr diagnose`: what the simulation gets wrong, why, and what fixing it is worth.
+
+data         measured pairs by site            chain       the forward model, rendered with small changes
+nominal      the model that is judged          projection  texture and DEM error taken out, per ground pixel
+statistics   products per cluster of pixels    evidence    held-out gain and significance, scene-wide effects
+images       the same for effects per image    selection   name, refine, look again
+unexplained  what is left, what cannot be seen answer      verdict, JSON, diagnosis.h5      report   HTML
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from schemas import ArtefactError, ConfigError, atomic_path, check_output
+from stages.diagnose.answer import Answer, cause_json, held_out, parameters, write_diagnosis
+from stages.diagnose.data import group_pairs, load_site, survey
+from stages.diagnose.nominal import fit, lit_mask, load_nominal
+from stages.diagnose.selection import Round, Search, enough, search
+from stages.diagnose.unexplained import Structure, blind_effects, measure
+from stages.effects import effect_names
+from stages.network.dataset import PairReader
+
+MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model says nothing about the images
+
+
+@dataclass(frozen=True)
+class Config:
+    """model : fitted where there is no checkpoint; most_pairs : used for the search (all test pairs are scored)."""
+
+    model: str = "M2"
+    most_causes: int = 4
+    most_images: int = 16
+    most_pairs: int = 384
+    seed: int = 0
+
+
+@dataclass
+class Result:
+    answer: Answer
+    search: Search | None
+    round: Round | None
+    structure: Structure | None
+
+
+@torch.no_grad()
+def run(
+    pairs: Path,
+    checkpoint: Path | None = None,
+    config: Config = Config(),  # noqa: B008 - frozen
+    output: Path | None = None,
+    json_file: Path | None = None,
+    report: Path | None = None,
+    overwrite: bool = False,
+    say: Callable[[str], None] | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> Result:
+    """Diagnose the pairs; write what is asked for. Raises ArtefactError, ConfigError, RegistryError."""
+    if config.most_causes < 1 or config.most_pairs < 1 or config.most_images < 1:
+        raise ConfigError("diagnose: expected counts of at least 1 for causes, images and pairs.")
+    inputs = [p for p in (pairs, checkpoint) if p is not None]
+    for path in (output, json_file, report):
+        if path is not None:
+            check_output(path, inputs, overwrite)
+    with PairReader(pairs) as reader:
+        result = diagnose(reader, checkpoint, config, say or (lambda _: None), progress or (lambda *_: None))
+        image_ids = reader.image_ids
+    if output is not None:
+        write_diagnosis(output, result.answer, image_ids, inputs, overwrite)
+    if json_file is not None:
+        import json
+
+        with atomic_path(json_file) as partial:
+            partial.write_text(json.dumps(result.answer.to_json(), indent=1))
+    if report is not None:
+        from stages.diagnose.report import write_report
+
+        write_report(report, result)
+    return result
+
+
+def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, progress) -> Result:
+    """The whole decision on an open file."""
+    if "sun_horizon_deg" not in reader.file:
+        raise ArtefactError(
+            f"{reader.path}:/sun_horizon_deg: expected the terrain horizon (without it shadows cannot be told from dark ground), "
+            "found none; write the pairs again with 'lunargr project'."
+        )
+    nominal = load_nominal(checkpoint, config.model, reader.units)
+    train, test = _split(reader)
+    groups = group_pairs(reader, train, config.most_images)
+    sites, used = [], 0
+    for members in groups:
+        if used and used + len(members) > config.most_pairs:
+            break
+        sites.append(load_site(reader, members))
+        used += len(members)
+    answer = Answer("cannot_tell", config={**dataclasses.asdict(config), "checkpoint": str(checkpoint or "")})
+    answer.pairs, answer.sites = used, len(sites)
+    answer.images = len({int(f) for s in sites for f in s.frames})
+    few = enough(sites) if sites else "no pairs to learn from"
+    if few:
+        answer.note, answer.blind = few, effect_names()
+        return Result(answer, None, None, None)
+    measured = [s.image for s in sites]
+    fit(nominal, sites, [], reader.units, measured)
+    first = copy.copy(nominal)
+    data = survey(sites, len(reader.image_ids))
+    has = frozenset({"sun_horizon"})
+    state = Search(nominal, sites, data, len(reader.image_ids), reader.units, has, progress, measured=measured)
+    misfit = _misfit(state)
+    if not misfit < MISFIT:
+        answer.verdict, answer.unexplained_fraction = "unexplained", 1.0
+        answer.note = (
+            f"the nominal model does not fit at all: its residual has {100 * misfit:.0f} % of the images' own variation about "
+            "zero; check units, Sun direction and registration before any cause is sought"
+        )
+        return Result(answer, state, None, None)
+    seen = search(state, config.most_causes, say)
+    structure = measure(seen.works)
+    _decide(answer, state, seen, structure)
+    hidden = [load_site(reader, g) for g in group_pairs(reader, test, config.most_images)[:64]]
+    tiles = [reader.tile[s.pairs] for s in hidden]
+    effects = [c.effect for c in answer.causes]
+    answer.held_out = held_out(hidden, tiles, first, nominal if effects else first, effects, state.dn, config.seed)
+    return Result(answer, state, seen, structure)
+
+
+def _split(reader: PairReader) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs to learn from and pairs to score: the test split, or the last of at least three sites."""
+    test = np.flatnonzero(reader.split == 2)
+    train = np.flatnonzero(reader.split != 2)
+    if len(train) and len(test):
+        return train, test
+    everything = np.arange(reader.count)
+    numbers = np.unique(reader.site)
+    if len(numbers) >= 3:
+        last = reader.site == numbers[-1]
+        return everything[~last], everything[last]
+    return everything, everything[:0]
+
+
+def _misfit(state: Search) -> float:
+    """rms residual over rms signal on fully lit pixels."""
+    signal = residual = 0.0
+    for chain in state.chains():
+        mask = lit_mask(chain)
+        image = chain.site.image
+        if state.dn:  # the free offset takes the mean: only variation counts
+            mean = (image * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
+            signal += float(((image - mean[:, None, None]) * mask).double().square().sum())
+        else:
+            signal += float((image * mask).double().square().sum())
+        residual += float(((image - chain.predict()) * mask).double().square().sum())
+    ratio = (residual / signal) ** 0.5 if signal > 0 else float("inf")
+    return ratio * (0.5 if state.dn else 1.0)  # film and texture: half of the variation may stay and say something
+
+
+def _decide(answer: Answer, state: Search, seen: Round, structure: Structure) -> None:
+    """The verdict from what was named, what is left and what could not be seen."""
+    answer.blind = blind_effects(state, seen)
+    explained = sum(c.fid**2 for c in state.causes)
+    left = structure.largest**2 if structure.present else 0.0
+    if structure.present and structure.largest**2 < 1e-3:
+        left = 1e-3 * structure.peak
+    answer.unexplained_fraction = left / (left + explained) if left + explained > 0 else 0.0
+    if structure.present and explained < left:
+        answer.verdict = "unexplained"
+        ranked = sorted(seen.best.values(), key=lambda e: -e.gain)
+        answer.closest = [c.effect.name for c in state.causes] or [e.effect for e in ranked[:1]]
+    elif state.causes:
+        answer.verdict = "named"
+        answer.causes = list(state.causes)
+    elif answer.blind:
+        answer.verdict = "cannot_tell"
+    else:
+        answer.verdict = "nothing_significant"
+
+
+__all__ = ["Answer", "Config", "Result", "cause_json", "diagnose", "parameters", "run"]

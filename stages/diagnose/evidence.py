@@ -41,6 +41,10 @@ class Evidence:
         return self.candidate.effect
 
 
+# Seen in shadows and at their edges, in few blocks of few images: there neither texture nor DEM error repeats
+LOCAL = ("penumbra", "distant_shadow", "dark_bias", "earthshine", "interreflection", "saturation")
+
+
 def weigh(data: Statistics) -> list[Evidence]:
     """Evidence for every candidate, the nuisance columns fitted along."""
     m = data.nuisance.shape[1] - 1
@@ -55,6 +59,7 @@ def weigh(data: Statistics) -> list[Evidence]:
     score = score - torch.einsum("cem,m->ce", data.cross[:, :, :m], delta) + residual_n @ gamma
     places = _groups(data.place)
     images = _groups(data.image)
+    cells = _groups(data.image.astype(np.int64) * 10_000_000 + data.place)
     out = []
     for k, candidate in enumerate(data.candidates):
         part = candidate.columns
@@ -64,7 +69,17 @@ def weigh(data: Statistics) -> list[Evidence]:
         gram = data.grams[k] - half - half.transpose(1, 2)
         gram = gram + torch.einsum("mk,cmn,nl->ckl", g, data.nuisance[:, :m, :m], g)
         raw = float(data.grams[k].sum(0).diagonal().sum())
-        out.append(_weigh_one(candidate, score[:, part], gram, places, images, data.rows, raw))
+        out.append(
+            _weigh_one(
+                candidate,
+                score[:, part],
+                gram,
+                cells if candidate.effect in LOCAL else places,
+                cells if candidate.effect in LOCAL else images,
+                data.rows,
+                raw,
+            )
+        )
     return out
 
 
@@ -103,6 +118,10 @@ def _weigh_one(candidate, score: Tensor, gram: Tensor, places, images, rows: flo
         wald = float(amount @ torch.linalg.solve(robust + 1e-12 * torch.diag(robust.diagonal()), amount)) / k
         freedom = max(effective - k, 0.5)
         tail = f_tail(wald, k, freedom)
+        if k > 2:  # with more columns than clusters only the held-out direction can be tested
+            held = (left_out * u).sum(1)
+            wald = float(held.sum() ** 2 / held.square().sum().clamp(min=1e-30)) if float(held.sum()) > 0 else 0.0
+            tail = f_tail(wald * max(count - 1, 1) / max(count - wald, 1e-9), 1, max(count - 1, 1))
         if tail >= p:
             p, statistic, covariance = tail, wald, robust
     if not halves:

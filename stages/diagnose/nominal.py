@@ -68,7 +68,7 @@ def fit(nominal: Nominal, sites: list[Site], base: list[Effect], units: str, mea
     measured : the images as read, one (n, H, W) per site; ``site.image`` becomes I/F
     """
     fitted = nominal.predictor is None
-    rounds = (ROUNDS if units == "dn" or not nominal.model.linear else 2) if fitted else (1 if units == "dn" else 0)
+    rounds = (ROUNDS if units == "dn" or not nominal.model.linear else 3) if fitted else (1 if units == "dn" else 0)
     for _ in range(rounds):
         gram = torch.zeros(len(nominal.vector), len(nominal.vector), dtype=torch.float64)
         score = torch.zeros(len(nominal.vector), dtype=torch.float64)
@@ -83,6 +83,7 @@ def fit(nominal: Nominal, sites: list[Site], base: list[Effect], units: str, mea
             # relative weights: every image counts alike, however low its Sun
             level = (predicted * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
             weight = (mask / level.clamp(min=1e-6)[:, None, None]).double()
+            weight = weight * _near(site.image - predicted, weight)
             columns = torch.stack(chain.surface_tangents()).double() * weight
             residual = (site.image - predicted).double() * weight
             flat = columns.flatten(1)
@@ -98,6 +99,18 @@ def fit(nominal: Nominal, sites: list[Site], base: list[Effect], units: str, mea
                 low = torch.tensor([p.lower for p in nominal.model.parameters])
                 high = torch.tensor([p.upper for p in nominal.model.parameters])
                 nominal.vector = nominal.vector.clamp(min=low, max=high)
+
+
+def _near(residual: Tensor, weight: Tensor) -> Tensor:
+    """1 where a weighted residual is within five robust deviations of its image's median: shadows of unknown walls are not."""
+    out = torch.zeros_like(weight)
+    for k, (r, w) in enumerate(zip(residual * weight, weight, strict=True)):
+        used = r[w > 0]
+        if len(used):
+            middle = used.median()
+            width = 1.4826 * (used - middle).abs().median()
+            out[k] = (r - middle).abs() < 5 * width + 1e-9
+    return out
 
 
 def _scale(site: Site, raw: Tensor, predicted: Tensor, mask: Tensor) -> None:

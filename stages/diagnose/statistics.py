@@ -16,7 +16,9 @@ from stages.diagnose.projection import Local, Projector, Rows
 from stages.effects import Effect, Survey, Trial, get_effect
 
 BLOCK = 32  # px
-CUT = 15
+CUT = math.radians(15)  # photometric effects are judged where neither slope nor shadow is a matter of sub-pixel relief
+DEEP = math.radians(2)  # below the horizon: shadow, whatever the DEM's errors
+OUTLIER = 7.0  # sigma
 SHOT = 0.8  # share of shot noise in the noise's variance at mean brightness
 EDGE = math.radians(6.0)  # relief below the DEM's resolution blurs shadows over a band like this ...
 DOUBT = 0.3  # ... by up to this share of the lit brightness
@@ -44,6 +46,7 @@ class SiteWork:
     projector: Projector
     local: Local
     residual: Tensor  # (n, H, W), I/F, measured minus predicted
+    albedo: Tensor  # (H, W), relative albedo of the ground beyond the prediction, not whitened
     rows: Rows  # of the residual alone, (1, ...), local nuisance removed
     raw_rows: Rows  # the same before that
 
@@ -69,32 +72,39 @@ class Statistics:
     static_cluster: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
 
 
-def ready(chain: Chain, dn: bool) -> SiteWork:
-    """Weights from the residual's own scatter, the projector, the texture and the residual's rows."""
+def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
+    """``wide`` keeps the pixels about shadow edges. Weights from the residual's own scatter, the projector, the texture and the residual's rows."""
     site = chain.site
-    residual = torch.where(site.valid, site.image - chain.predict(), 0.0)
-    weight = _first_weight(chain)
-    for _ in range(3):
+    weight = _first_weight(chain, wide)
+    residual = torch.where(site.valid, site.image - chain.textured, 0.0)
+    for _ in range(2):
         projector = Projector(chain, weight)
         dynamic, maps = projector.split(residual[None])
         if len(weight) < 2:
             break
-        weight = weight * _rescale(dynamic[0], weight)[:, None, None]
+        weight = weight * _rescale(dynamic[0], projector)[:, None, None]
+        if not wide:  # what no smooth effect can do: shadows of unknown walls, cut-off highlights, dead pixels
+            gross = dynamic[0].abs() > OUTLIER
+            if float(gross.sum()) < 0.3 * float((weight > 0).sum()):
+                weight = weight * ~gross
     projector = Projector(chain, weight)
     dynamic, maps = projector.split(residual[None])
     if len(weight) < 2:  # one image: its noise and the ground's texture cannot be told apart
         weight = weight / float((residual * weight).square()[weight > 0].mean().clamp(min=1e-12)) ** 0.5
         projector = Projector(chain, weight)
         dynamic, maps = projector.split(residual[None])
-    site.texture = (1 + maps[0, 0]).clamp(0.4, 2.5)
-    chain.textured = chain.render()
+    # the prediction moves the texture along with the ground; the static rows are about all of it
+    maps[:, 0] += site.texture - 1
+    if len(weight) >= 3:
+        site.texture = (1 + maps[0, 0]).clamp(0.4, 2.5)
+        chain.textured = chain.render()
     projector.learn_spectrum(maps[0])
     local = Local(projector, nuisance_columns(chain, dn))
     raw = Rows(dynamic, projector.whiten(maps))
-    return SiteWork(chain, projector, local, residual, local.remove(raw), raw)
+    return SiteWork(chain, projector, local, residual, maps[0, 0], local.remove(raw), raw)
 
 
-def _first_weight(chain: Chain) -> Tensor:
+def _first_weight(chain: Chain, wide: bool) -> Tensor:
     """1 / expected noise, (n, H, W): shot and read noise, and doubt where shadows end."""
     site, state = chain.site, chain.state
     predicted = chain.textured
@@ -109,27 +119,32 @@ def _first_weight(chain: Chain) -> Tensor:
         rising = torch.minimum(above, rising)
     else:
         use &= mu0 > GRAZING
-    use &= (rising > math.radians(CUT)) | ((above < -math.radians(2.0)) if above is not None else False)
+    if not wide and float((use & (rising > CUT)).sum()) > 0.1 * float(use.sum()):
+        use &= (rising > CUT) | ((above < -DEEP) if above is not None else torch.zeros_like(use))
     edge = torch.where(mu0 > 0 if above is None else above > 0, EDGE, 0.3 * EDGE)
     doubt = DOUBT * (state.reflectance + 0.2 * mean) * torch.exp(-rising.abs() / edge)
     variance = variance + doubt**2
     return use * variance.clamp(min=1e-14).rsqrt()
 
 
-def _rescale(dynamic: Tensor, weight: Tensor) -> Tensor:
-    """Per image, 1 / robust scatter of weighted rows that should have unit noise."""
+def _rescale(dynamic: Tensor, projector: Projector) -> Tensor:
+    """Per image, 1 / robust scatter of weighted rows that should have unit noise.
+
+    The projection takes the more from an image the larger its weight: each row is judged by the variance it has left,
+    and no image is believed to be much quieter than the others, or its weight would run away.
+    """
+    weight = projector.weight
+    left = (1 - sum(q.square() for q in projector.basis)).clamp(min=0.02).sqrt()
     out = torch.ones(len(dynamic))
-    for k, (row, w) in enumerate(zip(dynamic, weight, strict=True)):
-        used = row[w > 0]
+    for k, (row, w, share) in enumerate(zip(dynamic, weight, left, strict=True)):
+        used = (row / share)[w > 0]
         if len(used) > 50:
-            scatter = 1.4826 * float((used - used.median()).abs().median())
-            out[k] = 1 / max(scatter, 1e-3)
-    # projection takes from an image what its weight deserves: only part of a large correction is believed
-    return out.clamp(0.2, 5.0)
+            out[k] = 1 / max(1.4826 * float((used - used.median()).abs().median()), 1e-3)
+    return out.clamp(max=float(2 * out.median())).clamp(0.2, 5.0)
 
 
 def nuisance_columns(chain: Chain, dn: bool) -> Tensor:
-    """(n, k, H, W): shift east and south, and for dn images gain and offset."""
+    """(n, k, H, W): shift east and south, for dn images gain and offset, and image-wide effects named already."""
     image = chain.textured
     east = torch.zeros_like(image)
     south = torch.zeros_like(image)
@@ -138,7 +153,26 @@ def nuisance_columns(chain: Chain, dn: bool) -> Tensor:
     columns = [east, south]
     if dn:
         columns += [image, torch.full_like(image, float(image.mean()))]
+    for k, effect in enumerate(chain.base):
+        if effect.scope == "image" and effect.name != "misregistration":
+            columns += list(image_columns(chain, type(effect), k))
     return torch.stack(columns, 1)
+
+
+def image_columns(chain: Chain, cls: type[Effect], place: int | None = None) -> list[Tensor]:
+    """d image / d coordinate for an effect with one value per image, (n, H, W) each."""
+    frames = int(chain.site.observation.frame.max()) + 1
+    out = []
+    for parameter in cls.fitted():
+        step = 0.2 * cls.strong[parameter.name]
+        if place is None:
+            moved = chain.render(cls({parameter.name: torch.full((frames,), step)}, None))
+        else:
+            values = dict(chain.base[place].values)
+            values[parameter.name] = values[parameter.name] + step
+            moved = chain.replace(place, cls(values, chain.base[place].survey))
+        out.append((moved - chain.textured) / step)
+    return out
 
 
 def make_candidates(names: Sequence[str], data: Survey) -> list[Candidate]:

@@ -31,4 +31,6 @@ class AzimuthalAnisotropy(Effect):
         sun = state.sun_direction.to(state.elevation.dtype)
         level = torch.sqrt(sun[:, 0] ** 2 + sun[:, 1] ** 2).clamp(min=1e-6)
         east, north = (sun[:, 0] / level)[:, None, None], (sun[:, 1] / level)[:, None, None]
-        state.reflectance = state.reflectance * (1 + self.value("east", state) * east + self.value("north", state) * north)
+        state.reflectance = state.reflectance * (
+            1 + self.value("east", state) * east + self.value("north", state) * north
+        )

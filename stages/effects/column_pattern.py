@@ -30,6 +30,11 @@ class ColumnPattern(Effect):
     coordinates = tuple(Parameter(f"c{k}", "1", -0.5, 0.5, 0.0, f"cosine {k} over the columns") for k in ORDERS)
     strong = {p.name: 0.02 for p in coordinates}
 
+    def response(self, count: int) -> Tensor:
+        """Response at ``count`` samples from the first to the last column, (count,)."""
+        u = (torch.arange(count) + 0.5) / count
+        return 1 + sum(float(self.values[f"c{k}"]) * (math.sqrt(2) * torch.cos(math.pi * k * u)) for k in ORDERS)
+
     def columns(self, state: State) -> Tensor:
         sample = state.observation.detector_sample
         if sample is None:

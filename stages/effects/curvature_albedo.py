@@ -20,7 +20,9 @@ class CurvatureAlbedo(Effect):
     reference = "Fassett & Thomson (2014), JGR 119, 2255 (diffusion of lunar soil)"
     confused_with = ("dem_smoothing", "interreflection")
     separate = "images of the same ground under at least four Sun azimuths, which tell albedo from shading"
-    parameters = (Parameter("per_std", "1", -0.5, 0.5, 0.0, "relative change of albedo per standard deviation of curvature"),)
+    parameters = (
+        Parameter("per_std", "1", -0.5, 0.5, 0.0, "relative change of albedo per standard deviation of curvature"),
+    )
     strong = {"per_std": 0.1}
 
     def apply(self, state: State) -> None:

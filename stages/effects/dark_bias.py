@@ -12,10 +12,10 @@ class DarkBias(Effect):
     name = "dark_bias"
     slot = "sensor"
     title = "dark level and stray light"
-    mechanism = (
-        "Dark current, electronic offset and veiling stray light add the same amount to every pixel, in shadow as in light."
+    mechanism = "Dark current, electronic offset and veiling stray light add the same amount to every pixel, in shadow as in light."
+    reference = (
+        "Humm et al. (2016), Space Sci. Rev. 200, 431; stray light: Mahanti et al. (2016), Space Sci. Rev. 200, 393"
     )
-    reference = "Humm et al. (2016), Space Sci. Rev. 200, 431; stray light: Mahanti et al. (2016), Space Sci. Rev. 200, 393"
     confused_with = ("earthshine", "interreflection", "nonlinearity")
     separate = "an image with deep shadow, where nothing else is bright"
     parameters = (Parameter("iof", "1", -0.1, 0.1, 0.0, "added I/F, truth minus given"),)

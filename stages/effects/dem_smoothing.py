@@ -20,7 +20,9 @@ class DemSmoothing(Effect):
     reference = "Henriksen et al. (2017), Icarus 283, 122 (resolution of LROC NAC DTMs)"
     confused_with = ("psf_blur", "dem_scale")
     separate = "an image at incidence above 60 deg, where shading is linear in slope but optics blur albedo as well"
-    parameters = (Parameter("sigma2_px2", "px2", -2.0, 4.0, 0.0, "variance by which the DEM is smoother than the truth"),)
+    parameters = (
+        Parameter("sigma2_px2", "px2", -2.0, 4.0, 0.0, "variance by which the DEM is smoother than the truth"),
+    )
     strong = {"sigma2_px2": 1.0}
     tolerance = {"sigma2_px2": 0.35}
 

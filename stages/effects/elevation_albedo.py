@@ -20,7 +20,9 @@ class ElevationAlbedo(Effect):
     reference = "Lucey et al. (1998), JGR 103, 3679 (lunar albedo and composition)"
     confused_with = ("albedo_map",)
     separate = "images of the same ground under at least four Sun azimuths, which tell albedo from shading"
-    parameters = (Parameter("per_std", "1", -0.5, 0.5, 0.0, "relative change of albedo per standard deviation of height"),)
+    parameters = (
+        Parameter("per_std", "1", -0.5, 0.5, 0.0, "relative change of albedo per standard deviation of height"),
+    )
     strong = {"per_std": 0.1}
 
     def apply(self, state: State) -> None:

@@ -30,7 +30,7 @@ def load_extension(path: Path, image_ids: Sequence[str] | None = None) -> list[E
         cls = get_effect(entry["effect"])
         values = dict(entry["values"])
         for coordinate, table in entry.get("tables", {}).items():
-            column = tables[table["variable"]][:, table["column"]]
+            column = tables[table["variable"]].reshape(len(known), -1)[:, table["column"]]
             if order is not None and cls.scope == "image":
                 null = cls.null()[coordinate]
                 column = torch.tensor([float(column[k]) if k >= 0 else null for k in order], dtype=torch.float32)

@@ -41,7 +41,9 @@ def _add(state: State, strength: Tensor) -> None:
     lit = mu0 > 0.2
     share = state.reflectance / mu0.clamp(min=0.2) * lit
     albedo = share.sum((-2, -1), keepdim=True) / lit.sum((-2, -1), keepdim=True).clamp(min=1)
-    state.radiance = state.radiance + strength * albedo * received(state.elevation, state.radiance, state.observation.gsd)
+    state.radiance = state.radiance + strength * albedo * received(
+        state.elevation, state.radiance, state.observation.gsd
+    )
 
 
 def received(elevation: Tensor, radiance: Tensor, gsd: float) -> Tensor:

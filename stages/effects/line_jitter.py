@@ -33,7 +33,7 @@ class LineJitter(Effect):
         for k in ORDERS
     )
     strong = {p.name: 0.5 for p in coordinates}
-    tolerance = {"rms_px": 0.08}
+    tolerance = {"rms_px": 0.15}
 
     def apply(self, state: State) -> None:
         height = state.elevation.shape[-2]

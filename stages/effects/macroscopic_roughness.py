@@ -7,7 +7,7 @@ import torch
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation import State
 from stages.physics.photometry import Parameter
-from stages.physics.photometry.roughness import rough_cosines
+from stages.physics.photometry.roughness import rough_surface
 
 
 @register
@@ -32,8 +32,8 @@ class MacroscopicRoughness(Effect):
     def apply(self, state: State) -> None:
         theta = torch.deg2rad(self.value("theta_bar_deg", state))
         mu0, mu = state.angles.cos_incidence, state.angles.cos_emission
-        mu0e, mue, shadowing = rough_cosines(state.angles, theta)
+        x, y, shadowing = rough_surface(state.angles, theta)  # effective cosines in either order, S / mue
         smooth = mu0 / (mu0 + mu)
-        ratio = shadowing * (mu0e / (mu0e + mue)) / smooth
+        ratio = shadowing * (x * y / (x + y)) / smooth
         up = (mu0 > 1e-3) & (mu > 1e-3)
         state.reflectance = torch.where(up, state.reflectance * torch.where(up, ratio, 1.0), state.reflectance)

@@ -14,7 +14,9 @@ class Saturation(Effect):
     name = "saturation"
     slot = "sensor"
     title = "saturation"
-    mechanism = "The full well or the converter's last step cuts the signal off: nothing brighter than a level is recorded."
+    mechanism = (
+        "The full well or the converter's last step cuts the signal off: nothing brighter than a level is recorded."
+    )
     reference = "Janesick (2001), Scientific Charge-Coupled Devices, SPIE (full well)"
     confused_with = ("nonlinearity",)
     separate = "an image of the same ground at a shorter exposure or a lower Sun"

@@ -20,7 +20,9 @@ class SlopeAlbedo(Effect):
     reference = "Robinson et al. (2015), Icarus 252, 229; Senthil Kumar et al. (2016), JGR 121, 147"
     confused_with = ("macroscopic_roughness", "limb_darkening")
     separate = "images of the same ground under at least four Sun azimuths, which tell albedo from shading"
-    parameters = (Parameter("per_std", "1", -0.5, 0.5, 0.0, "relative change of albedo per standard deviation of slope"),)
+    parameters = (
+        Parameter("per_std", "1", -0.5, 0.5, 0.0, "relative change of albedo per standard deviation of slope"),
+    )
     strong = {"per_std": 0.1}
 
     def apply(self, state: State) -> None:

@@ -18,7 +18,9 @@ class SunAzimuth(Effect):
         "A wrong time, or north of the map taken for north of the crop, turns the Sun about the vertical in every image alike: "
         "slopes across the Sun's direction brighten on one side and darken on the other. Clockwise is positive."
     )
-    reference = "Acton (1996), Planet. Space Sci. 44, 65 (ephemerides); Archinal et al. (2018), CMDA 130, 22 (body frames)"
+    reference = (
+        "Acton (1996), Planet. Space Sci. 44, 65 (ephemerides); Archinal et al. (2018), CMDA 130, 22 (body frames)"
+    )
     confused_with = ("misregistration", "azimuthal_anisotropy")
     separate = "an image of the same ground with the Sun on another side"
     parameters = (Parameter("error_deg", "degree", -10.0, 10.0, 0.0, "truth minus given, the same for all images"),)

@@ -20,7 +20,9 @@ class SunElevation(Effect):
         "A wrong time, a wrong latitude or a local frame that is not level raises or lowers the Sun in every image alike: "
         "all shading contrast and all shadow edges move together."
     )
-    reference = "Acton (1996), Planet. Space Sci. 44, 65 (ephemerides); Archinal et al. (2018), CMDA 130, 22 (body frames)"
+    reference = (
+        "Acton (1996), Planet. Space Sci. 44, 65 (ephemerides); Archinal et al. (2018), CMDA 130, 22 (body frames)"
+    )
     confused_with = ("penumbra", "dem_scale")
     separate = "an image of the same ground with the Sun at least 20 deg higher or lower"
     parameters = (Parameter("error_deg", "degree", -10.0, 10.0, 0.0, "truth minus given, the same for all images"),)

@@ -68,7 +68,9 @@ class Scene:
         key = hashlib.sha1(json.dumps(layout.__dict__, sort_keys=True).encode()).hexdigest()[:12]
         self.key = f"scene-{key}"
         rng = np.random.default_rng(layout.seed)
-        self.heights = [make_terrain(rng, self._fine(), layout.gsd / layout.sub, layout.slope_deg) for _ in range(layout.sites)]
+        self.heights = [
+            make_terrain(rng, self._fine(), layout.gsd / layout.sub, layout.slope_deg) for _ in range(layout.sites)
+        ]
         self.suns, self.views = self._geometry(rng)
         self._grounds: dict[int, Ground] = {}
         self._layers: dict[tuple, Any] = {}
@@ -94,9 +96,7 @@ class Scene:
             lay = self.layout
             first = (lay.margin - lay.border) * lay.sub
             count = (lay.size + 2 * lay.border) * lay.sub
-            self._grounds[site] = Ground(
-                self.heights[site], lay.gsd / lay.sub, first, count, 1000 * lay.seed + site
-            )
+            self._grounds[site] = Ground(self.heights[site], lay.gsd / lay.sub, first, count, 1000 * lay.seed + site)
         return self._grounds[site]
 
     def layer(self, kind: str, site: int, image: int, *extra):
@@ -236,7 +236,21 @@ class Scene:
         noise_rng = np.random.default_rng((seed, 6))  # the same noise with and without the effect
         dems = [self.given_dem(s, truth, rng) for s in range(lay.sites)]
         inner = slice(lay.margin, lay.margin + lay.size)
-        out: dict[str, list] = {k: [] for k in ("elevation", "image", "sun_horizon_deg", "detector_sample", "detector_line", "sun_direction_enu", "camera_position_enu", "image_index", "site", "split")}
+        out: dict[str, list] = {
+            k: []
+            for k in (
+                "elevation",
+                "image",
+                "sun_horizon_deg",
+                "detector_sample",
+                "detector_line",
+                "sun_direction_enu",
+                "camera_position_enu",
+                "image_index",
+                "site",
+                "split",
+            )
+        }
         frames = [self._frame(rng, truth) for _ in range(lay.images)]
         for site in range(lay.sites):
             for image in range(lay.images):
@@ -336,11 +350,11 @@ def _roughness(mu0, mu, cosg, theta_deg):
     """Hapke's (1984) roughness relative to a smooth Lommel-Seeliger surface; the published formula of the program."""
     import torch
     from stages.physics.geometry import Angles
-    from stages.physics.photometry.roughness import rough_cosines
+    from stages.physics.photometry.roughness import rough_surface
 
     angles = Angles(torch.as_tensor(mu0), torch.as_tensor(mu), torch.full_like(torch.as_tensor(mu0), cosg))
-    mu0e, mue, shadow = (t.numpy() for t in rough_cosines(angles, torch.tensor(np.radians(theta_deg))))
-    return shadow * mu0e / (mu0e + mue) * (mu0 + mu) / mu0
+    x, y, shadow = (t.numpy() for t in rough_surface(angles, torch.tensor(np.radians(theta_deg))))
+    return shadow * x * y / (x + y) * (mu0 + mu) / mu0
 
 
 @numba.njit(cache=True)
@@ -370,7 +384,9 @@ def given_horizon(dem: np.ndarray, gsd: float, azimuth: float) -> np.ndarray:
     return _march(dem, gsd, float(np.sin(azimuth)), float(-np.cos(azimuth)))
 
 
-def write_pairs(path: Path, data: dict[str, Any], layout: Layout, *, units: str = "iof", without: tuple[str, ...] = ()) -> Path:
+def write_pairs(
+    path: Path, data: dict[str, Any], layout: Layout, *, units: str = "iof", without: tuple[str, ...] = ()
+) -> Path:
     """pairs.h5 as a foreign program would write it: only what the schema asks for."""
     count = len(data["image"])
     frames = int(data["image_index"].max()) + 1

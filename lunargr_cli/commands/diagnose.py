@@ -1,0 +1,88 @@
+"""`lunargr diagnose PAIRS [CHECKPOINT]`: what the simulation gets wrong, why, and what fixing it is worth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import Json, Overwrite, Quiet, Seed
+
+NAME, ORDER = "diagnose", 80
+
+
+def command(
+    pairs: Annotated[Path | None, typer.Argument(help="Pairs from 'lunargr project'.")] = None,
+    checkpoint: Annotated[
+        Path | None, typer.Argument(help="Checkpoint from 'lunargr train'; without it --model is fitted.")
+    ] = None,
+    model: Annotated[
+        str, typer.Option("--model", help="Reflectance model to fit where there is no checkpoint.")
+    ] = "M2",
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="diagnosis.h5: the extended model for train, render, evaluate."),
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option("--report", metavar="FILE", help="One HTML file with pictures and evidence.")
+    ] = None,
+    list_effects: Annotated[bool, typer.Option("--list", help="Explain every effect and stop.")] = False,
+    most_causes: Annotated[int, typer.Option("--causes", help="Most causes to name.")] = 4,
+    most_pairs: Annotated[int, typer.Option("--pairs", help="Most pairs that the search uses.")] = 384,
+    seed: Seed = 0,
+    json_file: Json = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Name the physical causes of the difference between measured and simulated images."""
+    from lunargr_cli.console import Console
+    from schemas import ConfigError
+
+    console = Console(quiet)
+    if list_effects:
+        _list(console)
+        return
+    if pairs is None:
+        raise ConfigError("diagnose: expected a file of pairs, found none; give pairs.h5, or --list.")
+    from stages import diagnose
+    from stages.diagnose.answer import describe
+
+    config = diagnose.Config(model, most_causes, most_pairs=most_pairs, seed=seed)
+    result = diagnose.run(
+        pairs, checkpoint, config, output, json_file, report, overwrite, console.say, console.progress
+    )
+    answer = result.answer
+    rows = [
+        (
+            c.effect.name,
+            describe(c),
+            f"{c.p:.1e}",
+            f"{c.gain:.0f} +- {c.gain_error:.0f}",
+            f"{c.fid:.3f}",
+            ", ".join(g for g in c.group if g != c.effect.name) or "-",
+        )
+        for c in answer.causes
+    ]
+    if rows:
+        console.table(
+            "causes", ("effect", "parameters", "p (family)", "gain, nats", "size / noise", "equally good"), rows
+        )
+    if not quiet:
+        print(f"{answer.verdict}: {answer.sentence()}")
+        if answer.blind and answer.verdict != "cannot_tell":
+            print(f"These data could not show: {', '.join(answer.blind)}.")
+
+
+def _list(console) -> None:
+    from stages.effects import effect_names, get_effect
+
+    for name in effect_names():
+        effect = get_effect(name)
+        print(f"{name} ({effect.slot}, per {effect.scope}): {effect.title}")
+        print(f"  {effect.mechanism}")
+        for p in effect.parameters:
+            unit = "" if p.unit == "1" else f" {p.unit}"
+            print(f"  {p.name}: {p.description}; {p.lower:g} .. {p.upper:g}{unit}, null {p.default:g}")
+        print(f"  reference: {effect.reference}")
+        print(f"  confused with: {', '.join(effect.confused_with) or '-'}; told apart by {effect.separate}\n")
