@@ -43,6 +43,7 @@ bench: $(STAMP) ## speed and memory, each beside a named peer in the same run
 
 docs: $(STAMP) ## write the generated parts of docs/ again
 	$(BIN)/python examples/photometry_page.py
+	$(BIN)/python examples/file_list.py
 
 # --- the embedded scene --------------------------------------------------------------------------------------------
 
