@@ -23,6 +23,8 @@ from stages.physics.grid import Grid, sphere_crs
 SPECIAL = 3.4e38
 # 16-bit and 8-bit cubes keep their specials at the ends of the range.
 _SPECIAL_INT16 = (-32768, -32767, -32766, -32765, -32764)
+_SPECIAL_UINT16 = (0, 1, 2, 65534, 65535)
+_SPECIAL_UINT8 = (0, 255)
 
 Mask = NDArray[np.bool_]
 
@@ -66,6 +68,8 @@ def read_window(dataset: DatasetReader, window: Window, band: int = 1) -> NDArra
         invalid = invalid | ~np.isfinite(values) | (np.abs(values) >= SPECIAL)
     elif dataset.driver in ("ISIS3", "PDS", "PDS4", "VICAR") and values.dtype == np.int16:
         invalid = invalid | np.isin(values, _SPECIAL_INT16)
+    elif dataset.driver == "ISIS3" and values.dtype in (np.uint8, np.uint16):
+        invalid = invalid | np.isin(values, _SPECIAL_UINT8 if values.dtype == np.uint8 else _SPECIAL_UINT16)
     elif values.dtype == np.int16 and dataset.nodata is None:
         invalid = invalid | (values == -32768)
     scale, offset = dataset.scales[band - 1], dataset.offsets[band - 1]
