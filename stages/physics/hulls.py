@@ -90,10 +90,10 @@ def _find_tangents(hull, depth, s, heights, seen_s, seen_h):
     """What each line sees highest from row s: along a hull, going outwards, slopes rise and then fall."""
     for k in range(depth.size):
         p = depth[k] - 1
-        h = heights[k]
-        if p < 0 or h == NOTHING:
+        if p < 0:
             seen_s[k] = NOWHERE
             continue
+        h = heights[k] if heights[k] > NOTHING else hull[p, k, 1]  # beside missing ground: from about there
         rise, run = hull[p, k, 1] - h, s - hull[p, k, 0]
         while p > 0:
             next_rise, next_run = hull[p - 1, k, 1] - h, s - hull[p - 1, k, 0]
@@ -129,10 +129,18 @@ def _horizon_rows(
         if r >= 0:
             _could_be_seen(samples, r, visible)
             _push(hull, depth, np.float32(r), samples[r % RING], visible, chosen)
+        here_sink = sink(sinks, float(i))
         j0, j1 = max(0, first - whole[i]), min(columns, first + count - whole[i])
+        after = whole[min(i + 1, whole.size - 1)]
+        soon = min(columns, first + count - after) > max(0, first - after)
+        if r >= 0 and i % 2 == 0 and (j1 > j0 or soon):  # from 16 rows away, the next row sees the same points highest
+            _sample_lines(
+                z, z_row + z_step * i, whole[i], z_column, first, lines, columns, fraction[i], np.float32(here_sink),
+                observers,
+            )  # fmt: skip
+            _find_tangents(hull, depth, np.float32(i), observers, seen_s, seen_h)
         if j1 <= j0:
             continue
-        here_sink = sink(sinks, float(i))
         n = j1 - j0
         here = z[z_row + z_step * i, j0 - z_column : j1 - z_column]
         best = angle[:n]
@@ -171,9 +179,6 @@ def _horizon_rows(
         if r >= 0:
             f = fraction[i]
             c, row_i = np.float32(here_sink), np.float32(i)
-            _sample_lines(z, z_row + z_step * i, whole[i], z_column, first, lines, columns, f, c, observers)
-            if i % 2 == 0:  # from 16 rows away, the next row sees the same points highest
-                _find_tangents(hull, depth, row_i, observers, seen_s, seen_h)
             at = j0 + whole[i] - first
             for phase in range(SPACING):
                 # pixels whose left line is (at + phase) // SPACING, + 1 for every SPACING columns

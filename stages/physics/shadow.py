@@ -144,6 +144,42 @@ def _by_rows(
         )  # fmt: skip
 
 
+@numba.njit
+def _pack(shade, n, low, high, reverse, packed):
+    """Eight rows of flags side by side in one number, so that turning them back moves eight pixels at a time."""
+    for g in range(n // 8):
+        line = packed[g, low:high]
+        line[:] = 0
+        for q in range(8):
+            shift = np.uint64(8 * (7 - q) if reverse else 8 * q)
+            row = shade[8 * g + q, low:high]
+            for k in range(high - low):
+                line[k] |= np.uint64(row[k]) << shift
+
+
+@numba.njit
+def _unpack_column(packed, g, j, target):
+    p = packed[g, j]
+    for q in range(8):
+        target[q] = np.uint8((p >> np.uint64(8 * q)) & np.uint64(255))
+
+
+@numba.njit
+def _turn_back(shade, packed, j0, out, column, step, begin, end, whole, first, count, low, high):
+    """out[j, column + step * i] = shade[i - begin, j - j0] wherever pixel (i, j) belongs to the strip of lines."""
+    n = end - begin
+    _pack(shade, n, low - j0, high - j0, step < 0, packed)
+    for j in range(low, high):
+        if not (first <= j + whole[begin] < first + count and first <= j + whole[end - 1] < first + count):
+            transpose_out(shade, j0, out, column, step, begin, end, whole, first, count, j, j + 1)
+            continue
+        for g in range(n // 8):
+            at = column + step * (begin + 8 * g)
+            _unpack_column(packed, g, j - j0, out[j, at : at + 8] if step > 0 else out[j, at - 7 : at + 1])
+        for i in range(begin + n // 8 * 8, end):
+            out[j, column + step * i] = shade[i - begin, j - j0]
+
+
 def _by_columns(
     z, z_column, z_step, out, out_column, out_step, start, stop, columns, first_line, line_count, state,
     whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, drop, shear, sinks,
@@ -159,6 +195,7 @@ def _by_columns(
         pitch = count + BLOCK + 3 * margin + 24
         rows = np.empty((BLOCK + margin, pitch), dtype=np.float32)
         shade = np.empty((BLOCK, pitch), dtype=np.bool_)
+        packed = np.empty((BLOCK // 8, pitch), dtype=np.uint64)
         for begin in range(start, stop, BLOCK):
             end = min(begin + BLOCK, stop)
             from_row = max(begin - margin, 0)
@@ -177,8 +214,8 @@ def _by_columns(
                 whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, drop,
                 shear, sinks, top, limit,
             )  # fmt: skip
-            transpose_out(
-                shade, j0, out, out_column, out_step, begin, end, whole, first, count,
+            _turn_back(
+                shade, packed, j0, out, out_column, out_step, begin, end, whole, first, count,
                 max(j0, first - high), min(j1, first + count - low),
             )  # fmt: skip
 
@@ -219,8 +256,9 @@ def sweep_shadow(
     parallel = grid.size > SMALL
     state = _state(sweep, (LINES_TURNED if sweep.by_columns else LINES) if parallel else sweep.line_count)
     origin, step = (sweep.rows - 1, -1) if sweep.reverse else (0, 1)
+    target = out.view(np.uint8) if sweep.by_columns else out
     _KERNELS[sweep.by_columns, parallel](
-        grid, origin, step, out, origin, step, 0, sweep.rows, sweep.columns, sweep.first_line, sweep.line_count, state,
+        grid, origin, step, target, origin, step, 0, sweep.rows, sweep.columns, sweep.first_line, sweep.line_count, state,
         *tables,
     )  # fmt: skip
     return out
@@ -244,7 +282,7 @@ def sweep_shadow_bands(
         out = np.empty((shape[0], stop - start) if sweep.by_columns else (stop - start, shape[1]), dtype=np.bool_)
         z_row, out_row, step = (stop - 1, stop - 1, -1) if sweep.reverse else (-before, -start, 1)
         _KERNELS[sweep.by_columns, z.size > SMALL](
-            z, z_row, step, out, out_row, step, start, stop, sweep.columns, sweep.first_line, sweep.line_count, state,
+            z, z_row, step, out.view(np.uint8) if sweep.by_columns else out, out_row, step, start, stop, sweep.columns, sweep.first_line, sweep.line_count, state,
             *tables,
         )  # fmt: skip
         yield (slice(0, shape[0]), inner, out) if sweep.by_columns else (inner, slice(0, shape[1]), out)
