@@ -150,10 +150,10 @@ def write_geotiff(
 class Preview:
     """A picture of at most ``limit`` pixels a side, gathered from rows as they come (means of whole pixels)."""
 
-    def __init__(self, height: int, width: int, limit: int = 4096) -> None:
+    def __init__(self, height: int, width: int, limit: int = 3072) -> None:
         self.factor = max(1, -(-max(height, width) // limit))
         self._shape = (-(-height // self.factor), -(-width // self.factor))
-        self._sum = np.zeros(self._shape)
+        self._sum = np.zeros(self._shape, np.float32)
         self._count = np.zeros(self._shape, np.int32)
         self._row = 0
 
@@ -170,7 +170,7 @@ class Preview:
     def image(self) -> Floats32:
         """(h, w) float32, NaN where nothing was seen."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            return (self._sum / self._count).astype(np.float32)
+            return self._sum / self._count.astype(np.float32)
 
 
 def stretch(
@@ -180,24 +180,29 @@ def stretch(
 
     White is the 99.5th percentile, black a little under the 0.2th (0 where there are shadows), with display gamma.
     """
-    known = image[np.isfinite(image)]
     if limits is None:
+        every = max(1, image.size // 2_000_000)
+        known = image.ravel()[::every]
+        known = known[np.isfinite(known)]
         if known.size == 0:
             limits = (0.0, 1.0)
         else:
-            low, high = (float(v) for v in np.percentile(known[:: max(1, known.size // 2_000_000)], (0.2, 99.5)))
+            low, high = (float(v) for v in np.percentile(known, (0.2, 99.5)))
             low = min(0.9 * low, low)
             limits = (low, max(1.05 * high - 0.05 * low, low + 1e-6))
     low, high = limits
-    scaled = np.clip((np.nan_to_num(image, nan=low) - low) / (high - low), 0.0, 1.0) ** (1.0 / DISPLAY_GAMMA)
-    return np.round(255.0 * scaled).astype(np.uint8), limits
+    grey = np.empty(image.shape, np.uint8)
+    for row in range(0, len(image), 256):  # a preview may have millions of pixels, and each needs several floats
+        scaled = np.clip((np.nan_to_num(image[row : row + 256], nan=low) - low) / (high - low), 0.0, 1.0)
+        grey[row : row + 256] = np.round(255.0 * scaled ** (1.0 / DISPLAY_GAMMA))
+    return grey, limits
 
 
 def write_png(path: Path, image: Floats32, limits: tuple[float, float] | None = None) -> tuple[float, float]:
     """A stretched 8-bit preview, transparent (and black beneath) where ``image`` is NaN; returns the limits used."""
     grey, limits = stretch(image, limits)
-    known = np.isfinite(image)
-    pixels = np.stack([np.where(known, grey, 0), np.where(known, 255, 0)], axis=-1).astype(np.uint8)
+    alpha = np.isfinite(image).astype(np.uint8)
+    pixels = np.stack([grey * alpha, alpha * np.uint8(255)], axis=-1)
     height, width = image.shape
     with atomic_path(path) as partial:
         spec = oiio.ImageSpec(width, height, 2, oiio.UINT8)

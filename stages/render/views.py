@@ -115,7 +115,7 @@ def render_camera(
     if any(effect.slot == "sensor" for effect in light.extensions):  # these need the whole image
         bands = [_whole(bands, light, scene.grid)]
     named = {path.suffix.lower(): path for path in files}
-    preview, tally, done, ground = Preview(camera.lines, camera.samples), Tally(), 0, False
+    preview, tally, done, ground = Preview(camera.lines, camera.samples, 8192), Tally(), 0, False
     with contextlib.ExitStack() as stack:
         exr = None
         if ".exr" in named:
