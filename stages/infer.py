@@ -6,26 +6,23 @@ inner part is then exactly what one pass over the whole map would give: no squar
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
-import rasterio
-import rasterio.shutil
 import torch
 from numpy.typing import NDArray
-from rasterio.windows import Window
 
 from schemas import SCENE, SVBRDF, ArtefactError, ArtefactWriter, ConfigError, atomic_path, check_output, open_artefact
 from schemas.hdf5 import silence_hdf5
 from stages.network.normalisation import FILL_REACH, fill_holes
 from stages.network.predictor import Predictor, choose_device, load_predictor
 from stages.network.runtime import keep_freed_memory
+from stages.physics.geotiff import write_geotiff
 from stages.physics.grid import Grid, read_grid
 
 Progress = Callable[[int, int, str], None]
@@ -113,7 +110,7 @@ def run(
             share, ranges = _statistics(writer.file, names)
             if whole:
                 with atomic_path(tiff) as partial:
-                    write_geotiff(partial, writer.file, grid, names, attributes)
+                    write_geotiff(partial, writer.file, grid)
     return Summary(grid, predictor.model.name, share, windows, ranges)
 
 
@@ -285,37 +282,6 @@ def _statistics(file: h5py.File, names: list[str]) -> tuple[float, dict[str, tup
         else:
             ranges[name] = (math.nan, math.nan, math.nan, math.nan)
     return share, ranges
-
-
-def _strips(height: int, rows: int = 512) -> Iterator[tuple[int, int]]:
-    for first in range(0, height, rows):
-        yield first, min(height, first + rows)
-
-
-def write_geotiff(path: Path, file: h5py.File, grid: Grid, names: list[str], attributes: dict[str, Any]) -> None:
-    """The maps as a cloud-optimised GeoTIFF: one band per coefficient, named; nodata NaN; model and quantity as tags."""
-    plain = path.with_name(path.name + ".plain.tif")
-    profile = {
-        "driver": "GTiff", "height": grid.height, "width": grid.width, "count": len(names), "dtype": "float32", "crs": grid.crs,
-        "transform": grid.transform, "nodata": math.nan, "tiled": True, "blockxsize": 256, "blockysize": 256, "BIGTIFF": "IF_SAFER",
-    }  # fmt: skip
-    try:
-        with rasterio.open(plain, "w", **profile) as out:
-            for first, last in _strips(grid.height):
-                window = Window(0, first, grid.width, last - first)
-                out.write(file["coefficients"][:, first:last], window=window)
-            for k, name in enumerate(names, start=1):
-                out.set_band_description(k, name)
-            tags = {key: value for key, value in attributes.items()} | {
-                "coefficients": json.dumps(names),
-                "software": "lunargr",
-            }
-            out.update_tags(**{key: str(value) for key, value in tags.items()})
-        rasterio.shutil.copy(
-            plain, path, driver="COG", compress="DEFLATE", predictor="3", blocksize="256", overview_resampling="average"
-        )
-    finally:
-        plain.unlink(missing_ok=True)
 
 
 def open_terrain(path: Path) -> bool:

@@ -11,7 +11,20 @@ from typing import Any
 import h5py
 import numpy as np
 
-from schemas import ArtefactError, ArtefactWriter, Schema, open_artefact, read_config, read_kind
+from schemas import (
+    ArtefactError,
+    ArtefactWriter,
+    Schema,
+    atomic_path,
+    check_output,
+    open_artefact,
+    read_config,
+    read_kind,
+    read_strings,
+)
+from stages.physics.frames import relative_path
+from stages.physics.geotiff import write_geotiff
+from stages.physics.grid import read_grid
 
 Progress = Callable[[int, int, str], None]
 
@@ -19,6 +32,10 @@ Progress = Callable[[int, int, str], None]
 RECORD = {"scene": "frame", "crops": "pair", "pairs": "pair", "evaluation": "pair"}
 MAPS = ("svbrdf",)
 # Root attributes that may differ between the parts of one whole.
+PATHS = ("path", "camera")
+STANDARD = {
+    "Conventions", "title", "lunargr_schema", "schema_version", "lunargr_version", "history", "config", "inputs", "seed",
+}  # fmt: skip
 _OWN = {"history", "inputs", "config", "lunargr_version", "metrics"}
 
 
@@ -29,6 +46,8 @@ def run(parts: Sequence[Path], output: Path, overwrite: bool = False, progress: 
         raise ArtefactError(
             f"{parts[0]}: a '{schema.name}' has no parts to merge; parts are: {', '.join((*RECORD, *MAPS))}."
         )
+    if schema.name in MAPS:
+        check_output(output.with_suffix(".tif"), parts, overwrite)
     with contextlib.ExitStack() as stack:
         files = [stack.enter_context(open_artefact(p, schema)) for p in parts]
         order = sorted(range(len(files)), key=lambda k: _shard(files[k])[0])
@@ -37,7 +56,9 @@ def run(parts: Sequence[Path], output: Path, overwrite: bool = False, progress: 
         _check_alike(parts, files)
         record = RECORD.get(schema.name)
         sizes = _sizes(schema, files, record)
-        attributes = {k: v for k, v in files[0].attrs.items() if k not in _standard(files[0])}
+        attributes = {k: v for k, v in files[0].attrs.items() if k not in STANDARD}
+        if "scene" in attributes:
+            attributes["scene"] = _moved(str(attributes["scene"]), parts[0], output)
         config = read_config(files[0]) | {"shard": [0, 1]}
         seed = int(files[0].attrs.get("seed", -1))
         with ArtefactWriter(
@@ -65,25 +86,33 @@ def run(parts: Sequence[Path], output: Path, overwrite: bool = False, progress: 
                     _concatenate(files, name, target, dims.index(record))
                 elif schema.name in MAPS and dims[-2:] == ("y", "x"):
                     _overlay(files, name, target)
+                elif name in PATHS:
+                    target[...] = np.array(
+                        [_moved(v, parts[0], output) for v in read_strings(files[0], name)], dtype=object
+                    )
                 elif target.shape == () or 0 not in target.shape:
                     target[...] = files[0][name][...]
+            if "path" in names and record == "frame":
+                _move_paths(files, parts, writer.file, output)
+            if schema.name in MAPS:
+                with atomic_path(output.with_suffix(".tif")) as partial:
+                    write_geotiff(partial, writer.file, read_grid(writer.file, output))
             if progress:
                 progress(len(names), len(names), "merging")
     return schema
 
 
-def _standard(file: h5py.File) -> set[str]:
-    return {
-        "Conventions",
-        "title",
-        "lunargr_schema",
-        "schema_version",
-        "lunargr_version",
-        "history",
-        "config",
-        "inputs",
-        "seed",
-    }
+def _moved(path: str, part: Path, output: Path) -> str:
+    """A path that was relative to a part, relative to the output."""
+    return relative_path(part.resolve().parent / path, output.resolve().parent) if path else ""
+
+
+def _move_paths(files: Sequence[h5py.File], parts: Sequence[Path], merged: h5py.File, output: Path) -> None:
+    for name in PATHS:
+        moved = [
+            _moved(v, part, output) for file, part in zip(files, parts, strict=True) for v in read_strings(file, name)
+        ]
+        merged[name][...] = np.array(moved, dtype=object)
 
 
 def _shard(file: h5py.File) -> tuple[int, int]:

@@ -133,6 +133,8 @@ def test_shards_make_the_same_map(small_artefacts, checkpoint, reference, tmp_pa
         )
         assert not parts[-1].with_suffix(".tif").exists()
     merge.run([parts[1], parts[2], parts[0]], tmp_path / "whole.h5")
+    with rasterio.open(tmp_path / "whole.tif") as tiff:
+        np.testing.assert_allclose(tiff.read(), reference[0], rtol=2e-3, atol=2e-5)
     with h5py.File(tmp_path / "whole.h5") as file:
         np.testing.assert_allclose(file["coefficients"][...], reference[0], rtol=2e-3, atol=2e-5)
         np.testing.assert_array_equal(file["valid"][...].astype(bool), reference[1])

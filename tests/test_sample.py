@@ -113,8 +113,12 @@ def test_shards_make_one_whole(small_artefacts, tmp_path):
     for k in range(3):
         parts.append(tmp_path / f"part{k}.h5")
         sample.run(small_artefacts["scene"], parts[-1], sample.Config(**config, shard=(k, 3)))
-    merge.run([parts[2], parts[0], parts[1]], tmp_path / "merged.h5")
-    with h5py.File(whole) as a, h5py.File(tmp_path / "merged.h5") as b:
+    merged = tmp_path / "elsewhere" / "merged.h5"
+    merge.run([parts[2], parts[0], parts[1]], merged)
+    with h5py.File(whole) as a, h5py.File(merged) as b:
+        assert (merged.parent / b.attrs["scene"]).resolve() == small_artefacts["scene"].resolve()
+        for path in b["path"].asstr():
+            assert (merged.parent / path).exists()
         for name in a:
             if a[name].dtype.kind != "O":
                 np.testing.assert_array_equal(a[name][...], b[name][...], err_msg=name)
