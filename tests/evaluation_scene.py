@@ -34,6 +34,10 @@ class Scene:
     noise: float
     frame_names: list[str] = field(default_factory=list)
 
+    @property
+    def site(self) -> np.ndarray:
+        return np.arange(len(self.tile))
+
     def observation(self, indices) -> Observation:
         pick = np.asarray(indices)
         return Observation(

@@ -229,3 +229,13 @@ def test_shared_illumination_gives_what_the_formation_chain_gives(scene):
     expected = form(observation, model, values)
     assert torch.equal(shade(illuminate(observation), model, values), expected)
     assert (expected == 0).any() and (expected > 0).any()
+
+
+def test_a_single_tile_gives_flagged_intervals_over_its_sites(scene):
+    import dataclasses
+
+    result, *_ = _evaluate(dataclasses.replace(scene, tile=np.zeros_like(scene.tile)))
+    row = result["models"]["learned"]
+    assert result["tiles"] == 1 and result["bootstrap_unit"] == "site"
+    assert row["mse_low"] < row["mse"] < row["mse_high"]
+    assert any("too narrow" in w for w in result["warnings"])

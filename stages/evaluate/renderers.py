@@ -21,6 +21,7 @@ class Reader(Protocol):
 
     split: np.ndarray
     tile: np.ndarray
+    site: np.ndarray
     frame: np.ndarray
 
     def observation(self, indices: np.ndarray) -> Observation: ...

@@ -163,6 +163,9 @@ def evaluate_pairs(
     if not scores.pixels.any():
         raise ArtefactError(f"split '{config.split}': expected valid pixels, found none; project the pairs again.")
     tile = np.asarray(reader.tile)[wanted]
+    unit = "tile"
+    if len(np.unique(tile)) == 1:  # better a flagged interval over crop sites than none
+        unit, tile = "site", np.asarray(reader.site)[wanted]
     bootstrap = TileBootstrap(tile, config.bootstrap, config.seed)
     frames = np.asarray(reader.frame)
     result = {
@@ -172,7 +175,8 @@ def evaluate_pairs(
         "titles": {row.name: TITLES[row.name] for row in rows},
         "pairs": len(wanted),
         "valid_pixels": int(scores.pixels.sum()),
-        "tiles": bootstrap.tiles,
+        "tiles": len(np.unique(np.asarray(reader.tile)[wanted])),
+        "bootstrap_unit": unit,
         "bootstrap": config.bootstrap,
         "image_units": units,
         "dn_full_range": None if calibrated else scale,
@@ -180,7 +184,7 @@ def evaluate_pairs(
         "fitted_on_pairs": len(train),
         "frames_fitted_on_split": sorted({frame_names[f] for f in frames[orphans]}),
         "lpips_unavailable": None if perceptual.available else perceptual.reason,
-        "warnings": _warnings(bootstrap, frames, orphans),
+        "warnings": _warnings(bootstrap, unit, frames, orphans),
     }
     return result, rows, scores, scale
 
@@ -197,10 +201,12 @@ def dn_scale(reader: Reader, indices: np.ndarray, size: int) -> float:
     return full_scale(largest)
 
 
-def _warnings(bootstrap: TileBootstrap, frames: np.ndarray, orphans: np.ndarray) -> list[str]:
+def _warnings(bootstrap: TileBootstrap, unit: str, frames: np.ndarray, orphans: np.ndarray) -> list[str]:
     found = []
     if not bootstrap.enough:
-        found.append("one ground tile: there is nothing to resample, so no interval is given")
+        found.append("one site on one ground tile: there is nothing to resample, so no interval is given")
+    elif unit == "site":
+        found.append("one ground tile: the intervals resample the sites within it and are too narrow")
     elif bootstrap.tiles < MANY_TILES:
         found.append(f"only {bootstrap.tiles} ground tiles: the intervals are too narrow")
     if len(orphans):

@@ -11,6 +11,7 @@ import numpy as np
 from stages.report import page, pictures
 
 COLOURS = {"learned": "#3b8ecb", "global": "#4f9d69", "lunar_lambert": "#c08a2e", "hapke": "#c25b63"}
+UNITS = {"tile": "ground tiles", "site": "the sites of one ground tile"}
 FAIREST = "hapke_gain_offset"
 
 
@@ -72,7 +73,7 @@ def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
     section.add(
         page.paragraph(
             f"{result['pairs']:,} crops of the split '{result['split']}' on {result['tiles']} ground tiles; errors in {unit}. "
-            "Intervals come from resampling ground tiles."
+            f"Intervals come from resampling {UNITS.get(result.get('bootstrap_unit', 'tile'))}."
         ),
         page.table("Lowest MSE in bold", header, rows, best),
         page.chart(_errors(result), "Root mean squared error with 95 % intervals"),
