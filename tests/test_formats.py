@@ -250,3 +250,59 @@ def test_grids_of_any_body_come_back(projection, radius, rng):
     np.testing.assert_allclose(back_lat, lat, atol=1e-9)
     np.testing.assert_allclose(grid.rowcol_of_lonlat(lon + 360, lat), [row, col], atol=1e-6)
     np.testing.assert_allclose(grid.rowcol_of_lonlat(lon - 360, lat), [row, col], atol=1e-6)
+
+
+# --- planetographic latitudes ---------------------------------------------------------------------------------------
+
+MARS = (3396190.0, 3376200.0)
+
+
+def planetographic(latitude_deg):
+    """Of a planetocentric latitude on Mars' ellipsoid."""
+    return np.degrees(np.arctan(np.tan(np.radians(latitude_deg)) * (MARS[0] / MARS[1]) ** 2))
+
+
+@pytest.mark.parametrize("kind", ["longlat", "stere"])
+def test_planetographic_rasters_meet_planetocentric_grids(tmp_path, kind):
+    """A raster whose pixels hold their own planetographic latitude, read on a grid on the sphere."""
+    figure = f"+a={MARS[0]} +b={MARS[1]} +no_defs"
+    if kind == "longlat":
+        crs, step, x0, y0 = CRS.from_proj4(f"+proj=longlat {figure}"), 0.002, 9.8, 45.6
+    else:
+        crs, step, x0, y0 = (
+            CRS.from_proj4(f"+proj=stere +lat_0=45.3 +lon_0=10 {figure} +units=m"),
+            120.0,
+            -15000.0,
+            15000.0,
+        )
+    n = 250
+    move = Affine(step, 0, x0, 0, -step, y0)
+    own = Grid(crs.to_wkt(), move, n, n, MARS[0])
+    rows, cols = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    lon, ocentric = own.lonlat(rows, cols)
+    if kind == "longlat":
+        np.testing.assert_allclose(planetographic(ocentric), y0 - (rows + 0.5) * step, atol=1e-9)
+    array = (planetographic(ocentric) - 45).astype(np.float32)
+    profile = {
+        "driver": "GTiff",
+        "height": n,
+        "width": n,
+        "count": 1,
+        "dtype": "float32",
+        "crs": crs,
+        "transform": move,
+    }
+    with rasterio.open(tmp_path / "a.tif", "w", **profile) as out:
+        out.write(array, 1)
+    sphere = CRS.from_proj4(f"+proj=stere +lat_0=45 +lon_0=10 +R={MARS[0]} +units=m +no_defs")
+    grid = Grid(sphere.to_wkt(), Affine(200, 0, -3000, 0, -200, 3000), 30, 30, MARS[0])
+    with rasters.open_raster(tmp_path / "a.tif") as dataset:
+        values, valid = rasters.warp(dataset, grid, rasterio.warp.Resampling.bilinear)
+        size = rasters.pixel_size(dataset, MARS[0], 10.0, 45.0)
+    assert valid.all()
+    _, latitude = grid.lonlat(*np.meshgrid(np.arange(30), np.arange(30), indexing="ij"))
+    # to a tenth of a pixel of the raster; without the conversion it would be 20 km
+    np.testing.assert_allclose(values + 45, planetographic(latitude), atol=2e-4)
+    assert size == (pytest.approx(85 if kind == "longlat" else 120, rel=0.03), pytest.approx(120, rel=0.03))
+    back = own.rowcol_of_lonlat(lon, ocentric)
+    np.testing.assert_allclose(back, [rows, cols], atol=1e-5)

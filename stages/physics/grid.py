@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import h5py
 import numpy as np
@@ -24,6 +24,7 @@ from stages.physics.bodies import Body
 GDAL_CENTRE = 0.5  # GDAL's coordinate of the centre of the first pixel
 CSM_CENTRE = 0.5
 ISIS_CENTRE = 1.0
+_ELLIPSOID = re.compile(r"(?:SPHEROID|ELLIPSOID)\[\"[^\"]*\",\s*([0-9.eE+]+),\s*([0-9.eE+]+)")
 
 Floats = NDArray[np.float64]
 
@@ -44,6 +45,13 @@ class Grid:
     @cached_property
     def crs(self) -> CRS:
         return CRS.from_wkt(self.crs_wkt)
+
+    @cached_property
+    def _geographic(self) -> CRS:
+        """Longitude and latitude of the kind that ``crs`` itself counts in."""
+        if latitude_squash(self.crs) == 1.0:
+            return sphere_crs(self.radius)
+        return CRS.from_proj4(f"+proj=longlat {ellipsoid_of(self.crs)} +no_defs")
 
     @property
     def gsd(self) -> float:
@@ -67,15 +75,25 @@ class Grid:
 
     def lonlat(self, row: ArrayLike, col: ArrayLike) -> tuple[Floats, Floats]:
         """East longitude and planetocentric latitude, degrees."""
-        x, y = np.broadcast_arrays(*self.xy(row, col))
-        lon, lat = rasterio.warp.transform(self.crs, sphere_crs(self.radius), x.ravel(), y.ravel())
+        return self.map_lonlat(*self.xy(row, col))
+
+    def map_lonlat(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
+        """East longitude and planetocentric latitude, degrees, of map coordinates."""
+        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        lon, lat = rasterio.warp.transform(self.crs, self._geographic, x.ravel(), y.ravel())
+        lat = _scaled_tangent(np.asarray(lat), latitude_squash(self.crs))
         return np.reshape(lon, x.shape), np.reshape(lat, x.shape)
 
     def rowcol_of_lonlat(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
         """(row, col), fractional, of places given in degrees."""
+        return self.rowcol(*self.map_xy(longitude_deg, latitude_deg))
+
+    def map_xy(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
+        """Map coordinates of places given in degrees."""
         lon, lat = np.broadcast_arrays(np.asarray(longitude_deg, float), np.asarray(latitude_deg, float))
-        x, y = rasterio.warp.transform(sphere_crs(self.radius), self.crs, lon.ravel(), lat.ravel())
-        return self.rowcol(np.reshape(x, lon.shape), np.reshape(y, lon.shape))
+        lat_own = _scaled_tangent(lat.ravel(), 1 / latitude_squash(self.crs))
+        x, y = rasterio.warp.transform(self._geographic, self.crs, lon.ravel(), lat_own)
+        return np.reshape(x, lon.shape), np.reshape(y, lon.shape)
 
     def window(self, row: int, col: int, height: int, width: int) -> Grid:
         """The grid of array[row : row + height, col : col + width]."""
@@ -154,6 +172,36 @@ def crs_radius(crs: CRS) -> float | None:
     """Equatorial radius of a CRS's ellipsoid in metres, None where it names none."""
     match = re.search(r"(?:SPHEROID|ELLIPSOID)\[\"[^\"]*\",\s*([0-9.eE+]+)", crs.to_wkt())
     return float(match.group(1)) if match else None
+
+
+def latitude_squash(crs: CRS) -> float:
+    """tan(planetocentric) / tan(planetographic latitude), (b/a)^2: 1 for spheres and where the CRS says 'ocentric'.
+
+    PROJ leaves latitudes as they are between an ellipsoid and a sphere, which on Mars is 20 km in the middle latitudes.
+    """
+    return _squash(crs.to_wkt())
+
+
+@lru_cache(maxsize=256)
+def _squash(wkt: str) -> float:
+    match = _ELLIPSOID.search(wkt)
+    inverse = float(match.group(2)) if match else 0.0
+    return 1.0 if inverse == 0 or "ocentric" in wkt.lower() else (1 - 1 / inverse) ** 2
+
+
+def ellipsoid_of(crs: CRS) -> str:
+    """A CRS's ellipsoid as PROJ parameters."""
+    match = _ELLIPSOID.search(crs.to_wkt())
+    if match is None:
+        return ""
+    return f"+a={match.group(1)} +rf={match.group(2)}" if float(match.group(2)) else f"+R={match.group(1)}"
+
+
+def _scaled_tangent(latitude_deg: Floats, factor: float) -> Floats:
+    if factor == 1.0:
+        return latitude_deg
+    latitude = np.radians(latitude_deg)
+    return np.degrees(np.arctan2(factor * np.sin(latitude), np.cos(latitude)))
 
 
 def check_body(where: str, crs: CRS, body: Body) -> None:

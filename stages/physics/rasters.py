@@ -6,18 +6,21 @@ import contextlib
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rasterio
 import rasterio.warp
 from numpy.typing import NDArray
+from rasterio.crs import CRS
 from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
 from rasterio.io import DatasetReader
+from rasterio.transform import Affine
 from rasterio.warp import Resampling
 from rasterio.windows import Window
 
 from schemas.errors import InputError
-from stages.physics.grid import Grid, sphere_crs
+from stages.physics.grid import Grid, ellipsoid_of, latitude_squash
 
 # ISIS special pixels of 32-bit cubes (NULL, LRS, LIS, HIS, HRS) all lie beyond this; so do -3.4028e38 in its spellings.
 SPECIAL = 3.4e38
@@ -105,8 +108,12 @@ def transform_points(grid: Grid, dataset: DatasetReader, x: NDArray, y: NDArray)
 
     A geographic raster may count longitudes 0..360 or -180..180: the points follow the raster's own domain.
     """
-    tx, ty = rasterio.warp.transform(grid.crs, dataset.crs, x, y)
-    tx, ty = np.asarray(tx), np.asarray(ty)
+    if latitude_squash(grid.crs) == latitude_squash(dataset.crs):
+        tx, ty = rasterio.warp.transform(grid.crs, dataset.crs, x, y)
+        tx, ty = np.asarray(tx), np.asarray(ty)
+    else:
+        own = Grid(dataset.crs.to_wkt(), Affine.identity(), dataset.height, dataset.width, grid.radius)
+        tx, ty = own.map_xy(*grid.map_lonlat(x, y))
     if dataset.crs.is_geographic:
         left = min(dataset.bounds.left, dataset.bounds.right)
         tx = (tx - left) % 360.0 + left
@@ -136,7 +143,7 @@ def warp(dataset: DatasetReader, grid: Grid, resampling: Resampling, band: int =
         "dst_transform": grid.transform,
         "dst_crs": grid.crs,
         "tolerance": 0,
-    }
+    } | _latitudes(dataset, grid)
     rasterio.warp.reproject(
         (source - base).astype(np.float32),
         values,
@@ -155,6 +162,33 @@ def warp(dataset: DatasetReader, grid: Grid, resampling: Resampling, band: int =
     return values, valid
 
 
+def _latitudes(dataset: DatasetReader, grid: Grid) -> dict[str, Any]:
+    """What GDAL must be told where raster and grid count latitudes in different ways: see latitude_squash."""
+    if latitude_squash(dataset.crs) == latitude_squash(grid.crs):
+        return {}
+    steps = []
+    for crs, inverse in ((dataset.crs, True), (grid.crs, False)):
+        figure = ellipsoid_of(crs)
+        geocentric = f"+step {'' if inverse else '+inv '}+proj=geoc {figure}"
+        if crs.is_geographic:
+            units = ("deg", "rad") if inverse else ("rad", "deg")
+            projection = f"+step +proj=unitconvert +xy_in={units[0]} +xy_out={units[1]}"
+        else:
+            projection = f"+step {'+inv ' if inverse else ''}{_plain(crs.to_proj4())}"
+        pair = [projection, geocentric] if latitude_squash(crs) != 1.0 else [projection]
+        steps += pair if inverse else pair[::-1]
+    # CRSs from PROJ strings count east first, as the pipeline does; those from files may not
+    return {
+        "src_crs": CRS.from_proj4(dataset.crs.to_proj4()),
+        "dst_crs": CRS.from_proj4(grid.crs.to_proj4()),
+        "COORDINATE_OPERATION": " ".join(["+proj=pipeline", *steps]),
+    }
+
+
+def _plain(proj4: str) -> str:
+    return " ".join(word for word in proj4.split() if not word.startswith(("+no_defs", "+type", "+wktext")))
+
+
 def choose_resampling(dataset: DatasetReader, grid: Grid) -> tuple[Resampling, float]:
     """Area mean when coarsening, cubic otherwise; and the raster's own pixel size at the grid's centre, m."""
     size = pixel_size(dataset, grid.radius, *(np.ravel(v)[0] for v in grid.lonlat(grid.height / 2, grid.width / 2)))
@@ -163,7 +197,8 @@ def choose_resampling(dataset: DatasetReader, grid: Grid) -> tuple[Resampling, f
 
 def pixel_size(dataset: DatasetReader, radius: float, longitude_deg: float, latitude_deg: float) -> tuple[float, float]:
     """True size in metres of a raster's pixel (along columns, along rows) at a place on the body."""
-    x, y = rasterio.warp.transform(sphere_crs(radius), dataset.crs, [longitude_deg], [latitude_deg])
+    own = Grid(dataset.crs.to_wkt(), dataset.transform, dataset.height, dataset.width, radius)
+    x, y = own.map_xy(np.array([longitude_deg]), np.array([latitude_deg]))
     u, v = ~dataset.transform @ (x[0], y[0])
     return pixel_size_at(dataset, radius, v, u)
 
