@@ -113,3 +113,30 @@ def test_bad_input_is_one_line_and_leaves_nothing(trained, tmp_path, case):
     code, message = run_command(*arguments)
     assert code == 3 and message and "\n" not in message
     assert {p: p.stat().st_size for p in (*tmp_path.iterdir(), *trained.iterdir())} == before
+
+
+def test_extend_scores_the_extended_model_in_further_rows(tmp_path):
+    """A planted dark bias is what --extend takes away: the extended model's error falls back to that without bias."""
+    from schemas import DIAGNOSIS, ArtefactWriter
+    from stages.effects import Survey
+
+    bias = 0.02
+    scene = make_scene(np.random.default_rng(6), pairs=24)
+    write_pairs(tmp_path / "clean.h5", scene)
+    config = train.Config(epochs=2, batch=8, widths=(4, 8), dropout=(0.0, 0.0), device="cpu", precision="fp32")
+    train.run(tmp_path / "clean.h5", tmp_path / "checkpoint.h5", config)
+    scene.images += np.float32(bias)
+    write_pairs(tmp_path / "biased.h5", scene)
+    effect = {"effect": "dark_bias", "values": {"iof": bias}, "tables": {}, "survey": Survey().to_json()}
+    content = {"report": "{}", "extension": json.dumps([effect])}
+    with ArtefactWriter(tmp_path / "diagnosis.h5", DIAGNOSIS, {"frame": 4}, attributes=content, seed=0) as out:
+        out.write("image_id", scene.frame_names)
+    found = {}
+    for name, more in (("clean", ()), ("biased", ("--extend", tmp_path / "diagnosis.h5"))):
+        files = (tmp_path / f"{name}.h5", tmp_path / "checkpoint.h5", "-o", tmp_path / f"{name}_evaluation.h5")
+        assert run_command("evaluate", *files, *more, "--device", "cpu", "-q")[0] == 0
+        found[name] = json.loads((tmp_path / f"{name}_evaluation.json").read_text())["models"]
+    clean, biased = found["clean"], found["biased"]
+    assert biased["learned_extended"]["mse"] == pytest.approx(clean["learned"]["mse"], rel=1e-3)
+    assert biased["learned"]["mse"] > 3 * biased["learned_extended"]["mse"]
+    assert {"learned_extended_gain_offset", "global_extended"} <= set(biased) - set(clean)

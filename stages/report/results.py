@@ -235,7 +235,8 @@ VERDICTS = {
 def diagnosis(result: dict[str, Any]) -> page.Section:
     """What the simulation still gets wrong."""
     section = page.Section("Diagnosis")
-    section.add(page.paragraph(VERDICTS.get(result["verdict"], result["verdict"])))
+    known = result.get("verdict", "")
+    section.add(page.paragraph(VERDICTS.get(known, known or "The file holds no verdict.")))
     rows = []
     for cause in result.get("causes", []):
         values = "; ".join(
@@ -252,6 +253,11 @@ def diagnosis(result: dict[str, Any]) -> page.Section:
     if rows:
         header = ["cause", "parameters", "p (family-wise)", "gain, nats", "residual rms", "not to be told apart from"]
         section.add(page.table("Causes", header, rows))
+    for cause in result.get("causes", []):
+        if len(cause["group"]) > 1 and cause.get("to_separate"):
+            section.add(
+                page.paragraph(f"To separate {cause['effect'].replace('_', ' ')}: {cause['to_separate']}", "soft")
+            )
     held_out = result.get("held_out") or {}
     if held_out.get("gain_percent") is not None:
         section.add(
