@@ -135,3 +135,44 @@ def test_spice_kernels_without_spiceypy_or_files(monkeypatch, tmp_path):
     monkeypatch.setenv(ephemeris.KERNELS_VARIABLE, str(tmp_path / "none.tm"))
     with pytest.raises((ConfigError, InputError), match=ephemeris.KERNELS_VARIABLE):
         subsolar_point("2015-01-01")
+
+
+def test_spice_kernels_are_used_where_there_are_any(tmp_path, monkeypatch):
+    """Kernels written here with the built-in Sun and Moon, and a Moon whose prime meridian is turned by 90 deg."""
+    spiceypy = pytest.importorskip("spiceypy", reason="spiceypy is the extra 'spice'")
+    from astropy.coordinates import get_body_barycentric_posvel
+
+    times = [f"2015-03-{day:02d}T00:00:00" for day in range(1, 12)]
+    epochs = np.array([utc_to_et(t) for t in times])
+    handle = spiceypy.spkopn(str(tmp_path / "sun_moon.bsp"), "test", 0)
+    for name, code in (("sun", 10), ("moon", 301)):
+        states = []
+        for t in times:
+            position, velocity = get_body_barycentric_posvel(name, parse_utc(t).tdb, ephemeris="builtin")
+            states.append([*position.xyz.to_value("km"), *velocity.xyz.to_value("km/s")])
+        spiceypy.spkw13(handle, code, 0, "J2000", epochs[0], epochs[-1], name, 7, len(states), states, epochs)
+    spiceypy.spkcls(handle)
+    moon = ephemeris.ORIENTATIONS["moon"]
+    (tmp_path / "moon.tpc").write_text(
+        "\\begindata\n"
+        f"BODY301_POLE_RA = ( {moon.pole_ra[0]} {moon.pole_ra[1]} 0 )\nBODY301_POLE_DEC = ( {moon.pole_dec[0]} {moon.pole_dec[1]} 0 )\n"
+        f"BODY301_PM = ( {moon.meridian[0] + 90} {moon.meridian[1]} {moon.meridian[2]} )\nBODY3_NUT_PREC_ANGLES = ( "
+        + "\n".join(f"{t[0]} {t[1] * 36525}" for t in moon.terms)  # a line holds at most 132 characters
+        + " )\n"
+        + "".join(
+            f"BODY301_NUT_PREC_{axis} = ( " + "\n".join(str(t[k]) for t in moon.terms) + " )\n"
+            for axis, k in (("RA", 2), ("DEC", 3), ("PM", 4))
+        )
+        + "\\begintext\n"
+    )
+    built_in = subsolar_point("2015-03-05T06:00:00")
+    try:
+        monkeypatch.setenv(ephemeris.KERNELS_VARIABLE, f"{tmp_path / 'sun_moon.bsp'}:{tmp_path / 'moon.tpc'}")
+        found = subsolar_point("2015-03-05T06:00:00")
+        assert (found.longitude_deg - built_in.longitude_deg + 90 + 180) % 360 - 180 == pytest.approx(0, abs=1e-3)
+        assert found.latitude_deg == pytest.approx(built_in.latitude_deg, abs=1e-3)
+        assert found.distance_au == pytest.approx(built_in.distance_au, abs=1e-7)
+        with pytest.raises(InputError, match="no place of the Sun seen from 'ceres'"):
+            subsolar_point("2015-03-05T06:00:00", "ceres")
+    finally:
+        spiceypy.kclear()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import ConfigError
 from stages.physics.bodies import Body
-from stages.physics.cameras.base import Camera, camera_from_document, read_document
+from stages.physics.cameras import Camera, open_camera
 from stages.physics.formation import SUN_RADIUS
 from stages.physics.frames import ASTRONOMICAL_UNIT
 from stages.physics.light import SunHorizon
@@ -84,7 +84,7 @@ def _three(values: Sequence[float], option: str) -> tuple[float, float, float]:
 def find_camera(surface: Surface, config: Config) -> Camera:
     """The camera of a view: a model from a file, or a pinhole at a place. Raises LunargrError."""
     if config.camera:
-        return camera_from_document(read_document(Path(config.camera)), config.camera)
+        return open_camera(config.camera)
     grid = surface.grid
     lon, lat, altitude = _three(config.position or (), "--position")
     position = place(lon, lat, altitude, grid.radius)
