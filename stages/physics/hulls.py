@@ -12,7 +12,18 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.physics.sweeps import FLAGS, NOTHING, PixelSize, Sweep, Taps, arctangent, sink, transpose_in, transpose_out
+from stages.physics.sweeps import (
+    FLAGS,
+    NOTHING,
+    PixelSize,
+    Sweep,
+    Taps,
+    arctangent,
+    sink,
+    strip_width,
+    transpose_in,
+    transpose_out,
+)
 
 NEAR = 16  # rows
 NEAR_COLUMNS = 8  # rows within which crossings of columns are looked at too
@@ -306,10 +317,11 @@ def sweep_horizon(
     line_count = j1 + int(shifts.max(initial=0)) - first_line
     out = np.empty(grid.shape, dtype=np.float32)
     parallel = grid.size > SMALL
+    strip = -(-strip_width(line_count, LINES) // SPACING) * SPACING if parallel else line_count
     bend = 0.0 if body_radius is None else 0.5 * sweep.step**2 / body_radius
     origin, step = (sweep.rows - 1, -1) if sweep.reverse else (0, 1)
     _KERNELS[sweep.by_columns, parallel](
-        grid, origin, step, out, 0, i1, sweep.columns, first_line, line_count, LINES if parallel else line_count,
+        grid, origin, step, out, 0, i1, sweep.columns, first_line, line_count, strip,
         sweep.whole, sweep.fraction, taps.rows, taps.columns, taps.weight,
         taps.distance, NEAR, sweep.shear, sweep.step, (bend, 0.5 * (sweep.rows - 1)),
     )  # fmt: skip

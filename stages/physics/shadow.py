@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.physics.sweeps import FLAGS, NOTHING, PixelSize, Sweep, Taps, sink, transpose_in, transpose_out
+from stages.physics.sweeps import FLAGS, NOTHING, PixelSize, Sweep, Taps, sink, strip_width, transpose_in, transpose_out
 
 NEAR = 4  # rows; 2 rows double the disagreement with a ray tracer, 8 halve it again
 LINES = 1024  # lines per strip of a sweep by rows: the rows in use then stay in the first-level cache
@@ -242,8 +242,9 @@ def _tables(
     )  # fmt: skip
 
 
-def _state(sweep: Sweep, width: int) -> NDArray[np.float32]:
+def _state(sweep: Sweep, parallel: bool) -> NDArray[np.float32]:
     """(strips, width + 1), m: the highest ray over every line so far."""
+    width = strip_width(sweep.line_count, LINES_TURNED if sweep.by_columns else LINES) if parallel else sweep.line_count
     return np.full((-(-sweep.line_count // width), width + 1), NOTHING, dtype=np.float32)
 
 
@@ -254,7 +255,7 @@ def sweep_shadow(
     sweep, tables = _tables(grid.shape, gsd, azimuth, sun_elevation, body_radius)
     out = np.empty(grid.shape, dtype=np.bool_)
     parallel = grid.size > SMALL
-    state = _state(sweep, (LINES_TURNED if sweep.by_columns else LINES) if parallel else sweep.line_count)
+    state = _state(sweep, parallel)
     origin, step = (sweep.rows - 1, -1) if sweep.reverse else (0, 1)
     target = out.view(np.uint8) if sweep.by_columns else out
     _KERNELS[sweep.by_columns, parallel](
@@ -270,7 +271,7 @@ def sweep_shadow_bands(
     """The same, band by band from the Sun's side; only the rays' heights go from one band to the next."""
     shape = (int(elevation.shape[0]), int(elevation.shape[1]))
     sweep, tables = _tables(shape, gsd, azimuth, sun_elevation, body_radius)
-    state = _state(sweep, LINES_TURNED if sweep.by_columns else LINES)
+    state = _state(sweep, True)
     for start in range(0, sweep.rows, band):
         stop = min(start + band, sweep.rows)
         before = max(0, start - NEAR - 1)  # the nearest rows are looked at again

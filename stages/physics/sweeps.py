@@ -89,6 +89,13 @@ class Sweep:
         return self.columns + int(self.whole.max(initial=0)) - self.first_line
 
 
+def strip_width(lines: int, aim: int) -> int:
+    """Lines per strip, about ``aim``, so that every thread gets as many strips as the others."""
+    threads = numba.get_num_threads()
+    strips = -(-max(1, -(-lines // aim)) // threads) * threads
+    return -(-lines // strips)
+
+
 @dataclass(frozen=True)
 class Taps:
     """The crossings of a pixel's own ray over its first rows, the same for all pixels of a sweep.

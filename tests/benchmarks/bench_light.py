@@ -35,15 +35,15 @@ def terrain(n: int, seed: int = 1, tile: int = 2048) -> np.ndarray:
     return tiled + np.arange(n, dtype=np.float32) * 0.01
 
 
-def timed(call, repeats: int = 5) -> float:
-    """Median seconds, after one call that compiles."""
+def timed(call, repeats: int = 7) -> float:
+    """Least seconds of several calls, which other work on the machine disturbs less, after one that compiles."""
     call()
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
         call()
         times.append(time.perf_counter() - start)
-    return statistics.median(times)
+    return min(times)
 
 
 def embree(z: np.ndarray):
@@ -87,7 +87,7 @@ def speed(size: int, peer_size: int, sun_elevation: float) -> None:
         azimuth = math.radians(degrees)
         big = large.size / 1e6 / timed(lambda a=azimuth: cast_shadow(large, GSD, a, sun_elevation))
         mid = small.size / 1e6 / timed(lambda a=azimuth: cast_shadow(small, GSD, a, sun_elevation))
-        angle = small.size / 1e6 / timed(lambda a=azimuth: horizon(small, GSD, a), 3)
+        angle = small.size / 1e6 / timed(lambda a=azimuth: horizon(small, GSD, a))
         ours.append(big)
         horizons.append(angle)
         line = f"{degrees:8d} {big:9.0f} {mid:9.0f} {angle:9.0f}"
