@@ -176,7 +176,10 @@ def rough(tmp_path_factory):
     return ground.write_dem(folder / "dem.tif"), photograph(camera(), ground.height, ground.reflect)
 
 
-@pytest.mark.parametrize(("kind", "command"), [("shift", ["--register"]), ("affine", ["--register", "affine"])])
+@pytest.mark.parametrize(
+    ("kind", "command"),
+    [("shift", ["--register"]), pytest.param("affine", ["--register", "affine"], marks=pytest.mark.slow)],
+)
 def test_a_camera_that_is_off_is_found_out_and_put_right(rough, tmp_path, kind, command):
     """The image is the true one, its camera model believes to have stood 50 m, 2.5 px, further east."""
     dem, image = rough
