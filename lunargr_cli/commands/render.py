@@ -118,7 +118,11 @@ def command(
     lunargr render --dem dem.tif --model hapke --parameters w=0.25 --sun-azimuth 90 --sun-elevation 30 -o hapke.exr
     lunargr render svbrdf.h5 --trajectory descent.csv --sun-azimuth 90 --sun-elevation 30 -o views/
     """
-    if (source is None) == (dem is None):
+    if source is not None and dem is None:
+        path = source
+    elif dem is not None and source is None:
+        path = dem
+    else:
         raise ConfigError("render: expected a reflectance map (svbrdf.h5) or --dem DEM, one of the two.")
     if parameters and dem is None:
         raise ConfigError("--parameters: expected together with --dem; an svbrdf.h5 holds its own coefficients.")
@@ -151,8 +155,6 @@ def command(
         backplanes_in_tif=backplanes,
     )
     console = Console(quiet)
-    path = source or dem
-    assert path is not None
     if trajectory is not None:
         results = render.run_trajectory(
             path,
