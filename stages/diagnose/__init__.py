@@ -53,7 +53,7 @@ class Result:
 def run(
     pairs: Path,
     checkpoint: Path | None = None,
-    config: Config = Config(),  # noqa: B008 - frozen
+    config: Config = Config(),
     output: Path | None = None,
     json_file: Path | None = None,
     report: Path | None = None,

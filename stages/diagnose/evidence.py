@@ -116,7 +116,7 @@ def _weigh_one(candidate, score: Tensor, gram: Tensor, places, images, rows: flo
         effective = float(energy.sum() ** 2 / energy.square().sum().clamp(min=1e-30))
         robust = inverse @ meat @ inverse
         wald = float(amount @ torch.linalg.solve(robust + 1e-12 * torch.diag(robust.diagonal()), amount)) / k
-        freedom = max(effective - k, 0.5)
+        freedom = max(effective - k, 0.8 * (count - 1 - k), 0.5)
         tail = f_tail(wald, k, freedom)
         if k > 2:  # with more columns than clusters only the held-out direction can be tested
             held = (left_out * u).sum(1)

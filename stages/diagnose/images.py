@@ -125,7 +125,6 @@ def _weigh(name: str, folds: list[_Fold], frames: int, rows: float) -> ImageEvid
     total = _Fold(sum(f.gram for f in folds), sum(f.score for f in folds))  # type: ignore[arg-type]
     seen = total.gram.diagonal().view(frames, k).sum(1) > 0
     count = int(seen.sum())
-    ridge = 1e-4 * total.gram.diagonal().mean().clamp(min=1e-12)
 
     def solve(fold: _Fold, penalty: float) -> Tensor:
         matrix = fold.gram + penalty * torch.eye(len(fold.gram), dtype=torch.float64)

@@ -20,6 +20,7 @@ ALBEDO_PRIOR = 0.1  # relative; both priors only keep badly seen pixels from blo
 SLOPE_PRIOR = math.tan(math.radians(4))
 FREE_SLOPES = 6  # images of a site from which two slopes per pixel can be spared
 BINS = 12
+ALBEDO_BAND, SLOPE_BAND = 0.1, 0.25  # cycles per px
 
 
 @dataclass
@@ -106,7 +107,9 @@ class Projector:
             mean = torch.where(filled, mean, mean[filled].mean())
             smooth = (mean.log()[low] * (1 - share) + mean.log()[low + 1] * share).exp()
             filters.append(smooth.rsqrt())
-        self.filter = torch.stack(filters)
+        # a given DEM's shortest slopes are noise of its own: what follows terrain is sought at longer wavelengths
+        shortest = [ALBEDO_BAND] + [SLOPE_BAND] * (len(filters) - 1)
+        self.filter = torch.stack([f * torch.exp(-((k / b) ** 2)) for f, b in zip(filters, shortest, strict=True)])
         self.filter[:, 0, 0] = 0.0  # the mean belongs to the nominal model
 
     def whiten(self, maps: Tensor) -> Tensor:

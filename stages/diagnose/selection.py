@@ -34,6 +34,8 @@ GATE_STATIC = 5e-4
 FLOOR_FID = 0.012  # an effect smaller than this against the noise is never worth a name
 FLOOR_IMAGE = 0.035  # the same for effects with values per image, which have more to fit with
 FLOOR_GAIN = 12.0  # nats
+# linear in their coordinates: the first estimate needs no second one
+LINEAR = ("dark_bias", "earthshine", "interreflection", "nonlinearity", "column_pattern", "azimuthal_anisotropy", *STATIC)
 KEEP_SHARE = 0.8  # of a per-image effect's gain that a scene-wide effect must keep to replace it
 
 
@@ -134,6 +136,10 @@ class Search:
         scene.sort(key=lambda e: -e.gain)
         image = [e for e in seen.images.values() if self.worth_image(e, count)]
         image.sort(key=lambda e: -e.gain)
+        if image and image[0].effect == "image_gain" and not scene:
+            # a scene-wide effect that does nearly as well with a few numbers as gains do with one for each image
+            near = [e for e in seen.best.values() if e.gain > KEEP_SHARE * image[0].gain and self.worth(e, count, 5.0)]
+            scene = sorted(near, key=lambda e: -e.gain)
         if image and (not scene or scene[0].gain < KEEP_SHARE * image[0].gain):
             top = image[0]
             close = [e.effect for e in image[1:] if e.gain > top.gain - 2 * math.hypot(top.gain_error, e.gain_error)]
@@ -146,12 +152,15 @@ class Search:
         wall = [e for e in scene if e.effect == "distant_shadow"]
         first = wall[0] if wall else scene[0]  # gross as it is, a missing shadow spoils every other estimate
         group = [first.effect, *(e.effect for e in scene[1:] if _as_good(first, e))]
-        return Cause(start(first, self.data), min(1.0, first.p * count), first.gain, first.gain_error, first.fid, group)
+        effect = start(first, self.data)
+        errors = dict(effect.first_errors)  # type: ignore[attr-defined]
+        p = min(1.0, first.p * count)
+        return Cause(effect, p, first.gain, first.gain_error, first.fid, group, errors)
 
-    def worth(self, e: Evidence, count: int) -> bool:
+    def worth(self, e: Evidence, count: int, ease: float = 1.0) -> bool:
         """Whether the evidence is enough for a name."""
         gate = min(GATE, GATE_STATIC * count) if e.effect in STATIC else GATE
-        if e.p * count > gate or e.fid < FLOOR_FID or min(e.gain_image, e.gain_place) <= 0:
+        if e.p * count > gate * ease or e.fid < FLOOR_FID or min(e.gain_image, e.gain_place) <= 0:
             return False
         if e.gain < max(FLOOR_GAIN, 2 * e.gain_error):
             return False
@@ -164,6 +173,8 @@ class Search:
         low, high = cls.bounds(name)
         span = high - low
         if not low - 0.05 * span <= value <= high + 0.05 * span:
+            return False
+        if cls.null()[name] == 0 and low < 0 < high and not 0.9 * low < value < 0.9 * high:
             return False
         if name in cls.tolerance:
             return abs(value - cls.null()[name]) - cls.tolerance[name] > 3 * error
@@ -201,7 +212,7 @@ class Search:
             named = {c.effect.name: c for c in self.causes if c.effect.scope == "image"}
             found = weigh_images(works, list(named), self.frames, self.dn, self.data) if named else {}
             for name, cause in named.items():
-                if name in found and found[name].gain > FLOOR_GAIN:
+                if name in found and name != "image_gain" and found[name].gain > FLOOR_GAIN:
                     cause.effect = as_effect(found[name], cause.effect, self.data)
 
 
@@ -217,7 +228,8 @@ def start(evidence: Evidence, data: Survey) -> Effect:
     null = cls.null()
     values: dict[str, float] = {**null, **evidence.candidate.trial.fixed}
     touched = set(evidence.candidate.trial.fixed)
-    for amount, column in zip(evidence.amount.tolist(), evidence.candidate.trial.columns, strict=True):
+    cause_errors: dict[str, float] = {}
+    for k, (amount, column) in enumerate(zip(evidence.amount.tolist(), evidence.candidate.trial.columns, strict=True)):
         for name, reference in column.items():
             low, high = cls.bounds(name)
             values[name] = min(max(values[name] + amount * (reference - null[name]), low), high)
@@ -227,7 +239,10 @@ def start(evidence: Evidence, data: Survey) -> Effect:
                 values[name] = min(max(null[name] + share * (reference - null[name]), low), high)
                 if cls.name == "saturation":
                     values[name] = reference
+            if cls.name in LINEAR:
+                cause_errors[name] = abs(reference - null[name]) * float(evidence.covariance[k, k].clamp(min=0)) ** 0.5
     effect = cls(values, data)
+    effect.first_errors = cause_errors  # type: ignore[attr-defined]
     still = {"axis", "side", "distance_px"}
     effect.held = tuple(p.name for p in cls.fitted() if p.name not in touched or p.name in still)  # type: ignore[attr-defined]
     return effect
@@ -291,7 +306,7 @@ def _move(cause: Cause, names: Sequence[str], delta: Tensor, error: Tensor) -> N
     values = dict(cause.effect.values)
     for k, name in enumerate(names):
         owner, _, coordinate = name.partition(".")
-        if owner != cls.name or not coordinate:
+        if owner != cls.name or not coordinate or cls.name in LINEAR:
             continue
         low, high = cls.bounds(coordinate)
         step = float(delta[k])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from stages.effects.base import Effect, register
 from stages.effects.fields import cosine_field
 from stages.physics.formation import State
@@ -25,7 +27,7 @@ class AlbedoMap(Effect):
     separate = "neighbouring sites: the pattern goes on across their borders, whatever the terrain"
     parameters = (Parameter("per_std", "1", 0.0, 1.0, 0.0, "rms of the field, relative to albedo"),)
     coordinates = tuple(Parameter(f"c{m}{n}", "1", -0.5, 0.5, 0.0, f"cosine {m} down, {n} across") for m, n in ORDERS)
-    strong = {p.name: 0.05 for p in coordinates}
+    strong: ClassVar = {p.name: 0.05 for p in coordinates}
 
     def apply(self, state: State) -> None:
         height, width = state.elevation.shape[-2:]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from stages.effects.base import Effect, register
@@ -22,10 +24,10 @@ class AzimuthalAnisotropy(Effect):
     confused_with = ("sun_azimuth", "image_gain")
     separate = "an image of the same ground with the Sun on the opposite side"
     parameters = (
-        Parameter("east", "1", -0.5, 0.5, 0.0, "relative change when lit from the east"),
-        Parameter("north", "1", -0.5, 0.5, 0.0, "relative change when lit from the north"),
+        Parameter("east", "1", -0.3, 0.3, 0.0, "relative change when lit from the east"),
+        Parameter("north", "1", -0.3, 0.3, 0.0, "relative change when lit from the north"),
     )
-    strong = {"east": 0.05, "north": 0.05}
+    strong: ClassVar = {"east": 0.05, "north": 0.05}
 
     def apply(self, state: State) -> None:
         sun = state.sun_direction.to(state.elevation.dtype)

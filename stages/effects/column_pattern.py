@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -28,7 +29,7 @@ class ColumnPattern(Effect):
     separate = "an image of the same ground with the detector's row lying across it in another direction"
     parameters = (Parameter("rms", "1", 0.0, 1.0, 0.0, "rms of the response about 1"),)
     coordinates = tuple(Parameter(f"c{k}", "1", -0.5, 0.5, 0.0, f"cosine {k} over the columns") for k in ORDERS)
-    strong = {p.name: 0.02 for p in coordinates}
+    strong: ClassVar = {p.name: 0.02 for p in coordinates}
 
     def response(self, count: int) -> Tensor:
         """Response at ``count`` samples from the first to the last column, (count,)."""

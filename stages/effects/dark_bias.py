@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation import State
 from stages.physics.photometry import Parameter
@@ -19,7 +21,7 @@ class DarkBias(Effect):
     confused_with = ("earthshine", "interreflection", "nonlinearity")
     separate = "an image with deep shadow, where nothing else is bright"
     parameters = (Parameter("iof", "1", -0.1, 0.1, 0.0, "added I/F, truth minus given"),)
-    strong = {"iof": 0.004}
+    strong: ClassVar = {"iof": 0.004}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

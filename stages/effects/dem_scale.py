@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
@@ -22,7 +24,7 @@ class DemScale(Effect):
     confused_with = ("dem_smoothing", "sun_elevation")
     separate = "an image with the Sun much lower, where shadow lengths give heights"
     parameters = (Parameter("relative", "1", -0.5, 1.0, 0.0, "relative error of heights, truth minus given"),)
-    strong = {"relative": 0.1}
+    strong: ClassVar = {"relative": 0.1}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.effects.filters import gaussian
 from stages.physics.formation import State
@@ -23,8 +25,8 @@ class DemSmoothing(Effect):
     parameters = (
         Parameter("sigma2_px2", "px2", -2.0, 4.0, 0.0, "variance by which the DEM is smoother than the truth"),
     )
-    strong = {"sigma2_px2": 1.0}
-    tolerance = {"sigma2_px2": 0.35}
+    strong: ClassVar = {"sigma2_px2": 1.0}
+    tolerance: ClassVar = {"sigma2_px2": 0.35}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
@@ -30,7 +32,7 @@ class DistantShadow(Effect):
         Parameter("distance_px", "px", 0.0, 4000.0, 1.0, "distance of the ridge from the crop's border"),
         Parameter("side", "1", 0.0, 4.0, 0.0, "0 any side, 1 north, 2 east, 3 south, 4 west"),
     )
-    strong = {"height_m": 0.0}  # set by the trials: it depends on the Sun's elevation
+    strong: ClassVar = {"height_m": 0.0}  # set by the trials: it depends on the Sun's elevation
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

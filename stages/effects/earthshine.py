@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 
@@ -34,7 +35,7 @@ class Earthshine(Effect):
         Parameter("north", "1", -0.1, 0.1, 0.0, "irradiance times the direction's north component"),
         Parameter("up", "1", -0.1, 0.1, 0.0, "irradiance times the direction's up component"),
     )
-    strong = {"east": 0.004, "north": 0.004, "up": 0.004}
+    strong: ClassVar = {"east": 0.004, "north": 0.004, "up": 0.004}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
@@ -27,7 +29,7 @@ class Echo(Effect):
         Parameter("lag_px", "px", -64.0, 64.0, 4.0, "how much later the echo appears"),
     )
     coordinates = (*parameters, Parameter("axis", "1", 0.0, 1.0, 0.0, "0 along samples, 1 along lines"))
-    strong = {"fraction": 0.05}
+    strong: ClassVar = {"fraction": 0.05}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from stages.effects import fields
+from typing import ClassVar
+
 from stages.effects.base import Effect, register
 from stages.physics.formation import State
 from stages.physics.photometry import Parameter
@@ -23,7 +24,7 @@ class ElevationAlbedo(Effect):
     parameters = (
         Parameter("per_std", "1", -0.5, 0.5, 0.0, "relative change of albedo per standard deviation of height"),
     )
-    strong = {"per_std": 0.1}
+    strong: ClassVar = {"per_std": 0.1}
 
     def apply(self, state: State) -> None:
         mean, std = self.survey.elevation

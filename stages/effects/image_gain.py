@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from stages.effects.base import Effect, register
 from stages.physics.formation import State
 from stages.physics.photometry import Parameter
@@ -22,7 +24,7 @@ class ImageGain(Effect):
     separate = "more images than there are phase angles and Sun azimuths in play"
     parameters = (Parameter("rms", "1", 0.0, 1.0, 0.0, "rms of the gains about their mean"),)
     coordinates = (Parameter("gain", "1", -0.9, 4.0, 0.0, "relative gain of an image"),)
-    strong = {"gain": 0.02}
+    strong: ClassVar = {"gain": 0.02}
 
     def apply(self, state: State) -> None:
         state.radiance = state.radiance * (1 + self.value("gain", state))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -28,7 +29,7 @@ class Interreflection(Effect):
     confused_with = ("earthshine", "dark_bias")
     separate = "an image with the Sun so low that crater floors lie in shadow beside lit walls"
     parameters = (Parameter("strength", "1", -1.0, 5.0, 0.0, "share of the light that diffuse terrain would scatter"),)
-    strong = {"strength": 1.5}
+    strong: ClassVar = {"strength": 1.5}
 
     def apply(self, state: State) -> None:
         strength = self.value("strength", state)

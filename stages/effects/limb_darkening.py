@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from stages.effects.base import Effect, register
 from stages.physics.formation import State
 from stages.physics.photometry import Parameter
@@ -20,7 +22,7 @@ class LimbDarkening(Effect):
     confused_with = ("macroscopic_roughness", "phase_slope")
     separate = "an oblique image, at emission above 50 deg"
     parameters = (Parameter("share", "1", -1.0, 1.5, 0.0, "share of Lommel-Seeliger"),)
-    strong = {"share": 0.3}
+    strong: ClassVar = {"share": 0.3}
 
     def apply(self, state: State) -> None:
         total = (state.angles.cos_incidence.clamp(min=0) + state.angles.cos_emission.clamp(min=0)).clamp(min=0.05)

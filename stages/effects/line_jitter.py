@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 
@@ -32,8 +33,8 @@ class LineJitter(Effect):
         for axis in ("east", "south")
         for k in ORDERS
     )
-    strong = {p.name: 0.5 for p in coordinates}
-    tolerance = {"rms_px": 0.15}
+    strong: ClassVar = {p.name: 0.5 for p in coordinates}
+    tolerance: ClassVar = {"rms_px": 0.15}
 
     def apply(self, state: State) -> None:
         height = state.elevation.shape[-2]

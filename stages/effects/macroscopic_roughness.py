@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
@@ -23,7 +25,7 @@ class MacroscopicRoughness(Effect):
     confused_with = ("limb_darkening", "phase_slope", "sun_elevation")
     separate = "images of the same ground at incidence 30 and 80 deg, one of them oblique"
     parameters = (Parameter("theta_bar_deg", "degree", 0.0, 45.0, 0.0, "mean slope angle"),)
-    strong = {"theta_bar_deg": 20.0}
+    strong: ClassVar = {"theta_bar_deg": 20.0}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from stages.effects.base import Effect, register
 from stages.physics.formation import State
 from stages.physics.photometry import Parameter
@@ -25,8 +27,8 @@ class Misregistration(Effect):
         Parameter("east_px", "px", -5.0, 5.0, 0.0, "the pixel shows ground this many columns further east"),
         Parameter("south_px", "px", -5.0, 5.0, 0.0, "the pixel shows ground this many rows further south"),
     )
-    strong = {"east_px": 0.5, "south_px": 0.5}
-    tolerance = {"rms_px": 0.3 * 2**0.5}
+    strong: ClassVar = {"east_px": 0.5, "south_px": 0.5}
+    tolerance: ClassVar = {"rms_px": 0.3 * 2**0.5}
 
     def apply(self, state: State) -> None:
         east, south = self.value("east_px", state), self.value("south_px", state)

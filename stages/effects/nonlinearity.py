@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
@@ -25,7 +27,7 @@ class Nonlinearity(Effect):
         Parameter("quadratic", "1", -10.0, 10.0, 0.0, "coefficient of I^2, per unit of I/F"),
         Parameter("log", "1", -0.5, 0.5, 0.0, "coefficient of I ln I"),
     )
-    strong = {"quadratic": 1.0, "log": 0.05}
+    strong: ClassVar = {"quadratic": 1.0, "log": 0.05}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
@@ -25,7 +27,7 @@ class OppositionSurge(Effect):
         Parameter("B0", "1", -0.9, 4.0, 0.0, "amplitude"),
         Parameter("h", "1", 0.005, 0.5, 0.06, "angular width, as tan(g/2)"),
     )
-    strong = {"B0": 1.0}
+    strong: ClassVar = {"B0": 1.0}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
@@ -22,7 +24,7 @@ class Penumbra(Effect):
     confused_with = ("sun_elevation", "distant_shadow")
     separate = "an image with the Sun low enough to cast long shadows"
     parameters = (Parameter("radius_deg", "degree", 0.02, 3.0, 0.2666, "effective angular radius of the Sun"),)
-    strong = {"radius_deg": 0.7}
+    strong: ClassVar = {"radius_deg": 0.7}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

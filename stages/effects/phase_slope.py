@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from stages.effects.base import Effect, register
@@ -19,7 +21,7 @@ class PhaseSlope(Effect):
     confused_with = ("opposition_surge", "nonlinearity", "image_gain")
     separate = "an image at phase angle below 10 deg, and one above 90 deg"
     parameters = (Parameter("per_radian", "1", -3.0, 3.0, 0.0, "beta in exp(-beta g)"),)
-    strong = {"per_radian": 0.5}
+    strong: ClassVar = {"per_radian": 0.5}
 
     def apply(self, state: State) -> None:
         state.reflectance = state.reflectance * torch.exp(-self.value("per_radian", state) * state.angles.phase)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.effects.filters import gaussian
 from stages.physics.formation import State
@@ -21,8 +23,8 @@ class PsfBlur(Effect):
     confused_with = ("dem_smoothing", "misregistration")
     separate = "an image with cast shadows, whose edges the DEM's resolution does not soften"
     parameters = (Parameter("sigma2_px2", "px2", -0.5, 6.0, 0.0, "variance added to the point-spread function"),)
-    strong = {"sigma2_px2": 1.0}
-    tolerance = {"sigma2_px2": 0.2}
+    strong: ClassVar = {"sigma2_px2": 1.0}
+    tolerance: ClassVar = {"sigma2_px2": 0.2}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
@@ -21,7 +23,7 @@ class Saturation(Effect):
     confused_with = ("nonlinearity",)
     separate = "an image of the same ground at a shorter exposure or a lower Sun"
     parameters = (Parameter("iof", "1", 1e-4, 10.0, 10.0, "level at which the signal is cut"),)
-    strong = {"iof": 0.0}  # set by the trials: the data's own brightness decides
+    strong: ClassVar = {"iof": 0.0}  # set by the trials: the data's own brightness decides
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from stages.effects import fields
 from stages.effects.base import Effect, register
 from stages.physics.formation import State
@@ -23,7 +25,7 @@ class SlopeAlbedo(Effect):
     parameters = (
         Parameter("per_std", "1", -0.5, 0.5, 0.0, "relative change of albedo per standard deviation of slope"),
     )
-    strong = {"per_std": 0.1}
+    strong: ClassVar = {"per_std": 0.1}
 
     def apply(self, state: State) -> None:
         mean, std = self.survey.slope

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
@@ -24,7 +26,7 @@ class SunAzimuth(Effect):
     confused_with = ("misregistration", "azimuthal_anisotropy")
     separate = "an image of the same ground with the Sun on another side"
     parameters = (Parameter("error_deg", "degree", -10.0, 10.0, 0.0, "truth minus given, the same for all images"),)
-    strong = {"error_deg": 0.5}
+    strong: ClassVar = {"error_deg": 0.5}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

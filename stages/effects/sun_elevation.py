@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 
@@ -26,7 +27,7 @@ class SunElevation(Effect):
     confused_with = ("penumbra", "dem_scale")
     separate = "an image of the same ground with the Sun at least 20 deg higher or lower"
     parameters = (Parameter("error_deg", "degree", -10.0, 10.0, 0.0, "truth minus given, the same for all images"),)
-    strong = {"error_deg": 0.5}
+    strong: ClassVar = {"error_deg": 0.5}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -11,10 +11,11 @@ from typing import Any
 import h5py
 import numba
 import numpy as np
+from scipy.ndimage import gaussian_filter, uniform_filter
+
 from hidden.layers import SUN_RADIUS_DEG, Ground
 from hidden.sensor import Detector, Pose, shoot
 from hidden.terrain import make_terrain, red_noise
-from scipy.ndimage import gaussian_filter, uniform_filter
 
 RADIUS = 1737400.0
 ALTITUDE = 100e3
@@ -349,6 +350,7 @@ class Scene:
 def _roughness(mu0, mu, cosg, theta_deg):
     """Hapke's (1984) roughness relative to a smooth Lommel-Seeliger surface; the published formula of the program."""
     import torch
+
     from stages.physics.geometry import Angles
     from stages.physics.photometry.roughness import rough_surface
 

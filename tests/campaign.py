@@ -1,0 +1,253 @@
+"""`make campaign`: plant every effect in hidden scenes, name it blindly, and write what came out into docs.
+
+    python tests/campaign.py --seed 7 --scenes 4 --nulls 100 --output docs/diagnose_campaign
+
+Writes OUTPUT.json (every case), OUTPUT.md (tables) and OUTPUT.png (planted against named). Seeds of a final campaign are
+drawn once, after the code is frozen; development uses others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from hidden.scene import Layout, Scene, Truth, write_pairs
+
+# effect -> parameters at full strength; weaker plants multiply the first one
+PLANTS: dict[str, dict] = {
+    "misregistration": {"rms_px": 1.0},
+    "dem_smoothing": {"sigma2_px2": 1.5},
+    "dem_scale": {"relative": 0.12},
+    "line_jitter": {"rms_px": 0.5},
+    "sun_elevation": {"error_deg": 1.5},
+    "sun_azimuth": {"error_deg": 3.0},
+    "penumbra": {"radius_deg": 2.0},
+    "distant_shadow": {"height_m": 120.0, "side": "west", "distance_m": 300.0},
+    "interreflection": {"strength": 4.0},
+    "earthshine": {"irradiance": 0.002, "elevation_deg": 50.0, "azimuth_deg": 120.0},
+    "opposition_surge": {"B0": 0.3, "h": 0.06},
+    "phase_slope": {"per_radian": 0.08},
+    "limb_darkening": {"share": 0.15},
+    "macroscopic_roughness": {"theta_bar_deg": 18.0},
+    "slope_albedo": {"per_std": 0.05},
+    "elevation_albedo": {"per_std": 0.06},
+    "curvature_albedo": {"per_std": 0.04},
+    "albedo_map": {"per_std": 0.10},
+    "azimuthal_anisotropy": {"east": 0.02, "north": 0.01},
+    "image_gain": {"rms": 0.02},
+    "dark_bias": {"iof": 0.001},
+    "nonlinearity": {"quadratic": 1.0},
+    "psf_blur": {"sigma2_px2": 0.8},
+    "column_pattern": {"rms": 0.01},
+    "echo": {"fraction": 0.03, "lag_px": 6},
+    "saturation": {"iof": 0.085},
+}
+UNKNOWN = {"banding": {"amplitude": 0.01, "period": 7.0}, "ghost": {"share": 0.03}}
+
+
+def random_world(rng: np.random.Generator) -> dict:
+    """Imperfections that every data set has."""
+    return {
+        "texture": float(rng.uniform(0.015, 0.04)),
+        "texture_power": float(rng.uniform(2.0, 3.0)),
+        "dem_noise_deg": float(rng.uniform(0.2, 1.0)),
+        "dem_smoothing": float(rng.uniform(0.0, 0.45)),
+        "seam": float(rng.uniform(0, 0.2)),
+        "misregistration": float(rng.uniform(0.1, 0.3)),
+        "snr": float(rng.uniform(50, 100)),
+    }
+
+
+def diagnose(path: Path) -> dict:
+    """The JSON that a user would get."""
+    import torch
+
+    from stages import diagnose as stage
+
+    torch.set_num_threads(2)
+    return stage.run(path).answer.to_json()
+
+
+def case(scene: Scene, effect: dict, seed: int, folder: Path) -> dict:
+    rng = np.random.default_rng((seed, 99))
+    truth = Truth(effect=effect, **random_world(rng))
+    write_pairs(folder / "pairs.h5", scene.make(truth, seed), scene.layout)
+    started = time.perf_counter()
+    found = diagnose(folder / "pairs.h5")
+    return {
+        "seed": seed,
+        "scene": scene.layout.seed,
+        "planted": effect,
+        "seconds": time.perf_counter() - started,
+        "answer": found,
+    }
+
+
+def summarise(cases: list[dict]) -> str:
+    """Markdown tables, every share with its counts."""
+    lines = ["# Campaign of `lunargr diagnose`", "", "Written by `tests/campaign.py`; every share is a count.", ""]
+    nulls = [c for c in cases if not c["planted"]]
+    named = [c for c in nulls if c["answer"]["causes"]]
+    lines += ["| | |", "|---|---|", f"| any cause named when nothing is hidden | {_share(len(named), len(nulls))} |"]
+    lines.append(f"| verdicts on nulls | {dict(Counter(c['answer']['verdict'] for c in nulls))} |")
+    lines.append(f"| what was named on nulls | {dict(Counter(c['answer']['causes'][0]['effect'] for c in named))} |")
+    single = [c for c in cases if len(c["planted"]) == 1 and next(iter(c["planted"])) in PLANTS]
+    first = [c for c in single if _first(c) == next(iter(c["planted"]))]
+    group = [c for c in single if next(iter(c["planted"])) in _group(c)]
+    lines.append(f"| planted cause named first | {_share(len(first), len(single))} |")
+    lines.append(f"| planted cause within the group | {_share(len(group), len(single))} |")
+    wrong = [c for c in single if _first(c) not in ("", next(iter(c["planted"])))]
+    lines.append(f"| another cause named first | {_share(len(wrong), len(single))} |")
+    double = [c for c in cases if len(c["planted"]) == 2]
+    both = [c for c in double if set(c["planted"]) <= {x["effect"] for x in c["answer"]["causes"]}]
+    third = [c for c in double if {x["effect"] for x in c["answer"]["causes"]} - set(c["planted"])]
+    lines.append(f"| two planted: both named | {_share(len(both), len(double))} |")
+    lines.append(f"| two planted: a spurious further cause | {_share(len(third), len(double))} |")
+    strange = [c for c in cases if set(c["planted"]) & set(UNKNOWN)]
+    said = [c for c in strange if c["answer"]["verdict"] == "unexplained"]
+    wrong = [c for c in strange if c["answer"]["causes"]]
+    lines.append(f"| outside the catalogue: `unexplained` | {_share(len(said), len(strange))} |")
+    lines.append(f"| outside the catalogue: a name | {_share(len(wrong), len(strange))} |")
+    seconds = [c["seconds"] for c in cases]
+    lines.append(f"| seconds per diagnosis, median / largest | {np.median(seconds):.1f} / {max(seconds):.1f} |")
+    lines += [
+        "",
+        "| planted | strength | named first | blind | verdicts | parameter, found / planted |",
+        "|---|---|---|---|---|---|",
+    ]
+    for effect in PLANTS:
+        for strength in sorted({_strength(c) for c in single if effect in c["planted"]}):
+            mine = [c for c in single if effect in c["planted"] and _strength(c) == strength]
+            hit = [c for c in mine if _first(c) == effect]
+            blind = sum(effect in c["answer"]["blind"] for c in mine)
+            verdicts = ", ".join(f"{k} {v}" for k, v in Counter(c["answer"]["verdict"] for c in mine).items())
+            lines.append(
+                f"| `{effect}` | {strength:.3g} | {len(hit)} of {len(mine)} | {blind} | {verdicts} | {_ratio(effect, hit)} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def _strength(c: dict) -> float:
+    return float(next(iter(next(iter(c["planted"].values())).values())))
+
+
+def _first(c: dict) -> str:
+    causes = c["answer"]["causes"]
+    return causes[0]["effect"] if causes else ""
+
+
+def _group(c: dict) -> list[str]:
+    causes = c["answer"]["causes"]
+    return causes[0]["group"] if causes else []
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{part} of {whole} ({100 * part / whole:.0f} %)" if whole else "not run"
+
+
+def _ratio(effect: str, hits: list[dict]) -> str:
+    name = next(iter(PLANTS[effect]))
+    found = [
+        c["answer"]["causes"][0]["parameters"][name]["value"] / c["planted"][effect][name]
+        for c in hits
+        if name in c["answer"]["causes"][0]["parameters"]
+    ]
+    return f"{np.median(found):.2f} ({min(found):.2f} .. {max(found):.2f})" if found else "-"
+
+
+def picture(cases: list[dict], path: Path) -> None:
+    """Planted (rows) against named first (columns)."""
+    from matplotlib.figure import Figure
+
+    names = list(PLANTS)
+    rows, columns = [*names, "nothing", *UNKNOWN], [*names, "no name", "unexplained"]
+    table = np.zeros((len(rows), len(columns)))
+    for c in cases:
+        if len(c["planted"]) > 1:
+            continue
+        row = next(iter(c["planted"]), "nothing")
+        first = _first(c)
+        column = first or ("unexplained" if c["answer"]["verdict"] == "unexplained" else "no name")
+        table[rows.index(row), columns.index(column)] += 1
+    share = table / np.maximum(table.sum(1, keepdims=True), 1)
+    figure = Figure(figsize=(11, 11), layout="constrained")
+    axis = figure.subplots()
+    axis.imshow(share, cmap="Blues", vmin=0, vmax=1)
+    axis.set_xticks(range(len(columns)), columns, rotation=90)
+    axis.set_yticks(range(len(rows)), rows)
+    axis.set_xlabel("named first")
+    axis.set_ylabel("planted")
+    for r, c in zip(*np.nonzero(table), strict=True):
+        axis.text(c, r, int(table[r, c]), ha="center", va="center", color="white" if share[r, c] > 0.5 else "black")
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--scenes", type=int, default=2)
+    parser.add_argument("--nulls", type=int, default=20, help="per scene")
+    parser.add_argument("--plants", type=int, default=1, help="per effect, strength and scene")
+    parser.add_argument("--strengths", type=float, nargs="+", default=[1.0])
+    parser.add_argument("--doubles", type=int, default=4, help="per scene")
+    parser.add_argument("--sites", type=int, default=4)
+    parser.add_argument("--images", type=int, default=12)
+    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--only", nargs="*", default=None)
+    parser.add_argument("--output", type=Path, required=True)
+    options = parser.parse_args()
+    rng = np.random.default_rng(options.seed)
+    cases: list[dict] = []
+    cache = Path(tempfile.gettempdir()) / "lunargr-hidden"
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for _ in range(options.scenes):
+            layout = Layout(
+                seed=int(rng.integers(2**31)), sites=options.sites, images=options.images, size=options.size,
+                slope_deg=float(rng.uniform(5, 10)),
+            )  # fmt: skip
+            scene = Scene(layout, cache)
+            jobs: list[dict] = [{} for _ in range(options.nulls)]
+            for effect, values in PLANTS.items():
+                if options.only is not None and effect not in options.only:
+                    continue
+                key = next(iter(values))
+                jobs += [
+                    {effect: {**values, key: values[key] * s}} for s in options.strengths for _ in range(options.plants)
+                ]
+            if options.only is None:
+                jobs += [{k: v} for k, v in UNKNOWN.items() for _ in range(options.plants)]
+                for _ in range(options.doubles):
+                    pair = rng.choice(
+                        ["phase_slope", "limb_darkening", "column_pattern", "image_gain", "line_jitter", "echo"],
+                        2,
+                        replace=False,
+                    )
+                    jobs.append({str(k): PLANTS[str(k)] for k in pair})
+            for job in jobs:
+                done = case(scene, job, int(rng.integers(2**31)), folder)
+                cases.append(done)
+                answer = done["answer"]
+                print(
+                    f"{','.join(job) or 'nothing':24s} -> {answer['verdict']:20s} "
+                    f"{[(c['effect'], {k: p['value'] for k, p in c['parameters'].items()}, round(c['gain_nats'])) for c in answer['causes']]} "
+                    f"closest {answer['closest']} blind {len(answer['blind'])} {done['seconds']:.1f} s",
+                    flush=True,
+                )
+            options.output.with_suffix(".json").write_text(json.dumps(cases, indent=1))
+            options.output.with_suffix(".md").write_text(summarise(cases))
+            picture(cases, options.output.with_suffix(".png"))
+    print(summarise(cases))
+
+
+if __name__ == "__main__":
+    main()
