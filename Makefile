@@ -102,10 +102,10 @@ reproduce-apollo15: $(A)/report.html ## the same stages on five real Apollo 15 f
 
 $(A)/scene.h5: | $(STAMP)
 	@test -f $(A_DATA)/images.csv || { echo "reproduce-apollo15: no data at $(A_DATA); set LUNARGR_SHARED to the folder that holds data/apollo15"; exit 3; }
-	$(LUNARGR) ingest $(A_DATA)/gld100_64ppd.tif --images $(A_DATA)/images.csv --gsd 474 --crop 64 -o $@ --overwrite
+	$(LUNARGR) ingest $(A_DATA)/gld100_64ppd.tif --images $(A_DATA)/images.csv --gsd 474 --crop 48 -o $@ --overwrite
 
 $(A)/crops.h5: $(A)/scene.h5
-	$(LUNARGR) sample $< --count 2000 --tile-m 45000 -o $@ --overwrite
+	$(LUNARGR) sample $< --count 3000 --tile-m 32000 --split 70/10/20 -o $@ --overwrite
 
 $(A)/pairs.h5: $(A)/crops.h5
 	$(LUNARGR) project $< -o $@ --overwrite
@@ -126,7 +126,7 @@ $(A)/match.json: $(A)/pairs.h5 $(A)/checkpoint.h5
 	$(LUNARGR) match $^ --count 12 --json $@ --figures $(A)/figures --overwrite
 
 $(A)/diagnosis.h5: $(A)/scene.h5
-	$(LUNARGR) sample $< --stack --count 12 --tile-m 45000 -o $(A)/stack_crops.h5 --overwrite
+	$(LUNARGR) sample $< --stack --count 24 --tile-m 32000 --split 70/10/20 -o $(A)/stack_crops.h5 --overwrite
 	$(LUNARGR) project $(A)/stack_crops.h5 -o $(A)/stack.h5 --overwrite
 	$(LUNARGR) diagnose $(A)/stack.h5 --model M2 -o $@ --json $(A)/diagnosis.json --report $(A)/diagnosis.html --overwrite
 

@@ -24,7 +24,7 @@ from stages.physics.positions import blocks, valid_positions
 
 Progress = Callable[[int, int, str], None]
 
-MINIMUM_TILES = 25  # where --tile-m is left to us: enough tiles for a test part that is not one odd place
+MINIMUM_TILES = 60  # where --tile-m is left to us: enough tiles for a test part that is not one odd place
 LARGEST_TILE = 4  # crops
 
 
