@@ -19,6 +19,7 @@ from stages.physics.sweeps import (
     Sweep,
     Taps,
     arctangent,
+    compile_kernels,
     sink,
     strip_width,
     transpose_in,
@@ -287,9 +288,9 @@ def _by_columns(
 
 # Small grids are swept by the calling thread alone: no start-up cost, and safe in worker processes and threads.
 _KERNELS = {
-    (columns, parallel): numba.njit(parallel=parallel, cache=True)(_by_columns if columns else _by_rows)
-    for columns in (False, True)
-    for parallel in (False, True)
+    (columns, parallel): kernel
+    for columns, function in ((False, _by_rows), (True, _by_columns))
+    for parallel, kernel in compile_kernels(function).items()
 }
 
 

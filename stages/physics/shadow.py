@@ -16,7 +16,18 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.physics.sweeps import FLAGS, NOTHING, PixelSize, Sweep, Taps, sink, strip_width, transpose_in, transpose_out
+from stages.physics.sweeps import (
+    FLAGS,
+    NOTHING,
+    PixelSize,
+    Sweep,
+    Taps,
+    compile_kernels,
+    sink,
+    strip_width,
+    transpose_in,
+    transpose_out,
+)
 
 NEAR = 4  # rows; 2 rows double the disagreement with a ray tracer, 8 halve it again
 LINES = 1024  # lines per strip of a sweep by rows: the rows in use then stay in the first-level cache
@@ -222,9 +233,9 @@ def _by_columns(
 
 # Small grids are swept by the calling thread alone: no start-up cost, and safe in worker processes and threads.
 _KERNELS = {
-    (columns, parallel): numba.njit(parallel=parallel, cache=True)(_by_columns if columns else _by_rows)
-    for columns in (False, True)
-    for parallel in (False, True)
+    (columns, parallel): kernel
+    for columns, function in ((False, _by_rows), (True, _by_columns))
+    for parallel, kernel in compile_kernels(function).items()
 }
 
 

@@ -10,7 +10,10 @@ a cell into triangles and for the bilinear surface alike: those crossings are al
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from types import FunctionType
+from typing import Any
 
 import numba
 import numpy as np
@@ -94,6 +97,17 @@ def strip_width(lines: int, aim: int) -> int:
     threads = numba.get_num_threads()
     strips = -(-max(1, -(-lines // aim)) // threads) * threads
     return -(-lines // strips)
+
+
+def compile_kernels(function: Callable[..., None]) -> dict[bool, Any]:
+    """The kernel for one thread (False) and for all (True), cached on disk.
+
+    Numba's cache tells functions apart by name and code, not by options: under one name the kernel for all threads
+    would be read back as the one for one thread. The second goes by another name.
+    """
+    twin = FunctionType(function.__code__, function.__globals__, f"{function.__name__}_parallel")
+    twin.__qualname__, twin.__module__ = twin.__name__, function.__module__
+    return {False: numba.njit(cache=True)(function), True: numba.njit(parallel=True, cache=True)(twin)}
 
 
 @dataclass(frozen=True)
