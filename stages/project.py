@@ -194,7 +194,7 @@ def _project(
                         # the line-scan camera's own place for this crop, not the one for the middle of its image
                         centre = local.up[place] * (grid.radius + mean[place])
                         geometry.camera[place] = local.axes[place] @ (pixels.ortho.camera_position - centre)
-                        _write_rays(rays, k, pixels.ortho)
+                        _write_rays(rays, int(k), pixels.ortho)
                     east, north, up = geometry.sun[place]
                     angle = horizon_in_scene(
                         scene_file["elevation"],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 import typer.core
@@ -20,7 +20,7 @@ NAME, ORDER = "project", 40
 class CLASS(typer.core.TyperCommand):
     """``--register`` alone means ``--register shift``: typer knows no option whose value may be left out."""
 
-    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         full = []
         for k, word in enumerate(args):
             full.append(word)

@@ -35,14 +35,15 @@ class CameraImage:
         if self._dataset is not None:
             window = Window(sample, line, samples, lines)
             return rasters.read_window(self._dataset, window).astype(np.float32)
+        picture: Any = self._picture
         # read_scanlines wants whole rows: a few at a time bound the memory
         out = np.empty((lines, samples), np.float32)
         for first in range(0, lines, 256):
             last = min(lines, first + 256)
-            rows = self._picture.read_scanlines(line + first, line + last, 0, 0, 1, self._picture.spec().format)
+            rows = picture.read_scanlines(line + first, line + last, 0, 0, 1, picture.spec().format)
             if rows is None:
                 raise InputError(
-                    f"{self.path}: cannot be read to the end ({' '.join(self._picture.geterror().split())}); the file is damaged "
+                    f"{self.path}: cannot be read to the end ({' '.join(picture.geterror().split())}); the file is damaged "
                     "or truncated, fetch it again."
                 )
             out[first:last] = np.asarray(rows, np.float32).reshape(last - first, self.samples)[

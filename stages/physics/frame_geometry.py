@@ -80,7 +80,8 @@ def _sun(camera: Camera | None, time: str, body: Body, where: str) -> tuple[floa
     if not time:
         return None
     try:
-        return tuple(subsolar_point(time, body))
+        point = subsolar_point(time, body)
+        return point.longitude_deg, point.latitude_deg, point.distance_au
     except GeometryError as error:
         raise GeometryError(f"{where}: {error}") from None
 

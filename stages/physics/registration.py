@@ -384,4 +384,4 @@ def _solve(design: Floats, values: Floats, weight: Floats) -> tuple[Floats, floa
     off = values - design @ solution
     counted = root[:, 0] > 0
     scatter = 1.4826 * float(np.median(np.abs(off[counted]))) if counted.any() else math.inf
-    return solution, scatter, np.abs(off).max(axis=1)
+    return np.asarray(solution, float), scatter, np.asarray(np.abs(off).max(axis=1), float)

@@ -143,9 +143,9 @@ class CameraSource:
         axes = self.grid.local_frames(*middle).axes[0]
         centre = axes[2] * (self.grid.radius + lowest)
         line, sample = self.camera.ground_to_image(centre)
-        line = float(line) if np.isfinite(line) else self.camera.lines / 2
-        sample = float(sample) if np.isfinite(sample) else self.camera.samples / 2
-        _, direction = self.camera.rays(line, sample)
+        at = float(line) if np.isfinite(line) else self.camera.lines / 2
+        across = float(sample) if np.isfinite(sample) else self.camera.samples / 2
+        _, direction = self.camera.rays(at, across)
         east, north, up = axes @ -direction
         emission = math.acos(max(-1.0, min(1.0, float(up))))
         reach = reach_px(max(0.0, self.heights[1] - lowest), emission, self.grid.gsd)

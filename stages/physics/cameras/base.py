@@ -117,7 +117,8 @@ class Camera(ABC):
         origin, direction = self.rays(line, sample)
         radius = self.semi_axes[0]
         height = np.zeros(origin.shape[:-1])
-        previous_height = previous_gap = None
+        previous_height: Floats | None = None
+        previous_gap: Floats | None = None
         points = np.full_like(origin, np.nan)
         done = np.zeros(height.shape, bool)
         for _ in range(iterations):
@@ -134,7 +135,7 @@ class Camera(ABC):
                 if (done | ~np.isfinite(gap)).all():
                     break
                 step = gap
-                if previous_gap is not None:
+                if previous_gap is not None and previous_height is not None:
                     slope = (gap - previous_gap) / (height - previous_height)
                     secant = -gap / slope
                     usable = np.isfinite(secant) & (slope < -0.2) & (np.abs(secant) < 10 * np.abs(gap) + 1)

@@ -50,7 +50,7 @@ class Detector:
                 f"{where}: expected 'focal2pixel_lines' and 'focal2pixel_samples' that span the detector and a focal "
                 f"length other than 0, found determinant {determinant:g} and {focal_length:g} mm."
             )
-        summing = tuple(read.number(document, f"detector_{axis}_summing", where) for axis in ("line", "sample"))
+        summing = _pair(document, "detector_line_summing", "detector_sample_summing", where)
         if min(summing) <= 0:
             raise GeometryError(f"{where}: expected detector summing above 0, found {summing}.")
         code, coefficients = read_distortion(document, where)
@@ -58,8 +58,8 @@ class Detector:
             focal_length=focal_length,
             to_line=to_line,
             to_sample=to_sample,
-            centre=tuple(read.number(document, f"detector_center.{axis}", where) for axis in ("line", "sample")),
-            start=tuple(read.number(document, f"starting_detector_{axis}", where) for axis in ("line", "sample")),
+            centre=_pair(document, "detector_center.line", "detector_center.sample", where),
+            start=_pair(document, "starting_detector_line", "starting_detector_sample", where),
             summing=summing,
             distortion=code,
             coefficients=coefficients,
@@ -132,7 +132,8 @@ class Exposure:
             else "km"
         )
         metres = 1000.0 if unit == "km" else 1.0
-        axes = tuple(read.number(document, f"radii.{axis}", where) * metres for axis in ("semimajor", "semiminor"))
+        major, minor = _pair(document, "radii.semimajor", "radii.semiminor", where)
+        axes = major * metres, minor * metres
         if min(axes) <= 0:
             raise GeometryError(f"{where}: expected radii above 0, found {axes} m.")
         centre = read.number(document, "center_ephemeris_time", where)
@@ -150,3 +151,7 @@ class Exposure:
     def sun_body_fixed(self, times: Floats) -> Floats:
         """(n, 3) place of the Sun, body-fixed, m, at times (n,)."""
         return (self.body.at(times) @ self.sun.at(times)[..., None])[..., 0]
+
+
+def _pair(document: Mapping[str, Any], first: str, second: str, where: str) -> tuple[float, float]:
+    return read.number(document, first, where), read.number(document, second, where)

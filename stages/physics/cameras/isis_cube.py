@@ -150,7 +150,8 @@ def _rotations(path: Path, label: Block, name: str) -> dict[str, Any]:
             f"{path}: expected 5 or 8 fields in table '{name}', found {table.shape[1]}; run spiceinit again."
         )
     rotations: dict[str, Any] = {"quaternions": table[:, :4], "ephemeris_times": table[:, -1]}
-    constant = (label.find("Table", name) or {}).get("ConstantRotation")
+    block = label.find("Table", name)
+    constant = block.get("ConstantRotation") if block is not None else None
     if constant is not None:
         rotations["constant_rotation"] = constant
     return rotations

@@ -215,7 +215,7 @@ def _spline_slopes(times: Floats, values: Floats) -> Floats:
     for k in range(1, n - 1):
         matrix[k, k - 1 : k + 2] = h[k], 2 * (h[k] + h[k - 1]), h[k - 1]
         right[k] = 3 * (h[k] * chord[k - 1] + h[k - 1] * chord[k])
-    return np.linalg.solve(matrix, right)
+    return np.asarray(np.linalg.solve(matrix, right), float)
 
 
 @numba.njit(cache=True)
