@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import subprocess
 import sys
 
 import h5py
@@ -458,3 +459,19 @@ def test_an_interrupted_render_leaves_nothing(scene, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         render.run(path, tmp_path / "o.exr", render.Config(sun_azimuth_deg=1.0, sun_elevation_deg=40.0))
     assert [p.name for p in tmp_path.iterdir()] == ["svbrdf.h5"]
+
+
+@pytest.mark.parametrize("suffix", ["exr", "tif"])
+def test_a_file_that_cannot_grow_is_one_line_and_nothing_half_written(scene, tmp_path, suffix):
+    """As on a full disk or over quota: the process may write no more than 60 kB into one file."""
+    path, *_ = scene
+    out = tmp_path / "out"
+    code = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000));"
+        f"sys.argv = ['lunargr', 'render', {str(path)!r}, *{SUN!r}, '-o', {str(out / f'o.{suffix}')!r}, '-q'];"
+        "from lunargr_cli.main import main; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    told = [line for line in done.stderr.splitlines() if line.startswith("lunargr")]
+    assert done.returncode == 3 and len(told) == 1 and "Traceback" not in done.stderr, done.stderr
+    assert list(out.iterdir()) == []

@@ -67,7 +67,7 @@ def fit_chart(grid: Grid) -> Chart:
         miss = _terms(check[2] / scale, check[3] / scale, degree) @ solution - np.stack([check[1], check[0]], axis=1)
         error = float(np.abs(miss).max())
         if error < TOLERANCE:
-            return Chart(axes, _square(solution, degree), scale, 1.02 * scale, grid.radius, error)
+            return Chart(axes, _square(np.asarray(solution, float), degree), scale, 1.02 * scale, grid.radius, error)
     raise GeometryError(
         f"the scene spans {height} x {width} px of {grid.gsd:g} m, too much of the body for one perspective view; "
         "crop it (gdal_translate -projwin) to what the camera can see."

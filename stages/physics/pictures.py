@@ -17,6 +17,7 @@ import OpenImageIO as oiio
 import rasterio
 import rasterio.shutil
 from numpy.typing import NDArray
+from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from schemas.errors import InputError
@@ -94,14 +95,17 @@ def read_exr(path: Path) -> dict[str, Floats32]:
 class GeoTiffWriter:
     """Rows of a GeoTIFF as they come."""
 
-    def __init__(self, target: rasterio.io.DatasetWriter) -> None:
-        self._target = target
+    def __init__(self, path: Path, target: rasterio.io.DatasetWriter) -> None:
+        self._path, self._target = path, target
         self._row = 0
 
     def write(self, bands: NDArray) -> None:
         """Append rows: (bands, rows, W), NaN where there is nothing."""
         rows, width = bands.shape[1:]
-        self._target.write(bands, window=Window(0, self._row, width, rows))
+        try:
+            self._target.write(bands, window=Window(0, self._row, width, rows))
+        except RasterioError as error:
+            raise _failed(self._path, str(error.__cause__ or error)) from None
         self._row += rows
 
 
@@ -140,11 +144,14 @@ def write_geotiff(
                 if units:
                     target.set_band_unit(k, units[k - 1])
             target.update_tags(**{k.upper(): str(v) for k, v in (tags or {}).items()})
-            yield GeoTiffWriter(target)
-        rasterio.shutil.copy(
-            str(plain), str(partial), driver="COG", COMPRESS="DEFLATE", LEVEL="1", PREDICTOR="YES",
-            BIGTIFF="IF_SAFER", OVERVIEW_RESAMPLING="AVERAGE", NUM_THREADS="ALL_CPUS",
-        )  # fmt: skip
+            yield GeoTiffWriter(path, target)
+        try:
+            rasterio.shutil.copy(
+                str(plain), str(partial), driver="COG", COMPRESS="DEFLATE", LEVEL="1", PREDICTOR="YES",
+                BIGTIFF="IF_SAFER", OVERVIEW_RESAMPLING="AVERAGE", NUM_THREADS="ALL_CPUS",
+            )  # fmt: skip
+        except RasterioError as error:
+            raise _failed(path, str(error.__cause__ or error)) from None
 
 
 class Preview:
@@ -170,7 +177,7 @@ class Preview:
     def image(self) -> Floats32:
         """(h, w) float32, NaN where nothing was seen."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            return self._sum / self._count.astype(np.float32)
+            return np.asarray(self._sum / self._count.astype(np.float32), np.float32)
 
 
 def stretch(
