@@ -91,7 +91,7 @@ def run(parts: Sequence[Path], output: Path, overwrite: bool = False, progress: 
                         [_moved(v, parts[0], output) for v in read_strings(files[0], name)], dtype=object
                     )
                 elif target.shape == () or 0 not in target.shape:
-                    target[...] = files[0][name][...]
+                    target[...] = _known(files, name)
             if "path" in names and record == "frame":
                 _move_paths(files, parts, writer.file, output)
             if schema.name in MAPS:
@@ -169,6 +169,15 @@ def _concatenate(files: Sequence[h5py.File], name: str, target: h5py.Dataset, ax
         if source.ndim == 1:
             target[place : place + source.shape[0]] = source[...]
         place += source.shape[axis]
+
+
+def _known(files: Sequence[h5py.File], name: str) -> Any:
+    """What the parts have in common; NaN where one part knows nothing (an image that it did not register) gives way."""
+    values = files[0][name][...]
+    for file in files[1:]:
+        if values.dtype.kind == "f" and name in file and file[name].shape == values.shape:
+            values = np.where(np.isnan(values), file[name][...], values)
+    return values
 
 
 def _overlay(files: Sequence[h5py.File], name: str, target: h5py.Dataset, rows: int = 256) -> None:

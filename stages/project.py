@@ -162,8 +162,8 @@ def _project(
         names = ("elevation", "valid", "sun_horizon_deg", "sun_direction_enu", "camera_position_enu", "convergence_deg")
         elevation, valid, horizon, sun_out, camera_out, convergence = (writer.dataset(n) for n in names)
         chosen = sorted({int(k) for k in image_index})
-        by_camera = any(frames[k].camera for k in chosen)
-        rays = [writer.dataset(n) for n in RAY_VARIABLES] if by_camera else []
+        # of the whole table, not of this shard's images: the parts of one whole hold the same variables
+        rays = [writer.dataset(n) for n in RAY_VARIABLES] if any(f.camera for f in frames) else []
         known = overview_extremes(scene_file["elevation"], overview)
         registered: list[Registered] = []
         done = 0

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from lunargr_cli.main import app
 from schemas.errors import ConfigError, GeometryError, InputError, LunargrError
-from stages import ingest, project, sample
+from stages import ingest, merge, project, sample
 from stages.physics.bodies import find_body
 from stages.physics.cameras import open_camera
 from stages.physics.cameras.pinhole import Pinhole
@@ -385,3 +385,23 @@ def test_bad_camera_images_get_one_clear_line(small_files, raw, tmp_path):
 
 
 SPACECRAFT = {"spacecraft_longitude_deg": LON, "spacecraft_latitude_deg": LAT, "spacecraft_altitude_m": ALTITUDE}
+
+
+def test_shards_join_into_what_one_run_gives(rough, tmp_path):
+    """Each shard registers the images it holds, by all their crops: parts agree, and the whole knows every shift."""
+    dem, image = rough
+    table = write_frame(tmp_path, camera(), image)
+    (tmp_path / "b.json").write_text(json.dumps(camera(50.0).to_document()))
+    with table.open("a", newline="") as stream:
+        csv.writer(stream).writerow(["RAW2", "raw.tif", "iof", "b.json", *small_scene.SUN, 1.0])
+    _, whole = run_all(dem, table, tmp_path, register="shift")
+    parts = []
+    for k in (0, 1):
+        parts.append(tmp_path / f"part{k}.h5")
+        project.run(tmp_path / "crops.h5", parts[-1], project.Config(register="shift", shard=(k, 2)))
+    merge.run(parts, tmp_path / "joined.h5")
+    with h5py.File(whole) as one, h5py.File(tmp_path / "joined.h5") as joined:
+        for name in ("shift_col_px", "shift_row_px", "image", "detector_line", "emission_deg"):
+            np.testing.assert_array_equal(joined[name][...], one[name][...])
+        assert np.isfinite(one["shift_col_px"][...]).all()
+        assert one["shift_col_px"][1] - one["shift_col_px"][0] == pytest.approx(2.5, abs=0.15)
