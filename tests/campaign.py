@@ -47,8 +47,8 @@ PLANTS: dict[str, dict] = {
     "dark_bias": {"iof": 0.001},
     "nonlinearity": {"quadratic": 1.0},
     "psf_blur": {"sigma2_px2": 0.8},
-    "column_pattern": {"rms": 0.01},
-    "echo": {"fraction": 0.03, "lag_px": 6},
+    "column_pattern": {"rms": 0.03},
+    "echo": {"fraction": 0.05, "lag_px": 6},
     "saturation": {"iof": 0.085},
 }
 UNKNOWN = {"banding": {"amplitude": 0.01, "period": 7.0}, "ghost": {"share": 0.03}}

@@ -4,6 +4,7 @@ data         measured pairs by site            chain       the forward model, re
 nominal      the model that is judged          projection  texture and DEM error taken out, per ground pixel
 statistics   products per cluster of pixels    evidence    held-out gain and significance, scene-wide effects
 images       the same for effects per image    selection   name, refine, look again
+plateau      highlights that are cut off
 unexplained  what is left, what cannot be seen answer      verdict, JSON, diagnosis.h5      report   HTML
 """
 
@@ -22,6 +23,7 @@ from schemas import ArtefactError, ConfigError, atomic_path, check_output
 from stages.diagnose.answer import Answer, cause_json, held_out, parameters, write_diagnosis
 from stages.diagnose.data import group_pairs, load_site, survey
 from stages.diagnose.nominal import fit, lit_mask, load_nominal
+from stages.diagnose.plateau import KEEP_BELOW, plateau, saturated
 from stages.diagnose.selection import Round, Search, enough, search
 from stages.diagnose.unexplained import Structure, blind_effects, measure
 from stages.effects import effect_names
@@ -108,12 +110,15 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     if few:
         answer.note, answer.blind = few, effect_names()
         return Result(answer, None, None, None)
+    cut = None if reader.units == "dn" else plateau(sites)
     measured = [s.image for s in sites]
     fit(nominal, sites, [], reader.units, measured)
     first = copy.copy(nominal)
     data = survey(sites, len(reader.image_ids))
     has = frozenset({"sun_horizon"})
     state = Search(nominal, sites, data, len(reader.image_ids), reader.units, has, progress, measured=measured)
+    if cut is not None:
+        state.causes.append(saturated(cut, data, sites))
     misfit = _misfit(state)
     if not misfit < MISFIT:
         answer.verdict, answer.unexplained_fraction = "unexplained", 1.0
@@ -128,7 +133,13 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     hidden = [load_site(reader, g) for g in group_pairs(reader, test, config.most_images)[:64]]
     tiles = [reader.tile[s.pairs] for s in hidden]
     effects = [c.effect for c in answer.causes]
+    for site in hidden if cut is not None else []:
+        site.valid &= site.image < KEEP_BELOW * cut
     answer.held_out = held_out(hidden, tiles, first, nominal if effects else first, effects, state.dn, config.seed)
+    if effects and answer.held_out.high < -1.0:  # a model that predicts unseen ground worse explains nothing
+        answer.verdict, answer.closest, answer.causes = "unexplained", [c.effect.name for c in answer.causes], []
+        answer.unexplained_fraction = 1.0
+        answer.held_out = held_out(hidden, tiles, first, first, [], state.dn, config.seed)
     return Result(answer, state, seen, structure)
 
 

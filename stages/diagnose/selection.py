@@ -21,6 +21,7 @@ from stages.diagnose.statistics import (
     SiteWork,
     Statistics,
     gather_site,
+    gather_static,
     join,
     make_candidates,
     ready,
@@ -33,9 +34,18 @@ GATE = 0.01  # family-wise
 GATE_STATIC = 5e-4
 FLOOR_FID = 0.012  # an effect smaller than this against the noise is never worth a name
 FLOOR_IMAGE = 0.035  # the same for effects with values per image, which have more to fit with
+FLOOR_STATIC = 4.0  # nats; the static rows are cut at short waves and count for less than their worth
 FLOOR_GAIN = 12.0  # nats
 # linear in their coordinates: the first estimate needs no second one
-LINEAR = ("dark_bias", "earthshine", "interreflection", "nonlinearity", "column_pattern", "azimuthal_anisotropy", *STATIC)
+LINEAR = (
+    "dark_bias",
+    "earthshine",
+    "interreflection",
+    "nonlinearity",
+    "column_pattern",
+    "azimuthal_anisotropy",
+    *STATIC,
+)
 KEEP_SHARE = 0.8  # of a per-image effect's gain that a scene-wide effect must keep to replace it
 
 
@@ -78,6 +88,7 @@ class Search:
     progress: Callable[[int, int, str], None]
     causes: list[Cause] = field(default_factory=list)
     measured: list[Tensor] = field(default_factory=list)
+    refused: set[str] = field(default_factory=set)  # looked good to the linear model, and made things worse
 
     @property
     def base(self) -> list[Effect]:
@@ -102,11 +113,14 @@ class Search:
         """Effects that are neither named nor excluded by the kind of data."""
         named = {c.effect.name for c in self.causes}
         excluded = {"image_gain"} if self.dn else set()
+        excluded |= self.refused
         return [n for n in effect_names() if n not in named | excluded and get_effect(n).visible(self.data, self.has)]
 
     def look(self) -> Round:
         names = self.open_names()
-        plain = [n for n in names if get_effect(n).scope == "scene" and n not in (*EDGE_EFFECTS, *BASELINE)]
+        plain = [n for n in names if get_effect(n).scope == "scene" and n not in (*EDGE_EFFECTS, *BASELINE, *STATIC)]
+        still = make_candidates([n for n in names if n in STATIC], self.data)
+        still_parts = []
         edge = [n for n in names if n in EDGE_EFFECTS]
         candidates, at_edge = make_candidates(plain, self.data), make_candidates(edge, self.data)
         works, parts, edge_parts = [], [], []
@@ -114,6 +128,8 @@ class Search:
             work = ready(chain, self.dn)
             parts.append(gather_site(work, candidates, self.data)[0])
             works.append(work)
+            if still:
+                still_parts.append(gather_static(work, still, self.data))
             if at_edge:
                 work = ready(chain, self.dn, wide=True)
                 edge_parts.append(gather_site(work, at_edge, self.data, [edge_nuisance(chain, self.data)])[0])
@@ -123,6 +139,8 @@ class Search:
         for name in BASELINE:
             if name in names:
                 best[name] = weigh(_swap(statistics, name, self.data))[0]
+        if still:
+            best |= best_guises(weigh(join(still_parts)))
         if at_edge:
             best |= best_guises(weigh(join(edge_parts)))
         image_names = [n for n in names if get_effect(n).scope == "image"]
@@ -149,9 +167,14 @@ class Search:
             )  # fmt: skip
         if not scene:
             return None
-        wall = [e for e in scene if e.effect == "distant_shadow"]
+        wall = [e for e in scene if e.effect in ("distant_shadow", "saturation")]
         first = wall[0] if wall else scene[0]  # gross as it is, a missing shadow spoils every other estimate
-        group = [first.effect, *(e.effect for e in scene[1:] if _as_good(first, e))]
+        rivals = [e for e in scene if e is not first and _as_good(first, e)]
+        simpler = [e for e in rivals if e.candidate.size < first.candidate.size and e.gain > 0.85 * first.gain]
+        if simpler:
+            rivals = [first, *(e for e in rivals if e is not simpler[0])]
+            first = simpler[0]
+        group = [first.effect, *(e.effect for e in rivals)]
         effect = start(first, self.data)
         errors = dict(effect.first_errors)  # type: ignore[attr-defined]
         p = min(1.0, first.p * count)
@@ -160,9 +183,13 @@ class Search:
     def worth(self, e: Evidence, count: int, ease: float = 1.0) -> bool:
         """Whether the evidence is enough for a name."""
         gate = min(GATE, GATE_STATIC * count) if e.effect in STATIC else GATE
-        if e.p * count > gate * ease or e.fid < FLOOR_FID or min(e.gain_image, e.gain_place) <= 0:
+        if (
+            e.p * count > gate * ease
+            or (e.fid < FLOOR_FID and e.effect not in STATIC)
+            or min(e.gain_image, e.gain_place) <= 0
+        ):
             return False
-        if e.gain < max(FLOOR_GAIN, 2 * e.gain_error):
+        if e.gain < max(FLOOR_STATIC if e.effect in STATIC else FLOOR_GAIN, 1.5 * e.gain_error):
             return False
         cls = get_effect(e.effect)
         column = e.candidate.trial.columns[0]
@@ -182,7 +209,10 @@ class Search:
             up, spread = e.amount[0], e.covariance[0, 0].clamp(min=0).sqrt()
             return float(up) > 3 * float(spread)
         if e.effect in ("distant_shadow", "saturation"):  # a shadow is dark and a cut-off flat, or it is something else
-            return 0.5 < float(e.amount[0]) < 2.0 and e.amount[0] ** 2 > 9 * e.covariance[0, 0]
+            return (
+                0.5 < float(e.amount[0]) < (10.0 if e.effect == "distant_shadow" else 2.0)
+                and e.amount[0] ** 2 > 9 * e.covariance[0, 0]
+            )
         return True
 
     def worth_image(self, e: ImageEvidence, count: int) -> bool:
@@ -331,11 +361,23 @@ def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
         cause = state.choose(seen)
         if cause is None:
             return seen
-        say(f"found {cause.effect.name}: gain {cause.gain:.0f} +- {cause.gain_error:.0f} nats")
         cause.rms_before = state.residual_rms()
+        kept = state.nominal.vector, [s.texture for s in state.sites], [(c, c.effect) for c in state.causes]
         state.causes.append(cause)
         state.refine()
         cause.rms_after = state.residual_rms()
+        if not cause.rms_after < 1.02 * cause.rms_before:
+            state.causes.pop()
+            state.refused.add(cause.effect.name)
+            state.nominal.vector = kept[0]
+            for site, texture in zip(state.sites, kept[1], strict=True):
+                site.texture = texture
+            for known, effect in kept[2]:
+                known.effect = effect
+            if len(state.refused) > 3:
+                return seen
+            continue
+        say(f"found {cause.effect.name}: gain {cause.gain:.0f} +- {cause.gain_error:.0f} nats")
 
 
 def enough(sites: list[Site]) -> str:

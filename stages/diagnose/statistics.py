@@ -251,6 +251,25 @@ def gather_site(
     return _reduce(work, candidates, names, z, m, y), z, m
 
 
+def gather_static(work: SiteWork, candidates: Sequence[Candidate], data: Survey) -> Statistics:
+    """Statistics from the static rows alone, for albedo that follows terrain.
+
+    Such effects leave no trace in the dynamic rows, while nuisances that the dynamic rows fix would carry their own
+    errors into the static ones. Clusters are blocks of ground.
+    """
+    columns = [c for k in candidates for c in trial_columns(work.chain, k.effect, k.trial, data)]
+    z, y = _still(work.projector.rows(torch.stack(columns))), _still(work.raw_rows)
+    nothing = Rows(y.dynamic[:1] * 0, y.static[:1] * 0)
+    out = _reduce(work, candidates, ["none"], z, nothing, y)
+    out.image = out.place
+    out.rows = max(out.rows, 1.0)
+    return out
+
+
+def _still(rows: Rows) -> Rows:
+    return Rows(torch.zeros_like(rows.dynamic), rows.static)
+
+
 def _site_columns(chain: Chain) -> Tensor:
     """The nominal model's freedom within a site: each coefficient may change and drift across the crop."""
     tangents = chain.surface_tangents()

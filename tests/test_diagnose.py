@@ -1,0 +1,180 @@
+"""`lunargr diagnose` on hidden data that Mitsuba traced: names, silence, structure, blindness, bad input."""
+
+from __future__ import annotations
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from campaign import PLANTS, UNKNOWN, random_world
+from hidden.scene import Layout, Scene, Truth, write_pairs
+from typer.testing import CliRunner
+
+from schemas import ArtefactError
+from stages import diagnose
+from stages.effects import load_extension
+
+# What two sites of 64 px in ten images can show, with the first parameter's relative error where it is recovered.
+SHOWN = {
+    "misregistration": 0.15,
+    "line_jitter": 0.3,
+    "sun_azimuth": 0.2,
+    "distant_shadow": None,
+    "opposition_surge": 0.1,
+    "phase_slope": 0.1,
+    "limb_darkening": 0.15,
+    "slope_albedo": 0.3,
+    "elevation_albedo": 0.3,
+    "curvature_albedo": 0.3,
+    "azimuthal_anisotropy": 0.15,
+    "image_gain": 0.4,
+    "psf_blur": 0.3,
+}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene(Layout())
+
+
+def _pairs(scene, folder, effect, seed=11, **changes):
+    world = random_world(np.random.default_rng((seed, 99))) | changes
+    units = world.pop("units", "iof")
+    data = scene.make(Truth(effect=effect, units=units, **world), seed)
+    return write_pairs(folder / "pairs.h5", data, scene.layout, units=units)
+
+
+@pytest.mark.parametrize("effect", SHOWN)
+def test_planted_cause_is_named(scene, tmp_path, effect):
+    answer = diagnose.run(_pairs(scene, tmp_path, {effect: PLANTS[effect]})).answer.to_json()
+    assert answer["verdict"] == "named"
+    first = answer["causes"][0]
+    assert effect in first["group"]
+    assert first["effect"] == effect
+    if SHOWN[effect] is not None:
+        name = next(iter(PLANTS[effect]))
+        found = first["parameters"][name]
+        assert found["value"] == pytest.approx(PLANTS[effect][name], rel=SHOWN[effect])
+        assert found["unit"]
+
+
+@pytest.mark.parametrize("effect", [e for e in PLANTS if e not in SHOWN])
+def test_other_plants_are_answered_without_a_crash(scene, tmp_path, effect):
+    """These data are too few, or the effect too weak, to demand the name: the answer must still be whole."""
+    answer = diagnose.run(_pairs(scene, tmp_path, {effect: PLANTS[effect]})).answer.to_json()
+    assert answer["verdict"] in ("named", "nothing_significant", "unexplained", "cannot_tell")
+    assert (answer["verdict"] == "named") == bool(answer["causes"])
+    assert answer["held_out"]["gain_percent_high"] >= -1
+
+
+@pytest.mark.parametrize("seed", [21, 22, 23, 24])
+def test_nothing_hidden_names_nothing(scene, tmp_path, seed):
+    answer = diagnose.run(_pairs(scene, tmp_path, {}, seed)).answer
+    assert not answer.causes
+    assert answer.verdict in ("nothing_significant", "cannot_tell")
+
+
+@pytest.mark.parametrize("what", UNKNOWN)
+def test_outside_the_catalogue_is_unexplained(scene, tmp_path, what):
+    answer = diagnose.run(_pairs(scene, tmp_path, {what: UNKNOWN[what]})).answer
+    assert answer.verdict == "unexplained" and not answer.causes
+
+
+def test_two_planted(scene, tmp_path):
+    planted = {k: PLANTS[k] for k in ("phase_slope", "line_jitter")}
+    answer = diagnose.run(_pairs(scene, tmp_path, planted)).answer
+    assert {c.effect.name for c in answer.causes} == set(planted)
+
+
+def test_what_the_data_cannot_show_is_said(scene, tmp_path):
+    """Gains of images in dn are free: a planted one leaves no trace."""
+    answer = diagnose.run(_pairs(scene, tmp_path, {"image_gain": {"rms": 0.02}}, units="dn")).answer
+    assert answer.verdict == "cannot_tell"
+    assert "image_gain" in answer.blind
+
+
+def test_outputs(scene, tmp_path):
+    from lunargr_cli.main import app
+
+    pairs = _pairs(scene, tmp_path, {"phase_slope": PLANTS["phase_slope"], "line_jitter": PLANTS["line_jitter"]})
+    names = [str(tmp_path / n) for n in ("d.h5", "d.json", "d.html")]
+    out = CliRunner().invoke(
+        app, ["diagnose", str(pairs), "-o", names[0], "--json", names[1], "--report", names[2], "-q"]
+    )
+    assert out.exit_code == 0, out.output
+    answer = json.loads((tmp_path / "d.json").read_text())
+    keys = {"verdict", "causes", "unexplained_fraction", "blind", "held_out", "data", "config"}
+    assert keys <= set(answer)
+    cause = answer["causes"][0]
+    assert {"effect", "parameters", "p_family_wise", "gain_nats", "gain_error", "group", "to_separate"} <= set(cause)
+    assert answer["held_out"]["gain_percent_low"] > 0
+    page = (tmp_path / "d.html").read_text()
+    assert "data:image/png;base64" in page and "http" not in page.split("</style>")[1].replace("https://", "")
+    effects = {e.name: e for e in load_extension(tmp_path / "d.h5", ["image-003", "never-seen"])}
+    assert float(effects["phase_slope"].values["per_radian"]) == pytest.approx(0.08, rel=0.1)
+    shifts = effects["line_jitter"].values["east1_px"]
+    assert shifts.shape == (2,) and float(shifts[1]) == 0.0
+
+
+def test_list_explains_every_effect():
+    from lunargr_cli.main import app
+
+    out = CliRunner().invoke(app, ["diagnose", "--list"])
+    assert out.exit_code == 0
+    assert all(effect in out.output for effect in PLANTS)
+
+
+def test_without_horizon_a_clear_line(scene, tmp_path):
+    path = _pairs(scene, tmp_path, {})
+    with h5py.File(path, "a") as file:
+        del file["sun_horizon_deg"]
+    with pytest.raises(ArtefactError, match="sun_horizon_deg"):
+        diagnose.run(path)
+
+
+def test_too_few_pixels_cannot_tell(scene, tmp_path):
+    path = _pairs(scene, tmp_path, {"phase_slope": PLANTS["phase_slope"]})
+    with h5py.File(path, "a") as file:
+        file["valid"][:, 10:] = 0
+    answer = diagnose.run(path).answer
+    assert answer.verdict == "cannot_tell" and not answer.causes and "too few" in answer.sentence()
+
+
+def test_a_model_that_does_not_fit_names_nothing(scene, tmp_path):
+    path = _pairs(scene, tmp_path, {})
+    with h5py.File(path, "a") as file:
+        file["image"][...] = np.random.default_rng(1).exponential(0.05, file["image"].shape)
+    answer = diagnose.run(path).answer
+    assert answer.verdict == "unexplained" and not answer.causes
+
+
+def test_f_tail_against_scipy():
+    from scipy.stats import f
+
+    from stages.diagnose.numbers import f_tail
+
+    for x, a, b in ((1.3, 1, 7), (40.0, 2, 9.5), (3.0, 8, 20), (0.2, 1, 1)):
+        assert f_tail(x, a, b) == pytest.approx(f.sf(x, a, b), rel=1e-6)
+
+
+def test_projection_leaves_no_texture_and_no_slope_error(scene, tmp_path):
+    """Residuals made of a static albedo and a static slope error alone leave the dynamic rows empty."""
+    from stages.diagnose.data import group_pairs, load_site
+    from stages.diagnose.nominal import fit, load_nominal
+    from stages.diagnose.projection import Projector
+    from stages.network.dataset import PairReader
+
+    with PairReader(_pairs(scene, tmp_path, {})) as reader:
+        site = load_site(reader, group_pairs(reader, np.arange(reader.count), 16)[0])
+    nominal = load_nominal(None, "M2", "iof")
+    fit(nominal, [site], [], "iof", [site.image])
+    chain = nominal.chain(site, [])
+    east, north = chain.slope_tangents()
+    torch.manual_seed(0)
+    error = 0.05 * torch.randn(64, 64) * chain.textured + 0.02 * torch.randn(64, 64) * east
+    error = error + 0.02 * torch.randn(64, 64) * north
+    projector = Projector(chain, site.valid.float())
+    dynamic, _ = projector.split(error[None])
+    assert float(dynamic.square().sum()) < 1e-6 * float(error.square().sum())

@@ -1,0 +1,140 @@
+"""Effects: each does nothing at its null value, something elsewhere, has a gradient, and says what it is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from schemas import RegistryError
+from stages.effects import Survey, effect_names, get_effect
+from stages.effects.filters import gaussian
+from stages.physics.formation import Observation, displace, form
+from stages.physics.photometry import get_model
+
+CATALOGUE = [
+    "misregistration",
+    "dem_smoothing",
+    "dem_scale",
+    "line_jitter",
+    "sun_elevation",
+    "sun_azimuth",
+    "penumbra",
+    "distant_shadow",
+    "interreflection",
+    "earthshine",
+    "opposition_surge",
+    "phase_slope",
+    "limb_darkening",
+    "macroscopic_roughness",
+    "slope_albedo",
+    "elevation_albedo",
+    "curvature_albedo",
+    "albedo_map",
+    "azimuthal_anisotropy",
+    "image_gain",
+    "dark_bias",
+    "nonlinearity",
+    "psf_blur",
+    "column_pattern",
+    "echo",
+    "saturation",
+]
+
+
+def _scene() -> Observation:
+    rng = np.random.default_rng(4)
+    size = 32
+    spectrum = np.fft.rfft2(rng.normal(size=(size, size)))
+    k = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size))
+    z = np.fft.irfft2(spectrum / (k + 0.03) ** 2, s=(size, size))
+    z = torch.tensor(z / np.abs(np.gradient(z)).mean() * 0.7, dtype=torch.float32)
+    suns = [[0.5, 0.4, 0.7], [-0.8, 0.3, 0.35]]
+    sun = torch.nn.functional.normalize(torch.tensor(suns, dtype=torch.float32), dim=1)
+    horizon = torch.atan(torch.rand(2, size, size, generator=torch.Generator().manual_seed(1)) * 0.5)
+    camera = torch.tensor([[2e4, 1e4, 1e5], [0.0, -3e4, 1e5]])
+    return Observation(
+        z.expand(2, -1, -1).clone(), sun, camera, 5.0, 1737400.0, horizon, frame=torch.tensor([0, 1]),
+        site=torch.tensor([0, 0]),
+    )  # fmt: skip
+
+
+SCENE, M2 = _scene(), get_model("M2")
+COEFFICIENTS = torch.tensor([0.08, 0.02, 0.01])[None, :, None, None]
+SURVEY = Survey(crop_px=32, gsd=5.0, brightness=0.06, brightness_quantiles=(0.07, 0.075, 0.08, 0.09), slope=(0.2, 0.1))
+
+
+def _values(cls, trial, factor: float = 1.0) -> dict:
+    values = dict(trial.fixed)
+    for column in trial.columns:
+        values |= {k: cls.null()[k] + factor * (v - cls.null()[k]) for k, v in column.items()}
+    if cls.scope != "scene":
+        values = {k: torch.full((2,), float(v)) for k, v in values.items()}
+    return values
+
+
+def test_the_catalogue_is_complete():
+    assert sorted(effect_names()) == sorted(CATALOGUE)
+
+
+def test_unknown_names_list_the_choices():
+    with pytest.raises(RegistryError, match="phase_slope"):
+        get_effect("phase")
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_effect(name):
+    cls = get_effect(name)
+    plain = form(SCENE, M2, COEFFICIENTS)
+    null = form(SCENE, M2, COEFFICIENTS, [cls(None, SURVEY)])
+    torch.testing.assert_close(null, plain, atol=2e-6, rtol=1e-5)
+    trials = list(cls.trials(SURVEY))
+    changed = [
+        float((form(SCENE, M2, COEFFICIENTS, [cls(_values(cls, t), SURVEY)]) - plain).abs().max()) for t in trials
+    ]
+    assert max(changed) > 1e-5
+    assert all(math.isfinite(c) for c in changed)
+    for p in cls.fitted():
+        assert p.lower <= p.default <= p.upper, p
+    assert cls.mechanism and cls.reference and cls.separate and cls.confused_with
+    assert all(other in CATALOGUE for other in cls.confused_with)
+
+
+@pytest.mark.parametrize("name", [n for n in CATALOGUE if n != "distant_shadow"])
+def test_effect_has_a_gradient(name):
+    cls = get_effect(name)
+    trial = cls.trials(SURVEY)[-1]
+    values = _values(cls, trial)
+    key = next(iter(trial.columns[0]))
+    leaf = torch.as_tensor(values[key], dtype=torch.float32).clone().requires_grad_()
+    image = form(SCENE, M2, COEFFICIENTS, [cls({**values, key: leaf}, SURVEY)])
+    image.square().sum().backward()
+    assert torch.isfinite(leaf.grad).all() and float(leaf.grad.abs().sum()) > 0
+
+
+def test_values_per_image_go_with_the_frame():
+    gain = get_effect("image_gain")({"gain": torch.tensor([0.1, 0.0])})
+    ratio = form(SCENE, M2, COEFFICIENTS, [gain]).sum((1, 2)) / form(SCENE, M2, COEFFICIENTS).sum((1, 2))
+    torch.testing.assert_close(ratio, torch.tensor([1.1, 1.0]))
+
+
+def test_closed_forms():
+    plain = form(SCENE, M2, COEFFICIENTS)
+    biased = form(SCENE, M2, COEFFICIENTS, [get_effect("dark_bias")({"iof": 0.003})])
+    torch.testing.assert_close(biased - plain, torch.full_like(plain, 0.003), atol=1e-7, rtol=0)
+    cut = form(SCENE, M2, COEFFICIENTS, [get_effect("saturation")({"iof": 0.05})])
+    assert float(cut.max()) <= 0.05
+    impulse = torch.zeros(1, 41, 41)
+    impulse[0, 20, 20] = 1
+    spread = gaussian(impulse, 1.5)[0]
+    x = torch.arange(41.0) - 20
+    assert float((spread.sum(0) * x * x).sum()) == pytest.approx(1.5, rel=1e-3)
+    moved = displace(impulse, torch.tensor(2.0), torch.tensor(-3.0))
+    assert divmod(int(moved.argmax()), 41) == (23, 18)
+
+
+def test_slots_fix_the_order():
+    a, b = get_effect("dark_bias")({"iof": 0.01}), get_effect("image_gain")({"gain": torch.tensor([0.5, 0.5])})
+    torch.testing.assert_close(form(SCENE, M2, COEFFICIENTS, [a, b]), form(SCENE, M2, COEFFICIENTS, [b, a]))
