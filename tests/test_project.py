@@ -114,9 +114,7 @@ def test_moved_scene_changed_scene_and_mixed_units(small_artefacts, small_files,
 
 def test_sun_below_a_crops_horizon_is_refused(tmp_path):
     files = small_scene.write_scene(tmp_path / "f", images=1)
-    text = files.images.read_text().replace(
-        ",-25.0,", ",-70.18,"
-    )  # the terminator runs through the scene
+    text = files.images.read_text().replace(",-25.0,", ",-70.18,")  # the terminator runs through the scene
     files.images.write_text(text)
     with pytest.raises(GeometryError, match="horizon"):
         ingest.run(files.dem, files.images, tmp_path / "s.h5", ingest.Config(crop=32))

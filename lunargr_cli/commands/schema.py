@@ -23,7 +23,7 @@ def command(
         return
     schema = get_schema(name)
     print(f"{schema.name}, version {schema.version}, written by 'lunargr {schema.stage}': {schema.title}\n")
-    console.table("dimensions", ("name", "what"), schema.dims.items())
+    console.table("dimensions", ("name", "what"), list(schema.dims.items()))
     rows = []
     for v in schema.variables:
         text = v.description + ("" if v.required else " (optional)")

@@ -104,7 +104,11 @@ def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Fram
         raise InputError(f"{where} ({text['image_id']}): expected units 'iof' or 'dn', found '{units or 'nothing'}'.")
     camera = text.get("camera", "")
     text = complete_row(
-        text, table.parent / text["path"], table.parent / camera if camera else None, body, f"{where} ({text['image_id']})"
+        text,
+        table.parent / text["path"],
+        table.parent / camera if camera else None,
+        body,
+        f"{where} ({text['image_id']})",
     )
     numbers = {}
     for key, (low, high) in _NUMBERS.items():

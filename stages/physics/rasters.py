@@ -59,8 +59,8 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(cause).split())[:160]
 
 
-def read_window(dataset: DatasetReader, window: Window, band: int = 1) -> NDArray[np.float32]:
-    """A window as float32 in physical units, NaN wherever it is nodata in any spelling.
+def read_window(dataset: DatasetReader, window: Window, band: int = 1) -> NDArray[np.float64]:
+    """A window as float64 in physical units, NaN wherever it is nodata in any spelling.
 
     Honours masks, nodata tags, scale and offset; NaN, infinities, -3.4028227e38 and ISIS special pixels are nodata.
     """
