@@ -67,5 +67,5 @@ class Earthshine(Effect):
         dark = all(not torch.is_tensor(v) and v == 0 for v in self.values.values())
         if not dark:
             # a facet turned away gets nothing; the sign of a single trial column is kept so that columns stay linear
-            up = torch.as_tensor(self.values["up"])
-            state.radiance = state.radiance + (facing.clamp(min=0) if float(up) > 0 else facing)
+            above = self.value("up", state) > 0
+            state.radiance = state.radiance + torch.where(above, facing.clamp(min=0), facing)

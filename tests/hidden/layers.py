@@ -109,7 +109,7 @@ class Ground:
         shape = (self.count, self.count)
         return (self.normal @ sun).reshape(shape).astype(np.float32), (share / samples).reshape(shape)
 
-    def bounced(self, sun: np.ndarray, seed: int, depth: int = 3, samples: int = 6) -> list[np.ndarray]:
+    def bounced(self, sun: np.ndarray, seed: int, depth: int = 2, samples: int = 3) -> list[np.ndarray]:
         """Light that arrives after 1, 2, ... diffuse bounces on white ground, as I/F of a white facet."""
         mi, rng = self.mi, np.random.default_rng(seed)
         layers = [np.zeros(len(self.place), np.float32) for _ in range(depth)]
