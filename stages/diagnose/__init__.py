@@ -34,12 +34,13 @@ MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model say
 
 @dataclass(frozen=True)
 class Config:
-    """model : fitted where there is no checkpoint; most_pairs : used for the search (all test pairs are scored)."""
+    """model : fitted where there is no checkpoint; most_pairs, most_sites : used for the search."""
 
     model: str = "M2"
     most_causes: int = 4
     most_images: int = 16
     most_pairs: int = 384
+    most_sites: int = 64
     seed: int = 0
 
 
@@ -99,7 +100,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     groups = group_pairs(reader, train, config.most_images)
     sites, used = [], 0
     for members in groups:
-        if used and used + len(members) > config.most_pairs:
+        if used and (used + len(members) > config.most_pairs or len(sites) >= config.most_sites):
             break
         sites.append(load_site(reader, members))
         used += len(members)

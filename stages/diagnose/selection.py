@@ -13,7 +13,7 @@ from torch import Tensor
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import Site
 from stages.diagnose.evidence import Evidence, best_guises, weigh
-from stages.diagnose.images import ImageEvidence, as_effect, weigh_images
+from stages.diagnose.images import FEWEST, ImageEvidence, as_effect, weigh_images
 from stages.diagnose.nominal import Nominal, fit, lit_mask
 from stages.diagnose.statistics import (
     BASELINE,
@@ -114,6 +114,8 @@ class Search:
         named = {c.effect.name for c in self.causes}
         excluded = {"image_gain"} if self.dn else set()
         excluded |= self.refused
+        if max(s.count for s in self.sites) < FEWEST:  # one look at the ground: albedo and shading are the same thing
+            excluded |= set(STATIC)
         return [n for n in effect_names() if n not in named | excluded and get_effect(n).visible(self.data, self.has)]
 
     def look(self) -> Round:
