@@ -41,6 +41,9 @@ lint: $(STAMP) ## ruff, formatting and mypy
 bench: $(STAMP) ## speed and memory, each beside a named peer in the same run
 	for script in tests/benchmarks/bench_*.py; do echo "== $$script"; $(BIN)/python $$script; done
 
+campaign: $(STAMP) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
+	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --output results/campaign
+
 docs: $(STAMP) ## write the generated parts of docs/ again
 	$(BIN)/python examples/photometry_page.py
 	$(BIN)/python examples/file_list.py
@@ -48,7 +51,7 @@ docs: $(STAMP) ## write the generated parts of docs/ again
 # --- the embedded scene --------------------------------------------------------------------------------------------
 
 D := demo
-DEMO_TRAIN := --epochs 8 --batch 32 --lr 1e-3 --schedule cosine
+DEMO_TRAIN := --epochs 6 --batch 32 --lr 1e-3 --schedule cosine
 
 demo: $(D)/report.html ## run every stage on the embedded scene and name a report to open
 	@echo; echo "Open $(abspath $(D)/report.html)"
@@ -60,7 +63,7 @@ $(D)/scene.h5: $(D)/scene/images.csv
 	$(LUNARGR) ingest $(D)/scene/dem.tif --images $(D)/scene/images.csv --gsd 5 -o $@ --overwrite
 
 $(D)/crops.h5: $(D)/scene.h5
-	$(LUNARGR) sample $< --count 1600 -o $@ --overwrite
+	$(LUNARGR) sample $< --count 1200 -o $@ --overwrite
 
 $(D)/pairs.h5: $(D)/crops.h5
 	$(LUNARGR) project $< -o $@ --overwrite
@@ -82,11 +85,11 @@ $(D)/match.json: $(D)/pairs.h5 $(D)/checkpoint.h5
 
 # Places that every image covers: what the images disagree on there cannot be the ground.
 $(D)/stack.h5: $(D)/scene.h5
-	$(LUNARGR) sample $< --stack --count 6 -o $(D)/stack_crops.h5 --overwrite
+	$(LUNARGR) sample $< --stack --crop 64 --count 8 -o $(D)/stack_crops.h5 --overwrite
 	$(LUNARGR) project $(D)/stack_crops.h5 -o $@ --overwrite
 
 $(D)/diagnosis.h5: $(D)/stack.h5
-	$(LUNARGR) diagnose $< --model M2 -o $@ --json $(D)/diagnosis.json --report $(D)/diagnosis.html --overwrite
+	$(LUNARGR) diagnose $< --model hapke -o $@ --json $(D)/diagnosis.json --report $(D)/diagnosis.html --overwrite
 
 $(D)/report.html: $(D)/evaluation.h5 $(D)/match.json $(D)/render.exr $(D)/diagnosis.h5
 	$(LUNARGR) report $(D)/scene.h5 $(D)/crops.h5 $(D)/pairs.h5 $(D)/checkpoint.h5 $(D)/svbrdf.h5 $(D)/evaluation.h5 $(D)/match.json \
@@ -128,7 +131,7 @@ $(A)/match.json: $(A)/pairs.h5 $(A)/checkpoint.h5
 $(A)/diagnosis.h5: $(A)/scene.h5
 	$(LUNARGR) sample $< --stack --count 24 --tile-m 32000 --split 70/10/20 -o $(A)/stack_crops.h5 --overwrite
 	$(LUNARGR) project $(A)/stack_crops.h5 -o $(A)/stack.h5 --overwrite
-	$(LUNARGR) diagnose $(A)/stack.h5 --model M2 -o $@ --json $(A)/diagnosis.json --report $(A)/diagnosis.html --overwrite
+	$(LUNARGR) diagnose $(A)/stack.h5 --model hapke -o $@ --json $(A)/diagnosis.json --report $(A)/diagnosis.html --overwrite
 
 $(A)/report.html: $(A)/evaluation.h5 $(A)/match.json $(A)/render.exr $(A)/diagnosis.h5
 	$(LUNARGR) report $(A)/scene.h5 $(A)/crops.h5 $(A)/pairs.h5 $(A)/checkpoint.h5 $(A)/svbrdf.h5 $(A)/evaluation.h5 $(A)/match.json \
