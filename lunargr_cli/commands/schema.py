@@ -24,11 +24,11 @@ def command(
     schema = get_schema(name)
     print(f"{schema.name}, version {schema.version}, written by 'lunargr {schema.stage}': {schema.title}\n")
     console.table("dimensions", ("name", "what"), list(schema.dims.items()))
-    rows = []
+    variables = []
     for v in schema.variables:
         text = v.description + ("" if v.required else " (optional)")
         if v.flags:
             text += "; " + ", ".join(f"{value} = {meaning}" for meaning, value in v.flags)
-        rows.append((v.name, ", ".join(v.dims), v.dtype, " or ".join((v.unit, *v.unit_choices)) or "-", text))
-    console.table("variables", ("name", "dims", "type", "unit", "what"), rows)
+        variables.append((v.name, ", ".join(v.dims), v.dtype, " or ".join((v.unit, *v.unit_choices)) or "-", text))
+    console.table("variables", ("name", "dims", "type", "unit", "what"), variables)
     console.table("root attributes", ("name", "what"), [(a.name, a.description) for a in schema.attributes])

@@ -82,7 +82,8 @@ class State:
 class Extension(Protocol):
     """A physical effect that extends the chain (``stages/effects``)."""
 
-    slot: str
+    @property
+    def slot(self) -> str: ...
 
     def apply(self, state: State) -> None: ...
 
