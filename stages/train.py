@@ -13,7 +13,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +89,11 @@ def run(
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
     keep_freed_memory()
     extensions = _load_extensions(config.extend)
+    if (
+        extensions and config.augment
+    ):  # an effect may belong to a direction on the ground, which turning crops would lose
+        say("crops are not turned or mirrored: the extended model may hold effects bound to an azimuth")
+        config = replace(config, augment=False)
     with PairReader(pairs) as reader:
         train, validation = reader.indices("train"), reader.indices("validation")
         if not len(train):
