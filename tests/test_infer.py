@@ -57,19 +57,18 @@ def test_the_grid_of_windows_does_not_matter(small_artefacts, checkpoint, refere
         assert np.nanmax(np.abs(got[k] - reference[0][k])) < 1e-3 * spread
 
 
-def test_no_squares_at_window_borders(small_artefacts, checkpoint, tmp_path):
-    """Mean step of a coefficient across window borders over the mean step elsewhere: at most 1.05."""
+def test_no_squares_at_window_borders(small_artefacts, checkpoint, reference, tmp_path):
+    """Mean step of a coefficient across window borders, over the same pixels of a map made in one piece: at most 1.05.
+
+    The same pixels, since five borders on this small map cross other terrain than the rest does.
+    """
     got, _ = maps(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", window=64, stride=64)
-    for layer in got:
-        step = np.abs(np.diff(layer, axis=1))
-        across = np.zeros(step.shape[1], bool)
-        across[63::64] = True
-        # Terrain itself is not alike at the few borders there are; hundreds of rows make the two means comparable.
-        ratio = np.nanmean(step[:, across]) / np.nanmean(step[:, ~across])
-        assert ratio <= 1.25
-        smooth = np.abs(np.diff(layer, n=2, axis=1))
-        kink = np.nanmean(smooth[:, across[1:] | across[:-1]]) / np.nanmean(smooth)
-        assert kink <= 1.25
+    for layer, seamless in zip(got, reference[0], strict=True):
+        for axis in (0, 1):
+            borders = np.arange(63, layer.shape[axis] - 1, 64)
+            across = np.nanmean(np.abs(np.diff(layer, axis=axis).take(borders, axis)))
+            without = np.nanmean(np.abs(np.diff(seamless, axis=axis).take(borders, axis)))
+            assert across / without <= 1.05
 
 
 def test_the_map_is_what_the_network_says_of_the_whole_terrain(small_artefacts, checkpoint, reference):
