@@ -54,13 +54,17 @@ def photograph(view: Pinhole, height=small_scene.height, reflect=small_scene.rad
     return reflect(x, y).astype(np.float32)
 
 
+def write_image(path, image):
+    output = oiio.ImageOutput.create(str(path))
+    output.open(str(path), oiio.ImageSpec(image.shape[1], image.shape[0], 1, oiio.FLOAT))
+    assert output.write_image(np.ascontiguousarray(image[..., None]))
+    output.close()
+
+
 def write_frame(folder, view, image, **columns):
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "camera.json").write_text(json.dumps(view.to_document()))
-    output = oiio.ImageOutput.create(str(folder / "raw.tif"))
-    output.open(str(folder / "raw.tif"), oiio.ImageSpec(image.shape[1], image.shape[0], 1, oiio.FLOAT))
-    assert output.write_image(np.ascontiguousarray(image[..., None]))
-    output.close()
+    write_image(folder / "raw.tif", image)
     row = {
         "image_id": "RAW", "path": "raw.tif", "units": "iof", "camera": "camera.json",
         "subsolar_longitude_deg": small_scene.SUN[0], "subsolar_latitude_deg": small_scene.SUN[1], "solar_distance_au": 1.0,

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from stages.physics.cameras import Camera
@@ -96,7 +97,7 @@ def orthorectify(
             part = np.s_[r : r + BLOCK, c : c + BLOCK]
             h, w = wanted[part].shape
             if wanted[part].any():
-                corners = _corners(terrain, camera, (row + r, col + c, h, w), displacement)
+                corners = _corners(terrain, camera, (row + r, col + c, h, w), line[part], displacement)
                 image[part], complete[part] = _resample(read_window, camera, corners, wanted[part])
     known = seen & np.isfinite(centres[..., 0])
     return Ortho(
@@ -118,9 +119,9 @@ def footprint(
 
     heights : lowest and highest elevation, m. Pixels that look past the body do not count.
     """
-    t = np.linspace(0, 1, edge)
-    line = np.concatenate([np.zeros(edge), np.ones(edge), t, t, t]) * camera.lines
-    sample = np.concatenate([t, t, np.zeros(edge), np.ones(edge), np.full(edge, 0.5)]) * camera.samples
+    line, sample = (
+        v.ravel() for v in np.meshgrid(camera.edge_lines(edge), np.linspace(0, camera.samples, edge), indexing="ij")
+    )
     rows, cols = [], []
     for height in heights:
         # above the grid's own sphere, which the camera model need not share
@@ -290,12 +291,23 @@ def _sun(camera: Camera, line: Floats, seen: NDArray[np.bool_], given: Floats | 
 
 
 def _corners(
-    terrain: Terrain, camera: Camera, box: tuple[int, int, int, int], displacement: Displacement | None
+    terrain: Terrain, camera: Camera, box: tuple[int, int, int, int], line: Floats, displacement: Displacement | None
 ) -> tuple[Floats, Floats]:
-    """(line, sample), each (h + 1, w + 1), of the corners between pixels, CSM coordinates."""
+    """(line, sample), each (h, w, 2, 2): CSM coordinates of every pixel's corners, by row and by column.
+
+    line : (h, w) of the pixels' centres. Where the image is pieced together, a pixel's corners are looked up in the
+    exposure that shows its centre: in the image the next exposure may lie anywhere.
+    """
     row, col, height, width = box
     r, c = np.meshgrid(np.arange(height + 1) + row - 0.5, np.arange(width + 1) + col - 0.5, indexing="ij")
-    return camera.ground_to_image(_ground(terrain, r, c, displacement))
+    points = _ground(terrain, r, c, displacement)
+    piece = camera.piece(line)
+    if piece is not None:
+        return camera.ground_to_piece(
+            np.moveaxis(sliding_window_view(points, (2, 2), axis=(0, 1)), 2, -1), piece[..., None, None]
+        )
+    found = camera.ground_to_image(points)
+    return sliding_window_view(found[0], (2, 2)), sliding_window_view(found[1], (2, 2))
 
 
 def _resample(
@@ -307,42 +319,30 @@ def _resample(
     """
     line, sample = corners
     height, width = wanted.shape
-    whole, used = wanted.copy(), np.zeros(line.shape, bool)
-    at = [np.s_[dr : dr + height, dc : dc + width] for dr in (0, 1) for dc in (0, 1)]
-    for corner in at:
-        whole &= camera.inside(line[corner], sample[corner])
-    for corner in at:
-        used[corner] |= whole
+    whole = wanted & camera.inside(line, sample).all(axis=(2, 3))
     values, complete = np.full(wanted.shape, np.nan, np.float32), np.zeros(wanted.shape, bool)
     if not whole.any():
         return values, complete
-    l0, l1 = max(0, math.floor(line[used].min()) - 1), min(camera.lines, math.ceil(line[used].max()) + 1)
-    s0, s1 = max(0, math.floor(sample[used].min()) - 1), min(camera.samples, math.ceil(sample[used].max()) + 1)
+    lines, samples = line[whole], sample[whole]
+    l0, l1 = max(0, math.floor(lines.min()) - 1), min(camera.lines, math.ceil(lines.max()) + 1)
+    s0, s1 = max(0, math.floor(samples.min()) - 1), min(camera.samples, math.ceil(samples.max()) + 1)
     if (l1 - l0) * (s1 - s0) > WINDOW_PX and wanted.size > 1:
         middle = max(height, width) // 2
-        first, second = (
-            ((np.s_[:middle], np.s_[:]), (np.s_[middle:], np.s_[:]))
-            if height >= width
-            else (
-                (np.s_[:], np.s_[:middle]),
-                (np.s_[:], np.s_[middle:]),
-            )
-        )
-        for rows, cols in (first, second):
-            edge = tuple(slice(k.start, k.stop + 1 if k.stop is not None else None) for k in (rows, cols))
-            values[rows, cols], complete[rows, cols] = _resample(
-                read_window, camera, (line[edge], sample[edge]), wanted[rows, cols]
-            )
+        halves = (np.s_[:middle], np.s_[middle:]) if height >= width else (np.s_[:, :middle], np.s_[:, middle:])
+        for part in halves:
+            values[part], complete[part] = _resample(read_window, camera, (line[part], sample[part]), wanted[part])
         return values, complete
-    across = np.hypot(np.diff(line, axis=1), np.diff(sample, axis=1))
-    along = np.hypot(np.diff(line, axis=0), np.diff(sample, axis=0))
-    n_col = _count(np.maximum(across[:-1], across[1:])[whole])
-    n_row = _count(np.maximum(along[:, :-1], along[:, 1:])[whole])
+    spans = [
+        np.hypot(np.diff(lines, axis=axis), np.diff(samples, axis=axis)).max(axis=(1, 2)) for axis in (1, 2)
+    ]  # along rows' sides, along columns'
+    n_row, n_col = _count(spans[0]), _count(spans[1])
     pixels = read_window(l0, s0, l1 - l0, s1 - s0)
     _average(
         np.ascontiguousarray(pixels, np.float32),
-        line - CSM_CENTRE - l0,
-        sample - CSM_CENTRE - s0,
+        line,
+        sample,
+        CSM_CENTRE + l0,
+        CSM_CENTRE + s0,
         whole,
         n_row,
         n_col,
@@ -362,7 +362,7 @@ def _count(size_px: Floats) -> int:
 
 
 @numba.njit(cache=True, parallel=True)
-def _average(pixels, line, sample, wanted, n_row, n_col, values, complete):
+def _average(pixels, line, sample, first_line, first_sample, wanted, n_row, n_col, values, complete):
     lines, samples = pixels.shape
     for i in numba.prange(wanted.shape[0]):
         for j in range(wanted.shape[1]):
@@ -374,12 +374,13 @@ def _average(pixels, line, sample, wanted, n_row, n_col, values, complete):
                 f = (a + 0.5) / n_row
                 for b in range(n_col):
                     g = (b + 0.5) / n_col
-                    y = (1 - f) * ((1 - g) * line[i, j] + g * line[i, j + 1]) + f * (
-                        (1 - g) * line[i + 1, j] + g * line[i + 1, j + 1]
+                    y = (1 - f) * ((1 - g) * line[i, j, 0, 0] + g * line[i, j, 0, 1]) + f * (
+                        (1 - g) * line[i, j, 1, 0] + g * line[i, j, 1, 1]
                     )
-                    x = (1 - f) * ((1 - g) * sample[i, j] + g * sample[i, j + 1]) + f * (
-                        (1 - g) * sample[i + 1, j] + g * sample[i + 1, j + 1]
+                    x = (1 - f) * ((1 - g) * sample[i, j, 0, 0] + g * sample[i, j, 0, 1]) + f * (
+                        (1 - g) * sample[i, j, 1, 0] + g * sample[i, j, 1, 1]
                     )
+                    y, x = y - first_line, x - first_sample
                     y = min(max(y, 0.0), lines - 1.0)
                     x = min(max(x, 0.0), samples - 1.0)
                     y0, x0 = min(int(y), max(lines - 2, 0)), min(int(x), max(samples - 2, 0))

@@ -72,6 +72,22 @@ class Camera(ABC):
         line = np.asarray(line, float)
         return self.rays(line, np.full(line.shape, self.samples / 2) if sample is None else sample)[0]
 
+    def piece(self, line: ArrayLike) -> NDArray[np.int64] | None:
+        """Which exposure took each line, where the image is pieced together of several that overlap on the ground.
+
+        None for an image in one piece, over which places move steadily as they do over the ground.
+        """
+        return None
+
+    def ground_to_piece(self, points: ArrayLike, piece: ArrayLike) -> tuple[Floats, Floats]:
+        """As :meth:`ground_to_image`, in a given exposure (indices that broadcast with the points); lines are held
+        where that exposure's own pixels are, so that its neighbours in the image do not mix in."""
+        return self.ground_to_image(points)
+
+    def edge_lines(self, count: int) -> Floats:
+        """Image lines (n,) between whose places on the ground the image lies: ``count`` or more, first and last among them."""
+        return np.linspace(0.0, self.lines, count)
+
     def inside(self, line: ArrayLike, sample: ArrayLike) -> NDArray[np.bool_]:
         """Whether image coordinates lie on the detector."""
         line, sample = np.asarray(line, float), np.asarray(sample, float)

@@ -1,21 +1,23 @@
-"""What frame and line-scan ISDs share: the detector, its optics and the tables around the exposure.
+"""What frame, push-frame and line-scan ISDs share: the detector, its optics and the tables around the exposure.
 
 An ISD (image support data) is the JSON that ALE writes and CSM cameras read. Focal-plane lengths are in mm.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError
 from stages.physics.cameras import document as read
 from stages.physics.cameras.base import meet_ellipsoid
-from stages.physics.cameras.distortion import distort_arrays, read_distortion, undistort_arrays
+from stages.physics.cameras.distortion import distort, distort_arrays, read_distortion, undistort_arrays
 from stages.physics.cameras.tables import Rotations, States, read_rotations, read_states
 
 Floats = NDArray[np.float64]
@@ -109,6 +111,19 @@ class Detector:
             ahead, behind = self.places(vectors + change), self.places(vectors - change)
             columns.append(np.stack([(ahead[i] - behind[i]) / (2 * step) for i in (0, 1)], axis=-1))
         return np.stack(columns, axis=-1)
+
+
+@numba.njit(cache=True)
+def detector_place(x, y, z, focal, sense, to_line, to_sample, model, coefficients):
+    """Detector (line, sample) from the principal point of a camera vector; NaN behind the camera."""
+    if z * focal * sense <= 0:
+        return math.nan, math.nan
+    scale = focal / z
+    dx, dy = distort(model, coefficients, x * scale, y * scale)
+    return (
+        to_line[0] + to_line[1] * dx + to_line[2] * dy,
+        to_sample[0] + to_sample[1] * dx + to_sample[2] * dy,
+    )
 
 
 @dataclass(frozen=True)

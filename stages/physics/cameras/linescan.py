@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 from schemas.errors import GeometryError, InputError
 from stages.physics.cameras import document as read
 from stages.physics.cameras.base import Camera, Floats, cross_matrix, register
-from stages.physics.cameras.distortion import distort
-from stages.physics.cameras.isd import Detector, Exposure
+from stages.physics.cameras.isd import Detector, Exposure, detector_place
 from stages.physics.cameras.tables import EvenTable, check_times, even_pointing, even_positions, lagrange
 
 ISD_FIRST_LINE = 0.5  # 'line_scan_rate' counts its lines from 0.5 where the image begins
@@ -263,19 +262,6 @@ def _quaternion_product(a: Floats, b: Floats) -> Floats:
 
 
 @numba.njit(cache=True)
-def _detector_place(x, y, z, focal, sense, to_line, to_sample, model, coefficients):
-    """Detector (line, sample) from the principal point of a camera vector; NaN behind the camera."""
-    if z * focal * sense <= 0:
-        return math.nan, math.nan
-    scale = focal / z
-    dx, dy = distort(model, coefficients, x * scale, y * scale)
-    return (
-        to_line[0] + to_line[1] * dx + to_line[2] * dy,
-        to_sample[0] + to_sample[1] * dx + to_sample[2] * dy,
-    )
-
-
-@numba.njit(cache=True)
 def _line_of_time(time, line_starts, line_times, line_rates):
     k = line_starts.size - 1
     while k > 0 and (time - line_times[k]) * line_rates[k] < 0:  # not there yet, whichever way time runs
@@ -350,7 +336,7 @@ def _find(
                 cx = (g * a[3] + f * b[3]) * vx + (g * a[4] + f * b[4]) * vy + (g * a[5] + f * b[5]) * vz
                 cy = (g * a[6] + f * b[6]) * vx + (g * a[7] + f * b[7]) * vy + (g * a[8] + f * b[8]) * vz
                 cz = (g * a[9] + f * b[9]) * vx + (g * a[10] + f * b[10]) * vy + (g * a[11] + f * b[11]) * vz
-                row, column = _detector_place(cx, cy, cz, focal, sense, to_line, to_sample, model, coefficients)
+                row, column = detector_place(cx, cy, cz, focal, sense, to_line, to_sample, model, coefficients)
                 row += line_offset
                 if not math.isfinite(row):
                     break
@@ -382,7 +368,7 @@ def _find(
                 cx = vx + w * tx + qy * tz - qz * ty
                 cy = vy + w * ty + qz * tx - qx * tz
                 cz = vz + w * tz + qx * ty - qy * tx
-                row, column = _detector_place(cx, cy, cz, focal, sense, to_line, to_sample, model, coefficients)
+                row, column = detector_place(cx, cy, cz, focal, sense, to_line, to_sample, model, coefficients)
                 row += line_offset
                 time -= row / gradient
                 if not abs(row) > tolerance:
