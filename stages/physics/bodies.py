@@ -21,9 +21,19 @@ RADII = {
     "europa": 1560800.0,
     "ganymede": 2631200.0,
     "callisto": 2410300.0,
+    "mimas": 198200.0,
+    "enceladus": 252100.0,
+    "tethys": 531000.0,
+    "dione": 561400.0,
+    "rhea": 763500.0,
     "titan": 2574730.0,
+    "iapetus": 734300.0,
+    "triton": 1352600.0,
     "pluto": 1188300.0,
     "charon": 606000.0,
+    "eros": 8450.0,
+    "bennu": 244.61,  # Barnouin et al. 2019
+    "ryugu": 448.4,  # Watanabe et al. 2019
 }
 
 

@@ -1,8 +1,10 @@
-"""Time, the Sun and the bodies' orientation: where the Sun stands over a place at a UTC time, offline.
+"""Time, the Sun and the bodies: where the Sun stands over a place at a UTC time, offline.
 
-Positions come from astropy's built-in ephemeris (ERFA), orientations from the report of the IAU Working Group on
-Cartographic Coordinates and Rotational Elements (Archinal et al. 2018, Celest. Mech. Dyn. Astr. 130:22). For the Moon
-that frame agrees with the DE421 mean-Earth frame within 155 m on the ground, which is 0.005 deg.
+Planets and the Moon move by astropy's built-in ephemeris (ERFA), satellites by their planet and the face that they turn
+to it, asteroids by published elements (small_bodies.py); orientations are the IAU's (orientations.py). Sub-solar points
+are good to 0.01 deg for the Moon, Mercury, Venus, Earth, Mars, Ceres, Vesta, Eros and Bennu in the years of their missions,
+to 0.03 deg for Jupiter's, Saturn's and Neptune's satellites (the built-in ephemeris), 0.1 deg for Pluto and Charon. For
+the Moon the IAU frame agrees with the DE421 mean-Earth frame within 155 m on the ground, which is 0.005 deg.
 
 Where the environment variable ``LUNARGR_SPICE_KERNELS`` names SPICE kernels (a meta-kernel, or several files joined
 by the path separator), spiceypy answers instead, for every body that the kernels hold.
@@ -13,7 +15,6 @@ from __future__ import annotations
 import math
 import os
 import re
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -23,15 +24,18 @@ from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError, InputError
 from stages.physics.bodies import Body
+from stages.physics.orientations import CENTURY, ORIENTATIONS
+from stages.physics.small_bodies import ELEMENTS, GAUSS, Elements, small_body_state
 
 if TYPE_CHECKING:
     from astropy.time import Time
 
+Floats = NDArray[np.float64]
 KERNELS_VARIABLE = "LUNARGR_SPICE_KERNELS"
 AU = 149597870700.0  # m, IAU 2012 definition
 SPEED_OF_LIGHT = 299792458.0  # m/s
 J2000 = 2451545.0  # Julian date, TDB
-CENTURY = 36525.0  # days
+DAY = 86400.0  # s
 
 
 class SubsolarPoint(NamedTuple):
@@ -90,128 +94,23 @@ def et_to_utc(ephemeris_time: float) -> str:
     return str(Time(J2000, ephemeris_time / 86400.0, format="jd", scale="tdb").utc.isot) + "Z"
 
 
-# --- orientation ----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Orientation:
-    """A body's pole and prime meridian: right ascension, declination, W in degrees.
-
-    Each of ``pole_ra`` and ``pole_dec`` is (constant, per century), ``meridian`` (constant, per day, per day^2).
-    Each term is (phase, rate, d_ra, d_dec, d_w): ra += d_ra sin(a), dec += d_dec cos(a), w += d_w sin(a)
-    with a = phase + rate * time, time in days, or in centuries where ``terms_per_century``.
-    """
-
-    pole_ra: tuple[float, float]
-    pole_dec: tuple[float, float]
-    meridian: tuple[float, float, float]
-    terms: tuple[tuple[float, float, float, float, float], ...] = ()
-    terms_per_century: bool = False
-
-    def rotation(self, days: float) -> NDArray[np.float64]:
-        """(3, 3), takes ICRF vectors to body-fixed ones; ``days`` of TDB since J2000."""
-        centuries = days / CENTURY
-        ra = self.pole_ra[0] + self.pole_ra[1] * centuries
-        dec = self.pole_dec[0] + self.pole_dec[1] * centuries
-        w = self.meridian[0] + (self.meridian[1] * days) % 360.0 + self.meridian[2] * days * days
-        for phase, rate, d_ra, d_dec, d_w in self.terms:
-            angle = math.radians((phase + rate * (centuries if self.terms_per_century else days)) % 360.0)
-            ra += d_ra * math.sin(angle)
-            dec += d_dec * math.cos(angle)
-            w += d_w * math.sin(angle)
-        return _about_z(w) @ _about_x(90.0 - dec) @ _about_z(90.0 + ra)
-
-
-def _about_z(angle_deg: float) -> NDArray[np.float64]:
-    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _about_x(angle_deg: float) -> NDArray[np.float64]:
-    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
-
-
-# Archinal et al. (2018), tables 1 and 2.
-ORIENTATIONS = {
-    "moon": Orientation(
-        (269.9949, 0.0031),
-        (66.5392, 0.0130),
-        (38.3213, 13.17635815, -1.4e-12),
-        (
-            (125.045, -0.0529921, -3.8787, 1.5419, 3.5610),
-            (250.089, -0.1059842, -0.1204, 0.0239, 0.1208),
-            (260.008, 13.0120009, 0.0700, -0.0278, -0.0642),
-            (176.625, 13.3407154, -0.0172, 0.0068, 0.0158),
-            (357.529, 0.9856003, 0.0, 0.0, 0.0252),
-            (311.589, 26.4057084, 0.0072, -0.0029, -0.0066),
-            (134.963, 13.0649930, 0.0, 0.0009, -0.0047),
-            (276.617, 0.3287146, 0.0, 0.0, -0.0046),
-            (34.226, 1.7484877, 0.0, 0.0, 0.0028),
-            (15.134, -0.1589763, -0.0052, 0.0008, 0.0052),
-            (119.743, 0.0036096, 0.0, 0.0, 0.0040),
-            (239.961, 0.1643573, 0.0, 0.0, 0.0019),
-            (25.053, 12.9590088, 0.0043, -0.0009, -0.0044),
-        ),
-    ),
-    "mercury": Orientation(
-        (281.0103, -0.0328),
-        (61.4155, -0.0049),
-        (329.5988, 6.1385108, 0.0),
-        (
-            (174.7910857, 4.092335, 0.0, 0.0, 0.01067257),
-            (349.5821714, 8.184670, 0.0, 0.0, -0.00112309),
-            (164.3732571, 12.277005, 0.0, 0.0, -0.00011040),
-            (339.1643429, 16.369340, 0.0, 0.0, -0.00002539),
-            (153.9554286, 20.461675, 0.0, 0.0, -0.00000571),
-        ),
-    ),
-    "venus": Orientation((272.76, 0.0), (67.16, 0.0), (160.20, -1.4813688, 0.0)),
-    "mars": Orientation(
-        (317.269202, -0.10927547),
-        (54.432516, -0.05827105),
-        (176.049863, 350.891982443297, 0.0),
-        (
-            (198.991226, 19139.4819985, 0.000068, 0.0, 0.0),
-            (226.292679, 38280.8511281, 0.000238, 0.0, 0.0),
-            (249.663391, 57420.7251593, 0.000052, 0.0, 0.0),
-            (266.183510, 76560.6367950, 0.000009, 0.0, 0.0),
-            (79.398797, 0.5042615, 0.419057, 0.0, 0.0),
-            (122.433576, 19139.9407476, 0.0, 0.000051, 0.0),
-            (43.058401, 38280.8753272, 0.0, 0.000141, 0.0),
-            (57.663379, 57420.7517205, 0.0, 0.000031, 0.0),
-            (79.476401, 76560.6495004, 0.0, 0.000005, 0.0),
-            (166.325722, 0.5042615, 0.0, 1.591274, 0.0),
-            (129.071773, 19140.0328244, 0.0, 0.0, 0.000145),
-            (36.352167, 38281.0473591, 0.0, 0.0, 0.000157),
-            (56.668646, 57420.9295360, 0.0, 0.0, 0.000040),
-            (67.364003, 76560.2552215, 0.0, 0.0, 0.000001),
-            (104.792680, 95700.4387578, 0.0, 0.0, 0.000001),
-            (95.391654, 0.5042615, 0.0, 0.0, 0.584542),
-        ),
-        terms_per_century=True,
-    ),
-}
-
-
 def body_name(body: str | Body) -> str:
     return (body.name if isinstance(body, Body) else str(body)).strip().lower()
 
 
-def body_rotation(time_utc: str | datetime, body: str | Body = "moon") -> NDArray[np.float64]:
+def body_rotation(time_utc: str | datetime, body: str | Body = "moon") -> Floats:
     """(3, 3), takes ICRF vectors to body-fixed ones at that time. Raises GeometryError for a body without a model."""
     name = body_name(body)
     if name not in ORIENTATIONS:
         raise _unknown(name)
-    time = parse_utc(time_utc).tdb
-    return ORIENTATIONS[name].rotation(float((time.jd1 - J2000) + time.jd2))
+    return ORIENTATIONS[name].rotation(_days(parse_utc(time_utc).tdb))
 
 
 # --- the Sun --------------------------------------------------------------------------------------------------------
 
 
 def subsolar_point(time_utc: str | datetime, body: str | Body = "moon") -> SubsolarPoint:
-    """Where the Sun is overhead on ``body`` at that UTC time; good to 0.01 deg.
+    """Where the Sun is overhead on ``body`` at that UTC time; how well is said at the top of this file.
 
     The Sun's direction is the apparent one (light time and aberration), which is where its light comes from.
     Raises InputError for a time that cannot be read, GeometryError for a body that neither the built-in ephemeris nor
@@ -229,31 +128,95 @@ def _subsolar_point(time_utc: str, body: str, kernels: str) -> SubsolarPoint:
     return SubsolarPoint(longitude, latitude, distance / AU)
 
 
-def _sun_from_astropy(time_utc: str, body: str) -> NDArray[np.float64]:
+# Satellites turn one face to their planet: where that face looks is where the planet is. Mean distances, m (NASA fact
+# sheets); eccentric orbits swing by a few degrees of this small offset.
+SATELLITES = {
+    "phobos": ("mars", 9.376e6),
+    "deimos": ("mars", 23.463e6),
+    "io": ("jupiter", 421.8e6),
+    "europa": ("jupiter", 671.1e6),
+    "ganymede": ("jupiter", 1070.4e6),
+    "callisto": ("jupiter", 1882.7e6),
+    "mimas": ("saturn", 185.5e6),
+    "enceladus": ("saturn", 238.0e6),
+    "tethys": ("saturn", 294.7e6),
+    "dione": ("saturn", 377.4e6),
+    "rhea": ("saturn", 527.1e6),
+    "titan": ("saturn", 1221.9e6),
+    "iapetus": ("saturn", 3560.9e6),
+    "triton": ("neptune", 354.8e6),
+}
+# Mean elements of the Pluto system's centre for 1800..2050 (Standish, JPL, "Approximate positions of the planets"):
+# a au, e, inclination, mean longitude, longitude of perihelion, node; and their change per century
+PLUTO = (
+    (39.48211675, 0.24882730, 17.14001206, 238.92903833, 224.06891629, 110.30393684),
+    (-0.00031596, 0.00005170, 0.00004818, 145.20780515, -0.04062942, -0.01183482),
+)
+
+
+def _sun_from_astropy(time_utc: str, body: str) -> Floats:
     """The Sun's apparent place, body-fixed, m."""
     if body not in ORIENTATIONS:
         raise _unknown(body)
-    from astropy.coordinates import get_body_barycentric_posvel
-
-    time = parse_utc(time_utc).tdb
-
-    def state(name: str, at: Time) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        position, velocity = get_body_barycentric_posvel(name, at, ephemeris="builtin")
-        return position.xyz.to_value("m"), velocity.xyz.to_value("m/s")
-
-    place, velocity = state(body, time)
-    sun = state("sun", time)[0] - place
-    light_time = np.linalg.norm(sun) / SPEED_OF_LIGHT
     from astropy.time import TimeDelta
 
-    sun = state("sun", time - TimeDelta(light_time, format="sec"))[0] - place
+    time = parse_utc(time_utc).tdb
+    place, velocity = _state(body, time)
+    sun = _builtin("sun", time)[0] - place
+    light_time = np.linalg.norm(sun) / SPEED_OF_LIGHT
+    sun = _builtin("sun", time - TimeDelta(light_time, format="sec"))[0] - place
     distance = np.linalg.norm(sun)
     apparent = sun / distance + velocity / SPEED_OF_LIGHT  # aberration to first order: 20 arcsec at most here
     apparent *= distance / np.linalg.norm(apparent)
-    return ORIENTATIONS[body].rotation(float((time.jd1 - J2000) + time.jd2)) @ apparent
+    return ORIENTATIONS[body].rotation(_days(time)) @ apparent
 
 
-def _sun_from_kernels(time_utc: str, body: str, kernels: str) -> NDArray[np.float64]:
+def _state(body: str, time: Time) -> tuple[Floats, Floats]:
+    """Barycentric position, m, and velocity, m/s, ICRF."""
+    if body in SATELLITES:
+        planet, distance = SATELLITES[body]
+        place, velocity = _builtin(planet, time)
+        days, step = _days(time), 1e-3
+        before, now, after = (
+            -distance * ORIENTATIONS[body].rotation(days + k * step)[0] for k in (-1, 0, 1)
+        )  # row 0 of the rotation is the prime meridian's direction
+        return place + now, velocity + (after - before) / (2 * step * DAY)
+    if body in ("pluto", "charon"):
+        days, step = _days(time), 10.0
+        before, now, after = (_pluto((days + k * step) / CENTURY) * AU for k in (-1, 0, 1))
+        return _beside_the_sun(now, (after - before) / (2 * step * DAY), time)
+    if body in ELEMENTS:
+        position, velocity = small_body_state(body, J2000 + _days(time))
+        return _beside_the_sun(position * AU, velocity * AU / DAY, time)
+    return _builtin(body, time)
+
+
+def _beside_the_sun(position: Floats, velocity: Floats, time: Time) -> tuple[Floats, Floats]:
+    place, motion = _builtin("sun", time)
+    return place + position, motion + velocity
+
+
+def _pluto(centuries: float) -> Floats:
+    """Heliocentric place of the Pluto system's centre, au, equatorial."""
+    a, e, inclination, longitude, perihelion, node = (c + r * centuries for c, r in zip(*PLUTO, strict=True))
+    elements = Elements(
+        0.0, longitude - perihelion, perihelion - node, node, inclination, e, math.degrees(GAUSS / a**1.5), ""
+    )
+    return elements.state()[:3]
+
+
+def _builtin(name: str, time: Time) -> tuple[Floats, Floats]:
+    from astropy.coordinates import get_body_barycentric_posvel
+
+    position, velocity = get_body_barycentric_posvel(name, time, ephemeris="builtin")
+    return position.xyz.to_value("m"), velocity.xyz.to_value("m/s")
+
+
+def _days(time: Time) -> float:
+    return float((time.jd1 - J2000) + time.jd2)
+
+
+def _sun_from_kernels(time_utc: str, body: str, kernels: str) -> Floats:
     """As above, from the user's SPICE kernels; the mean-Earth frame of the Moon where they define it."""
     try:
         import spiceypy
@@ -297,6 +260,6 @@ def _furnish(kernels: str) -> None:
 
 def _unknown(name: str) -> GeometryError:
     return GeometryError(
-        f"body '{name}': the built-in ephemeris knows {', '.join(ORIENTATIONS)}; give the sub-solar point, "
+        f"body '{name}': the Sun's place is known without kernels for {', '.join(sorted(ORIENTATIONS))}; give the sub-solar point, "
         f"or SPICE kernels in the environment variable {KERNELS_VARIABLE} (with 'lunargr[spice]')."
     )

@@ -91,7 +91,7 @@ class PushFrame(Camera):
             centres=even_positions(exposure.positions, exposure.positions.times, exposure.body).at(times),
             rotations=read.quaternion_matrix(quaternions),
             suns=even_positions(exposure.sun, exposure.positions.times, exposure.body).at(times),
-            times=exposure.centre_time + times,
+            times=np.asarray(exposure.centre_time + times, float),
         )
         middle = (framelets // 2 + 0.5) * camera.height
         origin, axis = camera.rays(middle, camera.samples / 2)
@@ -114,8 +114,8 @@ class PushFrame(Camera):
         return slope
 
     def piece(self, line: ArrayLike) -> NDArray[np.int64]:
-        line = np.nan_to_num(np.asarray(line, float), nan=0.0)
-        return np.clip(np.floor(line / self.height), 0, len(self.times) - 1).astype(np.int64)
+        places = np.nan_to_num(np.asarray(line, float), nan=0.0) / self.height
+        return np.clip(np.floor(places), 0, len(self.times) - 1).astype(np.int64)
 
     def edge_lines(self, count: int) -> Floats:
         starts = np.arange(len(self.times)) * float(self.height)
