@@ -45,41 +45,29 @@ class Evidence:
 LOCAL = ("penumbra", "distant_shadow", "dark_bias", "earthshine", "interreflection", "saturation")
 
 
-def weigh(data: Statistics) -> list[Evidence]:
+def weigh(data: Statistics, only: slice = slice(None)) -> list[Evidence]:
     """Evidence for every candidate, the nuisance columns fitted along."""
-    m = data.nuisance.shape[1] - 1
-    sums = data.nuisance.sum(0)
-    ridge = 1e-9 * sums[:m, :m].diagonal().clamp(min=1e-12)
-    normal = sums[:m, :m] + torch.diag(ridge)
-    cross = data.cross.sum(0)
-    gamma = torch.linalg.solve(normal, cross[:, :m].T) if m else torch.zeros(0, len(cross), dtype=torch.float64)
-    delta = torch.linalg.solve(normal, sums[:m, m]) if m else torch.zeros(0, dtype=torch.float64)
-    score = data.cross[:, :, m] - torch.einsum("me,cm->ce", gamma, data.nuisance[:, :m, m])
-    residual_n = torch.einsum("cmk,k->cm", data.nuisance[:, :m, :m], delta)
-    score = score - torch.einsum("cem,m->ce", data.cross[:, :, :m], delta) + residual_n @ gamma
-    places = _groups(data.place)
-    images = _groups(data.image)
-    cells = _groups(data.image.astype(np.int64) * 10_000_000 + data.place)
+    m = data.count
+    sums = data.products.sum(0)
+    normal = sums[:m, :m] + torch.diag(1e-9 * sums[:m, :m].diagonal().clamp(min=1e-12) + data.bound**-2)
+    share = torch.linalg.solve(normal, sums[:m, m:]) if m else sums[:0, m:]  # (m, 1 + E)
+    # what is left of the residual and of every candidate, per cluster: rows X - N share
+    n, cross = data.products[:, :m, :m], data.products[:, :m, m:]
+    delta, gamma = share[:, 0], share[:, 1:]
+    score = data.products[:, m + 1 :, m] - torch.einsum("cme,m->ce", cross[:, :, 1:], delta)
+    score = score - (cross[:, :, 0] - n @ delta) @ gamma
+    places, cells = _groups(data.place), _groups(data.image)
     out = []
-    for k, candidate in enumerate(data.candidates):
+    for candidate in data.candidates[only]:
         part = candidate.columns
+        columns = slice(m + 1 + part.start, m + 1 + part.stop)
         g = gamma[:, part]
-        zn = data.cross[:, part, :m]
-        half = torch.einsum("ckm,ml->ckl", zn, g)
-        gram = data.grams[k] - half - half.transpose(1, 2)
-        gram = gram + torch.einsum("mk,cmn,nl->ckl", g, data.nuisance[:, :m, :m], g)
-        raw = float(data.grams[k].sum(0).diagonal().sum())
-        out.append(
-            _weigh_one(
-                candidate,
-                score[:, part],
-                gram,
-                cells if candidate.effect in LOCAL else places,
-                cells if candidate.effect in LOCAL else images,
-                data.rows,
-                raw,
-            )
-        )
+        half = torch.einsum("cmk,ml->ckl", data.products[:, :m, columns], g)
+        raw = data.products[:, columns, columns]
+        gram = raw - half - half.transpose(1, 2) + torch.einsum("mk,cmn,nl->ckl", g, n, g)
+        energy = float(raw.sum(0).diagonal().sum())
+        # the pull of the bounds on the nuisances belongs to no cluster: it is small and left out
+        out.append(_weigh_one(candidate, score[:, part], gram, places, cells, data.rows, energy))
     return out
 
 

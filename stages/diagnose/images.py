@@ -6,18 +6,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from stages.diagnose.numbers import f_tail
-from stages.diagnose.projection import Rows
+from stages.diagnose.projection import Local
 from stages.diagnose.statistics import (
+    BASELINE,
     BLOCK,
     SiteWork,
     _site_columns,
-    _without,
     image_columns,
     nuisance_columns,
+    tangent_columns,
     trial_columns,
 )
 from stages.effects import Effect, Survey, get_effect
@@ -73,51 +75,70 @@ def weigh_images(
 
 def _site_folds(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) -> dict[str, list[_Fold]]:
     """Per effect, normal equations of its values on two interleaved halves of the blocks, everything else removed."""
-    chain = work.chain
-    fixed = list(_site_columns(chain)) + [chain.unresolved_slopes()]
-    for effect in ("psf_blur", "dem_smoothing"):
-        fixed += trial_columns(chain, effect, get_effect(effect).trials(data)[0], data)
-    common = work.projector.rows(torch.stack(fixed))
-    y = _without(common, work.raw_rows)
-    shifts = nuisance_columns(chain, dn)
-    out = {}
+    chain, projector = work.chain, work.projector
+    fixed = [*_site_columns(chain), chain.unresolved_slopes(), *tangent_columns(chain, data)[1]]
+    for effect in BASELINE:
+        if effect not in [e.name for e in chain.base]:
+            fixed += trial_columns(chain, effect, get_effect(effect).trials(data)[0], data)
+    columns = torch.stack([*fixed, work.residual]) * projector.weight
+    on_basis = projector.coefficients(columns)
+    projector.project_(columns, on_basis)
+    # all columns of single images at once: shifts (and gain and offset), then the effects' own
     base = [e.name for e in chain.base]
+    groups = {"": nuisance_columns(chain, dn)}
     for name in names:
         place = base.index(name) if name in base else None
-        own = torch.stack(image_columns(chain, get_effect(name), place), 1)
-        others = shifts[:, 2:] if name == "misregistration" else shifts
-        if name in base and name != "misregistration":
-            others = shifts[:, : 4 if dn else 2]
-        z = _without(common, _spread(work, own))
-        if others.shape[1]:
-            z = _without(_without(common, _spread(work, others)), z)
-            left = _without(_without(common, _spread(work, others)), y)
-        else:
-            left = y
-        out[name] = _fold_up(z, left)
+        groups[name] = torch.stack(image_columns(chain, get_effect(name), place), 1)
+    local = Local(projector, torch.cat(list(groups.values()), 1))
+    n, k = local.raw.shape[:2]
+    ends = np.cumsum([g.shape[1] for g in groups.values()])
+    own = {name: np.arange(end - g.shape[1], end) for (name, g), end in zip(groups.items(), ends, strict=True)}
+    folds = []
+    for mask in _halves(*work.residual.shape[-2:]):
+        flat = columns[..., mask].flatten(1)
+        cross = local.cross(columns, torch.zeros_like(on_basis), mask)  # the columns are projected already
+        top = torch.cat([(flat @ flat.T).double(), cross.T], 1)
+        folds.append(torch.cat([top, torch.cat([cross, local.products(mask)], 1)]))
+    first = len(columns)
+
+    def places(kinds) -> np.ndarray:
+        """Rows of the products that belong to these columns, image by image."""
+        return (first + np.arange(n)[:, None] * k + np.asarray(kinds, int)).flatten()
+
+    out = {}
+    for name in names:
+        others = own[""]
+        if name == "misregistration":
+            others = others[2:]
+        elif name in base:
+            others = others[: 4 if dn else 2]
+        nuisance = np.concatenate([np.arange(first - 1), places(others)])
+        wanted = np.concatenate([[first - 1], places(own[name])])
+        out[name] = _without(folds, nuisance, wanted)
     return out
 
 
-def _spread(work: SiteWork, columns: Tensor) -> Rows:
-    """Columns (n, k, H, W) of single images -> rows of n k columns, each zero in the other images before projection."""
-    n, k, height, width = columns.shape
-    wide = torch.zeros(n * k, n, height, width)
-    for i in range(n):
-        wide[i * k : (i + 1) * k, i] = columns[i]
-    return work.projector.rows(wide)
-
-
-def _fold_up(z: Rows, y: Rows) -> list[_Fold]:
-    height, width = y.dynamic.shape[-2:]
+def _halves(height: int, width: int) -> list[Tensor]:
+    """A chessboard of blocks: its black and its white pixels, (H, W) bool each."""
     size = min(BLOCK, max(8, min(height, width) // 4))
     parity = (torch.arange(height)[:, None] // size + torch.arange(width) // size) % 2
-    folds = []
-    for half in (0, 1):
-        mask = parity == half
-        zd, zs = z.dynamic[..., mask].flatten(1), z.static[..., mask].flatten(1)
-        yd, ys = y.dynamic[0][..., mask].flatten(), y.static[0][..., mask].flatten()
-        folds.append(_Fold((zd @ zd.T + zs @ zs.T).double(), (zd @ yd + zs @ ys).double()))
-    return folds
+    return [parity == 0, parity == 1]
+
+
+def _without(folds: list[Tensor], nuisance: np.ndarray, wanted: np.ndarray) -> list[_Fold]:
+    """Products of the wanted columns (the residual first) once the nuisance columns are fitted to all folds together."""
+    total = sum(folds)
+    gram = total[np.ix_(nuisance, nuisance)]
+    scale = gram.diagonal().clamp(min=1e-30).rsqrt()
+    normal = gram * scale[:, None] * scale + 1e-6 * torch.eye(len(gram), dtype=torch.float64)
+    share = torch.linalg.solve(normal, scale[:, None] * total[np.ix_(nuisance, wanted)]) * scale[:, None]
+    out = []
+    for fold in folds:
+        cross = fold[np.ix_(nuisance, wanted)]
+        half = cross.T @ share
+        left = fold[np.ix_(wanted, wanted)] - half - half.T + share.T @ fold[np.ix_(nuisance, nuisance)] @ share
+        out.append(_Fold(left[1:, 1:], left[1:, 0]))
+    return out
 
 
 def _weigh(name: str, folds: list[_Fold], frames: int, rows: float) -> ImageEvidence:

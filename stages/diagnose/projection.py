@@ -9,7 +9,6 @@ of relative albedo and slope error, whitened by their own spectrum: the static r
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -20,26 +19,13 @@ ALBEDO_PRIOR = 0.1  # relative; both priors only keep badly seen pixels from blo
 SLOPE_PRIOR = math.tan(math.radians(4))
 FREE_SLOPES = 6  # images of a site from which two slopes per pixel can be spared
 BINS = 12
-ALBEDO_BAND, SLOPE_BAND = 0.1, 0.25  # cycles per px
-
-
-@dataclass
-class Rows:
-    """Columns split into dynamic (E, n, H, W) and static (E, K, H, W) rows of about unit noise."""
-
-    dynamic: Tensor
-    static: Tensor
-
-    def dot(self, other: Rows) -> Tensor:
-        """(E, F) inner products over everything."""
-        a, b = self.dynamic.flatten(1), other.dynamic.flatten(1)
-        return a @ b.T + self.static.flatten(1) @ other.static.flatten(1).T
+ALBEDO_BAND, SLOPE_BAND = 0.1, 0.15  # cycles per px
 
 
 class Projector:
     """The split for one site, linear and the same for every column.
 
-    weight : (n, H, W), 1 / noise, 0 where masked
+    weight : (n, H, W), 1 / noise, 0 where masked. Columns are (E, n, H, W), weighted by whoever makes them.
     """
 
     def __init__(self, chain: Chain, weight: Tensor) -> None:
@@ -49,16 +35,17 @@ class Projector:
         if len(weight) >= FREE_SLOPES:
             columns += [t * weight for t in chain.slope_tangents()]
             priors += [SLOPE_PRIOR, SLOPE_PRIOR]
-        self.basis: list[Tensor] = []
+        basis: list[Tensor] = []
         k = len(columns)
         upper = torch.zeros(k, k, *weight.shape[1:])
         for j, column in enumerate(columns):
-            for i, q in enumerate(self.basis):
+            for i, q in enumerate(basis):
                 upper[i, j] = (q * column).sum(0)
                 column = column - q * upper[i, j]
             norm = column.square().sum(0).sqrt()
             upper[j, j] = norm
-            self.basis.append(torch.where(norm > 1e-4 * weight.amax(), column / norm.clamp(min=1e-12), 0.0))
+            basis.append(torch.where(norm > 1e-4 * weight.amax(), column / norm.clamp(min=1e-12), 0.0))
+        self.basis = torch.stack(basis)  # (K, n, H, W), orthonormal per pixel
         r = upper.permute(2, 3, 0, 1).double()
         penalty = torch.diag(torch.tensor([1 / p**2 for p in priors], dtype=torch.float64))
         inverse = torch.linalg.solve(r.transpose(-1, -2) @ r + penalty, r.transpose(-1, -2))
@@ -68,27 +55,37 @@ class Projector:
     @property
     def dynamic_rows(self) -> int:
         """Degrees of freedom of the dynamic rows."""
-        used = sum(float((q.abs().sum(0) > 0).sum()) for q in self.basis)
+        used = float((self.basis.abs().sum(1) > 0).sum())
         return max(int(float((self.weight > 0).sum()) - used), 0)
 
-    def split(self, columns: Tensor, weighted: bool = False) -> tuple[Tensor, Tensor]:
-        """(E, n, H, W) -> dynamic part, weighted; static maps (E, K, H, W), not yet whitened."""
-        x = columns if weighted else columns * self.weight
-        found = []
-        for q in self.basis:
-            c = (x * q).sum(1)
-            x = torch.addcmul(x, q, c[:, None], value=-1)
-            found.append(c)
-        return x, self.maps(torch.stack(found, 1))
+    def coefficients(self, columns: Tensor) -> Tensor:
+        """(E, n, H, W) -> coefficients on the basis, (E, K, H, W)."""
+        out = columns.new_empty(len(columns), len(self.basis), *columns.shape[-2:])
+        for x, c in zip(columns, out, strict=True):  # one column at a time stays in the cache
+            for k, q in enumerate(self.basis):
+                torch.sum(x * q, 0, out=c[k])
+        return out
+
+    def project_(self, columns: Tensor, coefficients: Tensor) -> Tensor:
+        """Take the basis' share out of columns (E, n, H, W), in place."""
+        for x, c in zip(columns, coefficients, strict=True):
+            for k, q in enumerate(self.basis):
+                x.addcmul_(q, c[k], value=-1)
+        return columns
 
     def maps(self, coefficients: Tensor) -> Tensor:
         """Coefficients on the basis (E, K, H, W) -> maps of albedo and slope errors."""
-        return torch.einsum("ijhw,ejhw->eihw", self.back, coefficients)
+        out = torch.zeros_like(coefficients)
+        for i in range(len(self.back)):
+            for j in range(len(self.back)):
+                out[:, i].addcmul_(self.back[i, j], coefficients[:, j])
+        return out
 
     def learn_spectrum(self, maps: Tensor) -> None:
         """Set the whitening filter from the residual's own maps (K, H, W)."""
         height, width = maps.shape[-2:]
-        power = torch.fft.rfft2(maps).abs().square() / (height * width)
+        self.window = _tapered(height)[:, None] * _tapered(width)
+        power = torch.fft.rfft2(maps * self.window).abs().square() / (height * width)
         ky, kx = torch.fft.fftfreq(height)[:, None], torch.fft.rfftfreq(width)
         k = torch.sqrt(ky**2 + kx**2).clamp(min=0.5 / max(height, width))
         place = (k / k.min()).log() / (k.max() / k.min()).log() * (BINS - 1)
@@ -116,55 +113,58 @@ class Projector:
         """Static maps (E, K, H, W) -> rows of unit noise."""
         if self.filter is None:
             raise RuntimeError("learn_spectrum comes before whiten")
-        return torch.fft.irfft2(torch.fft.rfft2(maps) * self.filter, s=maps.shape[-2:])
+        return torch.fft.irfft2(torch.fft.rfft2(maps * self.window) * self.filter, s=maps.shape[-2:])
 
-    def rows(self, columns: Tensor) -> Rows:
-        """(E, n, H, W) in I/F -> rows."""
-        dynamic, maps = self.split(columns)
-        return Rows(dynamic, self.whiten(maps))
+
+def _tapered(count: int) -> Tensor:
+    """A window that falls to zero over an eighth of the crop at either end: borders are no part of a spectrum, (count,)."""
+    edge = (torch.arange(count) + 0.5).minimum(count - torch.arange(count) - 0.5) / (count / 8)
+    return torch.sin(0.5 * math.pi * edge.clamp(max=1)) ** 2
 
 
 class Local:
-    """Columns of single images (shifts, gains), which live in one image and reach the others through the projection.
+    """Columns that live in one image each (shifts, gains) and reach the others through the projection.
 
+    Only their dynamic rows count: what one image does to the maps of the ground is lost among twelve.
     columns : (n, k, H, W) in I/F
     """
 
-    def __init__(self, projector: Projector, columns: Tensor, prior: Tensor | None = None) -> None:
-        self.projector = projector
+    def __init__(self, projector: Projector, columns: Tensor) -> None:
         self.raw = columns * projector.weight[:, None]
-        n, k = columns.shape[:2]
-        on_basis = torch.stack([self.raw * q[:, None] for q in projector.basis], 2)  # (n, k, K, H, W)
-        flat = on_basis.flatten(0, 1)
-        self.static = projector.whiten(projector.maps(flat))
-        b, s = flat.flatten(1), self.static.flatten(1)
-        gram = s @ s.T - b @ b.T
-        raw = self.raw.flatten(2)
+        # (n k, K, H, W): their coefficients on the basis
+        self.coefficients = (self.raw[:, :, None] * projector.basis.transpose(0, 1)[:, None]).flatten(0, 1)
+        self.gram = self.products(None)
+
+    def products(self, mask: Tensor | None) -> Tensor:
+        """(n k, n k) inner products after projection, over the pixels of ``mask`` (H, W)."""
+        raw, on_basis = self._flat(self.raw, mask), self._flat(self.coefficients, mask)
+        n, k = raw.shape[:2]
+        gram = -(on_basis.flatten(1) @ on_basis.flatten(1).T)
         own = raw @ raw.transpose(1, 2)
         for i in range(n):
             gram[i * k : (i + 1) * k, i * k : (i + 1) * k] += own[i]
-        self.gram = gram.double()
-        if prior is not None:
-            self.gram = self.gram + torch.diag(prior.double().repeat(n))
+        return gram.double()
 
-    def cross(self, rows: Rows) -> Tensor:
-        """(n k, E) inner products with columns that are projected already."""
+    def cross(self, columns: Tensor, coefficients: Tensor, mask: Tensor | None = None) -> Tensor:
+        """(n k, E) inner products with weighted columns (E, n, H, W) of known coefficients (E, K, H, W)."""
+        raw = self._flat(self.raw, mask)
+        x = self._flat(columns, mask)
+        own = torch.cat([r @ x[:, i].T for i, r in enumerate(raw)])
+        shared = self._flat(self.coefficients, mask).flatten(1) @ self._flat(coefficients, mask).flatten(1).T
+        return (own - shared).double()
+
+    @staticmethod
+    def _flat(x: Tensor, mask: Tensor | None) -> Tensor:
+        return x.flatten(-2) if mask is None else x[..., mask]
+
+    def remove_(self, columns: Tensor, coefficients: Tensor) -> None:
+        """Take what the local columns can explain out of weighted columns and their coefficients, in place."""
         n, k = self.raw.shape[:2]
-        dynamic = torch.einsum("nkx,enx->nke", self.raw.flatten(2), rows.dynamic.flatten(2)).reshape(n * k, -1)
-        return (dynamic + self.static.flatten(1) @ rows.static.flatten(1).T).double()
-
-    def fit(self, rows: Rows) -> Tensor:
-        """Least-squares coefficients (n k, E)."""
         ridge = 1e-9 * self.gram.diagonal().mean().clamp(min=1e-30)
-        return torch.linalg.solve(self.gram + ridge * torch.eye(len(self.gram), dtype=torch.float64), self.cross(rows))
-
-    def remove(self, rows: Rows) -> Rows:
-        """The rows without what the local columns can explain."""
-        n, k = self.raw.shape[:2]
-        fitted = self.fit(rows).float()
-        image = torch.einsum("nkx,nke->enx", self.raw.flatten(2), fitted.view(n, k, -1))
-        image = image.view(-1, n, *self.raw.shape[2:])
-        for q in self.projector.basis:
-            image = torch.addcmul(image, q, (image * q).sum(1, keepdim=True), value=-1)
-        static = torch.einsum("fx,fe->ex", self.static.flatten(1), fitted).view(-1, *self.static.shape[1:])
-        return Rows(rows.dynamic - image, rows.static - static)
+        fitted = torch.linalg.solve(
+            self.gram + ridge * torch.eye(len(self.gram), dtype=torch.float64), self.cross(columns, coefficients)
+        ).float()
+        flat, raw = columns.flatten(-2), self.raw.flatten(-2)
+        for i in range(n):
+            flat[:, i] -= fitted[i * k : (i + 1) * k].T @ raw[i]
+        coefficients.flatten(1).addmm_(fitted.T, self.coefficients.flatten(1), alpha=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from stages.diagnose.data import Site
 from stages.diagnose.evidence import Evidence, best_guises, weigh
 from stages.diagnose.images import FEWEST, ImageEvidence, as_effect, weigh_images
 from stages.diagnose.nominal import Nominal, fit, lit_mask
+from stages.diagnose.projection import FREE_SLOPES
 from stages.diagnose.statistics import (
     BASELINE,
     Candidate,
@@ -29,7 +31,9 @@ from stages.diagnose.statistics import (
 from stages.effects import Effect, Survey, effect_names, get_effect
 
 EDGE_EFFECTS = ("penumbra", "distant_shadow")  # judged with the pixels about shadow edges
-STATIC = ("slope_albedo", "elevation_albedo", "curvature_albedo")  # live in the ground's texture alone
+ALBEDO = ("slope_albedo", "elevation_albedo", "curvature_albedo")  # live in the ground's texture alone
+RELIEF = ("dem_scale", "dem_smoothing")  # live in the ground's apparent slopes alone
+STATIC = (*ALBEDO, *RELIEF)
 GATE = 0.01  # family-wise
 GATE_STATIC = 5e-4
 FLOOR_FID = 0.012  # an effect smaller than this against the noise is never worth a name
@@ -121,30 +125,32 @@ class Search:
     def look(self) -> Round:
         names = self.open_names()
         plain = [n for n in names if get_effect(n).scope == "scene" and n not in (*EDGE_EFFECTS, *BASELINE, *STATIC)]
-        still = make_candidates([n for n in names if n in STATIC], self.data)
-        still_parts = []
+        # group of effects -> the nuisances fitted along, in the rows of what stays with the ground
+        still = [(make_candidates([n for n in names if n in ALBEDO], self.data), ())]
+        if max(s.count for s in self.sites) >= FREE_SLOPES:
+            still.append((make_candidates([n for n in names if n == "dem_smoothing"], self.data), ()))
+            still.append((make_candidates([n for n in names if n == "dem_scale"], self.data), ("dem_smoothing",)))
+        still = [(c, [n for n in fixed if n in names]) for c, fixed in still if c]
         edge = [n for n in names if n in EDGE_EFFECTS]
         candidates, at_edge = make_candidates(plain, self.data), make_candidates(edge, self.data)
-        works, parts, edge_parts = [], [], []
+        works, parts, edge_parts, still_parts = [], [], [], [[] for _ in still]
         for k, chain in enumerate(self.chains()):
             work = ready(chain, self.dn)
-            parts.append(gather_site(work, candidates, self.data)[0])
+            parts.append(gather_site(work, candidates, self.data))
             works.append(work)
-            if still:
-                still_parts.append(gather_static(work, still, self.data))
+            for collected, (group, fixed) in zip(still_parts, still, strict=True):
+                collected.append(gather_static(work, group, self.data, fixed))
             if at_edge:
                 work = ready(chain, self.dn, wide=True)
-                edge_parts.append(gather_site(work, at_edge, self.data, [edge_nuisance(chain, self.data)])[0])
+                edge_parts.append(gather_site(work, at_edge, self.data, [edge_nuisance(chain, self.data)]))
             self.progress(k + 1, len(self.sites), f"looking for causes, round {len(self.causes) + 1}")
         statistics = join(parts)
         best = best_guises(weigh(statistics))
-        for name in BASELINE:
-            if name in names:
-                best[name] = weigh(_swap(statistics, name, self.data))[0]
-        if still:
-            best |= best_guises(weigh(join(still_parts)))
-        if at_edge:
-            best |= best_guises(weigh(join(edge_parts)))
+        if "psf_blur" in names:
+            best["psf_blur"] = weigh(_swap(statistics, "psf_blur", self.data))[0]
+        for collected in [*still_parts, edge_parts]:
+            if collected:
+                best |= best_guises(weigh(join(collected)))
         image_names = [n for n in names if get_effect(n).scope == "image"]
         images = weigh_images(works, image_names, self.frames, self.dn, self.data)
         return Round(works, statistics, best, images)
@@ -235,9 +241,9 @@ class Search:
                 work = ready(chain, self.dn, wide)
                 works.append(work)
                 extra = [edge_nuisance(chain, self.data)] if wide else []
-                parts.append(gather_site(work, [], self.data, extra)[0])
+                parts.append(gather_site(work, [], self.data, extra))
             joined = join(parts)
-            if joined.nuisance.shape[1] > 1:
+            if joined.count > 0:
                 delta, error = solve_nuisance(joined)
                 for cause in self.causes:
                     _move(cause, joined.names, delta, error)
@@ -294,33 +300,29 @@ def _as_good(first: Evidence, other: Evidence) -> bool:
 
 def _swap(data: Statistics, name: str, survey: Survey) -> Statistics:
     """The same statistics with one nuisance column as the only candidate."""
-    j = data.names.index(name)
-    rest = [k for k in range(data.nuisance.shape[1]) if k != j]
+    j, m = data.names.index(name), data.count
+    rest = [k for k in range(m) if k != j]
+    order = [*rest, m, j]
     trial = get_effect(name).trials(survey)[0]
-    return Statistics(
-        [Candidate(name, trial, slice(0, 1))],
-        [n for n in data.names if n != name],
-        data.nuisance[:, rest][:, :, rest],
-        data.nuisance[:, j, rest][:, None],
-        [data.nuisance[:, j, j][:, None, None]],
-        data.image,
-        data.place,
-        torch.ones(1, 1),
-        data.rows,
-        data.power,
-        data.static_cluster,
+    return dataclasses.replace(
+        data,
+        candidates=[Candidate(name, trial, slice(0, 1))],
+        names=[data.names[k] for k in rest],
+        bound=data.bound[rest],
+        products=data.products[:, order][:, :, order],
     )
 
 
 def solve_nuisance(data: Statistics) -> tuple[Tensor, Tensor]:
     """Estimates and cluster-robust standard errors of all nuisance columns together."""
-    m = data.nuisance.shape[1] - 1
-    sums = data.nuisance.sum(0)
-    scale = sums[:m, :m].diagonal().clamp(min=1e-30).rsqrt()
-    normal = sums[:m, :m] * scale[:, None] * scale + 1e-6 * torch.eye(m, dtype=torch.float64)
+    m = data.count
+    sums = data.products.sum(0)
+    gram = sums[:m, :m] + torch.diag(data.bound**-2)
+    scale = gram.diagonal().clamp(min=1e-30).rsqrt()
+    normal = gram * scale[:, None] * scale + 1e-6 * torch.eye(m, dtype=torch.float64)
     inverse = torch.linalg.inv(normal) * scale[:, None] * scale
     delta = inverse @ sums[:m, m]
-    score = data.nuisance[:, :m, m] - torch.einsum("cml,l->cm", data.nuisance[:, :m, :m], delta)
+    score = data.products[:, :m, m] - torch.einsum("cml,l->cm", data.products[:, :m, :m], delta)
     variance = torch.zeros(m, dtype=torch.float64)
     for labels in (data.image, data.place):
         _, index = np.unique(labels, return_inverse=True)

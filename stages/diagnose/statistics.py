@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import GRAZING
-from stages.diagnose.projection import Local, Projector, Rows
+from stages.diagnose.projection import Local, Projector
 from stages.effects import Effect, Survey, Trial, get_effect
 
 BLOCK = 32  # px
@@ -22,7 +22,11 @@ OUTLIER = 7.0  # sigma
 SHOT = 0.8  # share of shot noise in the noise's variance at mean brightness
 EDGE = math.radians(6.0)  # relief below the DEM's resolution blurs shadows over a band like this ...
 DOUBT = 0.3  # ... by up to this share of the lit brightness
-BASELINE = ("dem_smoothing", "psf_blur")  # what every data set has a little of: always fitted along
+# What every data set has a little of, always fitted along, with the size that is ordinary (multiples of the column):
+# without a bound on it a strange amount of one imitates other effects.
+BASELINE = {"dem_smoothing": 0.7, "psf_blur": 0.4}
+UNRESOLVED_SLOPES = 1.0
+FREE = 1e6  # no bound
 
 
 @dataclass(frozen=True)
@@ -40,68 +44,75 @@ class Candidate:
 
 @dataclass
 class SiteWork:
-    """A site made ready: weights, projection, residual rows with the local nuisance removed."""
+    """A site made ready: weights, projection, and what is left of the measurement.
+
+    residual : (n, H, W), I/F, measured minus predicted; albedo : (H, W), relative albedo of the ground beyond the
+    prediction, not whitened; static : (K, H, W), whitened maps of the residual; dynamic : (n, H, W), the residual's
+    dynamic rows once everything local and the nominal model's own freedom are taken out
+    """
 
     chain: Chain
     projector: Projector
     local: Local
-    residual: Tensor  # (n, H, W), I/F, measured minus predicted
-    albedo: Tensor  # (H, W), relative albedo of the ground beyond the prediction, not whitened
-    rows: Rows  # of the residual alone, (1, ...), local nuisance removed
-    raw_rows: Rows  # the same before that
+    residual: Tensor
+    albedo: Tensor
+    static: Tensor
+    dynamic: Tensor
 
 
 @dataclass
 class Statistics:
-    """Per cluster: m nuisance columns, the residual, E candidate columns.
+    """Per cluster the products of m nuisance columns, the residual and E candidate columns.
 
-    nuisance : (C, m + 1, m + 1) products of [nuisance, residual]; cross : (C, E, m + 1)
-    grams : per candidate (C, K, K); image, place : (C,) cluster numbers; total : (E, E)
+    products : (C, m + 1 + E, m + 1 + E); bound : (m,) ordinary sizes of the nuisances
+    image, place : (C,) cluster numbers
     """
 
     candidates: list[Candidate]
     names: list[str]  # of the nuisance columns
-    nuisance: Tensor
-    cross: Tensor
-    grams: list[Tensor]
+    bound: Tensor
+    products: Tensor
     image: np.ndarray
     place: np.ndarray
-    total: Tensor
     rows: float  # dynamic degrees of freedom
-    power: float  # sum of squares of the dynamic residual rows
-    static_cluster: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+
+    @property
+    def count(self) -> int:
+        """Nuisance columns."""
+        return len(self.names)
 
 
 def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
-    """``wide`` keeps the pixels about shadow edges. Weights from the residual's own scatter, the projector, the texture and the residual's rows."""
+    """Weights from the residual's own scatter, the projector, the texture. ``wide`` keeps the pixels about shadow edges."""
     site = chain.site
     weight = _first_weight(chain, wide)
     residual = torch.where(site.valid, site.image - chain.textured, 0.0)
+
+    def split() -> tuple[Projector, Tensor, Tensor]:
+        projector = Projector(chain, weight)
+        weighted = (residual * weight)[None]
+        on_basis = projector.coefficients(weighted)
+        return projector, projector.project_(weighted, on_basis)[0], projector.maps(on_basis)[0]
+
+    projector, dynamic, maps = split()
     for _ in range(2):
-        projector = Projector(chain, weight)
-        dynamic, maps = projector.split(residual[None])
-        if len(weight) < 2:
-            break
-        weight = weight * _rescale(dynamic[0], projector)[:, None, None]
-        if not wide:  # what no smooth effect can do: shadows of unknown walls, cut-off highlights, dead pixels
-            gross = dynamic[0].abs() > OUTLIER
-            if float(gross.sum()) < 0.3 * float((weight > 0).sum()):
-                weight = weight * ~gross
-    projector = Projector(chain, weight)
-    dynamic, maps = projector.split(residual[None])
-    if len(weight) < 2:  # one image: its noise and the ground's texture cannot be told apart
-        weight = weight / float((residual * weight).square()[weight > 0].mean().clamp(min=1e-12)) ** 0.5
-        projector = Projector(chain, weight)
-        dynamic, maps = projector.split(residual[None])
+        if len(weight) < 2:  # one image: its noise and the ground's texture cannot be told apart
+            weight = weight / float((residual * weight).square()[weight > 0].mean().clamp(min=1e-12)) ** 0.5
+        else:
+            weight = weight * _rescale(dynamic, projector)[:, None, None]
+            if not wide:  # what no smooth effect can do: shadows of unknown walls, cut-off highlights, dead pixels
+                gross = dynamic.abs() > OUTLIER
+                if float(gross.sum()) < 0.3 * float((weight > 0).sum()):
+                    weight = weight * ~gross
+        projector, dynamic, maps = split()
     # the prediction moves the texture along with the ground; the static rows are about all of it
-    maps[:, 0] += site.texture - 1
+    maps[0] += site.texture - 1
     if len(weight) >= 3:
-        site.texture = (1 + maps[0, 0]).clamp(0.4, 2.5)
+        site.texture = (1 + maps[0]).clamp(0.4, 2.5)
         chain.textured = chain.render()
-    projector.learn_spectrum(maps[0])
+    projector.learn_spectrum(maps)
     local = Local(projector, nuisance_columns(chain, dn))
-    raw = Rows(dynamic, projector.whiten(maps))
-    return SiteWork(chain, projector, local, residual, maps[0, 0], local.remove(raw), raw)
+    return SiteWork(chain, projector, local, residual, maps[0], projector.whiten(maps[None])[0], dynamic)
 
 
 def _first_weight(chain: Chain, wide: bool) -> Tensor:
@@ -224,111 +235,120 @@ def derivative_step(cls: type[Effect], coordinate: str, data: Survey) -> float:
 
 def gather_site(
     work: SiteWork, candidates: Sequence[Candidate], data: Survey, extra: Sequence[tuple[str, list[Tensor]]] = ()
-) -> tuple[Statistics, Rows, Rows]:
-    """Statistics of one site, with the candidates' and nuisance rows for whoever needs more."""
-    chain = work.chain
-    columns: list[Tensor] = []
-    for candidate in candidates:
-        columns += trial_columns(chain, candidate.effect, candidate.trial, data)
+) -> Statistics:
+    """Statistics of one site; ``work.dynamic`` becomes what local columns and the nominal model's freedom leave."""
+    chain, projector = work.chain, work.projector
+    own = _site_columns(chain)
     names, nuisance = tangent_columns(chain, data)
-    for effect in BASELINE:
+    bound = [FREE] * len(names)
+    for effect, ordinary in BASELINE.items():
         if effect not in [e.name for e in chain.base]:
             names.append(effect)
+            bound.append(ordinary)
             nuisance += trial_columns(chain, effect, get_effect(effect).trials(data)[0], data)
     names.append("unresolved_slopes")
+    bound.append(UNRESOLVED_SLOPES)
     nuisance.append(chain.unresolved_slopes())
     for name, more in extra:
         names += [f"{name}{k}" for k in range(len(more))]
+        bound += [FREE] * len(more)
         nuisance += more
-    own = _site_columns(chain)
-    z = work.local.remove(work.projector.rows(torch.stack(columns))) if columns else None
-    m = work.local.remove(work.projector.rows(torch.stack(nuisance)))
-    s = work.local.remove(work.projector.rows(own))
-    y = work.rows
-    if z is None:
-        z = Rows(m.dynamic[:0], m.static[:0])
-    z, m, y = _without(s, z), _without(s, m), _without(s, y)
-    return _reduce(work, candidates, names, z, m, y), z, m
+    s, m = len(own), len(names)
+    count = s + m + 1 + sum(c.size for c in candidates)
+    columns = torch.empty(count, *work.residual.shape)
+    for k, column in enumerate([*own, *nuisance, work.residual]):
+        torch.mul(column, projector.weight, out=columns[k])
+    k = s + m + 1
+    for candidate in candidates:
+        for column in trial_columns(chain, candidate.effect, candidate.trial, data):
+            torch.mul(column, projector.weight, out=columns[k])
+            k += 1
+    dynamic, static = _rows_(work, columns, s + m)
+    _without_(dynamic, static, s)
+    work.dynamic = dynamic[s + m].clone()
+    return _reduce(work, candidates, names, bound, dynamic[s:], static[s:])
 
 
-def gather_static(work: SiteWork, candidates: Sequence[Candidate], data: Survey) -> Statistics:
-    """Statistics from the static rows alone, for albedo that follows terrain.
+def gather_static(
+    work: SiteWork, candidates: Sequence[Candidate], data: Survey, nuisance: Sequence[str] = ()
+) -> Statistics:
+    """Statistics from the static rows alone, for what stays with the ground: albedo that follows terrain, a DEM's faults.
 
     Such effects leave no trace in the dynamic rows, while nuisances that the dynamic rows fix would carry their own
     errors into the static ones. Clusters are blocks of ground.
     """
-    columns = [c for k in candidates for c in trial_columns(work.chain, k.effect, k.trial, data)]
-    z, y = _still(work.projector.rows(torch.stack(columns))), _still(work.raw_rows)
-    nothing = Rows(y.dynamic[:1] * 0, y.static[:1] * 0)
-    out = _reduce(work, candidates, ["none"], z, nothing, y)
+    chain = work.chain
+    fixed = [c for e in nuisance for c in trial_columns(chain, e, get_effect(e).trials(data)[0], data)]
+    columns = [c for k in candidates for c in trial_columns(chain, k.effect, k.trial, data)]
+    weighted = torch.stack(fixed + columns) * work.projector.weight
+    if candidates[0].effect.startswith("dem_"):  # the nominal model was fitted to images that hold the effect: take out what it took
+        tangents = torch.stack(chain.surface_tangents()).mul_(work.projector.weight).flatten(1)
+        share = torch.linalg.lstsq(tangents.T.double(), weighted.flatten(1).T.double()).solution.float()
+        weighted.flatten(1).addmm_(share.T, tangents, alpha=-1)
+    maps = work.projector.maps(work.projector.coefficients(weighted))
+    rows = work.projector.whiten(maps)
+    static = torch.cat([rows[: len(fixed)], work.static[None], rows[len(fixed) :]])
+    out = _reduce(work, candidates, list(nuisance), [BASELINE[e] for e in nuisance], static[:, :0], static)
     out.image = out.place
-    out.rows = max(out.rows, 1.0)
     return out
 
 
-def _still(rows: Rows) -> Rows:
-    return Rows(torch.zeros_like(rows.dynamic), rows.static)
+def _rows_(work: SiteWork, columns: Tensor, residual: int) -> tuple[Tensor, Tensor]:
+    """Weighted columns, in place -> dynamic rows without the local columns (E, n, H, W), and static rows (E, K, H, W)."""
+    projector = work.projector
+    on_basis = projector.coefficients(columns)
+    static = projector.whiten(projector.maps(on_basis))
+    static[residual] = work.static
+    work.local.remove_(columns, on_basis)
+    return projector.project_(columns, on_basis), static
 
 
-def _site_columns(chain: Chain) -> Tensor:
+def _site_columns(chain: Chain) -> list[Tensor]:
     """The nominal model's freedom within a site: each coefficient may change and drift across the crop."""
     tangents = chain.surface_tangents()
     height, width = tangents[0].shape[-2:]
     y = torch.linspace(-1, 1, height)[:, None]
     x = torch.linspace(-1, 1, width)
-    return torch.stack([t * f for t in tangents for f in (torch.ones(()), x, y)])
+    return [t * f for t in tangents for f in (torch.ones(()), x, y)]
 
 
-def _without(nuisance: Rows, rows: Rows) -> Rows:
-    """Rows orthogonal to the nuisance rows."""
-    if not len(rows.dynamic):
-        return rows
-    gram = nuisance.dot(nuisance).double()
+def _without_(dynamic: Tensor, static: Tensor, count: int) -> None:
+    """Make all rows orthogonal to the first ``count``, in place."""
+    d, t = dynamic.flatten(1), static.flatten(1)
+    gram = (d[:count] @ d.T + t[:count] @ t.T).double()
     scale = gram.diagonal().clamp(min=1e-30).rsqrt()
-    normal = gram * scale[:, None] * scale + 1e-6 * torch.eye(len(gram), dtype=torch.float64)
-    share = torch.linalg.solve(normal, scale[:, None] * nuisance.dot(rows).double()) * scale[:, None]
-    share = share.float()
-    return Rows(
-        rows.dynamic - torch.einsum("fe,f...->e...", share, nuisance.dynamic),
-        rows.static - torch.einsum("fe,f...->e...", share, nuisance.static),
-    )
+    normal = gram[:, :count] * scale[:, None] * scale + 1e-6 * torch.eye(count, dtype=torch.float64)
+    share = (torch.linalg.solve(normal, scale[:, None] * gram[:, count:]) * scale[:, None]).float()
+    d[count:].addmm_(share.T, d[:count], alpha=-1)
+    t[count:].addmm_(share.T, t[:count], alpha=-1)
 
 
-def _reduce(work: SiteWork, candidates, names, z: Rows, m: Rows, y: Rows) -> Statistics:
+def _reduce(
+    work: SiteWork, candidates: Sequence[Candidate], names: list[str], bound: list[float], dynamic: Tensor, static: Tensor
+) -> Statistics:
+    """Rows (m + 1 + E, ...) -> products per cluster: a block of an image, or of a map."""
     site = work.chain.site
     size = min(BLOCK, max(8, min(site.image.shape[-2:]) // 4))
-    count, k = z.dynamic.shape[0], len(names)
-    every = torch.cat([m.dynamic, y.dynamic, z.dynamic])
-    static = torch.cat([m.static, y.static, z.static])
-    blocks = torch.cat([_blocks(every, size), _blocks(static, size)], 1)  # (columns, clusters, px)
-    a = blocks.permute(1, 0, 2).contiguous()
-    head = a[:, : k + 1]
-    nuisance = head @ head.transpose(1, 2)
-    cross = a[:, k + 1 :] @ head.transpose(1, 2)
-    grams = []
-    for candidate in candidates:
-        part = a[:, k + 1 + candidate.columns.start : k + 1 + candidate.columns.stop]
-        grams.append((part @ part.transpose(1, 2)).double())
-    per_map = blocks.shape[1] // (every.shape[1] + static.shape[1])
-    frames = site.frames
-    image = np.concatenate([np.repeat(frames, per_map), np.full(static.shape[1] * per_map, -1 - site.number)])
-    place = np.tile(np.arange(per_map), every.shape[1] + static.shape[1]) + 10_000 * site.number
-    flat = z.dynamic.flatten(1)
-    total = flat @ flat.T + z.static.flatten(1) @ z.static.flatten(1).T if count else torch.zeros(0, 0)
-    is_static = np.arange(len(image)) >= every.shape[1] * per_map
+    products = [_block_products(rows, size) for every in (dynamic, static) for rows in every.unbind(1)]
+    per_map = len(products[0])
+    image = np.concatenate([np.repeat(site.frames[: dynamic.shape[1]], per_map), np.full(static.shape[1] * per_map, -1)])
+    place = np.tile(np.arange(per_map), len(products)) + 10_000 * site.number
+    # an image's faults are known for all of its sites, yet each site has a DEM error of its own
+    image = image + 100_000 * site.number
     return Statistics(
-        list(candidates), list(names), nuisance.double(), cross.double(), grams, image, place, total.double(),
-        work.projector.dynamic_rows, float(y.dynamic.square().sum()), is_static,
+        list(candidates), list(names), torch.tensor(bound, dtype=torch.float64), torch.cat(products).double(),
+        image, place, float(max(work.projector.dynamic_rows, 1)),
     )  # fmt: skip
 
 
-def _blocks(columns: Tensor, size: int) -> Tensor:
-    """(E, n, H, W) -> (E, n * blocks, px of a block), edges filled with zeros."""
+def _block_products(columns: Tensor, size: int) -> Tensor:
+    """(E, H, W) -> inner products within each block, (blocks, E, E); edges filled with zeros."""
     height, width = columns.shape[-2:]
-    columns = torch.nn.functional.pad(columns, (0, -width % size, 0, -height % size))
-    e, n, height, width = columns.shape
-    cut = columns.view(e, n, height // size, size, width // size, size)
-    return cut.permute(0, 1, 2, 4, 3, 5).reshape(e, n * (height // size) * (width // size), size * size)
+    if height % size or width % size:
+        columns = torch.nn.functional.pad(columns, (0, -width % size, 0, -height % size))
+    e, height, width = columns.shape
+    cut = columns.view(e, height // size, size, width // size, size).permute(1, 3, 0, 2, 4).reshape(-1, e, size * size)
+    return torch.bmm(cut, cut.transpose(1, 2))
 
 
 def join(parts: Sequence[Statistics]) -> Statistics:
@@ -337,13 +357,9 @@ def join(parts: Sequence[Statistics]) -> Statistics:
     return Statistics(
         first.candidates,
         first.names,
-        torch.cat([p.nuisance for p in parts]),
-        torch.cat([p.cross for p in parts]),
-        [torch.cat([p.grams[k] for p in parts]) for k in range(len(first.grams))],
+        first.bound,
+        torch.cat([p.products for p in parts]),
         np.concatenate([p.image for p in parts]),
         np.concatenate([p.place for p in parts]),
-        torch.stack([p.total for p in parts]).sum(0),
         sum(p.rows for p in parts),
-        sum(p.power for p in parts),
-        np.concatenate([p.static_cluster for p in parts]),
     )

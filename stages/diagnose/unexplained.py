@@ -9,7 +9,7 @@ import torch
 
 from stages.diagnose.images import FEWEST
 from stages.diagnose.selection import EDGE_EFFECTS, Round, Search
-from stages.diagnose.statistics import BASELINE, SiteWork, _site_columns, _without
+from stages.diagnose.statistics import BASELINE, SiteWork
 from stages.effects import effect_names, get_effect
 
 CELL = 8  # px
@@ -43,8 +43,7 @@ def measure(works: list[SiteWork]) -> Structure:
     for work in works:
         if work.chain.site.count < 2:
             continue
-        own = work.local.remove(work.projector.rows(_site_columns(work.chain)))
-        y = _without(own, work.rows).dynamic[0]
+        y = work.dynamic
         used = (work.projector.weight > 0).float()
         y = y.clamp(-4, 4) * used
         noise = _noise(y, used)

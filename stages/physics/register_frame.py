@@ -21,7 +21,9 @@ from stages.physics.sources import Source
 
 REGION_PX = 128  # a side; smaller crops say too little each
 MOST_REGIONS = 64
-MODEL = "lunar_lambert"  # shading alone matters here: gain and offset are free, and slow changes are taken off
+# Shading alone matters here: gain and offset are free, and slow changes are taken off. How the surface darkens towards the
+# limb is free too, between these two: over oblique views another law shades as if the ground lay a part of a pixel away.
+MODELS = ("lunar_lambert", "lommel_seeliger")
 
 
 def choose_regions(
@@ -68,11 +70,11 @@ def register_frame(
     for row, col, height, width in regions:
         z = np.asarray(elevation[row : row + height, col : col + width], np.float32)
         pixels = source.read(row, col, height, width)
-        rendering, lit = render_region(frame, z, elevation, overview, grid, row, col)
+        rendering, *others, lit = render_region(frame, z, elevation, overview, grid, row, col)
         valid = pixels.valid & np.isfinite(z)
         # Shadows lie where they do whatever the surface is like: they count, but their inside holds no structure.
         weights = np.where(lit > 0.05, 1.0, 0.5)
-        shifts.append(estimate_shift(pixels.values, rendering, valid, weights, max_shift, terrain_patterns(z)))
+        shifts.append(estimate_shift(pixels.values, rendering, valid, weights, max_shift, [*others, *terrain_patterns(z)]))
     middles = np.array([(r + (h - 1) / 2, c + (w - 1) / 2) for r, c, h, w in regions]).reshape(-1, 2)
     return fit_field(shifts, middles[:, 0], middles[:, 1], kind), shifts
 
@@ -88,8 +90,9 @@ def terrain_patterns(z: NDArray[np.float32]) -> list[NDArray[np.float64]]:
 
 def render_region(
     frame: Frame, z: NDArray[np.float32], elevation: Any, overview: Overview, grid: Grid, row: int, col: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """I/F of a uniform surface, shadows cast by the whole scene, and the visible share of the Sun; NaN without terrain."""
+) -> tuple[NDArray[np.float64], ...]:
+    """I/F of a uniform surface by each of MODELS, shadows cast by the whole scene, and whether the Sun shines; NaN without
+    terrain."""
     height, width = z.shape
     known = np.isfinite(z)
     mean = float(z[known].mean()) if known.any() else 0.0
@@ -118,10 +121,11 @@ def render_region(
         body_radius=grid.radius,
         sun_horizon=torch.from_numpy(np.nan_to_num(horizon, nan=-1.5).astype(np.float32))[None],
     )
-    model = get_model(MODEL)
-    coefficients = torch.tensor([p.default for p in model.parameters])[None, :, None, None]
-    with torch.no_grad():
-        image = form(observation, model, coefficients)[0].numpy().astype(float)
+    images = []
+    for model in map(get_model, MODELS):
+        coefficients = torch.tensor([p.default for p in model.parameters])[None, :, None, None]
+        with torch.no_grad():
+            images.append(form(observation, model, coefficients)[0].numpy().astype(float))
+        images[-1][~known] = np.nan
     lit = (math.asin(max(-1.0, min(1.0, float(up)))) > horizon).astype(float)
-    image[~known] = np.nan
-    return image, lit
+    return *images, lit
