@@ -30,12 +30,12 @@ from stages.physics.labels import label_time, product_time
 ALTITUDE = 120e3
 
 
-def camera(east: float = 0.0) -> Pinhole:
-    """Nearly overhead; ``east`` metres off, pointing with it, so that the ground it sees moves by as much."""
+def camera(east: float = 0.0, north: float = 0.0) -> Pinhole:
+    """Nearly overhead; ``east`` and ``north`` metres off, pointing with it, so that the ground it sees moves by as much."""
     up = unit_vectors(LON, LAT)
     to_east = np.cross([0, 0, 1.0], up)
     to_east /= np.linalg.norm(to_east)
-    shift = east * to_east
+    shift = east * to_east + north * np.cross(up, to_east)
     return Pinhole.looking_at(up * (RADIUS + ALTITUDE) + shift, up * RADIUS + shift, math.radians(3.4), (400, 380))
 
 
@@ -204,6 +204,22 @@ def test_a_camera_that_is_off_is_found_out_and_put_right(rough, tmp_path, kind, 
         assert np.isfinite(mended - truth).sum() > 1000
         assert after < 0.2 * before
     assert len((tmp_path / "s.csv").read_text().splitlines()) >= 5
+
+
+@pytest.mark.parametrize("planted", [(4.0, -4.0), (-3.25, 2.5), (1.75, 3.6)])
+def test_planted_shifts_of_four_pixels_come_back(rough, tmp_path, planted):
+    """Both axes at once, whole and fractional pixels, over ground whose albedo the rendering does not know."""
+    dem, image = rough
+    rows, cols = np.meshgrid(np.arange(image.shape[0]), np.arange(image.shape[1]), indexing="ij")
+    albedo = 1 + 0.08 * np.sin(rows / 5.3 + 0.7) * np.cos(cols / 6.1) + 0.06 * np.sin((rows + 2 * cols) / 17)
+    table = write_frame(tmp_path, camera(planted[0] * 20, -planted[1] * 20), (image * albedo).astype(np.float32))
+    summary, path = run_all(dem, table, tmp_path, register="shift")
+    with h5py.File(path) as file:
+        found = file["shift_col_px"][0], file["shift_row_px"][0]
+        sigma = file["shift_sigma_px"][0]
+    assert found == (pytest.approx(planted[0], abs=0.1), pytest.approx(planted[1], abs=0.1))
+    assert max(abs(found[0] - planted[0]), abs(found[1] - planted[1])) < 3 * sigma < 0.6
+    assert summary.registered[0].field.used >= 4
 
 
 def mosaic(file):

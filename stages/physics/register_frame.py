@@ -74,18 +74,21 @@ def register_frame(
         valid = pixels.valid & np.isfinite(z)
         # Shadows lie where they do whatever the surface is like: they count, but their inside holds no structure.
         weights = np.where(lit > 0.05, 1.0, 0.5)
-        shifts.append(estimate_shift(pixels.values, rendering, valid, weights, max_shift, [*others, *terrain_patterns(z)]))
+        patterns = [*others, *albedo_patterns(z, rendering)]
+        shifts.append(estimate_shift(pixels.values, rendering, valid, weights, max_shift, patterns))
     middles = np.array([(r + (h - 1) / 2, c + (w - 1) / 2) for r, c, h, w in regions]).reshape(-1, 2)
     return fit_field(shifts, middles[:, 0], middles[:, 1], kind), shifts
 
 
-def terrain_patterns(z: NDArray[np.float32]) -> list[NDArray[np.float64]]:
-    """What albedo may follow: height, curvature at three scales, steepness and its square; (H, W) each, NaN taken as level."""
+def albedo_patterns(z: NDArray[np.float32], rendering: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """What albedo may follow, as it shows under the light of ``rendering``: height, curvature at three scales and its
+    size at two (rims and floors alike), steepness at two and its square; (H, W) each, NaN taken as level."""
     filled = np.where(np.isfinite(z), z, np.nanmean(z) if np.isfinite(z).any() else 0.0).astype(float)
-    south, east = np.gradient(filled)
     curvature = [cv2.Laplacian(cv2.GaussianBlur(filled, (0, 0), sigma), cv2.CV_64F) for sigma in (0.5, 1.0, 3.0)]
-    steepness = np.hypot(south, east)
-    return [filled - filled.mean(), *curvature, steepness, steepness**2]
+    steepness = [np.hypot(*np.gradient(blurred)) for blurred in (filled, cv2.GaussianBlur(filled, (0, 0), 3.0))]
+    patterns = [filled - filled.mean(), *curvature, *map(np.abs, curvature[1:]), *steepness, steepness[0] ** 2]
+    light = np.nan_to_num(rendering)
+    return [pattern * light for pattern in patterns]
 
 
 def render_region(

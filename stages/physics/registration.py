@@ -22,12 +22,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import correlate1d, spline_filter
 
 from schemas.errors import GeometryError
 
 Floats = NDArray[np.float64]
 
-HIGH_PASS_PX = 8.0  # sigma of the mean that is taken off
+# sigma of the mean that is taken off: albedo is strongest over long distances, shading over short ones
+HIGH_PASS_PX = 4.0
 SMOOTH_PX = 0.7  # sigma of the blur that both get, against pixel noise and aliasing
 LEAST_PIXELS = 400
 LEAST_SHARE = 0.1
@@ -99,7 +101,10 @@ def estimate_shift(
     templates = [b]
     for pattern in patterns:
         extra = _small_structure(np.where(good_rendering, np.asarray(pattern, float), 0.0), good_rendering)
-        if extra[good_rendering].std() > 0:
+        size = float((extra**2).sum())
+        # what it has in common with the rendering stays with the rendering, whose strength has a sign to be checked
+        extra -= b * float((extra * b).sum()) / float((b * b).sum())
+        if float((extra**2).sum()) > 1e-6 * size:
             templates.append(extra / extra[good_rendering].std() * b[good_rendering].std())
     reach = math.ceil(max_shift)
     scores = _combined(
@@ -197,17 +202,16 @@ def _refine(
     image: Floats, good: NDArray[np.bool_], templates: Sequence[Floats], weight: Floats, start: tuple[float, float]
 ) -> tuple[float, float, float, float]:
     """Gauss-Newton from ``start``; (dx, dy, standard error, correlation)."""
-    height, width = image.shape
-    cols, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    solid = _eroded(good, 5).astype(np.float32)
-    whole = _eroded(weight > 0, 3)
-    small = image.astype(np.float32)
+    solid, whole = _eroded(good, 7), _eroded(weight > 0, 3)
+    spline = spline_filter(image, order=5)
     dx, dy = start
     change = np.full(2, np.inf)
     for step in range(ITERATIONS):
-        x, y = cols + np.float32(dx), rows + np.float32(dy)
-        moved = cv2.remap(small, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT).astype(float)
-        use = (cv2.remap(solid, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) > 0.999) & whole
+        moved = _moved(spline, dx, dy)
+        use = whole.copy()
+        for column in (math.floor(dx), math.ceil(dx)):
+            for row in (math.floor(dy), math.ceil(dy)):
+                use &= _displaced(solid, column, row)
         if use.sum() < LEAST_PIXELS / 2:
             return math.nan, math.nan, math.inf, 0.0
         w = weight[use]
@@ -252,6 +256,35 @@ def _refine(
     return dx, dy, sigma, correlation if strength[0] > 0 else -abs(correlation)
 
 
+def _moved(spline: Floats, dx: float, dy: float) -> Floats:
+    """The image at (row + dy, col + dx) from the coefficients of its quintic spline.
+
+    A cubic convolution's phase depends on the fraction of a pixel: it drew shifts by up to 0.05 px.
+    """
+    for axis, shift in ((0, dy), (1, dx)):
+        whole = math.floor(shift)
+        weights = [_quintic(shift - whole - k) for k in range(-2, 4)]
+        # taps reach from two before to three behind the whole pixel: correlate1d centres an even window on its fourth
+        spline = correlate1d(spline, weights, axis=axis, mode="constant", origin=-1)
+        spline = _displaced(spline, *((whole, 0) if axis else (0, whole)))
+    return spline
+
+
+def _quintic(x: float) -> float:
+    """The centred B-spline of fifth order."""
+    return sum((-1) ** k * math.comb(6, k) * max(0.0, x + 3 - k) ** 5 for k in range(7)) / 120
+
+
+def _displaced(values: NDArray, columns: int, rows: int) -> NDArray:
+    """values[row + rows, col + columns], zeros from outside."""
+    out = np.zeros_like(values)
+    height, width = values.shape
+    r0, r1, c0, c1 = max(0, -rows), min(height, height - rows), max(0, -columns), min(width, width - columns)
+    if r1 > r0 and c1 > c0:
+        out[r0:r1, c0:c1] = values[r0 + rows : r1 + rows, c0 + columns : c1 + columns]
+    return out
+
+
 def _eroded(mask: NDArray[np.bool_], size: int) -> NDArray[np.bool_]:
     kernel = np.ones((size, size), np.uint8)
     return cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
@@ -283,7 +316,9 @@ class Field:
 
     coefficients : (2, 3), px and px per px; rows dx, dy; columns constant, by column, by row
     origin : (row0, col0); used, regions : how many regions it rests on and how many were tried
-    scatter : px, robust standard deviation of a region about it; sigma : px, standard error of its mean
+    scatter : px, robust standard deviation of a region about it
+    sigma : px, standard error: of the mean over the regions, and as much again as one region scatters, because albedo that
+        follows the terrain pulls all of them the same way (up to 1.4 times the scatter in simulated scenes)
     correlation : median over the regions used; refused : why it must not be applied, empty where it may be
     """
 
@@ -363,7 +398,7 @@ def fit_field(shifts: Sequence[Shift], row: ArrayLike, col: ArrayLike, kind: str
     coefficients[:, : len(terms)] = solution.T
     sigma = math.sqrt(float(np.linalg.inv((design * (weight * keep)[:, None]).T @ design)[0, 0]))
     correlation = float(np.median([s.correlation for s, g in zip(shifts, good, strict=True) if g]))
-    field = Field(coefficients, origin, int(keep.sum()), regions, scatter, sigma, correlation)
+    field = Field(coefficients, origin, int(keep.sum()), regions, scatter, math.hypot(sigma, scatter), correlation)
     if scatter > WORST_SCATTER_PX:
         return replace(field, refused=f"its regions scatter by {scatter:.2f} px")
     if sigma > WORST_FIELD_SIGMA_PX:

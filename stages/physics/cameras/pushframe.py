@@ -91,7 +91,7 @@ class PushFrame(Camera):
             centres=even_positions(exposure.positions, exposure.positions.times, exposure.body).at(times),
             rotations=read.quaternion_matrix(quaternions),
             suns=even_positions(exposure.sun, exposure.positions.times, exposure.body).at(times),
-            times=np.asarray(exposure.centre_time + times, float),
+            times=np.asarray(exposure.centre_time + times, np.float64),
         )
         middle = (framelets // 2 + 0.5) * camera.height
         origin, axis = camera.rays(middle, camera.samples / 2)
