@@ -25,7 +25,7 @@ from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.ephemeris import subsolar_point
 from stages.physics.frames import read_frames
 from stages.physics.grid import unit_vectors
-from stages.physics.labels import label_time, product_time
+from stages.physics.labels import index_images, label_time, product_time
 
 ALTITUDE = 120e3
 
@@ -328,12 +328,12 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def write_index(folder, rows):
+def write_index(folder, rows, columns=COLUMNS):
     label, start = (
         ["PDS_VERSION_ID = PDS3", '^INDEX_TABLE = "CUMINDEX.TAB"', "OBJECT = INDEX_TABLE", f"  ROWS = {len(rows)}"],
         1,
     )
-    for name, width, _ in COLUMNS:
+    for name, width, _ in columns:
         quoted = int("<" in _)
         label += [
             "  OBJECT = COLUMN",
@@ -348,7 +348,7 @@ def write_index(folder, rows):
     for row in rows:
         cells = [
             f'"{form.format(v)}"' if "<" in form else form.format(v)
-            for (_, _, form), v in zip(COLUMNS, row, strict=True)
+            for (_, _, form), v in zip(columns, row, strict=True)
         ]
         lines.append(",".join(cells))
     (folder / "CUMINDEX.TAB").write_text("\r\n".join(lines) + "\r\n")
@@ -375,6 +375,41 @@ def test_a_cumulative_index_replaces_the_table(tmp_path):
         assert frame.spacecraft_altitude_m == pytest.approx(54470)
         assert frame.solar_distance_au == pytest.approx(0.98866, abs=1e-5)
         assert (frame.subsolar_latitude_deg, frame.subsolar_longitude_deg) == (-1.12, 143.61)
+
+
+def one_pixel(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return write_raster(path, np.ones((4, 4), np.float32), small_scene.local_crs(), Affine(20, 0, 0, 0, -20, 0))
+
+
+def test_an_index_finds_images_in_the_archives_own_tree(tmp_path):
+    """LROC's paths begin at the server's root; what is not known is -9999 or N/A."""
+    place = "/LRO-L-LROC-2-EDR-V1.0/LROLRC_0001/DATA/MAP/M1.tif"
+    rows = [(place, "M1", "2010-11-09 13:06:40.356", -1.12, -9999.0, 147900798.0, "N/A", 102.6, 54.47)]
+    for kept in ("LRO-L-LROC-2-EDR-V1.0/LROLRC_0001", "LROLRC_0001", "."):
+        top = tmp_path / kept.replace("/", "_").replace(".", "here")
+        volume = top / kept
+        one_pixel(volume / "DATA/MAP/M1.tif")
+        (volume / "INDEX").mkdir()
+        columns = [("FILE_SPECIFICATION_NAME", 60, "{:<58}"), *COLUMNS[1:]]
+        row = index_images(write_index(volume / "INDEX", rows, columns))[0]
+        assert (volume / "INDEX" / row["path"]).resolve() == (volume / "DATA/MAP/M1.tif").resolve()
+        assert float(row["subsolar_latitude_deg"]) == -1.12 and float(row["spacecraft_altitude_m"]) == 54470
+        assert not {"subsolar_longitude_deg", "spacecraft_latitude_deg"} & set(row)
+
+
+def test_indices_of_messenger_and_hirise_name_their_files_otherwise(tmp_path):
+    """MDIS: PATH_NAME and FILE_NAME (msgrmds_2001/INDEX/CUMINDEX.LBL); HiRISE: FILE_NAME_SPECIFICATION; CTX: IMAGE_TIME."""
+    one_pixel(tmp_path / "2011088/EN0209877468M.tif")
+    times = ("IMAGE_TIME", 26, "{:<24}")
+    split = [("PATH_NAME", 12, "{:<10}"), ("FILE_NAME", 24, "{:<22}"), ("PRODUCT_ID", 18, "{:<16}"), times]
+    row = index_images(
+        write_index(tmp_path, [("2011088", "EN0209877468M.tif", "EN0209877468M", "2011-03-29T09:20:03")], split)
+    )[0]
+    assert row["path"] == "2011088/EN0209877468M.tif" and row["start_time"] == "2011-03-29T09:20:03"
+    whole = [("FILE_NAME_SPECIFICATION", 40, "{:<38}"), ("PRODUCT_ID", 18, "{:<16}")]
+    row = index_images(write_index(tmp_path, [("2011088/EN0209877468M.tif", "EN0209877468M")], whole))[0]
+    assert row["path"] == "2011088/EN0209877468M.tif" and row["start_time"] == ""
 
 
 def test_bad_indices_get_one_clear_line(tmp_path):

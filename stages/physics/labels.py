@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import xml.etree.ElementTree as ElementTree
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -252,15 +253,19 @@ def _index_pair(path: Path) -> tuple[Path, Path]:
     return (path, other) if is_label else (other, path)
 
 
-# our column -> names that indices use, each with the factor to our unit
-INDEX_COLUMNS: Mapping[str, tuple[tuple[str, float], ...]] = {
-    "subsolar_longitude_deg": (("SUB_SOLAR_LONGITUDE", 1.0),),
-    "subsolar_latitude_deg": (("SUB_SOLAR_LATITUDE", 1.0),),
-    "solar_distance_au": (("SOLAR_DISTANCE", 1.0 / 149597870.7),),
-    "spacecraft_longitude_deg": (("SUB_SPACECRAFT_LONGITUDE", 1.0),),
-    "spacecraft_latitude_deg": (("SUB_SPACECRAFT_LATITUDE", 1.0),),
-    "spacecraft_altitude_m": (("SPACECRAFT_ALTITUDE", 1000.0),),
+# Our column -> what indices call it (LROC, MESSENGER MDIS; degrees, longitudes east, km), the factor to our unit and the
+# values that can be: archives fill what they do not know with -9999, 1E32 and the like.
+INDEX_COLUMNS: Mapping[str, tuple[str, float, float, float]] = {
+    "subsolar_longitude_deg": ("SUB_SOLAR_LONGITUDE", 1.0, -360.0, 360.0),
+    "subsolar_latitude_deg": ("SUB_SOLAR_LATITUDE", 1.0, -90.0, 90.0),
+    "solar_distance_au": ("SOLAR_DISTANCE", 1.0 / 149597870.7, 0.1, 100.0),
+    "spacecraft_longitude_deg": ("SUB_SPACECRAFT_LONGITUDE", 1.0, -360.0, 360.0),
+    "spacecraft_latitude_deg": ("SUB_SPACECRAFT_LATITUDE", 1.0, -90.0, 90.0),
+    "spacecraft_altitude_m": ("SPACECRAFT_ALTITUDE", 1000.0, 1.0, 1e11),
 }
+# LROC's and CTX's; HiRISE's. MESSENGER's indices split it into PATH_NAME and FILE_NAME.
+_FILE_COLUMNS = ("FILE_SPECIFICATION_NAME", "FILE_NAME_SPECIFICATION")
+_INDEX_TIMES = ("START_TIME", "IMAGE_TIME", "OBSERVATION_START_TIME")
 IMAGE_SUFFIXES = (".tif", ".tiff", ".cub", ".img", ".png", ".xml")
 
 
@@ -275,15 +280,15 @@ def index_images(path: Path) -> list[dict[str, str]]:
     folder = path.parent
     found = []
     nearby = {p.name.lower(): p for p in sorted(folder.iterdir()) if p.is_file()}
+    names = sorted(nearby)
+    listings: dict[Path, frozenset[str]] = {}
     for row in rows:
-        product = row.get("PRODUCT_ID", "") or Path(row.get("FILE_SPECIFICATION_NAME", "")).stem
-        named = row.get("FILE_SPECIFICATION_NAME", "")
-        image = next(
-            (p for p in ((folder / named), *(parent / named for parent in folder.parents)) if named and p.is_file()),
-            None,
-        )
-        candidates = [p for name, p in nearby.items() if product and name.startswith(product.lower())]
-        image = next((p for s in IMAGE_SUFFIXES for p in candidates if p.suffix.lower() == s), image)
+        named = _index_file(row)
+        product = row.get("PRODUCT_ID", "") or Path(named).stem
+        first, last = (bisect_left(names, product.lower() + end) for end in ("", chr(0x10FFFF)))
+        candidates = [nearby[name] for name in names[first:last]] if product else []
+        image = next((p for s in IMAGE_SUFFIXES for p in candidates if p.suffix.lower() == s), None)
+        image = image or _below(folder, named, listings)
         if image is None:
             continue
         camera = next((p for p in candidates if p.suffix.lower() == ".json"), None)
@@ -292,17 +297,39 @@ def index_images(path: Path) -> list[dict[str, str]]:
             "path": os.path.relpath(image.resolve(), folder.resolve()),
             "camera": camera.name if camera else "",
             "units": "iof" if ".cal" in image.name.lower() or ".iof" in image.name.lower() else "dn",
-            "start_time": row.get("START_TIME", ""),
+            "start_time": next((row[k] for k in _INDEX_TIMES if row.get(k)), ""),
         }
-        for key, names in INDEX_COLUMNS.items():
-            for name, factor in names:
-                try:
-                    ours[key] = repr(float(row[name]) * factor)
-                except (KeyError, ValueError):
-                    continue
+        for key, (name, factor, low, high) in INDEX_COLUMNS.items():
+            try:
+                value = float(row[name]) * factor
+            except (KeyError, ValueError):
+                continue
+            if low <= value <= high:
+                ours[key] = repr(value)
         found.append(ours)
     if not found:
         raise InputError(
             f"{path}: expected an image of at least one of its {len(rows)} products near it, found none; put them beside it."
         )
     return found
+
+
+def _index_file(row: Mapping[str, str]) -> str:
+    """Where a row says that its product is, relative to the volume or the archive."""
+    named = next((row[k] for k in _FILE_COLUMNS if row.get(k)), "")
+    if not named and row.get("FILE_NAME"):
+        named = f"{row.get('PATH_NAME', '')}/{row['FILE_NAME']}"
+    return named.replace("\\", "/").lstrip("/")  # some begin at the server's root
+
+
+def _below(folder: Path, named: str, listings: dict[Path, frozenset[str]]) -> Path | None:
+    """The named file under the index's folder or one above it, whatever part of the archive's tree was kept."""
+    parts = Path(named).parts
+    for first in range(len(parts)):
+        for parent in (folder, *list(folder.parents)[:4]):
+            place = parent.joinpath(*parts[first:-1])
+            if place not in listings:
+                listings[place] = frozenset(os.listdir(place)) if place.is_dir() else frozenset()
+            if parts[-1] in listings[place]:
+                return place / parts[-1]
+    return None

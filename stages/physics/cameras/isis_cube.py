@@ -29,7 +29,7 @@ def cube_document(path: Path) -> dict[str, Any]:
     if instrument not in ("NACL", "NACR"):
         raise InputError(
             f"{where}: expected a cube of the LROC NAC to take the camera from, found instrument '{instrument}'; make an ISD "
-            "with ALE (isd_generate) and name that."
+            "with ALE (isd_generate CUBE, see docs/from_pds_to_pairs.md, step 3) and name that."
         )
     keywords = label.find("NaifKeywords")
     if keywords is None:
