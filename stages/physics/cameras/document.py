@@ -113,6 +113,32 @@ def quaternion_matrix(quaternions: Floats) -> Floats:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def own_camera(document: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """What the JSON of our own frame cameras has in common: size, principal point, place, rotation and body.
+
+    Raises InputError or GeometryError.
+    """
+    point = array(document, "principal_point_px", where, (2,))
+    samples, lines = array(document, "size_px", where, (2,))
+    extent = {"samples": samples, "lines": lines}
+    return {
+        "lines": size(extent, "lines", f"{where}: 'size_px'"),
+        "samples": size(extent, "samples", f"{where}: 'size_px'"),
+        "principal_point_px": (float(point[0]), float(point[1])),
+        "centre": array(document, "position_mcmf", where, (3,)),
+        "rotation": rotation(document, "rotation_camera_to_mcmf", where),
+        "semi_axes": body_axes(document, where),
+    }
+
+
+def one_or_two(document: Mapping[str, Any], key: str, where: str, what: str) -> tuple[float, float]:
+    """A length along samples and lines above 0, given once or for each. Raises InputError or GeometryError."""
+    found = np.atleast_1d(array(document, key, where))
+    if found.size not in (1, 2) or (found <= 0).any():
+        raise GeometryError(f"{where}: expected one or two {what} in '{key}', found {found}.")
+    return float(found[0]), float(found[-1])
+
+
 def body_axes(document: Mapping[str, Any], where: str) -> tuple[float, float]:
     """The body of one of our own documents: ``body`` (name or metres), the Moon where absent."""
     radius = find_body(str(document.get("body", "moon"))).radius

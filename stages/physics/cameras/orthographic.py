@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from schemas.errors import GeometryError
 from stages.physics.cameras import document as read
 from stages.physics.cameras.base import Camera, Floats, register, small_rotation
 
@@ -39,20 +38,8 @@ class Orthographic(Camera):
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any], where: str) -> Orthographic:
-        pixel = np.atleast_1d(read.array(document, "pixel_size", where))
-        if pixel.size not in (1, 2) or (pixel <= 0).any():
-            raise GeometryError(f"{where}: expected one or two pixel sizes above 0 m in 'pixel_size', found {pixel}.")
-        point = read.array(document, "principal_point_px", where, (2,))
-        size = {"samples": read.array(document, "size_px", where, (2,))[0], "lines": document["size_px"][1]}
-        return cls(
-            lines=read.size(size, "lines", f"{where}: 'size_px'"),
-            samples=read.size(size, "samples", f"{where}: 'size_px'"),
-            pixel_size=(float(pixel[0]), float(pixel[-1])),
-            principal_point_px=(float(point[0]), float(point[1])),
-            centre=read.array(document, "position_mcmf", where, (3,)),
-            rotation=read.rotation(document, "rotation_camera_to_mcmf", where),
-            semi_axes=read.body_axes(document, where),
-        )
+        pixel = read.one_or_two(document, "pixel_size", where, "pixel sizes above 0 m")
+        return cls(pixel_size=pixel, **read.own_camera(document, where))
 
     def rays(self, line: ArrayLike, sample: ArrayLike) -> tuple[Floats, Floats]:
         line, sample = np.broadcast_arrays(np.asarray(line, float), np.asarray(sample, float))

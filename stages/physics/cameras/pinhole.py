@@ -40,20 +40,8 @@ class Pinhole(Camera):
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any], where: str) -> Pinhole:
-        focal = np.atleast_1d(read.array(document, "focal_px", where))
-        if focal.size not in (1, 2) or (focal <= 0).any():
-            raise GeometryError(f"{where}: expected one or two focal lengths above 0 px in 'focal_px', found {focal}.")
-        point = read.array(document, "principal_point_px", where, (2,))
-        size = {"samples": read.array(document, "size_px", where, (2,))[0], "lines": document["size_px"][1]}
-        return cls(
-            lines=read.size(size, "lines", f"{where}: 'size_px'"),
-            samples=read.size(size, "samples", f"{where}: 'size_px'"),
-            focal_px=(float(focal[0]), float(focal[-1])),
-            principal_point_px=(float(point[0]), float(point[1])),
-            centre=read.array(document, "position_mcmf", where, (3,)),
-            rotation=read.rotation(document, "rotation_camera_to_mcmf", where),
-            semi_axes=read.body_axes(document, where),
-        )
+        focal = read.one_or_two(document, "focal_px", where, "focal lengths above 0 px")
+        return cls(focal_px=focal, **read.own_camera(document, where))
 
     @classmethod
     def looking_at(
