@@ -22,13 +22,16 @@ import torch
 from schemas import ArtefactError, ConfigError, atomic_path, check_output
 from stages.diagnose.answer import Answer, cause_json, held_out, parameters, write_diagnosis
 from stages.diagnose.data import group_pairs, load_site, survey
+from stages.diagnose.looking import Round
 from stages.diagnose.nominal import fit, lit_mask, load_nominal
-from stages.diagnose.plateau import KEEP_BELOW, plateau, saturated
-from stages.diagnose.selection import Round, Search, enough, search
+from stages.diagnose.plateau import CLEAR_OF, KEEP_BELOW, plateau, saturated
+from stages.diagnose.selection import enough, search
+from stages.diagnose.state import Search
 from stages.diagnose.unexplained import Structure, blind_effects, measure
 from stages.effects import effect_names
 from stages.network.dataset import PairReader
 
+HARM = 10.0  # percent by which unseen pairs may be predicted worse (the same texture in all images of few sites can do that)
 MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model says nothing about the images
 
 
@@ -112,12 +115,21 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         answer.note, answer.blind = few, effect_names()
         return Result(answer, None, None, None)
     cut = None if reader.units == "dn" else plateau(sites)
-    measured = [s.image for s in sites]
+    for site in sites if cut is not None else []:
+        site.valid &= site.image < KEEP_BELOW * cut
+    measured, valid = [s.image for s in sites], [s.valid for s in sites]
     fit(nominal, sites, [], reader.units, measured)
+    if cut is not None:  # leaving out by the measured value alone would keep the dark half of the noise
+        for site in sites:
+            site.valid &= nominal.chain(site, []).textured < CLEAR_OF * cut
+        valid = [s.valid for s in sites]
+        fit(nominal, sites, [], reader.units, measured)
     first = copy.copy(nominal)
     data = survey(sites, len(reader.image_ids))
     has = frozenset({"sun_horizon"})
-    state = Search(nominal, sites, data, len(reader.image_ids), reader.units, has, progress, measured=measured)
+    state = Search(
+        nominal, sites, data, len(reader.image_ids), reader.units, has, progress, measured=measured, valid=valid
+    )
     if cut is not None:
         state.causes.append(saturated(cut, data, sites))
     misfit = _misfit(state)
@@ -130,6 +142,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         return Result(answer, state, None, None)
     seen = search(state, config.most_causes, say)
     structure = measure(seen.works)
+    state.restore()
     _decide(answer, state, seen, structure)
     hidden = [load_site(reader, g) for g in group_pairs(reader, test, config.most_images)[:64]]
     tiles = [reader.tile[s.pairs] for s in hidden]
@@ -137,7 +150,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     for site in hidden if cut is not None else []:
         site.valid &= site.image < KEEP_BELOW * cut
     answer.held_out = held_out(hidden, tiles, first, nominal if effects else first, effects, state.dn, config.seed)
-    if effects and answer.held_out.high < -1.0:  # a model that predicts unseen ground worse explains nothing
+    if effects and answer.held_out.high < -HARM:  # a model that predicts unseen ground worse explains nothing
         answer.verdict, answer.closest, answer.causes = "unexplained", [c.effect.name for c in answer.causes], []
         answer.unexplained_fraction = 1.0
         answer.held_out = held_out(hidden, tiles, first, first, [], state.dn, config.seed)

@@ -13,7 +13,7 @@ import torch
 
 from schemas import DIAGNOSIS, ArtefactWriter
 from stages.diagnose.nominal import Nominal, _scale, lit_mask
-from stages.diagnose.selection import Cause
+from stages.diagnose.state import Cause
 from stages.effects import Effect, get_effect
 from stages.effects.column_pattern import ColumnPattern
 

@@ -21,11 +21,19 @@ SCATTER = 0.14  # 8 deg: rms slope of relief below a typical DEM's resolution
 class Chain:
     """Renders a site with the effects named so far (``base``) plus one more.
 
-    coefficients : broadcastable to (n, C, H, W). Templates carry the site's albedo texture; predictions do not.
+    coefficients : broadcastable to (n, C, H, W). moved : effects that the site's images are free of already. Templates carry the site's albedo texture; predictions do not.
     """
 
-    def __init__(self, site: Site, model: ReflectanceModel, coefficients: Tensor, base: Sequence[Effect]) -> None:
+    def __init__(
+        self,
+        site: Site,
+        model: ReflectanceModel,
+        coefficients: Tensor,
+        base: Sequence[Effect],
+        moved: Sequence[Effect] = (),
+    ) -> None:
         self.site, self.model, self.coefficients, self.base = site, model, coefficients, list(base)
+        self.moved = list(moved)
         self._state = formation.illuminate(site.observation, self.base)
         self._state.reflectance = self._surface(self._state)
         self.textured = self.render()
@@ -55,7 +63,7 @@ class Chain:
             return self._expose(self._state, self._state.reflectance, self.base)
         effects = [*self.base, extra]
         if extra.slot in ("geometry", "illumination"):
-            state = formation.illuminate(self.site.observation, effects)
+            state = formation.illuminate(self.site.observation, effects, self._state)
             same = state.angles.cos_incidence is self._state.angles.cos_incidence
             return self._expose(state, self._state.reflectance if same else self._surface(state), effects)
         return self._expose(self._state, self._state.reflectance, effects)

@@ -35,14 +35,11 @@ class Evidence:
     fid: float
     share: Tensor
     left: float  # share of the template's energy that the nuisances leave
+    unit: float = 0.0  # size over noise of the first column at amount 1
 
     @property
     def effect(self) -> str:
         return self.candidate.effect
-
-
-# Seen in shadows and at their edges, in few blocks of few images: there neither texture nor DEM error repeats
-LOCAL = ("penumbra", "distant_shadow", "dark_bias", "earthshine", "interreflection", "saturation")
 
 
 def weigh(data: Statistics, only: slice = slice(None)) -> list[Evidence]:
@@ -106,7 +103,7 @@ def _weigh_one(candidate, score: Tensor, gram: Tensor, places, images, rows: flo
         wald = float(amount @ torch.linalg.solve(robust + 1e-12 * torch.diag(robust.diagonal()), amount)) / k
         freedom = max(effective - k, 0.8 * (count - 1 - k), 0.5)
         tail = f_tail(wald, k, freedom)
-        if k > 2:  # with more columns than clusters only the held-out direction can be tested
+        if 4 * k > count:  # with about as many columns as clusters only the held-out direction can be tested
             held = (left_out * u).sum(1)
             wald = float(held.sum() ** 2 / held.square().sum().clamp(min=1e-30)) if float(held.sum()) > 0 else 0.0
             tail = f_tail(wald * max(count - 1, 1) / max(count - wald, 1e-9), 1, max(count - 1, 1))
@@ -130,6 +127,7 @@ def _weigh_one(candidate, score: Tensor, gram: Tensor, places, images, rows: flo
         size,
         share,
         left,
+        math.sqrt(max(float(total_g[0, 0]), 0.0) / max(rows, 1.0)),
     )
 
 

@@ -85,6 +85,7 @@ def _site_folds(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) ->
     projector.project_(columns, on_basis)
     # all columns of single images at once: shifts (and gain and offset), then the effects' own
     base = [e.name for e in chain.base]
+    named = {*base, *(e.name for e in chain.moved)}
     groups = {"": nuisance_columns(chain, dn)}
     for name in names:
         place = base.index(name) if name in base else None
@@ -110,7 +111,7 @@ def _site_folds(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) ->
         others = own[""]
         if name == "misregistration":
             others = others[2:]
-        elif name in base:
+        elif name in named:
             others = others[: 4 if dn else 2]
         nuisance = np.concatenate([np.arange(first - 1), places(others)])
         wanted = np.concatenate([[first - 1], places(own[name])])

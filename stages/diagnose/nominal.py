@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,8 +34,8 @@ class Nominal:
             return vector
         return self.predictor.coefficients(site.observation.elevation[:1]) * vector
 
-    def chain(self, site: Site, base: list[Effect]) -> Chain:
-        return Chain(site, self.model, self.coefficients(site), base)
+    def chain(self, site: Site, base: Sequence[Effect], moved: Sequence[Effect] = ()) -> Chain:
+        return Chain(site, self.model, self.coefficients(site), base, moved)
 
 
 def load_nominal(checkpoint: Path | None, model: str, units: str) -> Nominal:
@@ -62,7 +63,9 @@ def lit_mask(chain: Chain) -> Tensor:
     return lit if above is None else lit & (above > MARGIN)
 
 
-def fit(nominal: Nominal, sites: list[Site], base: list[Effect], units: str, measured: list[Tensor]) -> None:
+def fit(
+    nominal: Nominal, sites: Sequence[Site], base: Sequence[Effect], units: str, measured: Sequence[Tensor]
+) -> None:
     """Least squares of the coefficients (and of gain and offset per pair where images are in dn), in place.
 
     measured : the images as read, one (n, H, W) per site; ``site.image`` becomes I/F

@@ -5,12 +5,13 @@ from __future__ import annotations
 import torch
 
 from stages.diagnose.data import Site
-from stages.diagnose.selection import Cause
+from stages.diagnose.state import Cause
 from stages.effects import Survey, get_effect
 
 PILE = 3.0  # pixels in the bin (2 %) of the level over those in the bins below it
 LEAST = 150  # pixels
-KEEP_BELOW = 0.97  # of the level: what is cut off says nothing more
+KEEP_BELOW = 0.97  # of the level: what is cut off says nothing more ...
+CLEAR_OF = 0.9  # ... and where the prediction comes as close as this, what is left is biased
 
 
 def plateau(sites: list[Site]) -> float | None:
@@ -35,12 +36,10 @@ def plateau(sites: list[Site]) -> float | None:
 
 
 def saturated(level: float, data: Survey, sites: list[Site]) -> Cause:
-    """The cause, and the sites without what was cut off: the rest is judged as if nothing had happened."""
-    count = sum(int((s.valid & (s.image >= KEEP_BELOW * level)).sum()) for s in sites)
-    for site in sites:
-        site.valid = site.valid & (site.image < KEEP_BELOW * level)
+    """The cause; what was cut off is masked elsewhere, and the rest judged as if nothing had happened."""
+    count = sum(int((s.image >= KEEP_BELOW * level).sum()) for s in sites)
     effect = get_effect("saturation")({"iof": level}, data)
-    effect.held = ("iof",)  # type: ignore[attr-defined]
+    effect.held = ("iof",)
     # an unbent histogram would hold a quarter of the pile in its last bin: log-likelihood of the excess
     gain = 1.386 * count
     return Cause(effect, 1e-12, gain, gain**0.5, 1.0, ["saturation"], {"iof": 0.005 * level})

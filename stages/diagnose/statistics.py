@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,7 +49,8 @@ class SiteWork:
 
     residual : (n, H, W), I/F, measured minus predicted; albedo : (H, W), relative albedo of the ground beyond the
     prediction, not whitened; static : (K, H, W), whitened maps of the residual; dynamic : (n, H, W), the residual's
-    dynamic rows once everything local and the nominal model's own freedom are taken out
+    dynamic rows once everything local and the nominal model's own freedom are taken out; slope_error : rms per axis of the
+    apparent slope errors, as tangent, by their median, NaN where images are too few
     """
 
     chain: Chain
@@ -58,6 +60,7 @@ class SiteWork:
     albedo: Tensor
     static: Tensor
     dynamic: Tensor
+    slope_error: float = math.nan
 
 
 @dataclass
@@ -112,7 +115,8 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
         chain.textured = chain.render()
     projector.learn_spectrum(maps)
     local = Local(projector, nuisance_columns(chain, dn))
-    return SiteWork(chain, projector, local, residual, maps[0], projector.whiten(maps[None])[0], dynamic)
+    slopes = float(maps[1:].square().sum(0).median() / (2 * math.log(2))) ** 0.5 if len(maps) > 1 else math.nan
+    return SiteWork(chain, projector, local, residual, maps[0], projector.whiten(maps[None])[0], dynamic, slopes)
 
 
 def _first_weight(chain: Chain, wide: bool) -> Tensor:
@@ -165,8 +169,11 @@ def nuisance_columns(chain: Chain, dn: bool) -> Tensor:
     if dn:
         columns += [image, torch.full_like(image, float(image.mean()))]
     for k, effect in enumerate(chain.base):
-        if effect.scope == "image" and effect.name != "misregistration":
+        if effect.scope == "image":
             columns += list(image_columns(chain, type(effect), k))
+    for effect in chain.moved:
+        if effect.name != "misregistration":  # shifts are there already
+            columns += list(image_columns(chain, type(effect)))
     return torch.stack(columns, 1)
 
 
@@ -206,21 +213,25 @@ def tangent_columns(chain: Chain, data: Survey) -> tuple[list[str], list[Tensor]
     """d image / d coordinate for the scene-wide effects that are in the chain already."""
     names, columns = [], []
     for k, effect in enumerate(chain.base):
-        if effect.scope != "scene":
-            continue
+        if effect.scope != "scene" or effect.channel in ("albedo", "relief"):
+            continue  # what stays with the ground is estimated there
         for coordinate in free_coordinates(effect):
-            value = float(effect.values[coordinate])
-            step = derivative_step(type(effect), coordinate, data)
-            moved = type(effect)({**effect.values, coordinate: value + step}, data)
             names.append(f"{effect.name}.{coordinate}")
-            columns.append((chain.replace(k, moved) - chain.textured) / step)
+            columns.append(tangent(chain, k, coordinate, data))
     return names, columns
+
+
+def tangent(chain: Chain, place: int, coordinate: str, data: Survey) -> Tensor:
+    """d image / d coordinate of the effect at ``place`` in the chain, (n, H, W)."""
+    effect = chain.base[place]
+    step = derivative_step(type(effect), coordinate, data)
+    moved = type(effect)({**effect.values, coordinate: float(effect.values[coordinate]) + step}, data)
+    return (chain.replace(place, moved) - chain.textured) / step
 
 
 def free_coordinates(effect: Effect) -> list[str]:
     """The coordinates that stay free once an effect is named: those of its best guise and its shape."""
-    fixed = getattr(effect, "held", ())
-    return [p.name for p in effect.fitted() if p.name not in fixed]
+    return [p.name for p in effect.fitted() if p.name not in effect.held]
 
 
 def derivative_step(cls: type[Effect], coordinate: str, data: Survey) -> float:
@@ -270,25 +281,32 @@ def gather_site(
 
 
 def gather_static(
-    work: SiteWork, candidates: Sequence[Candidate], data: Survey, nuisance: Sequence[str] = ()
+    work: SiteWork,
+    candidates: Sequence[Candidate],
+    columns: Sequence[Tensor],
+    nuisance: Sequence[tuple[str, float, Tensor]] = (),
+    nominal: bool = False,
 ) -> Statistics:
     """Statistics from the static rows alone, for what stays with the ground: albedo that follows terrain, a DEM's faults.
 
     Such effects leave no trace in the dynamic rows, while nuisances that the dynamic rows fix would carry their own
     errors into the static ones. Clusters are blocks of ground.
+
+    columns : (n, H, W) each, the candidates'; nuisance : name, ordinary size and column
+    nominal : take out what the nominal model, fitted to images that hold the effect, took of it
     """
-    chain = work.chain
-    fixed = [c for e in nuisance for c in trial_columns(chain, e, get_effect(e).trials(data)[0], data)]
-    columns = [c for k in candidates for c in trial_columns(chain, k.effect, k.trial, data)]
-    weighted = torch.stack(fixed + columns) * work.projector.weight
-    if candidates[0].effect.startswith("dem_"):  # the nominal model was fitted to images that hold the effect: take out what it took
-        tangents = torch.stack(chain.surface_tangents()).mul_(work.projector.weight).flatten(1)
-        share = torch.linalg.lstsq(tangents.T.double(), weighted.flatten(1).T.double()).solution.float()
+    weighted = torch.stack([*(column for _, _, column in nuisance), *columns]) * work.projector.weight
+    if nominal:
+        tangents = torch.stack(work.chain.surface_tangents()).mul_(work.projector.weight).flatten(1)
+        gram = (tangents @ tangents.T).double()
+        ridge = 1e-9 * torch.diag(gram.diagonal().clamp(min=1e-12))
+        share = torch.linalg.solve(gram + ridge, (tangents @ weighted.flatten(1).T).double()).float()
         weighted.flatten(1).addmm_(share.T, tangents, alpha=-1)
-    maps = work.projector.maps(work.projector.coefficients(weighted))
-    rows = work.projector.whiten(maps)
-    static = torch.cat([rows[: len(fixed)], work.static[None], rows[len(fixed) :]])
-    out = _reduce(work, candidates, list(nuisance), [BASELINE[e] for e in nuisance], static[:, :0], static)
+    rows = work.projector.whiten(work.projector.maps(work.projector.coefficients(weighted)))
+    first = len(nuisance)
+    static = torch.cat([rows[:first], work.static[None], rows[first:]])
+    names, bounds = [n for n, _, _ in nuisance], [b for _, b, _ in nuisance]
+    out = _reduce(work, candidates, names, bounds, static[:, :0], static)
     out.image = out.place
     return out
 
@@ -324,14 +342,21 @@ def _without_(dynamic: Tensor, static: Tensor, count: int) -> None:
 
 
 def _reduce(
-    work: SiteWork, candidates: Sequence[Candidate], names: list[str], bound: list[float], dynamic: Tensor, static: Tensor
+    work: SiteWork,
+    candidates: Sequence[Candidate],
+    names: list[str],
+    bound: list[float],
+    dynamic: Tensor,
+    static: Tensor,
 ) -> Statistics:
     """Rows (m + 1 + E, ...) -> products per cluster: a block of an image, or of a map."""
     site = work.chain.site
     size = min(BLOCK, max(8, min(site.image.shape[-2:]) // 4))
     products = [_block_products(rows, size) for every in (dynamic, static) for rows in every.unbind(1)]
     per_map = len(products[0])
-    image = np.concatenate([np.repeat(site.frames[: dynamic.shape[1]], per_map), np.full(static.shape[1] * per_map, -1)])
+    image = np.concatenate(
+        [np.repeat(site.frames[: dynamic.shape[1]], per_map), np.full(static.shape[1] * per_map, -1)]
+    )
     place = np.tile(np.arange(per_map), len(products)) + 10_000 * site.number
     # an image's faults are known for all of its sites, yet each site has a DEM error of its own
     image = image + 100_000 * site.number
@@ -349,6 +374,39 @@ def _block_products(columns: Tensor, size: int) -> Tensor:
     e, height, width = columns.shape
     cut = columns.view(e, height // size, size, width // size, size).permute(1, 3, 0, 2, 4).reshape(-1, e, size * size)
     return torch.bmm(cut, cut.transpose(1, 2))
+
+
+def without(data: Statistics, drop: Sequence[str], candidates: Sequence[Candidate]) -> Statistics:
+    """The same statistics with some nuisances ignored and of the candidates only those."""
+    keep = [k for k, name in enumerate(data.names) if name not in drop]
+    first = data.count + 1
+    columns = [k for c in candidates for k in range(first + c.columns.start, first + c.columns.stop)]
+    order = [*keep, data.count, *columns]
+    placed, start = [], 0
+    for c in candidates:
+        placed.append(dataclasses.replace(c, columns=slice(start, start + c.size)))
+        start += c.size
+    return dataclasses.replace(
+        data,
+        candidates=placed,
+        names=[data.names[k] for k in keep],
+        bound=data.bound[keep],
+        products=data.products[:, order][:, :, order],
+    )
+
+
+def swap(data: Statistics, name: str, survey: Survey) -> Statistics:
+    """The same statistics with one nuisance column as the only candidate."""
+    j, m = data.names.index(name), data.count
+    rest = [k for k in range(m) if k != j]
+    order = [*rest, m, j]
+    return dataclasses.replace(
+        data,
+        candidates=[Candidate(name, get_effect(name).trials(survey)[0], slice(0, 1))],
+        names=[data.names[k] for k in rest],
+        bound=data.bound[rest],
+        products=data.products[:, order][:, :, order],
+    )
 
 
 def join(parts: Sequence[Statistics]) -> Statistics:

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import torch
 
 from stages.diagnose.images import FEWEST
-from stages.diagnose.selection import EDGE_EFFECTS, Round, Search
-from stages.diagnose.statistics import BASELINE, SiteWork
+from stages.diagnose.looking import Round
+from stages.diagnose.naming import BLUR, FLOOR_FID
+from stages.diagnose.state import Search
+from stages.diagnose.statistics import SiteWork
 from stages.effects import effect_names, get_effect
 
 CELL = 8  # px
@@ -93,38 +95,26 @@ def _peak(power: torch.Tensor | None) -> float:
 def blind_effects(state: Search, seen: Round) -> list[str]:
     """Effects of which these data would not show even a strong case."""
     named = {c.effect.name for c in state.causes}
-    out = []
-    deep = max((s.count for s in state.sites), default=0) >= FEWEST
-    for name in effect_names():
-        cls = get_effect(name)
-        if name in named:
-            continue
-        if not cls.visible(state.data, state.has) or (state.dn and name in ("image_gain", "dark_bias")):
-            out.append(name)
-        elif cls.scope == "image":
-            if not deep:
-                out.append(name)
-        elif cls.scope == "scene" and name != "saturation":
-            evidence = seen.best.get(name)
-            if evidence is None or evidence.left <= 0:
-                out.append(name)
-                continue
-            if name in (*BASELINE, "distant_shadow"):
-                continue
-            column = evidence.candidate.trial.columns[0]
-            (coordinate, reference), *_ = column.items()
-            unit = abs(reference - cls.null()[coordinate])
-            error = unit * math.sqrt(max(float(evidence.covariance[0, 0]), 0.0))
-            size = abs(cls.strong[coordinate] - cls.null()[coordinate])
-            if error * SEE > size:
-                out.append(name)
-    if state.data.crop_px < 16 and "distant_shadow" not in out:
-        out.append("distant_shadow")
-    if all(not _shaded(state, name, seen) for name in EDGE_EFFECTS):
-        out += [n for n in EDGE_EFFECTS if n not in out and n not in named]
-    return out
+    return [n for n in effect_names() if n not in named and not _would_show(n, state, seen)]
 
 
-def _shaded(state: Search, name: str, seen: Round) -> bool:
-    evidence = seen.best.get(name)
-    return evidence is not None and float(evidence.covariance[0, 0]) < 1.0
+def _would_show(name: str, state: Search, seen: Round) -> bool:
+    cls = get_effect(name)
+    if not cls.visible(state.data, state.has) or (state.dn and name in ("image_gain", "dark_bias")):
+        return False
+    if cls.scope != "scene":
+        return state.deepest >= FEWEST
+    if name == "saturation":  # the histogram shows it
+        return not state.dn
+    e = seen.best.get(name)
+    if e is None or e.left <= 0:
+        return False
+    (coordinate, reference), *_ = e.candidate.trial.columns[0].items()
+    unit = abs(reference - cls.null()[coordinate])
+    error = unit * math.sqrt(max(float(e.covariance[0, 0]), 0.0))
+    size = abs(cls.strong[coordinate] - cls.null()[coordinate]) or unit
+    if name == "penumbra" and math.radians(size) < BLUR * seen.slope_error:
+        return False
+    if cls.channel in ("lit", "edge") and e.unit * size / unit < FLOOR_FID:
+        return False
+    return error * SEE < size

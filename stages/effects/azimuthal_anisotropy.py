@@ -15,6 +15,7 @@ from stages.physics.photometry import Parameter
 class AzimuthalAnisotropy(Effect):
     name = "azimuthal_anisotropy"
     slot = "reflectance"
+    linear = True
     title = "dependence on the Sun's azimuth"
     mechanism = (
         "Unresolved ripples, ejecta lineations or cliffs of one orientation reflect more when lit from one side: reflectance is "

@@ -64,6 +64,10 @@ class Effect:
     coordinates  what is fitted, where that is not the parameters themselves
     strong       a size that anybody would want to be told about: data that cannot show this much are blind to it
     tolerance    a size that every real data set has; smaller effects are a nuisance and no cause
+    channel      where `diagnose` looks for it: 'lit' (fully lit ground and deep shadow), 'edge' (also about shadow
+                 edges), 'albedo' or 'relief' (what stays with the ground in all images: its albedo, its slopes)
+    displaces    whether it moves images against the ground: what is known of it is taken out of the measurement
+    linear       whether the image is linear in the coordinates: the first estimate needs no second one
     """
 
     name: ClassVar[str]
@@ -78,10 +82,14 @@ class Effect:
     coordinates: ClassVar[tuple[Parameter, ...]] = ()
     strong: ClassVar[Mapping[str, float]] = {}
     tolerance: ClassVar[Mapping[str, float]] = {}
+    channel: ClassVar[str] = "lit"
+    displaces: ClassVar[bool] = False
+    linear: ClassVar[bool] = False
 
     def __init__(self, values: Mapping[str, Any] | None = None, survey: Survey | None = None) -> None:
         self.values: Values = {**self.null(), **(values or {})}
         self.survey = survey or Survey()
+        self.held: tuple[str, ...] = ()  # coordinates that a fit leaves alone
         for name in self.values:
             if name not in self.null():
                 raise RegistryError.unknown(f"parameter of effect {self.name}", name, self.null())

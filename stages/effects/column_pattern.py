@@ -19,6 +19,7 @@ ORDERS = tuple(range(1, 9))
 class ColumnPattern(Effect):
     name = "column_pattern"
     slot = "sensor"
+    linear = True
     title = "flat field over detector columns"
     mechanism = (
         "Vignetting, dust and an old flat field change the response smoothly along the detector's row of pixels, the same in every "

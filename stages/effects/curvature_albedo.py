@@ -14,6 +14,8 @@ from stages.physics.photometry import Parameter
 class CurvatureAlbedo(Effect):
     name = "curvature_albedo"
     slot = "reflectance"
+    channel = "albedo"
+    linear = True
     title = "albedo that follows curvature"
     mechanism = (
         "Ridges lose soil and hollows gather it: maturity, grain size and rock abundance follow the Laplacian of the height. "
@@ -26,6 +28,7 @@ class CurvatureAlbedo(Effect):
         Parameter("per_std", "1", -0.5, 0.5, 0.0, "relative change of albedo per standard deviation of curvature"),
     )
     strong: ClassVar = {"per_std": 0.1}
+    tolerance: ClassVar = {"per_std": 0.01}
 
     def apply(self, state: State) -> None:
         mean, std = self.survey.curvature

@@ -15,6 +15,7 @@ from stages.physics.photometry import Parameter
 class DemScale(Effect):
     name = "dem_scale"
     slot = "geometry"
+    channel = "relief"
     title = "vertical scale of the DEM"
     mechanism = (
         "A wrong base-to-height ratio in stereo, or shape from shading with a wrong albedo, scales all heights: every slope, "
@@ -25,6 +26,7 @@ class DemScale(Effect):
     separate = "an image with the Sun much lower, where shadow lengths give heights"
     parameters = (Parameter("relative", "1", -0.5, 1.0, 0.0, "relative error of heights, truth minus given"),)
     strong: ClassVar = {"relative": 0.1}
+    tolerance: ClassVar = {"relative": 0.05}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

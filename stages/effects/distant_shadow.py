@@ -18,6 +18,7 @@ SIDES = ("any", "north", "east", "south", "west")
 class DistantShadow(Effect):
     name = "distant_shadow"
     slot = "illumination"
+    channel = "edge"
     title = "shadow of terrain outside the DEM"
     mechanism = (
         "The horizon is computed from the DEM; a mountain beyond its edge still hides the Sun. Modelled as a straight ridge "
@@ -37,7 +38,7 @@ class DistantShadow(Effect):
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
         size = survey.crop_px * survey.gsd
-        heights = (0.05, 0.1, 0.2, 0.4, 0.8)
+        heights = (0.05, 0.075, 0.11, 0.16, 0.23, 0.33, 0.47, 0.7)
         return [
             Trial(({"height_m": h * size},), {"distance_px": d * survey.crop_px, "side": float(s)})
             for d in (0.02, 0.5)

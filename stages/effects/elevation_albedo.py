@@ -13,6 +13,8 @@ from stages.physics.photometry import Parameter
 class ElevationAlbedo(Effect):
     name = "elevation_albedo"
     slot = "reflectance"
+    channel = "albedo"
+    linear = True
     title = "albedo that follows height"
     mechanism = (
         "Lava floods low ground and is darker than the highlands; crater rays and dust settle by height. Standardised over the "
@@ -25,6 +27,7 @@ class ElevationAlbedo(Effect):
         Parameter("per_std", "1", -0.5, 0.5, 0.0, "relative change of albedo per standard deviation of height"),
     )
     strong: ClassVar = {"per_std": 0.1}
+    tolerance: ClassVar = {"per_std": 0.01}
 
     def apply(self, state: State) -> None:
         mean, std = self.survey.elevation

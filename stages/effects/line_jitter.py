@@ -19,6 +19,7 @@ class LineJitter(Effect):
     name = "line_jitter"
     slot = "geometry"
     scope = "image"
+    displaces = True
     title = "lines shifted against each other"
     mechanism = (
         "A line-scan camera reads lines one after the other while the platform's pointing drifts and trembles: the lines "

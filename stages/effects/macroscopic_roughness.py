@@ -29,7 +29,7 @@ class MacroscopicRoughness(Effect):
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
-        return [Trial(({"theta_bar_deg": t},)) for t in (4.0, 10.0, 23.0)]
+        return [Trial(({"theta_bar_deg": t},)) for t in (5.0, 9.0, 13.0, 17.0, 22.0, 28.0)]
 
     def apply(self, state: State) -> None:
         theta = torch.deg2rad(self.value("theta_bar_deg", state))

@@ -14,6 +14,7 @@ class Misregistration(Effect):
     name = "misregistration"
     slot = "geometry"
     scope = "image"
+    displaces = True
     title = "image shifted against the DEM"
     mechanism = (
         "Errors of the spacecraft's position and pointing, or of the map projection, put every pixel of an image a fixed "

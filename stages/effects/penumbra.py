@@ -15,6 +15,7 @@ from stages.physics.photometry import Parameter
 class Penumbra(Effect):
     name = "penumbra"
     slot = "illumination"
+    channel = "edge"
     title = "width of the penumbra"
     mechanism = (
         "The Sun's disc makes shadow edges soft. A point source, a wrong distance of the Sun, or roughness of the horizon below "
@@ -28,7 +29,7 @@ class Penumbra(Effect):
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
-        return [Trial(({"radius_deg": 0.45},)), Trial(({"radius_deg": 0.8},))]
+        return [Trial(({"radius_deg": r},)) for r in (0.45, 0.8, 1.2, 1.8, 2.5, 3.5)]
 
     @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:

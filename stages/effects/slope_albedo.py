@@ -14,6 +14,8 @@ from stages.physics.photometry import Parameter
 class SlopeAlbedo(Effect):
     name = "slope_albedo"
     slot = "reflectance"
+    channel = "albedo"
+    linear = True
     title = "albedo that follows slope"
     mechanism = (
         "Mass wasting on steep slopes uncovers fresh, bright material. Standardised over the data set: the same slope means the "
@@ -26,6 +28,7 @@ class SlopeAlbedo(Effect):
         Parameter("per_std", "1", -0.5, 0.5, 0.0, "relative change of albedo per standard deviation of slope"),
     )
     strong: ClassVar = {"per_std": 0.1}
+    tolerance: ClassVar = {"per_std": 0.01}
 
     def apply(self, state: State) -> None:
         mean, std = self.survey.slope

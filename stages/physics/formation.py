@@ -120,8 +120,13 @@ def form(
     return expose(state, extensions)
 
 
-def illuminate(observation: Observation, extensions: Sequence[Extension] = ()) -> State:
-    """The first half of the chain, which no coefficient enters: slopes, angles and the visible share of the Sun."""
+def illuminate(
+    observation: Observation, extensions: Sequence[Extension] = (), known: State | None = None
+) -> State:
+    """The first half of the chain, which no coefficient enters: slopes, angles and the visible share of the Sun.
+
+    known : a state of the same observation; what the extensions leave as it is there is taken over, not computed again
+    """
     state = State(
         observation,
         observation.elevation,
@@ -131,10 +136,18 @@ def illuminate(observation: Observation, extensions: Sequence[Extension] = ()) -
     )
     _apply(state, extensions, "geometry")
     gsd, radius = observation.gsd, observation.body_radius
-    state.slopes = geometry.curvature_slopes(*geometry.slopes(state.elevation, gsd), gsd, radius)
-    state.view = geometry.view_vectors(state.elevation, state.camera_position, gsd)
+    same_ground = known is not None and state.elevation is known.elevation
+    if same_ground and state.camera_position is known.camera_position:
+        state.slopes, state.view = known.slopes, known.view
+    else:
+        same_ground = False
+        state.slopes = geometry.curvature_slopes(*geometry.slopes(state.elevation, gsd), gsd, radius)
+        state.view = geometry.view_vectors(state.elevation, state.camera_position, gsd)
     _apply(state, extensions, "illumination")
-    state.angles = geometry.photometric_angles(*state.slopes, state.sun_direction, state.view)
+    if same_ground and state.sun_direction is known.sun_direction:
+        state.angles = known.angles
+    else:
+        state.angles = geometry.photometric_angles(*state.slopes, state.sun_direction, state.view)
     if state.sun_horizon is not None:
         sun_elevation = torch.asin(state.sun_direction[:, 2].clamp(-1, 1)).to(state.elevation.dtype)
         state.sun_visibility = sun_visibility(sun_elevation[:, None, None], state.sun_horizon, state.sun_radius)

@@ -297,7 +297,7 @@ class Scene:
             rotation_deg=float(rng.uniform(-4, 4)),
             offset=tuple(rng.uniform(-0.5, 0.5, 2)),
             error=tuple(shift * size),
-            first=(float(rng.uniform(0, 5000)), 2500.0 + 0.0 * extra[0]),
+            first=(float(rng.uniform(0, 5000)), 2500.0 + float(np.clip(extra[0], -2, 2)) * self.layout.size / 2),
         )
         camera = Detector(snr=truth.snr)
         if "image_gain" in effect:
@@ -312,10 +312,10 @@ class Scene:
             camera.smear = (e["fraction"], int(e["lag_px"]), int(e.get("axis", 0)))
         if "column_pattern" in effect:
             rms = effect["column_pattern"]["rms"]
-            half = self.layout.size / 2
+            half = 1.5 * self.layout.size  # the ground falls on other columns in every image
 
             def response(sample):
-                u = (sample - 2500.0) / half
+                u = np.clip((sample - 2500.0) / half, -1, 1)
                 shape = 0.9 * u**2 + 0.5 * np.sin(2.3 * u)
                 inside = np.linspace(-1, 1, 200)
                 known = 0.9 * inside**2 + 0.5 * np.sin(2.3 * inside)

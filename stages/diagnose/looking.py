@@ -1,0 +1,170 @@
+"""One look at the data: the evidence for every effect that is still open, each in the rows where it shows."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+
+from stages.diagnose.chain import Chain
+from stages.diagnose.evidence import Evidence, best_guises, weigh
+from stages.diagnose.images import ImageEvidence, weigh_images
+from stages.diagnose.pattern import PatternEvidence, weigh_pattern
+from stages.diagnose.projection import FREE_SLOPES
+from stages.diagnose.state import Search
+from stages.diagnose.statistics import (
+    BASELINE,
+    Candidate,
+    SiteWork,
+    Statistics,
+    gather_site,
+    gather_static,
+    join,
+    make_candidates,
+    ready,
+    swap,
+    trial_columns,
+    without,
+)
+from stages.effects import Trial, get_effect
+
+RELIEF_WIDTHS = (1.6, 4.0)  # deg: relief below the DEM's resolution blurs shadow edges like discs of these radii
+LADDER = (0.6, 0.7, 0.8, 0.9, 1.0, 1.12, 1.25, 1.45)  # of a wall's height, about the best of the first ladder
+# What the sites of a look are judged in; a name per kind of rows.
+GROUND = {"dem_smoothing": (), "dem_scale": ("dem_smoothing",)}  # effect -> nuisances fitted along
+
+
+@dataclass
+class Round:
+    """What one look at the data found.
+
+    best : the best guise of every scene-wide effect; images : effects with values per image; pattern : a broad albedo
+    pattern; slope_error : rms of the apparent slope errors of the DEM, rad, NaN where the images are too few
+    """
+
+    works: list[SiteWork]
+    best: dict[str, Evidence]
+    images: dict[str, ImageEvidence]
+    pattern: PatternEvidence | None = None
+    slope_error: float = math.nan
+    others: list[Evidence] = field(default_factory=list)  # guises that lost
+
+
+def look(state: Search, names: Sequence[str]) -> Round:
+    """Evidence for the effects of these names."""
+    kinds = {n: get_effect(n) for n in names}
+    lit = [n for n, c in kinds.items() if c.scope == "scene" and c.channel == "lit" and n not in BASELINE]
+    edge = [n for n, c in kinds.items() if c.channel == "edge"]
+    albedo = [n for n, c in kinds.items() if c.channel == "albedo" and c.scope == "scene"]
+    relief = [n for n in GROUND if n in kinds and state.deepest >= FREE_SLOPES]
+    candidates, at_edge = make_candidates(lit, state.data), make_candidates(edge, state.data)
+    on_ground = make_candidates(albedo, state.data)
+    works, parts, edge_parts, ground_parts = [], [], [], []
+    relief_parts: dict[str, list[Statistics]] = {n: [] for n in relief}
+    for k, chain in enumerate(state.chains()):
+        work = ready(chain, state.dn)
+        parts.append(gather_site(work, candidates, state.data))
+        works.append(work)
+        if on_ground:
+            columns = [c for e in on_ground for c in trial_columns(chain, e.effect, e.trial, state.data)]
+            ground_parts.append(gather_static(work, on_ground, columns))
+        for name, collected in relief_parts.items():
+            collected.append(_gather_relief(work, name, state))
+        if at_edge:
+            wide = ready(chain, state.dn, wide=True)
+            edge_parts.append(gather_site(wide, at_edge, state.data, [_relief_blur(chain, state)]))
+        state.progress(k + 1, len(state.sites), f"looking for causes, round {len(state.causes) + 1}")
+    statistics = join(parts)
+    evidence = weigh(statistics)
+    if "psf_blur" in kinds:
+        evidence += weigh(swap(statistics, "psf_blur", state.data))
+    if ground_parts:
+        evidence += weigh(join(ground_parts))
+    for collected in relief_parts.values():
+        evidence += weigh(join(collected))
+    if edge_parts:
+        evidence += _weigh_edges(state, join(edge_parts))
+    images = [n for n, c in kinds.items() if c.scope == "image"]
+    pattern = weigh_pattern(works) if "albedo_map" in kinds else None
+    return Round(
+        works,
+        best_guises(evidence),
+        weigh_images(works, images, state.frames, state.dn, state.data),
+        pattern,
+        _slope_error(works),
+        evidence,
+    )
+
+
+def _gather_relief(work: SiteWork, name: str, state: Search) -> Statistics:
+    candidates = make_candidates([name], state.data)
+    columns = [c for e in candidates for c in trial_columns(work.chain, name, e.trial, state.data)]
+    named = [e.name for e in work.chain.base]
+    along = [
+        (
+            other,
+            BASELINE[other],
+            trial_columns(work.chain, other, get_effect(other).trials(state.data)[0], state.data)[0],
+        )
+        for other in GROUND[name]
+        if other not in named
+    ]
+    return gather_static(work, candidates, columns, along, nominal=True)
+
+
+def _relief_blur(chain: Chain, state: Search) -> tuple[str, list[torch.Tensor]]:
+    """Shadow edges blurred by relief below the DEM's resolution, by two widths: no matter of a far wall."""
+    cls = get_effect("penumbra")
+    return "relief", [chain.render(cls({"radius_deg": r}, state.data)) - chain.textured for r in RELIEF_WIDTHS]
+
+
+def _weigh_edges(state: Search, data: Statistics) -> list[Evidence]:
+    """A wall is judged beside the blur of relief; a wide Sun looks like that blur, and is judged by its size."""
+    discs = [c for c in data.candidates if c.effect != "distant_shadow"]
+    walls = [c for c in data.candidates if c.effect == "distant_shadow"]
+    found = weigh(without(data, [f"relief{k}" for k in range(len(RELIEF_WIDTHS))], discs)) if discs else []
+    if walls:
+        weighed = weigh(without(data, [], walls))
+        top = max(weighed, key=lambda e: e.gain)
+        found += [top]
+        if top.gain > 12 and float(top.amount[0]) > 0.005 and top.fid > 0.015:
+            found += _climb(state, top)
+    return found
+
+
+def _climb(state: Search, top: Evidence) -> list[Evidence]:
+    """The wall's height on a finer ladder: a shadow's edge moves with it, and no linear model follows."""
+    (column,) = top.candidate.trial.columns
+    fixed = dict(top.candidate.trial.fixed)
+    for _ in range(2):
+        trials = [Trial(({"height_m": column["height_m"] * f},), fixed) for f in LADDER]
+        candidates = [Candidate("distant_shadow", t, slice(k, k + 1)) for k, t in enumerate(trials)]
+        parts = []
+        for chain in state.chains():
+            wide = ready(chain, state.dn, wide=True)
+            parts.append(gather_site(wide, candidates, state.data, [_relief_blur(chain, state)]))
+        best = max(weigh(join(parts)), key=lambda e: e.gain)
+        if best.gain <= top.gain:
+            break
+        top = best
+        (column,) = top.candidate.trial.columns
+    return [top]
+
+
+def _slope_error(works: Sequence[SiteWork]) -> float:
+    maps = [w.slope_error for w in works if math.isfinite(w.slope_error)]
+    return float(torch.tensor(maps).square().mean().sqrt()) if maps else math.nan
+
+
+def narrowed(seen: Round, later: Round) -> Round:
+    """A later look at fewer effects, with the earlier evidence for those that it left out."""
+    # once a blur or a shift is named the DEM looks better than it is: relief below its resolution stays
+    slopes = max(seen.slope_error, later.slope_error) if math.isfinite(seen.slope_error) else later.slope_error
+    best, images = {**seen.best, **later.best}, {**seen.images, **later.images}
+    return dataclasses.replace(later, best=best, images=images, slope_error=slopes)
+
+
+__all__ = ["Round", "look", "narrowed"]

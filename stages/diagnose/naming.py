@@ -1,0 +1,131 @@
+"""Which effect, if any, deserves to be named after a look."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from stages.diagnose.evidence import Evidence
+from stages.diagnose.images import ImageEvidence, as_effect
+from stages.diagnose.looking import Round
+from stages.diagnose.pattern import PatternEvidence
+from stages.diagnose.refining import start
+from stages.diagnose.state import Cause, Search
+from stages.effects import effect_names, get_effect
+
+GATE = 0.01  # family-wise
+FLOOR_FID = 0.022  # an effect smaller than this against the noise is never worth a name
+FLOOR_IMAGE = 0.035  # the same for effects with values per image, which have more to fit with
+FLOOR_GAIN = 12.0  # nats
+KEEP_SHARE = 0.8  # of a per-image effect's gain that a scene-wide effect must keep to replace it
+SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to replace it
+BLUR = 1.5  # radius of the discs, in rms slope errors of the DEM, that relief alone makes of the Sun
+LEAST_DISC = 0.5  # deg
+CLEAR_LAG = 4  # px: nearer echoes look like an imperfect point spread function
+STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
+
+
+def choose(state: Search, seen: Round) -> Cause | None:
+    """The next cause to name, or None."""
+    count = len(effect_names())
+    scene = sorted((e for e in seen.best.values() if worth(e, seen, count)), key=lambda e: -e.gain)
+    image = sorted((e for e in seen.images.values() if worth_image(e, count)), key=lambda e: -e.gain)
+    if image and image[0].effect == "image_gain" and not scene:
+        # a scene-wide effect that does nearly as well with a few numbers as gains do with one for each image
+        near = [e for e in seen.best.values() if e.gain > KEEP_SHARE * image[0].gain and worth(e, seen, count, 5.0)]
+        scene = sorted(near, key=lambda e: -e.gain)
+    if image and (not scene or scene[0].gain < KEEP_SHARE * image[0].gain):
+        top = image[0]
+        close = [e.effect for e in image[1:] if e.gain > top.gain - 2 * math.hypot(top.gain_error, e.gain_error)]
+        return Cause(
+            as_effect(top, None, state.data), min(1.0, top.p * count), top.gain, top.gain_error, top.fid,
+            [top.effect, *close], image_evidence=top,
+        )  # fmt: skip
+    if not scene:
+        return _pattern(state, seen.pattern, count)
+    if len(scene) > 1:  # whatever moves a shadow's edge blurs it too
+        scene = [e for e in scene if e.effect != "penumbra"]
+    wall = [e for e in scene if e.effect == "distant_shadow"]
+    first = wall[0] if wall else scene[0]  # gross as it is, a missing shadow spoils every other estimate
+    group = [first.effect, *(e.effect for e in scene if e is not first and _as_good(first, e))]
+    guises = [e for e in seen.others if e.effect == first.effect and e.candidate.size < first.candidate.size]
+    simpler = max(guises, key=lambda e: e.gain, default=first)
+    if simpler.gain > SIMPLER * first.gain:
+        first = simpler
+    effect, errors = start(first, state.data)
+    return Cause(effect, min(1.0, first.p * count), first.gain, first.gain_error, first.fid, group, errors)
+
+
+def worth(e: Evidence, seen: Round, count: int, ease: float = 1.0) -> bool:
+    """Whether the evidence is enough for a name."""
+    cls = get_effect(e.effect)
+    still = cls.channel in ("albedo", "relief")  # judged in rows of their own, where the size against noise says little
+    if e.p * count > GATE * ease or min(e.gain_image, e.gain_place) <= 0:
+        return False
+    if e.gain < max(FLOOR_GAIN, 1.5 * e.gain_error) or (e.fid < FLOOR_FID and not still):
+        return False
+    (name, reference), *_ = e.candidate.trial.columns[0].items()
+    unit = reference - cls.null()[name]
+    value = cls.null()[name] + float(e.amount[0]) * unit
+    error = abs(unit) * float(e.covariance[0, 0].clamp(min=0)) ** 0.5
+    low, high = cls.bounds(name)
+    span = high - low
+    if not low - 0.05 * span <= value <= high + 0.05 * span:
+        return False
+    if cls.null()[name] == 0 and low < 0 < high and not 0.9 * low < value < 0.9 * high:
+        return False
+    if e.effect == "echo" and abs(e.candidate.trial.fixed["lag_px"]) < CLEAR_LAG and e.fid < 2 * FLOOR_FID:
+        return False
+    if e.effect == "penumbra":
+        blur = seen.slope_error if math.isfinite(seen.slope_error) else math.radians(2)
+        return value > max(BLUR * math.degrees(blur), LEAST_DISC) + 3 * error
+    if name in cls.tolerance:
+        return abs(value - cls.null()[name]) - cls.tolerance[name] > 3 * error
+    if e.effect == "earthshine":  # a source above the ground, known to a third
+        return float(e.amount[0]) > 3 * float(e.covariance[0, 0].clamp(min=0).sqrt())
+    if e.effect in ("distant_shadow", "saturation"):  # a shadow is dark and a cut-off flat, or it is something else
+        return 0.5 < float(e.amount[0]) < 2.0 and float(e.amount[0]) ** 2 > 9 * float(e.covariance[0, 0])
+    return True
+
+
+def worth_image(e: ImageEvidence, count: int) -> bool:
+    """The same for effects with values per image."""
+    if e.p * count > GATE or e.gain < max(FLOOR_GAIN, 2 * e.gain_error) or e.fid < FLOOR_IMAGE:
+        return False
+    cls = get_effect(e.effect)
+    if not cls.tolerance:
+        return e.fid > 2 * FLOOR_IMAGE
+    return e.rms > 1.1 * cls.tolerance[cls.parameters[0].name]
+
+
+def _pattern(state: Search, e: PatternEvidence | None, count: int) -> Cause | None:
+    """A broad albedo pattern: named last, since terrain, columns and the nominal model make such patterns too."""
+    if e is None or e.p * count > GATE or e.gain < FLOOR_GAIN:
+        return None
+    cls = get_effect("albedo_map")
+    whole = math.hypot(e.rms, e.texture)
+    if whole < STANDS_OUT * e.texture or e.rms - cls.tolerance["per_std"] < 2 * e.rms_error:
+        return None
+    values = {}
+    for k, parameter in enumerate(cls.fitted()):
+        table = torch.zeros(max(e.numbers) + 1)
+        table[e.numbers] = e.values[:, k].float()
+        values[parameter.name] = table
+    fid = math.sqrt(2 * e.gain / e.values.numel())
+    cause = Cause(cls(values, state.data), min(1.0, e.p * count), e.gain, e.gain_error, fid, ["albedo_map"])
+    cause.errors = {"per_std": e.rms_error}
+    return cause
+
+
+def _as_good(first: Evidence, other: Evidence) -> bool:
+    """Whether the paired difference of gains is within two standard errors."""
+    if len(first.share) != len(other.share):
+        spread = math.hypot(first.gain_error, other.gain_error)
+        return other.gain > max(first.gain - 2 * spread, 0.7 * first.gain)
+    difference = first.share - other.share
+    error = float(difference.std()) * math.sqrt(len(difference))
+    return float(difference.sum()) < 2 * error and other.gain > 0.5 * first.gain
+
+
+__all__ = ["FLOOR_FID", "choose", "worth", "worth_image"]

@@ -1,0 +1,152 @@
+"""From a first linear estimate to the values that fit best, with all named causes together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stages.diagnose.evidence import Evidence, weigh
+from stages.diagnose.images import as_effect, weigh_images
+from stages.diagnose.state import Cause, Search
+from stages.diagnose.statistics import (
+    Candidate,
+    SiteWork,
+    Statistics,
+    derivative_step,
+    gather_site,
+    gather_static,
+    join,
+    ready,
+    tangent,
+)
+from stages.effects import Effect, Survey, Trial, get_effect
+
+WORTH_MOVING = 12.0  # nats
+# far from linear: the trial that fitted best is a better start than what a line through it says
+KEEP_TRIAL = ("distant_shadow", "saturation")
+SHAPES = ("h", "lag_px", "radius_deg", "theta_bar_deg", "height_m")  # not more than half of themselves at a time
+STILL = ("axis", "side", "distance_px", "lag_px")  # found by the search alone
+
+
+def start(evidence: Evidence, data: Survey) -> tuple[Effect, dict[str, float]]:
+    """The effect at its linear estimate, within bounds, and its errors; other guises' coordinates stay at null."""
+    cls = get_effect(evidence.effect)
+    null = cls.null()
+    values: dict[str, float] = {**null, **evidence.candidate.trial.fixed}
+    touched = set(evidence.candidate.trial.fixed)
+    errors: dict[str, float] = {}
+    for k, (amount, column) in enumerate(zip(evidence.amount.tolist(), evidence.candidate.trial.columns, strict=True)):
+        for name, reference in column.items():
+            low, high = cls.bounds(name)
+            share = 1.0 if cls.name in KEEP_TRIAL else amount
+            values[name] = min(max(values[name] + share * (reference - null[name]), low), high)
+            touched.add(name)
+            errors[name] = abs(reference - null[name]) * float(evidence.covariance[k, k].clamp(min=0)) ** 0.5
+    effect = cls(values, data)
+    effect.held = tuple(p.name for p in cls.fitted() if p.name not in touched or p.name in STILL)
+    return effect, errors
+
+
+def refine(state: Search, steps: int = 2) -> None:
+    """Gauss-Newton on all named scene-wide coordinates together; values per image are estimated anew."""
+    for _ in range(steps):
+        state.fit()
+        works, parts, relief_parts = [], [], []
+        wide = any(c.effect.channel == "edge" for c in state.causes)
+        relief = [k for k, c in enumerate(state.causes) if c.effect.channel == "relief"]
+        for chain in state.chains():
+            work = ready(chain, state.dn, wide)
+            works.append(work)
+            parts.append(gather_site(work, [], state.data))
+            if relief:
+                relief_parts.append(_relief(work, relief, state))
+        joined = join(parts)
+        if joined.count > 0:
+            delta, error = solve_nuisance(joined)
+            for cause in state.causes:
+                _move(cause, joined.names, delta, error)
+        if relief:
+            for evidence in weigh(join(relief_parts)):
+                _move_relief(state, evidence)
+        named = {c.effect.name: c for c in state.causes if c.effect.scope == "image"}
+        found = weigh_images(works, list(named), state.frames, state.dn, state.data) if named else {}
+        for name, cause in named.items():
+            if name in found and found[name].gain > WORTH_MOVING:
+                cause.effect = as_effect(found[name], cause.effect, state.data)
+    state.fit()
+
+
+def _relief(work: SiteWork, places: Sequence[int], state: Search) -> Statistics:
+    """The DEM's faults that are named already, as candidates for a further step."""
+    candidates, columns = [], []
+    for k, place in enumerate(places):
+        effect = work.chain.base[place]
+        (coordinate,) = (p.name for p in effect.fitted())
+        step = derivative_step(type(effect), coordinate, state.data)
+        trial = Trial(({coordinate: effect.null()[coordinate] + step},))
+        candidates.append(Candidate(effect.name, trial, slice(k, k + 1)))
+        columns.append(step * tangent(work.chain, place, coordinate, state.data))
+    return gather_static(work, candidates, columns, nominal=True)
+
+
+def _move_relief(state: Search, evidence: Evidence) -> None:
+    cause = next(c for c in state.causes if c.effect.name == evidence.effect)
+    cls = type(cause.effect)
+    ((coordinate, reference),) = evidence.candidate.trial.columns[0].items()
+    step = reference - cls.null()[coordinate]
+    low, high = cls.bounds(coordinate)
+    value = float(cause.effect.values[coordinate]) + float(evidence.amount[0]) * step
+    cause.errors[coordinate] = abs(step) * float(evidence.covariance[0, 0].clamp(min=0)) ** 0.5
+    moved = cls({coordinate: min(max(value, low), high)}, cause.effect.survey)
+    moved.held = cause.effect.held
+    cause.effect = moved
+
+
+def solve_nuisance(data: Statistics) -> tuple[Tensor, Tensor]:
+    """Estimates and cluster-robust standard errors of all nuisance columns together."""
+    m = data.count
+    sums = data.products.sum(0)
+    gram = sums[:m, :m] + torch.diag(data.bound**-2)
+    scale = gram.diagonal().clamp(min=1e-30).rsqrt()
+    normal = gram * scale[:, None] * scale + 1e-6 * torch.eye(m, dtype=torch.float64)
+    inverse = torch.linalg.inv(normal) * scale[:, None] * scale
+    delta = inverse @ sums[:m, m]
+    score = data.products[:, :m, m] - torch.einsum("cml,l->cm", data.products[:, :m, :m], delta)
+    variance = torch.zeros(m, dtype=torch.float64)
+    for labels in (data.image, data.place):
+        _, index = np.unique(labels, return_inverse=True)
+        count = int(index.max()) + 1
+        summed = torch.zeros(count, m, dtype=torch.float64).index_add_(0, torch.from_numpy(index), score)
+        robust = inverse @ (summed.T @ summed) @ inverse * count / max(count - 1, 1)
+        variance = torch.maximum(variance, robust.diagonal())
+    return delta, variance.clamp(min=0).sqrt()
+
+
+def _move(cause: Cause, names: Sequence[str], delta: Tensor, error: Tensor) -> None:
+    cls = type(cause.effect)
+    if cls.scope != "scene":
+        return
+    values = dict(cause.effect.values)
+    for k, name in enumerate(names):
+        owner, _, coordinate = name.partition(".")
+        if owner != cls.name or not coordinate:
+            continue
+        cause.errors[coordinate] = float(error[k])
+        step = float(delta[k])
+        if cls.linear or not math.isfinite(step):
+            continue
+        low, high = cls.bounds(coordinate)
+        if coordinate in SHAPES:
+            size = abs(values[coordinate]) + 1e-9
+            step = min(max(step, -0.5 * size), 0.5 * size)
+        values[coordinate] = min(max(values[coordinate] + step, low), high)
+    moved = cls(values, cause.effect.survey)
+    moved.held = cause.effect.held
+    cause.effect = moved
+
+
+__all__ = ["refine", "solve_nuisance", "start"]

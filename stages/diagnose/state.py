@@ -1,0 +1,125 @@
+"""What a diagnosis knows so far: the data, the nominal model, the causes named."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from stages.diagnose.chain import Chain
+from stages.diagnose.data import Site
+from stages.diagnose.images import FEWEST, ImageEvidence
+from stages.diagnose.nominal import Nominal, fit, lit_mask
+from stages.effects import Effect, Survey, effect_names, get_effect
+from stages.physics import formation
+
+
+@dataclass
+class Cause:
+    """A named cause; ``fid`` and ``gain`` as when it was named."""
+
+    effect: Effect
+    p: float
+    gain: float
+    gain_error: float
+    fid: float
+    group: list[str]
+    errors: dict[str, float] = field(default_factory=dict)
+    image_evidence: ImageEvidence | None = None
+    rms_before: float = math.nan
+    rms_after: float = math.nan
+
+
+@dataclass
+class Search:
+    """State of a diagnosis. measured, valid : the images as read and their masks, (n, H, W) per site"""
+
+    nominal: Nominal
+    sites: list[Site]
+    data: Survey
+    frames: int
+    units: str
+    has: frozenset[str]
+    progress: Callable[[int, int, str], None]
+    causes: list[Cause] = field(default_factory=list)
+    measured: list[Tensor] = field(default_factory=list)
+    valid: list[Tensor] = field(default_factory=list)
+    refused: set[str] = field(default_factory=set)  # looked good to the linear model, and made things worse
+
+    @property
+    def base(self) -> list[Effect]:
+        return [c.effect for c in self.causes]
+
+    @property
+    def dn(self) -> bool:
+        return self.units == "dn"
+
+    @property
+    def deepest(self) -> int:
+        """Images of the site that has most."""
+        return max((s.count for s in self.sites), default=0)
+
+    def chains(self) -> list[Chain]:
+        still, moved = self.still, [e for e in self.base if e.displaces]
+        return [self.nominal.chain(site, still, moved) for site in self.sites]
+
+    @property
+    def still(self) -> list[Effect]:
+        """The named effects that do not move images: the others are taken out of the images themselves."""
+        return [e for e in self.base if not e.displaces]
+
+    def fit(self) -> None:
+        """Align the images by what is known of their displacement, and fit the nominal model to them.
+
+        Where images are moved against each other no column per ground pixel is the same in all of them: the model
+        stays where it is, and the measurement moves.
+        """
+        moved = [e for e in self.base if e.displaces]
+        images = []
+        for site, image, valid in zip(self.sites, self.measured, self.valid, strict=True):
+            east, south = displacement(site, moved)
+            aligned = formation.displace(image, -east, -south) if moved else image
+            whole = formation.displace(valid.float(), -east, -south) > 0.99 if moved else valid
+            site.valid = valid & whole
+            images.append(aligned)
+            if not self.dn:
+                site.image = aligned
+        fit(self.nominal, self.sites, self.still, self.units, images)
+
+    def restore(self) -> None:
+        """The images as they were read (in I/F), for whoever compares them with the whole model."""
+        for site, image, valid in zip(self.sites, self.measured, self.valid, strict=True):
+            site.valid = valid
+            site.image = (image - site.offset[:, None, None]) / site.gain[:, None, None] if self.dn else image
+
+    def residual_rms(self) -> float:
+        """rms of measured minus predicted over fully lit pixels, I/F."""
+        total, count = 0.0, 0
+        for chain in self.chains():
+            residual = (chain.site.image - chain.predict())[lit_mask(chain)]
+            total, count = total + float(residual.double().square().sum()), count + len(residual)
+        return math.sqrt(total / max(count, 1))
+
+    def open_names(self) -> list[str]:
+        """Effects that are neither named nor excluded by the kind of data."""
+        closed = {c.effect.name for c in self.causes} | self.refused
+        if self.dn:
+            closed.add("image_gain")
+        if self.deepest < FEWEST:  # one look at the ground: albedo and shading are the same thing
+            closed |= {n for n in effect_names() if get_effect(n).channel in ("albedo", "relief")}
+        return [n for n in effect_names() if n not in closed and get_effect(n).visible(self.data, self.has)]
+
+
+def displacement(site: Site, effects: Sequence[Effect]) -> tuple[Tensor, Tensor]:
+    """Where the effects look for a site's pixels, columns to the east and rows to the south, broadcastable to its images."""
+    seen = site.observation
+    state = formation.State(seen, seen.elevation, seen.sun_direction, seen.camera_position, None)
+    for effect in effects:
+        effect.apply(state)
+    if state.displacement is None:
+        return torch.zeros(()), torch.zeros(())
+    east, south = state.displacement
+    return torch.as_tensor(east), torch.as_tensor(south)
