@@ -29,11 +29,11 @@ from stages.diagnose.statistics import (
     trial_columns,
     without,
 )
-from stages.effects import Trial, get_effect
+from stages.effects import get_effect
 
 RELIEF_WIDTHS = (1.6, 4.0)  # deg: relief below the DEM's resolution blurs shadow edges like discs of these radii
-LADDER = (0.6, 0.7, 0.8, 0.9, 1.0, 1.12, 1.25, 1.45)  # of a wall's height, about the best of the first ladder
-# What the sites of a look are judged in; a name per kind of rows.
+LADDER = (0.72, 0.82, 0.92, 1.0, 1.08, 1.2, 1.35)  # of a wall's height ...
+DISTANCES = (0.04, 1.0, 3.0)  # ... and of its distance, about the best of the first ladder
 GROUND = {"dem_smoothing": (), "dem_scale": ("dem_smoothing",)}  # effect -> nuisances fitted along
 
 
@@ -80,11 +80,15 @@ def look(state: Search, names: Sequence[str]) -> Round:
     statistics = join(parts)
     evidence = weigh(statistics)
     if "psf_blur" in kinds:
-        evidence += weigh(swap(statistics, "psf_blur", state.data))
+        blurred = swap(statistics, "psf_blur", state.data)
+        evidence += weigh(blurred)
     if ground_parts:
         evidence += weigh(join(ground_parts))
     for collected in relief_parts.values():
         evidence += weigh(join(collected))
+    if "psf_blur" in kinds and any(e.effect == "dem_smoothing" and float(e.amount[0]) < 0 for e in evidence):
+        # no DEM is sharper than the ground: what looks so is a blur of the images
+        evidence += weigh(without(blurred, ["dem_smoothing"], blurred.candidates))
     if edge_parts:
         evidence += _weigh_edges(state, join(edge_parts))
     images = [n for n, c in kinds.items() if c.scope == "image"]
@@ -136,12 +140,15 @@ def _weigh_edges(state: Search, data: Statistics) -> list[Evidence]:
 
 
 def _climb(state: Search, top: Evidence) -> list[Evidence]:
-    """The wall's height on a finer ladder: a shadow's edge moves with it, and no linear model follows."""
-    (column,) = top.candidate.trial.columns
-    fixed = dict(top.candidate.trial.fixed)
-    for _ in range(2):
-        trials = [Trial(({"height_m": column["height_m"] * f},), fixed) for f in LADDER]
-        candidates = [Candidate("distant_shadow", t, slice(k, k + 1)) for k, t in enumerate(trials)]
+    """The wall's distance and height on a finer ladder: a shadow's edge moves with them, and no linear model follows."""
+    cls, crop = get_effect("distant_shadow"), state.data.crop_px
+    for distances in (DISTANCES, (1.0,)):
+        ((_, height),) = top.candidate.trial.columns[0].items()
+        fixed = top.candidate.trial.fixed
+        known = fixed["distance_px"] / crop
+        tangent = height / ((known + 0.5) * crop * state.data.gsd)
+        trials = [cls.trial(state.data, tangent * f, d * known, int(fixed["side"])) for d in distances for f in LADDER]
+        candidates = [Candidate(cls.name, t, slice(k, k + 1)) for k, t in enumerate(trials)]
         parts = []
         for chain in state.chains():
             wide = ready(chain, state.dn, wide=True)
@@ -150,7 +157,6 @@ def _climb(state: Search, top: Evidence) -> list[Evidence]:
         if best.gain <= top.gain:
             break
         top = best
-        (column,) = top.candidate.trial.columns
     return [top]
 
 

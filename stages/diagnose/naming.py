@@ -22,7 +22,7 @@ KEEP_SHARE = 0.8  # of a per-image effect's gain that a scene-wide effect must k
 SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to replace it
 BLUR = 1.5  # radius of the discs, in rms slope errors of the DEM, that relief alone makes of the Sun
 LEAST_DISC = 0.5  # deg
-CLEAR_LAG = 4  # px: nearer echoes look like an imperfect point spread function
+CLEAR_LAG = 4  # px
 STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
 
 
@@ -75,11 +75,15 @@ def worth(e: Evidence, seen: Round, count: int, ease: float = 1.0) -> bool:
         return False
     if cls.null()[name] == 0 and low < 0 < high and not 0.9 * low < value < 0.9 * high:
         return False
-    if e.effect == "echo" and abs(e.candidate.trial.fixed["lag_px"]) < CLEAR_LAG and e.fid < 2 * FLOOR_FID:
-        return False
+    if e.effect == "echo":  # near ones look like an imperfect point spread function
+        near = abs(e.candidate.trial.fixed["lag_px"]) < CLEAR_LAG
+        if value < 0 or (near and e.fid < 2 * FLOOR_FID):
+            return False
     if e.effect == "penumbra":
         blur = seen.slope_error if math.isfinite(seen.slope_error) else math.radians(2)
         return value > max(BLUR * math.degrees(blur), LEAST_DISC) + 3 * error
+    if e.effect == "dem_smoothing" and value < 0:  # no DEM is sharper than the ground
+        return False
     if name in cls.tolerance:
         return abs(value - cls.null()[name]) - cls.tolerance[name] > 3 * error
     if e.effect == "earthshine":  # a source above the ground, known to a third

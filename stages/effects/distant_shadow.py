@@ -13,6 +13,8 @@ from stages.physics.photometry import Parameter
 
 SIDES = ("any", "north", "east", "south", "west")
 
+TANGENTS = (0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)
+
 
 @register
 class DistantShadow(Effect):
@@ -37,14 +39,13 @@ class DistantShadow(Effect):
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
-        size = survey.crop_px * survey.gsd
-        heights = (0.05, 0.075, 0.11, 0.16, 0.23, 0.33, 0.47, 0.7)
-        return [
-            Trial(({"height_m": h * size},), {"distance_px": d * survey.crop_px, "side": float(s)})
-            for d in (0.02, 0.5)
-            for s in range(len(SIDES))
-            for h in heights
-        ]
+        return [cls.trial(survey, tangent, 0.5, side) for side in range(len(SIDES)) for tangent in TANGENTS]
+
+    @classmethod
+    def trial(cls, survey: Survey, tangent: float, distance: float, side: int) -> Trial:
+        """A wall ``distance`` crops away that stands at this tangent of elevation above the crop's centre."""
+        height = tangent * (distance + 0.5) * survey.crop_px * survey.gsd
+        return Trial(({"height_m": height},), {"distance_px": distance * survey.crop_px, "side": float(side)})
 
     @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:
