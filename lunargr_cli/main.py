@@ -2,16 +2,40 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
+import inspect
 import os
 import pkgutil
+import signal
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import typer
 
 from lunargr_cli import commands
 from lunargr_cli.console import say_error
 from schemas.errors import EXIT_CODE, LunargrError
+from schemas.locks import claim
+
+
+def _alone(command: Callable[..., None]) -> Callable[..., None]:
+    """The command, holding the lock of its output from its first step on and not only while it writes."""
+
+    @functools.wraps(command)
+    def run(*arguments: Any, **options: Any) -> None:
+        output = inspect.signature(command).bind(*arguments, **options).arguments.get("output")
+        # Under torchrun the first process alone writes.
+        if isinstance(output, Path) and os.environ.get("RANK", "0") == "0":
+            with claim(output):
+                command(*arguments, **options)
+        else:
+            command(*arguments, **options)
+
+    return run
+
 
 app = typer.Typer(
     name="lunargr",
@@ -28,11 +52,14 @@ for _module in sorted(
     (importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)),
     key=lambda module: module.ORDER,
 ):
-    app.command(name=_module.NAME, cls=getattr(_module, "CLASS", None))(_module.command)
+    _command = _module.command if getattr(_module, "SHARED_OUTPUT", False) else _alone(_module.command)
+    app.command(name=_module.NAME, cls=getattr(_module, "CLASS", None))(_command)
 
 
 def main() -> None:
     """Run the command line; a LunargrError is one line on standard error and exit code 3."""
+    # A Slurm time limit or `kill` unwinds like Ctrl-C: locks are let go of, and partial files go.
+    signal.signal(signal.SIGTERM, _stop)
     try:
         app()
     except LunargrError as error:
@@ -46,6 +73,10 @@ def main() -> None:
     except BrokenPipeError:  # `lunargr inspect file | head`
         sys.stderr.close()
         sys.exit(141)
+
+
+def _stop(number: int, frame: Any) -> None:
+    raise SystemExit(128 + number)
 
 
 if __name__ == "__main__":

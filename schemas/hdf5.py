@@ -21,6 +21,7 @@ import numpy as np
 
 from schemas.declaration import SCHEMAS, STRING, Schema, Variable
 from schemas.errors import ArtefactError, ConfigError, InputError, LunargrError
+from schemas.locks import claim, partial_path
 
 CONVENTIONS = "CF-1.11"
 _STANDARD_NAMES = {"x": "projection_x_coordinate", "y": "projection_y_coordinate"}
@@ -105,13 +106,20 @@ def _is_full_disk(error: BaseException | None) -> bool:
 def atomic_path(path: Path) -> Iterator[Path]:
     """A temporary name beside ``path`` that becomes ``path`` when the block ends well and vanishes when it does not.
 
-    Also turns a full disk into one clear line (InputError).
+    Also turns a full disk into one clear line (InputError), and refuses an output that another run is writing
+    (ConfigError).
     """
     path = Path(path)
-    partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
-    try:
+    partial = partial_path(path)
+    with claim(path), _whole_or_absent(path, partial):
         yield partial
         os.replace(partial, path)
+
+
+@contextlib.contextmanager
+def _whole_or_absent(path: Path, partial: Path) -> Iterator[None]:
+    try:
+        yield
     except BaseException as error:
         with contextlib.suppress(OSError):
             partial.unlink()

@@ -12,6 +12,7 @@ from lunargr_cli.options import BodyOption, Json, Overwrite, Quiet, Resume, Shar
 from schemas.errors import ConfigError
 
 NAME, ORDER = "render", 60
+SHARED_OUTPUT = True  # the shards of a trajectory share a folder; each file in it has its own lock
 
 
 def command(

@@ -22,6 +22,7 @@ from rasterio.windows import Window
 
 from schemas.errors import InputError
 from schemas.hdf5 import atomic_path
+from schemas.locks import partial_path
 from stages.physics.grid import Grid
 
 Floats32 = NDArray[np.float32]
@@ -112,7 +113,7 @@ class GeoTiffWriter:
 @contextlib.contextmanager
 def _scratch(path: Path) -> Iterator[Path]:
     """A file of strips beside the output, only a way to the cloud-optimised one, which GDAL must make in one go."""
-    scratch = path.with_name(f".{path.stem}.strips.partial-{os.getpid()}.tif")
+    scratch = path.with_name(f"{partial_path(path).stem}.strips.tif")
     try:
         yield scratch
     finally:
