@@ -23,6 +23,7 @@ from stages.diagnose.statistics import (
     gather_site,
     gather_static,
     join,
+    left_over,
     make_candidates,
     ready,
     swap,
@@ -163,6 +164,14 @@ def _climb(state: Search, top: Evidence) -> list[Evidence]:
 def _slope_error(works: Sequence[SiteWork]) -> float:
     maps = [w.slope_error for w in works if math.isfinite(w.slope_error)]
     return float(torch.tensor(maps).square().mean().sqrt()) if maps else math.nan
+
+
+def misfit(state: Search, works: Sequence[SiteWork]) -> float:
+    """Weighted sum of squares that all free parameters together leave, with the weights of an earlier look."""
+    total = 0.0
+    for chain, work in zip(state.chains(), works, strict=True):
+        total += left_over(chain, work.projector.weight * chain.site.valid, state.dn)
+    return total
 
 
 def narrowed(seen: Round, later: Round) -> Round:

@@ -20,14 +20,16 @@ FLOOR_IMAGE = 0.035  # the same for effects with values per image, which have mo
 FLOOR_GAIN = 12.0  # nats
 KEEP_SHARE = 0.8  # of a per-image effect's gain that a scene-wide effect must keep to replace it
 SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to replace it
+NEAR = 0.85  # of the best gain: linear models of strong effects are no closer than that
+RIVALS = 3
 BLUR = 1.5  # radius of the discs, in rms slope errors of the DEM, that relief alone makes of the Sun
 LEAST_DISC = 0.5  # deg
 CLEAR_LAG = 4  # px
 STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
 
 
-def choose(state: Search, seen: Round) -> Cause | None:
-    """The next cause to name, or None."""
+def choose(state: Search, seen: Round) -> list[Cause]:
+    """The next cause to name, and those that the linear model finds nearly as good; empty where there is none."""
     count = len(effect_names())
     scene = sorted((e for e in seen.best.values() if worth(e, seen, count)), key=lambda e: -e.gain)
     image = sorted((e for e in seen.images.values() if worth_image(e, count)), key=lambda e: -e.gain)
@@ -38,23 +40,28 @@ def choose(state: Search, seen: Round) -> Cause | None:
     if image and (not scene or scene[0].gain < KEEP_SHARE * image[0].gain):
         top = image[0]
         close = [e.effect for e in image[1:] if e.gain > top.gain - 2 * math.hypot(top.gain_error, e.gain_error)]
-        return Cause(
+        cause = Cause(
             as_effect(top, None, state.data), min(1.0, top.p * count), top.gain, top.gain_error, top.fid,
             [top.effect, *close], image_evidence=top,
         )  # fmt: skip
+        return [cause]
     if not scene:
-        return _pattern(state, seen.pattern, count)
+        pattern = _pattern(state, seen.pattern, count)
+        return [] if pattern is None else [pattern]
     if len(scene) > 1:  # whatever moves a shadow's edge blurs it too
         scene = [e for e in scene if e.effect != "penumbra"]
     wall = [e for e in scene if e.effect == "distant_shadow"]
     first = wall[0] if wall else scene[0]  # gross as it is, a missing shadow spoils every other estimate
-    group = [first.effect, *(e.effect for e in scene if e is not first and _as_good(first, e))]
-    guises = [e for e in seen.others if e.effect == first.effect and e.candidate.size < first.candidate.size]
-    simpler = max(guises, key=lambda e: e.gain, default=first)
-    if simpler.gain > SIMPLER * first.gain:
-        first = simpler
-    effect, errors = start(first, state.data)
-    return Cause(effect, min(1.0, first.p * count), first.gain, first.gain_error, first.fid, group, errors)
+    near = [] if wall else [e for e in scene if e is not first and e.gain > NEAR * first.gain]
+    causes = []
+    for e in [first, *near[:RIVALS]]:
+        group = [e.effect, *(o.effect for o in scene if o is not e and _as_good(first, o) and _as_good(e, o))]
+        guises = [g for g in seen.others if g.effect == e.effect and g.candidate.size < e.candidate.size]
+        simpler = max(guises, key=lambda g: g.gain, default=e)
+        guise = simpler if simpler.gain > SIMPLER * e.gain else e
+        effect, errors = start(guise, state.data)
+        causes.append(Cause(effect, min(1.0, e.p * count), e.gain, e.gain_error, e.fid, group, errors))
+    return causes
 
 
 def worth(e: Evidence, seen: Round, count: int, ease: float = 1.0) -> bool:

@@ -15,7 +15,7 @@ from stages.diagnose.data import GRAZING, MARGIN, Site
 from stages.effects import Effect
 from stages.physics.photometry import ReflectanceModel, get_model
 
-ROUNDS = 6
+ROUNDS = 10
 
 
 @dataclass
@@ -72,36 +72,65 @@ def fit(
     """
     fitted = nominal.predictor is None
     rounds = (ROUNDS if units == "dn" or not nominal.model.linear else 3) if fitted else (1 if units == "dn" else 0)
+    damping = 1e-7 if nominal.model.linear and units == "iof" else 1e-3
+    best: tuple[float, Tensor, Tensor, Tensor] | None = None  # cost, vector, normal equations
     for _ in range(rounds):
-        gram = torch.zeros(len(nominal.vector), len(nominal.vector), dtype=torch.float64)
-        score = torch.zeros(len(nominal.vector), dtype=torch.float64)
-        for site, raw in zip(sites, measured, strict=True):
-            chain = nominal.chain(site, base)
-            mask = lit_mask(chain)
-            predicted = chain.textured
-            if units == "dn":
-                _scale(site, raw, predicted, mask)
-            if not fitted:
-                continue
-            # relative weights: every image counts alike, however low its Sun
-            level = (predicted * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
-            weight = (mask / level.clamp(min=1e-6)[:, None, None]).double()
-            weight = weight * _near(site.image - predicted, weight)
-            columns = torch.stack(chain.surface_tangents()).double() * weight
-            residual = (site.image - predicted).double() * weight
-            flat = columns.flatten(1)
+        gram, score, cost = _normal_equations(nominal, sites, base, units, measured, fitted)
+        if not fitted:
+            continue
+        if best is not None and cost > best[0] and not nominal.model.linear:  # Levenberg (1944), Marquardt (1963)
+            damping *= 10
+        else:
+            best, damping = (cost, nominal.vector, gram, score), max(damping / 3, 1e-7)
+        _, vector, gram, score = best
+        felt = gram.diagonal() > 1e-12 * gram.diagonal().max()  # a width without its amplitude changes nothing
+        if not bool(felt.any()):
+            continue
+        scale = gram.diagonal()[felt].rsqrt()
+        normal = gram[felt][:, felt] * scale[:, None] * scale + damping * torch.eye(len(scale), dtype=torch.float64)
+        step = torch.zeros(len(vector))
+        step[felt] = (torch.linalg.solve(normal, score[felt] * scale) * scale).float()
+        nominal.vector = vector + step
+        if not nominal.model.linear:
+            low = torch.tensor([p.lower for p in nominal.model.parameters])
+            high = torch.tensor([p.upper for p in nominal.model.parameters])
+            nominal.vector = nominal.vector.clamp(min=low, max=high)
+    if fitted and not nominal.model.linear and best is not None:
+        cost = _normal_equations(nominal, sites, base, units, measured, False)[2]
+        if cost > best[0]:
+            nominal.vector = best[1]
+
+
+def _normal_equations(
+    nominal: Nominal,
+    sites: Sequence[Site],
+    base: Sequence[Effect],
+    units: str,
+    measured: Sequence[Tensor],
+    fitted: bool,
+) -> tuple[Tensor, Tensor, float]:
+    """Gram matrix and score of the coefficients (zero unless ``fitted``), and the mean squared residual they come from."""
+    gram = torch.zeros(len(nominal.vector), len(nominal.vector), dtype=torch.float64)
+    score = torch.zeros(len(nominal.vector), dtype=torch.float64)
+    cost, count = 0.0, 0.0
+    for site, raw in zip(sites, measured, strict=True):
+        chain = nominal.chain(site, base)
+        mask = lit_mask(chain)
+        predicted = chain.textured
+        if units == "dn":
+            _scale(site, raw, predicted, mask)
+        # relative weights: every image counts alike, however low its Sun
+        level = (predicted * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
+        weight = (mask / level.clamp(min=1e-6)[:, None, None]).double()
+        weight = weight * _near(site.image - predicted, weight)
+        residual = (site.image - predicted).double() * weight
+        cost += float(residual.square().sum())
+        count += float((weight > 0).sum())
+        if fitted:
+            flat = (torch.stack(chain.surface_tangents()).double() * weight).flatten(1)
             gram += flat @ flat.T
             score += flat @ residual.flatten()
-        if fitted and float(gram.diagonal().min()) > 0:
-            scale = gram.diagonal().rsqrt()
-            ridge = 1e-7 if units == "iof" else 1e-3
-            normal = gram * scale[:, None] * scale + ridge * torch.eye(len(scale), dtype=torch.float64)
-            step = torch.linalg.solve(normal, score * scale) * scale
-            nominal.vector = nominal.vector + step.float()
-            if not nominal.model.linear:
-                low = torch.tensor([p.lower for p in nominal.model.parameters])
-                high = torch.tensor([p.upper for p in nominal.model.parameters])
-                nominal.vector = nominal.vector.clamp(min=low, max=high)
+    return gram, score, cost / max(count, 1.0)
 
 
 def _near(residual: Tensor, weight: Tensor) -> Tensor:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from stages.diagnose.data import Site
-from stages.diagnose.looking import Round, look, narrowed
-from stages.diagnose.naming import FLOOR_FID, choose
+from stages.diagnose.looking import Round, look, misfit, narrowed
+from stages.diagnose.naming import FLOOR_FID, SIMPLER, choose
 from stages.diagnose.refining import refine
-from stages.diagnose.state import Search
+from stages.diagnose.state import Cause, Saved, Search
 
 REFUSALS = 3
 QUIET_GAIN = 6.0  # nats below which an effect, in the look before, is not looked at again
@@ -19,24 +19,15 @@ def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
     """Name causes one after the other; returns the last look, at what is left."""
     seen = look(state, state.open_names())
     while len(state.causes) < most:
-        cause = choose(state, seen)
-        if cause is None:
+        rivals = choose(state, seen)
+        if not rivals:
             return seen
-        cause.rms_before = state.residual_rms()
-        kept = state.nominal.vector, [s.texture for s in state.sites], [(c, c.effect) for c in state.causes]
-        state.causes.append(cause)
-        if cause.effect.scope != "site":
-            refine(state, 3 if cause.effect.displaces else 2)
-        cause.rms_after = state.residual_rms()
+        before, rms = state.save(), state.residual_rms()
+        cause = _contest(state, rivals, seen)
+        cause.rms_before, cause.rms_after = rms, state.residual_rms()
         if not cause.rms_after < WORSE * cause.rms_before:
-            state.causes.pop()
+            state.load(before)
             state.refused.add(cause.effect.name)
-            state.nominal.vector = kept[0]
-            for site, texture in zip(state.sites, kept[1], strict=True):
-                site.texture = texture
-            for known, effect in kept[2]:
-                known.effect = effect
-            state.fit()
             if len(state.refused) > REFUSALS:
                 return seen
             seen.best.pop(cause.effect.name, None)
@@ -50,6 +41,44 @@ def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
         seen.best.pop(cause.effect.name, None)
         seen.images.pop(cause.effect.name, None)
     return seen
+
+
+def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
+    """Take the cause into the model that leaves least once everything is fitted again; the state holds it afterwards."""
+    if len(rivals) == 1:
+        state.causes.append(rivals[0])
+        if rivals[0].effect.scope != "site":
+            refine(state, 3 if rivals[0].effect.displaces else 2)
+        return rivals[0]
+    before, nothing = state.save(), misfit(state, seen.works)
+    tried: list[tuple[float, int, Saved]] = []
+    for cause in rivals:
+        state.load(before)
+        state.causes.append(cause)
+        refine(state)
+        tried.append((nothing - misfit(state, seen.works), _freedom(cause), state.save()))
+    most = max(worth for worth, _, _ in tried)
+    # a superset of another effect always does a little better
+    place = min(
+        (k for k, (worth, _, _) in enumerate(tried) if worth >= SIMPLER * most),
+        key=lambda k: (tried[k][1], -tried[k][0]),
+        default=0,
+    )
+    cause = rivals[place]
+    state.load(tried[place][2])
+    names = [c.effect.name for c in rivals if c is not cause]
+    cause.group = [
+        cause.effect.name,
+        *(n for n in cause.group[1:] if n in names),
+        *(n for n in cause.group[1:] if n not in names),
+    ]
+    return cause
+
+
+def _freedom(cause: Cause) -> int:
+    """Coordinates that the cause's fit was free to move."""
+    effect = cause.effect
+    return len([p for p in effect.fitted() if p.name not in effect.held])
 
 
 def _restless(state: Search, seen: Round) -> Sequence[str]:

@@ -33,6 +33,15 @@ class Cause:
     rms_after: float = math.nan
 
 
+@dataclass(frozen=True)
+class Saved:
+    """A state to come back to."""
+
+    vector: Tensor
+    causes: list[tuple[Cause, Effect, dict[str, float]]]
+    sites: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
+
+
 @dataclass
 class Search:
     """State of a diagnosis. measured, valid : the images as read and their masks, (n, H, W) per site"""
@@ -88,6 +97,23 @@ class Search:
             if not self.dn:
                 site.image = aligned
         fit(self.nominal, self.sites, self.still, self.units, images)
+
+    def save(self) -> Saved:
+        """Everything that naming a cause changes."""
+        return Saved(
+            self.nominal.vector,
+            [(c, c.effect, dict(c.errors)) for c in self.causes],
+            [(s.image, s.valid, s.gain, s.offset, s.texture) for s in self.sites],
+        )
+
+    def load(self, saved: Saved) -> None:
+        """Back to what was saved."""
+        self.nominal.vector = saved.vector
+        self.causes[:] = [c for c, _, _ in saved.causes]
+        for cause, effect, errors in saved.causes:
+            cause.effect, cause.errors = effect, dict(errors)
+        for site, (image, valid, gain, offset, texture) in zip(self.sites, saved.sites, strict=True):
+            site.image, site.valid, site.gain, site.offset, site.texture = image, valid, gain, offset, texture
 
     def restore(self) -> None:
         """The images as they were read (in I/F), for whoever compares them with the whole model."""

@@ -119,6 +119,19 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
     return SiteWork(chain, projector, local, residual, maps[0], projector.whiten(maps[None])[0], dynamic, slopes)
 
 
+def left_over(chain: Chain, weight: Tensor, dn: bool) -> float:
+    """Sum of squares of the dynamic residual without shifts and the nominal model's freedom, at given weights."""
+    projector = Projector(chain, weight)
+    local = Local(projector, nuisance_columns(chain, dn))
+    residual = chain.site.image - chain.textured
+    columns = torch.stack([*_site_columns(chain), residual]) * weight
+    on_basis = projector.coefficients(columns)
+    local.remove_(columns, on_basis)
+    projector.project_(columns, on_basis)
+    _without_(columns, columns.new_zeros(len(columns), 0, 1, 1), len(columns) - 1)
+    return float(columns[-1].double().square().sum())
+
+
 def _first_weight(chain: Chain, wide: bool) -> Tensor:
     """1 / expected noise, (n, H, W): shot and read noise, and doubt where shadows end."""
     site, state = chain.site, chain.state
