@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,19 +29,46 @@ from stages.physics.grid import read_grid
 
 Progress = Callable[[int, int, str], None]
 
-# The dimension along which the shards of a stage are laid end to end; maps are joined pixel by pixel instead.
-RECORD = {"scene": "frame", "crops": "pair", "pairs": "pair", "evaluation": "pair"}
+# The dimension along which the shards of a stage are laid end to end; maps are joined by rows instead, and so are scenes
+# without images, which are shards of a DEM.
+RECORD = {"scene": "frame", "crops": "pair", "pairs": "pair"}
 MAPS = ("svbrdf",)
-# Root attributes that may differ between the parts of one whole.
 PATHS = ("path", "camera")
 STANDARD = {
     "Conventions", "title", "lunargr_schema", "schema_version", "lunargr_version", "history", "config", "inputs", "seed",
 }  # fmt: skip
-_OWN = {"history", "inputs", "config", "lunargr_version", "metrics"}
+# Root attributes that may differ between the parts of one whole.
+_OWN = {"history", "inputs", "config", "lunargr_version", "command", "provenance"}
+# What is joined rather than compared: extremes, counts, and the rows that a part holds.
+_JOINED: dict[str, Callable[[Sequence[Any]], Any]] = {
+    "elevation_low_m": min,
+    "elevation_high_m": max,
+    "dem_valid_px": sum,
+}
+ROWS = "shard_rows"
+BUFFER = 1 << 26  # bytes that are copied at a time
 
 
-def run(parts: Sequence[Path], output: Path, overwrite: bool = False, progress: Progress | None = None) -> Schema:
-    """Join ``parts``, in the order of their shards. Raises ArtefactError where they are not parts of one whole."""
+@dataclass(frozen=True)
+class Origin:
+    """What the whole says it was made from and by: a run in one piece would have said the same."""
+
+    config: Mapping[str, Any]
+    inputs: Sequence[Path]
+
+
+def run(
+    parts: Sequence[Path],
+    output: Path,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    virtual: bool = False,
+    origin: Origin | None = None,
+) -> Schema:
+    """Join ``parts``, in the order of their shards. Raises ArtefactError where they are not parts of one whole.
+
+    ``virtual``: large variables stay in the parts, which the output then needs.
+    """
     schema = read_kind(parts[0])
     if schema.name not in (*RECORD, *MAPS):
         raise ArtefactError(
@@ -55,18 +83,24 @@ def run(parts: Sequence[Path], output: Path, overwrite: bool = False, progress: 
         _check_complete(parts, files)
         _check_alike(parts, files)
         record = RECORD.get(schema.name)
+        if schema.name == "scene" and len(files) > 1 and not any(f["frame_window"].shape[0] for f in files):
+            record = None
+        by_rows = record is None
         sizes = _sizes(schema, files, record)
-        attributes = {k: v for k, v in files[0].attrs.items() if k not in STANDARD}
+        attributes = {k: v for k, v in files[0].attrs.items() if k not in STANDARD and k != ROWS}
+        for name, join in _JOINED.items():
+            if name in attributes and by_rows:
+                attributes[name] = join([f.attrs[name] for f in files])
         if "scene" in attributes:
             attributes["scene"] = _moved(str(attributes["scene"]), parts[0], output)
-        config = read_config(files[0]) | {"shard": [0, 1]}
+        config = dict(origin.config) if origin else read_config(files[0]) | {"shard": [0, 1]}
         seed = int(files[0].attrs.get("seed", -1))
         with ArtefactWriter(
             output,
             schema,
             sizes,
             config=config,
-            inputs=list(parts),
+            inputs=list(origin.inputs if origin else parts),
             seed=None if seed < 0 else seed,
             attributes=attributes,
             overwrite=overwrite,
@@ -78,14 +112,26 @@ def run(parts: Sequence[Path], output: Path, overwrite: bool = False, progress: 
                 if progress:
                     progress(number, len(names), f"merging {name}")
                 dims = schema[name].dims
+                if virtual and _worth_a_view(files, name):
+                    if record in dims:
+                        writer.link(name, _end_to_end(files, name, dims.index(record)))
+                        continue
+                    if by_rows and dims[-2:] == ("y", "x") and all(ROWS in f.attrs for f in files):
+                        writer.link(name, _own_rows(files, name))
+                        continue
+                    if not by_rows and files[0][name].is_virtual:
+                        writer.link(name, [((slice(None),) * len(dims), files[0][name], (slice(None),) * len(dims))])
+                        continue
                 unit = files[0][name].attrs.get("units")
                 target = writer.dataset(
                     name, unit=str(unit) if unit is not None and schema[name].unit_choices else None
                 )
                 if record in dims:
                     _concatenate(files, name, target, dims.index(record))
-                elif schema.name in MAPS and dims[-2:] == ("y", "x"):
+                elif dims[-2:] == ("y", "x") and by_rows:
                     _overlay(files, name, target)
+                elif dims[-2:] == ("y", "x"):
+                    _copy_rows(files[0][name], target, 0, target.shape[-2])
                 elif name in PATHS:
                     target[...] = np.array(
                         [_moved(v, parts[0], output) for v in read_strings(files[0], name)], dtype=object
@@ -135,7 +181,7 @@ def _check_alike(parts: Sequence[Path], files: Sequence[h5py.File]) -> None:
     first = files[0]
     for path, file in zip(parts[1:], files[1:], strict=True):
         for key, value in first.attrs.items():
-            if key not in _OWN and str(file.attrs.get(key)) != str(value):
+            if key not in {*_OWN, *_JOINED, ROWS} and str(file.attrs.get(key)) != str(value):
                 raise ArtefactError(
                     f"{path}: expected {key} = {value} as in {parts[0]}, found {file.attrs.get(key)}; these are not parts of one whole."
                 )
@@ -158,17 +204,61 @@ def _sizes(schema: Schema, files: Sequence[h5py.File], record: str | None) -> di
     return {dim: sizes[dim] for dim in schema.dims if dim in sizes}
 
 
+def _worth_a_view(files: Sequence[h5py.File], name: str) -> bool:
+    return files[0][name].ndim >= 2 and files[0][name].dtype.kind in "iufb"
+
+
+def _end_to_end(files: Sequence[h5py.File], name: str, axis: int) -> list[Any]:
+    place, found = 0, []
+    for file in files:
+        source, count = file[name], file[name].shape[axis]
+        before, after = (slice(None),) * axis, (slice(None),) * (source.ndim - axis - 1)
+        if count:
+            found.append(((*before, slice(place, place + count), *after), source, (slice(None),) * source.ndim))
+        place += count
+    return found
+
+
+def _own_rows(files: Sequence[h5py.File], name: str) -> list[Any]:
+    found = []
+    for file in files:
+        first, last = (int(v) for v in file.attrs[ROWS])
+        part = (*(slice(None),) * (file[name].ndim - 2), slice(first, last), slice(None))
+        if last > first:
+            found.append((part, file[name], part))
+    return found
+
+
 def _concatenate(files: Sequence[h5py.File], name: str, target: h5py.Dataset, axis: int) -> None:
     place = 0
     for file in files:
         source = file[name]
-        for k in range(source.shape[axis]):
-            key: tuple[Any, ...] = (slice(None),) * axis
-            if source.ndim >= 2:
-                target[(*key, place + k)] = source[(*key, k)]
-        if source.ndim == 1:
-            target[place : place + source.shape[0]] = source[...]
+        if not _move_chunks(source, target, axis, place):
+            step = max(1, BUFFER // max(1, source.nbytes // max(1, source.shape[axis])))
+            for k in range(0, source.shape[axis], step):
+                n = min(step, source.shape[axis] - k)
+                key: tuple[Any, ...] = (slice(None),) * axis
+                target[(*key, slice(place + k, place + k + n))] = source[(*key, slice(k, k + n))]
         place += source.shape[axis]
+
+
+def _move_chunks(source: h5py.Dataset, target: h5py.Dataset, axis: int, place: int) -> bool:
+    """Copy what is stored, as it is stored, where both files cut the variable alike: masks stay sparse and deflated.
+
+    Chunks that nobody wrote stay unwritten. False where it cannot be done.
+    """
+    alike = source.chunks is not None and source.chunks == target.chunks and source.dtype == target.dtype
+    if not alike or source.chunks[axis] != 1 or source.compression != target.compression:
+        return False
+    if (source.compression_opts, source.shuffle) != (target.compression_opts, target.shuffle):
+        return False
+    offsets: list[tuple[int, ...]] = []
+    source.id.chunk_iter(lambda info: offsets.append(info.chunk_offset))
+    for offset in offsets:
+        mask, stored = source.id.read_direct_chunk(offset)
+        moved = (*offset[:axis], offset[axis] + place, *offset[axis + 1 :])
+        target.id.write_direct_chunk(moved, stored, mask)
+    return True
 
 
 def _known(files: Sequence[h5py.File], name: str) -> Any:
@@ -181,7 +271,11 @@ def _known(files: Sequence[h5py.File], name: str) -> Any:
 
 
 def _overlay(files: Sequence[h5py.File], name: str, target: h5py.Dataset, rows: int = 256) -> None:
-    """Rows that a shard did not own hold fill values (NaN, or 0 for masks): take what any part knows."""
+    """Each part's own rows; where parts do not say which these are, what any part knows (others hold NaN, or 0)."""
+    if all(ROWS in file.attrs for file in files):
+        for file in files:
+            _copy_rows(file[name], target, *(int(v) for v in file.attrs[ROWS]))
+        return
     height = target.shape[-2]
     for first in range(0, height, rows):
         part = (..., slice(first, min(height, first + rows)), slice(None))
@@ -192,3 +286,9 @@ def _overlay(files: Sequence[h5py.File], name: str, target: h5py.Dataset, rows: 
                 np.where(np.isnan(joined), other, joined) if joined.dtype.kind == "f" else np.maximum(joined, other)
             )
         target[part] = joined
+
+
+def _copy_rows(source: h5py.Dataset, target: h5py.Dataset, first: int, last: int, rows: int = 256) -> None:
+    for row in range(first - first % rows, last, rows):
+        part = (..., slice(max(first, row), min(last, row + rows)), slice(None))
+        target[part] = source[part]

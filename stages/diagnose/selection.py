@@ -12,6 +12,7 @@ from stages.diagnose.state import Cause, Saved, Search
 
 REFUSALS = 3
 QUIET_GAIN = 6.0  # nats below which an effect, in the look before, is not looked at again
+SLIGHT = 0.005  # of what is left: by so much a simpler cause may do worse
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
 
 
@@ -58,9 +59,10 @@ def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
         refine(state)
         tried.append((nothing - misfit(state, seen.works), _freedom(cause), state.save()))
     most = max(worth for worth, _, _ in tried)
-    # a superset of another effect always does a little better
+    # a superset of another effect always does a little better; where much is explained, a little is much
+    least = most - min((1 - SIMPLER) * abs(most), SLIGHT * max(nothing - most, 0.0))
     place = min(
-        (k for k, (worth, _, _) in enumerate(tried) if worth >= SIMPLER * most),
+        (k for k, (worth, _, _) in enumerate(tried) if worth >= least),
         key=lambda k: (tried[k][1], -tried[k][0]),
         default=0,
     )
