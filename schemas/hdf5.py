@@ -60,13 +60,21 @@ def _except_h5py_unraisable(unraisable: Any) -> None:
         _hooks[-1][1](unraisable)
 
 
+# A shard names the same large inputs as the check before it: (path, size, time of change) -> SHA-256.
+known_digests: dict[tuple[str, int, int], str] = {}
+
+
 def sha256(path: Path) -> str:
-    """The SHA-256 of a file, read in blocks."""
-    digest = hashlib.sha256()
-    with open(path, "rb") as stream:
-        while block := stream.read(1 << 22):
-            digest.update(block)
-    return digest.hexdigest()
+    """The SHA-256 of a file, read in blocks, and once only while the file stays as it is."""
+    state = os.stat(path)
+    key = (os.path.realpath(path), state.st_size, state.st_mtime_ns)
+    if key not in known_digests:
+        digest = hashlib.sha256()
+        with open(path, "rb") as stream:
+            while block := stream.read(1 << 22):
+                digest.update(block)
+        known_digests[key] = digest.hexdigest()
+    return known_digests[key]
 
 
 def check_output(path: Path, inputs: Sequence[Path] = (), overwrite: bool = False) -> None:
@@ -225,20 +233,23 @@ class ArtefactWriter:
             if variable.name in _STANDARD_NAMES:
                 data.attrs["standard_name"] = _STANDARD_NAMES[variable.name]
             data.attrs["_Netcdf4Dimid"] = np.int32(list(self.sizes).index(variable.name))
-        else:
+        self._describe(data, variable, unit, scale=size_of_scale is not None)
+        return data
+
+    def _describe(self, data: h5py.Dataset, variable: Variable, unit: str | None, scale: bool = False) -> None:
+        if not scale:
             for axis, dim in enumerate(variable.dims):
                 data.dims[axis].attach_scale(self.file[dim])
         if variable.dtype != STRING:
             data.attrs["units"] = unit or variable.unit
-            if dtype.kind == "f":
-                data.attrs["_FillValue"] = np.array(np.nan, dtype)
+            if data.dtype.kind == "f":
+                data.attrs["_FillValue"] = np.array(np.nan, data.dtype)
         data.attrs["long_name"] = variable.description
         if variable.flags:
-            data.attrs["flag_values"] = np.array([value for _, value in variable.flags], dtype)
+            data.attrs["flag_values"] = np.array([value for _, value in variable.flags], variable.dtype)
             data.attrs["flag_meanings"] = " ".join(meaning for meaning, _ in variable.flags)
         if variable.georeferenced:
             data.attrs["grid_mapping"] = "crs"
-        return data
 
     def dataset(self, name: str, unit: str | None = None) -> h5py.Dataset:
         """The open dataset ``name``, created from its declaration on first use, for block-wise writing."""
@@ -254,6 +265,23 @@ class ArtefactWriter:
         else:
             target[...] = data
         return target
+
+    def link(self, name: str, sources: Sequence[tuple[tuple[slice, ...], h5py.Dataset, tuple[slice, ...]]]) -> None:
+        """Make a variable a view of datasets in other files: (where it goes, whole dataset, what of it).
+
+        The files are named relative to this one, and must stay; :func:`open_artefact` checks that they are there.
+        """
+        variable = self.schema[name]
+        shape = tuple(self.sizes[d] for d in variable.dims)
+        dtype = np.dtype(variable.dtype)
+        layout = h5py.VirtualLayout(shape, dtype)
+        for target, source, part in sources:
+            file = os.path.relpath(os.path.realpath(source.file.filename), os.path.realpath(self.path.parent))
+            view = h5py.VirtualSource(file, source.name, source.shape, source.dtype)
+            layout[target] = view[part]
+        data = self.file.create_virtual_dataset(name, layout, fillvalue=np.nan if dtype.kind == "f" else 0)
+        unit = sources[0][1].attrs.get("units") if sources and variable.unit_choices else None
+        self._describe(data, variable, str(unit) if unit is not None else None)
 
     def write_crs(self, wkt: str, transform: Sequence[float]) -> None:
         """The scalar ``crs`` variable that CF and GDAL look for; ``transform`` is affine (a, b, c, d, e, f)."""
@@ -326,6 +354,7 @@ def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5
                     f"write it again with 'lunargr {schema.stage}'."
                 )
         _check_sizes(path, file, schema)
+        _check_views(path, file)
     except BaseException:
         file.close()
         raise
@@ -410,6 +439,18 @@ def _check_sizes(path: Path, file: h5py.File, schema: Schema) -> None:
                 raise ArtefactError(
                     f"{path}:/{variable.name}: expected {first[0]} along '{dim}' as in /{first[1]}, found {size}; write it again."
                 )
+
+
+def _check_views(path: Path, file: h5py.File) -> None:
+    """HDF5 reads what a lost file held as fill values, without a word: such an artefact must not look whole."""
+    for data in file.values():
+        if isinstance(data, h5py.Dataset) and data.is_virtual:
+            for source in {s.file_name for s in data.virtual_sources()}:
+                if not (path.resolve().parent / source).exists():
+                    raise ArtefactError(
+                        f"{path}:{data.name}: expected the file '{source}' that it is a view of, found none; "
+                        "bring it back, or merge the parts again without --virtual."
+                    )
 
 
 def _text(value: Any) -> str:

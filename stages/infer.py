@@ -17,7 +17,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from schemas import SCENE, SVBRDF, ArtefactError, ArtefactWriter, ConfigError, atomic_path, check_output, open_artefact
+from schemas import (
+    SCENE,
+    SVBRDF,
+    ArtefactError,
+    ArtefactWriter,
+    ConfigError,
+    atomic_path,
+    check_output,
+    open_artefact,
+    read_strings,
+)
 from schemas.hdf5 import silence_hdf5
 from stages.network.normalisation import FILL_REACH, fill_holes
 from stages.network.predictor import Predictor, choose_device, load_predictor
@@ -114,6 +124,20 @@ def run(
     return Summary(grid, predictor.model.name, share, windows, ranges)
 
 
+def count_bands(scene: Path, config: Config) -> int:
+    """Rows of windows on a scene: more shards than these have nothing to do."""
+    stride = config.stride or max(1, config.window - config.window // 16)
+    with open_artefact(scene, SCENE) as file:
+        return len(axis_windows(file["elevation"].shape[0], config.window, stride, config.offset))
+
+
+def summarise(svbrdf: Path, windows: int = 0) -> Summary:
+    """What a map holds, for the table at the end."""
+    with open_artefact(svbrdf, SVBRDF) as file:
+        share, ranges = _statistics(file, read_strings(file, "coefficient_name"))
+        return Summary(read_grid(file, svbrdf), str(file.attrs["model"]), share, windows, ranges)
+
+
 def axis_windows(length: int, window: int, stride: int, offset: int) -> list[tuple[int, int]]:
     """(first, last) of the windows along one axis; they cover 0 .. length and overlap by window - stride."""
     start = (offset % stride) - stride if offset % stride else 0
@@ -162,6 +186,8 @@ def _predict(
     own_last = rows[last_band][0] if last_band < len(rows) else height
     if config.shard[0] == 0:
         own_first = 0
+    if config.shard[1] > 1:
+        writer.file.attrs["shard_rows"] = np.array([own_first, own_last], np.int64)
     bands = [k for k, (a, b) in enumerate(rows) if b > own_first and a < own_last]
     total = np.zeros((channels, 0, width), np.float32)
     weight = np.zeros((0, width), np.float32)

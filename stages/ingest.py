@@ -5,11 +5,15 @@ Everything streams in blocks: memory does not grow with the DEM.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 from rasterio.io import DatasetReader
@@ -17,11 +21,22 @@ from rasterio.transform import Affine
 from rasterio.warp import Resampling, calculate_default_transform
 from rasterio.windows import Window
 
-from schemas import SCENE, ArtefactWriter, ConfigError, GeometryError, InputError
+from schemas import (
+    SCENE,
+    ArtefactError,
+    ArtefactWriter,
+    ConfigError,
+    GeometryError,
+    InputError,
+    check_output,
+    open_artefact,
+    read_config,
+)
+from schemas.hdf5 import silence_hdf5
 from stages.physics import rasters
-from stages.physics.bodies import find_body
-from stages.physics.frames import Frame, read_frames, write_frames
-from stages.physics.grid import Grid, check_body, local_metric_crs, require_crs
+from stages.physics.bodies import Body, find_body
+from stages.physics.frames import Frame, load_frames, read_frames, write_frames
+from stages.physics.grid import Grid, check_body, local_metric_crs, read_grid, require_crs
 from stages.physics.positions import blocks, valid_positions
 from stages.physics.sources import open_source
 
@@ -43,6 +58,7 @@ class Config:
     body: str = "moon"
     block: int = 1024
     skip_outside: bool = False
+    shard: tuple[int, int] = (0, 1)
 
 
 @dataclass(frozen=True)
@@ -66,46 +82,134 @@ def run(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Summary:
-    """Write ``scene.h5``. Raises InputError, GeometryError or ConfigError; then nothing is written."""
+    """Write ``scene.h5``. Raises InputError, GeometryError or ConfigError; then nothing is written.
+
+    dem : a raster, or a scene whose grid and elevations are taken as they are. Shards are cut in two steps: of a raster
+    without images, its rows; of a scene with images, the images.
+    """
     if config.crop < 16 or config.crop % 2:
         raise ConfigError(f"--crop: expected an even number of pixels, at least 16; found {config.crop}.")
     body = find_body(config.body)
+    check_output(output, [dem] + ([images] if images else []), overwrite)
     frames = read_frames(images, body) if images else []
+    index, count = config.shard
+    with _open_terrain(dem, images, config, body) as terrain:
+        frames, skipped = _check_frames(frames, terrain.grid, config.skip_outside)
+        first, last = (len(frames) * k // count for k in (index, index + 1))
+        mine = frames[first:last]
+        sizes = {"frame": len(mine), "y": terrain.grid.height, "x": terrain.grid.width, "window": 4}
+        with ArtefactWriter(
+            output,
+            SCENE,
+            sizes,
+            config=terrain.config,
+            inputs=[dem] + ([images] if images else []),
+            attributes=terrain.attributes | {"crop_px": np.int32(config.crop)},
+            overwrite=overwrite,
+        ) as writer:
+            _write_grid(writer, terrain.grid)
+            known, low, high = terrain.write(writer, progress)
+            writer.file.attrs["elevation_low_m"], writer.file.attrs["elevation_high_m"] = low, high
+            writer.file.attrs["dem_valid_px"] = known
+            for name in ("valid", "valid_position", "frame_window"):  # also where there is no image at all
+                writer.dataset(name)
+            areas = [
+                _write_validity(frame, k, len(mine), terrain.grid, (low, high), writer, config, progress)
+                for k, frame in enumerate(mine)
+            ]
+            if frames and count == 1 and not any(areas):
+                raise GeometryError(
+                    f"{images}: a crop of {config.crop} px ({config.crop * terrain.grid.gsd:g} m) is larger than any valid "
+                    "region of any image; choose a smaller --crop or a finer --gsd."
+                )
+            writer.write("valid_area_m2", np.array(areas))
+            write_frames(writer, mine)
+    return summarise(output, tuple(skipped))
+
+
+def summarise(scene: Path, skipped: tuple[str, ...] = ()) -> Summary:
+    """What a scene holds, for the table at the end."""
+    with open_artefact(scene, SCENE) as file:
+        grid = read_grid(file, scene)
+        low, high, known = (file.attrs[k] for k in ("elevation_low_m", "elevation_high_m", "dem_valid_px"))
+        return Summary(
+            grid,
+            float(known) / (grid.height * grid.width),
+            (float(low), float(high)),
+            tuple(load_frames(file, scene)),
+            tuple(float(a) / 1e6 for a in file["valid_area_m2"][...]),
+            bool(read_config(file)["resampled"]),
+            skipped,
+        )
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Where the scene's elevations come from. ``write`` gives the number of valid pixels, and the extremes."""
+
+    grid: Grid
+    config: dict[str, Any]
+    attributes: dict[str, Any]
+    write: Callable[[ArtefactWriter, Progress | None], tuple[int, float, float]]
+
+
+@contextlib.contextmanager
+def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body) -> Iterator[Terrain]:
+    index, count = config.shard
+    if is_artefact(dem):
+        if images is None:
+            raise ConfigError(f"{dem}: a scene already; add --images, or give a DEM that GDAL reads.")
+        with open_artefact(dem, SCENE, need=()) as file:
+            grid = read_grid(file, dem)
+            if abs(grid.radius - body.radius) > 1e-6 * body.radius:
+                raise ConfigError(f"{dem}: its body has a radius of {grid.radius:g} m; give the same --body.")
+            if config.gsd is not None and abs(config.gsd - grid.gsd) > 1e-3 * grid.gsd:
+                raise ConfigError(f"{dem}: a grid at {grid.gsd:g} m; leave --gsd away, or give the DEM itself.")
+            own = ("crop", "skip_outside", "shard", "block")
+            stored = read_config(file) | {k: v for k, v in asdict(config).items() if k in own}
+            names = ("gsd_m", "body_radius_m", "elevation_source")
+            yield Terrain(
+                grid, stored, {k: file.attrs[k] for k in names}, partial(_take_elevation, dem, file, count > 1)
+            )
+        return
+    if images is not None and count > 1:
+        raise ConfigError(
+            "--shard: the DEM comes first, then its images. Run 'lunargr ingest DEM --shard I/N' without --images and merge; "
+            "then give that scene in place of the DEM, with --images and --shard."
+        )
     with rasters.open_raster(dem, "a DEM") as dataset:
         crs = require_crs(str(dem), dataset.crs, dataset.transform)
         check_body(str(dem), crs, body)
         plan = plan_grid(dem, dataset, config.gsd, body.radius)
-        frames, skipped = _check_frames(frames, plan.grid, config.skip_outside)
-        inputs = [dem] + ([images] if images else [])
-        sizes = {"frame": len(frames), "y": plan.grid.height, "x": plan.grid.width, "window": 4}
-        attributes = {
-            "gsd_m": plan.grid.gsd,
-            "body_radius_m": body.radius,
-            "crop_px": np.int32(config.crop),
-            "elevation_source": dem.name,
-        }
+        attributes = {"gsd_m": plan.grid.gsd, "body_radius_m": body.radius, "elevation_source": dem.name}
+        if count > 1:
+            bands = math.ceil(plan.grid.height / config.block)
+            rows = [min(plan.grid.height, config.block * (bands * k // count)) for k in (index, index + 1)]
+            attributes["shard_rows"] = np.array(rows, np.int64)
         stored = asdict(config) | {"resampled": plan.factor is None}
-        with ArtefactWriter(
-            output, SCENE, sizes, config=stored, inputs=inputs, attributes=attributes, overwrite=overwrite
-        ) as writer:
-            _write_grid(writer, plan.grid)
-            share, extent = _write_elevation(dem, dataset, plan, writer, config, progress)
-            for name in ("valid", "valid_position", "frame_window"):  # also where there is no image at all
-                writer.dataset(name)
-            areas = [
-                _write_validity(frame, index, len(frames), plan.grid, extent, writer, config, progress)
-                for index, frame in enumerate(frames)
-            ]
-            if frames and not any(areas):
-                raise GeometryError(
-                    f"{images}: a crop of {config.crop} px ({config.crop * plan.grid.gsd:g} m) is larger than any valid region "
-                    "of any image; choose a smaller --crop or a finer --gsd."
-                )
-            writer.write("valid_area_m2", np.array(areas))
-            write_frames(writer, frames)
-    return Summary(
-        plan.grid, share, extent, tuple(frames), tuple(a / 1e6 for a in areas), plan.factor is None, tuple(skipped)
-    )
+        yield Terrain(plan.grid, stored, attributes, partial(_write_elevation, dem, dataset, plan, config))
+
+
+def count_bands(dem: Path, config: Config) -> int:
+    """Rows of blocks of a raster's grid: more shards than these have nothing to do."""
+    with rasters.open_raster(dem, "a DEM") as dataset:
+        require_crs(str(dem), dataset.crs, dataset.transform)
+        plan = plan_grid(dem, dataset, config.gsd, find_body(config.body).radius)
+    return math.ceil(plan.grid.height / config.block)
+
+
+def count_images(images: Path, config: Config) -> int:
+    """Rows of the image table."""
+    return len(read_frames(images, find_body(config.body)))
+
+
+def is_artefact(path: Path) -> bool:
+    """Whether a file is one of our own and not a raster."""
+    silence_hdf5()
+    if not (path.is_file() and h5py.is_hdf5(path)):
+        return False
+    with h5py.File(path, "r") as file:
+        return "lunargr_schema" in file.attrs
 
 
 @dataclass(frozen=True)
@@ -262,11 +366,12 @@ def _write_grid(writer: ArtefactWriter, grid: Grid) -> None:
 
 
 def _write_elevation(
-    dem: Path, dataset: DatasetReader, plan: Plan, writer: ArtefactWriter, config: Config, progress: Progress | None
-) -> tuple[float, tuple[float, float]]:
+    dem: Path, dataset: DatasetReader, plan: Plan, config: Config, writer: ArtefactWriter, progress: Progress | None
+) -> tuple[int, float, float]:
     grid = plan.grid
     elevation, dem_valid = writer.dataset("elevation"), writer.dataset("dem_valid")
-    todo = list(blocks(grid.height, grid.width, config.block))
+    first, last = writer.file.attrs.get("shard_rows", (0, grid.height))
+    todo = [b for b in blocks(grid.height, grid.width, config.block) if first <= b[0] < last]
     seen, low, high = 0, math.inf, -math.inf
     for number, (row, col, height, width) in enumerate(todo):
         if progress:
@@ -290,9 +395,32 @@ def _write_elevation(
             low, high = min(low, float(values[good].min())), max(high, float(values[good].max()))
     if progress:
         progress(len(todo), len(todo), "DEM blocks")
-    if not seen:
+    if not seen and config.shard[1] == 1:
         raise InputError(f"{dem}: expected elevations, found only nodata on the grid at {grid.gsd:g} m.")
-    return seen / (grid.height * grid.width), (low, high)
+    return seen, low, high
+
+
+def _take_elevation(
+    scene: Path, file: h5py.File, view: bool, writer: ArtefactWriter, progress: Progress | None
+) -> tuple[int, float, float]:
+    """The elevations of another scene; a shard, of which there may be hundreds, only looks into it."""
+    for name in ("elevation", "dem_valid"):
+        whole = (slice(None), slice(None))
+        if view:
+            writer.link(name, [(whole, file[name], whole)])
+            continue
+        target = writer.dataset(name)
+        for row in range(0, target.shape[0], 256):
+            target[row : row + 256] = file[name][row : row + 256]
+    if "dem_valid_px" not in file.attrs:
+        raise ArtefactError(
+            f"{scene}: expected the extremes of its elevations, found none; run 'lunargr ingest' again."
+        )
+    return (
+        int(file.attrs["dem_valid_px"]),
+        float(file.attrs["elevation_low_m"]),
+        float(file.attrs["elevation_high_m"]),
+    )
 
 
 def _check_frames(frames: Sequence[Frame], grid: Grid, skip_outside: bool) -> tuple[list[Frame], list[str]]:

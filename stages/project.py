@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -143,7 +145,7 @@ def _project(
     pairs, size = part.stop - part.start, file["elevation"].shape[1]
     half = size // 2
     row, col, image_index = (file[k][part] for k in ("row", "col", "image_index"))
-    overview = make_overview(scene_file["elevation"], max(1, math.ceil(max(grid.height, grid.width) / OVERVIEW_PX)))
+    overview = _overview_of(scene, scene_file["elevation"])
     attributes = {"gsd_m": grid.gsd, "body_radius_m": grid.radius}
     sizes = {"pair": pairs, "y": size, "x": size, "enu": 3, "frame": len(frames)}
     valid_pixels, shadowed, incidence, emission = 0, 0, [], []
@@ -232,6 +234,50 @@ def _project(
         shadowed / max(1, valid_pixels),
         tuple(registered),
     )
+
+
+def count_pairs(crops: Path) -> int:
+    """Crops in a file."""
+    with open_artefact(crops, CROPS) as file:
+        return int(file["row"].shape[0])
+
+
+def source_files(crops: Path) -> list[Path]:
+    """The images and camera models that crops are taken from."""
+    with open_artefact(crops, CROPS) as file:
+        frames = load_frames(file, crops)
+    return [p for f in frames for p in (f.path, f.camera) if p is not None]
+
+
+def summarise(pairs: Path) -> Summary:
+    """What pairs hold, for the line at the end: of a file that was put together from parts."""
+    with open_artefact(pairs, PAIRS) as file:
+        sun, camera = file["sun_direction_enu"][...], file["camera_position_enu"][...]
+        seen = shadowed = total = 0
+        for k in range(file["valid"].shape[0]):
+            valid = file["valid"][k].astype(bool)
+            above = np.radians(file["sun_horizon_deg"][k].astype(np.float64)) > math.asin(sun[k, 2])
+            seen, shadowed, total = seen + int(valid.sum()), shadowed + int((valid & above).sum()), total + valid.size
+    incidence = np.degrees(np.arccos(sun[:, 2]))
+    emission = np.degrees(np.arccos(camera[:, 2] / np.linalg.norm(camera, axis=1)))
+
+    def extremes(angles: NDArray[np.float64]) -> tuple[float, float]:
+        return (float(angles.min()), float(angles.max())) if len(angles) else (math.nan, math.nan)
+
+    return Summary(len(sun), seen / max(1, total), extremes(incidence), extremes(emission), shadowed / max(1, seen))
+
+
+_overviews: dict[tuple[Any, ...], Overview] = {}
+
+
+def _overview_of(scene: Path, elevation: h5py.Dataset) -> Overview:
+    """The far terrain, which takes a look at the whole DEM: the parts that one process works on share it."""
+    state = os.stat(scene)
+    key = (os.path.realpath(scene), state.st_size, state.st_mtime_ns)
+    if key not in _overviews:
+        _overviews.clear()
+        _overviews[key] = make_overview(elevation, max(1, math.ceil(max(elevation.shape) / OVERVIEW_PX)))
+    return _overviews[key]
 
 
 def overview_extremes(elevation: h5py.Dataset, overview: Overview) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from evaluation_scene import A, B, C, KnowsTheTruth, make_scene
 
 from stages.evaluate import fit
 from stages.evaluate.core import choose_fit_pairs
-from stages.evaluate.renderers import Renderer, constant, read_batch, unit_images
+from stages.evaluate.renderers import Constant, Renderer, read_batch, unit_images
 from stages.evaluate.run import Config, evaluate_pairs
 from stages.physics.photometry import get_model
 
@@ -99,13 +99,13 @@ def test_nonlinear_fit_finds_planted_hapke_parameters(scene):
     planted = np.array([p.default for p in model.parameters])
     planted[0] = 0.8 * planted[0]
     batch = read_batch(scene, np.flatnonzero(scene.split == 0), 1.0)
-    batch.image = Renderer("planted", model, constant(planted)).radiance_factor(batch)
+    batch.image = Renderer("planted", model, Constant(planted)).radiance_factor(batch)
     from stages.evaluate.core import sample_pixels
 
     sample = sample_pixels(batch, 100, np.random.default_rng(0))
     found = fit.fit_nonlinear(model, sample, 4, calibrated=True)
     batch.memo.clear()
-    refit = Renderer("refit", model, constant(found)).radiance_factor(batch)
+    refit = Renderer("refit", model, Constant(found)).radiance_factor(batch)
     spread = float(batch.image[batch.usable].std())
     assert float((refit - batch.image)[batch.usable].square().mean().sqrt()) < 5e-3 * spread
 

@@ -14,17 +14,17 @@ from stages.evaluate.metrics import psnr, squared_error, ssim
 from stages.evaluate.perceptual import Perceptual
 from stages.evaluate.renderers import (
     Batch,
+    Constant,
     Predictor,
     Reader,
     Renderer,
-    constant,
     learned,
     published,
     read_batch,
     unit_images,
 )
 from stages.physics.formation import Extension
-from stages.physics.radiometry import crop_range
+from stages.physics.radiometry import crop_range, full_scale
 
 SAMPLE_PIXELS = 100_000  # for models that are not linear in their parameters
 TITLES = {
@@ -125,16 +125,12 @@ def fit_renderers(
 
     Frames without train pairs get their gain and offset from ``orphans``, which no shared coefficient sees.
     """
-    from_network = learned(predictor)
-    hapke, lunar_lambert = published("hapke"), published("lunar_lambert")
-    network = Renderer("learned", predictor.model, from_network)
-    baseline = Renderer("lunar_lambert", lunar_lambert[0], constant(lunar_lambert[1]))
-    raw = Renderer("hapke", hapke[0], constant(hapke[1]))
     model = predictor.model
     start = np.array([p.default for p in model.parameters])
+    renderers = make_renderers(predictor, extensions, start)
+    network, extended, everywhere, everywhere_extended, baseline, raw = renderers.values()
     wanted = [row for row in layout(bool(extensions)) if not only or row[0] in only]
     needed = {source for _, source, _ in wanted}
-    extended = Renderer("learned_extended", model, from_network, tuple(extensions))
     fixed = [r for r in ([baseline] if calibrated else [network, baseline, raw, extended]) if r.name in needed]
     fit_global = not needed.isdisjoint({"global", "global_extended"})
 
@@ -162,9 +158,8 @@ def fit_renderers(
         solved = fit.solve_coefficients(known) if calibrated else fit.solve_uncalibrated(known, start)
     elif fit_global:
         solved = fit.fit_nonlinear(model, _join(samples), frames, calibrated)
-    everywhere = Renderer("global", model, constant(solved))
+    everywhere.coefficients = everywhere_extended.coefficients = Constant(solved)
     late = []
-    everywhere_extended = Renderer("global_extended", model, constant(solved), tuple(extensions))
     if "global_extended" in needed:
         late.append(everywhere_extended)
     if calibrated and baseline in fixed:
@@ -186,8 +181,36 @@ def fit_renderers(
         for renderer in late:
             _calibrate(renderer, again[renderer.name], np.ones(1))
 
-    renderers = {r.name: r for r in (network, extended, everywhere, everywhere_extended, baseline, raw)}
     return [Row(name, renderers[source], how) for name, source, how in wanted]
+
+
+def dn_scale(reader: Reader, indices: np.ndarray, size: int) -> float:
+    """Full DN range of the images from their largest valid value."""
+    largest = 0.0
+    indices = np.unique(indices)
+    for start in range(0, len(indices), size):
+        chosen = indices[start : start + size]
+        valid = torch.as_tensor(reader.valid(chosen)).bool()
+        if valid.any():
+            largest = max(largest, float(torch.as_tensor(reader.image(chosen))[valid].max()))
+    return full_scale(largest)
+
+
+def make_renderers(
+    predictor: Predictor, extensions: Sequence[Extension], coefficients: np.ndarray
+) -> dict[str, Renderer]:
+    """Everything that is compared, before anything is fitted; ``coefficients`` of the models that are the same everywhere."""
+    from_network, everywhere = learned(predictor), Constant(coefficients)
+    hapke, lunar_lambert = published("hapke"), published("lunar_lambert")
+    made = (
+        Renderer("learned", predictor.model, from_network),
+        Renderer("learned_extended", predictor.model, from_network, tuple(extensions)),
+        Renderer("global", predictor.model, everywhere),
+        Renderer("global_extended", predictor.model, everywhere, tuple(extensions)),
+        Renderer("lunar_lambert", lunar_lambert[0], Constant(lunar_lambert[1])),
+        Renderer("hapke", hapke[0], Constant(hapke[1])),
+    )
+    return {renderer.name: renderer for renderer in made}
 
 
 def layout(extended: bool) -> list[tuple[str, str, str | None]]:

@@ -132,10 +132,14 @@ def unit_images(model: ReflectanceModel, batch: Batch) -> Tensor:
     return torch.stack(images, dim=1)
 
 
-def constant(values: np.ndarray) -> Callable[[Batch], Tensor]:
-    """The same coefficients everywhere."""
-    tensor = torch.as_tensor(values, dtype=torch.float32)[None, :, None, None]
-    return lambda batch: tensor
+@dataclass(frozen=True)
+class Constant:
+    """The same coefficients (C,) everywhere."""
+
+    values: np.ndarray
+
+    def __call__(self, batch: Batch) -> Tensor:
+        return torch.as_tensor(self.values, dtype=torch.float32)[None, :, None, None]
 
 
 def learned(predictor: Predictor) -> Callable[[Batch], Tensor]:

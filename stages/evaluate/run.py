@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from schemas import (
     CHECKPOINT,
@@ -26,7 +25,8 @@ from schemas import (
 )
 from stages.effects import load_extension
 from stages.evaluate.bootstrap import TileBootstrap
-from stages.evaluate.core import TITLES, Row, choose_fit_pairs, fit_renderers, layout, score
+from stages.evaluate.core import TITLES, Row, Scores, choose_fit_pairs, dn_scale, fit_renderers, layout, score
+from stages.evaluate.parts import join_scores, read_fit, write_fit, write_scores
 from stages.evaluate.perceptual import Perceptual
 from stages.evaluate.renderers import Predictor, Reader
 from stages.evaluate.table import gain_table, metric_table
@@ -34,10 +34,14 @@ from stages.network.dataset import PairReader
 from stages.network.predictor import Predictor as Network
 from stages.network.predictor import choose_device, load_predictor
 from stages.physics.formation import Extension
-from stages.physics.radiometry import full_scale
 
 RENDERINGS_LIMIT = 512 * 2**20  # bytes of rendered crops that are kept without being asked for
 MANY_TILES = 10  # fewer make percentile intervals too narrow
+
+
+# (what, function, its arguments for every part, suffix) -> the parts that function(path, **arguments) wrote, in order
+Fan = Callable[[str, Callable[..., Any], Sequence[Mapping[str, Any]], str], list[Path]]
+PART_BATCHES = 32
 
 
 @dataclass
@@ -65,8 +69,11 @@ def run(
     figures: Path | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
+    fan: Fan | None = None,
 ) -> dict[str, Any]:
     """Evaluate a checkpoint on a split of a pairs file; returns what the JSON holds.
+
+    ``fan`` has the crops scored in parts, wherever it works on them.
 
     Writes ``output`` (evaluation artefact), the JSON beside it (and at ``json_file``), and figures where asked.
     Raises ConfigError or ArtefactError before anything is written.
@@ -89,7 +96,19 @@ def run(
         extensions = load_extension(extend, reader.image_ids) if extend else []
         notes = _notes(checkpoint, predictor.gsd, reader.gsd, extend)
         return _evaluate(
-            reader, predictor, extensions, wanted, config, notes, inputs, output, reports, figures, overwrite, progress
+            reader,
+            predictor,
+            extensions,
+            wanted,
+            config,
+            notes,
+            inputs,
+            output,
+            reports,
+            figures,
+            overwrite,
+            progress,
+            fan,
         )
 
 
@@ -158,8 +177,26 @@ def evaluate_pairs(
         reader, predictor, extensions, train, orphans, len(frame_names), calibrated, scale, config.batch, config.seed,
         tick, config.only,
     )  # fmt: skip
+    scores = score(reader, rows, wanted, scale, config.batch, Perceptual(), keep, tick)
+    return conclude(reader, predictor, wanted, frame_names, units, config, rows, scores, scale), rows, scores, scale
+
+
+def conclude(
+    reader: Reader,
+    predictor: Predictor,
+    wanted: np.ndarray,
+    frame_names: list[str],
+    units: str,
+    config: Config,
+    rows: list[Row],
+    scores: Scores,
+    scale: float,
+) -> dict[str, Any]:
+    """What the JSON holds."""
+    calibrated = units == "iof"
+    train, orphans = choose_fit_pairs(reader, wanted, config.fit_pairs, config.seed)
+    orphans = np.empty(0, int) if calibrated else orphans
     perceptual = Perceptual()
-    scores = score(reader, rows, wanted, scale, config.batch, perceptual, keep, tick)
     if not scores.pixels.any():
         raise ArtefactError(f"split '{config.split}': expected valid pixels, found none; project the pairs again.")
     tile = np.asarray(reader.tile)[wanted]
@@ -168,7 +205,7 @@ def evaluate_pairs(
         unit, tile = "site", np.asarray(reader.site)[wanted]
     bootstrap = TileBootstrap(tile, config.bootstrap, config.seed)
     frames = np.asarray(reader.frame)
-    result = {
+    return {
         "split": config.split,
         "models": metric_table(scores, bootstrap),
         "gains": gain_table(scores, bootstrap),
@@ -186,19 +223,28 @@ def evaluate_pairs(
         "lpips_unavailable": None if perceptual.available else perceptual.reason,
         "warnings": _warnings(bootstrap, unit, frames, orphans),
     }
-    return result, rows, scores, scale
 
 
-def dn_scale(reader: Reader, indices: np.ndarray, size: int) -> float:
-    """Full DN range of the images from their largest valid value."""
-    largest = 0.0
-    indices = np.unique(indices)
-    for start in range(0, len(indices), size):
-        chosen = indices[start : start + size]
-        valid = torch.as_tensor(reader.valid(chosen)).bool()
-        if valid.any():
-            largest = max(largest, float(torch.as_tensor(reader.image(chosen))[valid].max()))
-    return full_scale(largest)
+def _in_parts(
+    fan: Fan,
+    inputs: list[Path],
+    config: Config,
+    wanted: np.ndarray,
+    predictor: Network,
+    extensions: Sequence[Any],
+    measured: Any,
+    rendered: Any,
+) -> tuple[list[Row], float, Scores]:
+    files = {"pairs": inputs[0], "checkpoint": inputs[1], "extend": inputs[2] if len(inputs) > 2 else None}
+    files |= {"config": config}
+    [fitted] = fan("fit", write_fit, [files | {"wanted": wanted}], ".json")
+    rows, scale = read_fit(fitted, predictor, extensions, config.only)
+    step = PART_BATCHES * config.batch  # whole batches: the network sees the same ones whatever the parts
+    todo = [
+        files | {"fitted": fitted, "wanted": wanted[k : k + step], "renderings": rendered is not None}
+        for k in range(0, len(wanted), step)
+    ]
+    return rows, scale, join_scores(fan("scores", write_scores, todo, ".h5"), rows, measured, rendered)
 
 
 def _warnings(bootstrap: TileBootstrap, unit: str, frames: np.ndarray, orphans: np.ndarray) -> list[str]:
@@ -228,6 +274,7 @@ def _evaluate(
     figures: Path | None,
     overwrite: bool,
     progress: Callable[[int, int, str], None] | None,
+    fan: Fan | None,
 ) -> dict[str, Any]:
     height, width = reader.size
     rows_known = [name for name, _, _ in layout(bool(extensions))]
@@ -251,10 +298,16 @@ def _evaluate(
                 for k, image in enumerate(images):
                     rendered[k, position : position + len(crops)] = image
 
-        result, rows, scores, scale = evaluate_pairs(
-            reader, predictor, wanted, reader.image_ids, reader.units, config,
-            extensions=extensions, keep=keep, progress=progress,
-        )  # fmt: skip
+        if fan is None:
+            result, rows, scores, scale = evaluate_pairs(
+                reader, predictor, wanted, reader.image_ids, reader.units, config,
+                extensions=extensions, keep=keep, progress=progress,
+            )  # fmt: skip
+        else:
+            rows, scale, scores = _in_parts(fan, inputs, config, wanted, predictor, extensions, measured, rendered)
+            result = conclude(
+                reader, predictor, wanted, reader.image_ids, reader.units, config, rows, scores, scale
+            )  # fmt: skip
         result |= {"pairs_file": inputs[0].name, "checkpoint": inputs[1].name, "config": settings}
         result["warnings"] = notes + result["warnings"]
         artefact.write("model_name", scores.names)
