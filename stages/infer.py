@@ -75,11 +75,7 @@ def run(
     progress: Progress | None = None,
 ) -> Summary:
     """Write ``svbrdf.h5`` and, beside it or at ``geotiff``, a cloud-optimised GeoTIFF. Raises ConfigError, ArtefactError."""
-    stride = config.stride or max(1, config.window - config.window // 16)
-    if config.window < 16 or not 1 <= stride <= config.window:
-        raise ConfigError(
-            f"--window and --stride: expected 1 <= stride <= window and window >= 16, found {stride} and {config.window}."
-        )
+    stride = _stride(config)
     tiff = geotiff or output.with_suffix(".tif")
     check_output(output, [scene, checkpoint], overwrite)
     check_output(tiff, [scene, checkpoint, output], overwrite)
@@ -124,9 +120,18 @@ def run(
     return Summary(grid, predictor.model.name, share, windows, ranges)
 
 
+def _stride(config: Config) -> int:
+    stride = config.stride or max(1, config.window - config.window // 16)
+    if config.window < 16 or not 1 <= stride <= config.window:
+        raise ConfigError(
+            f"--window and --stride: expected 1 <= stride <= window and window >= 16, found {stride} and {config.window}."
+        )
+    return stride
+
+
 def count_bands(scene: Path, config: Config) -> int:
     """Rows of windows on a scene: more shards than these have nothing to do."""
-    stride = config.stride or max(1, config.window - config.window // 16)
+    stride = _stride(config)
     with open_artefact(scene, SCENE) as file:
         return len(axis_windows(file["elevation"].shape[0], config.window, stride, config.offset))
 

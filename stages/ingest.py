@@ -94,9 +94,12 @@ def run(
     frames = read_frames(images, body) if images else []
     index, count = config.shard
     with _open_terrain(dem, images, config, body) as terrain:
-        frames, skipped = _check_frames(frames, terrain.grid, config.skip_outside)
         first, last = (len(frames) * k // count for k in (index, index + 1))
-        mine = frames[first:last]
+        mine, skipped = _check_frames(frames[first:last], terrain.grid, config.skip_outside)
+        if frames and not mine and count == 1:
+            raise InputError(
+                "no image touches the DEM; check that images and DEM show the same place (longitudes, body, CRS)."
+            )
         sizes = {"frame": len(mine), "y": terrain.grid.height, "x": terrain.grid.width, "window": 4}
         with ArtefactWriter(
             output,
@@ -118,10 +121,7 @@ def run(
                 for k, frame in enumerate(mine)
             ]
             if frames and count == 1 and not any(areas):
-                raise GeometryError(
-                    f"{images}: a crop of {config.crop} px ({config.crop * terrain.grid.gsd:g} m) is larger than any valid "
-                    "region of any image; choose a smaller --crop or a finer --gsd."
-                )
+                raise _no_positions(images, config, terrain.grid.gsd)
             writer.write("valid_area_m2", np.array(areas))
             write_frames(writer, mine)
     return summarise(output, tuple(skipped))
@@ -198,9 +198,32 @@ def count_bands(dem: Path, config: Config) -> int:
     return math.ceil(plan.grid.height / config.block)
 
 
-def count_images(images: Path, config: Config) -> int:
-    """Rows of the image table."""
-    return len(read_frames(images, find_body(config.body)))
+def image_names(images: Path, config: Config) -> list[str]:
+    """The images of a table."""
+    return [frame.image_id for frame in read_frames(images, find_body(config.body))]
+
+
+def source_files(images: Path, config: Config) -> list[Path]:
+    """The images and camera models that a table names."""
+    return [p for f in read_frames(images, find_body(config.body)) for p in (f.path, f.camera) if p is not None]
+
+
+def check_positions(parts: Sequence[Path], images: Path, config: Config) -> None:
+    """What one run checks at its end, for shards: that any crop fits anywhere. Raises GeometryError."""
+    gsd = math.nan
+    for part in parts:
+        with open_artefact(part, SCENE) as file:
+            if file["valid_area_m2"][...].any():
+                return
+            gsd = float(file.attrs["gsd_m"])
+    raise _no_positions(images, config, gsd)
+
+
+def _no_positions(images: Path | None, config: Config, gsd: float) -> GeometryError:
+    return GeometryError(
+        f"{images}: a crop of {config.crop} px ({config.crop * gsd:g} m) is larger than any valid region of any image; "
+        "choose a smaller --crop or a finer --gsd."
+    )
 
 
 def is_artefact(path: Path) -> bool:
@@ -438,10 +461,6 @@ def _check_frames(frames: Sequence[Frame], grid: Grid, skip_outside: bool) -> tu
                 skipped.append(frame.image_id)
                 continue
         kept.append(frame)
-    if frames and not kept:
-        raise InputError(
-            "no image touches the DEM; check that images and DEM show the same place (longitudes, body, CRS)."
-        )
     return kept, skipped
 
 

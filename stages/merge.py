@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,33 +48,28 @@ ROWS = "shard_rows"
 BUFFER = 1 << 26  # bytes that are copied at a time
 
 
-@dataclass(frozen=True)
-class Origin:
-    """What the whole says it was made from and by: a run in one piece would have said the same."""
-
-    config: Mapping[str, Any]
-    inputs: Sequence[Path]
-
-
 def run(
     parts: Sequence[Path],
     output: Path,
     overwrite: bool = False,
     progress: Progress | None = None,
     virtual: bool = False,
-    origin: Origin | None = None,
+    inputs: Sequence[Path] | None = None,
+    geotiff: Path | None = None,
 ) -> Schema:
     """Join ``parts``, in the order of their shards. Raises ArtefactError where they are not parts of one whole.
 
-    ``virtual``: large variables stay in the parts, which the output then needs.
+    virtual : large variables stay in the parts, which the output then needs; inputs : what the whole says it was made
+    from, in place of its parts; geotiff : where the GeoTIFF of a map goes, beside the output where None
     """
     schema = read_kind(parts[0])
     if schema.name not in (*RECORD, *MAPS):
         raise ArtefactError(
             f"{parts[0]}: a '{schema.name}' has no parts to merge; parts are: {', '.join((*RECORD, *MAPS))}."
         )
+    tiff = geotiff or output.with_suffix(".tif")
     if schema.name in MAPS:
-        check_output(output.with_suffix(".tif"), parts, overwrite)
+        check_output(tiff, parts, overwrite)
     with contextlib.ExitStack() as stack:
         files = [stack.enter_context(open_artefact(p, schema)) for p in parts]
         order = sorted(range(len(files)), key=lambda k: _shard(files[k])[0])
@@ -93,14 +87,14 @@ def run(
                 attributes[name] = join([f.attrs[name] for f in files])
         if "scene" in attributes:
             attributes["scene"] = _moved(str(attributes["scene"]), parts[0], output)
-        config = dict(origin.config) if origin else read_config(files[0]) | {"shard": [0, 1]}
+        config = read_config(files[0]) | {"shard": [0, 1]}
         seed = int(files[0].attrs.get("seed", -1))
         with ArtefactWriter(
             output,
             schema,
             sizes,
             config=config,
-            inputs=list(origin.inputs if origin else parts),
+            inputs=list(parts if inputs is None else inputs),
             seed=None if seed < 0 else seed,
             attributes=attributes,
             overwrite=overwrite,
@@ -141,7 +135,7 @@ def run(
             if "path" in names and record == "frame":
                 _move_paths(files, parts, writer.file, output)
             if schema.name in MAPS:
-                with atomic_path(output.with_suffix(".tif")) as partial:
+                with atomic_path(tiff) as partial:
                     write_geotiff(partial, writer.file, read_grid(writer.file, output))
             if progress:
                 progress(len(names), len(names), "merging")

@@ -100,9 +100,7 @@ def run(
     if not 1.0 <= config.max_shift <= 32.0:
         raise ConfigError(f"--max-shift: expected 1 to 32 px, found {config.max_shift:g}.")
     with open_artefact(crops, CROPS) as file:
-        scene = Path(config.scene) if config.scene else crops.resolve().parent / str(file.attrs["scene"])
-        if not scene.exists():
-            raise ArtefactError(f"{scene}: no such file; {crops} was sampled from it. Name its new place with --scene.")
+        scene = _scene_of(crops, file, config)
         if sha256(scene) != file.attrs["scene_sha256"]:
             raise ArtefactError(f"{scene}: not the scene that {crops} was sampled from; run 'lunargr sample' again.")
         frames = load_frames(file, crops)
@@ -234,6 +232,19 @@ def _project(
         shadowed / max(1, valid_pixels),
         tuple(registered),
     )
+
+
+def _scene_of(crops: Path, file: h5py.File, config: Config) -> Path:
+    scene = Path(config.scene) if config.scene else crops.resolve().parent / str(file.attrs["scene"])
+    if not scene.exists():
+        raise ArtefactError(f"{scene}: no such file; {crops} was sampled from it. Name its new place with --scene.")
+    return scene
+
+
+def scene_of(crops: Path, config: Config) -> Path:
+    """The scene that crops were sampled from. Raises ArtefactError where it is gone."""
+    with open_artefact(crops, CROPS) as file:
+        return _scene_of(crops, file, config)
 
 
 def count_pairs(crops: Path) -> int:

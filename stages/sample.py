@@ -6,6 +6,7 @@ that its footprint touches belongs to one part: footprints of different parts th
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -109,8 +110,15 @@ def run(
             )
         parts = audit(chosen, tiles, grid, crop)
         first, last = (len(chosen) * k // config.shard[1] for k in (config.shard[0], config.shard[0] + 1))
-        _write(scene, output, file, grid, frames, tiles, chosen, slice(first, last), crop, config, overwrite, progress)
+        part = slice(first, last)
+        _write(scene, output, file, grid, frames, tiles, chosen, part, crop, config, parts, overwrite, progress)
     return parts
+
+
+def read_audit(crops: Path) -> list[Part]:
+    """The audit of the split, of all shards, as it stands in the file."""
+    with open_artefact(crops, CROPS) as file:
+        return [Part(**part) for part in json.loads(file.attrs["split_audit"])]
 
 
 class PositionMasks:
@@ -361,6 +369,7 @@ def _write(
     part: slice,
     crop: int,
     config: Config,
+    audited: list[Part],
     overwrite: bool,
     progress: Progress | None,
 ) -> None:
@@ -374,6 +383,7 @@ def _write(
         "scene_sha256": digest,
         "tile_m": tiles.edge * grid.gsd,
         "pairs_in_all_shards": np.int64(len(chosen)),
+        "split_audit": json.dumps([asdict(p) for p in audited]),
     }
     stored = asdict(config) | {"crop": crop}
     half = crop // 2

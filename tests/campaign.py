@@ -69,27 +69,68 @@ def random_world(rng: np.random.Generator) -> dict:
 
 def diagnose(path: Path) -> dict:
     """The JSON that a user would get."""
-    import torch
-
     from stages import diagnose as stage
 
-    torch.set_num_threads(2)
     return stage.run(path).answer.to_json()
 
 
 def case(scene: Scene, effect: dict, seed: int, folder: Path) -> dict:
     rng = np.random.default_rng((seed, 99))
-    truth = Truth(effect=effect, **random_world(rng))
-    write_pairs(folder / "pairs.h5", scene.make(truth, seed), scene.layout)
+    world = random_world(rng)
+    path = write_pairs(folder / "pairs.h5", scene.make(Truth(effect=effect, **world), seed), scene.layout)
     started = time.perf_counter()
-    found = diagnose(folder / "pairs.h5")
+    found = diagnose(path)
+    seconds = time.perf_counter() - started
+    fid, possible = 0.0, None
+    if effect:
+        twin = write_pairs(folder / "twin.h5", scene.make(Truth(**world), seed), scene.layout)
+        fid, possible = strength(path, twin, world["snr"])
     return {
         "seed": seed,
         "scene": scene.layout.seed,
         "planted": effect,
-        "seconds": time.perf_counter() - started,
+        "fid": fid,
+        "possible_gain_percent": possible,
+        "seconds": seconds,
         "answer": found,
     }
+
+
+def strength(planted: Path, twin: Path, snr: float) -> tuple[float, float]:
+    """What the effect leaves once nominal model and static texture are out, over the noise; and the gain of undoing it.
+
+    The twin is the same world, noise included, with nothing hidden. The gain is in percent of the mean squared error on
+    the test split.
+    """
+    import torch
+
+    from stages.diagnose.data import group_pairs, load_site
+    from stages.diagnose.nominal import fit, lit_mask, load_nominal
+    from stages.network.dataset import PairReader
+
+    residuals, errors = [], []
+    for path in (planted, twin):
+        with PairReader(path) as reader, torch.no_grad():
+            train, test = np.flatnonzero(reader.split != 2), np.flatnonzero(reader.split == 2)
+            sites = [load_site(reader, g) for g in group_pairs(reader, train, 99)]
+            nominal = load_nominal(None, "M2", reader.units)
+            fit(nominal, sites, [], reader.units, [s.image for s in sites])
+            chains = [nominal.chain(s, []) for s in sites]
+            residuals.append([(c.site.image - c.predict(), lit_mask(c), c.predict()) for c in chains])
+            unseen = [nominal.chain(load_site(reader, g), []) for g in group_pairs(reader, test, 99)]
+            squares = [((c.site.image - c.predict())[lit_mask(c)]).double().square() for c in unseen]
+            errors.append(float(torch.cat(squares).mean()))
+    total, count = 0.0, 0
+    for (first, lit, level), (second, also, _) in zip(*residuals, strict=True):
+        mean = (level * lit).sum((-2, -1), keepdim=True) / lit.sum((-2, -1), keepdim=True).clamp(min=1)
+        noise = mean / snr * (0.8 * level / mean + 0.2).clamp(min=0.05).sqrt()
+        use = (lit & also) / noise
+        difference, texture = (first - second) * use, level * use
+        share = (difference * texture).sum(0) / texture.square().sum(0).clamp(min=1e-12)
+        difference = difference - share * texture
+        total += float(difference.double().square().sum())
+        count += int((use > 0).sum())
+    return float(np.sqrt(total / max(count, 1))), 100 * (1 - errors[1] / errors[0])
 
 
 def summarise(cases: list[dict]) -> str:
@@ -107,6 +148,26 @@ def summarise(cases: list[dict]) -> str:
     lines.append(f"| planted cause within the group | {_share(len(group), len(single))} |")
     wrong = [c for c in single if _first(c) not in ("", next(iter(c["planted"])))]
     lines.append(f"| another cause named first | {_share(len(wrong), len(single))} |")
+    for low in (0.03, 0.06):
+        strong = [c for c in single if c["fid"] >= low]
+        hits = [c for c in strong if _first(c) == next(iter(c["planted"]))]
+        lines.append(f"| ... where it is at least {low} of the noise: named first | {_share(len(hits), len(strong))} |")
+        near = [c for c in strong if next(iter(c["planted"])) in _group(c)]
+        lines.append(
+            f"| ... where it is at least {low} of the noise: within the group | {_share(len(near), len(strong))} |"
+        )
+    weak = [c for c in single if c["fid"] < 0.03]
+    silent = [c for c in weak if c["answer"]["verdict"] == "nothing_significant"]
+    lines.append(f"| weaker than 0.03: `nothing_significant` | {_share(len(silent), len(weak))} |")
+    worth = [
+        c["answer"]["held_out"]["gain_percent"] / c["possible_gain_percent"]
+        for c in first
+        if c["possible_gain_percent"] > 3 and c["answer"]["held_out"]["gain_percent"] is not None
+    ]
+    if worth:
+        lines.append(
+            f"| held-out gain over that of the world without the effect, median of {len(worth)} | {np.median(worth):.2f} |"
+        )
     double = [c for c in cases if len(c["planted"]) == 2]
     both = [c for c in double if set(c["planted"]) <= {x["effect"] for x in c["answer"]["causes"]}]
     third = [c for c in double if {x["effect"] for x in c["answer"]["causes"]} - set(c["planted"])]
@@ -121,8 +182,8 @@ def summarise(cases: list[dict]) -> str:
     lines.append(f"| seconds per diagnosis, median / largest | {np.median(seconds):.1f} / {max(seconds):.1f} |")
     lines += [
         "",
-        "| planted | strength | named first | blind | verdicts | parameter, found / planted |",
-        "|---|---|---|---|---|---|",
+        "| planted | strength | over noise | named first | blind | verdicts | parameter, found / planted |",
+        "|---|---|---|---|---|---|---|",
     ]
     for effect in PLANTS:
         for strength in sorted({_strength(c) for c in single if effect in c["planted"]}):
@@ -130,8 +191,9 @@ def summarise(cases: list[dict]) -> str:
             hit = [c for c in mine if _first(c) == effect]
             blind = sum(effect in c["answer"]["blind"] for c in mine)
             verdicts = ", ".join(f"{k} {v}" for k, v in Counter(c["answer"]["verdict"] for c in mine).items())
+            fid = " ".join(f"{c['fid']:.2f}" for c in mine)
             lines.append(
-                f"| `{effect}` | {strength:.3g} | {len(hit)} of {len(mine)} | {blind} | {verdicts} | {_ratio(effect, hit)} |"
+                f"| `{effect}` | {strength:.3g} | {fid} | {len(hit)} of {len(mine)} | {blind} | {verdicts} | {_ratio(effect, hit)} |"
             )
     return "\n".join(lines) + "\n"
 
@@ -199,9 +261,9 @@ def main() -> None:
     parser.add_argument("--plants", type=int, default=1, help="per effect, strength and scene")
     parser.add_argument("--strengths", type=float, nargs="+", default=[1.0])
     parser.add_argument("--doubles", type=int, default=4, help="per scene")
-    parser.add_argument("--sites", type=int, default=4)
+    parser.add_argument("--sites", type=int, default=5, help="the last one is the test split")
     parser.add_argument("--images", type=int, default=12)
-    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--only", nargs="*", default=None)
     parser.add_argument("--output", type=Path, required=True)
     options = parser.parse_args()
@@ -213,17 +275,19 @@ def main() -> None:
         for _ in range(options.scenes):
             layout = Layout(
                 seed=int(rng.integers(2**31)), sites=options.sites, images=options.images, size=options.size,
-                slope_deg=float(rng.uniform(5, 10)),
+                slope_deg=float(rng.uniform(5, 10)), gsd=float(rng.choice([2.0, 5.0, 20.0])),
+                sun_elevations=(float(rng.uniform(6, 14)), float(rng.uniform(55, 75))),
             )  # fmt: skip
             scene = Scene(layout, cache)
             jobs: list[dict] = [{} for _ in range(options.nulls)]
-            for effect, values in PLANTS.items():
+            crop = layout.size * layout.gsd
+            wall = {"height_m": 0.19 * crop, "side": "west", "distance_m": 0.45 * crop}
+            for effect, values in (PLANTS | {"distant_shadow": wall}).items():
                 if options.only is not None and effect not in options.only:
                     continue
                 key = next(iter(values))
-                jobs += [
-                    {effect: {**values, key: values[key] * s}} for s in options.strengths for _ in range(options.plants)
-                ]
+                strengths = [1.0] if effect == "saturation" else options.strengths  # a level, not a size
+                jobs += [{effect: {**values, key: values[key] * s}} for s in strengths for _ in range(options.plants)]
             if options.only is None:
                 jobs += [{k: v} for k, v in UNKNOWN.items() for _ in range(options.plants)]
                 for _ in range(options.doubles):
@@ -240,10 +304,10 @@ def main() -> None:
                 print(
                     f"{','.join(job) or 'nothing':24s} -> {answer['verdict']:20s} "
                     f"{[(c['effect'], {k: p['value'] for k, p in c['parameters'].items()}, round(c['gain_nats'])) for c in answer['causes']]} "
-                    f"closest {answer['closest']} blind {len(answer['blind'])} {done['seconds']:.1f} s",
+                    f"closest {answer['closest']} blind {len(answer['blind'])} fid {done['fid']:.3f} {done['seconds']:.1f} s",
                     flush=True,
                 )
-            options.output.with_suffix(".json").write_text(json.dumps(cases, indent=1))
+                options.output.with_suffix(".json").write_text(json.dumps(cases, indent=1))
             options.output.with_suffix(".md").write_text(summarise(cases))
             picture(cases, options.output.with_suffix(".png"))
     print(summarise(cases))

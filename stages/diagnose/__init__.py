@@ -10,7 +10,6 @@ unexplained  what is left, what cannot be seen answer      verdict, JSON, diagno
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ import numpy as np
 import torch
 
 from schemas import ArtefactError, ConfigError, atomic_path, check_output
-from stages.diagnose.answer import Answer, cause_json, held_out, parameters, write_diagnosis
+from stages.diagnose.answer import Answer, HeldOut, cause_json, held_out, parameters, write_diagnosis
 from stages.diagnose.data import group_pairs, load_site, survey
 from stages.diagnose.looking import Round
 from stages.diagnose.nominal import fit, lit_mask, load_nominal
@@ -28,7 +27,7 @@ from stages.diagnose.plateau import CLEAR_OF, KEEP_BELOW, plateau, saturated
 from stages.diagnose.selection import enough, search
 from stages.diagnose.state import Search
 from stages.diagnose.unexplained import Structure, blind_effects, measure
-from stages.effects import effect_names
+from stages.effects import Effect, effect_names
 from stages.network.dataset import PairReader
 
 HARM = 10.0  # percent by which unseen pairs may be predicted worse (the same texture in all images of few sites can do that)
@@ -37,9 +36,10 @@ MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model say
 
 @dataclass(frozen=True)
 class Config:
-    """model : fitted where there is no checkpoint; most_pairs, most_sites : used for the search."""
+    """model : fitted where there is no checkpoint, in its coefficients ``free`` (() for all); most_pairs, most_sites : used for the search."""
 
     model: str = "M2"
+    free: tuple[str, ...] = ()
     most_causes: int = 4
     most_images: int = 16
     most_pairs: int = 384
@@ -98,7 +98,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
             f"{reader.path}:/sun_horizon_deg: expected the terrain horizon (without it shadows cannot be told from dark ground), "
             "found none; write the pairs again with 'lunargr project'."
         )
-    nominal = load_nominal(checkpoint, config.model, reader.units)
+    nominal = load_nominal(checkpoint, config.model, reader.units, config.free)
     train, test = _split(reader)
     groups = group_pairs(reader, train, config.most_images)
     sites, used = [], 0
@@ -124,7 +124,6 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
             site.valid &= nominal.chain(site, []).textured < CLEAR_OF * cut
         valid = [s.valid for s in sites]
         fit(nominal, sites, [], reader.units, measured)
-    first = copy.copy(nominal)
     data = survey(sites, len(reader.image_ids))
     has = frozenset({"sun_horizon"})
     state = Search(
@@ -147,13 +146,20 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     hidden = [load_site(reader, g) for g in group_pairs(reader, test, config.most_images)[:64]]
     tiles = [reader.tile[s.pairs] for s in hidden]
     effects = [c.effect for c in answer.causes]
+    # shifts that are ordinary, and no cause, are taken out under both models
+    shifts = [] if state.aligned is None or any(e.name == state.aligned.name for e in effects) else [state.aligned]
     for site in hidden if cut is not None else []:
         site.valid &= site.image < KEEP_BELOW * cut
-    answer.held_out = held_out(hidden, tiles, first, nominal if effects else first, effects, state.dn, config.seed)
+
+    def score(causes: list[Effect]) -> HeldOut:
+        models = (state.reference, nominal if causes else state.reference)
+        return held_out(hidden, tiles, models, (shifts, [*causes, *shifts]), state.dn, config.seed)
+
+    answer.held_out = score(effects)
     if effects and answer.held_out.high < -HARM:  # a model that predicts unseen ground worse explains nothing
         answer.verdict, answer.closest, answer.causes = "unexplained", [c.effect.name for c in answer.causes], []
         answer.unexplained_fraction = 1.0
-        answer.held_out = held_out(hidden, tiles, first, first, [], state.dn, config.seed)
+        answer.held_out = score([])
     return Result(answer, state, seen, structure)
 
 

@@ -48,17 +48,22 @@ class HeldOut:
 
 
 def held_out(
-    sites, tiles, nominal: Nominal, extended: Nominal, effects: Sequence[Effect], dn: bool, seed: int
+    sites,
+    tiles,
+    models: tuple[Nominal, Nominal],
+    effects: tuple[Sequence[Effect], Sequence[Effect]],
+    dn: bool,
+    seed: int,
 ) -> HeldOut:
-    """Score both models on sites that were kept away; in dn both get their own gain and offset per pair."""
+    """Score two models, each with its effects, on sites that were kept away; in dn both get a gain and offset per pair."""
     sums: list[tuple[int, float, float, int]] = []
     pairs = 0
     for site, tile in zip(sites, tiles, strict=True):
         squares = []
-        for model, chosen in ((nominal, []), (extended, list(effects))):
+        for model, chosen in zip(models, effects, strict=True):
             chain = model.chain(site, chosen)
             predicted = chain.predict()
-            mask = lit_mask(nominal.chain(site, []))
+            mask = lit_mask(models[0].chain(site, []))
             raw = site.image * site.gain[:, None, None] + site.offset[:, None, None]
             if dn:
                 _scale(site, raw, predicted, mask)

@@ -21,7 +21,8 @@ SCATTER = 0.14  # 8 deg: rms slope of relief below a typical DEM's resolution
 class Chain:
     """Renders a site with the effects named so far (``base``) plus one more.
 
-    coefficients : broadcastable to (n, C, H, W). moved : effects that the site's images are free of already. Templates carry the site's albedo texture; predictions do not.
+    coefficients : broadcastable to (n, C, H, W). moved : effects that the site's images are rid of; free : coefficients
+    that may move, None for all. Templates carry the site's albedo texture; predictions do not.
     """
 
     def __init__(
@@ -31,9 +32,11 @@ class Chain:
         coefficients: Tensor,
         base: Sequence[Effect],
         moved: Sequence[Effect] = (),
+        free: Tensor | None = None,
     ) -> None:
         self.site, self.model, self.coefficients, self.base = site, model, coefficients, list(base)
         self.moved = list(moved)
+        self.free = free
         self._state = formation.illuminate(site.observation, self.base)
         self._state.reflectance = self._surface(self._state)
         self.textured = self.render()
@@ -77,9 +80,11 @@ class Chain:
         return self._expose(self._state, self._state.reflectance, effects)
 
     def surface_tangents(self) -> list[Tensor]:
-        """d image / d coefficient, one (n, H, W) per coefficient: the nominal model's own freedom."""
+        """d image / d coefficient, one (n, H, W) per free coefficient: the nominal model's own freedom."""
         columns = []
         for k in range(self.coefficients.shape[1]):
+            if self.free is not None and not bool(self.free[k]):
+                continue
             c = self.coefficients.clone()
             step = 0.05 * float(c[:, k].abs().mean()) + 1e-4
             c[:, k] += step

@@ -189,12 +189,12 @@ def _weigh(name: str, folds: list[_Fold], frames: int, rows: float) -> ImageEvid
     )  # fmt: skip
 
 
-def as_effect(evidence: ImageEvidence, known: Effect | None, data: Survey) -> Effect:
-    """The effect with its values per image; increments are added to values known already."""
+def as_effect(evidence: ImageEvidence, known: Effect | None, data: Survey, share: float = 1.0) -> Effect:
+    """The effect with its values per image; ``share`` of the increments is added to values known already."""
     cls = get_effect(evidence.effect)
     values = {}
     for k, parameter in enumerate(cls.fitted()):
-        increment = evidence.values[:, k]
+        increment = share * evidence.values[:, k]
         values[parameter.name] = increment + known.values[parameter.name] if known is not None else increment
     return cls(values, data)
 

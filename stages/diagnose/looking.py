@@ -11,7 +11,7 @@ import torch
 
 from stages.diagnose.chain import Chain
 from stages.diagnose.evidence import Evidence, best_guises, weigh
-from stages.diagnose.images import ImageEvidence, weigh_images
+from stages.diagnose.images import FEWEST, ImageEvidence, as_effect, weigh_images
 from stages.diagnose.pattern import PatternEvidence, weigh_pattern
 from stages.diagnose.projection import FREE_SLOPES
 from stages.diagnose.state import Search
@@ -35,6 +35,10 @@ from stages.effects import get_effect
 RELIEF_WIDTHS = (1.6, 4.0)  # deg: relief below the DEM's resolution blurs shadow edges like discs of these radii
 LADDER = (0.72, 0.82, 0.92, 1.0, 1.08, 1.2, 1.35)  # of a wall's height ...
 DISTANCES = (0.04, 1.0, 3.0)  # ... and of its distance, about the best of the first ladder
+ALIGNMENTS = 3
+OVERSHOOT = 1.5  # texture and slopes, known from images that are not aligned yet, hide a third of each shift
+ENOUGH_PX = 0.06
+SURE = 0.01  # of the two halves of the blocks agreeing by chance
 GROUND = {"dem_smoothing": (), "dem_scale": ("dem_smoothing",)}  # effect -> nuisances fitted along
 
 
@@ -102,6 +106,25 @@ def look(state: Search, names: Sequence[str]) -> Round:
         _slope_error(works),
         evidence,
     )
+
+
+def align(state: Search) -> ImageEvidence | None:
+    """Estimate the shift of every image and take it out of the measurement; the evidence for shifts at all, if any.
+
+    A shift of a third of a pixel is ordinary and no cause, but its second order looks like a blur or a reflectance.
+    """
+    cls, first = get_effect("misregistration"), None
+    for _ in range(ALIGNMENTS if state.deepest >= FEWEST else 0):
+        works = [ready(chain, state.dn) for chain in state.chains()]
+        found = weigh_images(works, [cls.name], state.frames, state.dn, state.data).get(cls.name)
+        if found is None or found.p > SURE or found.gain < 0:
+            break
+        first = first or found
+        state.aligned = as_effect(found, state.aligned, state.data, OVERSHOOT)
+        state.fit()
+        if found.rms < ENOUGH_PX:
+            break
+    return first
 
 
 def _gather_relief(work: SiteWork, name: str, state: Search) -> Statistics:

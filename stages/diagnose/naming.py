@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import torch
@@ -110,6 +111,18 @@ def worth_image(e: ImageEvidence, count: int) -> bool:
     return e.rms > 1.1 * cls.tolerance[cls.parameters[0].name]
 
 
+def misaligned(state: Search, e: ImageEvidence) -> Cause | None:
+    """The shifts that were taken out of the images as a cause, where they are more than every data set has."""
+    count, effect = len(effect_names()), state.aligned
+    cls = type(effect)
+    e = dataclasses.replace(e, values=torch.stack([effect.values[p.name] for p in cls.fitted()], 1))
+    seen = e.values.abs().sum(1) > 0
+    e.rms = float(e.values[seen].square().sum(1).mean().sqrt()) if bool(seen.any()) else 0.0
+    if not worth_image(e, count):
+        return None
+    return Cause(effect, min(1.0, e.p * count), e.gain, e.gain_error, e.fid, [cls.name], image_evidence=e)
+
+
 def _pattern(state: Search, e: PatternEvidence | None, count: int) -> Cause | None:
     """A broad albedo pattern: named last, since terrain, columns and the nominal model make such patterns too."""
     if e is None or e.p * count > GATE or e.gain < FLOOR_GAIN:
@@ -139,4 +152,4 @@ def _as_good(first: Evidence, other: Evidence) -> bool:
     return float(difference.sum()) < 2 * error and other.gain > 0.5 * first.gain
 
 
-__all__ = ["FLOOR_FID", "choose", "worth", "worth_image"]
+__all__ = ["FLOOR_FID", "SIMPLER", "choose", "misaligned", "worth", "worth_image"]

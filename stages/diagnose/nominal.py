@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from schemas.errors import ArtefactError
+from schemas.errors import ArtefactError, RegistryError
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import GRAZING, MARGIN, Site
 from stages.effects import Effect
@@ -20,12 +20,12 @@ ROUNDS = 10
 
 @dataclass
 class Nominal:
-    """``source`` is 'fitted' or 'checkpoint'. ``vector`` (C,) scales maps (checkpoint) or is the set itself (fitted)."""
+    """``vector`` (C,) scales maps (checkpoint) or is the set itself (fitted); ``free`` (C,) bool is what a fit may move."""
 
     model: ReflectanceModel
     vector: Tensor
+    free: Tensor
     predictor: object = None
-    source: str = "fitted"
 
     def coefficients(self, site: Site) -> Tensor:
         """(1 or n, C, 1 or H, 1 or W)"""
@@ -35,14 +35,24 @@ class Nominal:
         return self.predictor.coefficients(site.observation.elevation[:1]) * vector
 
     def chain(self, site: Site, base: Sequence[Effect], moved: Sequence[Effect] = ()) -> Chain:
-        return Chain(site, self.model, self.coefficients(site), base, moved)
+        free = self.free if self.predictor is None else None  # maps may still drift
+        return Chain(site, self.model, self.coefficients(site), base, moved, free)
 
 
-def load_nominal(checkpoint: Path | None, model: str, units: str) -> Nominal:
-    """From a checkpoint, or with default coefficients that :func:`fit` improves. Raises ArtefactError, RegistryError."""
+def load_nominal(checkpoint: Path | None, model: str, units: str, free: Sequence[str] = ()) -> Nominal:
+    """From a checkpoint, or with default coefficients that :func:`fit` improves.
+
+    free : the coefficients that it may move, the others stay at their published values; () for all
+    Raises ArtefactError, RegistryError.
+    """
     if checkpoint is None:
         reflectance = get_model(model)
-        return Nominal(reflectance, torch.tensor([p.default for p in reflectance.parameters]))
+        names = [p.name for p in reflectance.parameters]
+        for name in free:
+            if name not in names:
+                raise RegistryError.unknown(f"coefficient of {model}", name, names)
+        chosen = torch.tensor([not free or name in free for name in names])
+        return Nominal(reflectance, torch.tensor([p.default for p in reflectance.parameters]), chosen)
     from stages.network.predictor import load_predictor
 
     predictor = load_predictor(checkpoint, "cpu")
@@ -52,7 +62,7 @@ def load_nominal(checkpoint: Path | None, model: str, units: str) -> Nominal:
             "train on the pairs that are to be diagnosed, or use --model."
         )
     count = len(predictor.model.parameters)
-    return Nominal(predictor.model, torch.ones(count), predictor, "checkpoint")
+    return Nominal(predictor.model, torch.ones(count), torch.zeros(count, dtype=torch.bool), predictor)
 
 
 def lit_mask(chain: Chain) -> Tensor:
@@ -88,8 +98,9 @@ def fit(
             continue
         scale = gram.diagonal()[felt].rsqrt()
         normal = gram[felt][:, felt] * scale[:, None] * scale + damping * torch.eye(len(scale), dtype=torch.float64)
+        places = torch.nonzero(nominal.free)[:, 0][felt]
         step = torch.zeros(len(vector))
-        step[felt] = (torch.linalg.solve(normal, score[felt] * scale) * scale).float()
+        step[places] = (torch.linalg.solve(normal, score[felt] * scale) * scale).float()
         nominal.vector = vector + step
         if not nominal.model.linear:
             low = torch.tensor([p.lower for p in nominal.model.parameters])
@@ -110,8 +121,9 @@ def _normal_equations(
     fitted: bool,
 ) -> tuple[Tensor, Tensor, float]:
     """Gram matrix and score of the coefficients (zero unless ``fitted``), and the mean squared residual they come from."""
-    gram = torch.zeros(len(nominal.vector), len(nominal.vector), dtype=torch.float64)
-    score = torch.zeros(len(nominal.vector), dtype=torch.float64)
+    count_free = int(nominal.free.sum())
+    gram = torch.zeros(count_free, count_free, dtype=torch.float64)
+    score = torch.zeros(count_free, dtype=torch.float64)
     cost, count = 0.0, 0.0
     for site, raw in zip(sites, measured, strict=True):
         chain = nominal.chain(site, base)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 
 from stages.diagnose.data import Site
-from stages.diagnose.looking import Round, look, misfit, narrowed
-from stages.diagnose.naming import FLOOR_FID, SIMPLER, choose
+from stages.diagnose.looking import Round, align, look, misfit, narrowed
+from stages.diagnose.naming import FLOOR_FID, SIMPLER, choose, misaligned
 from stages.diagnose.refining import refine
 from stages.diagnose.state import Cause, Saved, Search
 
@@ -14,19 +15,30 @@ REFUSALS = 3
 QUIET_GAIN = 6.0  # nats below which an effect, in the look before, is not looked at again
 SLIGHT = 0.005  # of what is left: by so much a simpler cause may do worse
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
+PROMISE = 0.25  # share of the foretold gain that a cause must bring once it is in the model
 
 
 def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
     """Name causes one after the other; returns the last look, at what is left."""
+    rms_as_read, state.reference = state.residual_rms(), copy.copy(state.nominal)
+    shifts = align(state)
+    if shifts is not None:
+        shifted = misaligned(state, shifts)
+        if shifted is not None:
+            say(f"found {shifted.effect.name}: gain {shifted.gain:.0f} +- {shifted.gain_error:.0f} nats")
+            shifted.rms_before, shifted.rms_after = rms_as_read, state.residual_rms()
+            state.causes.append(shifted)
+        else:  # ordinary shifts are no part of a gain
+            state.reference = copy.copy(state.nominal)
     seen = look(state, state.open_names())
     while len(state.causes) < most:
         rivals = choose(state, seen)
         if not rivals:
             return seen
-        before, rms = state.save(), state.residual_rms()
-        cause = _contest(state, rivals, seen)
+        before, rms, nothing = state.save(), state.residual_rms(), misfit(state, seen.works)
+        cause = _contest(state, rivals, seen, nothing)
         cause.rms_before, cause.rms_after = rms, state.residual_rms()
-        if not cause.rms_after < WORSE * cause.rms_before:
+        if not _kept_promise(state, cause, seen, nothing):
             state.load(before)
             state.refused.add(cause.effect.name)
             if len(state.refused) > REFUSALS:
@@ -44,14 +56,23 @@ def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
     return seen
 
 
-def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
+def _kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> bool:
+    """Whether the model with the cause in it fits better by what its linear estimate said."""
+    if cause.effect.channel in ("albedo", "relief"):  # the rows that are free of the ground do not know them
+        return True
+    if cause.effect.channel == "edge":  # judged in pixels that are masked here
+        return cause.rms_after < WORSE * cause.rms_before
+    return nothing - misfit(state, seen.works) > PROMISE * 2 * cause.gain
+
+
+def _contest(state: Search, rivals: list[Cause], seen: Round, nothing: float) -> Cause:
     """Take the cause into the model that leaves least once everything is fitted again; the state holds it afterwards."""
     if len(rivals) == 1:
         state.causes.append(rivals[0])
         if rivals[0].effect.scope != "site":
             refine(state, 3 if rivals[0].effect.displaces else 2)
         return rivals[0]
-    before, nothing = state.save(), misfit(state, seen.works)
+    before = state.save()
     tried: list[tuple[float, int, Saved]] = []
     for cause in rivals:
         state.load(before)

@@ -56,6 +56,8 @@ class Search:
     causes: list[Cause] = field(default_factory=list)
     measured: list[Tensor] = field(default_factory=list)
     valid: list[Tensor] = field(default_factory=list)
+    aligned: Effect | None = None  # shifts of the images, estimated before anything else
+    reference: Nominal | None = None  # the nominal model before any cause was named
     refused: set[str] = field(default_factory=set)  # looked good to the linear model, and made things worse
 
     @property
@@ -72,8 +74,16 @@ class Search:
         return max((s.count for s in self.sites), default=0)
 
     def chains(self) -> list[Chain]:
-        still, moved = self.still, [e for e in self.base if e.displaces]
+        still, moved = self.still, self.moved
         return [self.nominal.chain(site, still, moved) for site in self.sites]
+
+    @property
+    def moved(self) -> list[Effect]:
+        """What is taken out of the images: named displacements, or the shifts that every data set has a little of."""
+        named = [e for e in self.base if e.displaces]
+        if self.aligned is not None and all(e.name != self.aligned.name for e in named):
+            named.append(self.aligned)
+        return named
 
     @property
     def still(self) -> list[Effect]:
@@ -86,7 +96,7 @@ class Search:
         Where images are moved against each other no column per ground pixel is the same in all of them: the model
         stays where it is, and the measurement moves.
         """
-        moved = [e for e in self.base if e.displaces]
+        moved = self.moved
         images = []
         for site, image, valid in zip(self.sites, self.measured, self.valid, strict=True):
             east, south = displacement(site, moved)
@@ -131,7 +141,7 @@ class Search:
 
     def open_names(self) -> list[str]:
         """Effects that are neither named nor excluded by the kind of data."""
-        closed = {c.effect.name for c in self.causes} | self.refused
+        closed = {c.effect.name for c in self.causes} | self.refused | {"misregistration"}  # judged by ``align``
         if self.dn:
             closed.add("image_gain")
         if self.deepest < FEWEST:  # one look at the ground: albedo and shading are the same thing
