@@ -57,7 +57,7 @@ demo: $(D)/report.html ## run every stage on the embedded scene and name a repor
 	@echo; echo "Open $(abspath $(D)/report.html)"
 
 $(D)/scene/images.csv: | $(STAMP)
-	$(LUNARGR) simulate -o $(D)/scene --overwrite
+	$(LUNARGR) simulate -o $(D)/scene --hidden sun_azimuth:error_deg=5 --overwrite
 
 $(D)/scene.h5: $(D)/scene/images.csv
 	$(LUNARGR) ingest $(D)/scene/dem.tif --images $(D)/scene/images.csv --gsd 5 -o $@ --overwrite

@@ -16,6 +16,27 @@ Shard = Annotated[
     str | None,
     typer.Option("--shard", metavar="I/N", help="Do only part I of N (1-based); join the parts with 'lunargr merge'."),
 ]
+ResumeParts = Annotated[
+    bool,
+    typer.Option(
+        "--resume",
+        help="Work in parts that an interrupted run leaves finished; the same command then goes on with the rest.",
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS|local:N",
+        help="Work in parts on Dask: N processes of this machine, or the workers of a scheduler; goes on like --resume.",
+    ),
+]
+Parts = Annotated[
+    int | None,
+    typer.Option(
+        "--parts", metavar="N", min=1, help="With --scheduler or --resume: how many parts (default: by size)."
+    ),
+]
 Seed = Annotated[int, typer.Option("--seed", help="Seed of every random choice.")]
 Device = Annotated[str, typer.Option("--device", help="cpu, cuda, cuda:1, ... or auto.")]
 BodyOption = Annotated[
@@ -36,3 +57,15 @@ def parse_shard(text: str | None) -> tuple[int, int]:
     if first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last):
         return int(first) - 1, int(last)
     raise ConfigError(f"--shard: expected I/N with 1 <= I <= N, found '{text}'.")
+
+
+def in_parts(scheduler: str | None, resume: bool, parts: int | None, shard: str | None) -> bool:
+    """Whether a command works in parts. Raises ConfigError."""
+    wanted = scheduler is not None or resume
+    if wanted and shard is not None:
+        raise ConfigError(
+            "--shard: one part by hand; --scheduler and --resume make all parts themselves. Give one of them."
+        )
+    if parts is not None and not wanted:
+        raise ConfigError("--parts: expected --scheduler or --resume beside it.")
+    return wanted

@@ -18,19 +18,31 @@ from stages.effects import load_extension
 
 # What two sites of 64 px in ten images can show, with the first parameter's relative error where it is recovered.
 SHOWN = {
-    "misregistration": 0.15,
+    "misregistration": None,  # the campaign plants a mean size; the drawn shifts are compared below
+    "dem_smoothing": 0.35,
+    "dem_scale": 0.5,
     "line_jitter": 0.3,
-    "sun_azimuth": 0.2,
-    "distant_shadow": None,
+    "sun_elevation": 0.15,
+    "sun_azimuth": 0.1,
+    "distant_shadow": 0.3,
+    "interreflection": 0.3,
+    "earthshine": 0.2,
     "opposition_surge": 0.1,
     "phase_slope": 0.1,
-    "limb_darkening": 0.15,
-    "slope_albedo": 0.3,
-    "elevation_albedo": 0.3,
-    "curvature_albedo": 0.3,
-    "azimuthal_anisotropy": 0.15,
-    "image_gain": 0.4,
-    "psf_blur": 0.3,
+    "limb_darkening": 0.1,
+    "macroscopic_roughness": 0.1,
+    "slope_albedo": 0.25,
+    "elevation_albedo": 0.25,
+    "curvature_albedo": 0.25,
+    "albedo_map": 0.25,
+    "azimuthal_anisotropy": 0.1,
+    "image_gain": 0.35,
+    "dark_bias": 0.1,
+    "nonlinearity": 0.35,
+    "psf_blur": 0.25,
+    "column_pattern": None,  # its rms is over the columns that these crops happen to show
+    "echo": 0.15,
+    "saturation": 0.05,
 }
 
 
@@ -60,13 +72,27 @@ def test_planted_cause_is_named(scene, tmp_path, effect):
         assert found["unit"]
 
 
-@pytest.mark.parametrize("effect", [e for e in PLANTS if e not in SHOWN])
-def test_other_plants_are_answered_without_a_crash(scene, tmp_path, effect):
-    """These data are too few, or the effect too weak, to demand the name: the answer must still be whole."""
-    answer = diagnose.run(_pairs(scene, tmp_path, {effect: PLANTS[effect]})).answer.to_json()
-    assert answer["verdict"] in ("named", "nothing_significant", "unexplained", "cannot_tell")
-    assert (answer["verdict"] == "named") == bool(answer["causes"])
-    assert answer["held_out"]["gain_percent_high"] >= -1
+def test_a_wide_sun_looks_like_relief(scene, tmp_path):
+    """A DEM with errors of more than a degree blurs every shadow: what cannot be shown is said, not denied."""
+    answer = diagnose.run(_pairs(scene, tmp_path, {"penumbra": PLANTS["penumbra"]})).answer
+    assert set(SHOWN) == set(PLANTS) - {"penumbra"}
+    assert answer.verdict == "cannot_tell" and "penumbra" in answer.blind
+
+
+def test_shifts_come_back(scene, tmp_path):
+    """Shift by shift: the mean shift of all images is the DEM's own to give, so differences are compared."""
+    world = random_world(np.random.default_rng((11, 99)))
+    truth = Truth(effect={"misregistration": PLANTS["misregistration"]}, **world)
+    rng = np.random.default_rng((11, 5))
+    for site in range(scene.layout.sites):
+        scene.given_dem(site, truth, rng)
+    planted = np.array([scene._frame(rng, truth)[0].error for _ in range(scene.layout.images)])
+    cause = diagnose.run(_pairs(scene, tmp_path, truth.effect)).answer.causes[0]
+    found = np.stack([cause.effect.values[k].numpy() for k in ("south_px", "east_px")], 1)
+    high = np.array([sun[2] for sun in scene.suns]) > np.sin(np.radians(20))  # a low Sun leaves hardly a lit pixel
+    difference = (found - found[high].mean(0)) - (planted - planted[high].mean(0))
+    assert np.abs(difference[high]).max() < 0.12
+    assert np.sqrt((difference[high] ** 2).mean()) < 0.06
 
 
 @pytest.mark.parametrize("seed", [21, 22, 23, 24])
@@ -176,5 +202,6 @@ def test_projection_leaves_no_texture_and_no_slope_error(scene, tmp_path):
     error = 0.05 * torch.randn(64, 64) * chain.textured + 0.02 * torch.randn(64, 64) * east
     error = error + 0.02 * torch.randn(64, 64) * north
     projector = Projector(chain, site.valid.float())
-    dynamic, _ = projector.split(error[None])
+    weighted = (error * projector.weight)[None]
+    dynamic = projector.project_(weighted, projector.coefficients(weighted))
     assert float(dynamic.square().sum()) < 1e-6 * float(error.square().sum())

@@ -27,6 +27,10 @@ def command(
     report: Annotated[
         Path | None, typer.Option("--report", metavar="FILE", help="One HTML file with pictures and evidence.")
     ] = None,
+    free: Annotated[
+        str,
+        typer.Option("--free", help="Coefficients of --model that are fitted, by commas; the others stay published."),
+    ] = "",
     list_effects: Annotated[bool, typer.Option("--list", help="Explain every effect and stop.")] = False,
     most_causes: Annotated[int, typer.Option("--causes", help="Most causes to name.")] = 4,
     most_pairs: Annotated[int, typer.Option("--pairs", help="Most pairs that the search uses.")] = 384,
@@ -48,7 +52,8 @@ def command(
     from stages import diagnose
     from stages.diagnose.answer import describe
 
-    config = diagnose.Config(model, most_causes, most_pairs=most_pairs, seed=seed)
+    chosen = tuple(name.strip() for name in free.split(",") if name.strip())
+    config = diagnose.Config(model, chosen, most_causes, most_pairs=most_pairs, seed=seed)
     result = diagnose.run(
         pairs, checkpoint, config, output, json_file, report, overwrite, console.say, console.progress
     )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Device, Json, Output, Overwrite, Quiet, Seed
+from lunargr_cli.options import Device, Json, Output, Overwrite, Quiet, ResumeParts, Scheduler, Seed
 
 NAME, ORDER = "evaluate", 70
 
@@ -44,6 +44,8 @@ def command(
     seed: Seed = 0,
     device: Device = "auto",
     json_file: Json = None,
+    scheduler: Scheduler = None,
+    resume: ResumeParts = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -58,17 +60,15 @@ def command(
 
     console = Console(quiet)
     config = evaluate.Config(split, batch, bootstrap, fit_pairs, renderings, seed, device, tuple(only or ()))
-    result = evaluate.run(
-        pairs,
-        checkpoint,
-        output,
-        config,
-        extend=extend,
-        json_file=json_file,
-        figures=figures,
-        overwrite=overwrite,
-        progress=console.progress,
-    )
+    more = {"extend": extend, "json_file": json_file, "figures": figures, "overwrite": overwrite}
+    more["progress"] = console.progress
+    if scheduler is not None or resume:
+        from lunargr_cli.fanout.stages import run_evaluate
+
+        how = {"scheduler": scheduler, "say": console.say}
+        result = run_evaluate(pairs, checkpoint, output, config, **more, **how)
+    else:
+        result = evaluate.run(pairs, checkpoint, output, config, **more)
     columns, cells = result_lines(result)
     unit = "I/F" if result["image_units"] == "iof" else f"shares of {result['dn_full_range']:.0f} DN"
     console.table(

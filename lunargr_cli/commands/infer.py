@@ -7,7 +7,19 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import BodyOption, Device, Output, Overwrite, Quiet, Shard, parse_shard
+from lunargr_cli.options import (
+    BodyOption,
+    Device,
+    Output,
+    Overwrite,
+    Parts,
+    Quiet,
+    ResumeParts,
+    Scheduler,
+    Shard,
+    in_parts,
+    parse_shard,
+)
 
 NAME, ORDER = "infer", 60
 
@@ -29,6 +41,9 @@ def command(
     device: Device = "auto",
     shard: Shard = None,
     output: Output = Path("svbrdf.h5"),
+    scheduler: Scheduler = None,
+    resume: ResumeParts = False,
+    parts: Parts = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -52,19 +67,26 @@ def command(
         shard=parse_shard(shard),
     )
     check_output(output, [terrain, checkpoint], overwrite)
-    with tempfile.TemporaryDirectory(dir=output.parent, prefix=".infer-") as folder:
-        if not infer.open_terrain(terrain):
-            from stages import ingest
-            from stages.network.predictor import load_predictor
+    gridding = None
+    if not infer.open_terrain(terrain):
+        from stages import ingest
+        from stages.network.predictor import load_predictor
 
-            gsd = None if any_gsd else load_predictor(checkpoint).gsd
-            scene = Path(folder) / "scene.h5"
-            ingest.run(terrain, None, scene, ingest.Config(gsd=gsd, body=body or "moon"), progress=console.progress)
-        else:
+        gridding = ingest.Config(gsd=None if any_gsd else load_predictor(checkpoint).gsd, body=body or "moon")
+    if in_parts(scheduler, resume, parts, shard):
+        from lunargr_cli.fanout.stages import run_infer
+
+        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
+        found = run_infer(terrain, checkpoint, output, config, gridding, geotiff, parts, **how)
+    else:
+        with tempfile.TemporaryDirectory(dir=output.parent, prefix=".infer-") as folder:
             scene = terrain
-        found = infer.run(scene, checkpoint, output, config, geotiff, overwrite, console.progress)
+            if gridding is not None:
+                scene = Path(folder) / "scene.h5"
+                ingest.run(terrain, None, scene, gridding, progress=console.progress)
+            found = infer.run(scene, checkpoint, output, config, geotiff, overwrite, console.progress)
     console.say(
-        f"{output}: {found.grid.height} x {found.grid.width} px at {found.grid.gsd:g} m, {found.windows} windows, {found.valid_share:.1%} valid"
+        f"{output}: {found.grid.height} x {found.grid.width} px at {found.grid.gsd:g} m, {found.valid_share:.1%} valid"
     )
     rows = [(name, *(f"{v:.5f}" for v in values)) for name, values in found.coefficients.items()]
     console.table(f"coefficients of {found.model}", ("name", "mean", "std", "1 %", "99 %"), rows)

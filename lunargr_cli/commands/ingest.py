@@ -7,13 +7,29 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import BodyOption, Output, Overwrite, Quiet
+from lunargr_cli.options import (
+    BodyOption,
+    Output,
+    Overwrite,
+    Parts,
+    Quiet,
+    ResumeParts,
+    Scheduler,
+    Shard,
+    in_parts,
+    parse_shard,
+)
 
 NAME, ORDER = "ingest", 20
 
 
 def command(
-    dem: Annotated[Path, typer.Argument(help="DEM that GDAL reads: GeoTIFF, PDS IMG, ISIS cube; metres or degrees.")],
+    dem: Annotated[
+        Path,
+        typer.Argument(
+            help="DEM that GDAL reads: GeoTIFF, PDS IMG, ISIS cube; metres or degrees. Or a scene.h5 to add images to."
+        ),
+    ],
     images: Annotated[
         Path | None, typer.Option("--images", help="Image table: images.csv, or JSON with the same keys.")
     ] = None,
@@ -26,6 +42,10 @@ def command(
     skip_outside: Annotated[
         bool, typer.Option("--skip-outside", help="Leave out images that do not touch the DEM.")
     ] = False,
+    shard: Shard = None,
+    scheduler: Scheduler = None,
+    resume: ResumeParts = False,
+    parts: Parts = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -34,8 +54,14 @@ def command(
     from stages import ingest
 
     console = Console(quiet)
-    config = ingest.Config(gsd=gsd, crop=crop, body=body or "moon", skip_outside=skip_outside)
-    found = ingest.run(dem, images, output, config, overwrite, console.progress)
+    config = ingest.Config(gsd=gsd, crop=crop, body=body or "moon", skip_outside=skip_outside, shard=parse_shard(shard))
+    if in_parts(scheduler, resume, parts, shard):
+        from lunargr_cli.fanout.stages import run_ingest
+
+        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
+        found = run_ingest(dem, images, output, config, parts, **how)
+    else:
+        found = ingest.run(dem, images, output, config, overwrite, console.progress)
     grid, (low, high) = found.grid, found.elevation_range
     how = "reprojected to a local metric grid" if found.resampled else "area means of the DEM's own grid"
     console.say(

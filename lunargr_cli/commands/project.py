@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import typer.core
 
-from lunargr_cli.options import Output, Overwrite, Quiet, Shard, parse_shard
+from lunargr_cli.options import Output, Overwrite, Parts, Quiet, ResumeParts, Scheduler, Shard, in_parts, parse_shard
 
 if TYPE_CHECKING:
     from stages.project import Registered
@@ -50,12 +50,15 @@ def command(
     ] = None,
     shard: Shard = None,
     output: Output = Path("pairs.h5"),
+    scheduler: Scheduler = None,
+    resume: ResumeParts = False,
+    parts: Parts = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Orthorectify the images onto the crops; add the Sun, the camera and the terrain's horizon."""
     from lunargr_cli.console import Console
-    from schemas import check_output
+    from schemas import ConfigError, check_output
     from stages import project
 
     console = Console(quiet)
@@ -66,7 +69,17 @@ def command(
     config = project.Config(
         scene=str(scene) if scene else None, shard=parse_shard(shard), register=register, max_shift=max_shift
     )
-    found = project.run(crops, output, config, overwrite, console.progress)
+    if in_parts(scheduler, resume, parts, shard):
+        from lunargr_cli.fanout.stages import run_project
+
+        if regions_csv is not None:
+            raise ConfigError(
+                "--shifts: parts do not keep the regions' own shifts; leave out --scheduler and --resume."
+            )
+        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
+        found = run_project(crops, output, config, parts, **how)
+    else:
+        found = project.run(crops, output, config, overwrite, console.progress)
     (i0, i1), (e0, e1) = found.incidence_deg, found.emission_deg
     console.say(
         f"{output}: {found.pairs} pairs, {found.valid_share:.1%} of pixels valid, {found.shadowed_share:.1%} of these in cast shadow; "

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Output, Overwrite, Quiet, Seed, Shard, parse_shard
+from lunargr_cli.options import Output, Overwrite, Parts, Quiet, Scheduler, Seed, Shard, in_parts, parse_shard
 
 NAME, ORDER = "sample", 30
 
@@ -33,6 +33,8 @@ def command(
     seed: Seed = 0,
     shard: Shard = None,
     output: Output = Path("crops.h5"),
+    scheduler: Scheduler = None,
+    parts: Parts = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -58,6 +60,12 @@ def command(
         seed=seed,
         shard=parse_shard(shard),
     )
-    parts = sample.run(scene, output, config, overwrite, console.progress)
-    rows = [(p.name, p.pairs, p.images, p.tiles, f"{p.ground_km2:.2f}", f"{p.shared_km2:.2f}") for p in parts]
+    if in_parts(scheduler, False, parts, shard):
+        from lunargr_cli.fanout.stages import run_sample
+
+        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
+        audit = run_sample(scene, output, config, parts, **how)
+    else:
+        audit = sample.run(scene, output, config, overwrite, console.progress)
+    rows = [(p.name, p.pairs, p.images, p.tiles, f"{p.ground_km2:.2f}", f"{p.shared_km2:.2f}") for p in audit]
     console.table("split by ground tile", ("part", "pairs", "images", "tiles", "ground km2", "shared km2"), rows)

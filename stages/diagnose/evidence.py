@@ -103,7 +103,7 @@ def _weigh_one(candidate, score: Tensor, gram: Tensor, places, images, rows: flo
         wald = float(amount @ torch.linalg.solve(robust + 1e-12 * torch.diag(robust.diagonal()), amount)) / k
         freedom = max(effective - k, 0.8 * (count - 1 - k), 0.5)
         tail = f_tail(wald, k, freedom)
-        if 4 * k > count:  # with about as many columns as clusters only the held-out direction can be tested
+        if 2 * k > count:  # with about as many columns as clusters only the held-out direction can be tested
             held = (left_out * u).sum(1)
             wald = float(held.sum() ** 2 / held.square().sum().clamp(min=1e-30)) if float(held.sum()) > 0 else 0.0
             tail = f_tail(wald * max(count - 1, 1) / max(count - wald, 1e-9), 1, max(count - 1, 1))

@@ -56,6 +56,7 @@ class Round:
     pattern: PatternEvidence | None = None
     slope_error: float = math.nan
     others: list[Evidence] = field(default_factory=list)  # guises that lost
+    edges: list[SiteWork] = field(default_factory=list)  # the sites with the pixels about shadow edges
 
 
 def look(state: Search, names: Sequence[str]) -> Round:
@@ -67,7 +68,7 @@ def look(state: Search, names: Sequence[str]) -> Round:
     relief = [n for n in GROUND if n in kinds and state.deepest >= FREE_SLOPES]
     candidates, at_edge = make_candidates(lit, state.data), make_candidates(edge, state.data)
     on_ground = make_candidates(albedo, state.data)
-    works, parts, edge_parts, ground_parts = [], [], [], []
+    works, edges, parts, edge_parts, ground_parts = [], [], [], [], []
     relief_parts: dict[str, list[Statistics]] = {n: [] for n in relief}
     for k, chain in enumerate(state.chains()):
         work = ready(chain, state.dn)
@@ -80,6 +81,7 @@ def look(state: Search, names: Sequence[str]) -> Round:
             collected.append(_gather_relief(work, name, state))
         if at_edge:
             wide = ready(chain, state.dn, wide=True)
+            edges.append(wide)
             edge_parts.append(gather_site(wide, at_edge, state.data, [_relief_blur(chain, state)]))
         state.progress(k + 1, len(state.sites), f"looking for causes, round {len(state.causes) + 1}")
     statistics = join(parts)
@@ -105,6 +107,7 @@ def look(state: Search, names: Sequence[str]) -> Round:
         pattern,
         _slope_error(works),
         evidence,
+        edges or works,
     )
 
 

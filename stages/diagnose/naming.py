@@ -19,6 +19,7 @@ GATE = 0.01  # family-wise
 FLOOR_FID = 0.022  # an effect smaller than this against the noise is never worth a name
 FLOOR_IMAGE = 0.035  # the same for effects with values per image, which have more to fit with
 FLOOR_GAIN = 12.0  # nats
+RIVAL_SHARE = 0.6  # of the gain between a scene-wide effect and one per image, above which both are tried
 KEEP_SHARE = 0.8  # of a per-image effect's gain that a scene-wide effect must keep to replace it
 SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to replace it
 NEAR = 0.85  # of the best gain: linear models of strong effects are no closer than that
@@ -38,14 +39,21 @@ def choose(state: Search, seen: Round) -> list[Cause]:
         # a scene-wide effect that does nearly as well with a few numbers as gains do with one for each image
         near = [e for e in seen.best.values() if e.gain > KEEP_SHARE * image[0].gain and worth(e, seen, count, 5.0)]
         scene = sorted(near, key=lambda e: -e.gain)
-    if image and (not scene or scene[0].gain < KEEP_SHARE * image[0].gain):
+    single = []
+    if image:
         top = image[0]
         close = [e.effect for e in image[1:] if e.gain > top.gain - 2 * math.hypot(top.gain_error, e.gain_error)]
-        cause = Cause(
-            as_effect(top, None, state.data), min(1.0, top.p * count), top.gain, top.gain_error, top.fid,
-            [top.effect, *close], image_evidence=top,
-        )  # fmt: skip
-        return [cause]
+        single = [
+            Cause(
+                as_effect(top, None, state.data), min(1.0, top.p * count), top.gain, top.gain_error, top.fid,
+                [top.effect, *close], image_evidence=top,
+            )
+        ]  # fmt: skip
+        scene = [e for e in scene if e.gain > RIVAL_SHARE * top.gain]
+        if not scene:
+            return single
+        if top.gain < RIVAL_SHARE * scene[0].gain:
+            single = []
     if not scene:
         pattern = _pattern(state, seen.pattern, count)
         return [] if pattern is None else [pattern]
@@ -62,7 +70,7 @@ def choose(state: Search, seen: Round) -> list[Cause]:
         guise = simpler if simpler.gain > SIMPLER * e.gain else e
         effect, errors = start(guise, state.data)
         causes.append(Cause(effect, min(1.0, e.p * count), e.gain, e.gain_error, e.fid, group, errors))
-    return causes
+    return causes + single
 
 
 def worth(e: Evidence, seen: Round, count: int, ease: float = 1.0) -> bool:
@@ -71,7 +79,8 @@ def worth(e: Evidence, seen: Round, count: int, ease: float = 1.0) -> bool:
     still = cls.channel in ("albedo", "relief")  # judged in rows of their own, where the size against noise says little
     if e.p * count > GATE * ease or min(e.gain_image, e.gain_place) <= 0:
         return False
-    if e.gain < max(FLOOR_GAIN, 1.5 * e.gain_error) or (e.fid < FLOOR_FID and not still):
+    firm = 0.0 if e.effect == "distant_shadow" else 1.5 * e.gain_error  # a wall shades one image and spares the others
+    if e.gain < max(FLOOR_GAIN, firm) or (e.fid < FLOOR_FID and not still):
         return False
     (name, reference), *_ = e.candidate.trial.columns[0].items()
     unit = reference - cls.null()[name]

@@ -16,6 +16,7 @@ from stages.effects import Effect
 from stages.physics.photometry import ReflectanceModel, get_model
 
 ROUNDS = 10
+DARK = 0.3  # of the predicted brightness
 
 
 @dataclass
@@ -125,12 +126,17 @@ def _normal_equations(
     gram = torch.zeros(count_free, count_free, dtype=torch.float64)
     score = torch.zeros(count_free, dtype=torch.float64)
     cost, count = 0.0, 0.0
-    for site, raw in zip(sites, measured, strict=True):
-        chain = nominal.chain(site, base)
-        mask = lit_mask(chain)
-        predicted = chain.textured
-        if units == "dn":
-            _scale(site, raw, predicted, mask)
+    chains = [nominal.chain(site, base) for site in sites]
+    masks = [lit_mask(chain) for chain in chains]
+    if units == "dn":
+        for chain, raw, mask in zip(chains, measured, masks, strict=True):
+            _scale(chain.site, raw, chain.textured, mask)
+    dark = DARK * _brightness(chains, masks)
+    for chain, lit in zip(chains, masks, strict=True):
+        site, predicted = chain.site, chain.textured
+        mask = lit & (
+            site.image > dark * predicted
+        )  # darker: in the shadow of something that the horizon does not know
         # relative weights: every image counts alike, however low its Sun
         level = (predicted * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
         weight = (mask / level.clamp(min=1e-6)[:, None, None]).double()
@@ -143,6 +149,15 @@ def _normal_equations(
             gram += flat @ flat.T
             score += flat @ residual.flatten()
     return gram, score, cost / max(count, 1.0)
+
+
+def _brightness(chains: Sequence[Chain], masks: Sequence[Tensor]) -> float:
+    """Measured over predicted brightness, the median over the images of each one's median over lit pixels."""
+    ratios = []
+    for chain, mask in zip(chains, masks, strict=True):
+        ratio = chain.site.image / chain.textured.clamp(min=1e-6)
+        ratios += [float(r[m].median()) for r, m in zip(ratio, mask, strict=True) if int(m.sum()) > 50]
+    return max(float(torch.tensor(ratios).median()), 0.0) if ratios else 0.0
 
 
 def _near(residual: Tensor, weight: Tensor) -> Tensor:

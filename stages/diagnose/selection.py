@@ -14,6 +14,7 @@ from stages.diagnose.state import Cause, Saved, Search
 REFUSALS = 3
 QUIET_GAIN = 6.0  # nats below which an effect, in the look before, is not looked at again
 SLIGHT = 0.005  # of what is left: by so much a simpler cause may do worse
+MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
 PROMISE = 0.25  # share of the foretold gain that a cause must bring once it is in the model
 
@@ -36,7 +37,7 @@ def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
         if not rivals:
             return seen
         before, rms, nothing = state.save(), state.residual_rms(), misfit(state, seen.works)
-        cause = _contest(state, rivals, seen, nothing)
+        cause = _contest(state, rivals, seen)
         cause.rms_before, cause.rms_after = rms, state.residual_rms()
         if not _kept_promise(state, cause, seen, nothing):
             state.load(before)
@@ -65,20 +66,24 @@ def _kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> b
     return nothing - misfit(state, seen.works) > PROMISE * 2 * cause.gain
 
 
-def _contest(state: Search, rivals: list[Cause], seen: Round, nothing: float) -> Cause:
-    """Take the cause into the model that leaves least once everything is fitted again; the state holds it afterwards."""
+def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
+    """Take the cause into the model that leaves least once everything is fitted again; the state holds it afterwards.
+
+    Where a wrong Sun is among them shadow edges have a say: it moves them, a bent response does not.
+    """
     if len(rivals) == 1:
         state.causes.append(rivals[0])
         if rivals[0].effect.scope != "site":
             refine(state, 3 if rivals[0].effect.displaces else 2)
         return rivals[0]
-    before = state.save()
+    works = seen.edges if any(c.effect.name in MOVES_SHADOWS for c in rivals) else seen.works
+    before, nothing = state.save(), misfit(state, works)
     tried: list[tuple[float, int, Saved]] = []
     for cause in rivals:
         state.load(before)
         state.causes.append(cause)
-        refine(state)
-        tried.append((nothing - misfit(state, seen.works), _freedom(cause), state.save()))
+        refine(state, 3 if cause.effect.displaces else 2)
+        tried.append((nothing - misfit(state, works), _freedom(cause), state.save()))
     most = max(worth for worth, _, _ in tried)
     # a superset of another effect always does a little better; where much is explained, a little is much
     least = most - min((1 - SIMPLER) * abs(most), SLIGHT * max(nothing - most, 0.0))
@@ -101,7 +106,8 @@ def _contest(state: Search, rivals: list[Cause], seen: Round, nothing: float) ->
 def _freedom(cause: Cause) -> int:
     """Coordinates that the cause's fit was free to move."""
     effect = cause.effect
-    return len([p for p in effect.fitted() if p.name not in effect.held])
+    seen = cause.image_evidence.frames if cause.image_evidence is not None else 1
+    return seen * len([p for p in effect.fitted() if p.name not in effect.held])
 
 
 def _restless(state: Search, seen: Round) -> Sequence[str]:

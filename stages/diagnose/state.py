@@ -97,6 +97,9 @@ class Search:
         stays where it is, and the measurement moves.
         """
         moved = self.moved
+        level = float(torch.stack([s.texture.mean() for s in self.sites]).mean())
+        for site in self.sites:  # the mean albedo is the nominal model's to know, or unseen ground comes out too bright
+            site.texture = site.texture / level
         images = []
         for site, image, valid in zip(self.sites, self.measured, self.valid, strict=True):
             east, south = displacement(site, moved)

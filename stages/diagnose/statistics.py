@@ -20,6 +20,7 @@ BLOCK = 32  # px
 CUT = math.radians(15)  # photometric effects are judged where neither slope nor shadow is a matter of sub-pixel relief
 DEEP = math.radians(2)  # below the horizon: shadow, whatever the DEM's errors
 OUTLIER = 7.0  # sigma
+QUIETEST = 0.002  # noise over mean brightness: an image that looks quieter is dark
 SHOT = 0.8  # share of shot noise in the noise's variance at mean brightness
 EDGE = math.radians(6.0)  # relief below the DEM's resolution blurs shadows over a band like this ...
 DOUBT = 0.3  # ... by up to this share of the lit brightness
@@ -90,6 +91,8 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
     site = chain.site
     weight = _first_weight(chain, wide)
     residual = torch.where(site.valid, site.image - chain.textured, 0.0)
+    level = (chain.textured * site.valid).sum((-2, -1)) / site.valid.sum((-2, -1)).clamp(min=1)
+    most = 1 / (QUIETEST * level.clamp(min=1e-6))[:, None, None]
 
     def split() -> tuple[Projector, Tensor, Tensor]:
         projector = Projector(chain, weight)
@@ -107,6 +110,7 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
                 gross = dynamic.abs() > OUTLIER
                 if float(gross.sum()) < 0.3 * float((weight > 0).sum()):
                     weight = weight * ~gross
+        weight = weight.minimum(most)
         projector, dynamic, maps = split()
     # the prediction moves the texture along with the ground; the static rows are about all of it
     maps[0] += site.texture - 1
