@@ -117,7 +117,17 @@ def run(
             for name in ("valid", "valid_position", "frame_window"):  # also where there is no image at all
                 writer.dataset(name)
             areas = [
-                _write_validity(frame, k, len(mine), terrain.grid, (low, high), writer, config, progress)
+                _write_validity(
+                    frame,
+                    k,
+                    len(mine),
+                    terrain.grid,
+                    (low, high),
+                    terrain.file or writer.file,
+                    writer,
+                    config,
+                    progress,
+                )
                 for k, frame in enumerate(mine)
             ]
             if frames and count == 1 and not any(areas):
@@ -151,6 +161,7 @@ class Terrain:
     config: dict[str, Any]
     attributes: dict[str, Any]
     write: Callable[[ArtefactWriter, Progress | None], tuple[int, float, float]]
+    file: h5py.File | None = None  # where they can be read at once; views cannot be, while they are written
 
 
 @contextlib.contextmanager
@@ -169,7 +180,7 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body) ->
             stored = read_config(file) | {k: v for k, v in asdict(config).items() if k in own}
             names = ("gsd_m", "body_radius_m", "elevation_source")
             yield Terrain(
-                grid, stored, {k: file.attrs[k] for k in names}, partial(_take_elevation, dem, file, count > 1)
+                grid, stored, {k: file.attrs[k] for k in names}, partial(_take_elevation, dem, file, count > 1), file
             )
         return
     if images is not None and count > 1:
@@ -470,15 +481,16 @@ def _write_validity(
     count: int,
     grid: Grid,
     heights: tuple[float, float],
+    dem: h5py.File,
     writer: ArtefactWriter,
     config: Config,
     progress: Progress | None,
 ) -> float:
     """Write one image's masks; returns the ground area of its valid positions, m2."""
     valid, position = writer.dataset("valid"), writer.dataset("valid_position")
-    dem_valid = writer.file["dem_valid"]
+    dem_valid = dem["dem_valid"]
     used: tuple[int, int, int, int] | None = None
-    with open_source(frame, grid, writer.file["elevation"], heights) as source:
+    with open_source(frame, grid, dem["elevation"], heights) as source:
         row0, col0, height, width = source.box() or (0, 0, 0, 0)
         todo = list(blocks(height, width, config.block))
         for number, (r, c, h, w) in enumerate(todo):

@@ -138,3 +138,21 @@ def test_closed_forms():
 def test_slots_fix_the_order():
     a, b = get_effect("dark_bias")({"iof": 0.01}), get_effect("image_gain")({"gain": torch.tensor([0.5, 0.5])})
     torch.testing.assert_close(form(SCENE, M2, COEFFICIENTS, [a, b]), form(SCENE, M2, COEFFICIENTS, [b, a]))
+
+
+@pytest.mark.parametrize("slope_deg", [20.0, 45.0])
+def test_light_from_a_slope_is_its_view_factor(slope_deg):
+    """Flat ground before a long, evenly bright slope that rises to an angle b gets (1 - cos b) / 2 of it."""
+    from stages.effects.interreflection import gather
+
+    size, cell = 96, 10.0
+    x = torch.arange(size) - 47.5
+    height = (x.clamp(min=0) * cell * math.tan(math.radians(slope_deg))).expand(size, -1).contiguous()
+    bright = (x > 0).float().expand(size, -1)
+    light = gather(height, bright[None], cell)[0]
+    foot = light[40:56, 45].mean()
+    top = math.atan(47.5 * math.tan(math.radians(slope_deg)) / (95 - 45))  # the slope ends with the crop
+    assert float(foot) == pytest.approx((1 - math.cos(top)) / 2, rel=0.08)
+    assert float(light[:, :20].max()) < float(foot)
+    flat = gather(torch.zeros(size, size), torch.ones(1, size, size), cell)
+    assert float(flat.abs().max()) == 0.0

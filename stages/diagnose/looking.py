@@ -22,6 +22,7 @@ from stages.diagnose.statistics import (
     Statistics,
     gather_site,
     gather_static,
+    given,
     join,
     left_over,
     make_candidates,
@@ -38,6 +39,7 @@ DISTANCES = (0.04, 1.0, 3.0)  # ... and of its distance, about the best of the f
 ALIGNMENTS = 3
 OVERSHOOT = 1.5  # texture and slopes, known from images that are not aligned yet, hide a third of each shift
 ENOUGH_PX = 0.06
+QUIET_GAIN, QUIET_FID = 6.0, 0.012  # below both an effect is not looked at again
 SURE = 0.01  # of the two halves of the blocks agreeing by chance
 GROUND = {"dem_smoothing": (), "dem_scale": ("dem_smoothing",)}  # effect -> nuisances fitted along
 
@@ -57,6 +59,7 @@ class Round:
     slope_error: float = math.nan
     others: list[Evidence] = field(default_factory=list)  # guises that lost
     edges: list[SiteWork] = field(default_factory=list)  # the sites with the pixels about shadow edges
+    statistics: Statistics | None = None  # of the effects of lit ground
 
 
 def look(state: Search, names: Sequence[str]) -> Round:
@@ -108,6 +111,7 @@ def look(state: Search, names: Sequence[str]) -> Round:
         _slope_error(works),
         evidence,
         edges or works,
+        statistics,
     )
 
 
@@ -190,6 +194,15 @@ def _climb(state: Search, top: Evidence) -> list[Evidence]:
 def _slope_error(works: Sequence[SiteWork]) -> float:
     maps = [w.slope_error for w in works if math.isfinite(w.slope_error)]
     return float(torch.tensor(maps).square().mean().sqrt()) if maps else math.nan
+
+
+def quiet(seen: Round, named: str) -> set[str]:
+    """Effects of lit ground with nothing left to say once the named one is fitted along, by the products of a look."""
+    known = seen.best.get(named)
+    if seen.statistics is None or known is None or all(c.effect != named for c in seen.statistics.candidates):
+        return set()
+    left = best_guises(weigh(given(seen.statistics, known.candidate)))
+    return {n for n, e in left.items() if e.gain < QUIET_GAIN and e.fid < QUIET_FID}
 
 
 def misfit(state: Search, works: Sequence[SiteWork]) -> float:

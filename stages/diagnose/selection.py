@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from stages.diagnose.data import Site
-from stages.diagnose.looking import Round, align, look, misfit, narrowed
-from stages.diagnose.naming import FLOOR_FID, SIMPLER, choose, misaligned
+from stages.diagnose.looking import Round, align, look, misfit, narrowed, quiet
+from stages.diagnose.naming import SIMPLER, choose, misaligned
 from stages.diagnose.refining import refine
 from stages.diagnose.state import Cause, Saved, Search
 
 REFUSALS = 3
-QUIET_GAIN = 6.0  # nats below which an effect, in the look before, is not looked at again
 SLIGHT = 0.005  # of what is left: by so much a simpler cause may do worse
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
@@ -51,7 +50,8 @@ def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
         if cause.effect.scope == "site":  # the pattern of these sites' albedo was out of everything else already
             seen.pattern = None
             continue
-        seen = narrowed(seen, look(state, _restless(state, seen)))
+        silent = quiet(seen, cause.effect.name)
+        seen = narrowed(seen, look(state, [n for n in state.open_names() if n not in silent]))
         seen.best.pop(cause.effect.name, None)
         seen.images.pop(cause.effect.name, None)
     return seen
@@ -108,12 +108,6 @@ def _freedom(cause: Cause) -> int:
     effect = cause.effect
     seen = cause.image_evidence.frames if cause.image_evidence is not None else 1
     return seen * len([p for p in effect.fitted() if p.name not in effect.held])
-
-
-def _restless(state: Search, seen: Round) -> Sequence[str]:
-    """Open effects that had anything to say in the look before."""
-    quiet = {n for n, e in seen.best.items() if e.gain < QUIET_GAIN and e.fid < FLOOR_FID}
-    return [n for n in state.open_names() if n not in quiet]
 
 
 def enough(sites: list[Site]) -> str:

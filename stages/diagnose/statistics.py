@@ -412,6 +412,26 @@ def without(data: Statistics, drop: Sequence[str], candidates: Sequence[Candidat
     )
 
 
+def given(data: Statistics, known: Candidate) -> Statistics:
+    """The same statistics with one candidate's columns among the nuisances, and without its effect's other guises."""
+    first = data.count + 1
+    own = list(range(first + known.columns.start, first + known.columns.stop))
+    order = [*range(data.count), *own, data.count]
+    placed, start = [], 0
+    for c in data.candidates:
+        if c.effect != known.effect:
+            placed.append(dataclasses.replace(c, columns=slice(start, start + c.size)))
+            order += range(first + c.columns.start, first + c.columns.stop)
+            start += c.size
+    return dataclasses.replace(
+        data,
+        candidates=placed,
+        names=[*data.names, *(f"{known.effect}{k}" for k in range(len(own)))],
+        bound=torch.cat([data.bound, torch.full((len(own),), FREE, dtype=torch.float64)]),
+        products=data.products[:, order][:, :, order],
+    )
+
+
 def swap(data: Statistics, name: str, survey: Survey) -> Statistics:
     """The same statistics with one nuisance column as the only candidate."""
     j, m = data.names.index(name), data.count

@@ -1,0 +1,268 @@
+"""Wide stages in parts: on a real Dask cluster that loses a worker, after interruptions, and by hand; always the same bytes."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import h5py
+import numpy as np
+import pytest
+from cluster_scene import LUNARGR, assert_same, environment, finish, lunargr, stages, start, write_inputs
+
+from schemas import SCENE, ArtefactError, ConfigError, open_artefact
+from stages import ingest, merge, project
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    return write_inputs(tmp_path_factory.mktemp("inputs"))
+
+
+@pytest.fixture(scope="module")
+def in_one_process(inputs, tmp_path_factory):
+    """name -> what one uninterrupted process makes of it, made when first asked for."""
+    folder, made = tmp_path_factory.mktemp("one"), {}
+
+    def make(name):
+        if name not in made:
+            code, said = lunargr(*stages(inputs)[name], "-o", folder / f"{name}.h5")
+            assert code == 0, said
+            made[name] = folder / f"{name}.h5"
+        return made[name]
+
+    return make
+
+
+class Cluster:
+    """A scheduler and two workers, each a process of its own."""
+
+    def __init__(self, folder):
+        self.file = folder / "scheduler.json"
+        self.folder = folder
+        self.processes = [self._run("scheduler", "--port", "0", "--scheduler-file", self.file, "--no-dashboard")]
+        self.workers = []
+        while not self.file.exists():
+            time.sleep(0.05)
+        self.address = json.loads(self.file.read_text())["address"]
+
+    def _run(self, what, *options):
+        command = [sys.executable, "-m", "distributed.cli.dask_" + what, *map(str, options)]
+        return subprocess.Popen(command, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def fill(self):
+        """Two workers that live."""
+        self.workers = [w for w in self.workers if w.poll() is None]
+        while len(self.workers) < 2:
+            options = ["--no-nanny", "--nthreads", 1, "--no-dashboard", "--local-directory", self.folder]
+            self.workers.append(self._run("worker", self.address, *options))
+            self.processes.append(self.workers[-1])
+
+    def kill_one_at_work(self, output, process):
+        """SIGKILL the worker that is just writing a part of ``output``."""
+        parts = output.with_name(f"{output.name}.parts")
+        while process.poll() is None:
+            for worker in self.workers:
+                if list(parts.glob(f"*/.*partial-*-{worker.pid}-*")):
+                    worker.send_signal(signal.SIGKILL)
+                    worker.wait()
+                    return
+            time.sleep(0.001)
+        raise AssertionError(finish(process))
+
+    def close(self):
+        for process in self.processes[::-1]:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    pytest.importorskip("distributed")
+    made = Cluster(tmp_path_factory.mktemp("dask"))
+    yield made
+    made.close()
+
+
+PARTS = {"ingest": 3, "sample": 4, "project": 6, "infer": 4}
+
+
+def with_parts(name, inputs):
+    return [*stages(inputs)[name], *(["--parts", PARTS[name]] if name in PARTS else [])]
+
+
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("sample", "infer", "evaluate")]
+
+
+@pytest.mark.parametrize("name", ["ingest", "project", *SLOW])
+def test_a_worker_dies_and_nothing_is_lost(name, inputs, in_one_process, cluster, tmp_path):
+    whole = in_one_process(name)
+    cluster.fill()
+    output = tmp_path / f"{name}.h5"
+    process = start([*with_parts(name, inputs), "--scheduler", cluster.address, "-o", output])
+    cluster.kill_one_at_work(output, process)
+    code, said = finish(process)
+    assert code == 0, said
+    assert "Traceback" not in said
+    assert_same(whole, output)
+    with h5py.File(whole) as a, h5py.File(output) as b:
+        assert a.attrs["inputs"] == b.attrs["inputs"]
+    suffixes = {"infer": [".tif"], "evaluate": [".json"]}.get(name, [])
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([output.name, *(name + s for s in suffixes)])
+
+
+@pytest.mark.slow
+def test_workers_of_this_machine(inputs, in_one_process, tmp_path):
+    pytest.importorskip("distributed")
+    output = tmp_path / "pairs.h5"
+    code, said = lunargr("project", inputs["crops"], "--scheduler", "local:2", "--parts", 4, "-o", output)
+    assert code == 0, said
+    assert_same(in_one_process("project"), output)
+
+
+def test_a_worker_s_error_is_one_line(inputs, cluster, tmp_path):
+    """The error that one process would give, and no part that looks whole."""
+    cluster.fill()
+    table = tmp_path / "images.csv"
+    folder = inputs["images"].parent
+    text = inputs["images"].read_text()
+    for k in range(3):
+        text = text.replace(f"image{k}.tif", str(folder / f"image{k}.tif") if k != 1 else "broken.tif")
+    table.write_text(text)
+    (tmp_path / "broken.tif").write_text("no picture")
+    command = ["ingest", inputs["dem"], "--images", table, "--gsd", 20, "--crop", 32, "-o", tmp_path / "s.h5"]
+    code, said = lunargr(*command, "--scheduler", cluster.address, "--quiet")
+    assert code == 3
+    assert len(said.splitlines()) == 1 and "broken.tif" in said
+    assert not (tmp_path / "s.h5").exists()
+
+
+def test_schedulers_that_are_not_there(tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    from lunargr_cli.fanout import engines
+
+    monkeypatch.setattr(engines, "ANSWER", 1.0)
+    for where in ("tcp://127.0.0.1:9", "local:none", "nonsense"):
+        with pytest.raises(ConfigError, match="--scheduler: ") as caught, engines.open_dask(where, tmp_path):
+            pass
+        assert "\n" not in str(caught.value) and "local:N" in str(caught.value)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ConfigError, match=r"lunargr\[cluster\]"), engines.open_dask("local:2", tmp_path):
+        pass
+
+
+def interrupt(command, output, how, finished=2):
+    """Stop a run when ``finished`` of its parts are there; what it said."""
+    parts = output.with_name(f"{output.name}.parts")
+    process = start(command)
+    while len([p for p in parts.glob("*/*-of-*.h5") if not p.name.startswith(".")]) < finished:
+        assert process.poll() is None, finish(process)
+        time.sleep(0.002)
+    process.send_signal(how)
+    return finish(process)
+
+
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, *(pytest.param(s, marks=pytest.mark.slow) for s in (signal.SIGINT, signal.SIGTERM))]
+)
+def test_an_interrupted_run_goes_on_with_what_is_missing(inputs, in_one_process, tmp_path, how):
+    output = tmp_path / "pairs.h5"
+    command = ["project", inputs["crops"], "--resume", "--parts", 6, "-o", output]
+    code, said = interrupt(command, output, how)
+    assert code == {signal.SIGINT: 130, signal.SIGKILL: -9, signal.SIGTERM: 143}[how]
+    assert "Traceback" not in said
+    assert not output.exists()
+    code, said = lunargr(*command)
+    assert code == 0 and "of 6 parts are there already" in said, said
+    assert_same(in_one_process("project"), output)
+    assert [p.name for p in tmp_path.iterdir()] == ["pairs.h5"]
+
+
+@pytest.mark.slow
+def test_parts_of_another_command_are_not_used(inputs, in_one_process, tmp_path):
+    output = tmp_path / "pairs.h5"
+    interrupt(["project", inputs["crops"], "--resume", "--parts", 5, "-o", output], output, signal.SIGKILL)
+    code, said = lunargr("project", inputs["crops"], "--resume", "--parts", 6, "-o", output)
+    assert code == 0 and "already" not in said
+    assert_same(in_one_process("project"), output)
+
+
+def test_a_plain_run_after_a_kill_starts_anew_and_ends_the_same(inputs, in_one_process, tmp_path):
+    output = tmp_path / "map.h5"
+    command = [*stages(inputs)["infer"], "-o", output]
+    process = start(command)
+    while not list(tmp_path.glob(".map.partial-*")):
+        assert process.poll() is None, finish(process)
+        time.sleep(0.002)
+    process.kill()
+    finish(process)
+    assert not output.exists()
+    code, said = lunargr(*command)
+    assert code == 0, said
+    assert_same(in_one_process("infer"), output)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["map.h5", "map.tif"]
+
+
+# --- by hand: shards and merge --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("virtual", [False, True])
+def test_a_scene_by_hand_is_a_dem_in_rows_and_then_its_images(small_files, tmp_path, virtual):
+    config = {"gsd": 20, "crop": 32, "block": 100}
+    ingest.run(small_files.dem, small_files.images, tmp_path / "whole.h5", ingest.Config(**config))
+    rows = [tmp_path / f"rows{k}.h5" for k in range(3)]
+    for k, part in enumerate(rows):
+        ingest.run(small_files.dem, None, part, ingest.Config(**config, shard=(k, 3)))
+    merge.run(rows, tmp_path / "grid.h5", virtual=virtual)
+    images = [tmp_path / f"images{k}.h5" for k in range(2)]
+    for k, part in enumerate(images):
+        ingest.run(tmp_path / "grid.h5", small_files.images, part, ingest.Config(crop=32, block=100, shard=(k, 2)))
+        assert part.stat().st_size < 0.7 * (tmp_path / "whole.h5").stat().st_size  # no elevations of its own
+    merge.run(images, tmp_path / "scene.h5", virtual=virtual)
+    assert_same(tmp_path / "whole.h5", tmp_path / "scene.h5")
+    found, whole = ingest.summarise(tmp_path / "scene.h5"), ingest.summarise(tmp_path / "whole.h5")
+    assert (found.elevation_range, found.dem_valid_share) == (whole.elevation_range, whole.dem_valid_share)
+    with pytest.raises(ConfigError, match="the DEM comes first"):
+        ingest.run(small_files.dem, small_files.images, tmp_path / "x.h5", ingest.Config(**config, shard=(0, 2)))
+
+
+def test_a_view_says_so_when_a_part_is_gone(small_artefacts, tmp_path):
+    (tmp_path / "parts").mkdir()
+    parts = [tmp_path / "parts" / f"{k}.h5" for k in range(3)]
+    for k, part in enumerate(parts):
+        project.run(small_artefacts["crops"], part, project.Config(shard=(k, 3)))
+    code, said = lunargr("merge", *parts, "--virtual", "-o", tmp_path / "pairs.h5")
+    assert code == 0, said
+    assert_same(small_artefacts["pairs"], tmp_path / "pairs.h5")
+    with h5py.File(tmp_path / "pairs.h5") as file:
+        assert file["image"].is_virtual
+        assert np.isfinite(file["elevation"][-1]).all()
+    assert (tmp_path / "pairs.h5").stat().st_size < 0.2 * small_artefacts["pairs"].stat().st_size
+    parts[1].unlink()
+    with pytest.raises(ArtefactError, match=r"parts/1\.h5"):
+        open_artefact(tmp_path / "pairs.h5", project.PAIRS)
+
+
+def test_merging_keeps_masks_sparse(small_files, tmp_path):
+    """A merged scene is no larger than one that was made in one piece: chunks that nobody wrote stay unwritten."""
+    config = {"gsd": 20, "crop": 32, "block": 64}
+    ingest.run(small_files.dem, small_files.images, tmp_path / "whole.h5", ingest.Config(**config))
+    ingest.run(small_files.dem, None, tmp_path / "grid.h5", ingest.Config(**config))
+    parts = [tmp_path / f"{k}.h5" for k in range(3)]
+    for k, part in enumerate(parts):
+        ingest.run(tmp_path / "grid.h5", small_files.images, part, ingest.Config(crop=32, block=64, shard=(k, 3)))
+    merge.run(parts, tmp_path / "scene.h5")
+    with open_artefact(tmp_path / "scene.h5", SCENE) as a, open_artefact(tmp_path / "whole.h5", SCENE) as b:
+        for name in ("valid", "valid_position"):
+            assert a[name].id.get_num_chunks() == b[name].id.get_num_chunks()
+
+
+def test_shards_and_parts_do_not_mix(inputs, tmp_path):
+    for more in (["--shard", "1/2", "--resume"], ["--parts", "3"]):
+        done = subprocess.run(
+            [*LUNARGR, "project", inputs["crops"], *more, "-o", tmp_path / "x.h5"], capture_output=True, text=True
+        )
+        assert done.returncode == 3 and len(done.stderr.splitlines()) == 1
