@@ -445,7 +445,8 @@ def _check_views(path: Path, file: h5py.File) -> None:
     """HDF5 reads what a lost file held as fill values, without a word: such an artefact must not look whole."""
     for data in file.values():
         if isinstance(data, h5py.Dataset) and data.is_virtual:
-            for source in {s.file_name for s in data.virtual_sources()}:
+            plan = data.id.get_create_plist()
+            for source in {plan.get_virtual_filename(k) for k in range(plan.get_virtual_count())}:
                 if not (path.resolve().parent / source).exists():
                     raise ArtefactError(
                         f"{path}:{data.name}: expected the file '{source}' that it is a view of, found none; "

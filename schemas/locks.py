@@ -39,6 +39,17 @@ def partial_path(output: Path) -> Path:
     return output.with_name(f".{output.stem}.partial-{mark}{output.suffix}")
 
 
+@contextlib.contextmanager
+def scratch_path(output: Path, what: str) -> Iterator[Path]:
+    """A file beside ``output`` that is only a step on the way to it; removed at the end, or by the next run."""
+    path = partial_path(output)
+    path = path.with_name(f"{path.stem}.{what}{path.suffix}")
+    try:
+        yield path
+    finally:
+        path.unlink(missing_ok=True)
+
+
 def host() -> str:
     return socket.gethostname().split(".")[0]
 

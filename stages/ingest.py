@@ -28,7 +28,6 @@ from schemas import (
     ConfigError,
     GeometryError,
     InputError,
-    check_output,
     open_artefact,
     read_config,
 )
@@ -90,7 +89,6 @@ def run(
     if config.crop < 16 or config.crop % 2:
         raise ConfigError(f"--crop: expected an even number of pixels, at least 16; found {config.crop}.")
     body = find_body(config.body)
-    check_output(output, [dem] + ([images] if images else []), overwrite)
     frames = read_frames(images, body) if images else []
     index, count = config.shard
     with _open_terrain(dem, images, config, body) as terrain:

@@ -199,7 +199,7 @@ def _sizes(schema: Schema, files: Sequence[h5py.File], record: str | None) -> di
 
 
 def _worth_a_view(files: Sequence[h5py.File], name: str) -> bool:
-    return files[0][name].ndim >= 2 and files[0][name].dtype.kind in "iufb"
+    return files[0][name].ndim >= 2 and any(f[name].size for f in files) and files[0][name].dtype.kind in "iufb"
 
 
 def _end_to_end(files: Sequence[h5py.File], name: str, axis: int) -> list[Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -60,13 +60,12 @@ def command(
 
     console = Console(quiet)
     config = evaluate.Config(split, batch, bootstrap, fit_pairs, renderings, seed, device, tuple(only or ()))
-    more = {"extend": extend, "json_file": json_file, "figures": figures, "overwrite": overwrite}
+    more: dict[str, Any] = {"extend": extend, "json_file": json_file, "figures": figures, "overwrite": overwrite}
     more["progress"] = console.progress
     if scheduler is not None or resume:
         from lunargr_cli.fanout.stages import run_evaluate
 
-        how = {"scheduler": scheduler, "say": console.say}
-        result = run_evaluate(pairs, checkpoint, output, config, **more, **how)
+        result = run_evaluate(pairs, checkpoint, output, config, scheduler=scheduler, say=console.say, **more)
     else:
         result = evaluate.run(pairs, checkpoint, output, config, **more)
     columns, cells = result_lines(result)

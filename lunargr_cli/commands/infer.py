@@ -48,10 +48,11 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Predict georeferenced maps of reflectance coefficients for a DEM of any size."""
-    import tempfile
+    import contextlib
 
     from lunargr_cli.console import Console
     from schemas import ConfigError, check_output
+    from schemas.locks import scratch_path
     from stages import infer
 
     if precision not in ("fp32", "bf16"):
@@ -79,10 +80,10 @@ def command(
         how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
         found = run_infer(terrain, checkpoint, output, config, gridding, geotiff, parts, **how)
     else:
-        with tempfile.TemporaryDirectory(dir=output.parent, prefix=".infer-") as folder:
-            scene = terrain
+        scene = terrain
+        with contextlib.ExitStack() as stack:
             if gridding is not None:
-                scene = Path(folder) / "scene.h5"
+                scene = stack.enter_context(scratch_path(output, "grid"))
                 ingest.run(terrain, None, scene, gridding, progress=console.progress)
             found = infer.run(scene, checkpoint, output, config, geotiff, overwrite, console.progress)
     console.say(

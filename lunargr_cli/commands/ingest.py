@@ -63,9 +63,9 @@ def command(
     else:
         found = ingest.run(dem, images, output, config, overwrite, console.progress)
     grid, (low, high) = found.grid, found.elevation_range
-    how = "reprojected to a local metric grid" if found.resampled else "area means of the DEM's own grid"
+    method = "reprojected to a local metric grid" if found.resampled else "area means of the DEM's own grid"
     console.say(
-        f"{output}: {grid.height} x {grid.width} px at {grid.gsd:g} m, {how}; "
+        f"{output}: {grid.height} x {grid.width} px at {grid.gsd:g} m, {method}; "
         f"{found.dem_valid_share:.1%} valid, {low:.1f} to {high:.1f} m"
     )
     for name in found.skipped:

@@ -17,6 +17,9 @@ def command(
         list[Path], typer.Argument(metavar="PART...", help="Every part that --shard I/N wrote, in any order.")
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
+    virtual: Annotated[
+        bool, typer.Option("--virtual", help="Do not copy: the output is a view of its parts, which must stay.")
+    ] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -25,5 +28,5 @@ def command(
     from stages import merge
 
     console = Console(quiet)
-    schema = merge.run(parts, output, overwrite, console.progress)
+    schema = merge.run(parts, output, overwrite, console.progress, virtual)
     console.say(f"{output}: {len(parts)} parts of '{schema.name}' merged")

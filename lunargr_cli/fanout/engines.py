@@ -123,7 +123,8 @@ class _Dask:
 
         if not tasks:
             return
-        common = self.client.scatter((version("lunargr"), dict(known_digests)), broadcast=True, hash=False)
+        # Given along with every task: data scattered to workers would die with them.
+        common = version("lunargr"), dict(known_digests)
         waiting = [
             self.client.submit(_work, task, common, key=str(task.path), pure=False, retries=ERRORS) for task in tasks
         ]

@@ -24,7 +24,7 @@ def run_ingest(dem: Path, images: Path | None, output: Path, config: Any, parts:
     with _job(
         output, "ingest", config, parts, inputs, ingest.source_files(images, config) if images else (), how
     ) as job:
-        grid, skipped = dem, ()
+        grid = dem
         if not ingest.is_artefact(dem):
             bands = ingest.count_bands(dem, config)
             cut = _cut(config, parts or math.ceil(bands / BANDS_OF_DEM), bands)
@@ -41,8 +41,8 @@ def run_ingest(dem: Path, images: Path | None, output: Path, config: Any, parts:
     found = ingest.summarise(output)
     if images is not None:
         kept = {frame.image_id for frame in found.frames}
-        skipped = tuple(name for name in ingest.image_names(images, config) if name not in kept)
-    return replace(found, skipped=skipped)
+        found = replace(found, skipped=tuple(n for n in ingest.image_names(images, config) if n not in kept))
+    return found
 
 
 def ingest_part(path: Path, dem: Path, images: Path | None, config: Any) -> None:

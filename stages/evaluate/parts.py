@@ -91,14 +91,15 @@ def write_scores(
         shape = (len(wanted), *reader.size)
         chunks = (1, *reader.size)
         measured = file.create_dataset("measured", shape, "f4", chunks=chunks)
-        rendered = (
-            file.create_dataset("rendered", (len(rows), *shape), "f4", chunks=(1, *chunks)) if renderings else None
-        )
+        rendered: h5py.Dataset | None = None
+        if renderings:
+            rendered = file.create_dataset("rendered", (len(rows), *shape), "f4", chunks=(1, *chunks))
 
         def keep(position: int, crops: np.ndarray, images: list[np.ndarray]) -> None:
             measured[position : position + len(crops)] = crops
-            for k, image in enumerate(images if rendered is not None else ()):
-                rendered[k, position : position + len(crops)] = image
+            if rendered is not None:
+                for k, image in enumerate(images):
+                    rendered[k, position : position + len(crops)] = image
 
         scores = score(reader, rows, wanted, scale, config.batch, Perceptual(), keep, lambda count: None)
         for name in (*TABLES, *COUNTS):

@@ -235,7 +235,11 @@ def _in_parts(
     measured: Any,
     rendered: Any,
 ) -> tuple[list[Row], float, Scores]:
-    files = {"pairs": inputs[0], "checkpoint": inputs[1], "extend": inputs[2] if len(inputs) > 2 else None}
+    files: dict[str, Any] = {
+        "pairs": inputs[0],
+        "checkpoint": inputs[1],
+        "extend": inputs[2] if len(inputs) > 2 else None,
+    }
     files |= {"config": config}
     [fitted] = fan("fit", write_fit, [files | {"wanted": wanted}], ".json")
     rows, scale = read_fit(fitted, predictor, extensions, config.only)
