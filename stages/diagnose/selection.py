@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from stages.diagnose.data import Site
 from stages.diagnose.looking import Round, align, look, misfit, narrowed, quiet
-from stages.diagnose.naming import SIMPLER, choose, misaligned
+from stages.diagnose.naming import KEEP_SHARE, SIMPLER, choose, misaligned
 from stages.diagnose.refining import refine
 from stages.diagnose.state import Cause, Saved, Search
 
@@ -76,7 +76,9 @@ def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
         if rivals[0].effect.scope != "site":
             refine(state, 3 if rivals[0].effect.displaces else 2)
         return rivals[0]
-    works = seen.edges if any(c.effect.name in MOVES_SHADOWS for c in rivals) else seen.works
+    per_image = [k for k, c in enumerate(rivals) if c.effect.scope == "image"]  # free to follow any junk at the edges
+    moves = any(c.effect.name in MOVES_SHADOWS for c in rivals) and not per_image
+    works = seen.edges if moves else seen.works
     before, nothing = state.save(), misfit(state, works)
     tried: list[tuple[float, int, Saved]] = []
     for cause in rivals:
@@ -84,6 +86,11 @@ def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
         state.causes.append(cause)
         refine(state, 3 if cause.effect.displaces else 2)
         tried.append((nothing - misfit(state, works), _freedom(cause), state.save()))
+    if per_image and len(per_image) < len(rivals):  # a number for each image must do much better than one for all
+        alone = max(tried[k][0] for k in range(len(rivals)) if k not in per_image)
+        drop = alone > KEEP_SHARE * max(tried[k][0] for k in per_image)
+        keep = [k for k in range(len(rivals)) if (k in per_image) != drop]
+        rivals, tried = [rivals[k] for k in keep], [tried[k] for k in keep]
     most = max(worth for worth, _, _ in tried)
     # a superset of another effect always does a little better; where much is explained, a little is much
     least = most - min((1 - SIMPLER) * abs(most), SLIGHT * max(nothing - most, 0.0))
