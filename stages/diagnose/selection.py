@@ -12,6 +12,7 @@ from stages.diagnose.refining import refine
 from stages.diagnose.state import Cause, Saved, Search
 
 REFUSALS = 3
+MUCH = 0.02  # of what is left: by so much a cause for each image must do better than one for all
 SLIGHT = 0.005  # of what is left: by so much a simpler cause may do worse
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
@@ -88,7 +89,8 @@ def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
         tried.append((nothing - misfit(state, works), _freedom(cause), state.save()))
     if per_image and len(per_image) < len(rivals):  # a number for each image must do much better than one for all
         alone = max(tried[k][0] for k in range(len(rivals)) if k not in per_image)
-        drop = alone > KEEP_SHARE * max(tried[k][0] for k in per_image)
+        single = max(tried[k][0] for k in per_image)
+        drop = alone > KEEP_SHARE * single and single - alone < MUCH * (nothing - single)
         keep = [k for k in range(len(rivals)) if (k in per_image) != drop]
         rivals, tried = [rivals[k] for k in keep], [tried[k] for k in keep]
     most = max(worth for worth, _, _ in tried)
