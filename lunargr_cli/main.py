@@ -7,6 +7,7 @@ import importlib
 import inspect
 import os
 import pkgutil
+import shlex
 import signal
 import sys
 from collections.abc import Callable
@@ -19,6 +20,17 @@ from lunargr_cli import commands
 from lunargr_cli.console import say_error
 from schemas.errors import EXIT_CODE, LunargrError
 from schemas.locks import claim
+from schemas.said import said
+
+
+def _command_line() -> str:
+    """What made this process, as one would type it again."""
+    words = ["lunargr", *sys.argv[1:]]
+    processes, here = (int(os.environ.get(name, 1)) for name in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
+    if processes > 1:
+        nodes = ["--nnodes", str(processes // here)] if processes > here else []
+        words = ["torchrun", *nodes, "--nproc-per-node", str(here), "-m", "lunargr_cli.main", *sys.argv[1:]]
+    return shlex.join(words)
 
 
 def _alone(command: Callable[..., None]) -> Callable[..., None]:
@@ -26,6 +38,7 @@ def _alone(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
+        said.set((_command_line(), os.getcwd()))
         output = inspect.signature(command).bind(*arguments, **options).arguments.get("output")
         # Under torchrun the first process alone writes.
         if isinstance(output, Path) and os.environ.get("RANK", "0") == "0":

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import datetime
 import errno
-import hashlib
 import json
 import os
 import signal
@@ -22,8 +20,8 @@ import numpy as np
 from schemas.declaration import SCHEMAS, STRING, Schema, Variable
 from schemas.errors import ArtefactError, ConfigError, InputError, LunargrError
 from schemas.locks import claim, partial_path
+from schemas.provenance import describe_run, known_digests, sha256
 
-CONVENTIONS = "CF-1.11"
 _STANDARD_NAMES = {"x": "projection_x_coordinate", "y": "projection_y_coordinate"}
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # The netCDF-4 format's marker for a dimension without a coordinate variable of its own.
@@ -58,23 +56,6 @@ def _except_h5py_release(kind: type[BaseException], error: BaseException, trace:
 def _except_h5py_unraisable(unraisable: Any) -> None:
     if not _is_release(unraisable.exc_traceback):
         _hooks[-1][1](unraisable)
-
-
-# A shard names the same large inputs as the check before it: (path, size, time of change) -> SHA-256.
-known_digests: dict[tuple[str, int, int], str] = {}
-
-
-def sha256(path: Path) -> str:
-    """The SHA-256 of a file, read in blocks, and once only while the file stays as it is."""
-    state = os.stat(path)
-    key = (os.path.realpath(path), state.st_size, state.st_mtime_ns)
-    if key not in known_digests:
-        digest = hashlib.sha256()
-        with open(path, "rb") as stream:
-            while block := stream.read(1 << 22):
-                digest.update(block)
-        known_digests[key] = digest.hexdigest()
-    return known_digests[key]
 
 
 def check_output(path: Path, inputs: Sequence[Path] = (), overwrite: bool = False) -> None:
@@ -160,7 +141,7 @@ class ArtefactWriter:
         self.path = Path(path)
         self.schema = schema
         self.sizes = dict(sizes)
-        self._root_attributes = _provenance(schema, config or {}, inputs, seed) | dict(attributes or {})
+        self._root_attributes = describe_run(schema, config or {}, inputs, seed) | dict(attributes or {})
         self._stack = contextlib.ExitStack()
         self.file: h5py.File
 
@@ -312,24 +293,6 @@ def _terminate_as_exception() -> Iterator[None]:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-def _provenance(schema: Schema, config: Mapping[str, Any], inputs: Sequence[Path], seed: int | None) -> dict[str, Any]:
-    from importlib.metadata import version
-
-    now = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    sources = [{"name": Path(p).name, "sha256": sha256(Path(p))} for p in inputs]
-    return {
-        "Conventions": CONVENTIONS,
-        "title": schema.title,
-        "lunargr_schema": schema.name,
-        "schema_version": np.int32(schema.version),
-        "lunargr_version": version("lunargr"),
-        "history": f"{now} lunargr {schema.stage}",
-        "config": json.dumps(config, default=str, sort_keys=True),
-        "inputs": json.dumps(sources),
-        "seed": np.int64(-1 if seed is None else seed),
-    }
-
-
 def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5py.File:
     """Open an artefact for reading after checking that it is what it should be.
 
@@ -473,6 +436,7 @@ __all__ = [
     "LunargrError",
     "atomic_path",
     "check_output",
+    "known_digests",
     "open_artefact",
     "read_config",
     "read_kind",

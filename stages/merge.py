@@ -22,6 +22,7 @@ from schemas import (
     read_kind,
     read_strings,
 )
+from schemas.provenance import whole_command
 from stages.physics.frames import relative_path
 from stages.physics.geotiff import write_geotiff
 from stages.physics.grid import read_grid
@@ -35,9 +36,10 @@ MAPS = ("svbrdf",)
 PATHS = ("path", "camera")
 STANDARD = {
     "Conventions", "title", "lunargr_schema", "schema_version", "lunargr_version", "history", "config", "inputs", "seed",
+    "command", "folder", "provenance",
 }  # fmt: skip
 # Root attributes that may differ between the parts of one whole.
-_OWN = {"history", "inputs", "config", "lunargr_version", "command", "provenance"}
+_OWN = {"history", "inputs", "config", "lunargr_version", "command", "folder", "provenance"}
 # What is joined rather than compared: extremes, counts, and the rows that a part holds.
 _JOINED: dict[str, Callable[[Sequence[Any]], Any]] = {
     "elevation_low_m": min,
@@ -88,6 +90,13 @@ def run(
         if "scene" in attributes:
             attributes["scene"] = _moved(str(attributes["scene"]), parts[0], output)
         config = read_config(files[0]) | {"shard": [0, 1]}
+        if inputs is None and len(files) > 1 and _shard(files[0])[1] > 1:
+            # shards of one run: the whole is what that run in one piece would have made, from the same inputs
+            attributes |= {k: files[0].attrs[k] for k in ("inputs", "provenance", "folder") if k in files[0].attrs}
+            attributes["command"] = whole_command(str(files[0].attrs.get("command", "")), output)
+            attributes["parts"] = json.dumps([part.name for part in parts])
+            check_output(output, parts, overwrite)
+            inputs = []
         seed = int(files[0].attrs.get("seed", -1))
         with ArtefactWriter(
             output,

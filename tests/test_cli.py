@@ -27,6 +27,7 @@ STAGES = [
     "match",
     "diagnose",
     "inspect",
+    "replay",
     "schema",
     "merge",
 ]

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lunargr_cli.options import Json
+
+if TYPE_CHECKING:
+    from schemas.provenance import Step
 
 NAME, ORDER = "inspect", 90
 
@@ -20,6 +24,7 @@ def command(
     """Say what an artefact is, who made it and from what; check it against its schema."""
     from lunargr_cli.console import Console
     from schemas import atomic_path, open_artefact, read_kind
+    from schemas.provenance import chain
 
     schema = read_kind(file)
     with open_artefact(file, schema) as data:
@@ -41,13 +46,30 @@ def command(
         ("name", "shape", "type"),
         [(n, "x".join(map(str, v["shape"])) or "scalar", v["dtype"]) for n, v in variables.items()],
     )
-    console.table("attributes", ("name", "value"), attributes.items())
+    steps = chain(file)
+    shown = {k: v for k, v in attributes.items() if k != "provenance"}
+    console.table("attributes", ("name", "value"), shown.items())
+    console.table("made by, in this order", ("file", "command", "version", "seed", "sha256"), [_row(s) for s in steps])
     if json_file is not None:
         with atomic_path(json_file) as partial:
             partial.write_text(
                 json.dumps(
-                    {"file": file.name, "schema": schema.name, "attributes": attributes, "variables": variables},
+                    {
+                        "file": file.name,
+                        "schema": schema.name,
+                        "attributes": attributes,
+                        "variables": variables,
+                        "chain": [asdict(s) for s in steps],
+                    },
                     indent=1,
                     default=str,
                 )
             )
+
+
+def _row(step: Step) -> tuple[object, ...]:
+    record = step.record
+    if record is None:
+        return step.name, "(given)", "", "", step.sha256
+    how = record["command"] or f"(Python) {record['schema']} {json.dumps(record['config'], sort_keys=True)}"
+    return step.name, how, record["version"], "" if record["seed"] < 0 else record["seed"], step.sha256

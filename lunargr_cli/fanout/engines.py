@@ -119,12 +119,12 @@ class _Dask:
         """As they come. A part whose worker dies is given to another; one that fails is not tried elsewhere."""
         import distributed
 
-        from schemas.hdf5 import known_digests
+        from schemas.provenance import current_command, known_digests
 
         if not tasks:
             return
         # Given along with every task: data scattered to workers would die with them.
-        common = version("lunargr"), dict(known_digests)
+        common = version("lunargr"), dict(known_digests), current_command()
         waiting = [
             self.client.submit(_work, task, common, key=str(task.path), pure=False, retries=ERRORS) for task in tasks
         ]
@@ -152,12 +152,12 @@ class _Dask:
                 self.client.cancel(waiting, force=True)
 
 
-def _work(task: Task, common: tuple[str, dict[Any, str]]) -> LunargrError | None:
+def _work(task: Task, common: tuple[str, dict[Any, str], tuple[str, str] | None]) -> LunargrError | None:
     """On a worker. A LunargrError is an answer: no other worker would find anything else."""
-    from schemas.hdf5 import known_digests
     from schemas.locks import unlocked
+    from schemas.provenance import known_digests, run_by
 
-    expected, digests = common
+    expected, digests, command = common
     if version("lunargr") != expected:
         return ConfigError(
             f"--scheduler: the worker on {socket.gethostname()} has lunargr {version('lunargr')}, expected {expected}; install the same."
@@ -166,7 +166,7 @@ def _work(task: Task, common: tuple[str, dict[Any, str]]) -> LunargrError | None
     if task.path.exists():  # by a worker that was given up too early
         return None
     try:
-        with unlocked():
+        with unlocked(), run_by(command):
             task.function(task.path, **task.arguments)
     except LunargrError as error:
         return error

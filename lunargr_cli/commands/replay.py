@@ -1,0 +1,48 @@
+"""`lunargr replay FILE`: the commands that make an artefact again."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from schemas.provenance import Step
+
+NAME, ORDER = "replay", 91
+
+
+def command(file: Annotated[Path, typer.Argument(help="Any artefact of lunargr.")]) -> None:
+    """Print the chain of commands that makes an artefact again, as a shell script; nothing is run."""
+    from schemas import open_artefact, read_kind
+    from schemas.provenance import chain
+
+    open_artefact(file, read_kind(file)).close()
+    print("\n".join(script(chain(file))))
+
+
+def script(steps: Sequence[Step]) -> Iterator[str]:
+    """A shell script: inputs first, each with its hash; what no command is known for is said in comments."""
+    yield "set -eu"
+    folder, done = "", set()
+    for step in steps:
+        record = step.record
+        mark = f"  # sha256 {step.sha256}" if step.sha256 else ""
+        if record is None:
+            yield f"# needs {step.name}{mark}"
+            continue
+        seed = "" if record["seed"] < 0 else f", seed {record['seed']}"
+        yield f"# {step.name}: {record['schema']}, lunargr {record['version']}{seed}{mark.replace('  #', ',')}"
+        if not record["command"]:
+            yield f"# made from Python, by the stage's run(), with {json.dumps(record['config'], sort_keys=True)}"
+            continue
+        if record["folder"] != folder:
+            folder = record["folder"]
+            yield f"cd {shlex.quote(folder)}"
+        if record["command"] not in done:  # one command may leave several files
+            yield record["command"]
+        done.add(record["command"])

@@ -1,0 +1,159 @@
+"""Who made an artefact, from what: the command, its version, seed and options, its inputs' hashes, and the same for them.
+
+Every artefact carries the records of all that it descends from, so that the chain outlives the files.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import hashlib
+import json
+import os
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from schemas.declaration import Schema
+from schemas.said import said
+
+CONVENTIONS = "CF-1.11"
+# A shard names the same large inputs as the check before it: (path, size, time of change) -> SHA-256.
+known_digests: dict[tuple[str, int, int], str] = {}
+
+
+def sha256(path: Path) -> str:
+    """The SHA-256 of a file, read in blocks, and once only while the file stays as it is."""
+    state = os.stat(path)
+    key = (os.path.realpath(path), state.st_size, state.st_mtime_ns)
+    if key not in known_digests:
+        digest = hashlib.sha256()
+        with open(path, "rb") as stream:
+            while block := stream.read(1 << 22):
+                digest.update(block)
+        known_digests[key] = digest.hexdigest()
+    return known_digests[key]
+
+
+@contextlib.contextmanager
+def run_by(command: tuple[str, str] | None) -> Iterator[None]:
+    """Within this block artefacts say that they are made by this command line, in this folder."""
+    token = said.set(command)
+    try:
+        yield
+    finally:
+        said.reset(token)
+
+
+def current_command() -> tuple[str, str] | None:
+    """(command line, folder) of the run, None where lunargr is used as a library."""
+    return said.get()
+
+
+def describe_run(schema: Schema, config: Mapping[str, Any], inputs: Sequence[Path], seed: int | None) -> dict[str, Any]:
+    """The root attributes that say who makes an artefact now, and from what."""
+    now = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    sources = [{"name": Path(p).name, "sha256": sha256(Path(p))} for p in inputs]
+    command, folder = current_command() or ("", "")
+    ancestors: dict[str, dict[str, Any]] = {}
+    for path, source in zip(inputs, sources, strict=True):
+        own, earlier = read_record(Path(path))
+        ancestors |= earlier
+        if own is not None:
+            ancestors[source["sha256"]] = own
+    return {
+        "Conventions": CONVENTIONS,
+        "title": schema.title,
+        "lunargr_schema": schema.name,
+        "schema_version": np.int32(schema.version),
+        "lunargr_version": version("lunargr"),
+        "history": f"{now} {command or 'lunargr ' + schema.stage}",
+        "command": command,
+        "folder": folder,
+        "config": json.dumps(config, default=str, sort_keys=True),
+        "inputs": json.dumps(sources),
+        "seed": np.int64(-1 if seed is None else seed),
+        "provenance": json.dumps(ancestors, sort_keys=True),
+    }
+
+
+def read_record(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, Any]]]:
+    """An artefact's own record (None for other files) and, by SHA-256, those of all that it descends from."""
+    h5py._errors.silence_errors()
+    try:
+        if not h5py.is_hdf5(path):
+            return None, {}
+        with h5py.File(path, "r") as file:
+            root = {k: (v.decode() if isinstance(v, bytes) else v) for k, v in file.attrs.items()}
+    except OSError:
+        return None, {}
+    if "lunargr_schema" not in root:
+        return None, {}
+    record = {
+        "schema": str(root["lunargr_schema"]),
+        "history": str(root.get("history", "")),
+        "command": str(root.get("command", "")),
+        "folder": str(root.get("folder", "")),
+        "version": str(root.get("lunargr_version", "")),
+        "seed": int(root.get("seed", -1)),
+        "config": json.loads(root.get("config", "{}")),
+        "inputs": json.loads(root.get("inputs", "[]")),
+    }
+    return record, json.loads(root.get("provenance", "{}"))
+
+
+def whole_command(command: str, output: Path) -> str:
+    """What one run would have been called with, from a shard's command line: no --shard, and the whole's name."""
+    words, kept, named, skip = shlex.split(command), [], False, False
+    for word in words:
+        name, equals, _ = word.partition("=")
+        if skip:
+            skip = False
+        elif name == "--shard":
+            skip = not equals
+        elif name in ("-o", "--output"):
+            kept += ["-o", str(output)]
+            skip, named = not equals, True
+        else:
+            kept.append(word)
+    if words and not named:
+        kept += ["-o", str(output)]
+    return shlex.join(kept)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One file of a chain. ``record`` is None for files that no recorded command made: the user's own."""
+
+    name: str
+    sha256: str
+    record: dict[str, Any] | None
+
+
+def chain(path: Path) -> list[Step]:
+    """Everything that an artefact descends from, inputs before what was made of them, and last the artefact itself.
+
+    Its own SHA-256 is left empty: nobody needs it, and the file may be large.
+    """
+    own, ancestors = read_record(path)
+    steps: list[Step] = []
+    seen: set[str] = set()
+
+    def visit(source: Mapping[str, str]) -> None:
+        if source["sha256"] in seen:
+            return
+        seen.add(source["sha256"])
+        record = ancestors.get(source["sha256"])
+        for earlier in record["inputs"] if record else ():
+            visit(earlier)
+        steps.append(Step(source["name"], source["sha256"], record))
+
+    for source in own["inputs"] if own else ():
+        visit(source)
+    return [*steps, Step(path.name, "", own)]

@@ -1,0 +1,102 @@
+"""The whole chain of commands behind an artefact, kept in it, and a script that makes the same bytes again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+
+import h5py
+import pytest
+from cluster_scene import LUNARGR, assert_same, environment, lunargr
+
+from schemas.provenance import chain, whole_command
+
+
+@pytest.fixture(scope="module")
+def made(small_files, tmp_path_factory):
+    """scene, crops and pairs by commands, the crops in shards."""
+    folder = tmp_path_factory.mktemp("made")
+
+    def run(*arguments):
+        done = subprocess.run(
+            [*LUNARGR, *map(str, arguments)], cwd=folder, env=environment(), capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+
+    run("ingest", small_files.dem, "--images", small_files.images, "--gsd", 20, "--crop", 32, "-o", "scene.h5")
+    for k in (1, 2):
+        run("sample", "scene.h5", "--count", 60, "--tile-m", 1280, "--seed", 3, "--shard", f"{k}/2", "-o", f"c{k}.h5")
+    run("merge", "c1.h5", "c2.h5", "-o", "crops.h5")
+    run("project", "crops.h5", "--resume", "--output=pairs.h5")
+    return folder
+
+
+def test_the_chain_names_commands_versions_seeds_and_hashes(made, small_files):
+    steps = {s.name: s for s in chain(made / "pairs.h5")}
+    assert list(steps) == ["dem.tif", "images.csv", "scene.h5", "crops.h5", "pairs.h5"]
+    assert steps["dem.tif"].record is None
+    for name, path in (("dem.tif", small_files.dem), ("crops.h5", made / "crops.h5")):
+        assert steps[name].sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert steps["crops.h5"].record["seed"] == 3
+    assert (
+        steps["crops.h5"].record["command"] == "lunargr sample scene.h5 --count 60 --tile-m 1280 --seed 3 -o crops.h5"
+    )
+    assert steps["pairs.h5"].record["command"] == "lunargr project crops.h5 --resume --output=pairs.h5"
+    code, said = lunargr("inspect", made / "pairs.h5", "--json", made / "i.json")
+    assert code == 0 and "lunargr ingest" in said
+    assert [s["name"] for s in json.loads((made / "i.json").read_text())["chain"]] == list(steps)
+
+
+def test_replay_makes_the_same_bytes_after_all_else_is_gone(made, tmp_path):
+    kept = tmp_path / "kept.h5"
+    (made / "pairs.h5").rename(kept)
+    for name in ("scene.h5", "crops.h5", "c1.h5", "c2.h5"):
+        (made / name).unlink()
+    code, script = lunargr("replay", kept)
+    assert code == 0
+    binary = tmp_path / "bin"
+    binary.mkdir()
+    (binary / "lunargr").write_text(f'#!/bin/sh\nexec {LUNARGR[0]} -m lunargr_cli.main "$@"\n')
+    (binary / "lunargr").chmod(0o755)
+    path = {"PATH": f"{binary}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(["bash"], input=script, env=environment() | path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert_same(kept, made / "pairs.h5")
+
+
+def test_a_library_run_says_so(small_artefacts):
+    code, script = lunargr("replay", small_artefacts["pairs"])
+    assert code == 0
+    assert script.count("made from Python") == 3
+    assert '"tile_m": 1280' in script
+
+
+def test_a_file_of_another_program_is_where_the_chain_begins(small_artefacts, tmp_path):
+    pairs = tmp_path / "pairs.h5"
+    pairs.write_bytes(small_artefacts["pairs"].read_bytes())
+    with h5py.File(pairs, "r+") as file:
+        for name in ("lunargr_schema", "command", "inputs", "provenance"):
+            del file.attrs[name]
+    options = ["--epochs", 1, "--widths", "4-4", "--device", "cpu", "--precision", "fp32", "--quiet"]
+    code, said = lunargr("train", pairs, *options, "-o", tmp_path / "checkpoint.h5")
+    assert code == 0, said
+    code, script = lunargr("replay", tmp_path / "checkpoint.h5")
+    assert code == 0 and "# needs pairs.h5  # sha256" in script
+    assert "lunargr train" in script
+
+
+@pytest.mark.parametrize(
+    ("shard", "whole"),
+    [
+        ("lunargr project c.h5 --shard 1/2 -o p.1.h5", "lunargr project c.h5 -o 'my pairs.h5'"),
+        ("lunargr project c.h5 --output=p.1.h5 --shard=1/2 -q", "lunargr project c.h5 -o 'my pairs.h5' -q"),
+        ("lunargr project c.h5 --shard 1/2", "lunargr project c.h5 -o 'my pairs.h5'"),
+        ("", ""),
+    ],
+)
+def test_the_command_of_the_whole_from_that_of_a_shard(shard, whole, tmp_path):
+    from pathlib import Path
+
+    assert whole_command(shard, Path("my pairs.h5")) == whole
