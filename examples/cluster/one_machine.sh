@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The whole pipeline on one machine, its wide stages cut into shards that run side by side.
 #
-#   examples/cluster.sh DEM IMAGES_CSV FOLDER [SHARDS]
+#   examples/cluster/one_machine.sh DEM IMAGES_CSV FOLDER [SHARDS]
 #
 # The same seed gives the same artefacts as a run in one piece, whatever SHARDS is. What exists is not made again:
 # after a failure, run the same line once more. Settings, all optional (environment):

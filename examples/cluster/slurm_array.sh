@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
 # One wide stage as a Slurm array: task I of N writes part I, a dependent job merges.
 #
-#   examples/slurm_array.sh N OUTPUT STAGE ARGUMENTS...
-#   examples/slurm_array.sh 64 pairs.h5  project crops.h5
-#   examples/slurm_array.sh 32 svbrdf.h5 infer dem.tif checkpoint.h5
+#   examples/cluster/slurm_array.sh N OUTPUT STAGE ARGUMENTS...
+#   examples/cluster/slurm_array.sh 64 pairs.h5  project crops.h5
+#   examples/cluster/slurm_array.sh 32 svbrdf.h5 infer dem.tif checkpoint.h5
 #
 # Prints the id of the merging job, so that stages chain:
-#   a=$(examples/slurm_array.sh 16 crops.h5 sample scene.h5 --count 80000 --seed 1)
-#   b=$(AFTER=$a examples/slurm_array.sh 64 pairs.h5 project crops.h5)
+#   a=$(examples/cluster/slurm_array.sh 16 crops.h5 sample scene.h5 --count 80000 --seed 1)
+#   b=$(AFTER=$a examples/cluster/slurm_array.sh 64 pairs.h5 project crops.h5)
 #   sbatch --dependency=afterok:$b --gpus=1 --wrap "lunargr train pairs.h5 --resume -o checkpoint.h5"
 #
 # Settings (environment): LUNARGR=lunargr  CPUS=4  MEM=8G  TIME=02:00:00  AFTER=JOBID  SBATCH_OPTIONS="-p short"
@@ -46,6 +46,8 @@ common+=(${extra[@]+"${extra[@]}"})
 task="set -eu
 export OMP_NUM_THREADS=$CPUS NUMBA_NUM_THREADS=$CPUS
 part=$(printf %q "$stem").\$SLURM_ARRAY_TASK_ID-of-$count.h5
+# put back into the queue: the lock was this very task's
+[ \"\${SLURM_RESTART_COUNT:-0}\" = 0 ] || rm -f \"\$(dirname \"\$part\")/.\$(basename \"\$part\").lock\"
 [ -e \"\$part\" ] || $LUNARGR $arguments --shard \$SLURM_ARRAY_TASK_ID/$count --output \"\$part\""
 array=$(submit "${common[@]}" --job-name="lunargr-$1" --array="1-$count" --wrap "$task")
 
