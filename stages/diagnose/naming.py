@@ -22,9 +22,9 @@ FLOOR_GAIN = 12.0  # nats
 RIVAL_SHARE = 0.6  # of the gain between a scene-wide effect and one per image, above which both are tried
 KEEP_SHARE = 0.8  # of a per-image effect's gain that a scene-wide effect must keep to replace it
 SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to replace it
-NEAR = 0.85  # of the best gain: linear models of strong effects are no closer than that
-RIVALS = 3
-BLUR = 1.5  # radius of the discs, in rms slope errors of the DEM, that relief alone makes of the Sun
+NEAR = 0.9  # of the best gain: linear models of strong effects are no closer than that
+RIVALS = 2
+BLUR = 2.2  # radius of the discs, in rms slope errors of the DEM, that relief alone makes of the Sun
 LEAST_DISC = 0.5  # deg
 CLEAR_LAG = 4  # px
 STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
@@ -117,7 +117,7 @@ def worth_image(e: ImageEvidence, count: int) -> bool:
     cls = get_effect(e.effect)
     if not cls.tolerance:
         return e.fid > 2 * FLOOR_IMAGE
-    return e.rms > 1.1 * cls.tolerance[cls.parameters[0].name]
+    return e.rms > 1.2 * cls.tolerance[cls.parameters[0].name]
 
 
 def misaligned(state: Search, e: ImageEvidence) -> Cause | None:

@@ -16,6 +16,7 @@ from stages.effects import Effect
 from stages.physics.photometry import ReflectanceModel, get_model
 
 ROUNDS = 10
+PULL = 0.05
 DARK = 0.3  # of the predicted brightness
 
 
@@ -86,9 +87,10 @@ def fit(
     damping = 1e-7 if nominal.model.linear and units == "iof" else 1e-3
     best: tuple[float, Tensor, Tensor, Tensor] | None = None  # cost, vector, normal equations
     for _ in range(rounds):
-        gram, score, cost = _normal_equations(nominal, sites, base, units, measured, fitted)
+        gram, score, cost, count = _normal_equations(nominal, sites, base, units, measured, fitted)
         if not fitted:
             continue
+        cost += _drawn_to_published(nominal, gram, score, cost, count)
         if best is not None and cost > best[0] and not nominal.model.linear:  # Levenberg (1944), Marquardt (1963)
             damping *= 10
         else:
@@ -108,9 +110,13 @@ def fit(
             high = torch.tensor([p.upper for p in nominal.model.parameters])
             nominal.vector = nominal.vector.clamp(min=low, max=high)
     if fitted and not nominal.model.linear and best is not None:
-        cost = _normal_equations(nominal, sites, base, units, measured, False)[2]
+        _, _, cost, count = _normal_equations(nominal, sites, base, units, measured, False)
+        cost += _drawn_to_published(nominal, gram.clone(), score.clone(), cost, count)
         if cost > best[0]:
             nominal.vector = best[1]
+            _normal_equations(
+                nominal, sites, base, units, measured, False
+            )  # gains and offsets go with the coefficients
 
 
 def _normal_equations(
@@ -120,8 +126,8 @@ def _normal_equations(
     units: str,
     measured: Sequence[Tensor],
     fitted: bool,
-) -> tuple[Tensor, Tensor, float]:
-    """Gram matrix and score of the coefficients (zero unless ``fitted``), and the mean squared residual they come from."""
+) -> tuple[Tensor, Tensor, float, float]:
+    """Gram matrix and score of the coefficients (zero unless ``fitted``), the mean squared residual, its pixels."""
     count_free = int(nominal.free.sum())
     gram = torch.zeros(count_free, count_free, dtype=torch.float64)
     score = torch.zeros(count_free, dtype=torch.float64)
@@ -148,7 +154,25 @@ def _normal_equations(
             flat = (torch.stack(chain.surface_tangents()).double() * weight).flatten(1)
             gram += flat @ flat.T
             score += flat @ residual.flatten()
-    return gram, score, cost / max(count, 1.0)
+    return gram, score, cost / max(count, 1.0), count
+
+
+def _drawn_to_published(nominal: Nominal, gram: Tensor, score: Tensor, cost: float, count: float) -> float:
+    """Add the pull of a curved model's published coefficients to the normal equations; returns its share of the cost.
+
+    Films and detectors of unknown gain leave the level open, and the nine of Hapke's model imitate each other: nothing
+    is gained by an albedo of zero.
+    """
+    if nominal.model.linear:
+        return 0.0
+    every = nominal.model.parameters
+    published = torch.tensor([p.default for p in every])[nominal.free].double()
+    width = torch.tensor([(p.upper - p.lower) / 4 for p in every])[nominal.free].double()
+    away = (nominal.vector[nominal.free].double() - published) / width
+    pull = PULL * cost * count / len(width)
+    gram += torch.diag(pull / width.square())
+    score -= pull * away / width
+    return PULL * cost * float(away.square().mean())
 
 
 def _brightness(chains: Sequence[Chain], masks: Sequence[Tensor]) -> float:

@@ -85,7 +85,7 @@ def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
     for cause in rivals:
         state.load(before)
         state.causes.append(cause)
-        refine(state, 3 if cause.effect.displaces else 2)
+        refine(state, 2 if cause.effect.displaces else 1)
         tried.append((nothing - misfit(state, works), _freedom(cause), state.save()))
     if per_image and len(per_image) < len(rivals):  # a number for each image must do much better than one for all
         alone = max(tried[k][0] for k in range(len(rivals)) if k not in per_image)
@@ -103,6 +103,7 @@ def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
     )
     cause = rivals[place]
     state.load(tried[place][2])
+    refine(state, 1)
     names = [c.effect.name for c in rivals if c is not cause]
     cause.group = [
         cause.effect.name,
