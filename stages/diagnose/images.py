@@ -128,7 +128,7 @@ def _halves(height: int, width: int) -> list[Tensor]:
 
 def _without(folds: list[Tensor], nuisance: np.ndarray, wanted: np.ndarray) -> list[_Fold]:
     """Products of the wanted columns (the residual first) once the nuisance columns are fitted to all folds together."""
-    total = sum(folds)
+    total = torch.stack(folds).sum(0)
     gram = total[np.ix_(nuisance, nuisance)]
     scale = gram.diagonal().clamp(min=1e-30).rsqrt()
     normal = gram * scale[:, None] * scale + 1e-6 * torch.eye(len(gram), dtype=torch.float64)

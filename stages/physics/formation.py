@@ -120,9 +120,7 @@ def form(
     return expose(state, extensions)
 
 
-def illuminate(
-    observation: Observation, extensions: Sequence[Extension] = (), known: State | None = None
-) -> State:
+def illuminate(observation: Observation, extensions: Sequence[Extension] = (), known: State | None = None) -> State:
     """The first half of the chain, which no coefficient enters: slopes, angles and the visible share of the Sun.
 
     known : a state of the same observation; what the extensions leave as it is there is taken over, not computed again
@@ -136,16 +134,16 @@ def illuminate(
     )
     _apply(state, extensions, "geometry")
     gsd, radius = observation.gsd, observation.body_radius
-    same_ground = known is not None and state.elevation is known.elevation
-    if same_ground and state.camera_position is known.camera_position:
+    ground = known
+    if known is not None and state.elevation is known.elevation and state.camera_position is known.camera_position:
         state.slopes, state.view = known.slopes, known.view
     else:
-        same_ground = False
+        ground = None
         state.slopes = geometry.curvature_slopes(*geometry.slopes(state.elevation, gsd), gsd, radius)
         state.view = geometry.view_vectors(state.elevation, state.camera_position, gsd)
     _apply(state, extensions, "illumination")
-    if same_ground and state.sun_direction is known.sun_direction:
-        state.angles = known.angles
+    if ground is not None and state.sun_direction is ground.sun_direction:
+        state.angles = ground.angles
     else:
         state.angles = geometry.photometric_angles(*state.slopes, state.sun_direction, state.view)
     if state.sun_horizon is not None:
