@@ -26,15 +26,17 @@ from schemas import CHECKPOINT, ArtefactWriter, ConfigError, InputError, check_o
 from schemas.hdf5 import sha256
 from stages.network import symmetries
 from stages.network.dataset import Batch, PairReader
-from stages.network.losses import Radiometry, masked_mse
+from stages.network.losses import Radiometry, masked_mse, squared_error
 from stages.network.predictor import Predictor, choose_device, write_state
-from stages.network.processes import average_buffers, average_gradients, join_group, mean_over_ranks, same_everywhere
+from stages.network.processes import join_group, mean_over_ranks, same_everywhere, sum_gradients, sum_over_ranks
 from stages.network.resume import History, restore, save, snapshot
 from stages.network.runtime import choose_precision, keep_freed_memory
 from stages.network.unet import DROPOUT, WIDTHS, UNet
 from stages.network.uniform import elevation_scale, fit_start
 from stages.physics.formation import Extension, form
 from stages.physics.photometry import get_model
+
+CHECK_EVERY = 16  # batches: looking at the loss makes a GPU wait
 
 Say = Callable[[str], None]
 Progress = Callable[[int, int, str], None]
@@ -145,39 +147,38 @@ def run(
             began = time.monotonic()
             # All randomness of an epoch hangs on (seed, epoch): a resumed run draws what an uninterrupted one would.
             rng = np.random.default_rng([config.seed, epoch])
-            torch.manual_seed(hash((config.seed, epoch, rank)) % 2**31)
+            torch.manual_seed(hash((config.seed, epoch)) % 2**31)
             for group in optimizer.param_groups:
                 group["lr"] = _learning_rate(config, epoch)
             predictor.train()
-            loss_sum, pixel_sum, seen = 0.0, 0.0, 0
-            steps = _steps(train, config, rng, rank, ranks)
+            sums = torch.zeros(2, dtype=torch.float64, device=device)  # squared errors and pixels of this process
+            steps, keys = _steps(train, config, rng, rank, ranks)
             for number, batch in enumerate(_prefetch(reader, steps, device)):
                 measured = batch.image / radiometry.scale
                 with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
-                    coefficients = predictor(batch.observation.elevation)
+                    coefficients = predictor(batch.observation.elevation, keys[number].to(device))
                 rendered = form(batch.observation, model, coefficients.float(), extensions)
-                loss = masked_mse(radiometry(rendered, batch.observation.frame), measured, batch.valid)
-                if not torch.isfinite(loss):
-                    raise InputError(
-                        f"{pairs}: the loss is not finite in epoch {epoch + 1}; lower --lr or check the images' units."
-                    )
+                error = squared_error(radiometry(rendered, batch.observation.frame), measured, batch.valid)
+                pixels = batch.valid.sum().double()
+                sums += torch.stack([error.detach().double(), pixels])
+                if number % CHECK_EVERY == 0 and not torch.isfinite(sums[0]):
+                    break
+                # The mean over the valid pixels of the whole batch; this process has its share of the sum.
+                loss = error / sum_over_ranks(pixels, ranks).clamp(min=1).float()
                 optimizer.zero_grad(set_to_none=True)
                 loss.backward()
                 if ranks > 1:
-                    average_gradients(parameters, ranks)
+                    sum_gradients(parameters)
                 optimizer.step()
-                pixels = float(batch.valid.sum())
-                loss_sum, pixel_sum, seen = (
-                    loss_sum + loss.item() * pixels,
-                    pixel_sum + pixels,
-                    seen + len(batch.image) * ranks,
-                )
                 if progress and rank == 0:
                     progress(number + 1, len(steps), f"epoch {epoch + 1}/{config.epochs}")
+            error_sum, pixel_sum = sums.tolist()
+            if not math.isfinite(error_sum):
+                raise InputError(
+                    f"{pairs}: the loss is not finite in epoch {epoch + 1}; lower --lr or check the images' units."
+                )
             training_seconds = time.monotonic() - began
-            if ranks > 1:
-                average_buffers(predictor, ranks)
-            train_loss = mean_over_ranks(loss_sum, pixel_sum, ranks, device)
+            train_loss = mean_over_ranks(error_sum, pixel_sum, ranks, device)
             validation_loss = evaluate_loss(
                 reader, validation, predictor, radiometry, extensions, config.batch, device, rank, ranks
             )
@@ -194,7 +195,7 @@ def run(
                 best = snapshot(predictor, radiometry)
             if rank == 0:
                 save(sidecar, identity, predictor, radiometry, optimizer, history, best, precision)
-                speed = seen / training_seconds
+                speed = len(train) / training_seconds
                 left = (config.epochs - epoch - 1) * history.epoch_seconds[-1]
                 say(
                     f"epoch {epoch + 1:3d}/{config.epochs}  train {train_loss:.4e}  validation {validation_loss:.4e}"
@@ -267,17 +268,22 @@ def _learning_rate(config: Config, epoch: int) -> float:
 
 def _steps(
     train: NDArray[np.int64], config: Config, rng: np.random.Generator, rank: int, ranks: int
-) -> list[tuple[NDArray, NDArray | None]]:
-    """The batches of one epoch for this process: (pair indices, symmetries). Every process gets as many."""
+) -> tuple[list[tuple[NDArray, NDArray | None]], list[Tensor]]:
+    """The batches of one epoch for this process: (pair indices, symmetries), and the crops' keys for dropout.
+
+    Every process gets as many batches; what a crop meets does not depend on the process that works on it.
+    """
     order = rng.permutation(train)
     turns = rng.integers(0, symmetries.COUNT, len(order)) if config.augment else None
     count = math.ceil(len(order) / config.batch)
     bounds = [len(order) * k // count for k in range(count + 1)]  # equal batches: BatchNorm dislikes a rest of one
-    steps = []
+    drawn = torch.from_numpy(rng.integers(0, 2**62, len(order)))
+    steps, keys = [], []
     for first, last in itertools.pairwise(bounds):
         mine = np.arange(first, last)[rank::ranks] if last - first >= ranks else np.arange(first, last)
         steps.append((order[mine], None if turns is None else turns[mine]))
-    return steps
+        keys.append(drawn[mine])
+    return steps, keys
 
 
 def _prefetch(reader: PairReader, steps: Sequence[tuple[NDArray, NDArray | None]], device: torch.device):

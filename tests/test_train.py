@@ -18,6 +18,7 @@ from schemas import PAIRS, ArtefactError, ArtefactWriter, ConfigError, InputErro
 from stages import ingest, project, sample, train
 from stages.network.dataset import PairReader
 from stages.network.predictor import load_predictor
+from stages.network.unet import DROPOUT
 from stages.network.uniform import fit_radiometry, fit_uniform
 from stages.physics.formation import form
 from stages.physics.photometry import get_model
@@ -158,18 +159,21 @@ def test_uncalibrated_images_get_their_gains(tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_learn_like_one(small_artefacts, trained, tmp_path):
-    """torchrun with two processes: the same batches, so nearly the same losses."""
+    """torchrun with two processes: BatchNorm sees whole batches, dropout and loss too, so the losses agree to rounding.
+
+    Measured: 1e-6 to 6e-5 apart; without shared statistics, a factor of two in the first epoch.
+    """
     out = tmp_path / "checkpoint.h5"
     command = [
         sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "lunargr_cli.main", "train",
         str(small_artefacts["pairs"]), "-o", str(out), "--epochs", "4", "--batch", "16", "--widths", "4-8", "--lr", "2e-3", "--device", "cpu",
         "--precision", "fp32",
     ]  # fmt: skip
+    train.run(small_artefacts["pairs"], tmp_path / "one.h5", config(epochs=4, dropout=DROPOUT))
     subprocess.run(command, check=True, capture_output=True, timeout=240)
-    with h5py.File(out) as two, h5py.File(trained[0]) as one:
-        # Each process normalises by its own half of a batch: the losses are close, not equal.
-        np.testing.assert_allclose(two["train_loss"][0], one["train_loss"][0], rtol=0.5)
-        assert two["train_loss"][-1] < two["train_loss"][0]
+    with h5py.File(out) as two, h5py.File(tmp_path / "one.h5") as one:
+        for name in ("train_loss", "validation_loss"):
+            np.testing.assert_allclose(two[name][...], one[name][...], rtol=1e-3, err_msg=name)
 
 
 def test_bad_requests_are_refused_and_leave_nothing(small_artefacts, tmp_path):

@@ -6,10 +6,15 @@ import torch
 from torch import Tensor, nn
 
 
+def squared_error(predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
+    """Sum of squared errors over valid pixels."""
+    residual = (predicted - measured) * valid
+    return (residual * residual).sum()
+
+
 def masked_mse(predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
     """Mean squared error over valid pixels; 0 where there are none."""
-    residual = (predicted - measured) * valid
-    return (residual * residual).sum() / valid.sum().clamp(min=1)
+    return squared_error(predicted, measured, valid) / valid.sum().clamp(min=1)
 
 
 class Radiometry(nn.Module):

@@ -41,12 +41,12 @@ class Predictor(torch.nn.Module):
         self.image_units = "iof"
         self.gsd = float("nan")
 
-    def forward(self, elevation: Tensor) -> Tensor:
-        """(B, H, W) m -> (B, C, H, W) coefficients."""
+    def forward(self, elevation: Tensor, keys: Tensor | None = None) -> Tensor:
+        """(B, H, W) m -> (B, C, H, W) coefficients; ``keys`` as in :class:`UNet`."""
         x = scale_elevation(elevation, self.elevation_scale)
         if elevation.device.type == "cpu":
             x = x.to(memory_format=torch.channels_last)
-        raw = self.net(x).float() * self.output_scale + self.start[None, :, None, None]
+        raw = self.net(x, keys).float() * self.output_scale + self.start[None, :, None, None]
         return self.model.constrain(raw, dim=1)
 
     @torch.no_grad()

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import torch
 import torch.distributed as dist
-from torch import Tensor, nn
+from torch import Tensor
 
 
 def join_group() -> tuple[int, int]:
@@ -21,22 +21,20 @@ def join_group() -> tuple[int, int]:
     return dist.get_rank(), ranks
 
 
-def average_gradients(parameters: Sequence[Tensor], ranks: int) -> None:
+def sum_gradients(parameters: Sequence[Tensor]) -> None:
+    """Each process has the gradient of its share of the loss: add them up."""
     flat = torch.cat([(p.grad if p.grad is not None else torch.zeros_like(p)).reshape(-1) for p in parameters])
     dist.all_reduce(flat)
-    flat /= ranks
     offset = 0
     for p in parameters:
-        p.grad = flat[offset : offset + p.numel()].view_as(p).clone()
+        p.grad = torch.empty_like(p).copy_(flat[offset : offset + p.numel()].view_as(p))
         offset += p.numel()
 
 
-def average_buffers(network: nn.Module, ranks: int) -> None:
-    """Each process saw other crops: share BatchNorm's running statistics."""
-    for buffer in network.buffers():
-        if buffer.is_floating_point():
-            dist.all_reduce(buffer)
-            buffer /= ranks
+def sum_over_ranks(values: Tensor, ranks: int) -> Tensor:
+    if ranks > 1:
+        dist.all_reduce(values)
+    return values
 
 
 def mean_over_ranks(total: float, weight: float, ranks: int, device: torch.device) -> float:

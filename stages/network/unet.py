@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from stages.network.layers import SLOPE, BatchNorm, Dropout, draw_keys
+
 WIDTHS = (16, 32, 64, 128, 256)
 DROPOUT = (0.1, 0.1, 0.2, 0.2, 0.3)
 
@@ -34,18 +36,24 @@ def _conv(inputs: int, outputs: int) -> nn.Conv2d:
     return nn.Conv2d(inputs, outputs, 3, padding=1, padding_mode="replicate")
 
 
-def _block(inputs: int, outputs: int, dropout: float, first: bool = False) -> nn.Sequential:
-    """Two 3x3 convolutions with BatchNorm and LeakyReLU, dropout between them."""
-    entry = HeightConv(inputs, outputs) if first else _conv(inputs, outputs)
-    return nn.Sequential(
-        entry,
-        nn.BatchNorm2d(outputs),
-        nn.LeakyReLU(0.01, inplace=True),
-        nn.Dropout(dropout),
-        _conv(outputs, outputs),
-        nn.BatchNorm2d(outputs),
-        nn.LeakyReLU(0.01, inplace=True),
-    )
+class Block(nn.Sequential):
+    """Two 3x3 convolutions with BatchNorm and LeakyReLU, dropout between them. ``layer`` numbers the dropout."""
+
+    def __init__(self, inputs: int, outputs: int, dropout: float, layer: int) -> None:
+        super().__init__(
+            HeightConv(inputs, outputs) if layer == 0 else _conv(inputs, outputs),
+            BatchNorm(outputs),
+            nn.LeakyReLU(SLOPE, inplace=True),
+            Dropout(dropout, layer),
+            _conv(outputs, outputs),
+            BatchNorm(outputs),
+            nn.LeakyReLU(SLOPE, inplace=True),
+        )
+
+    def forward(self, x: Tensor, keys: Tensor) -> Tensor:  # type: ignore[override]
+        for step in self:
+            x = step(x, keys) if isinstance(step, Dropout) else step(x)
+        return x
 
 
 class UNet(nn.Module):
@@ -59,10 +67,13 @@ class UNet(nn.Module):
         if len(dropout) != len(widths):
             dropout = [dropout[min(k, len(dropout) - 1)] for k in range(len(widths))]
         self.down = nn.ModuleList(
-            _block(1 if k == 0 else widths[k - 1], width, dropout[k], first=k == 0) for k, width in enumerate(widths)
+            Block(1 if k == 0 else widths[k - 1], width, dropout[k], k) for k, width in enumerate(widths)
         )
         self.rise = nn.ModuleList(_conv(widths[k + 1], widths[k]) for k in reversed(range(len(widths) - 1)))
-        self.up = nn.ModuleList(_block(2 * widths[k], widths[k], dropout[k]) for k in reversed(range(len(widths) - 1)))
+        self.up = nn.ModuleList(
+            Block(2 * widths[k], widths[k], dropout[k], 2 * len(widths) - 2 - k)
+            for k in reversed(range(len(widths) - 1))
+        )
         self.head = nn.Conv2d(widths[0], outputs, 1)
         nn.init.zeros_(self.head.weight)  # training starts from the uniform surface, not from noise around it
         self.head.bias = nn.Parameter(torch.zeros(outputs))
@@ -83,14 +94,17 @@ class UNet(nn.Module):
         up = sum(2 * 2**k + 2**k for k in range(levels))
         return down + up + self.stride
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor, keys: Tensor | None = None) -> Tensor:
+        """``keys`` (B,) int64: what each crop's dropout hangs on; drawn where None."""
+        if keys is None:
+            keys = draw_keys(len(x), x.device) if self.training else x.new_empty(0, dtype=torch.int64)
         kept = []
         for block in self.down[:-1]:
-            x = block(x)
+            x = block(x, keys)
             kept.append(x)
             x = functional.max_pool2d(x, 2)
-        x = self.down[-1](x)
+        x = self.down[-1](x, keys)
         for rise, block in zip(self.rise, self.up, strict=True):
             x = rise(functional.interpolate(x, scale_factor=2.0, mode="nearest"))
-            x = block(torch.cat([x, kept.pop()], dim=1))
+            x = block(torch.cat([x, kept.pop()], dim=1), keys)
         return self.head(x)
