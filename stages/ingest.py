@@ -45,6 +45,9 @@ Progress = Callable[[int, int, str], None]
 METRIC_TOLERANCE = 0.01
 LARGEST_REACH = math.radians(30)  # a local stereographic map's scale is 7 % too large there
 ANY_RELIEF = 0.006  # of the radius: Olympus Mons; Vesta's and Phobos' shapes go beyond, their DEMs' datum does not
+STRIP_PX = 4096  # a raster whose blocks are wider is one in strips
+STRIPS = 96 << 20  # bytes of strips that stay in GDAL's cache
+LOWEST = 16  # rows of such a piece
 MINIMUM_COVERAGE = 0.5  # share of a coarse pixel that must be valid before its mean counts
 
 
@@ -403,17 +406,13 @@ def _write_elevation(
     grid = plan.grid
     elevation, dem_valid = writer.dataset("elevation"), writer.dataset("dem_valid")
     first, last = writer.file.attrs.get("shard_rows", (0, grid.height))
-    todo = [b for b in blocks(grid.height, grid.width, config.block) if first <= b[0] < last]
+    todo = [b for b in _pieces(dataset, grid, config) if first <= b[0] < last]
     seen, low, high = 0, math.inf, -math.inf
     for number, (row, col, height, width) in enumerate(todo):
         if progress:
             progress(number, len(todo), "DEM blocks")
         if plan.factor:
-            n = plan.factor
-            block = rasters.read_window(dataset, Window(col * n, row * n, width * n, height * n))
-            if plan.radius_is_elevation:
-                block -= grid.radius
-            values = area_mean(block, n)
+            values = _read_means(dataset, plan, plan.factor, (row, col, height, width))
         else:
             values, valid = rasters.warp(dataset, grid.window(row, col, height, width), plan.resampling)
             values[~valid] = np.nan
@@ -430,6 +429,37 @@ def _write_elevation(
     if not seen and config.shard[1] == 1:
         raise InputError(f"{dem}: expected elevations, found only nodata on the grid at {grid.gsd:g} m.")
     return seen, low, high
+
+
+def _pieces(dataset: DatasetReader, grid: Grid, config: Config) -> Iterator[tuple[int, int, int, int]]:
+    """(row, col, height, width) of what is worked on at a time; no piece reaches over a multiple of ``config.block``.
+
+    A DEM stored in strips as wide as itself is worked on in low pieces: GDAL's cache can then hold their strips until the
+    last piece of the row is done, where it would otherwise read the whole DEM again for every piece.
+    """
+    height, (_, strip) = config.block, dataset.block_shapes[0]
+    if strip > STRIP_PX:
+        rows_of_dem = STRIPS // (strip * np.dtype(dataset.dtypes[0]).itemsize)
+        height = min(height, max(LOWEST, int(rows_of_dem * grid.height / dataset.height)))
+    for top in range(0, grid.height, config.block):
+        rows = min(config.block, grid.height - top)
+        for row in range(0, rows, height):
+            for col in range(0, grid.width, config.block):
+                yield top + row, col, min(height, rows - row), min(config.block, grid.width - col)
+
+
+def _read_means(dataset: DatasetReader, plan: Plan, n: int, piece: tuple[int, int, int, int]) -> NDArray[np.float32]:
+    """Means of n x n pixels over a piece of the grid; however large n is, only so much is read at a time."""
+    row, col, height, width = piece
+    values = np.empty((height, width), np.float32)
+    step = max(1, rasters.LARGEST_WINDOW // (width * n * n))
+    for r in range(0, height, step):
+        h = min(step, height - r)
+        block = rasters.read_window(dataset, Window(col * n, (row + r) * n, width * n, h * n))
+        if plan.radius_is_elevation:
+            block -= plan.grid.radius
+        values[r : r + h] = area_mean(block, n)
+    return values
 
 
 def _take_elevation(

@@ -170,10 +170,10 @@ def _project(
         for index in chosen:
             frame = frames[index]
             mine = np.flatnonzero(image_index == index)
-            heights = np.stack([file["elevation"][part.start + k] for k in mine])
             # Even crops are centred on the corner shared by their four middle pixels.
             local = grid.local_frames(row[mine] - 0.5, col[mine] - 0.5)
-            mean = heights.mean(axis=(1, 2), dtype=float)
+            # crop by crop, and read again below: an image may have more crops than fit into memory
+            mean = np.array([file["elevation"][part.start + k].mean(dtype=float) for k in mine])
             geometry = crop_geometry(local, mean, grid.radius, frame.sun_position(), frame.camera_position(grid.radius))
             _check_directions(frame, geometry)
             with open_source(frame, grid, scene_file["elevation"], known) as source:
@@ -189,7 +189,8 @@ def _project(
                     done += 1
                     corner = int(row[k]) - half, int(col[k]) - half
                     pixels = source.read(*corner, size, size, field)
-                    seen = pixels.valid & np.isfinite(heights[place])
+                    heights = file["elevation"][part.start + k]
+                    seen = pixels.valid & np.isfinite(heights)
                     if pixels.ortho is not None:
                         # the line-scan camera's own place for this crop, not the one for the middle of its image
                         centre = local.up[place] * (grid.radius + mean[place])
@@ -206,7 +207,7 @@ def _project(
                         math.atan2(east, north) % (2 * math.pi),
                         body_radius=grid.radius,
                     )
-                    images[k], valid[k], elevation[k] = np.where(seen, pixels.values, np.nan), seen, heights[place]
+                    images[k], valid[k], elevation[k] = np.where(seen, pixels.values, np.nan), seen, heights
                     horizon[k] = np.degrees(angle)
                     sun_out[k], camera_out[k] = geometry.sun[place], geometry.camera[place]
                     convergence[k] = geometry.convergence_deg[place]

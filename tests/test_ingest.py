@@ -36,6 +36,23 @@ def test_integer_factor_is_the_area_mean_of_valid_pixels(small_files, tmp_path):
         np.testing.assert_allclose(scene["elevation"][...], mean, rtol=1e-6)
 
 
+@pytest.mark.parametrize("gsd", [60, 50])  # means of 3 x 3, and a reprojection (no multiple of the DEM's 20 m)
+def test_pieces_however_small_give_the_same_scene(small_files, tmp_path, monkeypatch, gsd):
+    """What is read at a time, which the source's strips and the memory decide, does not show in the result."""
+    strips = tmp_path / "strips.tif"
+    with rasterio.open(small_files.dem) as dem:
+        small_scene.write_raster(strips, dem.read(1), dem.crs, dem.transform, nodata=dem.nodata, blockysize=1)
+    for name, dem in (("a", small_files.dem), ("b", strips)):
+        ingest.run(dem, small_files.images, tmp_path / f"{name}.h5", ingest.Config(gsd=gsd, crop=32, block=64))
+        monkeypatch.setattr(ingest, "STRIP_PX", 100)
+        monkeypatch.setattr(ingest, "STRIPS", 384 * 4 * 100)
+        monkeypatch.setattr(ingest.rasters, "LARGEST_WINDOW", 5000)
+    with h5py.File(tmp_path / "a.h5") as a, h5py.File(tmp_path / "b.h5") as b:
+        np.testing.assert_allclose(a["elevation"][...], b["elevation"][...], atol=1e-4, rtol=0)
+        for name in ("dem_valid", "valid"):  # GDAL rounds a pixel on the edge of nodata to one side or the other
+            assert (a[name][...] != b[name][...]).mean() < 1e-4
+
+
 def test_degrees_become_a_metric_grid_true_to_the_terrain(tmp_path):
     """The same analytic terrain given in degrees comes out on metres where its formula says."""
     step = np.degrees(20 / small_scene.RADIUS)

@@ -29,6 +29,8 @@ _SPECIAL_INT16 = (-32768, -32767, -32766, -32765, -32764)
 _SPECIAL_UINT16 = (0, 1, 2, 65534, 65535)
 _SPECIAL_UINT8 = (0, 255)
 
+LARGEST_WINDOW = 1 << 22  # source pixels that are warped at a time: 0.2 GB with all that is made of them
+
 Mask = NDArray[np.bool_]
 
 
@@ -125,12 +127,14 @@ def transform_points(grid: Grid, dataset: DatasetReader, x: NDArray, y: NDArray)
 def warp(dataset: DatasetReader, grid: Grid, resampling: Resampling, band: int = 1) -> tuple[NDArray[np.float32], Mask]:
     """A raster on a grid: values (NaN where unknown) and where every contribution was valid.
 
-    Area-weighted for ``Resampling.average``. Only the window that the grid needs is read.
+    Area-weighted for ``Resampling.average``. Only the window that the grid needs is read, piece by piece where it is large.
     """
     values = np.full((grid.height, grid.width), np.nan, np.float32)
     window = source_window(dataset, grid)
     if window is None:
         return values, np.zeros(values.shape, bool)
+    if window.width * window.height > LARGEST_WINDOW and values.size > 1:
+        return _warp_halves(dataset, grid, resampling, band)
     source = read_window(dataset, window, band)
     transform = dataset.window_transform(window)
     invalid = ~np.isfinite(source)
@@ -160,6 +164,19 @@ def warp(dataset: DatasetReader, grid: Grid, resampling: Resampling, band: int =
         rasterio.warp.reproject(invalid.astype(np.float32), bad, resampling=coverage, **common)
         valid &= bad < 1e-3
     return values, valid
+
+
+def _warp_halves(
+    dataset: DatasetReader, grid: Grid, resampling: Resampling, band: int
+) -> tuple[NDArray[np.float32], Mask]:
+    axis = 0 if grid.height >= grid.width else 1
+    middle = (grid.height, grid.width)[axis] // 2
+    if axis == 0:
+        halves = grid.window(0, 0, middle, grid.width), grid.window(middle, 0, grid.height - middle, grid.width)
+    else:
+        halves = grid.window(0, 0, grid.height, middle), grid.window(0, middle, grid.height, grid.width - middle)
+    first, second = (warp(dataset, half, resampling, band) for half in halves)
+    return np.concatenate([first[0], second[0]], axis), np.concatenate([first[1], second[1]], axis)
 
 
 def _latitudes(dataset: DatasetReader, grid: Grid) -> dict[str, Any]:

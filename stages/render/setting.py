@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
 
 from schemas.errors import ConfigError
@@ -24,15 +23,12 @@ from stages.physics.surface import Surface, open_surface, open_terrain
 from stages.physics.view import look_at, pinhole_view, place, rotation_from_quaternion
 from stages.render.config import SUN, Config
 
-GDAL_CACHE_MB = 128
-
 
 @contextlib.contextmanager
 def open_source(source: Path, config: Config, body: Body) -> Iterator[Surface]:
     """The terrain and reflectance to render. Raises LunargrError."""
     opened = open_terrain if config.terrain_only else open_surface
-    # GDAL's own cache would take a twentieth of the machine's memory for data that pass through once
-    with rasterio.Env(GDAL_CACHEMAX=GDAL_CACHE_MB), opened(source, config.model, config.parameters, body) as surface:
+    with opened(source, config.model, config.parameters, body) as surface:
         yield surface
 
 
