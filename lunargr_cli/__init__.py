@@ -1,1 +1,28 @@
 """The lunargr command line."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import sys
+from typing import Any
+
+INTERRUPTED = "lunargr: interrupted; nothing half-written was kept."
+
+
+def _leave(number: int, frame: Any) -> None:
+    os.write(2, f"{INTERRUPTED}\n".encode())
+    os._exit(130)
+
+
+# Ctrl-C while the command is still being imported; `main` has its own way from then on. Only in the command's own process:
+# a program that uses this package as a library keeps its handlers.
+if (
+    os.path.basename((sys.argv or [""])[0]) in ("lunargr", "-m")
+    and multiprocessing.parent_process() is None
+    and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+):
+    with contextlib.suppress(ValueError):  # not the main thread
+        signal.signal(signal.SIGINT, _leave)

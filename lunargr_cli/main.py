@@ -16,7 +16,7 @@ from typing import Any
 
 import typer
 
-from lunargr_cli import commands
+from lunargr_cli import INTERRUPTED, commands
 from lunargr_cli.console import say_error
 from schemas.errors import EXIT_CODE, LunargrError
 from schemas.locks import claim
@@ -73,19 +73,31 @@ def main() -> None:
     """Run the command line; a LunargrError is one line on standard error and exit code 3."""
     # A Slurm time limit or `kill` unwinds like Ctrl-C: locks are let go of, and partial files go.
     signal.signal(signal.SIGTERM, _stop)
+    interrupted: list[int] = []
+
+    def interrupt(number: int, frame: Any) -> None:
+        interrupted.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
     try:
         app()
-    except LunargrError as error:
-        say_error(str(error))
-        sys.stdout.flush()
-        # Not sys.exit: after a full disk HDF5 would try, and fail, to flush its files once more while Python ends.
-        os._exit(EXIT_CODE)
-    except KeyboardInterrupt:
-        say_error("interrupted; nothing half-written was kept.")
-        sys.exit(130)
-    except BrokenPipeError:  # `lunargr inspect file | head`
-        sys.stderr.close()
-        sys.exit(141)
+    except BaseException as error:
+        # What an interruption breaks may say something else: a library that was just being imported, for one.
+        if interrupted or isinstance(error, KeyboardInterrupt):
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+            print(INTERRUPTED, file=sys.stderr, flush=True)
+            # Not sys.exit: Python would end itself by the signal where one of its own parts saw the interruption.
+            os._exit(130)
+        if isinstance(error, LunargrError):
+            say_error(str(error))
+            sys.stdout.flush()
+            # Not sys.exit: after a full disk HDF5 would try, and fail, to flush its files once more while Python ends.
+            os._exit(EXIT_CODE)
+        if isinstance(error, BrokenPipeError):  # `lunargr inspect file | head`
+            sys.stderr.close()
+            sys.exit(141)
+        raise
 
 
 def _stop(number: int, frame: Any) -> None:
