@@ -173,7 +173,15 @@ PAIRS = declare(
                 "orthorectified image: I/F where units = 1",
                 unit_choices=("dn",),
             ),
-            Variable("valid", ("pair", "y", "x"), "u1", "1", "1 = both DEM and image are valid", flags=VALIDITY),
+            Variable(
+                "valid",
+                ("pair", "y", "x"),
+                "u1",
+                "1",
+                "1 = both DEM and image are valid",
+                flags=VALIDITY,
+                compress=True,
+            ),
             Variable(
                 "sun_horizon_deg",
                 ("pair", "y", "x"),

@@ -23,6 +23,8 @@ from schemas.locks import claim, partial_path
 from schemas.provenance import describe_run, known_digests, sha256
 
 _STANDARD_NAMES = {"x": "projection_x_coordinate", "y": "projection_y_coordinate"}
+# What is not known, in datasets that keep so many decimals: NaN cannot pass HDF5's filter. netCDF's own default fill value.
+UNKNOWN = np.float32(9.969209968386869e36)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # The netCDF-4 format's marker for a dimension without a coordinate variable of its own.
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable.%10d"
@@ -190,13 +192,21 @@ class ArtefactWriter:
             os.truncate(self._partial, 0)
         self._stack.__exit__(kind, error, trace)
 
-    def _create(self, variable: Variable, size_of_scale: int | None = None, unit: str | None = None) -> h5py.Dataset:
+    def _create(
+        self,
+        variable: Variable,
+        size_of_scale: int | None = None,
+        unit: str | None = None,
+        decimals: int | None = None,
+    ) -> h5py.Dataset:
         shape = tuple(self.sizes[d] for d in variable.dims)
         options: dict[str, Any] = {}
         if shape and 0 not in shape:
             chunks = variable.chunks
             if chunks is None and len(shape) >= 3:  # one record (a pair, a band) a chunk: random access stays fast
                 chunks = (1,) * (len(shape) - 2) + shape[-2:]
+                if decimals is not None:  # a smaller piece spans less and takes fewer bits
+                    chunks = (1,) * (len(shape) - 2) + tuple(_piece(edge) for edge in shape[-2:])
             if chunks is not None:
                 options["chunks"] = tuple(min(c, s) for c, s in zip(chunks, shape, strict=True))
             if variable.compress:
@@ -208,6 +218,8 @@ class ArtefactWriter:
             dtype = np.dtype(variable.dtype)
             if dtype.kind == "f":
                 options["fillvalue"] = np.nan
+                if decimals is not None and shape and 0 not in shape:
+                    options |= {"scaleoffset": decimals, "fillvalue": UNKNOWN}
         data = self.file.create_dataset(variable.name, shape=shape, dtype=dtype, track_order=True, **options)
         if size_of_scale is not None:
             data.make_scale(variable.name)
@@ -224,7 +236,7 @@ class ArtefactWriter:
         if variable.dtype != STRING:
             data.attrs["units"] = unit or variable.unit
             if data.dtype.kind == "f":
-                data.attrs["_FillValue"] = np.array(np.nan, data.dtype)
+                data.attrs["_FillValue"] = np.array(data.fillvalue, data.dtype)
         data.attrs["long_name"] = variable.description
         if variable.flags:
             data.attrs["flag_values"] = np.array([value for _, value in variable.flags], variable.dtype)
@@ -232,10 +244,14 @@ class ArtefactWriter:
         if variable.georeferenced:
             data.attrs["grid_mapping"] = "crs"
 
-    def dataset(self, name: str, unit: str | None = None) -> h5py.Dataset:
-        """The open dataset ``name``, created from its declaration on first use, for block-wise writing."""
+    def dataset(self, name: str, unit: str | None = None, decimals: int | None = None) -> h5py.Dataset:
+        """The open dataset ``name``, created from its declaration on first use, for block-wise writing.
+
+        ``decimals`` keeps so many digits after the point, by HDF5's scale-offset filter, which every reader undoes: a
+        chunk takes as many bits a value as its range needs. Unknown values are then UNKNOWN, and never NaN.
+        """
         if name not in self.file:
-            return self._create(self.schema[name], unit=unit)
+            return self._create(self.schema[name], unit=unit, decimals=decimals)
         return self.file[name]
 
     def write(self, name: str, data: Any, unit: str | None = None) -> h5py.Dataset:
@@ -260,7 +276,8 @@ class ArtefactWriter:
             file = os.path.relpath(os.path.realpath(source.file.filename), os.path.realpath(self.path.parent))
             view = h5py.VirtualSource(file, source.name, source.shape, source.dtype)
             layout[target] = view[part]
-        data = self.file.create_virtual_dataset(name, layout, fillvalue=np.nan if dtype.kind == "f" else 0)
+        fill = sources[0][1].fillvalue if sources and sources[0][1].scaleoffset is not None else np.nan
+        data = self.file.create_virtual_dataset(name, layout, fillvalue=fill if dtype.kind == "f" else 0)
         unit = sources[0][1].attrs.get("units") if sources and variable.unit_choices else None
         self._describe(data, variable, str(unit) if unit is not None else None)
 
@@ -271,6 +288,11 @@ class ArtefactWriter:
         data.attrs["crs_wkt"] = wkt
         data.attrs["spatial_ref"] = wkt
         data.attrs["GeoTransform"] = " ".join(repr(v) for v in (c, a, b, f, d, e))
+
+
+def _piece(edge: int) -> int:
+    """The edge of a packed chunk: 64 or the nearest above it that divides ``edge``."""
+    return edge // (edge // 64) if edge > 64 and edge % (edge // 64) == 0 else edge
 
 
 @contextlib.contextmanager
@@ -421,6 +443,27 @@ def _text(value: Any) -> str:
     return value.decode() if isinstance(value, bytes) else str(value)
 
 
+def unpack(data: h5py.Dataset, values: Any) -> np.ndarray:
+    """Values read from ``data``, as CF means them: fill values become NaN in floats, and packed numbers are scaled.
+
+    Flags and other integers without ``scale_factor`` or ``add_offset`` stay as they are.
+    """
+    values = np.asarray(values)
+    packed = "scale_factor" in data.attrs or "add_offset" in data.attrs
+    if values.dtype.kind != "f" and not packed:
+        return values
+    fills = [data.attrs[k] for k in ("_FillValue", "missing_value") if k in data.attrs]
+    result = values.astype(np.float32 if values.dtype != np.float64 else np.float64)
+    if packed:
+        scale, offset = (float(np.ravel(data.attrs.get(k, v))[0]) for k, v in (("scale_factor", 1), ("add_offset", 0)))
+        result = (values * scale + offset).astype(np.float32)
+    for fill in fills:
+        known = values == np.asarray(np.ravel(fill)[0], values.dtype)
+        if known.any():
+            result[known] = np.nan
+    return result
+
+
 def read_strings(file: h5py.File, name: str) -> list[str]:
     """A string variable as a list of ``str``."""
     return [_text(v) for v in file[name][...]]
@@ -432,6 +475,7 @@ def read_config(file: h5py.File) -> dict[str, Any]:
 
 
 __all__ = [
+    "UNKNOWN",
     "ArtefactWriter",
     "LunargrError",
     "atomic_path",
@@ -443,4 +487,5 @@ __all__ = [
     "read_strings",
     "sha256",
     "silence_hdf5",
+    "unpack",
 ]

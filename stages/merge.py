@@ -127,7 +127,9 @@ def run(
                         continue
                 unit = files[0][name].attrs.get("units")
                 target = writer.dataset(
-                    name, unit=str(unit) if unit is not None and schema[name].unit_choices else None
+                    name,
+                    unit=str(unit) if unit is not None and schema[name].unit_choices else None,
+                    decimals=_decimals(files, name),
                 )
                 if record in dims:
                     _concatenate(files, name, target, dims.index(record))
@@ -232,6 +234,12 @@ def _own_rows(files: Sequence[h5py.File], name: str) -> list[Any]:
     return found
 
 
+def _decimals(files: Sequence[h5py.File], name: str) -> int | None:
+    """Digits after the point that a variable keeps, where all parts keep as many (ArtefactWriter.dataset)."""
+    kept = {file[name].scaleoffset for file in files if file[name].size}
+    return kept.pop() if len(kept) == 1 and files[0][name].dtype.kind == "f" else None
+
+
 def _concatenate(files: Sequence[h5py.File], name: str, target: h5py.Dataset, axis: int) -> None:
     place = 0
     for file in files:
@@ -253,7 +261,8 @@ def _move_chunks(source: h5py.Dataset, target: h5py.Dataset, axis: int, place: i
     alike = source.chunks is not None and source.chunks == target.chunks and source.dtype == target.dtype
     if not alike or source.chunks[axis] != 1 or source.compression != target.compression:
         return False
-    if (source.compression_opts, source.shuffle) != (target.compression_opts, target.shuffle):
+    how = [(d.compression_opts, d.shuffle, d.scaleoffset) for d in (source, target)]
+    if how[0] != how[1]:
         return False
     offsets: list[tuple[int, ...]] = []
     source.id.chunk_iter(lambda info: offsets.append(info.chunk_offset))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from collections.abc import Callable
@@ -24,7 +25,8 @@ from schemas import (
     InputError,
     open_artefact,
 )
-from schemas.hdf5 import sha256
+from schemas.hdf5 import sha256, unpack
+from stages.physics import rasters
 from stages.physics.frames import Frame, load_frames
 from stages.physics.grid import Grid, LocalFrames, read_grid
 from stages.physics.orthorectify import Ortho
@@ -35,7 +37,9 @@ from stages.physics.sources import Source, open_source
 
 Progress = Callable[[int, int, str], None]
 
-RAY_VARIABLES = ("detector_line", "detector_sample", "emission_deg", "phase_deg")
+# Digits after the point, which pairs.h5 keeps; docs/scaling.md says what they do to a rendering.
+IOF_DECIMALS, COUNT_DECIMALS, HORIZON_DECIMALS = 5, 1, 1
+RAY_VARIABLES = {"detector_line": 2, "detector_sample": 2, "emission_deg": 2, "phase_deg": 3}
 OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
 
 
@@ -158,12 +162,16 @@ def _project(
         overwrite=overwrite,
     ) as writer:
         unit = "1" if units == "iof" else "dn"
-        images = writer.dataset("image", unit=unit)
-        names = ("elevation", "valid", "sun_horizon_deg", "sun_direction_enu", "camera_position_enu", "convergence_deg")
-        elevation, valid, horizon, sun_out, camera_out, convergence = (writer.dataset(n) for n in names)
+        images = writer.dataset("image", unit=unit, decimals=_image_decimals(frames, units))
+        elevation = writer.dataset("elevation", decimals=_elevation_decimals(grid.gsd))
+        horizon = writer.dataset("sun_horizon_deg", decimals=HORIZON_DECIMALS)
+        names = ("valid", "sun_direction_enu", "camera_position_enu", "convergence_deg")
+        valid, sun_out, camera_out, convergence = (writer.dataset(n) for n in names)
         chosen = sorted({int(k) for k in image_index})
         # of the whole table, not of this shard's images: the parts of one whole hold the same variables
-        rays = [writer.dataset(n) for n in RAY_VARIABLES] if any(f.camera for f in frames) else []
+        rays = []
+        if any(f.camera for f in frames):
+            rays = [writer.dataset(name, decimals=digits) for name, digits in RAY_VARIABLES.items()]
         known = overview_extremes(scene_file["elevation"], overview)
         registered: list[Registered] = []
         done = 0
@@ -268,7 +276,8 @@ def summarise(pairs: Path) -> Summary:
         seen = shadowed = total = 0
         for k in range(file["valid"].shape[0]):
             valid = file["valid"][k].astype(bool)
-            above = np.radians(file["sun_horizon_deg"][k].astype(np.float64)) > math.asin(sun[k, 2])
+            angle = unpack(file["sun_horizon_deg"], file["sun_horizon_deg"][k]).astype(np.float64)
+            above = np.radians(angle) > math.asin(sun[k, 2])
             seen, shadowed, total = seen + int(valid.sum()), shadowed + int((valid & above).sum()), total + valid.size
     incidence = np.degrees(np.arccos(sun[:, 2]))
     emission = np.degrees(np.arccos(camera[:, 2] / np.linalg.norm(camera, axis=1)))
@@ -319,10 +328,34 @@ def _register(
     return Registered(frame.image_id, field, tuple((r, c, s) for (r, c), s in zip(places, shifts, strict=True)))
 
 
+def _put(target: h5py.Dataset, k: int, values: NDArray) -> None:
+    """One pair's values, unknown ones as the dataset writes them."""
+    known = np.isfinite(values)
+    target[k] = values if known.all() else np.where(known, values, target.fillvalue)
+
+
+def _elevation_decimals(gsd: float) -> int:
+    """Digits after the point: steps of at most gsd / 400, whose slopes err by less than 0.03 deg."""
+    return max(0, math.ceil(math.log10(400 / gsd)))
+
+
+def _image_decimals(frames: list[Frame], units: str) -> int | None:
+    """Digits after the point: 1e-5 of I/F; a tenth of a count; all where counts are not whole numbers."""
+    if units == "iof":
+        return IOF_DECIMALS
+    for frame in frames:
+        with contextlib.suppress(InputError), rasters.open_raster(frame.path) as image:
+            if np.dtype(image.dtypes[0]).kind == "f" or image.scales[0] < 1:
+                return None
+    return COUNT_DECIMALS
+
+
 def _write_rays(rays: list[h5py.Dataset], k: int, ortho: Ortho) -> None:
     line, sample, emission, phase = rays
-    line[k], sample[k] = ortho.detector_line, ortho.detector_sample
-    emission[k], phase[k] = np.degrees(ortho.emission), np.degrees(ortho.phase)
+    _put(line, k, ortho.detector_line)
+    _put(sample, k, ortho.detector_sample)
+    _put(emission, k, np.degrees(ortho.emission))
+    _put(phase, k, np.degrees(ortho.phase))
 
 
 def _write_shifts(writer: ArtefactWriter, frames: list[Frame], registered: list[Registered]) -> None:

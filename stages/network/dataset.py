@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import zlib
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +19,9 @@ from torch import Tensor
 
 from schemas.artefacts import PAIRS, SPLITS
 from schemas.errors import ArtefactError
-from schemas.hdf5 import open_artefact, read_strings
+from schemas.hdf5 import open_artefact, read_strings, unpack
 from stages.network.normalisation import fill_holes
+from stages.network.records import Records
 from stages.network.symmetries import turn_field, turn_vector
 from stages.physics.formation import Observation
 
@@ -46,16 +51,29 @@ class Batch:
         return Batch(o, self.image.to(device, non_blocking=True), self.valid.to(device, non_blocking=True))
 
 
+FIELDS = ("elevation", "image", "valid", "sun_horizon_deg", "sky_view")
+DETECTOR = ("detector_sample", "detector_line")
+
+
 class PairReader:
-    """Random access to pairs.h5, one HDF5 chunk per pair and variable.
+    """Random access to pairs.h5, whoever wrote it and however it is laid out.
 
     split, tile, frame, site : (n,) arrays; image_ids : one per frame; units : 'iof' or 'dn'; gsd, body_radius : m
+    threads : that read and decode one batch; detector : whether observations say where on the sensor a pixel was seen
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, threads: int = 1, detector: bool = True) -> None:
         self.path = Path(path)
         self.file: h5py.File = open_artefact(self.path, PAIRS)
         f = self.file
+        self._stack = contextlib.ExitStack()
+        self._stack.callback(f.close)
+        descriptor = os.open(self.path, os.O_RDONLY)
+        self._stack.callback(os.close, descriptor)
+        self._threads = max(1, threads)
+        self._pool = self._stack.enter_context(ThreadPoolExecutor(self._threads)) if threads > 1 else None
+        names = FIELDS + (DETECTOR if detector else ())
+        self._records = {name: Records(f[name], descriptor) for name in names if name in f}
         self.size: tuple[int, int] = f["elevation"].shape[1:]
         self.count: int = f["elevation"].shape[0]
         if not self.count:
@@ -68,6 +86,9 @@ class PairReader:
         self.frame = f["image_index"][...].astype(np.int64)
         self.site = f["site"][...].astype(np.int64)
         self.tile = f["tile"][...].astype(np.int64) if "tile" in f else self.site
+        self._sun, self._camera = (
+            unpack(f[n], f[n][...]).astype(np.float32) for n in ("sun_direction_enu", "camera_position_enu")
+        )
         self.image_ids = read_strings(f, "image_id")
         if self.frame.min() < 0 or self.frame.max() >= len(self.image_ids):
             raise ArtefactError(
@@ -75,7 +96,7 @@ class PairReader:
             )
 
     def close(self) -> None:
-        self.file.close()
+        self._stack.close()
 
     def __enter__(self) -> PairReader:
         return self
@@ -87,39 +108,54 @@ class PairReader:
         """Pairs of 'train', 'validation' or 'test'."""
         return np.flatnonzero(self.split == dict(SPLITS)[part])
 
-    def _fields(self, name: str, indices: Sequence[int] | NDArray) -> NDArray[np.float32]:
-        data = self.file[name]
-        out = np.empty((len(indices), *data.shape[1:]), np.float32)
-        for k, index in enumerate(indices):
-            out[k] = data[int(index)]
+    def _read(self, names: Sequence[str], indices: Sequence[int] | NDArray) -> dict[str, NDArray]:
+        """Variables of some pairs, (B, H, W): float32 with NaN where unknown, or flags; shared out over the threads."""
+        wanted = np.asarray(indices, dtype=np.int64)
+        parts = np.array_split(np.arange(len(wanted)), min(self._threads, max(1, len(wanted) // 4)))
+        out, jobs = {}, []
+        for name in (n for n in names if n in self._records):
+            records = self._records[name]
+            records.prepare(len(wanted))
+            out[name] = records.empty(len(wanted))
+            jobs += [(records, out[name][p[0] : p[-1] + 1], wanted[p]) for p in parts if len(p)]
+        try:
+            if self._pool is None:
+                for records, target, which in jobs:
+                    records.read_into(target, which)
+            else:
+                for done in [self._pool.submit(r.read_into, target, which) for r, target, which in jobs]:
+                    done.result()
+        except (OSError, zlib.error) as error:
+            raise ArtefactError(
+                f"{self.path}: cannot be read to the end ({error}); the file is damaged or truncated, write it again."
+            ) from None
         return out
 
     def elevation(self, indices: Sequence[int] | NDArray) -> Tensor:
         """(B, H, W) float32 m; holes are filled from their surroundings."""
-        out = self._fields("elevation", indices)
-        finite = np.isfinite(out)
-        if not finite.all():
-            for k in np.flatnonzero(~finite.all(axis=(1, 2))):
-                out[k] = fill_holes(out[k], finite[k])
-        return torch.from_numpy(out)
+        return torch.from_numpy(_without_holes(self._read(["elevation"], indices)["elevation"]))
 
     def observation(self, indices: Sequence[int] | NDArray) -> Observation:
         """Everything about these pairs but their images."""
+        names = [n for n in self._records if n not in ("image", "valid")]
+        return self._observation(self._read(names, indices), indices)
 
+    def _observation(self, found: dict[str, NDArray], indices: Sequence[int] | NDArray) -> Observation:
         def optional(name: str) -> Tensor | None:
-            return torch.from_numpy(self._fields(name, indices)) if name in self.file else None
+            return torch.from_numpy(found[name]) if name in found else None
 
-        horizon = optional("sun_horizon_deg")
+        horizon = found.get("sun_horizon_deg")
         if horizon is not None:
-            horizon = torch.nan_to_num(horizon, nan=-90.0) * (math.pi / 180)
+            _replace_unknown(horizon, -90.0)
+            horizon *= np.float32(math.pi / 180)
         rows = np.asarray(indices)
         return Observation(
-            elevation=self.elevation(indices),
-            sun_direction=torch.from_numpy(self._fields("sun_direction_enu", rows)),
-            camera_position=torch.from_numpy(self._fields("camera_position_enu", rows)),
+            elevation=torch.from_numpy(_without_holes(found["elevation"])),
+            sun_direction=torch.from_numpy(self._sun[rows]),
+            camera_position=torch.from_numpy(self._camera[rows]),
             gsd=self.gsd,
             body_radius=self.body_radius,
-            sun_horizon=horizon,
+            sun_horizon=optional("sun_horizon_deg"),
             sky_view=optional("sky_view"),
             detector_sample=optional("detector_sample"),
             detector_line=optional("detector_line"),
@@ -128,20 +164,48 @@ class PairReader:
 
     def image(self, indices: Sequence[int] | NDArray) -> Tensor:
         """(B, H, W) float32; 0 where invalid."""
-        return torch.from_numpy(np.nan_to_num(self._fields("image", indices), nan=0.0, posinf=0.0, neginf=0.0))
+        return torch.from_numpy(_replace_unknown(self._read(["image"], indices)["image"], 0.0))
 
     def valid(self, indices: Sequence[int] | NDArray) -> Tensor:
         """(B, H, W) bool: DEM and image both valid and finite."""
-        flag = self._fields("valid", indices) > 0.5
-        flag &= np.isfinite(self._fields("image", indices)) & np.isfinite(self._fields("elevation", indices))
-        return torch.from_numpy(flag)
+        return torch.from_numpy(_validity(self._read(["valid", "image", "elevation"], indices)))
 
     def batch(self, indices: Sequence[int] | NDArray, symmetries: NDArray | None = None) -> Batch:
         """A batch, each pair under its own symmetry of the square where given."""
-        batch = Batch(self.observation(indices), self.image(indices), self.valid(indices))
+        found = self._read(list(self._records), indices)
+        valid = torch.from_numpy(_validity(found))
+        image = torch.from_numpy(_replace_unknown(found["image"], 0.0))
+        batch = Batch(self._observation(found, indices), image, valid)
         if symmetries is not None:
             _turn(batch, symmetries)
         return batch
+
+
+def _all_known(values: NDArray) -> bool:
+    return bool(np.isfinite(values.sum()))
+
+
+def _replace_unknown(values: NDArray, by: float) -> NDArray:
+    """In place."""
+    if not _all_known(values):
+        np.nan_to_num(values, copy=False, nan=by, posinf=by, neginf=by)
+    return values
+
+
+def _validity(found: dict[str, NDArray]) -> NDArray[np.bool_]:
+    flag = found["valid"] > 0.5
+    for name in ("image", "elevation"):
+        if not _all_known(found[name]):
+            flag &= np.isfinite(found[name])
+    return flag
+
+
+def _without_holes(elevation: NDArray[np.float32]) -> NDArray[np.float32]:
+    if not _all_known(elevation):
+        finite = np.isfinite(elevation)
+        for k in np.flatnonzero(~finite.all(axis=(1, 2))):
+            elevation[k] = fill_holes(elevation[k], finite[k])
+    return elevation
 
 
 def _turn(batch: Batch, symmetries: NDArray) -> None:

@@ -1,0 +1,219 @@
+"""Random access to the crops of a pairs file: chunks read and decoded here where they are plain, by HDF5 where not.
+
+HDF5 takes a millisecond for the chunks of one pair, most of it spent decoding scale-offset chunks byte by byte and finding
+the chunk in its index. Here the index is read once, and whole batches are decoded without Python's lock.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from typing import Any
+
+import h5py
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from schemas.hdf5 import unpack
+
+_HEADER = (
+    21  # bytes before the codes of a scale-offset chunk: their width, the size of the minimum, the minimum, padding
+)
+_SLACK = 8  # bytes behind a buffer, so that eight can be read at its last value
+_DEFLATE, _SHUFFLE, _SCALE_OFFSET = h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_SCALEOFFSET
+_MIN_INDEX = 64  # records; for fewer, reading a large file's whole index costs more than HDF5 does
+
+
+class Records:
+    """A variable (record, y, x) of an open file, by record.
+
+    fast : whether records are read without HDF5: float32 chunks, plain or by scale-offset with decimals, byte chunks, plain
+    or deflated, and contiguous data, all of little-endian numbers without CF packing
+    """
+
+    def __init__(self, data: h5py.Dataset, descriptor: int) -> None:
+        self.data = data
+        self.shape: tuple[int, int] = data.shape[1:]
+        self._fd = descriptor
+        self._asked = 0
+        self._offset: NDArray[np.int64] | None = None  # (record, piece)
+        self._size: NDArray[np.int64] | None = None
+        self._last: tuple[bytes, bytes] = (b"", b"")
+        self._decimals, self._code_fill = 0, np.float32(np.nan)
+        self._has_fill = False
+        self.kind = self._find_kind()
+        self.fast = self.kind != "hdf5"
+        declared = data.attrs.get("_FillValue")
+        self._fill = np.float32(np.nan if declared is None else np.ravel(declared)[0])
+        if self._code_fill == self._fill:
+            self._code_fill = np.float32(np.nan)
+
+    def _find_kind(self) -> str:
+        data = self.data
+        plain = data.dtype in (np.dtype("<f4"), np.dtype("u1")) and not {"scale_factor", "add_offset"} & set(data.attrs)
+        if not plain or data.is_virtual or data.external or data.file.userblock_size or 0 in data.shape:
+            return "hdf5"
+        creation = data.id.get_create_plist()
+        filters = [creation.get_filter(k) for k in range(creation.get_nfilters())]
+        names = [f[0] for f in filters]
+        if data.chunks is None:
+            return "contiguous" if data.id.get_offset() is not None else "hdf5"
+        pieces = data.chunks
+        if pieces[0] != 1 or any(edge % piece for edge, piece in zip(self.shape, pieces[1:], strict=True)):
+            return "hdf5"
+        if not names:
+            return "plain"
+        if data.dtype == np.uint8 and names in ([_DEFLATE], [_SHUFFLE, _DEFLATE]):
+            return "deflated"
+        # Integers, and floats without decimals, are packed by other rules.
+        if data.dtype.kind == "f" and names == [_SCALE_OFFSET] and filters[0][2][0] == h5py.h5z.SO_FLOAT_DSCALE:
+            settings = np.array(
+                filters[0][2], np.uint32
+            )  # kind, decimals, values, class, size, sign, order, fill?, fill
+            self._decimals = int(settings[1:2].view(np.int32)[0])
+            self._has_fill = bool(settings[7])
+            self._code_fill = settings[8:9].view(np.float32)[0]
+            return "packed"
+        return "hdf5"
+
+    def prepare(self, count: int) -> None:
+        """Make ready for ``count`` more records, from the thread that opened the file."""
+        self._asked += count
+        if not self.fast or self._offset is not None or self._asked < min(_MIN_INDEX, len(self.data)):
+            return
+        records = len(self.data)
+        if self.kind == "contiguous":
+            each = self.data.dtype.itemsize * self.shape[0] * self.shape[1]
+            self._offset = self.data.id.get_offset() + each * np.arange(records, dtype=np.int64)[:, None]
+            self._size = np.full((records, 1), each)
+            return
+        _, rows, cols = self.data.chunks
+        across = self.shape[1] // cols
+        offset = np.full((records, self.shape[0] // rows * across), -1, np.int64)
+        size = np.zeros_like(offset)
+
+        def note(chunk: Any) -> None:
+            if not chunk.filter_mask:  # no filter was skipped
+                record, row, col = chunk.chunk_offset
+                piece = row // rows * across + col // cols
+                offset[record, piece], size[record, piece] = chunk.byte_offset, chunk.size
+
+        self.data.id.chunk_iter(note)
+        self._offset, self._size = offset, size
+
+    def empty(self, count: int) -> NDArray:
+        """Room for some records: bytes for flags, float32 for all else."""
+        return np.empty((count, *self.shape), np.uint8 if self.data.dtype == np.uint8 else np.float32)
+
+    def read_into(self, out: NDArray, indices: NDArray[np.int64]) -> None:
+        """Fill ``out`` (n, H, W) with records: NaN where unknown. Raises OSError, zlib.error for a damaged file."""
+        offset, size = self._offset, self._size
+        known = np.zeros(len(indices), bool)
+        if offset is not None and size is not None:
+            known = np.asarray((offset[indices] >= 0).all(axis=1))
+            if known.all():
+                self._decode(out, offset[indices], size[indices])
+                return
+        for k, index in enumerate(indices):
+            if known[k]:
+                self._decode(out[k : k + 1], offset[[index]], size[[index]])  # type: ignore[index]
+            else:
+                out[k] = unpack(self.data, self.data[int(index)])
+
+    def _decode(self, out: NDArray, offset: NDArray[np.int64], size: NDArray[np.int64]) -> None:
+        buffer, start = _fetch(self._fd, offset.ravel(), size.ravel(), self.data.name)
+        pieces = offset.shape[1]
+        rows, cols = self.data.chunks[1:] if self.data.chunks else self.shape
+        if self.kind == "packed":
+            head = buffer[start[:, None] + np.arange(_HEADER)]
+            width = np.ascontiguousarray(head[:, :4]).view("<u4")[:, 0].astype(np.int64)
+            minimum = np.ascontiguousarray(head[:, 5:9]).view("<f4")[:, 0]
+            if (size.ravel() < _HEADER + (rows * cols * width + 7) // 8).any() or width.max() > 32:
+                raise OSError(f"{self.data.name}: a chunk is damaged")
+            power, code_fill = np.float32(10.0**self._decimals), self._code_fill
+            _unpack_floats(buffer, start, width, minimum, out, pieces, rows, cols, power, self._has_fill, code_fill)
+            for number in np.flatnonzero(width == 32).tolist():  # the range is too wide to pack: floats as they are
+                first = start[number] + _HEADER
+                values = np.frombuffer(buffer[first : first + 4 * rows * cols].tobytes(), "<f4").copy()
+                values[values == self._fill] = np.nan
+                _at(out, number, pieces, rows, cols)[...] = values.reshape(rows, cols)
+        elif self.kind == "deflated":
+            for number, (first, count) in enumerate(zip(start.tolist(), size.ravel().tolist(), strict=True)):
+                stored = buffer[first : first + count].tobytes()
+                last = self._last  # masks are mostly alike
+                if stored != last[0]:
+                    self._last = last = stored, zlib.decompress(stored)
+                _at(out, number, pieces, rows, cols)[...] = np.frombuffer(last[1], np.uint8).reshape(rows, cols)
+        else:
+            _place(buffer, start, out.view(np.uint8), pieces, rows, cols * out.itemsize)
+            if out.dtype == np.float32 and np.isfinite(self._fill):
+                out[out == self._fill] = np.nan
+
+
+def _at(out: NDArray, number: int, pieces: int, rows: int, cols: int) -> NDArray:
+    """The part of ``out`` that piece ``number`` fills."""
+    k, piece = divmod(number, pieces)
+    across = out.shape[2] // cols
+    row, col = piece // across * rows, piece % across * cols
+    return out[k, row : row + rows, col : col + cols]
+
+
+def _fetch(fd: int, offset: NDArray[np.int64], size: NDArray[np.int64], name: str) -> tuple[NDArray, NDArray[np.int64]]:
+    """One buffer with all pieces, and where each begins; neighbours in the file are read in one go."""
+    start = np.zeros(len(offset), np.int64)
+    np.cumsum(size[:-1], out=start[1:])
+    total = int(start[-1] + size[-1])
+    buffer = np.empty(total + _SLACK, np.uint8)
+    view = memoryview(buffer)  # type: ignore[arg-type]
+    breaks = np.flatnonzero(offset[1:] != offset[:-1] + size[:-1]) + 1
+    for first, last in zip([0, *breaks], [*breaks, len(offset)], strict=True):
+        begin, end = int(start[first]), int(start[last]) if last < len(offset) else total
+        place = int(offset[first])
+        while begin < end:
+            got = os.preadv(fd, [view[begin:end]], place)
+            if not got:
+                raise OSError(f"{name}: the file ends early.")
+            begin, place = begin + got, place + got
+    return buffer, start
+
+
+@njit(nogil=True, cache=True)
+def _word(buffer, at):  # big-endian
+    value = np.uint64(0)
+    for k in range(8):
+        value = (value << np.uint64(8)) | np.uint64(buffer[at + k])
+    return value
+
+
+@njit(nogil=True, cache=True)
+def _unpack_floats(buffer, start, width, minimum, out, pieces, rows, cols, power, has_fill, fill):
+    """Scale-offset chunks to floats as HDF5 does: code / 10^decimals + minimum, in single precision. power : float32"""
+    across = out.shape[2] // cols
+    for number in range(start.size):
+        bits = width[number]
+        if bits == 32:
+            continue
+        k, piece = number // pieces, number % pieces
+        top, left = piece // across * rows, piece % across * cols
+        at, least = start[number] + _HEADER, minimum[number]
+        mask = (np.uint64(1) << np.uint64(bits)) - np.uint64(1)
+        unknown = mask if has_fill and bits else np.uint64(1) << np.uint64(32)  # the largest code is the fill value
+        for r in range(rows):
+            bit = r * cols * bits
+            for c in range(cols):
+                code = (_word(buffer, at + (bit >> 3)) >> np.uint64(64 - bits - (bit & 7))) & mask
+                bit += bits
+                out[k, top + r, left + c] = fill if code == unknown else np.float32(code) / power + least
+
+
+@njit(nogil=True, cache=True)
+def _place(buffer, start, out, pieces, rows, width):
+    """Plain chunks, as bytes, to their places. out : (n, H, bytes of a row)"""
+    across = out.shape[2] // width
+    for number in range(start.size):
+        k, piece = number // pieces, number % pieces
+        top, left = piece // across * rows, piece % across * width
+        for r in range(rows):
+            at = start[number] + r * width
+            out[k, top + r, left : left + width] = buffer[at : at + width]
