@@ -22,6 +22,9 @@ from schemas.errors import EXIT_CODE, LunargrError
 from schemas.locks import claim
 from schemas.said import said
 
+# Threads that wait for each other by spinning slow a busy machine down many times over. Read when torch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 
 def _command_line() -> str:
     """What made this process, as one would type it again."""

@@ -154,7 +154,10 @@ def parameters(cause: Cause) -> dict[str, dict[str, Any]]:
             table = torch.stack([torch.as_tensor(v) for v in effect.values.values()], 1)
             seen = table.abs().sum(1) > 0
             size = float(table[seen].square().sum(1).mean().sqrt()) if bool(seen.any()) else 0.0
-            error = cause.image_evidence.rms_error if cause.image_evidence else 0.0
+            seen_by = cause.image_evidence
+            error = seen_by.rms_error if seen_by else 0.0
+            if seen_by and seen_by.together > 1:  # what all images of a site have in common belongs to the ground
+                size *= math.sqrt(seen_by.together / (seen_by.together - 1))
         found = {name: (size, error)}
     return {k: {"value": _number(v), "error": _number(e), "unit": units[k]} for k, (v, e) in found.items()}
 

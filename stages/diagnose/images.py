@@ -29,7 +29,7 @@ FEWEST = 3  # images of a site, below which an image's own fault and the ground'
 
 @dataclass
 class ImageEvidence:
-    """values, errors : (frames, K), NaN-free; rms : of the values beyond their errors, by two independent halves."""
+    """values, errors : (frames, K), NaN-free; rms : of the values; together : images of the site that has most."""
 
     effect: str
     values: Tensor
@@ -41,6 +41,7 @@ class ImageEvidence:
     p: float
     fid: float
     frames: int
+    together: int
 
 
 @dataclass
@@ -70,7 +71,8 @@ def weigh_images(
             for into, fold in zip(total, folds, strict=True):
                 into.gram[place[:, None], place[None]] += fold.gram
                 into.score[place] += fold.score
-    return {name: _weigh(name, folds, frames, rows) for name, folds in sums.items()}
+    together = max((w.chain.site.count for w in works), default=1)
+    return {name: _weigh(name, folds, frames, rows, together) for name, folds in sums.items()}
 
 
 def _site_folds(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) -> dict[str, list[_Fold]]:
@@ -142,7 +144,7 @@ def _without(folds: list[Tensor], nuisance: np.ndarray, wanted: np.ndarray) -> l
     return out
 
 
-def _weigh(name: str, folds: list[_Fold], frames: int, rows: float) -> ImageEvidence:
+def _weigh(name: str, folds: list[_Fold], frames: int, rows: float, together: int) -> ImageEvidence:
     k = len(get_effect(name).fitted())
     total = _Fold(sum(f.gram for f in folds), sum(f.score for f in folds))  # type: ignore[arg-type]
     seen = total.gram.diagonal().view(frames, k).sum(1) > 0
@@ -185,7 +187,7 @@ def _weigh(name: str, folds: list[_Fold], frames: int, rows: float) -> ImageEvid
     return ImageEvidence(
         name, values.float(), errors.float(), rms, spread, gain,
         math.sqrt(2 * max(gain, 0.0) + count * k), p,
-        math.sqrt(max(float(flat @ total.gram @ flat), 0.0) / max(rows, 1.0)), count,
+        math.sqrt(max(float(flat @ total.gram @ flat), 0.0) / max(rows, 1.0)), count, together,
     )  # fmt: skip
 
 

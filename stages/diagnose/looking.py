@@ -14,6 +14,7 @@ from stages.diagnose.evidence import Evidence, best_guises, weigh
 from stages.diagnose.images import FEWEST, ImageEvidence, as_effect, weigh_images
 from stages.diagnose.pattern import PatternEvidence, weigh_pattern
 from stages.diagnose.projection import FREE_SLOPES
+from stages.diagnose.relief import ALONG, open_relief, weigh_relief
 from stages.diagnose.state import Search
 from stages.diagnose.statistics import (
     BASELINE,
@@ -41,7 +42,6 @@ OVERSHOOT = 1.5  # texture and slopes, known from images that are not aligned ye
 ENOUGH_PX = 0.06
 QUIET_GAIN, QUIET_FID = 6.0, 0.012  # below both an effect is not looked at again
 SURE = 0.01  # of the two halves of the blocks agreeing by chance
-GROUND = {"dem_smoothing": (), "dem_scale": ("dem_smoothing",)}  # effect -> nuisances fitted along
 
 
 @dataclass
@@ -68,7 +68,7 @@ def look(state: Search, names: Sequence[str]) -> Round:
     lit = [n for n, c in kinds.items() if c.scope == "scene" and c.channel == "lit" and n not in BASELINE]
     edge = [n for n, c in kinds.items() if c.channel == "edge"]
     albedo = [n for n, c in kinds.items() if c.channel == "albedo" and c.scope == "scene"]
-    relief = [n for n in GROUND if n in kinds and state.deepest >= FREE_SLOPES]
+    relief = [n for n in ALONG if n in kinds and state.deepest >= FREE_SLOPES]
     candidates, at_edge = make_candidates(lit, state.data), make_candidates(edge, state.data)
     on_ground = make_candidates(albedo, state.data)
     works, edges, parts, edge_parts, ground_parts = [], [], [], [], []
@@ -81,7 +81,7 @@ def look(state: Search, names: Sequence[str]) -> Round:
             columns = [c for e in on_ground for c in trial_columns(chain, e.effect, e.trial, state.data)]
             ground_parts.append(gather_static(work, on_ground, columns))
         for name, collected in relief_parts.items():
-            collected.append(_gather_relief(work, name, state))
+            collected.append(open_relief(work, name, state.data))
         if at_edge:
             wide = ready(chain, state.dn, wide=True)
             edges.append(wide)
@@ -95,7 +95,7 @@ def look(state: Search, names: Sequence[str]) -> Round:
     if ground_parts:
         evidence += weigh(join(ground_parts))
     for collected in relief_parts.values():
-        evidence += weigh(join(collected))
+        evidence += weigh_relief(collected, works)
     if "psf_blur" in kinds and any(e.effect == "dem_smoothing" and float(e.amount[0]) < 0 for e in evidence):
         # no DEM is sharper than the ground: what looks so is a blur of the images
         evidence += weigh(without(blurred, ["dem_smoothing"], blurred.candidates))
@@ -132,22 +132,6 @@ def align(state: Search) -> ImageEvidence | None:
         if found.rms < ENOUGH_PX:
             break
     return first
-
-
-def _gather_relief(work: SiteWork, name: str, state: Search) -> Statistics:
-    candidates = make_candidates([name], state.data)
-    columns = [c for e in candidates for c in trial_columns(work.chain, name, e.trial, state.data)]
-    named = [e.name for e in work.chain.base]
-    along = [
-        (
-            other,
-            BASELINE[other],
-            trial_columns(work.chain, other, get_effect(other).trials(state.data)[0], state.data)[0],
-        )
-        for other in GROUND[name]
-        if other not in named
-    ]
-    return gather_static(work, candidates, columns, along, nominal=True)
 
 
 def _relief_blur(chain: Chain, state: Search) -> tuple[str, list[torch.Tensor]]:

@@ -91,8 +91,9 @@ class Projector:
         place = (k / k.min()).log() / (k.max() / k.min()).log() * (BINS - 1)
         low = place.floor().long().clamp(max=BINS - 2)
         share = place - low
-        filters = []
-        for p in power:
+        filters, firm = [], []
+        noise = (self.back.square().sum(1) * self.window.square()).mean((-2, -1))
+        for p, n in zip(power, noise, strict=True):
             # weighted means in overlapping bins, in the log-mean-exp sense robust enough for chi-square power
             flat = torch.zeros(BINS)
             norm = torch.zeros(BINS)
@@ -104,6 +105,8 @@ class Projector:
             mean = torch.where(filled, mean, mean[filled].mean())
             smooth = (mean.log()[low] * (1 - share) + mean.log()[low + 1] * share).exp()
             filters.append(smooth.rsqrt())
+            firm.append((1 - n / smooth).clamp(min=0))
+        self.firm = torch.stack(firm)  # share of each frequency's power that is not the pixels' noise
         # a given DEM's shortest slopes are noise of its own: what follows terrain is sought at longer wavelengths
         shortest = [ALBEDO_BAND] + [SLOPE_BAND] * (len(filters) - 1)
         self.filter = torch.stack([f * torch.exp(-((k / b) ** 2)) for f, b in zip(filters, shortest, strict=True)])
@@ -114,6 +117,18 @@ class Projector:
         if self.filter is None:
             raise RuntimeError("learn_spectrum comes before whiten")
         return torch.fft.irfft2(torch.fft.rfft2(maps * self.window) * self.filter, s=maps.shape[-2:])
+
+    def slope_noise(self) -> float:
+        """Sum of squares that unit noise of the pixels leaves in the whitened maps of slope errors."""
+        if self.filter is None or len(self.back) < 3:
+            return 0.0
+        variance = (self.back[1:].square().sum(1) * self.window.square()).sum((-2, -1))
+        both = torch.full((self.filter.shape[-1],), 2.0)  # frequencies that the half plane stands for
+        both[0] = 1.0
+        if self.window.shape[-1] % 2 == 0:
+            both[-1] = 1.0
+        passed = (self.filter[1:].square() * both).sum((-2, -1)) / self.window.numel()
+        return float((variance * passed).sum())
 
 
 def _tapered(count: int) -> Tensor:

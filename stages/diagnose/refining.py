@@ -9,21 +9,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stages.diagnose.evidence import Evidence, weigh
+from stages.diagnose.evidence import Evidence
 from stages.diagnose.images import as_effect, weigh_images
+from stages.diagnose.relief import named_relief, weigh_relief
 from stages.diagnose.state import Cause, Search
 from stages.diagnose.statistics import (
-    Candidate,
-    SiteWork,
     Statistics,
     derivative_step,
     gather_site,
-    gather_static,
     join,
     ready,
-    tangent,
 )
-from stages.effects import Effect, Survey, Trial, get_effect
+from stages.effects import Effect, Survey, get_effect
 
 WORTH_MOVING = 12.0  # nats
 # far from linear: the trial that fitted best is a better start than what a line through it says
@@ -55,22 +52,25 @@ def refine(state: Search, steps: int = 2) -> None:
     """Gauss-Newton on all named scene-wide coordinates together; values per image are estimated anew."""
     for _ in range(steps):
         state.fit()
-        works, parts, relief_parts = [], [], []
+        works, parts = [], []
         wide = any(c.effect.channel == "edge" for c in state.causes)
-        relief = [k for k, c in enumerate(state.causes) if c.effect.channel == "relief"]
+        relief: dict[str, list[Statistics]] = {c.effect.name: [] for c in state.causes if c.effect.channel == "relief"}
         for chain in state.chains():
             work = ready(chain, state.dn, wide)
             works.append(work)
             parts.append(gather_site(work, [], state.data))
-            if relief:
-                relief_parts.append(_relief(work, relief, state))
+            for place, effect in enumerate(chain.base):
+                if effect.name in relief:
+                    (coordinate,) = (p.name for p in effect.fitted())
+                    step = derivative_step(type(effect), coordinate, state.data)
+                    relief[effect.name].append(named_relief(work, place, step, state.data))
         joined = join(parts)
         if joined.count > 0:
             delta, error = solve_nuisance(joined)
             for cause in state.causes:
                 _move(cause, joined.names, delta, error)
-        if relief:
-            for evidence in weigh(join(relief_parts)):
+        for collected in relief.values():
+            for evidence in weigh_relief(collected, works):
                 _move_relief(state, evidence)
         named = {c.effect.name: c for c in state.causes if c.effect.scope == "image"}
         found = weigh_images(works, list(named), state.frames, state.dn, state.data) if named else {}
@@ -78,19 +78,6 @@ def refine(state: Search, steps: int = 2) -> None:
             if name in found and found[name].gain > WORTH_MOVING:
                 cause.effect = as_effect(found[name], cause.effect, state.data)
     state.fit()
-
-
-def _relief(work: SiteWork, places: Sequence[int], state: Search) -> Statistics:
-    """The DEM's faults that are named already, as candidates for a further step."""
-    candidates, columns = [], []
-    for k, place in enumerate(places):
-        effect = work.chain.base[place]
-        (coordinate,) = (p.name for p in effect.fitted())
-        step = derivative_step(type(effect), coordinate, state.data)
-        trial = Trial(({coordinate: effect.null()[coordinate] + step},))
-        candidates.append(Candidate(effect.name, trial, slice(k, k + 1)))
-        columns.append(step * tangent(work.chain, place, coordinate, state.data))
-    return gather_static(work, candidates, columns, nominal=True)
 
 
 def _move_relief(state: Search, evidence: Evidence) -> None:

@@ -303,6 +303,7 @@ def gather_static(
     columns: Sequence[Tensor],
     nuisance: Sequence[tuple[str, float, Tensor]] = (),
     nominal: bool = False,
+    maps: slice = slice(None),
 ) -> Statistics:
     """Statistics from the static rows alone, for what stays with the ground: albedo that follows terrain, a DEM's faults.
 
@@ -311,6 +312,7 @@ def gather_static(
 
     columns : (n, H, W) each, the candidates'; nuisance : name, ordinary size and column
     nominal : take out what the nominal model, fitted to images that hold the effect, took of it
+    maps : which of the static maps count: albedo, and slopes to the east and south
     """
     weighted = torch.stack([*(column for _, _, column in nuisance), *columns]) * work.projector.weight
     if nominal:
@@ -323,7 +325,7 @@ def gather_static(
     first = len(nuisance)
     static = torch.cat([rows[:first], work.static[None], rows[first:]])
     names, bounds = [n for n, _, _ in nuisance], [b for _, b, _ in nuisance]
-    out = _reduce(work, candidates, names, bounds, static[:, :0], static)
+    out = _reduce(work, candidates, names, bounds, static[:, :0], static[:, maps])
     out.image = out.place
     return out
 

@@ -15,7 +15,6 @@ from stages.physics.photometry import Parameter
 class Nonlinearity(Effect):
     name = "nonlinearity"
     slot = "sensor"
-    linear = True
     title = "nonlinear response"
     mechanism = (
         "Well capacity, companding tables and film bend the response: measured = I + quadratic I^2 + log I ln I. The second term "

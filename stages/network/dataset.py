@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +20,7 @@ from schemas.artefacts import PAIRS, SPLITS
 from schemas.errors import ArtefactError
 from schemas.hdf5 import open_artefact, read_strings, unpack
 from stages.network.normalisation import fill_holes
-from stages.network.records import Records
+from stages.network.records import Mapping, Records
 from stages.network.symmetries import turn_field, turn_vector
 from stages.physics.formation import Observation
 
@@ -68,12 +67,12 @@ class PairReader:
         f = self.file
         self._stack = contextlib.ExitStack()
         self._stack.callback(f.close)
-        descriptor = os.open(self.path, os.O_RDONLY)
-        self._stack.callback(os.close, descriptor)
+        mapping = Mapping(self.path)
+        self._stack.callback(mapping.close)
         self._threads = max(1, threads)
         self._pool = self._stack.enter_context(ThreadPoolExecutor(self._threads)) if threads > 1 else None
         names = FIELDS + (DETECTOR if detector else ())
-        self._records = {name: Records(f[name], descriptor) for name in names if name in f}
+        self._records = {name: Records(f[name], mapping) for name in names if name in f}
         self.size: tuple[int, int] = f["elevation"].shape[1:]
         self.count: int = f["elevation"].shape[0]
         if not self.count:

@@ -1,0 +1,76 @@
+"""A DEM's scale and smoothing, judged in the maps of apparent slope errors: the channel of what is wrong with the ground."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+from stages.diagnose.evidence import Evidence, weigh
+from stages.diagnose.statistics import (
+    BASELINE,
+    Candidate,
+    SiteWork,
+    Statistics,
+    gather_static,
+    join,
+    make_candidates,
+    tangent,
+    trial_columns,
+)
+from stages.effects import Survey, Trial, get_effect
+
+ALONG = {"dem_smoothing": (), "dem_scale": ("dem_smoothing",)}  # effect -> nuisances fitted along
+MOST_HIDDEN = 0.05  # of the given slopes' variance, that is taken for noise at most
+
+
+def open_relief(work: SiteWork, name: str, data: Survey) -> Statistics:
+    """Products of an effect that is not in the model yet."""
+    candidates = make_candidates([name], data)
+    columns = [c for e in candidates for c in trial_columns(work.chain, name, e.trial, data)]
+    return _gather(work, candidates, columns, name, data)
+
+
+def named_relief(work: SiteWork, place: int, step: float, data: Survey) -> Statistics:
+    """Products of a further step of the effect at ``place`` in the model."""
+    effect = work.chain.base[place]
+    (coordinate,) = (p.name for p in effect.fitted())
+    trial = Trial(({coordinate: effect.null()[coordinate] + step},))
+    column = step * tangent(work.chain, place, coordinate, data)
+    return _gather(work, [Candidate(effect.name, trial, slice(0, 1))], [column], effect.name, data)
+
+
+def _gather(work: SiteWork, candidates, columns, name: str, data: Survey) -> Statistics:
+    named = [e.name for e in work.chain.base]
+    along = [
+        (other, BASELINE[other], trial_columns(work.chain, other, get_effect(other).trials(data)[0], data)[0])
+        for other in ALONG[name]
+        if other not in named
+    ]
+    return gather_static(work, candidates, columns, along, nominal=True, maps=slice(1, None))
+
+
+def weigh_relief(parts: Sequence[Statistics], works: Sequence[SiteWork]) -> list[Evidence]:
+    """Evidence from the maps of slope errors of all sites, a DEM's scale corrected for the DEM's own noise.
+
+    Slopes that the DEM has and the ground has not draw the regression of slope errors on given slopes to smaller
+    scales, by their share of the given slopes' variance (Fuller 1987, Measurement Error Models, ch. 1). That share is
+    estimated from what the fit leaves of the maps beyond the images' noise.
+    """
+    data = join(parts)
+    evidence = weigh(data)
+    for k, e in enumerate(evidence):
+        if e.effect != "dem_scale" or e.gain <= 0:
+            continue
+        m = data.count
+        sums = data.products.sum(0)
+        place = m + 1 + e.candidate.columns.start
+        left = float(sums[m, m]) - 2 * e.gain - sum(w.projector.slope_noise() for w in works)
+        (reference,) = e.candidate.trial.columns[0].values()
+        hidden = reference**2 * max(left, 0.0) / max(float(sums[place, place]), 1e-30)
+        hidden = min(hidden, MOST_HIDDEN)
+        covariance = e.covariance + (0.5 * hidden / reference) ** 2  # half of it may be the ground's own detail
+        evidence[k] = dataclasses.replace(e, amount=e.amount + hidden / reference, covariance=covariance)
+    return evidence
+
+
+__all__ = ["ALONG", "named_relief", "open_relief", "weigh_relief"]
