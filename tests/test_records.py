@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import h5py
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 from schemas import PAIRS, ArtefactError, ArtefactWriter
 from schemas.hdf5 import UNKNOWN, unpack
 from stages.network.dataset import PairReader
+from stages.network.records import Mapping, Records
 
 N, SIZE = 150, 128
 FIELDS = ("elevation", "image", "valid", "sun_horizon_deg")
@@ -123,10 +126,8 @@ def test_scale_offset_is_decoded_bit_for_bit_as_hdf5_does(decimals, fill, rng, t
     with h5py.File(tmp_path / "p.h5", "w") as file:
         options = {} if fill is None else {"fillvalue": fill}
         file.create_dataset("a", data=values, chunks=(1, 32, SIZE), scaleoffset=decimals, **options)
-    from stages.network.records import Records
-
-    with h5py.File(tmp_path / "p.h5") as file, open(tmp_path / "p.h5", "rb") as raw:
-        records = Records(file["a"], raw.fileno())
+    with h5py.File(tmp_path / "p.h5") as file, contextlib.closing(Mapping(tmp_path / "p.h5")) as mapping:
+        records = Records(file["a"], mapping)
         records.prepare(N)
         out = records.empty(N)
         records.read_into(out, np.arange(N))

@@ -21,6 +21,7 @@ from schemas.errors import ArtefactError
 from schemas.hdf5 import open_artefact, read_strings, unpack
 from stages.network.normalisation import fill_holes
 from stages.network.records import Mapping, Records
+from stages.network.runtime import keep_freed_memory
 from stages.network.symmetries import turn_field, turn_vector
 from stages.physics.formation import Observation
 
@@ -69,6 +70,7 @@ class PairReader:
         self._stack.callback(f.close)
         mapping = Mapping(self.path)
         self._stack.callback(mapping.close)
+        keep_freed_memory()  # page faults of new arrays would cost as much as reading
         self._threads = max(1, threads)
         self._pool = self._stack.enter_context(ThreadPoolExecutor(self._threads)) if threads > 1 else None
         names = FIELDS + (DETECTOR if detector else ())
