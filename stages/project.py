@@ -39,18 +39,20 @@ Progress = Callable[[int, int, str], None]
 
 # Digits after the point, which pairs.h5 keeps; docs/scaling.md says what they do to a rendering.
 IOF_DECIMALS, COUNT_DECIMALS, HORIZON_DECIMALS = 5, 1, 1
-RAY_VARIABLES = {"detector_line": 2, "detector_sample": 2, "emission_deg": 2, "phase_deg": 3}
+RAY_DECIMALS = {"detector_line": 2, "detector_sample": 2, "emission_deg": 2, "phase_deg": 3}
 OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
 
 
 @dataclass(frozen=True)
 class Config:
-    """scene : overrides the scene that crops.h5 names; register : None, 'shift' or 'affine'; max_shift : px searched."""
+    """scene : overrides the scene that crops.h5 names; register : None, 'shift' or 'affine'; max_shift : px searched;
+    exact : keep float32 as it is instead of the digits that matter."""
 
     scene: str | None = None
     shard: tuple[int, int] = (0, 1)
     register: str | None = None
     max_shift: float = 8.0
+    exact: bool = False
 
 
 @dataclass(frozen=True)
@@ -162,16 +164,17 @@ def _project(
         overwrite=overwrite,
     ) as writer:
         unit = "1" if units == "iof" else "dn"
-        images = writer.dataset("image", unit=unit, decimals=_image_decimals(frames, units))
-        elevation = writer.dataset("elevation", decimals=_elevation_decimals(grid.gsd))
-        horizon = writer.dataset("sun_horizon_deg", decimals=HORIZON_DECIMALS)
+        kept = {} if config.exact else _decimals(frames, units, grid.gsd)
+        images = writer.dataset("image", unit=unit, decimals=kept.get("image"))
+        elevation = writer.dataset("elevation", decimals=kept.get("elevation"))
+        horizon = writer.dataset("sun_horizon_deg", decimals=kept.get("sun_horizon_deg"))
         names = ("valid", "sun_direction_enu", "camera_position_enu", "convergence_deg")
         valid, sun_out, camera_out, convergence = (writer.dataset(n) for n in names)
         chosen = sorted({int(k) for k in image_index})
         # of the whole table, not of this shard's images: the parts of one whole hold the same variables
         rays = []
         if any(f.camera for f in frames):
-            rays = [writer.dataset(name, decimals=digits) for name, digits in RAY_VARIABLES.items()]
+            rays = [writer.dataset(name, decimals=kept.get(name)) for name in RAY_DECIMALS]
         known = overview_extremes(scene_file["elevation"], overview)
         registered: list[Registered] = []
         done = 0
@@ -334,20 +337,19 @@ def _put(target: h5py.Dataset, k: int, values: NDArray) -> None:
     target[k] = values if known.all() else np.where(known, values, target.fillvalue)
 
 
-def _elevation_decimals(gsd: float) -> int:
-    """Digits after the point: steps of at most gsd / 400, whose slopes err by less than 0.03 deg."""
-    return max(0, math.ceil(math.log10(400 / gsd)))
+def _decimals(frames: list[Frame], units: str, gsd: float) -> dict[str, int | None]:
+    """Digits after the point: elevations in steps of at most gsd / 400, images of 1e-5 of I/F or a tenth of a count.
 
-
-def _image_decimals(frames: list[Frame], units: str) -> int | None:
-    """Digits after the point: 1e-5 of I/F; a tenth of a count; all where counts are not whole numbers."""
-    if units == "iof":
-        return IOF_DECIMALS
-    for frame in frames:
-        with contextlib.suppress(InputError), rasters.open_raster(frame.path) as image:
-            if np.dtype(image.dtypes[0]).kind == "f" or image.scales[0] < 1:
-                return None
-    return COUNT_DECIMALS
+    Counts that are not whole numbers in the images keep all their digits: nobody knows how large they are.
+    """
+    image: int | None = IOF_DECIMALS if units == "iof" else COUNT_DECIMALS
+    if units == "dn":
+        for frame in frames:
+            with contextlib.suppress(InputError), rasters.open_raster(frame.path) as source:
+                if np.dtype(source.dtypes[0]).kind == "f" or source.scales[0] < 1:
+                    image = None
+    elevation = max(0, math.ceil(math.log10(400 / gsd)))
+    return {"image": image, "elevation": elevation, "sun_horizon_deg": HORIZON_DECIMALS, **RAY_DECIMALS}
 
 
 def _write_rays(rays: list[h5py.Dataset], k: int, ortho: Ortho) -> None:

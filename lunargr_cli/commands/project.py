@@ -48,6 +48,9 @@ def command(
     regions_csv: Annotated[
         Path | None, typer.Option("--shifts", metavar="CSV", help="Also write each region's own shift to a table.")
     ] = None,
+    exact: Annotated[
+        bool, typer.Option("--exact", help="Keep all digits of float32, not those that matter: three times the size.")
+    ] = False,
     shard: Shard = None,
     output: Output = Path("pairs.h5"),
     scheduler: Scheduler = None,
@@ -67,7 +70,11 @@ def command(
             raise typer.BadParameter("needs --register", param_hint="--shifts")
         check_output(regions_csv, [crops, output], overwrite)
     config = project.Config(
-        scene=str(scene) if scene else None, shard=parse_shard(shard), register=register, max_shift=max_shift
+        scene=str(scene) if scene else None,
+        shard=parse_shard(shard),
+        register=register,
+        max_shift=max_shift,
+        exact=exact,
     )
     if in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.stages import run_project
