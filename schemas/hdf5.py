@@ -34,7 +34,8 @@ def silence_hdf5() -> None:
     """Keep the HDF5 C library from printing its own error stack: our one line says it.
 
     After a full disk every HDF5 object that is let go of fails once more, where no one can catch it, and Cython reports
-    that through both hooks of ``sys``: these reports, and no others, are dropped.
+    that through both hooks of ``sys``: these reports, and no others, are kept from the terminal, and remembered: what an
+    object still held was not written, and the file must not become an artefact.
     """
     h5py._errors.silence_errors()
     if sys.excepthook is not _except_h5py_release:
@@ -42,6 +43,8 @@ def silence_hdf5() -> None:
         sys.excepthook, sys.unraisablehook = _except_h5py_release, _except_h5py_unraisable
 
 
+_lost: list[BaseException] = []  # what went wrong where HDF5 let go of objects
+_abandoned: list[h5py.File] = []
 _hooks: list[tuple[Callable[..., Any], Callable[[Any], Any]]] = []
 
 
@@ -51,12 +54,16 @@ def _is_release(trace: TracebackType | None) -> bool:
 
 
 def _except_h5py_release(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    if not _is_release(trace):
+    if _is_release(trace):
+        _lost.append(error)
+    else:
         _hooks[-1][0](kind, error, trace)
 
 
 def _except_h5py_unraisable(unraisable: Any) -> None:
-    if not _is_release(unraisable.exc_traceback):
+    if _is_release(unraisable.exc_traceback):
+        _lost.append(unraisable.exc_value or OSError("HDF5 could not close an object"))
+    else:
         _hooks[-1][1](unraisable)
 
 
@@ -116,7 +123,8 @@ def _whole_or_absent(path: Path, partial: Path) -> Iterator[None]:
             partial.unlink()
         if _is_full_disk(error):
             raise InputError(
-                f"{path}: the disk is full or over quota; nothing was written. Free some space and run the command again."
+                f"{path}: the disk is full or over quota; nothing half-written is left. "
+                "Free some space and run the command again."
             ) from None
         raise
 
@@ -146,6 +154,9 @@ class ArtefactWriter:
         self._root_attributes = describe_run(schema, config or {}, inputs, seed) | dict(attributes or {})
         self._stack = contextlib.ExitStack()
         self.file: h5py.File
+        # A dataset that is let go of writes what it still holds where no one hears of a failure: they all stay to the end.
+        self._kept: list[h5py.Dataset] = []
+        self._lost_before = len(_lost)
 
     def __enter__(self) -> ArtefactWriter:
         silence_hdf5()
@@ -154,9 +165,8 @@ class ArtefactWriter:
             partial = self._partial = self._stack.enter_context(atomic_path(self.path))
             self._stack.enter_context(_terminate_as_exception())
             try:
-                self.file = self._stack.enter_context(
-                    h5py.File(partial, "w", track_order=True, libver=("earliest", "v110"))
-                )
+                self.file = h5py.File(partial, "w", track_order=True, libver=("earliest", "v110"))
+                self._stack.callback(self._close)
             except OSError as error:
                 if _is_full_disk(error):
                     raise
@@ -187,10 +197,31 @@ class ArtefactWriter:
                 error = RuntimeError(f"{self.schema.name}: written without {', '.join(missing)}")
                 self._stack.__exit__(type(error), error, None)
                 raise error
+            error = self._flush()
         if _is_full_disk(error):
             # Give back the room that the partial file took: HDF5 can then flush and close without failing once more.
             os.truncate(self._partial, 0)
-        self._stack.__exit__(kind, error, trace)
+        self._stack.__exit__(None if error is None else type(error), error, trace)
+        self._kept.clear()
+        if kind is None and error is not None:
+            raise error
+
+    def _flush(self) -> BaseException | None:
+        """Write everything that HDF5 still holds; what went wrong, now or where a dataset was let go of."""
+        if len(_lost) > self._lost_before:
+            return _lost[self._lost_before]
+        try:
+            self.file.flush()
+        except (OSError, RuntimeError) as error:
+            return error
+        return None
+
+    def _close(self) -> None:
+        if len(_lost) > self._lost_before:
+            # HDF5 would follow a pointer into what it failed to let go of, and take the process down.
+            _abandoned.append(self.file)
+        else:
+            self.file.close()
 
     def _create(
         self,
@@ -227,6 +258,7 @@ class ArtefactWriter:
                 data.attrs["standard_name"] = _STANDARD_NAMES[variable.name]
             data.attrs["_Netcdf4Dimid"] = np.int32(list(self.sizes).index(variable.name))
         self._describe(data, variable, unit, scale=size_of_scale is not None)
+        self._kept.append(data)
         return data
 
     def _describe(self, data: h5py.Dataset, variable: Variable, unit: str | None, scale: bool = False) -> None:

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import resource
 import subprocess
 import sys
 
+import h5py
+import numpy as np
 import pytest
+from cluster_scene import assert_same, environment, finish, lunargr, start
+
+from schemas import SVBRDF, ArtefactWriter, InputError
 
 LINE = "lunargr: interrupted; nothing half-written was kept.\n"
 
@@ -33,3 +41,78 @@ def test_ctrl_c_is_one_line_wherever_it_falls(program):
 def test_a_library_keeps_its_handlers():
     done = python("sys.argv = ['other']; import lunargr_cli; os.kill(os.getpid(), signal.SIGINT)")
     assert "KeyboardInterrupt" in done.stderr
+
+
+@contextlib.contextmanager
+def file_size_limit(size):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_disk_that_is_full_for_a_moment_leaves_nothing_that_looks_whole(tmp_path):
+    """HDF5 writes what a dataset still holds when it is let go of, where a failure reaches nobody; then there is room again."""
+    path, values = tmp_path / "map.h5", np.arange(3 * 64 * 64, dtype=np.float32).reshape(3, 64, 64)
+    attributes = {"gsd_m": 5.0, "body_radius_m": 1.0, "model": "M2", "quantity": "I/F"}
+    with (
+        contextlib.suppress(InputError),
+        ArtefactWriter(path, SVBRDF, {"coefficient": 3, "y": 64, "x": 64}, attributes=attributes) as writer,
+    ):
+        for name in ("x", "y", "elevation", "valid", "coefficient_name"):
+            writer.write(name, ["a", "b", "c"] if name == "coefficient_name" else np.zeros(writer.dataset(name).shape))
+        writer.write_crs("", (1, 0, 0, 0, -1, 0))
+        data = writer.write("coefficients", values)
+        room = next(p for p in tmp_path.iterdir() if ".partial-" in p.name)
+        with file_size_limit(room.stat().st_size):
+            del data
+            gc.collect()
+    if path.exists():
+        with h5py.File(path) as file:
+            np.testing.assert_array_equal(file["coefficients"][...], values)
+
+
+LET_GO = """
+import gc, numpy as np, resource
+from pathlib import Path
+from schemas import SVBRDF, ArtefactWriter, InputError
+try:
+    with ArtefactWriter(Path("map.h5"), SVBRDF, {"coefficient": 1, "y": 4, "x": 4}) as writer:
+        group = writer.file.create_group("weights")
+        limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limit[1]))
+        group.create_dataset("w", data=np.ones((8, 256), np.float32), chunks=(8, 256))
+        gc.collect()
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        for v in SVBRDF.variables:
+            shape = [writer.sizes[d] for d in v.dims]
+            writer.write(v.name, ["a"] if v.dtype == "string" else np.zeros(shape))
+        writer.file.attrs.update({a.name: 1 for a in SVBRDF.attributes})
+except InputError as error:
+    print(error)
+    os._exit(3)  # as the command does: HDF5 is not to be trusted any more
+"""
+
+
+def test_a_failure_where_a_dataset_is_let_go_of_is_not_lost(tmp_path):
+    """Also of datasets that the writer did not make, such as a checkpoint's weights; HDF5 crashes where it goes on."""
+    words = [sys.executable, "-c", f"import os{LET_GO}"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, env=environment())
+    assert done.returncode == 3 and "disk is full" in done.stdout, done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_keeps_the_parts(small_artefacts, tmp_path):
+    """Each part fits, the whole does not: one line, and the same command goes on when there is room."""
+    output = tmp_path / "pairs.h5"
+    command = ["project", small_artefacts["crops"], "--resume", "--parts", 2, "-o", output]
+    size = small_artefacts["pairs"].stat().st_size * 2 // 3
+    process = start([*command, "--quiet"], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)))
+    code, said = finish(process)
+    assert code == 3 and len(said.splitlines()) == 1 and "disk is full" in said
+    assert not output.exists()
+    code, said = lunargr(*command)
+    assert code == 0 and "2 of 2 parts are there already" in said
+    assert_same(small_artefacts["pairs"], output)

@@ -68,7 +68,7 @@ def open_dask(scheduler: str, folder: Path) -> Iterator[Engine]:
                     n_workers=int(number),
                     threads_per_worker=1,
                     memory_limit=None,
-                    dashboard_address=None,
+                    dashboard_address="127.0.0.1:0",
                     local_directory=str(folder),
                 )
             )
@@ -81,8 +81,10 @@ def open_dask(scheduler: str, folder: Path) -> Iterator[Engine]:
 def _settings(workers: int) -> dict[str, Any]:
     threads = str(max(1, (os.cpu_count() or 1) // workers))
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+    environment = {name: os.environ.get(name, threads) for name in names}
     return {
-        "distributed.nanny.pre-spawn-environ": {name: os.environ.get(name, threads) for name in names},
+        # Workers that are stopped with work in their hands, after an error in another's, would say so at length.
+        "distributed.nanny.pre-spawn-environ": environment | {"DASK_LOGGING__DISTRIBUTED": "critical"},
         "distributed.scheduler.allowed-failures": DEATHS,
         "distributed.comm.timeouts.connect": f"{ANSWER:g}s",
         "distributed.diagnostics.nvml": False,

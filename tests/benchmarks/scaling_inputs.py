@@ -117,7 +117,9 @@ def write_map(scene: Path, output: Path) -> Path:
                 part = slice(row, min(height, row + 256))
                 elevation[part] = file["elevation"][part]
                 valid[part] = 1
-                coefficients[:, part] = np.array([0.09, 0.03, 0.01], np.float32)[:, None, None]
+                band = np.empty((3, part.stop - row, width), np.float32)
+                band[:] = np.array([0.09, 0.03, 0.01])[:, None, None]
+                coefficients[:, part] = band
     return output
 
 
