@@ -25,7 +25,7 @@ def start(arguments, **options) -> subprocess.Popen:
     return subprocess.Popen(command, env=environment(), **(pipes | options))
 
 
-def finish(process: subprocess.Popen, timeout: float = 120) -> tuple[int, str]:
+def finish(process: subprocess.Popen, timeout: float = 600) -> tuple[int, str]:
     out, err = process.communicate(timeout=timeout)
     return process.returncode, out + err
 
