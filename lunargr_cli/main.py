@@ -100,7 +100,23 @@ def main() -> None:
         if isinstance(error, BrokenPipeError):  # `lunargr inspect file | head`
             sys.stderr.close()
             sys.exit(141)
+        if isinstance(error, Exception) and (line := _lost_input(error)):
+            say_error(line)
+            os._exit(EXIT_CODE)
         raise
+
+
+def _lost_input(error: Exception) -> str | None:
+    """What to say where the libraries fail because an input went away, or was written over, under a stage's hands."""
+    from schemas.provenance import changed_inputs
+
+    lost = changed_inputs()
+    if not lost:
+        return None
+    return (
+        f"{lost[0]}: gone, or changed, while it was being read ({type(error).__name__}: {error}); nothing half-written is left. "
+        "Bring it back and run the command again."
+    )
 
 
 def _stop(number: int, frame: Any) -> None:

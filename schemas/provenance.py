@@ -41,6 +41,20 @@ def sha256(path: Path) -> str:
     return known_digests[key]
 
 
+def changed_inputs() -> list[str]:
+    """The files hashed by this process that are not any more what they were."""
+    changed = []
+    for path, size, modified in known_digests:
+        try:
+            state = os.stat(path)
+        except OSError:
+            changed.append(path)
+            continue
+        if (state.st_size, state.st_mtime_ns) != (size, modified):
+            changed.append(path)
+    return changed
+
+
 @contextlib.contextmanager
 def run_by(command: tuple[str, str] | None) -> Iterator[None]:
     """Within this block artefacts say that they are made by this command line, in this folder."""

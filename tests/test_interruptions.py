@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import os
 import resource
 import subprocess
 import sys
+import time
 
 import h5py
 import numpy as np
@@ -116,3 +118,17 @@ def test_a_full_disk_keeps_the_parts(small_artefacts, tmp_path):
     code, said = lunargr(*command)
     assert code == 0 and "2 of 2 parts are there already" in said
     assert_same(small_artefacts["pairs"], output)
+
+
+def test_an_input_that_is_lost_on_the_way_is_one_line(small_artefacts, tmp_path):
+    """Cut short while it is being read: by a copy that starts anew, or a network drive that goes away."""
+    crops, output = tmp_path / "crops.h5", tmp_path / "pairs.h5"  # a folder beside that of the artefacts
+    crops.write_bytes(small_artefacts["crops"].read_bytes())
+    process = start(["project", crops, "--scene", small_artefacts["scene"], "--quiet", "-o", output])
+    while not list(tmp_path.glob(".pairs.partial-*")):
+        assert process.poll() is None, finish(process)
+        time.sleep(0.002)
+    os.truncate(crops, 4096)
+    code, said = finish(process)
+    assert code == 3 and len(said.splitlines()) == 1 and str(crops) in said, said
+    assert [p.name for p in tmp_path.iterdir()] == ["crops.h5"]
