@@ -204,7 +204,7 @@ def write_diagnosis(
             if variable != "image_gain":
                 sizes["axis" if variable == "image_shift_px" else "mode"] = data.shape[1]
         else:
-            entry["values"] = {k: float(v) for k, v in effect.values.items()}
+            entry["values"] = {k: float(v) + effect.in_simulation.get(k, 0.0) for k, v in effect.values.items()}
         if isinstance(effect, ColumnPattern):
             tables["column_response"] = effect.response(256)
             sizes["column"] = 256

@@ -89,16 +89,15 @@ def look(state: Search, names: Sequence[str]) -> Round:
         state.progress(k + 1, len(state.sites), f"looking for causes, round {len(state.causes) + 1}")
     statistics = join(parts)
     evidence = weigh(statistics)
-    if "psf_blur" in kinds:
-        blurred = swap(statistics, "psf_blur", state.data)
-        evidence += weigh(blurred)
     if ground_parts:
         evidence += weigh(join(ground_parts))
     for collected in relief_parts.values():
         evidence += weigh_relief(collected, works)
-    if "psf_blur" in kinds and any(e.effect == "dem_smoothing" and float(e.amount[0]) < 0 for e in evidence):
-        # no DEM is sharper than the ground: what looks so is a blur of the images
-        evidence += weigh(without(blurred, ["dem_smoothing"], blurred.candidates))
+    if "psf_blur" in kinds:
+        blurred = swap(statistics, "psf_blur", state.data)
+        # judged beside a DEM smoother than the ground, if the maps of slopes show one: no DEM is sharper than the ground
+        drop = [] if _smooth(state, evidence) else ["dem_smoothing"]
+        evidence += weigh(without(blurred, drop, blurred.candidates))
     if edge_parts:
         evidence += _weigh_edges(state, join(edge_parts))
     images = [n for n, c in kinds.items() if c.scope == "image"]
@@ -173,6 +172,16 @@ def _climb(state: Search, top: Evidence) -> list[Evidence]:
             break
         top = best
     return [top]
+
+
+def _smooth(state: Search, evidence: Sequence[Evidence]) -> bool:
+    """Whether the DEM is, or may be, smoother than every DEM."""
+    cls = get_effect("dem_smoothing")
+    for e in evidence:
+        if e.effect == cls.name:
+            ((name, reference),) = e.candidate.trial.columns[0].items()
+            return float(e.amount[0]) * reference > 0.5 * cls.tolerance[name]
+    return state.deepest < FREE_SLOPES
 
 
 def _slope_error(works: Sequence[SiteWork]) -> float:

@@ -13,7 +13,7 @@ from stages.diagnose.looking import Round
 from stages.diagnose.pattern import PatternEvidence
 from stages.diagnose.refining import start
 from stages.diagnose.state import Cause, Search
-from stages.effects import effect_names, get_effect
+from stages.effects import Effect, effect_names, get_effect
 
 GATE = 0.01  # family-wise
 FLOOR_FID = 0.022  # an effect smaller than this against the noise is never worth a name
@@ -123,13 +123,18 @@ def worth_image(e: ImageEvidence, count: int) -> bool:
 def misaligned(state: Search, e: ImageEvidence) -> Cause | None:
     """The shifts that were taken out of the images as a cause, where they are more than every data set has."""
     count, effect = len(effect_names()), state.aligned
-    cls = type(effect)
-    e = dataclasses.replace(e, values=torch.stack([effect.values[p.name] for p in cls.fitted()], 1))
-    seen = e.values.abs().sum(1) > 0
-    e.rms = float(e.values[seen].square().sum(1).mean().sqrt()) if bool(seen.any()) else 0.0
+    e = with_values(e, effect)
     if not worth_image(e, count):
         return None
-    return Cause(effect, min(1.0, e.p * count), e.gain, e.gain_error, e.fid, [cls.name], image_evidence=e)
+    return Cause(effect, min(1.0, e.p * count), e.gain, e.gain_error, e.fid, [effect.name], image_evidence=e)
+
+
+def with_values(e: ImageEvidence, effect: Effect) -> ImageEvidence:
+    """The evidence with the values per image that the effect has now."""
+    values = torch.stack([torch.as_tensor(effect.values[p.name]) for p in effect.fitted()], 1)
+    seen = values.abs().sum(1) > 0
+    rms = float(values[seen].square().sum(1).mean().sqrt()) if bool(seen.any()) else 0.0
+    return dataclasses.replace(e, values=values, rms=rms)
 
 
 def _pattern(state: Search, e: PatternEvidence | None, count: int) -> Cause | None:
@@ -161,4 +166,4 @@ def _as_good(first: Evidence, other: Evidence) -> bool:
     return float(difference.sum()) < 2 * error and other.gain > 0.5 * first.gain
 
 
-__all__ = ["FLOOR_FID", "SIMPLER", "choose", "misaligned", "worth", "worth_image"]
+__all__ = ["FLOOR_FID", "SIMPLER", "choose", "misaligned", "with_values", "worth", "worth_image"]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from stages.diagnose.data import Site
 from stages.diagnose.looking import Round, align, look, misfit, narrowed, quiet
-from stages.diagnose.naming import KEEP_SHARE, SIMPLER, choose, misaligned
+from stages.diagnose.naming import KEEP_SHARE, SIMPLER, choose, misaligned, with_values, worth_image
 from stages.diagnose.refining import refine
 from stages.diagnose.state import Cause, Saved, Search
 
@@ -16,7 +16,8 @@ MUCH = 0.02  # of what is left: by so much a cause for each image must do better
 SLIGHT = 0.005  # of what is left: by so much a simpler cause may do worse
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
-PROMISE = 0.25  # share of the foretold gain that a cause must bring once it is in the model
+PROMISE = 0.25  # share of the foretold gain that a cause must bring once it is in the model ...
+ALSO_STILL = ("psf_blur",)  # ... but for these, part of whose gain lies in the maps of the ground
 
 
 def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
@@ -48,6 +49,7 @@ def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
             seen.images.pop(cause.effect.name, None)
             continue
         say(f"found {cause.effect.name}: gain {cause.gain:.0f} +- {cause.gain_error:.0f} nats")
+        _settle_shifts(state)
         if cause.effect.scope == "site":  # the pattern of these sites' albedo was out of everything else already
             seen.pattern = None
             continue
@@ -58,13 +60,23 @@ def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
     return seen
 
 
+def _settle_shifts(state: Search) -> None:
+    """Shifts that looked large before a further cause was known (jitter has a mean over any crop) may be ordinary now."""
+    for cause in [c for c in state.causes if c.effect.name == "misregistration"]:
+        e = cause.image_evidence
+        if e is not None and len(state.causes) > 1 and not worth_image(with_values(e, cause.effect), 1):
+            state.aligned = cause.effect
+            state.causes.remove(cause)
+
+
 def _kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> bool:
     """Whether the model with the cause in it fits better by what its linear estimate said."""
     if cause.effect.channel in ("albedo", "relief"):  # the rows that are free of the ground do not know them
         return True
     if cause.effect.channel == "edge":  # judged in pixels that are masked here
         return cause.rms_after < WORSE * cause.rms_before
-    return nothing - misfit(state, seen.works) > PROMISE * 2 * cause.gain
+    promised = 0.0 if cause.effect.name in ALSO_STILL else PROMISE * 2 * cause.gain
+    return nothing - misfit(state, seen.works) > promised
 
 
 def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:

@@ -124,11 +124,11 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
 
 
 def left_over(chain: Chain, weight: Tensor, dn: bool) -> float:
-    """Sum of squares of the dynamic residual without shifts and the nominal model's freedom, at given weights."""
+    """Sum of squares of the dynamic residual at given weights, without shifts, unresolved slopes, the nominal model's freedom."""
     projector = Projector(chain, weight)
     local = Local(projector, nuisance_columns(chain, dn))
     residual = chain.site.image - chain.textured
-    columns = torch.stack([*_site_columns(chain), residual]) * weight
+    columns = torch.stack([*_site_columns(chain), chain.unresolved_slopes(), residual]) * weight
     on_basis = projector.coefficients(columns)
     local.remove_(columns, on_basis)
     projector.project_(columns, on_basis)

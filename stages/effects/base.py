@@ -67,6 +67,8 @@ class Effect:
     channel      where `diagnose` looks for it: 'lit' (fully lit ground and deep shadow), 'edge' (also about shadow
                  edges), 'albedo' or 'relief' (what stays with the ground in all images: its albedo, its slopes)
     displaces    whether it moves images against the ground: what is known of it is taken out of the measurement
+    in_simulation  what a coordinate gets added in the extended model: `diagnose` judges with slopes of fourth order,
+                 while the simulation's smooth the ground by about a quarter of a squared pixel themselves
     linear       whether the image is linear in the coordinates: the first estimate needs no second one
     """
 
@@ -85,6 +87,7 @@ class Effect:
     channel: ClassVar[str] = "lit"
     displaces: ClassVar[bool] = False
     linear: ClassVar[bool] = False
+    in_simulation: ClassVar[Mapping[str, float]] = {}
 
     def __init__(self, values: Mapping[str, Any] | None = None, survey: Survey | None = None) -> None:
         self.values: Values = {**self.null(), **(values or {})}

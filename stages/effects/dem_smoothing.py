@@ -28,6 +28,7 @@ class DemSmoothing(Effect):
     )
     strong: ClassVar = {"sigma2_px2": 1.0}
     tolerance: ClassVar = {"sigma2_px2": 0.35}
+    in_simulation: ClassVar = {"sigma2_px2": 0.25}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
+from torch import Tensor
 
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation import State
@@ -31,11 +32,24 @@ class MacroscopicRoughness(Effect):
     def trials(cls, survey: Survey) -> list[Trial]:
         return [Trial(({"theta_bar_deg": t},)) for t in (5.0, 9.0, 13.0, 17.0, 22.0, 28.0)]
 
+    _known: tuple[Any, Any] = (None, None)  # angles, and what they gave
+
     def apply(self, state: State) -> None:
+        if torch.is_grad_enabled():
+            ratio = self._ratio(state)
+        else:  # `diagnose` renders the same angles many times over, and this is the dearest part of it
+            known = self._known
+            if state.angles is not known[0]:
+                known = self._known = (state.angles, self._ratio(state))
+            ratio = known[1]
+        state.reflectance = state.reflectance * ratio
+
+    def _ratio(self, state: State) -> Tensor:
+        """Rough over smooth reflectance, (B, H, W); 1 where the Sun or the camera is below the facet."""
         theta = torch.deg2rad(self.value("theta_bar_deg", state))
         mu0, mu = state.angles.cos_incidence, state.angles.cos_emission
         x, y, shadowing = rough_surface(state.angles, theta)  # effective cosines in either order, S / mue
         smooth = mu0 / (mu0 + mu)
         ratio = shadowing * (x * y / (x + y)) / smooth
         up = (mu0 > 1e-3) & (mu > 1e-3)
-        state.reflectance = torch.where(up, state.reflectance * torch.where(up, ratio, 1.0), state.reflectance)
+        return torch.where(up, ratio, 1.0)
