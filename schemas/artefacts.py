@@ -32,6 +32,8 @@ _FRAME_TABLE = _FRAMES + (
     Variable("spacecraft_longitude_deg", ("frame",), "f8", "degree", "east longitude below the camera"),
     Variable("spacecraft_latitude_deg", ("frame",), "f8", "degree", "latitude below the camera"),
     Variable("spacecraft_altitude_m", ("frame",), "f8", "m", "camera height above the reference sphere"),
+    Variable("sha256", ("frame",), STRING, "", "SHA-256 of the image file when it was ingested", required=False),
+    Variable("camera_sha256", ("frame",), STRING, "", "SHA-256 of the camera model file, or empty", required=False),
 )
 
 SCENE = declare(

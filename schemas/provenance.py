@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -24,6 +24,7 @@ from schemas.declaration import Schema
 from schemas.said import said
 
 CONVENTIONS = "CF-1.11"
+SIDECAR = "record.json"  # beside files that cannot carry a record themselves: rasters and tables
 # A shard names the same large inputs as the check before it: (path, size, time of change) -> SHA-256.
 known_digests: dict[tuple[str, int, int], str] = {}
 
@@ -72,7 +73,6 @@ def current_command() -> tuple[str, str] | None:
 
 def describe_run(schema: Schema, config: Mapping[str, Any], inputs: Sequence[Path], seed: int | None) -> dict[str, Any]:
     """The root attributes that say who makes an artefact now, and from what."""
-    now = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     sources = [{"name": Path(p).name, "sha256": sha256(Path(p))} for p in inputs]
     command, folder = current_command() or ("", "")
     ancestors: dict[str, dict[str, Any]] = {}
@@ -87,7 +87,7 @@ def describe_run(schema: Schema, config: Mapping[str, Any], inputs: Sequence[Pat
         "lunargr_schema": schema.name,
         "schema_version": np.int32(schema.version),
         "lunargr_version": version("lunargr"),
-        "history": f"{now} {command or 'lunargr ' + schema.stage}",
+        "history": f"{_now()} {command or 'lunargr ' + schema.stage}",
         "command": command,
         "folder": folder,
         "config": json.dumps(config, default=str, sort_keys=True),
@@ -100,11 +100,15 @@ def describe_run(schema: Schema, config: Mapping[str, Any], inputs: Sequence[Pat
 def read_record(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, Any]]]:
     """An artefact's own record (None for other files) and, by SHA-256, those of all that it descends from."""
     h5py._errors.silence_errors()
+    digests: list[tuple[str, str]] = []
     try:
         if not h5py.is_hdf5(path):
-            return None, {}
+            return _read_sidecar(path), {}
         with h5py.File(path, "r") as file:
             root = {k: (v.decode() if isinstance(v, bytes) else v) for k, v in file.attrs.items()}
+            if root.get("lunargr_schema") == "scene" and "sha256" in file and "camera_sha256" in file:
+                images, cameras = ([d.decode() for d in file[k][...]] for k in ("sha256", "camera_sha256"))
+                digests = list(zip(images, cameras, strict=True))
     except OSError:
         return None, {}
     if "lunargr_schema" not in root:
@@ -119,7 +123,44 @@ def read_record(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, 
         "config": json.loads(root.get("config", "{}")),
         "inputs": json.loads(root.get("inputs", "[]")),
     }
+    if digests:
+        record["images"] = {"count": len(digests), "sha256": digest_of(d for pair in digests for d in pair if d)}
     return record, json.loads(root.get("provenance", "{}"))
+
+
+def digest_of(digests: Iterable[str]) -> str:
+    """One for many files: what ``sha256sum FILES | cut -c 1-64 | sha256sum`` prints."""
+    return hashlib.sha256("".join(f"{digest}\n" for digest in digests).encode()).hexdigest()
+
+
+def sidecar(stage: str, config: Mapping[str, Any], seed: int, files: Sequence[Path], images: Sequence[Path]) -> str:
+    """What SIDECAR holds in a folder of rasters and tables: their record, and which contents it is the record of."""
+    command, home = current_command() or ("", "")
+    record = {
+        "schema": stage,
+        "history": f"{_now()} {command or 'lunargr ' + stage}",
+        "command": command,
+        "folder": home,
+        "version": version("lunargr"),
+        "seed": seed,
+        "config": config,
+        "inputs": [],
+        "made_images": digest_of(sha256(path) for path in images),
+    }
+    made = {path.name: sha256(path) for path in (*files, *images)}
+    return json.dumps({"record": record, "files": made}, indent=1, default=str) + "\n"
+
+
+def _read_sidecar(path: Path) -> dict[str, Any] | None:
+    try:
+        found = json.loads((path.parent / SIDECAR).read_text())
+        return found["record"] if found["files"].get(path.name) == sha256(path) else None
+    except (OSError, ValueError, KeyError, AttributeError):
+        return None
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def whole_command(command: str, output: Path) -> str:
@@ -164,10 +205,18 @@ def chain(path: Path) -> list[Step]:
             return
         seen.add(source["sha256"])
         record = ancestors.get(source["sha256"])
-        for earlier in record["inputs"] if record else ():
-            visit(earlier)
+        visit_sources(record)
         steps.append(Step(source["name"], source["sha256"], record))
 
-    for source in own["inputs"] if own else ():
-        visit(source)
+    def visit_sources(record: Mapping[str, Any] | None) -> None:
+        for earlier in record["inputs"] if record else ():
+            visit(earlier)
+        images = record.get("images") if record else None
+        if images and images["sha256"] not in seen:
+            seen.add(images["sha256"])
+            name = f"{images['count']} image{'s' if images['count'] > 1 else ''}"
+            steps.append(Step(name, images["sha256"], makers.get(images["sha256"])))
+
+    makers = {r["made_images"]: r for r in ancestors.values() if "made_images" in r}
+    visit_sources(own)
     return [*steps, Step(path.name, "", own)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from schemas import (
     open_artefact,
     read_config,
 )
-from schemas.hdf5 import silence_hdf5
+from schemas.hdf5 import sha256, silence_hdf5
 from stages.physics import rasters
 from stages.physics.bodies import Body, find_body
 from stages.physics.frames import Frame, load_frames, read_frames, write_frames
@@ -134,7 +134,7 @@ def run(
             if frames and count == 1 and not any(areas):
                 raise _no_positions(images, config, terrain.grid.gsd)
             writer.write("valid_area_m2", np.array(areas))
-            write_frames(writer, mine)
+            write_frames(writer, [_with_digests(frame) for frame in mine])
     return summarise(output, tuple(skipped))
 
 
@@ -549,6 +549,16 @@ def _write_validity(
     if progress and index == count - 1:
         progress(count * 1000, count * 1000, "image masks")
     return area
+
+
+def _with_digests(frame: Frame) -> Frame:
+    """What the files held that the masks were made from. Raises InputError."""
+    try:
+        return replace(frame, sha256=sha256(frame.path), camera_sha256=sha256(frame.camera) if frame.camera else "")
+    except OSError as error:
+        raise InputError(
+            f"{error.filename}: image '{frame.image_id}' cannot be read any more ({error.strerror}); bring it back."
+        ) from None
 
 
 def _union(box: tuple[int, int, int, int] | None, other: tuple[int, int, int, int]) -> tuple[int, int, int, int]:

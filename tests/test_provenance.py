@@ -35,7 +35,7 @@ def made(small_files, tmp_path_factory):
 
 def test_the_chain_names_commands_versions_seeds_and_hashes(made, small_files):
     steps = {s.name: s for s in chain(made / "pairs.h5")}
-    assert list(steps) == ["dem.tif", "images.csv", "scene.h5", "crops.h5", "pairs.h5"]
+    assert list(steps) == ["dem.tif", "images.csv", "3 images", "scene.h5", "crops.h5", "pairs.h5"]
     assert steps["dem.tif"].record is None
     for name, path in (("dem.tif", small_files.dem), ("crops.h5", made / "crops.h5")):
         assert steps[name].sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
@@ -85,6 +85,39 @@ def test_a_file_of_another_program_is_where_the_chain_begins(small_artefacts, tm
     code, script = lunargr("replay", tmp_path / "checkpoint.h5")
     assert code == 0 and "# needs pairs.h5  # sha256" in script
     assert "lunargr train" in script
+
+
+def test_images_count_as_inputs_together(made, small_files, small_artefacts):
+    """One digest for all, which a shell makes again; each image's own is in the scene. However the scene was made."""
+    images = [small_files.folder / f"image{k}.tif" for k in range(3)]
+    line = ["bash", "-c", 'sha256sum "$@" | cut -c 1-64 | sha256sum', "-", *map(str, images)]
+    expected = subprocess.run(line, capture_output=True, text=True, check=True).stdout.split()[0]
+    for path in (made / "pairs.h5", small_artefacts["scene"]):
+        assert {s.name: s for s in chain(path)}["3 images"].sha256 == expected
+    with h5py.File(small_artefacts["scene"]) as file:
+        own = [hashlib.sha256(path.read_bytes()).hexdigest() for path in images]
+        assert [d.decode() for d in file["sha256"][...]] == own
+
+
+def test_the_chain_goes_back_to_simulate(tmp_path):
+    """Rasters carry no record: it lies beside them, and holds for the contents that it names alone."""
+    from stages import ingest
+
+    options = ["--size-px", 160, "--images", 2, "--quiet"]
+    code, said = lunargr("simulate", "-o", tmp_path / "s", *options)
+    assert code == 0, said
+    scene = tmp_path / "scene.h5"
+    ingest.run(tmp_path / "s/dem.tif", tmp_path / "s/images.csv", scene, ingest.Config(gsd=5, crop=32))
+    steps = {s.name: s for s in chain(scene)}
+    for name in ("dem.tif", "images.csv", "2 images"):
+        assert steps[name].record["command"].startswith("lunargr simulate -o "), name
+    code, script = lunargr("replay", scene)
+    assert code == 0 and script.count("\nlunargr simulate -o ") == 1
+    with open(tmp_path / "s/images.csv", "a") as table:
+        table.write("\n")
+    ingest.run(tmp_path / "s/dem.tif", tmp_path / "s/images.csv", scene, ingest.Config(gsd=5, crop=32), overwrite=True)
+    steps = {s.name: s for s in chain(scene)}
+    assert steps["images.csv"].record is None and steps["dem.tif"].record is not None
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ _NUMBERS = {
 
 @dataclass(frozen=True)
 class Frame:
-    """One source image. ``units`` is 'iof' or 'dn'; ``camera`` is None for map-projected images."""
+    """One source image. ``units`` is 'iof' or 'dn'; ``camera`` is None for map-projected images; digests once it was read."""
 
     image_id: str
     path: Path
@@ -48,6 +48,8 @@ class Frame:
     spacecraft_longitude_deg: float
     spacecraft_latitude_deg: float
     spacecraft_altitude_m: float
+    sha256: str = ""
+    camera_sha256: str = ""
 
     def sun_position(self) -> np.ndarray:
         """(3,) body-fixed, m."""
@@ -110,7 +112,7 @@ def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Fram
         body,
         f"{where} ({text['image_id']})",
     )
-    numbers = {}
+    numbers: dict[str, Any] = {}
     for key, (low, high) in _NUMBERS.items():
         try:
             value = float(text.get(key, ""))
@@ -138,6 +140,9 @@ def write_frames(writer: ArtefactWriter, frames: Sequence[Frame]) -> None:
     writer.write("path", [relative_path(f.path, folder) for f in frames])
     writer.write("camera", [relative_path(f.camera, folder) if f.camera else "" for f in frames])
     writer.write("start_time", [f.start_time for f in frames])
+    if all(f.sha256 for f in frames):
+        writer.write("sha256", [f.sha256 for f in frames])
+        writer.write("camera_sha256", [f.camera_sha256 for f in frames])
     writer.write("units", np.array([0 if f.units == "iof" else 1 for f in frames], np.uint8))
     for key in _NUMBERS:
         writer.write(key, np.array([getattr(f, key) for f in frames]))
@@ -146,8 +151,9 @@ def write_frames(writer: ArtefactWriter, frames: Sequence[Frame]) -> None:
 def load_frames(file: h5py.File, path: Path) -> list[Frame]:
     """The frame table of a scene or crops artefact at ``path``."""
     folder = path.resolve().parent
-    columns = {key: file[key][...] for key in _NUMBERS}
     names, paths, cameras, times = (read_strings(file, k) for k in ("image_id", "path", "camera", "start_time"))
+    columns: dict[str, Any] = {key: file[key][...].tolist() for key in _NUMBERS}
+    columns |= {k: read_strings(file, k) for k in ("sha256", "camera_sha256") if k in file}
     return [
         Frame(
             image_id=names[k],
@@ -155,7 +161,7 @@ def load_frames(file: h5py.File, path: Path) -> list[Frame]:
             units="dn" if file["units"][k] else "iof",
             camera=folder / cameras[k] if cameras[k] else None,
             start_time=times[k],
-            **{key: float(column[k]) for key, column in columns.items()},
+            **{key: column[k] for key, column in columns.items()},
         )
         for k in range(len(names))
     ]

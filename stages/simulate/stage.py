@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from schemas import atomic_path, check_output
+from schemas.provenance import SIDECAR, sidecar
 from stages.physics.frames import ASTRONOMICAL_UNIT
 from stages.physics.grid import Grid, local_metric_crs, unit_vectors
 from stages.simulate import sensor
@@ -45,7 +46,7 @@ class Summary:
 
 
 def run(folder: Path, config: Config, overwrite: bool = False, progress: Progress | None = None) -> Summary:
-    """Simulate a scene into ``folder``: dem.tif, images/*.tif, images.csv, truth.h5, truth.tif.
+    """Simulate a scene into ``folder``: dem.tif, images/*.tif, images.csv, truth.h5, truth.tif, record.json.
 
     Raises ConfigError where files exist and ``overwrite`` is not given.
     """
@@ -54,7 +55,7 @@ def run(folder: Path, config: Config, overwrite: bool = False, progress: Progres
     truth = Truth(config)
     shots = plan_passes(config)
     names = [f"images/{shot.image_id}.tif" for shot in shots]
-    for name in ("dem.tif", "images.csv", "truth.h5", "truth.tif", *names):
+    for name in ("dem.tif", "images.csv", "truth.h5", "truth.tif", SIDECAR, *names):
         check_output(folder / name, overwrite=overwrite)
     say = progress or (lambda done, total, what: None)
 
@@ -75,6 +76,9 @@ def run(folder: Path, config: Config, overwrite: bool = False, progress: Progres
         working = scene_grid(config, config.gsd, config.size_px)
         write_truth(folder / "truth.h5", config, scene, working, terrain.craters, images, hidden, overwrite)
     write_table(folder / "images.csv", rows)
+    files = [folder / name for name in ("dem.tif", "images.csv", "truth.tif")]
+    with atomic_path(folder / SIDECAR) as partial:
+        partial.write_text(sidecar("simulate", asdict(config), config.seed, files, [folder / name for name in names]))
     return Summary(folder, images, covered, dem_valid, len(terrain.craters), hidden)
 
 
