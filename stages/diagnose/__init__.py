@@ -4,7 +4,8 @@ data         measured pairs by site            chain       the forward model, re
 nominal      the model that is judged          projection  texture and DEM error taken out, per ground pixel
 statistics   products per cluster of pixels    evidence    held-out gain and significance, scene-wide effects
 images       the same for effects per image    selection   name, refine, look again
-plateau      highlights that are cut off
+plateau      highlights that are cut off                relief      a DEM's scale and smoothing
+parallel     sites side by side
 unexplained  what is left, what cannot be seen answer      verdict, JSON, diagnosis.h5      report   HTML
 """
 
@@ -20,6 +21,7 @@ import torch
 
 from schemas import ArtefactError, ConfigError, atomic_path, check_output
 from stages.diagnose.answer import Answer, HeldOut, cause_json, held_out, parameters, write_diagnosis
+from stages.diagnose.chain import Chain
 from stages.diagnose.data import group_pairs, load_site, survey
 from stages.diagnose.looking import Round
 from stages.diagnose.nominal import fit, lit_mask, load_nominal
@@ -179,16 +181,17 @@ def _split(reader: PairReader) -> tuple[np.ndarray, np.ndarray]:
 
 def _misfit(state: Search) -> float:
     """rms residual over rms signal on fully lit pixels."""
-    signal = residual = 0.0
-    for chain in state.chains():
-        mask = lit_mask(chain)
-        image = chain.site.image
+
+    def of(chain: Chain) -> tuple[float, float]:
+        mask, image = lit_mask(chain), chain.site.image
+        level = torch.zeros(len(image))
         if state.dn:  # the free offset takes the mean: only variation counts
-            mean = (image * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
-            signal += float(((image - mean[:, None, None]) * mask).double().square().sum())
-        else:
-            signal += float((image * mask).double().square().sum())
-        residual += float(((image - chain.predict()) * mask).double().square().sum())
+            level = (image * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
+        varied = (image - level[:, None, None]) * mask
+        left = (image - chain.predict()) * mask
+        return float(varied.double().square().sum()), float(left.double().square().sum())
+
+    signal, residual = (sum(x) for x in zip(*state.each(of), strict=True))
     ratio = (residual / signal) ** 0.5 if signal > 0 else float("inf")
     return ratio * (0.5 if state.dn else 1.0)  # film and texture: half of the variation may stay and say something
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.numbers import f_tail
+from stages.diagnose.parallel import per_site
 from stages.diagnose.projection import Local
 from stages.diagnose.statistics import (
     BASELINE,
@@ -56,11 +57,10 @@ def weigh_images(
     """Evidence for each effect of image scope, from the sites with enough images."""
     sums: dict[str, list[_Fold]] = {}
     rows = 0.0
-    for work in works:
-        if work.chain.site.count < FEWEST:
-            continue
+    deep = [work for work in works if work.chain.site.count >= FEWEST]
+    for work, every in zip(deep, per_site(lambda work: _site_folds(work, names, dn, data), deep), strict=True):
         rows += work.projector.dynamic_rows
-        for name, folds in _site_folds(work, names, dn, data).items():
+        for name, folds in every.items():
             k = len(get_effect(name).fitted())
             place = torch.from_numpy(work.chain.site.frames)[:, None] * k + torch.arange(k)
             place = place.flatten()

@@ -62,6 +62,18 @@ class Round:
     statistics: Statistics | None = None  # of the effects of lit ground
 
 
+@dataclass
+class _Seen:
+    """What a look finds at one site: products of effects on lit ground, on albedo, on slopes and about shadow edges."""
+
+    work: SiteWork
+    lit: Statistics
+    ground: Statistics | None = None
+    relief: list[Statistics] = field(default_factory=list)
+    wide: SiteWork | None = None
+    edges: Statistics | None = None
+
+
 def look(state: Search, names: Sequence[str]) -> Round:
     """Evidence for the effects of these names."""
     kinds = {n: get_effect(n) for n in names}
@@ -71,35 +83,35 @@ def look(state: Search, names: Sequence[str]) -> Round:
     relief = [n for n in ALONG if n in kinds and state.deepest >= FREE_SLOPES]
     candidates, at_edge = make_candidates(lit, state.data), make_candidates(edge, state.data)
     on_ground = make_candidates(albedo, state.data)
-    works, edges, parts, edge_parts, ground_parts = [], [], [], [], []
-    relief_parts: dict[str, list[Statistics]] = {n: [] for n in relief}
-    for k, chain in enumerate(state.chains()):
+
+    def of(chain: Chain) -> _Seen:
         work = ready(chain, state.dn)
-        parts.append(gather_site(work, candidates, state.data))
-        works.append(work)
+        seen = _Seen(work, gather_site(work, candidates, state.data))
         if on_ground:
             columns = [c for e in on_ground for c in trial_columns(chain, e.effect, e.trial, state.data)]
-            ground_parts.append(gather_static(work, on_ground, columns))
-        for name, collected in relief_parts.items():
-            collected.append(open_relief(work, name, state.data))
+            seen.ground = gather_static(work, on_ground, columns)
+        seen.relief = [open_relief(work, name, state.data) for name in relief]
         if at_edge:
-            wide = ready(chain, state.dn, wide=True)
-            edges.append(wide)
-            edge_parts.append(gather_site(wide, at_edge, state.data, [_relief_blur(chain, state)]))
-        state.progress(k + 1, len(state.sites), f"looking for causes, round {len(state.causes) + 1}")
-    statistics = join(parts)
+            seen.wide = ready(chain, state.dn, wide=True)
+            seen.edges = gather_site(seen.wide, at_edge, state.data, [_relief_blur(chain, state)])
+        return seen
+
+    title = f"looking for causes, round {len(state.causes) + 1}"
+    every = state.each(of, lambda done: state.progress(done, len(state.sites), title))
+    works, edges = [s.work for s in every], [s.wide for s in every if s.wide is not None]
+    statistics = join([s.lit for s in every])
     evidence = weigh(statistics)
-    if ground_parts:
-        evidence += weigh(join(ground_parts))
-    for collected in relief_parts.values():
-        evidence += weigh_relief(collected, works)
+    if on_ground:
+        evidence += weigh(join([s.ground for s in every if s.ground is not None]))
+    for k in range(len(relief)):
+        evidence += weigh_relief([s.relief[k] for s in every], works)
     if "psf_blur" in kinds:
         blurred = swap(statistics, "psf_blur", state.data)
         # judged beside a DEM smoother than the ground, if the maps of slopes show one: no DEM is sharper than the ground
         drop = [] if _smooth(state, evidence) else ["dem_smoothing"]
         evidence += weigh(without(blurred, drop, blurred.candidates))
-    if edge_parts:
-        evidence += _weigh_edges(state, join(edge_parts))
+    if at_edge:
+        evidence += _weigh_edges(state, join([s.edges for s in every if s.edges is not None]))
     images = [n for n, c in kinds.items() if c.scope == "image"]
     pattern = weigh_pattern(works) if "albedo_map" in kinds else None
     return Round(
@@ -121,7 +133,7 @@ def align(state: Search) -> ImageEvidence | None:
     """
     cls, first = get_effect("misregistration"), None
     for _ in range(ALIGNMENTS if state.deepest >= FEWEST else 0):
-        works = [ready(chain, state.dn) for chain in state.chains()]
+        works = state.each(lambda chain: ready(chain, state.dn))
         found = weigh_images(works, [cls.name], state.frames, state.dn, state.data).get(cls.name)
         if found is None or found.p > SURE or found.gain < 0:
             break
@@ -163,11 +175,12 @@ def _climb(state: Search, top: Evidence) -> list[Evidence]:
         tangent = height / ((known + 0.5) * crop * state.data.gsd)
         trials = [cls.trial(state.data, tangent * f, d * known, int(fixed["side"])) for d in distances for f in LADDER]
         candidates = [Candidate(cls.name, t, slice(k, k + 1)) for k, t in enumerate(trials)]
-        parts = []
-        for chain in state.chains():
+
+        def of(chain: Chain, candidates: list[Candidate] = candidates) -> Statistics:
             wide = ready(chain, state.dn, wide=True)
-            parts.append(gather_site(wide, candidates, state.data, [_relief_blur(chain, state)]))
-        best = max(weigh(join(parts)), key=lambda e: e.gain)
+            return gather_site(wide, candidates, state.data, [_relief_blur(chain, state)])
+
+        best = max(weigh(join(state.each(of))), key=lambda e: e.gain)
         if best.gain <= top.gain:
             break
         top = best
@@ -200,10 +213,8 @@ def quiet(seen: Round, named: str) -> set[str]:
 
 def misfit(state: Search, works: Sequence[SiteWork]) -> float:
     """Weighted sum of squares that all free parameters together leave, with the weights of an earlier look."""
-    total = 0.0
-    for chain, work in zip(state.chains(), works, strict=True):
-        total += left_over(chain, work.projector.weight * chain.site.valid, state.dn)
-    return total
+    weights = {id(w.chain.site): w.projector.weight for w in works}
+    return sum(state.each(lambda chain: left_over(chain, weights[id(chain.site)] * chain.site.valid, state.dn)))
 
 
 def narrowed(seen: Round, later: Round) -> Round:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from torch import Tensor
 from schemas.errors import ArtefactError, RegistryError
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import GRAZING, MARGIN, Site
+from stages.diagnose.parallel import per_site
 from stages.effects import Effect
 from stages.physics.photometry import ReflectanceModel, get_model
 
@@ -27,14 +29,17 @@ class Nominal:
     model: ReflectanceModel
     vector: Tensor
     free: Tensor
-    predictor: object = None
+    predictor: Any = None
+    maps: dict[int, Tensor] = field(default_factory=dict)  # what the network says of each site
 
     def coefficients(self, site: Site) -> Tensor:
         """(1 or n, C, 1 or H, 1 or W)"""
         vector = self.vector[None, :, None, None]
         if self.predictor is None:
             return vector
-        return self.predictor.coefficients(site.observation.elevation[:1]) * vector
+        if site.number not in self.maps:
+            self.maps[site.number] = self.predictor.coefficients(site.observation.elevation[:1])
+        return self.maps[site.number] * vector
 
     def chain(self, site: Site, base: Sequence[Effect], moved: Sequence[Effect] = ()) -> Chain:
         free = self.free if self.predictor is None else None  # maps may still drift
@@ -76,14 +81,21 @@ def lit_mask(chain: Chain) -> Tensor:
 
 
 def fit(
-    nominal: Nominal, sites: Sequence[Site], base: Sequence[Effect], units: str, measured: Sequence[Tensor]
+    nominal: Nominal,
+    sites: Sequence[Site],
+    base: Sequence[Effect],
+    units: str,
+    measured: Sequence[Tensor],
+    most: int = ROUNDS,
 ) -> None:
     """Least squares of the coefficients (and of gain and offset per pair where images are in dn), in place.
 
     measured : the images as read, one (n, H, W) per site; ``site.image`` becomes I/F
+    most : rounds at most; one is enough for a linear model that was fitted to nearly the same before
     """
     fitted = nominal.predictor is None
     rounds = (ROUNDS if units == "dn" or not nominal.model.linear else 3) if fitted else (1 if units == "dn" else 0)
+    rounds = min(rounds, most)
     damping = 1e-7 if nominal.model.linear and units == "iof" else 1e-3
     best: tuple[float, Tensor, Tensor, Tensor] | None = None  # cost, vector, normal equations
     for _ in range(rounds):
@@ -132,28 +144,33 @@ def _normal_equations(
     gram = torch.zeros(count_free, count_free, dtype=torch.float64)
     score = torch.zeros(count_free, dtype=torch.float64)
     cost, count = 0.0, 0.0
-    chains = [nominal.chain(site, base) for site in sites]
+    chains = per_site(lambda site: nominal.chain(site, base), sites)
     masks = [lit_mask(chain) for chain in chains]
     if units == "dn":
         for chain, raw, mask in zip(chains, measured, masks, strict=True):
             _scale(chain.site, raw, chain.textured, mask)
     dark = DARK * _brightness(chains, masks)
-    for chain, lit in zip(chains, masks, strict=True):
+
+    def of(place: int) -> tuple[Tensor, Tensor, float, float]:
+        chain = chains[place]
         site, predicted = chain.site, chain.textured
-        mask = lit & (
-            site.image > dark * predicted
-        )  # darker: in the shadow of something that the horizon does not know
+        # darker: in the shadow of something that the horizon does not know
+        mask = masks[place] & (site.image > dark * predicted)
         # relative weights: every image counts alike, however low its Sun
         level = (predicted * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
         weight = (mask / level.clamp(min=1e-6)[:, None, None]).double()
         weight = weight * _near(site.image - predicted, weight)
         residual = (site.image - predicted).double() * weight
-        cost += float(residual.square().sum())
-        count += float((weight > 0).sum())
+        flat = residual.new_zeros(count_free, 1)
         if fitted:
             flat = (torch.stack(chain.surface_tangents()).double() * weight).flatten(1)
-            gram += flat @ flat.T
-            score += flat @ residual.flatten()
+        on = flat @ residual.flatten() if fitted else flat[:, 0]
+        return flat @ flat.T, on, float(residual.square().sum()), float((weight > 0).sum())
+
+    for products, on, squares, pixels in per_site(of, range(len(chains))):
+        gram += products
+        score += on
+        cost, count = cost + squares, count + pixels
     return gram, score, cost / max(count, 1.0), count
 
 

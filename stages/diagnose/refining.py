@@ -9,11 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stages.diagnose.chain import Chain
 from stages.diagnose.evidence import Evidence
 from stages.diagnose.images import as_effect, weigh_images
 from stages.diagnose.relief import named_relief, weigh_relief
 from stages.diagnose.state import Cause, Search
 from stages.diagnose.statistics import (
+    SiteWork,
     Statistics,
     derivative_step,
     gather_site,
@@ -50,26 +52,16 @@ def start(evidence: Evidence, data: Survey) -> tuple[Effect, dict[str, float]]:
 
 def refine(state: Search, steps: int = 2) -> None:
     """Gauss-Newton on all named scene-wide coordinates together; values per image are estimated anew."""
-    for _ in range(steps):
-        state.fit()
-        works, parts = [], []
-        wide = any(c.effect.channel == "edge" for c in state.causes)
-        relief: dict[str, list[Statistics]] = {c.effect.name: [] for c in state.causes if c.effect.channel == "relief"}
-        for chain in state.chains():
-            work = ready(chain, state.dn, wide)
-            works.append(work)
-            parts.append(gather_site(work, [], state.data))
-            for place, effect in enumerate(chain.base):
-                if effect.name in relief:
-                    (coordinate,) = (p.name for p in effect.fitted())
-                    step = derivative_step(type(effect), coordinate, state.data)
-                    relief[effect.name].append(named_relief(work, place, step, state.data))
-        joined = join(parts)
+    for step in range(steps):
+        state.fit(again=step > 0)
+        every = state.each(lambda chain: _gather(state, chain))
+        works = [work for work, _, _ in every]
+        joined = join([lit for _, lit, _ in every])
         if joined.count > 0:
             delta, error = solve_nuisance(joined)
             for cause in state.causes:
                 _move(cause, joined.names, delta, error)
-        for collected in relief.values():
+        for collected in zip(*(relief for _, _, relief in every), strict=True):
             for evidence in weigh_relief(collected, works):
                 _move_relief(state, evidence)
         named = {c.effect.name: c for c in state.causes if c.effect.scope == "image"}
@@ -78,6 +70,18 @@ def refine(state: Search, steps: int = 2) -> None:
             if name in found and found[name].gain > WORTH_MOVING:
                 cause.effect = as_effect(found[name], cause.effect, state.data)
     state.fit()
+
+
+def _gather(state: Search, chain: Chain) -> tuple[SiteWork, Statistics, list[Statistics]]:
+    """Products of further steps of all named effects at one site; those of the DEM apart."""
+    work = ready(chain, state.dn, wide=any(c.effect.channel == "edge" for c in state.causes))
+    relief = []
+    for place, effect in enumerate(chain.base):
+        if effect.channel == "relief":
+            (coordinate,) = (p.name for p in effect.fitted())
+            step = derivative_step(type(effect), coordinate, state.data)
+            relief.append(named_relief(work, place, step, state.data))
+    return work, gather_site(work, [], state.data), relief
 
 
 def _move_relief(state: Search, evidence: Evidence) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -12,9 +13,12 @@ from torch import Tensor
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import Site
 from stages.diagnose.images import FEWEST, ImageEvidence
-from stages.diagnose.nominal import Nominal, fit, lit_mask
+from stages.diagnose.nominal import ROUNDS, Nominal, fit, lit_mask
+from stages.diagnose.parallel import per_site
 from stages.effects import Effect, Survey, effect_names, get_effect
 from stages.physics import formation
+
+R = TypeVar("R")
 
 
 @dataclass
@@ -73,9 +77,10 @@ class Search:
         """Images of the site that has most."""
         return max((s.count for s in self.sites), default=0)
 
-    def chains(self) -> list[Chain]:
+    def each(self, function: Callable[[Chain], R], done: Callable[[int], None] = lambda count: None) -> list[R]:
+        """What ``function`` makes of the model of every site, in their order."""
         still, moved = self.still, self.moved
-        return [self.nominal.chain(site, still, moved) for site in self.sites]
+        return per_site(lambda site: function(self.nominal.chain(site, still, moved)), self.sites, done)
 
     @property
     def moved(self) -> list[Effect]:
@@ -90,11 +95,11 @@ class Search:
         """The named effects that do not move images: the others are taken out of the images themselves."""
         return [e for e in self.base if not e.displaces]
 
-    def fit(self) -> None:
+    def fit(self, again: bool = False) -> None:
         """Align the images by what is known of their displacement, and fit the nominal model to them.
 
         Where images are moved against each other no column per ground pixel is the same in all of them: the model
-        stays where it is, and the measurement moves.
+        stays where it is, and the measurement moves. ``again``: nearly the same was fitted a moment ago.
         """
         moved = self.moved
         level = float(torch.stack([s.texture.mean() for s in self.sites]).mean())
@@ -109,7 +114,8 @@ class Search:
             images.append(aligned)
             if not self.dn:
                 site.image = aligned
-        fit(self.nominal, self.sites, self.still, self.units, images)
+        rounds = 1 if again and self.nominal.model.linear and not self.dn else ROUNDS
+        fit(self.nominal, self.sites, self.still, self.units, images, rounds)
 
     def save(self) -> Saved:
         """Everything that naming a cause changes."""
@@ -136,11 +142,13 @@ class Search:
 
     def residual_rms(self) -> float:
         """rms of measured minus predicted over fully lit pixels, I/F."""
-        total, count = 0.0, 0
-        for chain in self.chains():
+
+        def of(chain: Chain) -> tuple[float, int]:
             residual = (chain.site.image - chain.predict())[lit_mask(chain)]
-            total, count = total + float(residual.double().square().sum()), count + len(residual)
-        return math.sqrt(total / max(count, 1))
+            return float(residual.double().square().sum()), len(residual)
+
+        squares, counts = zip(*self.each(of), strict=True)
+        return math.sqrt(sum(squares) / max(sum(counts), 1))
 
     def open_names(self) -> list[str]:
         """Effects that are neither named nor excluded by the kind of data."""

@@ -13,7 +13,6 @@ from stages.physics.photometry import Parameter
 class DarkBias(Effect):
     name = "dark_bias"
     slot = "sensor"
-    linear = True
     title = "dark level and stray light"
     mechanism = "Dark current, electronic offset and veiling stray light add the same amount to every pixel, in shadow as in light."
     reference = (

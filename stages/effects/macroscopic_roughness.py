@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -32,16 +34,18 @@ class MacroscopicRoughness(Effect):
     def trials(cls, survey: Survey) -> list[Trial]:
         return [Trial(({"theta_bar_deg": t},)) for t in (5.0, 9.0, 13.0, 17.0, 22.0, 28.0)]
 
-    _known: tuple[Any, Any] = (None, None)  # angles, and what they gave
+    def __init__(self, values: Mapping[str, Any] | None = None, survey: Survey | None = None) -> None:
+        super().__init__(values, survey)
+        self._known: dict[int, tuple[Any, Any]] = {}  # by thread: angles, and what they gave
 
     def apply(self, state: State) -> None:
         if torch.is_grad_enabled():
             ratio = self._ratio(state)
         else:  # `diagnose` renders the same angles many times over, and this is the dearest part of it
-            known = self._known
-            if state.angles is not known[0]:
-                known = self._known = (state.angles, self._ratio(state))
-            ratio = known[1]
+            angles, ratio = self._known.get(threading.get_ident(), (None, None))
+            if angles is not state.angles:
+                ratio = self._ratio(state)
+                self._known[threading.get_ident()] = (state.angles, ratio)
         state.reflectance = state.reflectance * ratio
 
     def _ratio(self, state: State) -> Tensor:
