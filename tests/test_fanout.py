@@ -11,8 +11,9 @@ import time
 import h5py
 import numpy as np
 import pytest
-from cluster_scene import LUNARGR, assert_same, environment, finish, lunargr, stages, start, write_inputs
+from cluster_scene import assert_same, environment, finish, lunargr, stages, start, write_inputs
 
+from lunargr_cli.options import in_parts
 from schemas import SCENE, ArtefactError, ConfigError, open_artefact
 from stages import ingest, merge, project
 
@@ -22,10 +23,13 @@ def inputs(tmp_path_factory):
     return write_inputs(tmp_path_factory.mktemp("inputs"))
 
 
+MADE_FIRST = {"ingest": "scene", "sample": "crops", "project": "pairs"}  # with the options that the commands are given
+
+
 @pytest.fixture(scope="module")
 def in_one_process(inputs, tmp_path_factory):
     """name -> what one uninterrupted process makes of it, made when first asked for."""
-    folder, made = tmp_path_factory.mktemp("one"), {}
+    folder, made = tmp_path_factory.mktemp("one"), {k: inputs[v] for k, v in MADE_FIRST.items()}
 
     def make(name):
         if name not in made:
@@ -94,10 +98,10 @@ def with_parts(name, inputs):
     return [*stages(inputs)[name], *(["--parts", PARTS[name]] if name in PARTS else [])]
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("sample", "infer", "evaluate")]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("ingest", "sample", "infer", "evaluate")]
 
 
-@pytest.mark.parametrize("name", ["ingest", "project", *SLOW])
+@pytest.mark.parametrize("name", ["project", *SLOW])
 def test_a_worker_dies_and_nothing_is_lost(name, inputs, in_one_process, cluster, tmp_path):
     whole = in_one_process(name)
     cluster.fill()
@@ -190,6 +194,7 @@ def test_parts_of_another_command_are_not_used(inputs, in_one_process, tmp_path)
     assert_same(in_one_process("project"), output)
 
 
+@pytest.mark.slow
 def test_a_plain_run_after_a_kill_starts_anew_and_ends_the_same(inputs, in_one_process, tmp_path):
     output = tmp_path / "map.h5"
     command = [*stages(inputs)["infer"], "-o", output]
@@ -261,8 +266,7 @@ def test_merging_keeps_masks_sparse(small_files, tmp_path):
 
 
 def test_shards_and_parts_do_not_mix(inputs, tmp_path):
-    for more in (["--shard", "1/2", "--resume"], ["--parts", "3"]):
-        done = subprocess.run(
-            [*LUNARGR, "project", inputs["crops"], *more, "-o", tmp_path / "x.h5"], capture_output=True, text=True
-        )
-        assert done.returncode == 3 and len(done.stderr.splitlines()) == 1
+    with pytest.raises(ConfigError, match="one part by hand"):
+        in_parts(None, True, None, "1/2")
+    code, said = lunargr("project", inputs["crops"], "--parts", "3", "-o", tmp_path / "x.h5")
+    assert code == 3 and len(said.splitlines()) == 1 and "--parts" in said

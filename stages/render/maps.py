@@ -17,6 +17,7 @@ from stages.render.setting import metadata
 
 Progress = Callable[[int, int, str], None]
 BAND_ROWS = 256
+BAND_PX = 1 << 20  # of a wide map fewer rows at a time: memory does not follow its width
 BAND_COLUMNS = 1024
 UNITS = {"image": "1", "shadow": "1", "depth": "m", "elevation": "m"}
 
@@ -45,10 +46,11 @@ def render_map(
             if suffix in named:
                 units = [UNITS.get(b, "degree") for b in bands]
                 tif = stack.enter_context(write_geotiff(named[suffix], grid, bands, told, units))
-        for row in range(0, grid.height, BAND_ROWS):
+        rows = max(32, min(BAND_ROWS, BAND_PX // grid.width // 16 * 16))  # EXR packs 16 rows together
+        for row in range(0, grid.height, rows):
             if progress:
                 progress(row, grid.height, "rows")
-            height = min(BAND_ROWS, grid.height - row)
+            height = min(rows, grid.height - row)
             band = {c: np.empty((height, grid.width), np.float32) for c in wanted}
             for col in range(0, grid.width, BAND_COLUMNS):
                 block = shade_block(surface, light, row, col, height, min(BAND_COLUMNS, grid.width - col))
