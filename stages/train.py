@@ -96,7 +96,7 @@ def run(
     ):  # an effect may belong to a direction on the ground, which turning crops would lose
         say("crops are not turned or mirrored: the extended model may hold effects bound to an azimuth")
         config = replace(config, augment=False)
-    with PairReader(pairs) as reader:
+    with PairReader(pairs, detector=bool(extensions)) as reader:
         train, validation = reader.indices("train"), reader.indices("validation")
         if not len(train):
             raise InputError(
@@ -120,7 +120,7 @@ def run(
         predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         radiometry.to(device)
         parameters = [p for p in (*predictor.parameters(), *radiometry.parameters()) if p.requires_grad]
-        optimizer = torch.optim.Adam(parameters, lr=config.lr)
+        optimizer = torch.optim.Adam(parameters, lr=config.lr, fused=True)
         history = History()
         best: dict[str, Tensor] = {}
 

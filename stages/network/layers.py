@@ -12,7 +12,8 @@ SLOPE = 0.01  # of LeakyReLU below zero
 _WORD = 0xFFFFFFFF
 
 
-def _shared() -> bool:
+def shared() -> bool:
+    """Whether several processes work on one batch."""
     return dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
 
 
@@ -24,17 +25,21 @@ class BatchNorm(nn.BatchNorm2d):
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        if not (self.training and _shared()):
+        if not (self.training and shared()):
             return super().forward(x)
+        y, mean, variance, count = _SharedNorm.apply(x, self.weight, self.bias, self.eps)
+        self.note(mean, variance, count)
+        return y
+
+    @torch.no_grad()
+    def note(self, mean: Tensor, variance: Tensor, count: Tensor) -> None:
+        """Let a batch's statistics (float64) into the running ones."""
         assert self.running_mean is not None and self.running_var is not None and self.momentum is not None
         assert self.num_batches_tracked is not None
         self.num_batches_tracked += 1
-        y, mean, variance, count = _SharedNorm.apply(x, self.weight, self.bias, self.eps)
-        with torch.no_grad():
-            unbiased = variance * (count / (count - 1).clamp(min=1))
-            self.running_mean.lerp_(mean.to(self.running_mean.dtype), self.momentum)
-            self.running_var.lerp_(unbiased.to(self.running_var.dtype), self.momentum)
-        return y
+        unbiased = variance * (count / (count - 1).clamp(min=1))
+        self.running_mean.lerp_(mean.to(self.running_mean.dtype), self.momentum)
+        self.running_var.lerp_(unbiased.to(self.running_var.dtype), self.momentum)
 
 
 class _SharedNorm(torch.autograd.Function):
@@ -118,15 +123,17 @@ def layer_keys(keys: Tensor, layer: int) -> tuple[Tensor, Tensor]:
 def kept_values(keys: Tensor, layer: int, p: float, shape: torch.Size | tuple[int, ...]) -> tuple[Tensor, float]:
     """Mask (B, C, H, W), True = kept, and the factor that keeps the mean.
 
-    Value number e of a crop, channels fastest, takes half ``e % 2`` of the mixed 32-bit word ``e // 2``.
+    A row's values, channels fastest, take 16 bits each of 32-bit words that follow each other through the crop: the first
+    half of the row the lower bits, the second half the upper ones.
     """
     channels, height, width = shape
     threshold, scale = dropout_threshold(p)
     low, high = (k[:, None] for k in layer_keys(keys, layer))
-    values = channels * height * width
-    x = torch.arange((values + 1) // 2, device=keys.device)[None] * 0x9E3779B9 + low & _WORD
+    length = width * channels
+    half = (length + 1) // 2
+    x = torch.arange(height * half, device=keys.device)[None] * 0x9E3779B9 + low & _WORD
     x = (x ^ x >> 16) * 0x21F0AAAD & _WORD
     x = (x ^ x >> 15 ^ high) * 0x735A2D97 & _WORD
-    x = x ^ x >> 15
-    halves = torch.stack([x & 0xFFFF, x >> 16], dim=-1).flatten(1)[:, :values]
-    return (halves >= threshold).view(-1, height, width, channels).permute(0, 3, 1, 2), scale
+    x = (x ^ x >> 15).view(-1, height, half)
+    bits = torch.cat([x & 0xFFFF, x[..., : length - half] >> 16], dim=-1)
+    return (bits >= threshold).view(-1, height, width, channels).permute(0, 3, 1, 2), scale

@@ -58,6 +58,11 @@ def save(
             write_state(file.create_group(f"optimizer/{index}"), {k: torch.as_tensor(v) for k, v in moments.items()})
 
 
+def _laid_out(value: Tensor, like: Tensor) -> Tensor:
+    """In the memory order of its parameter, which a fused optimiser takes for granted."""
+    return torch.empty_like(like).copy_(value) if value.shape == like.shape else value
+
+
 def restore(
     sidecar: Path,
     identity: str,
@@ -81,7 +86,11 @@ def restore(
             for part in ("predictor", "radiometry"):
                 best.update({f"{part}/{k}": v.to(device) for k, v in read_state(file[f"best/{part}"]).items()})
             state: dict[str, Any] = optimizer.state_dict()
-            state["state"] = {int(k): read_state(group) for k, group in file["optimizer"].items()}
+            parameters = [p for group in optimizer.param_groups for p in group["params"]]
+            state["state"] = {
+                int(k): {name: _laid_out(value, parameters[int(k)]) for name, value in read_state(group).items()}
+                for k, group in file["optimizer"].items()
+            }
             optimizer.load_state_dict(state)
             for key, value in json.loads(str(file.attrs["history"])).items():
                 setattr(history, key, value)
