@@ -44,12 +44,17 @@ class Grid:
 
     @cached_property
     def crs(self) -> CRS:
-        return CRS.from_wkt(self.crs_wkt)
+        return _parsed(self.crs_wkt)
+
+    @property
+    def squash(self) -> float:
+        """:func:`latitude_squash` of its CRS."""
+        return _squash(self.crs_wkt)
 
     @cached_property
     def _geographic(self) -> CRS:
         """Longitude and latitude of the kind that ``crs`` itself counts in."""
-        if latitude_squash(self.crs) == 1.0:
+        if self.squash == 1.0:
             return sphere_crs(self.radius)
         return CRS.from_proj4(f"+proj=longlat {ellipsoid_of(self.crs)} +no_defs")
 
@@ -81,7 +86,7 @@ class Grid:
         """East longitude and planetocentric latitude, degrees, of map coordinates."""
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         lon, lat = rasterio.warp.transform(self.crs, self._geographic, x.ravel(), y.ravel())
-        lat = _scaled_tangent(np.asarray(lat), latitude_squash(self.crs))
+        lat = _scaled_tangent(np.asarray(lat), self.squash)
         return np.reshape(lon, x.shape), np.reshape(lat, x.shape)
 
     def rowcol_of_lonlat(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
@@ -91,7 +96,7 @@ class Grid:
     def map_xy(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
         """Map coordinates of places given in degrees."""
         lon, lat = np.broadcast_arrays(np.asarray(longitude_deg, float), np.asarray(latitude_deg, float))
-        lat_own = _scaled_tangent(lat.ravel(), 1 / latitude_squash(self.crs))
+        lat_own = _scaled_tangent(lat.ravel(), 1 / self.squash)
         x, y = rasterio.warp.transform(self._geographic, self.crs, lon.ravel(), lat_own)
         return np.reshape(x, lon.shape), np.reshape(y, lon.shape)
 
@@ -156,6 +161,12 @@ def unit_vectors(longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> Floats:
     return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat) + 0 * lon], axis=-1)
 
 
+@lru_cache(maxsize=256)
+def _parsed(wkt: str) -> CRS:
+    return CRS.from_wkt(wkt)
+
+
+@lru_cache(maxsize=256)
 def sphere_crs(radius: float) -> CRS:
     """Longitude and latitude on the reference sphere."""
     return CRS.from_proj4(f"+proj=longlat +R={radius!r} +no_defs")

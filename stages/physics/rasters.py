@@ -110,7 +110,7 @@ def transform_points(grid: Grid, dataset: DatasetReader, x: NDArray, y: NDArray)
 
     A geographic raster may count longitudes 0..360 or -180..180: the points follow the raster's own domain.
     """
-    if latitude_squash(grid.crs) == latitude_squash(dataset.crs):
+    if grid.squash == latitude_squash(dataset.crs):
         tx, ty = rasterio.warp.transform(grid.crs, dataset.crs, x, y)
         tx, ty = np.asarray(tx), np.asarray(ty)
     else:
@@ -181,7 +181,7 @@ def _warp_halves(
 
 def _latitudes(dataset: DatasetReader, grid: Grid) -> dict[str, Any]:
     """What GDAL must be told where raster and grid count latitudes in different ways: see latitude_squash."""
-    if latitude_squash(dataset.crs) == latitude_squash(grid.crs):
+    if latitude_squash(dataset.crs) == grid.squash:
         return {}
     steps = []
     for crs, inverse in ((dataset.crs, True), (grid.crs, False)):

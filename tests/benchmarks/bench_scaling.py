@@ -197,7 +197,7 @@ STAGES = {
     ),
     "ingest --images": Stage(
         "image of 5,000 px by lines", "Mpx", (6000, 12500, 25000), (12500, 25000, 50000),
-        lambda b, n: ["ingest", b.ground(6000 if n <= 25000 else 12000), "--images", b.table(n)], lambda n: 5e-3 * n,
+        lambda b, n: ["ingest", b.ground(12000), "--images", b.table(n)], lambda n: 5e-3 * n,
     ),
     "sample": Stage(
         "crops", "1,000 crops", (2000, 6000, 12000), (10000, 40000, 100000),
