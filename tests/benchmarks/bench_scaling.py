@@ -229,7 +229,7 @@ STAGES = {
         lambda b, n: ["merge", *[b.some_pairs()] * (n // 256)], one,
     ),
     "diagnose": Stage(
-        "pairs of stacks", "1,000 pairs", (48, 96, 192), (48, 480, 1920),
+        "pairs of stacks", "1,000 pairs", (12, 24, 48), (48, 480, 1920),
         lambda b, n: ["diagnose", b.stack(n), "--model", "hapke", "--pairs", n], one,
     ),
 }  # fmt: skip
