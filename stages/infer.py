@@ -6,9 +6,12 @@ inner part is then exactly what one pass over the whole map would give: no squar
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ import h5py
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from schemas import (
     SCENE,
@@ -31,7 +35,7 @@ from schemas import (
 from schemas.hdf5 import silence_hdf5
 from stages.network.normalisation import FILL_REACH, fill_holes
 from stages.network.predictor import Predictor, choose_device, load_predictor
-from stages.network.runtime import keep_freed_memory
+from stages.network.runtime import choose_inference_precision, keep_freed_memory
 from stages.physics.geotiff import write_geotiff
 from stages.physics.grid import Grid, read_grid
 
@@ -43,7 +47,9 @@ GSD_TOLERANCE = 0.05  # relative; beyond it the network would meet terrain at a 
 
 @dataclass(frozen=True)
 class Config:
-    """window, stride : px; windows overlap by their difference and are blended; offset : px, shifts their grid."""
+    """window, stride : px; windows overlap by their difference and are blended; offset : px, shifts their grid;
+    precision : fp32, bf16, or auto (see ``stages.network.runtime.choose_inference_precision``).
+    """
 
     window: int = 1024
     stride: int | None = None
@@ -82,6 +88,7 @@ def run(
     device = choose_device(config.device)
     keep_freed_memory()
     predictor = load_predictor(checkpoint, device)
+    precision = config.precision
     # A shard holds some rows only; the GeoTIFF is made of the merged whole.
     whole = config.shard[1] == 1
     with open_artefact(scene, SCENE) as file:
@@ -91,6 +98,8 @@ def run(
                 f"{scene}: expected a grid near {predictor.gsd:g} m, at which {checkpoint} was trained, found {grid.gsd:g} m; "
                 "ingest the DEM at that --gsd or add --any-gsd."
             )
+        if precision == "auto":
+            precision = choose_inference_precision(predictor, _sample_of(file), device)
         names = [p.name for p in predictor.model.parameters]
         sizes = {"coefficient": len(names), "y": grid.height, "x": grid.width}
         attributes = {
@@ -98,6 +107,7 @@ def run(
             "body_radius_m": grid.radius,
             "model": predictor.model.name,
             "quantity": QUANTITY,
+            "precision": precision,
         }
         with ArtefactWriter(
             output,
@@ -112,7 +122,7 @@ def run(
             writer.write("x", file["x"][...])
             writer.write("y", file["y"][...])
             writer.write("coefficient_name", names)
-            windows = _predict(file, writer, predictor, config, stride, device, progress)
+            windows = _predict(file, writer, predictor, replace(config, precision=precision), stride, device, progress)
             share, ranges = _statistics(writer.file, names)
             if whole:
                 with atomic_path(tiff) as partial:
@@ -121,7 +131,7 @@ def run(
 
 
 def _stride(config: Config) -> int:
-    stride = config.stride or max(1, config.window - config.window // 16)
+    stride = config.stride or config.window  # windows carry their context: they need no overlap
     if config.window < 16 or not 1 <= stride <= config.window:
         raise ConfigError(
             f"--window and --stride: expected 1 <= stride <= window and window >= 16, found {stride} and {config.window}."
@@ -197,30 +207,41 @@ def _predict(
     total = np.zeros((channels, 0, width), np.float32)
     weight = np.zeros((0, width), np.float32)
     top, done = own_first, 0
+    boxes = [(*rows[k], *columns) for k in bands for columns in cols]
+    found = _in_order(
+        boxes,
+        lambda r0, r1, c0, c1: predict_window(
+            elevation, dem_valid, predictor, (r0, c0, r1 - r0, c1 - c0), device, config.precision
+        ),
+        device,
+    )
     for place, band in enumerate(bands):
         r0, r1 = rows[band]
+        if not overlap:
+            copied[r0:r1] = elevation[r0:r1]
+            top = r1
         # Rows above this band get no more contributions: write them and let go of them.
-        if r0 > top:
+        if overlap and r0 > top:
             _flush(total, weight, top, r0, own_first, own_last, elevation, dem_valid, coefficients, valid, copied)
             total, weight, top = total[:, r0 - top :], weight[r0 - top :], r0
-        if r1 > top + weight.shape[0]:
+        if overlap and r1 > top + weight.shape[0]:
             grow = r1 - top - weight.shape[0]
             total = np.concatenate([total, np.zeros((channels, grow, width), np.float32)], axis=1)
             weight = np.concatenate([weight, np.zeros((grow, width), np.float32)])
-        for c0, c1 in cols:
+        for (c0, c1), values in zip(cols, itertools.islice(found, len(cols)), strict=True):
             if progress:
                 progress(done, len(bands) * len(cols), "windows")
             done += 1
-            values = predict_window(
-                elevation, dem_valid, predictor, (r0, c0, r1 - r0, c1 - c0), device, config.precision
-            )
             if values is None:
+                continue
+            if not overlap:
+                _write_window(values, r0, c0, dem_valid, coefficients, valid)
                 continue
             w = blend_weights(r0, r1, overlap, height)[:, None] * blend_weights(c0, c1, overlap, width)
             skip = max(0, top - r0)  # a shard's first band may begin above its rows
             total[:, r0 + skip - top : r1 - top, c0:c1] += (values * w)[:, skip:]
             weight[r0 + skip - top : r1 - top, c0:c1] += w[skip:]
-        if place == len(bands) - 1:
+        if overlap and place == len(bands) - 1:
             _flush(
                 total,
                 weight,
@@ -237,6 +258,44 @@ def _predict(
     if progress:
         progress(done, done, "windows")
     return done
+
+
+def _in_order(
+    boxes: Sequence[tuple[int, int, int, int]],
+    work: Callable[[int, int, int, int], NDArray[np.float32] | None],
+    device: torch.device,
+) -> Iterator[NDArray[np.float32] | None]:
+    """What ``work`` makes of each box, in their order: on the CPU, as many at a time as there are threads.
+
+    One thread works on a window from reading to the end: what it gives does not depend on how many there are.
+    """
+    threads = torch.get_num_threads() if device.type == "cpu" else 1
+    if device.type == "cpu":
+        torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            waiting: deque[Future[NDArray[np.float32] | None]] = deque()
+            try:
+                for box in boxes:
+                    waiting.append(pool.submit(work, *box))
+                    if len(waiting) > threads:  # one is ready or nearly so for every one that is worked on
+                        yield waiting.popleft().result()
+                while waiting:
+                    yield waiting.popleft().result()
+            finally:
+                for job in waiting:
+                    job.cancel()
+    finally:
+        if device.type == "cpu":
+            torch.set_num_threads(threads)
+
+
+def _sample_of(scene: h5py.File, size: int = 256) -> Tensor:
+    """A window of terrain from the middle of a scene, holes filled."""
+    height, width = scene["elevation"].shape
+    r0, c0 = max(0, (height - size) // 2), max(0, (width - size) // 2)
+    part = np.s_[r0 : r0 + size, c0 : c0 + size]
+    return torch.from_numpy(fill_holes(scene["elevation"][part], scene["dem_valid"][part].astype(bool)))
 
 
 def predict_window(
@@ -270,8 +329,8 @@ def predict_window(
     valid = dem_valid[fr0:fr1, fc0:fc1].astype(bool)
     terrain = fill_holes(elevation[fr0:fr1, fc0:fc1], valid)[r0 - fr0 : r1 - fr0, c0 - fc0 : c1 - fc0]
     with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
-        out = predictor.coefficients(torch.from_numpy(np.ascontiguousarray(terrain))[None].to(device))[0]
-    return out[:, row - r0 : row - r0 + h, col - c0 : col - c0 + w].float().cpu().numpy()
+        out = predictor.part(torch.from_numpy(np.ascontiguousarray(terrain)).to(device), (row - r0, col - c0, h, w))
+    return out.float().cpu().numpy()
 
 
 def _flush(
@@ -298,10 +357,27 @@ def _flush(
     copied[a:b] = elevation[a:b]
 
 
+def _write_window(
+    values: NDArray[np.float32],
+    row: int,
+    col: int,
+    dem_valid: Any,
+    coefficients: h5py.Dataset,
+    valid: h5py.Dataset,
+) -> None:
+    """A window that no other touches."""
+    part = np.s_[row : row + values.shape[1], col : col + values.shape[2]]
+    mask = dem_valid[part].astype(bool)
+    if not mask.all():
+        values[:, ~mask] = np.nan
+    coefficients[(slice(None), *part)] = values
+    valid[part] = mask
+
+
 def _statistics(file: h5py.File, names: list[str]) -> tuple[float, dict[str, tuple[float, float, float, float]]]:
-    """Mean, std and percentiles from at most a few million pixels, read in strips."""
+    """Mean, std and percentiles from at most half a million pixels, read in strips."""
     height, width = file["valid"].shape
-    step = max(1, math.ceil(math.sqrt(height * width / 2e6)))
+    step = max(1, math.ceil(math.sqrt(height * width / 5e5)))
     share = float(np.mean([file["valid"][r, :].mean() for r in range(0, height, max(1, height // 256))]))
     ranges = {}
     for k, name in enumerate(names):

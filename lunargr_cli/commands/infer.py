@@ -29,10 +29,13 @@ def command(
     checkpoint: Annotated[Path, typer.Argument(help="checkpoint.h5 from 'lunargr train'.")],
     window: Annotated[int, typer.Option("--window", help="Window size, px; context around it is added.")] = 1024,
     stride: Annotated[
-        int | None, typer.Option("--stride", help="Step between windows, px (default: 15/16 of a window).")
+        int | None, typer.Option("--stride", help="Step between windows, px (default: a window).")
     ] = None,
     window_offset: Annotated[int, typer.Option("--window-offset", metavar="PX", help="Shift the grid of windows.")] = 0,
-    precision: Annotated[str, typer.Option("--precision", help="fp32 or bf16.")] = "fp32",
+    precision: Annotated[
+        str,
+        typer.Option("--precision", help="fp32, bf16, or auto: bf16 where the processor has it and it does no harm."),
+    ] = "auto",
     any_gsd: Annotated[bool, typer.Option("--any-gsd", help="Allow a DEM at another GSD than the training's.")] = False,
     geotiff: Annotated[
         Path | None, typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif).")
@@ -55,8 +58,8 @@ def command(
     from schemas.locks import scratch_path
     from stages import infer
 
-    if precision not in ("fp32", "bf16"):
-        raise ConfigError(f"--precision: expected fp32 or bf16, found '{precision}'.")
+    if precision not in ("auto", "fp32", "bf16"):
+        raise ConfigError(f"--precision: expected auto, fp32 or bf16, found '{precision}'.")
     console = Console(quiet)
     config = infer.Config(
         window=window,

@@ -50,16 +50,29 @@ class Predictor(torch.nn.Module):
         return self.model.constrain(raw, dim=1)
 
     @torch.no_grad()
+    def part(self, elevation: Tensor, target: tuple[int, int, int, int]) -> Tensor:
+        """(H, W) m -> (C, h, w), of the part (row, col, h, w); H and W as for :meth:`coefficients`."""
+        was = self.training
+        self.eval()
+        x = scale_elevation(self._whole_strides(elevation[None]), self.elevation_scale)
+        raw = self.net.part(x, target).float() * self.output_scale + self.start[None, :, None, None]
+        out = self.model.constrain(raw, dim=1)[0]
+        self.train(was)
+        return out
+
+    def _whole_strides(self, elevation: Tensor) -> Tensor:
+        stride = self.net.stride
+        height, width = elevation.shape[-2:]
+        pad = (0, -width % stride, 0, -height % stride)
+        return torch.nn.functional.pad(elevation[:, None], pad, mode="replicate")[:, 0] if any(pad) else elevation
+
+    @torch.no_grad()
     def coefficients(self, elevation: Tensor) -> Tensor:
         """(B, H, W) m -> (B, C, H, W), in evaluation mode. H and W need not be multiples of the network's stride."""
         was = self.training
         self.eval()
-        stride = self.net.stride
         height, width = elevation.shape[-2:]
-        pad = (0, -width % stride, 0, -height % stride)
-        if any(pad):
-            elevation = torch.nn.functional.pad(elevation[:, None], pad, mode="replicate")[:, 0]
-        out = self(elevation)[..., :height, :width]
+        out = self(self._whole_strides(elevation))[..., :height, :width]
         self.train(was)
         return out
 

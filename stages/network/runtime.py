@@ -7,9 +7,11 @@ import sys
 import time
 
 import torch
+from torch import Tensor
 
 from stages.network.predictor import Predictor
 
+CLOSE = 0.02  # of a coefficient's spread: what bf16 may cost in inference
 WORTH_IT = 1.25  # bf16 loses digits: it must be faster by this much
 
 
@@ -21,7 +23,8 @@ def keep_freed_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError):
         return  # another C library, which has no such knob
-    m_trim_threshold, m_top_pad, m_mmap_threshold = -1, -2, -3
+    m_trim_threshold, m_top_pad, m_mmap_threshold, m_arena_max = -1, -2, -3, -8
+    mallopt(m_arena_max, 1)  # other threads' own arenas map large blocks anew each time
     mallopt(m_mmap_threshold, 1 << 30)
     mallopt(m_trim_threshold, (1 << 31) - 1)
     mallopt(m_top_pad, 1 << 26)
@@ -31,6 +34,29 @@ def choose_precision(predictor: Predictor, size: tuple[int, int], device: torch.
     """'bf16' where two training steps with it are clearly faster on this device, else 'fp32'; leaves no trace."""
     seconds = {name: _time_step(predictor, size, device, name == "bf16") for name in ("fp32", "bf16")}
     return "bf16" if seconds["fp32"] > WORTH_IT * seconds["bf16"] else "fp32"
+
+
+def choose_inference_precision(predictor: Predictor, sample: Tensor, device: torch.device) -> str:
+    """'bf16' where the processor has instructions for it and the coefficients of a sample keep their meaning.
+
+    Nothing is timed: all parts of a map, on machines of one kind, must choose alike. sample : (H, W) m
+    """
+    if device.type == "cpu":
+        able = any(
+            bool(getattr(torch.cpu, name, lambda: False)())
+            for name in ("_is_amx_tile_supported", "_is_avx512_bf16_supported")
+        )
+    else:
+        able = torch.cuda.is_bf16_supported()
+    if not able:
+        return "fp32"
+    box = (0, 0, *sample.shape)
+    exact = predictor.part(sample.to(device), box)
+    with torch.autocast(device.type, torch.bfloat16):
+        short = predictor.part(sample.to(device), box)
+    error = (short - exact).square().mean(dim=(1, 2)).sqrt()
+    spread = exact.std(dim=(1, 2))
+    return "bf16" if bool((error <= CLOSE * spread + 1e-6).all()) else "fp32"
 
 
 def _time_step(predictor: Predictor, size: tuple[int, int], device: torch.device, bf16: bool) -> float:
