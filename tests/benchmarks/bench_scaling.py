@@ -200,15 +200,15 @@ STAGES = {
         lambda b, n: ["ingest", b.ground(12000), "--images", b.table(n)], lambda n: 5e-3 * n,
     ),
     "sample": Stage(
-        "crops", "1,000 crops", (2000, 6000, 12000), (10000, 40000, 100000),
+        "crops", "thousand crops", (2000, 6000, 12000), (10000, 40000, 100000),
         lambda b, n: ["sample", b.scene(), "--count", n, "--crop", CROP, "--tile-m", 2000], one,
     ),
     "project": Stage(
-        "pairs", "1,000 pairs", (250, 500, 1000), (1000, 4000, 20000),
+        "pairs", "thousand pairs", (250, 500, 1000), (1000, 4000, 20000),
         lambda b, n: ["project", b.crops(n)], one,
     ),
     "train": Stage(
-        "pairs, one epoch of a small network", "1,000 pairs", (1024, 2048, 4096), (10240, 40960, 102400),
+        "pairs, one epoch of a small network", "thousand pairs", (1024, 2048, 4096), (10240, 40960, 102400),
         lambda b, n: ["train", b.pairs(n), "--epochs", 1, "--widths", "4-4", "--batch", 64, "--device", "cpu"], one,
     ),
     "infer": Stage(
@@ -220,16 +220,16 @@ STAGES = {
         lambda b, n: ["render", b.map(n), "--sun-azimuth", 100, "--sun-elevation", 20], mpx, ".exr",
     ),
     "evaluate": Stage(
-        "pairs, all scored", "1,000 pairs", (512, 1024, 2048), (10240, 40960, 102400),
+        "pairs, all scored", "thousand pairs", (512, 1024, 2048), (10240, 40960, 102400),
         lambda b, n: ["evaluate", b.pairs(n), b.checkpoint(), "--split", "train", "--fit-pairs", 256, "--device", "cpu"],
         one,
     ),
     "merge": Stage(
-        "pairs in parts of 256", "1,000 pairs", (2048, 4096, 8192), (10240, 40960, 102400),
+        "pairs in parts of 256", "thousand pairs", (2048, 4096, 8192), (10240, 40960, 102400),
         lambda b, n: ["merge", *[b.some_pairs()] * (n // 256)], one,
     ),
     "diagnose": Stage(
-        "pairs of stacks", "1,000 pairs", (12, 24, 48), (48, 480, 1920),
+        "pairs of stacks", "thousand pairs", (12, 24, 48), (48, 480, 1920),
         lambda b, n: ["diagnose", b.stack(n), "--model", "hapke", "--pairs", n], one,
     ),
 }  # fmt: skip
@@ -268,6 +268,7 @@ def draw(curves: list[Curve], path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from PIL import Image
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.6), constrained_layout=True)
     for k, curve in enumerate(curves):
@@ -285,6 +286,9 @@ def draw(curves: list[Curve], path: Path) -> None:
     figure.legend(loc="outside right center", fontsize=7, frameon=False)
     figure.savefig(path, dpi=100)
     plt.close(figure)
+    with Image.open(path) as picture:  # few colours: a third of the bytes
+        small = picture.convert("RGB").quantize(64)
+    small.save(path, optimize=True)
 
 
 def main() -> None:
