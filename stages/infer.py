@@ -213,7 +213,8 @@ def _predict(
         lambda r0, r1, c0, c1: predict_window(
             elevation, dem_valid, predictor, (r0, c0, r1 - r0, c1 - c0), device, config.precision
         ),
-        device,
+        # two windows at a time keep reading and small layers from leaving cores idle; of float32, memory holds one
+        2 if device.type == "cpu" and config.precision == "bf16" else 1,
     )
     for place, band in enumerate(bands):
         r0, r1 = rows[band]
@@ -263,22 +264,19 @@ def _predict(
 def _in_order(
     boxes: Sequence[tuple[int, int, int, int]],
     work: Callable[[int, int, int, int], NDArray[np.float32] | None],
-    device: torch.device,
+    together: int,
 ) -> Iterator[NDArray[np.float32] | None]:
-    """What ``work`` makes of each box, in their order: on the CPU, as many at a time as there are threads.
-
-    One thread works on a window from reading to the end: what it gives does not depend on how many there are.
-    """
-    threads = torch.get_num_threads() if device.type == "cpu" else 1
-    if device.type == "cpu":
-        torch.set_num_threads(1)
+    """What ``work`` makes of each box, in their order, ``together`` at a time, which share PyTorch's threads."""
+    threads = torch.get_num_threads()
+    together = max(1, min(together, threads))
+    torch.set_num_threads(threads // together)
     try:
-        with ThreadPoolExecutor(threads) as pool:
+        with ThreadPoolExecutor(together) as pool:
             waiting: deque[Future[NDArray[np.float32] | None]] = deque()
             try:
                 for box in boxes:
                     waiting.append(pool.submit(work, *box))
-                    if len(waiting) > threads:  # one is ready or nearly so for every one that is worked on
+                    if len(waiting) > together:  # while one is written, the others go on
                         yield waiting.popleft().result()
                 while waiting:
                     yield waiting.popleft().result()
@@ -286,8 +284,7 @@ def _in_order(
                 for job in waiting:
                     job.cancel()
     finally:
-        if device.type == "cpu":
-            torch.set_num_threads(threads)
+        torch.set_num_threads(threads)
 
 
 def _sample_of(scene: h5py.File, size: int = 256) -> Tensor:

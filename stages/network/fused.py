@@ -55,7 +55,7 @@ def _apply(x: Tensor, scale: Tensor, shift: Tensor, dropping: tuple, pad: int, d
     crops, channels, height, width = x.shape
     out = empty(crops, channels, height + 2 * pad, width + 2 * pad, dtype)
     rows = (_row(scale.float(), width), _row(shift.float(), width))
-    share_out(kernels.normalise, crops, rows_of(x), rows_of(out), *rows, *dropping, pad, channels)
+    share_out(kernels.normalise, crops * height, rows_of(x), rows_of(out), *rows, *dropping, pad, channels)
     return out
 
 
@@ -116,7 +116,7 @@ class _Pool(torch.autograd.Function):
         crops, channels, height, width = x.shape
         ctx.save_for_backward(x)
         out = empty(crops, channels, height // 2 + 2, width // 2 + 2, x.dtype)
-        share_out(kernels.pool, crops, pixels_of(x), rows_of(out))
+        share_out(kernels.pool, crops * (height // 2), pixels_of(x), rows_of(out))
         return out
 
     @staticmethod
@@ -139,7 +139,7 @@ class _Join(torch.autograd.Function):
         channels = quarters.shape[1] // 4
         ctx.shapes = quarters.shape, kept.shape
         out = empty(crops, channels + others, height + 2, width + 2, kept.dtype)
-        share_out(kernels.join, crops, pixels_of(quarters), pixels_of(kept), pixels_of(out))
+        share_out(kernels.join, crops * height, pixels_of(quarters), pixels_of(kept), pixels_of(out))
         return out
 
     @staticmethod

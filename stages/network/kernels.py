@@ -47,14 +47,14 @@ def empty(crops: int, channels: int, height: int, width: int, dtype: torch.dtype
 _pools: dict[int, ThreadPoolExecutor] = {}
 
 
-def share_out(kernel: Callable[..., None], crops: int, *arguments: Any) -> None:
-    """kernel(first, last, *arguments) over all crops, on as many threads as PyTorch uses."""
-    threads = min(torch.get_num_threads(), crops)
+def share_out(kernel: Callable[..., None], count: int, *arguments: Any) -> None:
+    """kernel(first, last, *arguments) over ``count`` crops or rows, on as many threads as PyTorch uses."""
+    threads = min(torch.get_num_threads(), count)
     if threads <= 1:
-        kernel(0, crops, *arguments)
+        kernel(0, count, *arguments)
         return
     pool = _pools.setdefault(threads, ThreadPoolExecutor(threads))
-    bounds = [crops * k // threads for k in range(threads + 1)]
+    bounds = [count * k // threads for k in range(threads + 1)]
     for job in [pool.submit(kernel, a, b, *arguments) for a, b in itertools.pairwise(bounds)]:
         job.result()
 
@@ -157,19 +157,21 @@ def _fold(row, out, channels):
 
 @njit(nogil=True, cache=True)
 def normalise(first, last, x, out, scale, shift, keys, threshold, factor, pad, channels):
-    """out = dropout(leaky(x * scale + shift)), edges continued by ``pad`` pixels; scale, shift : (W * C,)"""
+    """out = dropout(leaky(x * scale + shift)), edges continued by ``pad`` pixels; scale, shift : (W * C,)
+
+    first, last : rows, counted through all crops
+    """
     rows, length = x.shape[1], x.shape[2]
     line = np.empty(length, np.float32)
-    for n in range(first, last):
-        target = out[n]
-        for r in range(rows):
-            row = x[n, r]
-            for j in range(length):
-                v = _value(row[j]) * scale[j] + shift[j]
-                line[j] = v if v > 0 else v * SLOPE
-            if threshold:
-                _drop(line, r, keys[n, 0], keys[n, 1], threshold, factor)
-            _write(line, target, r, rows, pad, channels)
+    for i in range(first, last):
+        n, r = i // rows, i % rows
+        row = x[n, r]
+        for j in range(length):
+            v = _value(row[j]) * scale[j] + shift[j]
+            line[j] = v if v > 0 else v * SLOPE
+        if threshold:
+            _drop(line, r, keys[n, 0], keys[n, 1], threshold, factor)
+        _write(line, out[n], r, rows, pad, channels)
 
 
 @register_jitable
@@ -249,22 +251,21 @@ def give_back(first, last, x, g, scale, constant, linear):
 
 @njit(nogil=True, cache=True)
 def pool(first, last, x, out):
-    """Largest of 2 x 2, edges continued by a pixel. x : (B, 2 h, 2 w, C), out : (B, h + 2, (w + 2) * C)"""
+    """Largest of 2 x 2, edges continued by a pixel. x : (B, 2 h, 2 w, C), out : (B, h + 2, (w + 2) * C)
+
+    first, last : rows of the result, counted through all crops
+    """
     rows, columns, channels = x.shape[1] // 2, x.shape[2] // 2, x.shape[3]
     line = np.empty((columns, channels), np.float32)
-    for n in range(first, last):
-        for r in range(rows):
-            for k in range(columns):
-                p0, p1, p2, p3 = (
-                    x[n, 2 * r, 2 * k],
-                    x[n, 2 * r, 2 * k + 1],
-                    x[n, 2 * r + 1, 2 * k],
-                    x[n, 2 * r + 1, 2 * k + 1],
-                )
-                to = line[k]
-                for c in range(channels):
-                    to[c] = max(max(_value(p0[c]), _value(p1[c])), max(_value(p2[c]), _value(p3[c])))
-            _write(line.reshape(-1), out[n], r, rows, 1, channels)
+    for i in range(first, last):
+        n, r = i // rows, i % rows
+        upper, lower = x[n, 2 * r], x[n, 2 * r + 1]
+        for k in range(columns):
+            p0, p1, p2, p3 = upper[2 * k], upper[2 * k + 1], lower[2 * k], lower[2 * k + 1]
+            to = line[k]
+            for c in range(channels):
+                to[c] = max(max(_value(p0[c]), _value(p1[c])), max(_value(p2[c]), _value(p3[c])))
+        _write(line.reshape(-1), out[n], r, rows, 1, channels)
 
 
 @njit(nogil=True, cache=True)
@@ -299,28 +300,30 @@ def join(first, last, quarters, kept, out):
     """Upsampled values beside kept ones, edges continued by a pixel.
 
     quarters : (B, h + 1, w + 1, 4 c): pixel (2 j + a, 2 k + b) is quarter 2 a + b at (j + a, k + b)
-    kept : (B, 2 h, 2 w, d); out : (B, 2 h + 2, 2 w + 2, c + d)
+    kept : (B, 2 h, 2 w, d); out : (B, 2 h + 2, 2 w + 2, c + d); first, last : rows of ``kept``, through all crops
     """
     rows, columns, others = kept.shape[1], kept.shape[2], kept.shape[3]
     channels = quarters.shape[3] // 4
-    for n in range(first, last):
+    for i in range(first, last):
+        n, r = i // rows, i % rows
+        a = r & 1
         target = out[n]
-        for r in range(rows):
-            a = r & 1
-            source, row, line = quarters[n, r // 2 + a], kept[n, r], target[r + 1]
-            for k in range(columns):
-                b = k & 1
-                at = (2 * a + b) * channels
-                raised, beside = source[k // 2 + b, at : at + channels], row[k]
-                left, right = line[k + 1, :channels], line[k + 1, channels:]
-                for c in range(channels):
-                    left[c] = raised[c]
-                for c in range(others):
-                    right[c] = beside[c]
-            line[0] = line[1]
-            line[columns + 1] = line[columns]
-        target[0] = target[1]
-        target[rows + 1] = target[rows]
+        source, row, line = quarters[n, r // 2 + a], kept[n, r], target[r + 1]
+        for k in range(columns):
+            b = k & 1
+            at = (2 * a + b) * channels
+            raised, beside = source[k // 2 + b, at : at + channels], row[k]
+            left, right = line[k + 1, :channels], line[k + 1, channels:]
+            for c in range(channels):
+                left[c] = raised[c]
+            for c in range(others):
+                right[c] = beside[c]
+        line[0] = line[1]
+        line[columns + 1] = line[columns]
+        if r == 0:
+            target[0] = line
+        if r == rows - 1:
+            target[rows + 1] = line
 
 
 @njit(nogil=True, cache=True)

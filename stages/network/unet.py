@@ -73,7 +73,8 @@ class Block(nn.Sequential):
         assert second.bias is not None
         y = entry.differences(x) if isinstance(entry, HeightConv) else functional.conv2d(x, entry.weight)
         y = norm_act(y, entry.bias, first, 1, drop, keys)
-        return norm_act(functional.conv2d(y, second.weight), second.bias, last, pad)
+        y = functional.conv2d(y, second.weight)
+        return norm_act(y, second.bias, last, pad)
 
 
 class UNet(nn.Module):
@@ -171,7 +172,9 @@ class UNet(nn.Module):
             for first, length, edge in ((top, height, rows), (left, width, columns)):
                 cut += [max(0, (first >> level) - MARGIN), min(edge, -(-(first + length) >> level) + MARGIN)]
             cuts.append(cut)
-        for below, cut in zip(reversed(cuts[1:]), reversed(cuts[:-1]), strict=True):  # no more than is raised to a level
+        for below, cut in zip(
+            reversed(cuts[1:]), reversed(cuts[:-1]), strict=True
+        ):  # no more than is raised to a level
             cut[0], cut[1] = max(cut[0], 2 * below[0]), min(cut[1], 2 * below[1])
             cut[2], cut[3] = max(cut[2], 2 * below[2]), min(cut[3], 2 * below[3])
         kept = []

@@ -1,0 +1,164 @@
+"""Inference on the CPU: the bare network in the best form found, ours on a window, and `lunargr infer` from DEM to GeoTIFF.
+
+The bare network is the paper's U-Net with BatchNorm folded into the convolutions, upsampling before the convolution, channels
+last, in bfloat16 where that is faster, eager and compiled, on one tile without any context: nothing is read or written.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import rasterio
+import torch
+from rasterio.transform import Affine
+from torch import Tensor, nn
+from torch.nn import functional
+
+from schemas import CHECKPOINT, ArtefactWriter
+from stages.network.predictor import Predictor, write_state
+from stages.network.runtime import keep_freed_memory
+from stages.network.unet import DROPOUT, WIDTHS, UNet
+from stages.physics.photometry import get_model
+
+TILE, SIZE, ROUNDS = 1024, int(os.environ.get("SIZE", "4096")), 3
+
+
+class BareUNet(nn.Module):
+    """Convolutions and LeakyReLU only."""
+
+    def __init__(self, outputs: int) -> None:
+        super().__init__()
+
+        def pair(inputs: int, width: int) -> nn.ModuleList:
+            return nn.ModuleList([nn.Conv2d(inputs, width, 3, padding=1), nn.Conv2d(width, width, 3, padding=1)])
+
+        levels = range(len(WIDTHS) - 1)
+        self.down = nn.ModuleList(pair(([1, *WIDTHS])[k], WIDTHS[k]) for k in range(len(WIDTHS)))
+        self.rise = nn.ModuleList(
+            nn.ConvTranspose2d(WIDTHS[k + 1], WIDTHS[k], 4, stride=2, padding=1) for k in reversed(levels)
+        )
+        self.up = nn.ModuleList(pair(2 * WIDTHS[k], WIDTHS[k]) for k in reversed(levels))
+        self.head = nn.Conv2d(WIDTHS[0], outputs, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        kept = []
+        for k, (first, second) in enumerate(self.down):  # type: ignore[misc]
+            x = functional.leaky_relu(second(functional.leaky_relu(first(x), 0.01)), 0.01)
+            if k < len(self.down) - 1:
+                kept.append(x)
+                x = functional.max_pool2d(x, 2)
+        for rise, (first, second) in zip(self.rise, self.up, strict=True):  # type: ignore[misc]
+            x = torch.cat([rise(x), kept.pop()], dim=1)
+            x = functional.leaky_relu(second(functional.leaky_relu(first(x), 0.01)), 0.01)
+        return self.head(x)
+
+
+def write_inputs(folder: Path) -> tuple[Path, Path]:
+    """A rough DEM of SIZE x SIZE pixels, and a checkpoint whose maps vary."""
+    rng = np.random.default_rng(0)
+    spectrum = np.hypot(*np.meshgrid(np.fft.fftfreq(SIZE), np.fft.rfftfreq(SIZE), indexing="ij"))
+    spectrum[0, 0] = 1
+    z = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(SIZE, SIZE))) / spectrum**1.8, (SIZE, SIZE))
+    dem, checkpoint = folder / "dem.tif", folder / "checkpoint.h5"
+    profile = {
+        "driver": "GTiff", "height": SIZE, "width": SIZE, "count": 1, "dtype": "float32", "tiled": True, "nodata": -9999.0,
+        "crs": "+proj=eqc +R=1737400 +units=m", "transform": Affine(5, 0, 0, 0, -5, 0),
+    }  # fmt: skip
+    with rasterio.open(dem, "w", **profile) as out:
+        out.write((150 * z / z.std()).astype(np.float32), 1)
+    torch.manual_seed(0)
+    predictor = Predictor(get_model("M2"), UNet(3), 10.0, torch.tensor([0.06, 0.02, 0.01]), 0.03)
+    nn.init.normal_(predictor.net.head.weight, 0, 0.1)
+    attributes = {
+        "model": "M2", "coefficients": '["a", "b", "c"]', "elevation_scale_m": 10.0, "output_scale": 0.03, "gsd_m": 5.0,
+        "body_radius_m": 1737400.0, "image_units": "iof", "best_epoch": np.int32(0), "start": "{}", "precision": "fp32",
+    }  # fmt: skip
+    config = {"widths": WIDTHS, "dropout": DROPOUT}
+    with ArtefactWriter(
+        checkpoint, CHECKPOINT, {"epoch": 1, "frame": 1}, config=config, attributes=attributes
+    ) as writer:
+        for name in ("train_loss", "validation_loss", "epoch_seconds", "gain", "offset"):
+            writer.write(name, np.ones(1))
+        writer.write("image_id", ["A"])
+        write_state(writer.file.create_group("weights", track_order=True), predictor.state_dict())
+    return dem, checkpoint
+
+
+def bare(bf16: bool, compiled: bool) -> Callable[[], None]:
+    net = BareUNet(3).eval().to(memory_format=torch.channels_last)
+    x = torch.randn(1, 1, TILE, TILE).contiguous(memory_format=torch.channels_last)
+    if bf16:
+        net, x = net.bfloat16(), x.bfloat16()
+    run = torch.compile(net) if compiled else net
+
+    def work() -> None:
+        with torch.no_grad():
+            run(x)
+
+    return work
+
+
+def ours(bf16: bool, context: int) -> Callable[[], None]:
+    predictor = Predictor(get_model("M2"), UNet(3), 10.0, torch.tensor([0.06, 0.02, 0.01]), 0.03).eval()
+    predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    x = torch.randn(TILE + 2 * context, TILE + 2 * context)
+
+    def work() -> None:
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            predictor.part(x, (context, context, TILE, TILE))
+
+    return work
+
+
+def main() -> None:
+    keep_freed_memory()
+    jobs = {f"bare, {n}, eager": bare(n == "bf16", False) for n in ("fp32", "bf16")}
+    jobs["bare, bf16, compiled"] = bare(True, True)
+    for name in ("fp32", "bf16"):
+        jobs |= {f"ours, {name}": ours(name == "bf16", 0), f"ours, {name}, with context": ours(name == "bf16", 128)}
+    best = dict.fromkeys(jobs, float("inf"))
+    for name, job in list(jobs.items()):
+        try:
+            job()
+        except Exception as error:  # no compiler on this machine
+            print(f"{name}: not possible here ({type(error).__name__})")
+            del jobs[name], best[name]
+    for _ in range(ROUNDS):
+        for name, job in jobs.items():
+            began = time.perf_counter()
+            job()
+            best[name] = min(best[name], time.perf_counter() - began)
+    fastest = min(seconds for name, seconds in best.items() if name.startswith("bare"))
+    print(f"{torch.get_num_threads()} threads; load {os.getloadavg()[0]:.1f}; tiles of {TILE} x {TILE}")
+    for name, seconds in best.items():
+        print(f"{name:28s} {TILE**2 / seconds / 1e6:6.2f} Mpx/s, {fastest / seconds:5.2f} of the fastest bare network")
+    with tempfile.TemporaryDirectory() as folder:
+        dem, checkpoint = write_inputs(Path(folder))
+        command = [sys.executable, "-m", "lunargr_cli.main"]
+        scene = str(Path(folder) / "scene.h5")
+        subprocess.run([*command, "ingest", str(dem), "-o", scene, "--quiet"], check=True)
+        for source in (scene, str(dem)):
+            began = time.perf_counter()
+            out = str(Path(folder) / "map.h5")
+            subprocess.run(
+                [*command, "infer", source, str(checkpoint), "-o", out, "--overwrite", "--quiet"], check=True
+            )
+            rate = SIZE**2 / (time.perf_counter() - began) / 1e6
+            memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+            share = rate / (TILE**2 / fastest / 1e6)
+            print(
+                f"`lunargr infer` of {Path(source).suffix} {SIZE} x {SIZE}: {rate:6.2f} Mpx/s, {share:5.2f} of the fastest bare "
+                f"network; {memory:.0f} MB at most"
+            )
+
+
+if __name__ == "__main__":
+    main()
