@@ -86,9 +86,9 @@ def main() -> None:
     try:
         app()
     except BaseException as error:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is left to tidy while Python ends
         # What an interruption breaks may say something else: a library that was just being imported, for one.
         if interrupted or isinstance(error, KeyboardInterrupt):
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
             print(INTERRUPTED, file=sys.stderr, flush=True)
             # Not sys.exit: Python would end itself by the signal where one of its own parts saw the interruption.
             os._exit(130)

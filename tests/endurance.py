@@ -32,7 +32,7 @@ RESUMABLE = {"ingest": 3, "project": 6, "infer": 4, "evaluate": None, "train": N
 def commands(paths: dict[str, Path]) -> dict[str, list[object]]:
     """Every stage's arguments on the small scene."""
     train = ["train", paths["pairs"], "--epochs", 2, "--batch", 16, "--widths", "4-4-8", "--device", "cpu"]
-    diagnose = ["diagnose", paths["pairs"], "--pairs", 16, "--causes", 1]
+    diagnose = ["diagnose", paths["pairs"], "--pairs", 40, "--causes", 1]
     render = ["render", paths["svbrdf"], "--sun-azimuth", 270, "--sun-elevation", 30]
     return stages(paths) | {"train": [*train, "--precision", "fp32"], "diagnose": diagnose, "render": render}
 
