@@ -67,6 +67,7 @@ class Chain:
         self._state = self._illuminate(self.base)
         self._state.reflectance = self._surface(self._state)
         self.textured = self.render()
+        self._tangents: tuple[Tensor | None, list[Tensor]] = (None, [])
 
     @property
     def state(self) -> State:
@@ -111,7 +112,9 @@ class Chain:
 
     def surface_tangents(self) -> list[Tensor]:
         """d image / d coefficient, one (n, H, W) per free coefficient: the nominal model's own freedom."""
-        columns = []
+        if self._tangents[0] is self.textured:
+            return self._tangents[1]
+        columns: list[Tensor] = []
         for k in range(self.coefficients.shape[1]):
             if self.free is not None and not bool(self.free[k]):
                 continue
@@ -120,6 +123,7 @@ class Chain:
             c[:, k] += step
             shifted = self._expose(self._state, self._surface(self._state, c), self.base)
             columns.append((shifted - self.textured) / step)
+        self._tangents = (self.textured, columns)
         return columns
 
     def slope_tangents(self) -> tuple[Tensor, Tensor]:

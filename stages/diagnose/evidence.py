@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.numbers import f_tail
-from stages.diagnose.statistics import Candidate, Statistics
+from stages.diagnose.statistics import SITE, Candidate, Statistics
 
 
 @dataclass
@@ -36,6 +36,7 @@ class Evidence:
     share: Tensor
     left: float  # share of the template's energy that the nuisances leave
     unit: float = 0.0  # size over noise of the first column at amount 1
+    agreement: float = 1.0  # gain of one amount for all sites over that of an amount for each
 
     @property
     def effect(self) -> str:
@@ -54,6 +55,7 @@ def weigh(data: Statistics, only: slice = slice(None)) -> list[Evidence]:
     score = data.products[:, m + 1 :, m] - torch.einsum("cme,m->ce", cross[:, :, 1:], delta)
     score = score - (cross[:, :, 0] - n @ delta) @ gamma
     places, cells = _groups(data.place), _groups(data.image)
+    sites = _groups(data.place // SITE)
     out = []
     for candidate in data.candidates[only]:
         part = candidate.columns
@@ -64,7 +66,9 @@ def weigh(data: Statistics, only: slice = slice(None)) -> list[Evidence]:
         gram = raw - half - half.transpose(1, 2) + torch.einsum("mk,cmn,nl->ckl", g, n, g)
         energy = float(raw.sum(0).diagonal().sum())
         # the pull of the bounds on the nuisances belongs to no cluster: it is small and left out
-        out.append(_weigh_one(candidate, score[:, part], gram, places, cells, data.rows, energy))
+        found = _weigh_one(candidate, score[:, part], gram, places, cells, data.rows, energy)
+        found.agreement = _agreement(found.amount, score[:, part], gram, sites)
+        out.append(found)
     return out
 
 
@@ -129,6 +133,21 @@ def _weigh_one(candidate, score: Tensor, gram: Tensor, places, images, rows: flo
         left,
         math.sqrt(max(float(total_g[0, 0]), 0.0) / max(rows, 1.0)),
     )
+
+
+def _agreement(amount: Tensor, score: Tensor, gram: Tensor, sites: tuple[Tensor, int]) -> float:
+    """What is wrong with the light or the camera is wrong alike everywhere; a misfit of the ground is not."""
+    labels, count = sites
+    k = len(amount)
+    if count < 3:
+        return 1.0
+    u = torch.zeros(count, k, dtype=torch.float64).index_add_(0, labels, score)
+    g = torch.zeros(count, k, k, dtype=torch.float64).index_add_(0, labels, gram)
+    ridge = 1e-6 * torch.diag(g.sum(0).diagonal().clamp(min=1e-12))
+    own = 0.5 * float((torch.linalg.solve(g + ridge, u[..., None])[..., 0] * u).sum())
+    common = float(amount @ u.sum(0) - 0.5 * amount @ g.sum(0) @ amount)
+    chance = 0.5 * k * (count - 1)  # nats that the further amounts gain from noise alone
+    return common / max(own - chance, 1e-9)
 
 
 def best_guises(evidence: list[Evidence]) -> dict[str, Evidence]:

@@ -43,6 +43,7 @@ class ImageEvidence:
     fid: float
     frames: int
     together: int
+    agreement: float = 1.0  # gain of values that hold for all sites over that of values for each
 
 
 @dataclass
@@ -56,6 +57,7 @@ def weigh_images(
 ) -> dict[str, ImageEvidence]:
     """Evidence for each effect of image scope, from the sites with enough images."""
     sums: dict[str, list[_Fold]] = {}
+    parts: dict[str, list[tuple[Tensor, _Fold]]] = {}
     rows = 0.0
     deep = [work for work in works if work.chain.site.count >= FEWEST]
     for work, every in zip(deep, per_site(lambda work: _site_folds(work, names, dn, data), deep), strict=True):
@@ -68,11 +70,30 @@ def weigh_images(
                 name,
                 [_Fold(torch.zeros(frames * k, frames * k).double(), torch.zeros(frames * k).double()) for _ in folds],
             )
+            whole = _Fold(sum(f.gram for f in folds), sum(f.score for f in folds))  # type: ignore[arg-type]
+            parts.setdefault(name, []).append((place, whole))
             for into, fold in zip(total, folds, strict=True):
                 into.gram[place[:, None], place[None]] += fold.gram
                 into.score[place] += fold.score
     together = max((w.chain.site.count for w in works), default=1)
-    return {name: _weigh(name, folds, frames, rows, together) for name, folds in sums.items()}
+    found = {name: _weigh(name, folds, frames, rows, together) for name, folds in sums.items()}
+    for name, e in found.items():
+        e.agreement = _agreement(e.values.flatten().double(), parts[name])
+    return found
+
+
+def _agreement(values: Tensor, parts: list[tuple[Tensor, _Fold]]) -> float:
+    """An image's gain is the same wherever it looks; what stands for a misfit of the ground is not."""
+    if len(parts) < 3:
+        return 1.0
+    own = common = 0.0
+    for place, fold in parts:
+        ridge = 1e-6 * float(fold.gram.diagonal().mean()) * torch.eye(len(fold.gram), dtype=torch.float64)
+        own += 0.5 * float(fold.score @ torch.linalg.solve(fold.gram + ridge, fold.score))
+        here = values[place]
+        common += float(here @ fold.score - 0.5 * here @ fold.gram @ here)
+    chance = 0.5 * (sum(len(place) for place, _ in parts) - len(values))
+    return common / max(own - chance, 1e-9)
 
 
 def _site_folds(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) -> dict[str, list[_Fold]]:

@@ -19,6 +19,7 @@ GATE = 0.01  # family-wise
 FLOOR_FID = 0.022  # an effect smaller than this against the noise is never worth a name
 FLOOR_IMAGE = 0.035  # the same for effects with values per image, which have more to fit with
 FLOOR_GAIN = 12.0  # nats
+AGREE = 0.95  # of the gain of an amount for each site that one amount for all must keep
 RIVAL_SHARE = 0.6  # of the gain between a scene-wide effect and one per image, above which both are tried
 KEEP_SHARE = 0.8  # of a per-image effect's gain that a scene-wide effect must keep to replace it
 SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to replace it
@@ -79,6 +80,8 @@ def worth(e: Evidence, seen: Round, count: int, ease: float = 1.0) -> bool:
     still = cls.channel in ("albedo", "relief")  # judged in rows of their own, where the size against noise says little
     if e.p * count > GATE * ease or min(e.gain_image, e.gain_place) <= 0:
         return False
+    if e.agreement < AGREE and not still and e.effect != "distant_shadow":
+        return False
     firm = 0.0 if e.effect == "distant_shadow" else 1.5 * e.gain_error  # a wall shades one image and spares the others
     if e.gain < max(FLOOR_GAIN, firm) or (e.fid < FLOOR_FID and not still):
         return False
@@ -115,6 +118,8 @@ def worth_image(e: ImageEvidence, count: int) -> bool:
     if e.p * count > GATE or e.gain < max(FLOOR_GAIN, 2 * e.gain_error) or e.fid < FLOOR_IMAGE:
         return False
     cls = get_effect(e.effect)
+    if e.effect == "image_gain" and e.agreement < AGREE:
+        return False
     if not cls.tolerance:
         return e.fid > 2 * FLOOR_IMAGE
     return e.rms > 1.2 * cls.tolerance[cls.parameters[0].name]

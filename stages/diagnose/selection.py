@@ -17,7 +17,7 @@ SLIGHT = 0.005  # of what is left: by so much a simpler cause may do worse
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
 PROMISE = 0.25  # share of the foretold gain that a cause must bring once it is in the model ...
-ALSO_STILL = ("psf_blur",)  # ... but for these, part of whose gain lies in the maps of the ground
+ALSO_STILL = ("psf_blur", "echo")  # ... but for these, part of whose gain lies in the maps of the ground
 
 
 def search(state: Search, most: int, say: Callable[[str], None]) -> Round:

@@ -114,7 +114,8 @@ class Search:
             images.append(aligned)
             if not self.dn:
                 site.image = aligned
-        rounds = 1 if again and self.nominal.model.linear and not self.dn else ROUNDS
+        known = self.nominal.model.linear and not self.dn
+        rounds = (1 if known else 2) if again else (ROUNDS if known else 4)
         fit(self.nominal, self.sites, self.still, self.units, images, rounds)
 
     def save(self) -> Saved:

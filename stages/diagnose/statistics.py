@@ -17,6 +17,7 @@ from stages.diagnose.projection import Local, Projector
 from stages.effects import Effect, Survey, Trial, get_effect
 
 BLOCK = 32  # px
+SITE = 10_000  # between the numbers of two sites' first blocks
 CUT = math.radians(15)  # photometric effects are judged where neither slope nor shadow is a matter of sub-pixel relief
 DEEP = math.radians(2)  # below the horizon: shadow, whatever the DEM's errors
 OUTLIER = 7.0  # sigma
@@ -376,7 +377,7 @@ def _reduce(
     image = np.concatenate(
         [np.repeat(site.frames[: dynamic.shape[1]], per_map), np.full(static.shape[1] * per_map, -1)]
     )
-    place = np.tile(np.arange(per_map), len(products)) + 10_000 * site.number
+    place = np.tile(np.arange(per_map), len(products)) + SITE * site.number
     # an image's faults are known for all of its sites, yet each site has a DEM error of its own
     image = image + 100_000 * site.number
     return Statistics(
