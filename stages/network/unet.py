@@ -38,7 +38,9 @@ class HeightConv(nn.Conv2d):
 
     def forward(self, x: Tensor) -> Tensor:
         assert self.bias is not None
-        return self.differences(x) + self.bias[:, None, None]
+        y = self.differences(x) + self.bias[:, None, None]
+        kind = x.device.type
+        return y.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else y
 
 
 def _conv(inputs: int, outputs: int) -> nn.Conv2d:
