@@ -11,6 +11,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from stages.network.losses import Radiometry, masked_mse
 from stages.network.normalisation import FILL_REACH, fill_holes, scale_elevation
+from stages.network.predictor import Predictor
+from stages.network.runtime import choose_inference_precision
 from stages.network.symmetries import COUNT, turn_field, turn_vector
 from stages.network.unet import UNet
 from stages.physics.formation import Observation, form
@@ -99,6 +101,36 @@ def test_outputs_depend_on_nothing_beyond_reach():
     assert (rows - 256).abs().max() > net.reach // 2
     inner = slice(net.reach + 32, 512 - net.reach - 32)
     torch.testing.assert_close(rolled[..., inner, inner], original[..., inner, inner], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("part", [(200, 180, 77, 130), (0, 0, 100, 90), (300, 0, 340, 576), (639, 575, 1, 1)])
+def test_a_part_is_what_the_whole_has_there(part):
+    """Inside, at corners, along an edge: dropping context on the way up changes nothing but the last digit."""
+    torch.manual_seed(4)
+    net = shaken(UNet(2, (4, 4, 6, 6, 8))).eval()
+    for module in net.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            torch.nn.init.normal_(module.running_mean, 0, 0.3)
+            torch.nn.init.normal_(module.bias, 0, 0.3)
+    x = torch.randn(1, 1, 640, 576)
+    row, col, height, width = part
+    with torch.no_grad():
+        whole = net.plain(x, torch.zeros(0, dtype=torch.int64))[..., row : row + height, col : col + width]
+    torch.testing.assert_close(net.part(x, part), whole, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("contrast", "expected"), [(1.0, "bf16"), (1e-4, "fp32")])
+def test_bf16_is_refused_where_it_would_drown_the_coefficients(contrast, expected, monkeypatch):
+    """A map that hardly varies about a large mean has nothing left of its spread in three digits."""
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+    torch.manual_seed(5)
+    net = shaken(UNet(1, (8, 16)))
+    with torch.no_grad():
+        net.head.weight *= contrast
+        net.head.bias += 1
+    predictor = Predictor(get_model("M1"), net, 1.0, torch.zeros(1), 1.0)
+    sample = torch.randn(64, 64).cumsum(0).cumsum(1) * 0.1
+    assert choose_inference_precision(predictor, sample, torch.device("cpu")) == expected
 
 
 @pytest.mark.parametrize("symmetry", range(COUNT))
