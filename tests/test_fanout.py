@@ -144,6 +144,21 @@ def test_a_worker_s_error_is_one_line(inputs, cluster, tmp_path):
     assert not (tmp_path / "s.h5").exists()
 
 
+def test_a_diagnosis_on_a_worker(inputs, cluster, tmp_path):
+    cluster.fill()
+    texts = []
+    for name, where in (("here", []), ("there", ["--scheduler", cluster.address])):
+        files = [tmp_path / f"{name}.h5", "--json", tmp_path / f"{name}.json", "--report", tmp_path / f"{name}.html"]
+        code, said = lunargr("diagnose", inputs["pairs"], "--model", "M1", *where, "--quiet", "-o", *files)
+        assert code == 0, said
+        texts.append(json.loads((tmp_path / f"{name}.json").read_text()))
+    assert texts[0] == texts[1] and texts[0]["verdict"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        f"{n}{s}" for n in ("here", "there") for s in (".h5", ".html", ".json")
+    ]
+    assert_same(tmp_path / "here.h5", tmp_path / "there.h5")
+
+
 def test_schedulers_that_are_not_there(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     from lunargr_cli.fanout import engines

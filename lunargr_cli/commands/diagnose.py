@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Json, Overwrite, Quiet, Seed
+from lunargr_cli.options import Json, Overwrite, Quiet, Scheduler, Seed
 
 NAME, ORDER = "diagnose", 80
 
@@ -36,6 +36,7 @@ def command(
     most_pairs: Annotated[int, typer.Option("--pairs", help="Most pairs that the search uses.")] = 384,
     seed: Seed = 0,
     json_file: Json = None,
+    scheduler: Scheduler = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -54,29 +55,34 @@ def command(
 
     chosen = tuple(name.strip() for name in free.split(",") if name.strip())
     config = diagnose.Config(model, chosen, most_causes, most_pairs=most_pairs, seed=seed)
-    result = diagnose.run(
-        pairs, checkpoint, config, output, json_file, report, overwrite, console.say, console.progress
-    )
-    answer = result.answer
+    if scheduler:
+        from lunargr_cli.fanout.stages import run_diagnose
+
+        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
+        answer = run_diagnose(pairs, checkpoint, output, json_file, report, config, **how)
+    else:
+        progress = console.progress
+        result = diagnose.run(pairs, checkpoint, config, output, json_file, report, overwrite, console.say, progress)
+        answer = result.answer.to_json()
     rows = [
         (
-            c.effect.name,
-            describe(c),
-            f"{c.p:.1e}",
-            f"{c.gain:.0f} +- {c.gain_error:.0f}",
-            f"{c.fid:.3f}",
-            ", ".join(g for g in c.group if g != c.effect.name) or "-",
+            c["effect"],
+            describe(c["parameters"]),
+            f"{c['p_family_wise']:.1e}",
+            f"{c['gain_nats']:.0f} +- {c['gain_error']:.0f}",
+            f"{c['size_over_noise']:.3f}",
+            ", ".join(g for g in c["group"] if g != c["effect"]) or "-",
         )
-        for c in answer.causes
+        for c in answer["causes"]
     ]
     if rows:
         console.table(
             "causes", ("effect", "parameters", "p (family)", "gain, nats", "size / noise", "equally good"), rows
         )
     if not quiet:
-        print(f"{answer.verdict}: {answer.sentence()}")
-        if answer.blind and answer.verdict != "cannot_tell":
-            print(f"These data could not show: {', '.join(answer.blind)}.")
+        print(f"{answer['verdict']}: {answer['sentence']}")
+        if answer["blind"] and answer["verdict"] != "cannot_tell":
+            print(f"These data could not show: {', '.join(answer['blind'])}.")
 
 
 def _list(console) -> None:

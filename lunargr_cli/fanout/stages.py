@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from lunargr_cli.fanout.job import open_job
+from schemas import ConfigError, atomic_path
 from schemas.hdf5 import check_output
 
 # What a part holds where --parts does not say: some minutes of work on real data.
@@ -155,6 +158,40 @@ def run_evaluate(
             progress=job.progress,
             fan=job.fan,
         )
+
+
+def run_diagnose(
+    pairs: Path,
+    checkpoint: Path | None,
+    output: Path | None,
+    json_file: Path | None,
+    report: Path | None,
+    config: Any,
+    **how: Any,
+) -> dict[str, Any]:
+    """One part: a search uses a few hundred pairs and decides one thing after the other. Returns the JSON's content."""
+    if output is None:
+        raise ConfigError("diagnose: expected --output with --scheduler (the part lies beside it), found none.")
+    pairs, checkpoint = pairs.resolve(), checkpoint and checkpoint.resolve()
+    inputs = [pairs, *([checkpoint] if checkpoint else [])]
+    for path in (json_file, report):
+        if path is not None:
+            check_output(path, inputs, how["overwrite"])
+    with _job(output, "diagnose", config, None, inputs, (), how) as job:
+        arguments = {"pairs": pairs, "checkpoint": checkpoint, "config": config}
+        (piece,) = job.fan("diagnosis", diagnose_part, [arguments])
+        for made, wanted in ((".json", json_file), (".html", report), (".h5", output)):
+            if wanted is not None:
+                with atomic_path(wanted) as partial:
+                    shutil.copyfile(piece.with_suffix(made), partial)
+        return json.loads(piece.with_suffix(".json").read_text())
+
+
+def diagnose_part(path: Path, pairs: Path, checkpoint: Path | None, config: Any) -> None:
+    from stages import diagnose
+
+    texts = path.with_suffix(".json"), path.with_suffix(".html")
+    diagnose.run(pairs, checkpoint, config, path, *texts, overwrite=True)
 
 
 def _cut(config: Any, count: int, most: int | None = None) -> list[Any]:

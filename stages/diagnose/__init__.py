@@ -79,8 +79,6 @@ def run(
     with PairReader(pairs) as reader:
         result = diagnose(reader, checkpoint, config, say or (lambda _: None), progress or (lambda *_: None))
         image_ids = reader.image_ids
-    if output is not None:
-        write_diagnosis(output, result.answer, image_ids, inputs, overwrite)
     if json_file is not None:
         import json
 
@@ -90,6 +88,8 @@ def run(
         from stages.diagnose.report import write_report
 
         write_report(report, result)
+    if output is not None:  # last: where it is, the others are
+        write_diagnosis(output, result.answer, image_ids, inputs, overwrite)
     return result
 
 

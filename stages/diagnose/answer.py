@@ -114,6 +114,7 @@ class Answer:
             "held_out": self.held_out.to_json(),
             "data": {"pairs": self.pairs, "sites": self.sites, "images": self.images},
             "note": self.note,
+            "sentence": self.sentence(),
             "config": self.config,
         }
 
@@ -122,7 +123,7 @@ class Answer:
         if self.note:
             return self.note[0].upper() + self.note[1:] + ("" if self.note.endswith(".") else ".")
         if self.verdict == "named":
-            parts = [f"{get_effect(c.effect.name).title} ({describe(c)})" for c in self.causes]
+            parts = [f"{get_effect(c.effect.name).title} ({describe(parameters(c))})" for c in self.causes]
             gain = self.held_out.gain
             worth = f"; it lowers the squared error of unseen pairs by {gain:.1f} %" if math.isfinite(gain) else ""
             return f"The simulation lacks {' and '.join(parts)}{worth}."
@@ -162,11 +163,11 @@ def parameters(cause: Cause) -> dict[str, dict[str, Any]]:
     return {k: {"value": _number(v), "error": _number(e), "unit": units[k]} for k, (v, e) in found.items()}
 
 
-def describe(cause: Cause) -> str:
-    """'error_deg = 0.31 +- 0.02 degree'"""
+def describe(found: dict[str, dict[str, Any]]) -> str:
+    """Reported parameters as 'error_deg = 0.31 +- 0.02 degree'."""
     return ", ".join(
         f"{k} = {p['value']:.3g} +- {p['error']:.1g}{'' if p['unit'] == '1' else ' ' + p['unit']}"
-        for k, p in parameters(cause).items()
+        for k, p in found.items()
     )
 
 

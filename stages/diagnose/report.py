@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from schemas import atomic_path
-from stages.diagnose.answer import describe
+from stages.diagnose.answer import describe, parameters
 from stages.diagnose.nominal import lit_mask
 from stages.effects import get_effect
 
@@ -62,7 +62,7 @@ def _causes(answer) -> str:
         effect = get_effect(c.effect.name)
         cells = (
             f"<b>{c.effect.name}</b><br>{html.escape(effect.title)}",
-            html.escape(describe(c)),
+            html.escape(describe(parameters(c))),
             f"{c.p:.1e}",
             f"{c.gain:.0f} &plusmn; {c.gain_error:.0f}",
             f"{c.rms_before:.3e} &rarr; {c.rms_after:.3e}",
