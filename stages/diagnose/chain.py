@@ -110,7 +110,7 @@ class Chain:
             return self._expose(state, self._surface(state), effects)
         return self._expose(self._state, self._state.reflectance, effects)
 
-    def surface_tangents(self) -> list[Tensor]:
+    def surface_tangents(self, keep: bool = True) -> list[Tensor]:
         """d image / d coefficient, one (n, H, W) per free coefficient: the nominal model's own freedom."""
         if self._tangents[0] is self.textured:
             return self._tangents[1]
@@ -123,7 +123,8 @@ class Chain:
             c[:, k] += step
             shifted = self._expose(self._state, self._surface(self._state, c), self.base)
             columns.append((shifted - self.textured) / step)
-        self._tangents = (self.textured, columns)
+        if keep:
+            self._tangents = (self.textured, columns)
         return columns
 
     def slope_tangents(self) -> tuple[Tensor, Tensor]:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.diagnose.numbers import f_tail
-from stages.diagnose.parallel import per_site
 from stages.diagnose.projection import Local
 from stages.diagnose.statistics import (
     BASELINE,
@@ -52,19 +52,31 @@ class _Fold:
     score: Tensor
 
 
-def weigh_images(
-    works: Sequence[SiteWork], names: Sequence[str], frames: int, dn: bool, data: Survey
-) -> dict[str, ImageEvidence]:
+@dataclass
+class ImageProducts:
+    """What one site says of effects with values per image: per effect, normal equations on two halves of the blocks."""
+
+    frames: NDArray[np.int64]
+    rows: float
+    folds: dict[str, list[_Fold]]
+
+
+def gather_images(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) -> ImageProducts | None:
+    """None for sites with too few images."""
+    if work.chain.site.count < FEWEST or not names:
+        return None
+    return ImageProducts(work.chain.site.frames, work.projector.dynamic_rows, _site_folds(work, names, dn, data))
+
+
+def weigh_images(every: Sequence[ImageProducts | None], frames: int) -> dict[str, ImageEvidence]:
     """Evidence for each effect of image scope, from the sites with enough images."""
     sums: dict[str, list[_Fold]] = {}
     parts: dict[str, list[tuple[Tensor, _Fold]]] = {}
-    rows = 0.0
-    deep = [work for work in works if work.chain.site.count >= FEWEST]
-    for work, every in zip(deep, per_site(lambda work: _site_folds(work, names, dn, data), deep), strict=True):
-        rows += work.projector.dynamic_rows
-        for name, folds in every.items():
+    deep = [site for site in every if site is not None]
+    for site in deep:
+        for name, folds in site.folds.items():
             k = len(get_effect(name).fitted())
-            place = torch.from_numpy(work.chain.site.frames)[:, None] * k + torch.arange(k)
+            place = torch.from_numpy(site.frames)[:, None] * k + torch.arange(k)
             place = place.flatten()
             total = sums.setdefault(
                 name,
@@ -75,7 +87,7 @@ def weigh_images(
             for into, fold in zip(total, folds, strict=True):
                 into.gram[place[:, None], place[None]] += fold.gram
                 into.score[place] += fold.score
-    together = max((w.chain.site.count for w in works), default=1)
+    rows, together = sum(site.rows for site in deep), max((len(site.frames) for site in deep), default=1)
     found = {name: _weigh(name, folds, frames, rows, together) for name, folds in sums.items()}
     for name, e in found.items():
         e.agreement = _agreement(e.values.flatten().double(), parts[name])
@@ -222,4 +234,4 @@ def as_effect(evidence: ImageEvidence, known: Effect | None, data: Survey, share
     return cls(values, data)
 
 
-__all__ = ["ImageEvidence", "as_effect", "weigh_images"]
+__all__ = ["ImageEvidence", "as_effect", "gather_images", "weigh_images"]

@@ -11,15 +11,15 @@ import torch
 
 from stages.diagnose.chain import Chain
 from stages.diagnose.evidence import Evidence, best_guises, weigh
-from stages.diagnose.images import FEWEST, ImageEvidence, as_effect, weigh_images
+from stages.diagnose.images import FEWEST, ImageEvidence, ImageProducts, as_effect, gather_images, weigh_images
 from stages.diagnose.pattern import PatternEvidence, weigh_pattern
 from stages.diagnose.projection import FREE_SLOPES
-from stages.diagnose.relief import ALONG, open_relief, weigh_relief
+from stages.diagnose.relief import ALONG, Relief, open_relief, weigh_relief
 from stages.diagnose.state import Search
 from stages.diagnose.statistics import (
     BASELINE,
     Candidate,
-    SiteWork,
+    Remains,
     Statistics,
     gather_site,
     gather_static,
@@ -52,13 +52,13 @@ class Round:
     pattern; slope_error : rms of the apparent slope errors of the DEM, rad, NaN where the images are too few
     """
 
-    works: list[SiteWork]
+    works: list[Remains]
     best: dict[str, Evidence]
     images: dict[str, ImageEvidence]
     pattern: PatternEvidence | None = None
     slope_error: float = math.nan
     others: list[Evidence] = field(default_factory=list)  # guises that lost
-    edges: list[SiteWork] = field(default_factory=list)  # the sites with the pixels about shadow edges
+    edges: list[Remains] = field(default_factory=list)  # the sites with the pixels about shadow edges
     statistics: Statistics | None = None  # of the effects of lit ground
 
 
@@ -66,11 +66,12 @@ class Round:
 class _Seen:
     """What a look finds at one site: products of effects on lit ground, on albedo, on slopes and about shadow edges."""
 
-    work: SiteWork
+    work: Remains
     lit: Statistics
+    images: ImageProducts | None
     ground: Statistics | None = None
-    relief: list[Statistics] = field(default_factory=list)
-    wide: SiteWork | None = None
+    relief: list[Relief] = field(default_factory=list)
+    wide: Remains | None = None
     edges: Statistics | None = None
 
 
@@ -83,17 +84,20 @@ def look(state: Search, names: Sequence[str]) -> Round:
     relief = [n for n in ALONG if n in kinds and state.deepest >= FREE_SLOPES]
     candidates, at_edge = make_candidates(lit, state.data), make_candidates(edge, state.data)
     on_ground = make_candidates(albedo, state.data)
+    images = [n for n, c in kinds.items() if c.scope == "image"]
 
     def of(chain: Chain) -> _Seen:
         work = ready(chain, state.dn)
-        seen = _Seen(work, gather_site(work, candidates, state.data))
+        products = gather_site(work, candidates, state.data)
+        seen = _Seen(work.remains(), products, gather_images(work, images, state.dn, state.data))
         if on_ground:
             columns = [c for e in on_ground for c in trial_columns(chain, e.effect, e.trial, state.data)]
             seen.ground = gather_static(work, on_ground, columns)
         seen.relief = [open_relief(work, name, state.data) for name in relief]
         if at_edge:
-            seen.wide = ready(chain, state.dn, wide=True)
-            seen.edges = gather_site(seen.wide, at_edge, state.data, [_relief_blur(chain, state)])
+            wide = ready(chain, state.dn, wide=True)
+            seen.edges = gather_site(wide, at_edge, state.data, [_relief_blur(chain, state)])
+            seen.wide = wide.remains()
         return seen
 
     title = f"looking for causes, round {len(state.causes) + 1}"
@@ -104,7 +108,7 @@ def look(state: Search, names: Sequence[str]) -> Round:
     if on_ground:
         evidence += weigh(join([s.ground for s in every if s.ground is not None]))
     for k in range(len(relief)):
-        evidence += weigh_relief([s.relief[k] for s in every], works)
+        evidence += weigh_relief([s.relief[k] for s in every])
     if "psf_blur" in kinds:
         blurred = swap(statistics, "psf_blur", state.data)
         # judged beside a DEM smoother than the ground, if the maps of slopes show one: no DEM is sharper than the ground
@@ -112,12 +116,11 @@ def look(state: Search, names: Sequence[str]) -> Round:
         evidence += weigh(without(blurred, drop, blurred.candidates))
     if at_edge:
         evidence += _weigh_edges(state, join([s.edges for s in every if s.edges is not None]))
-    images = [n for n, c in kinds.items() if c.scope == "image"]
     pattern = weigh_pattern(works) if "albedo_map" in kinds else None
     return Round(
         works,
         best_guises(evidence),
-        weigh_images(works, images, state.frames, state.dn, state.data),
+        weigh_images([s.images for s in every], state.frames),
         pattern,
         _slope_error(works),
         evidence,
@@ -133,8 +136,8 @@ def align(state: Search) -> ImageEvidence | None:
     """
     cls, first = get_effect("misregistration"), None
     for _ in range(ALIGNMENTS if state.deepest >= FEWEST else 0):
-        works = state.each(lambda chain: ready(chain, state.dn))
-        found = weigh_images(works, [cls.name], state.frames, state.dn, state.data).get(cls.name)
+        every = state.each(lambda chain: gather_images(ready(chain, state.dn), [cls.name], state.dn, state.data))
+        found = weigh_images(every, state.frames).get(cls.name)
         if found is None or found.p > SURE or found.gain < 0:
             break
         first = first or found
@@ -197,7 +200,7 @@ def _smooth(state: Search, evidence: Sequence[Evidence]) -> bool:
     return state.deepest < FREE_SLOPES
 
 
-def _slope_error(works: Sequence[SiteWork]) -> float:
+def _slope_error(works: Sequence[Remains]) -> float:
     maps = [w.slope_error for w in works if math.isfinite(w.slope_error)]
     return float(torch.tensor(maps).square().mean().sqrt()) if maps else math.nan
 
@@ -211,9 +214,9 @@ def quiet(seen: Round, named: str) -> set[str]:
     return {n for n, e in left.items() if e.gain < QUIET_GAIN and e.fid < QUIET_FID}
 
 
-def misfit(state: Search, works: Sequence[SiteWork]) -> float:
+def misfit(state: Search, works: Sequence[Remains]) -> float:
     """Weighted sum of squares that all free parameters together leave, with the weights of an earlier look."""
-    weights = {id(w.chain.site): w.projector.weight for w in works}
+    weights = {id(w.site): w.weight for w in works}
     return sum(state.each(lambda chain: left_over(chain, weights[id(chain.site)] * chain.site.valid, state.dn)))
 
 

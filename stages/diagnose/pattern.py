@@ -11,7 +11,7 @@ from torch import Tensor
 
 from stages.diagnose.images import FEWEST
 from stages.diagnose.numbers import f_tail
-from stages.diagnose.statistics import SiteWork
+from stages.diagnose.statistics import Remains
 from stages.effects.albedo_map import ORDERS
 from stages.effects.fields import cosine_field
 
@@ -33,18 +33,18 @@ class PatternEvidence:
     p: float
 
 
-def weigh_pattern(works: Sequence[SiteWork]) -> PatternEvidence | None:
+def weigh_pattern(works: Sequence[Remains]) -> PatternEvidence | None:
     """From sites with enough images to know their albedo; None where there are none."""
     values, numbers, expected = [], [], []
     for work in works:
-        if work.chain.site.count < FEWEST:
+        if work.site.count < FEWEST:
             continue
         albedo = work.albedo - work.albedo.mean()
         height, width = albedo.shape
         orders = [(m, n) for m in range(SHORTEST + 1) for n in range(SHORTEST + 1) if m + n > 0]
         power = {o: float((albedo * cosine_field(o, height, width)).mean()) for o in orders}
         values.append(torch.tensor([power[o] for o in ORDERS]))
-        numbers.append(work.chain.site.number)
+        numbers.append(work.site.number)
         expected.append(_foretold({o: v * v for o, v in power.items()}))
     if not values:
         return None

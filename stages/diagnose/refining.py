@@ -11,11 +11,10 @@ from torch import Tensor
 
 from stages.diagnose.chain import Chain
 from stages.diagnose.evidence import Evidence
-from stages.diagnose.images import as_effect, weigh_images
-from stages.diagnose.relief import named_relief, weigh_relief
+from stages.diagnose.images import ImageProducts, as_effect, gather_images, weigh_images
+from stages.diagnose.relief import Relief, named_relief, weigh_relief
 from stages.diagnose.state import Cause, Search
 from stages.diagnose.statistics import (
-    SiteWork,
     Statistics,
     derivative_step,
     gather_site,
@@ -55,25 +54,24 @@ def refine(state: Search, steps: int = 2) -> None:
     for step in range(steps):
         state.fit(again=step > 0)
         every = state.each(lambda chain: _gather(state, chain))
-        works = [work for work, _, _ in every]
-        joined = join([lit for _, lit, _ in every])
+        joined = join([lit for lit, _, _ in every])
         if joined.count > 0:
             delta, error = solve_nuisance(joined)
             for cause in state.causes:
                 _move(cause, joined.names, delta, error)
-        for collected in zip(*(relief for _, _, relief in every), strict=True):
-            for evidence in weigh_relief(collected, works):
+        for collected in zip(*(relief for _, relief, _ in every), strict=True):
+            for evidence in weigh_relief(collected):
                 _move_relief(state, evidence)
         named = {c.effect.name: c for c in state.causes if c.effect.scope == "image"}
-        found = weigh_images(works, list(named), state.frames, state.dn, state.data) if named else {}
+        found = weigh_images([images for _, _, images in every], state.frames)
         for name, cause in named.items():
             if name in found and found[name].gain > WORTH_MOVING:
                 cause.effect = as_effect(found[name], cause.effect, state.data)
     state.fit()
 
 
-def _gather(state: Search, chain: Chain) -> tuple[SiteWork, Statistics, list[Statistics]]:
-    """Products of further steps of all named effects at one site; those of the DEM apart."""
+def _gather(state: Search, chain: Chain) -> tuple[Statistics, list[Relief], ImageProducts | None]:
+    """Products of further steps of all named effects at one site: scene-wide ones, the DEM's, those per image."""
     work = ready(chain, state.dn, wide=any(c.effect.channel == "edge" for c in state.causes))
     relief = []
     for place, effect in enumerate(chain.base):
@@ -81,7 +79,9 @@ def _gather(state: Search, chain: Chain) -> tuple[SiteWork, Statistics, list[Sta
             (coordinate,) = (p.name for p in effect.fitted())
             step = derivative_step(type(effect), coordinate, state.data)
             relief.append(named_relief(work, place, step, state.data))
-    return work, gather_site(work, [], state.data), relief
+    single = [e.name for e in state.base if e.scope == "image"]
+    lit = gather_site(work, [], state.data)
+    return lit, relief, gather_images(work, single, state.dn, state.data)
 
 
 def _move_relief(state: Search, evidence: Evidence) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from stages.diagnose.evidence import Evidence, weigh
 from stages.diagnose.statistics import (
@@ -23,14 +24,22 @@ ALONG = {"dem_smoothing": (), "dem_scale": ("dem_smoothing",)}  # effect -> nuis
 MOST_HIDDEN = 0.05  # of the given slopes' variance, that is taken for noise at most
 
 
-def open_relief(work: SiteWork, name: str, data: Survey) -> Statistics:
+@dataclass
+class Relief:
+    """Products of one site, and the sum of squares that the images' noise leaves in its maps."""
+
+    products: Statistics
+    noise: float
+
+
+def open_relief(work: SiteWork, name: str, data: Survey) -> Relief:
     """Products of an effect that is not in the model yet."""
     candidates = make_candidates([name], data)
     columns = [c for e in candidates for c in trial_columns(work.chain, name, e.trial, data)]
     return _gather(work, candidates, columns, name, data)
 
 
-def named_relief(work: SiteWork, place: int, step: float, data: Survey) -> Statistics:
+def named_relief(work: SiteWork, place: int, step: float, data: Survey) -> Relief:
     """Products of a further step of the effect at ``place`` in the model."""
     effect = work.chain.base[place]
     (coordinate,) = (p.name for p in effect.fitted())
@@ -39,24 +48,25 @@ def named_relief(work: SiteWork, place: int, step: float, data: Survey) -> Stati
     return _gather(work, [Candidate(effect.name, trial, slice(0, 1))], [column], effect.name, data)
 
 
-def _gather(work: SiteWork, candidates, columns, name: str, data: Survey) -> Statistics:
+def _gather(work: SiteWork, candidates, columns, name: str, data: Survey) -> Relief:
     named = [e.name for e in work.chain.base]
     along = [
         (other, BASELINE[other], trial_columns(work.chain, other, get_effect(other).trials(data)[0], data)[0])
         for other in ALONG[name]
         if other not in named
     ]
-    return gather_static(work, candidates, columns, along, nominal=True, maps=slice(1, None))
+    products = gather_static(work, candidates, columns, along, nominal=True, maps=slice(1, None))
+    return Relief(products, work.projector.slope_noise())
 
 
-def weigh_relief(parts: Sequence[Statistics], works: Sequence[SiteWork]) -> list[Evidence]:
+def weigh_relief(parts: Sequence[Relief]) -> list[Evidence]:
     """Evidence from the maps of slope errors of all sites, a DEM's scale corrected for the DEM's own noise.
 
     Slopes that the DEM has and the ground has not draw the regression of slope errors on given slopes to smaller
     scales, by their share of the given slopes' variance (Fuller 1987, Measurement Error Models, ch. 1). That share is
     estimated from what the fit leaves of the maps beyond the images' noise.
     """
-    data = join(parts)
+    data = join([p.products for p in parts])
     evidence = weigh(data)
     for k, e in enumerate(evidence):
         if e.effect != "dem_scale" or e.gain <= 0:
@@ -64,7 +74,7 @@ def weigh_relief(parts: Sequence[Statistics], works: Sequence[SiteWork]) -> list
         m = data.count
         sums = data.products.sum(0)
         place = m + 1 + e.candidate.columns.start
-        left = float(sums[m, m]) - 2 * e.gain - sum(w.projector.slope_noise() for w in works)
+        left = float(sums[m, m]) - 2 * e.gain - sum(p.noise for p in parts)
         (reference,) = e.candidate.trial.columns[0].values()
         hidden = reference**2 * max(left, 0.0) / max(float(sums[place, place]), 1e-30)
         hidden = min(hidden, MOST_HIDDEN)
@@ -73,4 +83,4 @@ def weigh_relief(parts: Sequence[Statistics], works: Sequence[SiteWork]) -> list
     return evidence
 
 
-__all__ = ["ALONG", "named_relief", "open_relief", "weigh_relief"]
+__all__ = ["ALONG", "Relief", "named_relief", "open_relief", "weigh_relief"]

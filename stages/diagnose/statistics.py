@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.chain import Chain
-from stages.diagnose.data import GRAZING
+from stages.diagnose.data import GRAZING, Site
 from stages.diagnose.projection import Local, Projector
 from stages.effects import Effect, Survey, Trial, get_effect
 
@@ -63,6 +63,20 @@ class SiteWork:
     static: Tensor
     dynamic: Tensor
     slope_error: float = math.nan
+
+    def remains(self) -> Remains:
+        return Remains(self.chain.site, self.projector.weight, self.albedo, self.dynamic, self.slope_error)
+
+
+@dataclass
+class Remains:
+    """What is kept of a site's work while other sites are worked on; names as in :class:`SiteWork`."""
+
+    site: Site
+    weight: Tensor
+    albedo: Tensor
+    dynamic: Tensor
+    slope_error: float
 
 
 @dataclass

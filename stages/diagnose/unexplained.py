@@ -11,7 +11,7 @@ from stages.diagnose.images import FEWEST
 from stages.diagnose.looking import Round
 from stages.diagnose.naming import BLUR, FLOOR_FID
 from stages.diagnose.state import Search
-from stages.diagnose.statistics import SiteWork
+from stages.diagnose.statistics import Remains
 from stages.effects import effect_names, get_effect
 
 CELL = 8  # px
@@ -38,15 +38,15 @@ class Structure:
         return self.largest > STRUCTURE or self.peak > PEAK
 
 
-def measure(works: list[SiteWork]) -> Structure:
+def measure(works: list[Remains]) -> Structure:
     """Structure of the dynamic residual rows, in units of the noise."""
     cells, lines, columns, weights = [], [], [], []
     spectra = None
     for work in works:
-        if work.chain.site.count < 2:
+        if work.site.count < 2:
             continue
         y = work.dynamic
-        used = (work.projector.weight > 0).float()
+        used = (work.weight > 0).float()
         y = y.clamp(-4, 4) * used
         noise = _noise(y, used)
         y = y / noise
