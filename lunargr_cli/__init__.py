@@ -10,6 +10,19 @@ import sys
 from typing import Any
 
 INTERRUPTED = "lunargr: interrupted; nothing half-written was kept."
+signals: list[int] = []  # that asked this command to stop
+
+
+def stop(number: int, frame: Any) -> None:
+    """Unwind: locks are let go of, and partial files go."""
+    signals.append(number)
+    raise_again()
+
+
+def raise_again() -> None:
+    """Python swallows what is raised while it collects garbage: whoever is called often asks here."""
+    if signals:
+        raise KeyboardInterrupt if signals[0] == signal.SIGINT else SystemExit(128 + signals[0])
 
 
 def _leave(number: int, frame: Any) -> None:

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
+from lunargr_cli import raise_again
+
 
 def say_error(message: str) -> None:
     """One line on standard error."""
@@ -34,6 +36,7 @@ class Console:
 
     def progress(self, done: int, total: int, what: str = "") -> None:
         """Show how far a long loop is and how long it still takes."""
+        raise_again()
         now = time.monotonic()
         if done == 0:
             self._started = now

@@ -16,7 +16,7 @@ from typing import Any
 
 import typer
 
-from lunargr_cli import INTERRUPTED, commands
+from lunargr_cli import INTERRUPTED, commands, signals, stop
 from lunargr_cli.console import say_error
 from schemas.errors import EXIT_CODE, LunargrError
 from schemas.locks import claim
@@ -74,21 +74,14 @@ for _module in sorted(
 
 def main() -> None:
     """Run the command line; a LunargrError is one line on standard error and exit code 3."""
-    # A Slurm time limit or `kill` unwinds like Ctrl-C: locks are let go of, and partial files go.
-    signal.signal(signal.SIGTERM, _stop)
-    interrupted: list[int] = []
-
-    def interrupt(number: int, frame: Any) -> None:
-        interrupted.append(number)
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGINT, interrupt)
+    for number in (signal.SIGINT, signal.SIGTERM):  # a Slurm time limit or `kill` unwinds like Ctrl-C
+        signal.signal(number, stop)
     try:
         app()
     except BaseException as error:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is left to tidy while Python ends
         # What an interruption breaks may say something else: a library that was just being imported, for one.
-        if interrupted or isinstance(error, KeyboardInterrupt):
+        if signal.SIGINT in signals or isinstance(error, KeyboardInterrupt):
             print(INTERRUPTED, file=sys.stderr, flush=True)
             # Not sys.exit: Python would end itself by the signal where one of its own parts saw the interruption.
             os._exit(130)
@@ -117,10 +110,6 @@ def _lost_input(error: Exception) -> str | None:
         f"{lost[0]}: gone, or changed, while it was being read ({type(error).__name__}: {error}); nothing half-written is left. "
         "Bring it back and run the command again."
     )
-
-
-def _stop(number: int, frame: Any) -> None:
-    raise SystemExit(128 + number)
 
 
 if __name__ == "__main__":
