@@ -121,7 +121,7 @@ def _site_folds(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) ->
     # all columns of single images at once: shifts (and gain and offset), then the effects' own
     base = [e.name for e in chain.base]
     named = {*base, *(e.name for e in chain.moved)}
-    groups = {"": nuisance_columns(chain, dn)}
+    groups = {"": nuisance_columns(chain, dn), "brightness": chain.textured[:, None]}
     for name in names:
         place = base.index(name) if name in base else None
         groups[name] = torch.stack(image_columns(chain, get_effect(name), place), 1)
@@ -144,8 +144,8 @@ def _site_folds(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) ->
     out = {}
     for name in names:
         others = own[""]
-        if name == "misregistration":
-            others = others[2:]
+        if name == "misregistration":  # what a wrong phase function does to an image's brightness is no shift
+            others = np.concatenate([others[2:], own["brightness"]]) if not dn else others[2:]
         elif name in named:
             others = others[: 4 if dn else 2]
         nuisance = np.concatenate([np.arange(first - 1), places(others)])
