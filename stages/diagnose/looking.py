@@ -40,6 +40,7 @@ DISTANCES = (0.04, 1.0, 3.0)  # ... and of its distance, about the best of the f
 ALIGNMENTS = 3
 OVERSHOOT = 1.5  # texture and slopes, known from images that are not aligned yet, hide a third of each shift
 ENOUGH_PX = 0.06
+SAME = 0.6  # agreement over the sites, below which shifts are something else
 QUIET_GAIN, QUIET_FID = 6.0, 0.012  # below both an effect is not looked at again
 SURE = 0.01  # of the two halves of the blocks agreeing by chance
 
@@ -134,13 +135,13 @@ def align(state: Search) -> ImageEvidence | None:
 
     A shift of a third of a pixel is ordinary and no cause, but its second order looks like a blur or a reflectance.
     """
-    cls, first = get_effect("misregistration"), None
+    cls, first, last = get_effect("misregistration"), None, math.inf
     for _ in range(ALIGNMENTS if state.deepest >= FEWEST else 0):
         every = state.each(lambda chain: gather_images(ready(chain, state.dn), [cls.name], state.dn, state.data))
         found = weigh_images(every, state.frames).get(cls.name)
-        if found is None or found.p > SURE or found.gain < 0:
+        if found is None or found.p > SURE or found.gain < 0 or found.agreement < SAME or found.rms > last:
             break
-        first = first or found
+        first, last = first or found, found.rms
         state.aligned = as_effect(found, state.aligned, state.data, OVERSHOOT)
         state.fit()
         if found.rms < ENOUGH_PX:

@@ -10,6 +10,7 @@ from stages.diagnose.looking import Round, align, look, misfit, narrowed, quiet
 from stages.diagnose.naming import KEEP_SHARE, SIMPLER, choose, misaligned, with_values, worth_image
 from stages.diagnose.refining import refine
 from stages.diagnose.state import Cause, Saved, Search
+from stages.effects import get_effect
 
 REFUSALS = 3
 MUCH = 0.02  # of what is left: by so much a cause for each image must do better than one for all
@@ -50,6 +51,7 @@ def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
             continue
         say(f"found {cause.effect.name}: gain {cause.gain:.0f} +- {cause.gain_error:.0f} nats")
         _settle_shifts(state)
+        _settle_gains(state, seen)
         if cause.effect.scope == "site":  # the pattern of these sites' albedo was out of everything else already
             seen.pattern = None
             continue
@@ -67,6 +69,23 @@ def _settle_shifts(state: Search) -> None:
         if e is not None and len(state.causes) > 1 and not worth_image(with_values(e, cause.effect), 1):
             state.aligned = cause.effect
             state.causes.remove(cause)
+
+
+def _settle_gains(state: Search, seen: Round) -> None:
+    """Gains of images stand for any two scene-wide causes together; once one of these is named, the other may do."""
+    gains = next((c for c in state.causes if c.effect.name == "image_gain"), None)
+    if gains is None or gains is state.causes[-1]:
+        return
+    before, best, rms = state.save(), misfit(state, seen.works), state.residual_rms()
+    state.causes.remove(gains)
+    refine(state, 2)
+    names = [n for n in state.open_names() if get_effect(n).scope == "scene" and get_effect(n).channel == "lit"]
+    rivals = [c for c in choose(state, look(state, names)) if c.effect.scope == "scene"]
+    if rivals:
+        cause = _contest(state, rivals, seen)
+        cause.rms_before, cause.rms_after = rms, state.residual_rms()
+    if misfit(state, seen.works) > (1 + MUCH) * best:
+        state.load(before)
 
 
 def _kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> bool:

@@ -141,7 +141,8 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
 def left_over(chain: Chain, weight: Tensor, dn: bool) -> float:
     """Sum of squares of the dynamic residual at given weights, without shifts, unresolved slopes, the nominal model's freedom."""
     projector = Projector(chain, weight)
-    local = Local(projector, nuisance_columns(chain, dn))
+    # values per image stay as they are, or they would have a set for each site here
+    local = Local(projector, nuisance_columns(chain, dn, named=False))
     residual = chain.site.image - chain.textured
     columns = torch.stack([*_site_columns(chain), chain.unresolved_slopes(), residual]) * weight
     on_basis = projector.coefficients(columns)
@@ -190,8 +191,8 @@ def _rescale(dynamic: Tensor, projector: Projector) -> Tensor:
     return out.clamp(max=float(2 * out.median())).clamp(0.2, 5.0)
 
 
-def nuisance_columns(chain: Chain, dn: bool) -> Tensor:
-    """(n, k, H, W): shift east and south, for dn images gain and offset, and image-wide effects named already."""
+def nuisance_columns(chain: Chain, dn: bool, named: bool = True) -> Tensor:
+    """(n, k, H, W): shift east and south, for dn images gain and offset, and image-wide effects ``named`` already."""
     image = chain.textured
     east = torch.zeros_like(image)
     south = torch.zeros_like(image)
@@ -200,10 +201,10 @@ def nuisance_columns(chain: Chain, dn: bool) -> Tensor:
     columns = [east, south]
     if dn:
         columns += [image, torch.full_like(image, float(image.mean()))]
-    for k, effect in enumerate(chain.base):
+    for k, effect in enumerate(chain.base if named else ()):
         if effect.scope == "image":
             columns += list(image_columns(chain, type(effect), k))
-    for effect in chain.moved:
+    for effect in chain.moved if named else ():
         if effect.name != "misregistration":  # shifts are there already
             columns += list(image_columns(chain, type(effect)))
     return torch.stack(columns, 1)

@@ -18,7 +18,7 @@ from hidden.sensor import Detector, Pose, shoot
 from hidden.terrain import make_terrain, red_noise
 
 RADIUS = 1737400.0
-ALTITUDE = 100e3
+DISTANCE = 400.0  # crop sizes: the traced camera is at infinity
 
 
 @dataclass(frozen=True)
@@ -267,7 +267,7 @@ class Scene:
                 out["detector_sample"].append(sample)
                 out["detector_line"].append(line)
                 out["sun_direction_enu"].append(sun)
-                out["camera_position_enu"].append(self.views[image] * ALTITUDE)
+                out["camera_position_enu"].append(self.views[image] * DISTANCE * lay.size * lay.gsd)
                 out["image_index"].append(image)
                 out["site"].append(site)
                 out["split"].append(2 if split and site == lay.sites - 1 else 0)
