@@ -311,7 +311,7 @@ class Scene:
             e = effect["echo"]
             camera.smear = (e["fraction"], int(e["lag_px"]), int(e.get("axis", 0)))
         if "column_pattern" in effect:
-            rms = effect["column_pattern"]["rms"]
+            uneven = effect["column_pattern"]["rms"]
             half = 1.5 * self.layout.size  # the ground falls on other columns in every image
 
             def response(sample):
@@ -319,7 +319,7 @@ class Scene:
                 shape = 0.9 * u**2 + 0.5 * np.sin(2.3 * u)
                 inside = np.linspace(-1, 1, 200)
                 known = 0.9 * inside**2 + 0.5 * np.sin(2.3 * inside)
-                return 1 - rms * (shape - known.mean()) / known.std()
+                return 1 - uneven * (shape - known.mean()) / known.std()
 
             camera.response = response
         camera.level = effect.get("saturation", {}).get("iof", np.inf)
