@@ -41,7 +41,13 @@ def _alone(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
-        said.set((_command_line(), os.getcwd()))
+        before = said.set((_command_line(), os.getcwd()))
+        try:
+            alone(*arguments, **options)
+        finally:
+            said.reset(before)
+
+    def alone(*arguments: Any, **options: Any) -> None:
         output = inspect.signature(command).bind(*arguments, **options).arguments.get("output")
         # Under torchrun the first process alone writes.
         if isinstance(output, Path) and os.environ.get("RANK", "0") == "0":

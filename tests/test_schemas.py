@@ -77,7 +77,8 @@ def test_an_incomplete_artefact_is_a_bug_and_leaves_nothing(tmp_path):
 def test_a_killed_stage_leaves_nothing(tmp_path, number):
     code = textwrap.dedent(
         """
-        import sys, time
+        import signal, sys, time
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background
         from pathlib import Path
         from schemas import PAIRS, ArtefactWriter
         with ArtefactWriter(Path(sys.argv[1]), PAIRS, {"pair": 1, "y": 2, "x": 2, "enu": 3, "frame": 1}) as w:
