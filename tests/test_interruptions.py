@@ -21,7 +21,11 @@ LINE = "lunargr: interrupted; nothing half-written was kept.\n"
 
 
 def python(program: str) -> subprocess.CompletedProcess:
-    words = [sys.executable, "-c", f"import os, signal, sys; sys.argv = ['lunargr', 'schema', 'pairs']; {program}"]
+    listen = (
+        "signal.signal(signal.SIGINT, signal.default_int_handler)"  # shells make what runs in the background deaf to it
+    )
+    start = f"import os, signal, sys; {listen}; sys.argv = ['lunargr', 'schema', 'pairs']"
+    words = [sys.executable, "-c", f"{start}; {program}"]
     return subprocess.run(words, capture_output=True, text=True)
 
 
