@@ -52,7 +52,7 @@ def full_scale(largest: float) -> float:
     if largest <= 1:
         return 1.0
     bits = 8
-    while 2**bits - 1 < largest:
+    while 2**bits - 0.5 < largest:  # files that keep a tenth of a count round a little over the top
         bits += 1
     return float(2**bits - 1)
 
