@@ -108,7 +108,9 @@ def test_a_constant_rendering_is_matched_by_the_mean():
         assert torch.allclose(match_crops(rendered, measured, valid, how), torch.full((1, 8, 8), 0.5))
 
 
-@pytest.mark.parametrize(("largest", "expected"), [(0.4, 1), (17, 255), (255, 255), (255.006, 255), (256, 511), (4000, 4095)])
+@pytest.mark.parametrize(
+    ("largest", "expected"), [(0.4, 1), (17, 255), (255, 255), (255.006, 255), (256, 511), (4000, 4095)]
+)
 def test_full_scale_of_digital_numbers(largest, expected):
     assert full_scale(largest) == expected
 
