@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar
@@ -55,7 +56,7 @@ class Trial:
     fixed: Mapping[str, float] = field(default_factory=dict)
 
 
-class Effect:
+class Effect(ABC):
     """Base of every effect. Subclasses fill the class attributes and ``apply``; the default trial is one per parameter.
 
     slot         where in the chain it acts: geometry, illumination, reflectance, radiance or sensor
@@ -125,9 +126,9 @@ class Effect:
     def bounds(cls, name: str) -> tuple[float, float]:
         return next((p.lower, p.upper) for p in cls.fitted() if p.name == name)
 
+    @abstractmethod
     def apply(self, state: State) -> None:
         """Change what the slot may change (see ``formation.State``), differentiable in the values."""
-        raise NotImplementedError(f"{type(self).__name__} must define apply")
 
     def value(self, name: str, state: State) -> Tensor:
         """A coordinate ready to multiply images: scalar, or (B, 1, 1) by image or site; null where not known."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -34,7 +35,7 @@ class Models:
     lightglue: Path | None = None
 
 
-class Matcher:
+class Matcher(ABC):
     """Base of every matcher. One file in this folder per matcher; it decorates itself with @register."""
 
     name: ClassVar[str]
@@ -46,9 +47,9 @@ class Matcher:
         if models.features is not None and not self.needs_models:
             raise ConfigError(f"--features-model: the matcher '{self.name}' takes no network; choose aliked or disk.")
 
+    @abstractmethod
     def match(self, measured: np.ndarray, rendered: np.ndarray) -> Matches:
         """Correspondences between two (H, W) uint8 pictures."""
-        raise NotImplementedError(f"{type(self).__name__} must define match")
 
 
 _MATCHERS: dict[str, type[Matcher]] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
@@ -28,7 +29,7 @@ class Parameter:
 ALBEDO = Parameter("albedo", "1", 0.0, 1.0, 0.12, "normal albedo: I/F at incidence = emission = phase = 0")
 
 
-class ReflectanceModel:
+class ReflectanceModel(ABC):
     """Base of every reflectance model. Subclasses fill the class attributes and ``radiance_factor``."""
 
     name: ClassVar[str]
@@ -42,12 +43,12 @@ class ReflectanceModel:
     # The formula and its gradients are finite for any cosines in [-1, 1]: no need to keep them from 0 first.
     finite: ClassVar[bool] = False
 
+    @abstractmethod
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         """I/F = pi r, including cos(incidence), wherever incidence and emission are below 90 deg.
 
         parameters : tensors that broadcast with the angles. Callers use :func:`evaluate`, which masks the rest.
         """
-        raise NotImplementedError(f"{type(self).__name__} must define radiance_factor")
 
     def constrain(self, raw: Tensor, dim: int) -> Tensor:
         """Network outputs -> parameters within their bounds (sigmoid between lower and upper)."""

@@ -26,6 +26,7 @@ Effective cosines mu0e, mue and shadowing S: macroscopic roughness of mean slope
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
 
@@ -99,8 +100,9 @@ class HapkeBase(ReflectanceModel):
     reciprocal = True
     h_function: ClassVar[str] = "2002"
 
+    @abstractmethod
     def phase_function(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
-        raise NotImplementedError(f"{type(self).__name__} must define phase_function")
+        """p(g) of single scattering, 1 on average over the sphere."""
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         w = parameters["w"]
