@@ -1,7 +1,8 @@
-"""Artefact schemas, declared once; HDF5 writing, opening and validation; the errors."""
+"""Artefact schemas, declared once; writing, opening and validation; the errors."""
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from schemas.artefacts import CHECKPOINT, CROPS, DIAGNOSIS, EVALUATION, PAIRS, SCENE, SPLITS, SVBRDF, UNITS
@@ -17,26 +18,26 @@ from schemas.errors import (
 )
 from schemas.truth import TRUTH
 
-_HDF5 = ("ArtefactWriter", "atomic_path", "check_output", "open_artefact", "read_config", "read_kind", "read_strings")
+# Where those are who need h5py: `lunargr --help` must answer at once.
+_LATER = {
+    "ArtefactWriter": "writing",
+    "atomic_path": "outputs",
+    "check_output": "outputs",
+    "open_artefact": "reading",
+    "read_config": "reading",
+    "read_kind": "reading",
+    "read_strings": "reading",
+}
 
 if TYPE_CHECKING:
-    from schemas.hdf5 import (
-        ArtefactWriter,
-        atomic_path,
-        check_output,
-        open_artefact,
-        read_config,
-        read_kind,
-        read_strings,
-    )
+    from schemas.outputs import atomic_path, check_output
+    from schemas.reading import open_artefact, read_config, read_kind, read_strings
+    from schemas.writing import ArtefactWriter
 
 
 def __getattr__(name: str) -> Any:
-    """Import h5py only for those who open files: `lunargr --help` must answer at once."""
-    if name in _HDF5:
-        from schemas import hdf5
-
-        return getattr(hdf5, name)
+    if name in _LATER:
+        return getattr(importlib.import_module(f"schemas.{_LATER[name]}"), name)
     raise AttributeError(f"module 'schemas' has no attribute '{name}'")
 
 

@@ -25,7 +25,8 @@ from schemas import (
     InputError,
     open_artefact,
 )
-from schemas.hdf5 import sha256, unpack
+from schemas.provenance import sha256
+from schemas.reading import unpack
 from stages.physics import rasters
 from stages.physics.frames import Frame, load_frames
 from stages.physics.grid import Grid, LocalFrames, read_grid

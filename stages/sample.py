@@ -18,7 +18,7 @@ from geographiclib.geodesic import Geodesic
 from numpy.typing import NDArray
 
 from schemas import CROPS, SCENE, SPLITS, ArtefactWriter, ConfigError, GeometryError, open_artefact
-from schemas.hdf5 import sha256
+from schemas.provenance import sha256
 from stages.physics.frames import Frame, load_frames, relative_path, write_frames
 from stages.physics.grid import Grid, read_grid
 from stages.physics.positions import blocks, valid_positions

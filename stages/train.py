@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from schemas import CHECKPOINT, ArtefactWriter, ConfigError, InputError, check_output
-from schemas.hdf5 import sha256
+from schemas.provenance import sha256
 from stages.network import symmetries
 from stages.network.dataset import Batch, PairReader
 from stages.network.losses import Radiometry, masked_mse, squared_error

@@ -11,6 +11,8 @@ from rasterio.transform import Affine
 
 from schemas import ConfigError, GeometryError, InputError
 from stages import ingest
+from stages.ingest import elevation
+from stages.physics import rasters
 from stages.physics.positions import valid_positions
 
 
@@ -44,9 +46,9 @@ def test_pieces_however_small_give_the_same_scene(small_files, tmp_path, monkeyp
         small_scene.write_raster(strips, dem.read(1), dem.crs, dem.transform, nodata=dem.nodata, blockysize=1)
     for name, dem in (("a", small_files.dem), ("b", strips)):
         ingest.run(dem, small_files.images, tmp_path / f"{name}.h5", ingest.Config(gsd=gsd, crop=32, block=64))
-        monkeypatch.setattr(ingest, "STRIP_PX", 100)
-        monkeypatch.setattr(ingest, "STRIPS", 384 * 4 * 100)
-        monkeypatch.setattr(ingest.rasters, "LARGEST_WINDOW", 5000)
+        monkeypatch.setattr(elevation, "STRIP_PX", 100)
+        monkeypatch.setattr(elevation, "STRIPS", 384 * 4 * 100)
+        monkeypatch.setattr(rasters, "LARGEST_WINDOW", 5000)
     with h5py.File(tmp_path / "a.h5") as a, h5py.File(tmp_path / "b.h5") as b:
         np.testing.assert_allclose(a["elevation"][...], b["elevation"][...], atol=1e-4, rtol=0)
         for name in ("dem_valid", "valid"):  # GDAL rounds a pixel on the edge of nodata to one side or the other

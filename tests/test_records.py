@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from schemas import PAIRS, ArtefactError, ArtefactWriter
-from schemas.hdf5 import UNKNOWN, unpack
+from schemas.hdf5 import UNKNOWN
+from schemas.reading import unpack
 from stages.network.dataset import PairReader
 from stages.network.records import Mapping, Records
 

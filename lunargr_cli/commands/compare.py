@@ -95,7 +95,7 @@ def _same(checkpoint: Path, config: Any, pairs: Path) -> bool:
     from dataclasses import asdict
 
     from schemas import CHECKPOINT, open_artefact, read_config
-    from schemas.hdf5 import sha256
+    from schemas.provenance import sha256
 
     with open_artefact(checkpoint, CHECKPOINT) as file:
         found, inputs = read_config(file), json.loads(str(file.attrs["inputs"]))

@@ -16,8 +16,9 @@ from typing import Any
 
 from lunargr_cli.fanout.engines import Engine, Here, Task, open_dask
 from schemas.errors import ConfigError, InputError
-from schemas.hdf5 import check_output, sha256
 from schemas.locks import claim
+from schemas.outputs import check_output
+from schemas.provenance import sha256
 
 Progress = Callable[[int, int, str], None]
 Say = Callable[[str], None]

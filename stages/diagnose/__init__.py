@@ -2,11 +2,14 @@
 
 data         measured pairs by site            chain       the forward model, rendered with small changes
 nominal      the model that is judged          projection  texture and DEM error taken out, per ground pixel
+columns      what effects add to images        preparing   a site's weights, texture and slopes
 statistics   products per cluster of pixels    evidence    held-out gain and significance, scene-wide effects
-images       the same for effects per image    selection   name, refine, look again
-plateau      highlights that are cut off                relief      a DEM's scale and smoothing
-parallel     sites side by side
-unexplained  what is left, what cannot be seen answer      verdict, JSON, diagnosis.h5      report   HTML
+images       effects with values per image     relief      a DEM's scale and smoothing
+pattern      a broad albedo pattern            plateau     highlights that are cut off
+looking      one look at all of that           naming      what deserves a name after it
+refining     the values that fit best          selection   name, refine, look again
+state        what is known so far              parallel    sites side by side
+unexplained  what is left, what is not seen    answer      verdict, JSON, diagnosis.h5      report   HTML
 """
 
 from __future__ import annotations

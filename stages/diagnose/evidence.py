@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stages.diagnose.columns import Candidate
 from stages.diagnose.numbers import f_tail
-from stages.diagnose.statistics import SITE, Candidate, Statistics
+from stages.diagnose.statistics import SITE, Statistics
 
 
 @dataclass

@@ -11,18 +11,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.diagnose.numbers import f_tail
-from stages.diagnose.projection import Local
-from stages.diagnose.statistics import (
+from stages.diagnose.columns import (
     BASELINE,
-    BLOCK,
-    SiteWork,
-    _site_columns,
     image_columns,
+    nominal_columns,
     nuisance_columns,
     tangent_columns,
     trial_columns,
 )
+from stages.diagnose.numbers import f_tail
+from stages.diagnose.preparing import SiteWork
+from stages.diagnose.projection import Local
+from stages.diagnose.statistics import BLOCK
 from stages.effects import Effect, Survey, get_effect
 
 FEWEST = 3  # images of a site, below which an image's own fault and the ground's texture are one
@@ -111,7 +111,7 @@ def _agreement(values: Tensor, parts: list[tuple[Tensor, _Fold]]) -> float:
 def _site_folds(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) -> dict[str, list[_Fold]]:
     """Per effect, normal equations of its values on two interleaved halves of the blocks, everything else removed."""
     chain, projector = work.chain, work.projector
-    fixed = [*_site_columns(chain), chain.unresolved_slopes(), *tangent_columns(chain, data)[1]]
+    fixed = [*nominal_columns(chain), chain.unresolved_slopes(), *tangent_columns(chain, data)[1]]
     for effect in BASELINE:
         if effect not in [e.name for e in chain.base]:
             fixed += trial_columns(chain, effect, get_effect(effect).trials(data)[0], data)

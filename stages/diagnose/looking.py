@@ -10,28 +10,15 @@ from dataclasses import dataclass, field
 import torch
 
 from stages.diagnose.chain import Chain
+from stages.diagnose.columns import BASELINE, Candidate, make_candidates, trial_columns
 from stages.diagnose.evidence import Evidence, best_guises, weigh
 from stages.diagnose.images import FEWEST, ImageEvidence, ImageProducts, as_effect, gather_images, weigh_images
 from stages.diagnose.pattern import PatternEvidence, weigh_pattern
+from stages.diagnose.preparing import Remains, left_over, ready
 from stages.diagnose.projection import FREE_SLOPES
 from stages.diagnose.relief import ALONG, Relief, open_relief, weigh_relief
 from stages.diagnose.state import Search
-from stages.diagnose.statistics import (
-    BASELINE,
-    Candidate,
-    Remains,
-    Statistics,
-    gather_site,
-    gather_static,
-    given,
-    join,
-    left_over,
-    make_candidates,
-    ready,
-    swap,
-    trial_columns,
-    without,
-)
+from stages.diagnose.statistics import Statistics, gather_site, gather_static, given, join, swap, without
 from stages.effects import get_effect
 
 RELIEF_WIDTHS = (1.6, 4.0)  # deg: relief below the DEM's resolution blurs shadow edges like discs of these radii

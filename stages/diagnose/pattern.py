@@ -11,7 +11,7 @@ from torch import Tensor
 
 from stages.diagnose.images import FEWEST
 from stages.diagnose.numbers import f_tail
-from stages.diagnose.statistics import Remains
+from stages.diagnose.preparing import Remains
 from stages.effects.albedo_map import ORDERS
 from stages.effects.fields import cosine_field
 

@@ -10,17 +10,13 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.chain import Chain
+from stages.diagnose.columns import derivative_step
 from stages.diagnose.evidence import Evidence
 from stages.diagnose.images import ImageProducts, as_effect, gather_images, weigh_images
+from stages.diagnose.preparing import ready
 from stages.diagnose.relief import Relief, named_relief, weigh_relief
 from stages.diagnose.state import Cause, Search
-from stages.diagnose.statistics import (
-    Statistics,
-    derivative_step,
-    gather_site,
-    join,
-    ready,
-)
+from stages.diagnose.statistics import Statistics, gather_site, join
 from stages.effects import Effect, Survey, get_effect
 
 WORTH_MOVING = 12.0  # nats

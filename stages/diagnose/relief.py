@@ -6,18 +6,10 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from stages.diagnose.columns import BASELINE, Candidate, make_candidates, tangent, trial_columns
 from stages.diagnose.evidence import Evidence, weigh
-from stages.diagnose.statistics import (
-    BASELINE,
-    Candidate,
-    SiteWork,
-    Statistics,
-    gather_static,
-    join,
-    make_candidates,
-    tangent,
-    trial_columns,
-)
+from stages.diagnose.preparing import SiteWork
+from stages.diagnose.statistics import Statistics, gather_static, join
 from stages.effects import Survey, Trial, get_effect
 
 ALONG = {"dem_smoothing": (), "dem_scale": ("dem_smoothing",)}  # effect -> nuisances fitted along

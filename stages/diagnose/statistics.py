@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,72 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stages.diagnose.chain import Chain
-from stages.diagnose.data import GRAZING, Site
-from stages.diagnose.projection import Local, Projector
-from stages.effects import Effect, Survey, Trial, get_effect
+from stages.diagnose.columns import BASELINE, Candidate, nominal_columns, tangent_columns, trial_columns
+from stages.diagnose.preparing import SiteWork, clear_of_
+from stages.effects import Survey, get_effect
 
 BLOCK = 32  # px
 SITE = 10_000  # between the numbers of two sites' first blocks
-CUT = math.radians(15)  # photometric effects are judged where neither slope nor shadow is a matter of sub-pixel relief
-DEEP = math.radians(2)  # below the horizon: shadow, whatever the DEM's errors
-OUTLIER = 7.0  # sigma
-QUIETEST = 0.002  # noise over mean brightness: an image that looks quieter is dark
-SHOT = 0.8  # share of shot noise in the noise's variance at mean brightness
-EDGE = math.radians(6.0)  # relief below the DEM's resolution blurs shadows over a band like this ...
-DOUBT = 0.3  # ... by up to this share of the lit brightness
-# What every data set has a little of, always fitted along, with the size that is ordinary (multiples of the column):
-# without a bound on it a strange amount of one imitates other effects.
-BASELINE = {"dem_smoothing": 0.7, "psf_blur": 0.4}
 UNRESOLVED_SLOPES = 1.0
 FREE = 1e6  # no bound
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """An effect in one of its guises, and which columns are its."""
-
-    effect: str
-    trial: Trial
-    columns: slice
-
-    @property
-    def size(self) -> int:
-        return self.columns.stop - self.columns.start
-
-
-@dataclass
-class SiteWork:
-    """A site made ready: weights, projection, and what is left of the measurement.
-
-    residual : (n, H, W), I/F, measured minus predicted; albedo : (H, W), relative albedo of the ground beyond the
-    prediction, not whitened; static : (K, H, W), whitened maps of the residual; dynamic : (n, H, W), the residual's
-    dynamic rows once everything local and the nominal model's own freedom are taken out; slope_error : rms per axis of the
-    apparent slope errors, as tangent, by their median, NaN where images are too few
-    """
-
-    chain: Chain
-    projector: Projector
-    local: Local
-    residual: Tensor
-    albedo: Tensor
-    static: Tensor
-    dynamic: Tensor
-    slope_error: float = math.nan
-
-    def remains(self) -> Remains:
-        return Remains(self.chain.site, self.projector.weight, self.albedo, self.dynamic, self.slope_error)
-
-
-@dataclass
-class Remains:
-    """What is kept of a site's work while other sites are worked on; names as in :class:`SiteWork`."""
-
-    site: Site
-    weight: Tensor
-    albedo: Tensor
-    dynamic: Tensor
-    slope_error: float
 
 
 @dataclass
@@ -101,188 +42,12 @@ class Statistics:
         return len(self.names)
 
 
-def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
-    """Weights from the residual's own scatter, the projector, the texture. ``wide`` keeps the pixels about shadow edges."""
-    site = chain.site
-    weight = _first_weight(chain, wide)
-    residual = torch.where(site.valid, site.image - chain.textured, 0.0)
-    level = (chain.textured * site.valid).sum((-2, -1)) / site.valid.sum((-2, -1)).clamp(min=1)
-    most = 1 / (QUIETEST * level.clamp(min=1e-6))[:, None, None]
-
-    def split() -> tuple[Projector, Tensor, Tensor]:
-        projector = Projector(chain, weight)
-        weighted = (residual * weight)[None]
-        on_basis = projector.coefficients(weighted)
-        return projector, projector.project_(weighted, on_basis)[0], projector.maps(on_basis)[0]
-
-    projector, dynamic, maps = split()
-    for _ in range(2):
-        if len(weight) < 2:  # one image: its noise and the ground's texture cannot be told apart
-            weight = weight / float((residual * weight).square()[weight > 0].mean().clamp(min=1e-12)) ** 0.5
-        else:
-            weight = weight * _rescale(dynamic, projector)[:, None, None]
-            if not wide:  # what no smooth effect can do: shadows of unknown walls, cut-off highlights, dead pixels
-                gross = dynamic.abs() > OUTLIER
-                if float(gross.sum()) < 0.3 * float((weight > 0).sum()):
-                    weight = weight * ~gross
-        weight = weight.minimum(most)
-        projector, dynamic, maps = split()
-    # the prediction moves the texture along with the ground; the static rows are about all of it
-    maps[0] += site.texture - 1
-    if len(weight) >= 3:
-        site.texture = (1 + maps[0]).clamp(0.4, 2.5)
-        chain.textured = chain.render()
-    projector.learn_spectrum(maps)
-    local = Local(projector, nuisance_columns(chain, dn))
-    slopes = float(maps[1:].square().sum(0).median() / (2 * math.log(2))) ** 0.5 if len(maps) > 1 else math.nan
-    return SiteWork(chain, projector, local, residual, maps[0], projector.whiten(maps[None])[0], dynamic, slopes)
-
-
-def left_over(chain: Chain, weight: Tensor, dn: bool) -> float:
-    """Sum of squares of the dynamic residual at given weights, without shifts, unresolved slopes, the nominal model's freedom."""
-    projector = Projector(chain, weight)
-    # values per image stay as they are, or they would have a set for each site here
-    local = Local(projector, nuisance_columns(chain, dn, named=False))
-    residual = chain.site.image - chain.textured
-    columns = torch.stack([*_site_columns(chain), chain.unresolved_slopes(), residual]) * weight
-    on_basis = projector.coefficients(columns)
-    local.remove_(columns, on_basis)
-    projector.project_(columns, on_basis)
-    _without_(columns, columns.new_zeros(len(columns), 0, 1, 1), len(columns) - 1)
-    return float(columns[-1].double().square().sum())
-
-
-def _first_weight(chain: Chain, wide: bool) -> Tensor:
-    """1 / expected noise, (n, H, W): shot and read noise, and doubt where shadows end."""
-    site, state = chain.site, chain.state
-    predicted = chain.textured
-    mean = (predicted * site.valid).sum((-2, -1)) / site.valid.sum((-2, -1)).clamp(min=1)
-    mean = mean.clamp(min=1e-6)[:, None, None]
-    variance = (0.02 * mean) ** 2 * (1 - SHOT + SHOT * (predicted / mean).clamp(min=0))
-    above = chain.height_above_horizon()
-    mu0 = state.angles.cos_incidence
-    use = site.valid & ((mu0 > GRAZING) | (mu0 < -GRAZING)) & (state.angles.cos_emission > 0.15)
-    rising = torch.asin(mu0.clamp(-1, 1))  # the Sun above the facet's own plane
-    if above is not None:
-        rising = torch.minimum(above, rising)
-    else:
-        use &= mu0 > GRAZING
-    if not wide and float((use & (rising > CUT)).sum()) > 0.1 * float(use.sum()):
-        use &= (rising > CUT) | ((above < -DEEP) if above is not None else torch.zeros_like(use))
-    edge = torch.where(mu0 > 0 if above is None else above > 0, EDGE, 0.3 * EDGE)
-    doubt = DOUBT * (state.reflectance + 0.2 * mean) * torch.exp(-rising.abs() / edge)
-    variance = variance + doubt**2
-    return use * variance.clamp(min=1e-14).rsqrt()
-
-
-def _rescale(dynamic: Tensor, projector: Projector) -> Tensor:
-    """Per image, 1 / robust scatter of weighted rows that should have unit noise.
-
-    The projection takes the more from an image the larger its weight: each row is judged by the variance it has left,
-    and no image is believed to be much quieter than the others, or its weight would run away.
-    """
-    weight = projector.weight
-    left = (1 - sum(q.square() for q in projector.basis)).clamp(min=0.02).sqrt()
-    out = torch.ones(len(dynamic))
-    for k, (row, w, share) in enumerate(zip(dynamic, weight, left, strict=True)):
-        used = (row / share)[w > 0]
-        if len(used) > 50:
-            out[k] = 1 / max(1.4826 * float((used - used.median()).abs().median()), 1e-3)
-    return out.clamp(max=float(2 * out.median())).clamp(0.2, 5.0)
-
-
-def nuisance_columns(chain: Chain, dn: bool, named: bool = True) -> Tensor:
-    """(n, k, H, W): shift east and south, for dn images gain and offset, and image-wide effects ``named`` already."""
-    image = chain.textured
-    east = torch.zeros_like(image)
-    south = torch.zeros_like(image)
-    east[..., 1:-1] = (image[..., 2:] - image[..., :-2]) / 2
-    south[..., 1:-1, :] = (image[..., 2:, :] - image[..., :-2, :]) / 2
-    columns = [east, south]
-    if dn:
-        columns += [image, torch.full_like(image, float(image.mean()))]
-    for k, effect in enumerate(chain.base if named else ()):
-        if effect.scope == "image":
-            columns += list(image_columns(chain, type(effect), k))
-    for effect in chain.moved if named else ():
-        if effect.name != "misregistration":  # shifts are there already
-            columns += list(image_columns(chain, type(effect)))
-    return torch.stack(columns, 1)
-
-
-def image_columns(chain: Chain, cls: type[Effect], place: int | None = None) -> list[Tensor]:
-    """d image / d coordinate for an effect with one value per image, (n, H, W) each."""
-    frames = int(chain.site.observation.frame.max()) + 1
-    out = []
-    for parameter in cls.fitted():
-        step = 0.2 * cls.strong[parameter.name]
-        if place is None:
-            moved = chain.render(cls({parameter.name: torch.full((frames,), step)}, None))
-        else:
-            values = dict(chain.base[place].values)
-            values[parameter.name] = values[parameter.name] + step
-            moved = chain.replace(place, cls(values, chain.base[place].survey))
-        out.append((moved - chain.textured) / step)
-    return out
-
-
-def make_candidates(names: Sequence[str], data: Survey) -> list[Candidate]:
-    """Every guise of every effect, with its place among the columns."""
-    out, start = [], 0
-    for name in names:
-        for trial in get_effect(name).trials(data):
-            out.append(Candidate(name, trial, slice(start, start + len(trial.columns))))
-            start += len(trial.columns)
-    return out
-
-
-def trial_columns(chain: Chain, effect: str, trial: Trial, data: Survey) -> list[Tensor]:
-    """(n, H, W) each: what the effect at the trial's values adds to the image."""
-    cls = get_effect(effect)
-    return [chain.render(cls({**trial.fixed, **column}, data)) - chain.textured for column in trial.columns]
-
-
-def tangent_columns(chain: Chain, data: Survey) -> tuple[list[str], list[Tensor]]:
-    """d image / d coordinate for the scene-wide effects that are in the chain already."""
-    names, columns = [], []
-    for k, effect in enumerate(chain.base):
-        if effect.scope != "scene" or effect.channel in ("albedo", "relief"):
-            continue  # what stays with the ground is estimated there
-        for coordinate in free_coordinates(effect):
-            names.append(f"{effect.name}.{coordinate}")
-            columns.append(tangent(chain, k, coordinate, data))
-    return names, columns
-
-
-def tangent(chain: Chain, place: int, coordinate: str, data: Survey) -> Tensor:
-    """d image / d coordinate of the effect at ``place`` in the chain, (n, H, W)."""
-    effect = chain.base[place]
-    step = derivative_step(type(effect), coordinate, data)
-    moved = type(effect)({**effect.values, coordinate: float(effect.values[coordinate]) + step}, data)
-    return (chain.replace(place, moved) - chain.textured) / step
-
-
-def free_coordinates(effect: Effect) -> list[str]:
-    """The coordinates that stay free once an effect is named: those of its best guise and its shape."""
-    return [p.name for p in effect.fitted() if p.name not in effect.held]
-
-
-def derivative_step(cls: type[Effect], coordinate: str, data: Survey) -> float:
-    """A step for finite differences: a tenth of a realistic size."""
-    for trial in cls.trials(data):
-        for column in trial.columns:
-            if coordinate in column:
-                return 0.1 * abs(column[coordinate] - cls.null()[coordinate]) or 1e-3
-    parameter = next(p for p in cls.fitted() if p.name == coordinate)
-    return max(0.05 * abs(parameter.default), 1e-3 * (parameter.upper - parameter.lower))
-
-
 def gather_site(
     work: SiteWork, candidates: Sequence[Candidate], data: Survey, extra: Sequence[tuple[str, list[Tensor]]] = ()
 ) -> Statistics:
     """Statistics of one site; ``work.dynamic`` becomes what local columns and the nominal model's freedom leave."""
     chain, projector = work.chain, work.projector
-    own = _site_columns(chain)
+    own = nominal_columns(chain)
     names, nuisance = tangent_columns(chain, data)
     bound = [FREE] * len(names)
     for effect, ordinary in BASELINE.items():
@@ -308,7 +73,7 @@ def gather_site(
             torch.mul(column, projector.weight, out=columns[k])
             k += 1
     dynamic, static = _rows_(work, columns, s + m)
-    _without_(dynamic, static, s)
+    clear_of_(dynamic, static, s)
     work.dynamic = dynamic[s + m].clone()
     return _reduce(work, candidates, names, bound, dynamic[s:], static[s:])
 
@@ -354,26 +119,6 @@ def _rows_(work: SiteWork, columns: Tensor, residual: int) -> tuple[Tensor, Tens
     static[residual] = work.static
     work.local.remove_(columns, on_basis)
     return projector.project_(columns, on_basis), static
-
-
-def _site_columns(chain: Chain) -> list[Tensor]:
-    """The nominal model's freedom within a site: each coefficient may change and drift across the crop."""
-    tangents = chain.surface_tangents()
-    height, width = tangents[0].shape[-2:]
-    y = torch.linspace(-1, 1, height)[:, None]
-    x = torch.linspace(-1, 1, width)
-    return [t * f for t in tangents for f in (torch.ones(()), x, y)]
-
-
-def _without_(dynamic: Tensor, static: Tensor, count: int) -> None:
-    """Make all rows orthogonal to the first ``count``, in place."""
-    d, t = dynamic.flatten(1), static.flatten(1)
-    gram = (d[:count] @ d.T + t[:count] @ t.T).double()
-    scale = gram.diagonal().clamp(min=1e-30).rsqrt()
-    normal = gram[:, :count] * scale[:, None] * scale + 1e-6 * torch.eye(count, dtype=torch.float64)
-    share = (torch.linalg.solve(normal, scale[:, None] * gram[:, count:]) * scale[:, None]).float()
-    d[count:].addmm_(share.T, d[:count], alpha=-1)
-    t[count:].addmm_(share.T, t[:count], alpha=-1)
 
 
 def _reduce(

@@ -10,8 +10,8 @@ import torch
 from stages.diagnose.images import FEWEST
 from stages.diagnose.looking import Round
 from stages.diagnose.naming import BLUR, FLOOR_FID
+from stages.diagnose.preparing import Remains
 from stages.diagnose.state import Search
-from stages.diagnose.statistics import Remains
 from stages.effects import effect_names, get_effect
 
 CELL = 8  # px

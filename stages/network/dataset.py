@@ -18,7 +18,7 @@ from torch import Tensor
 
 from schemas.artefacts import PAIRS, SPLITS
 from schemas.errors import ArtefactError
-from schemas.hdf5 import open_artefact, read_strings, unpack
+from schemas.reading import open_artefact, read_strings, unpack
 from stages.network.normalisation import fill_holes
 from stages.network.records import Mapping, Records
 from stages.network.runtime import keep_freed_memory

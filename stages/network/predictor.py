@@ -13,7 +13,7 @@ from torch import Tensor
 
 from schemas.artefacts import CHECKPOINT
 from schemas.errors import ArtefactError, ConfigError
-from schemas.hdf5 import open_artefact, read_config, read_strings
+from schemas.reading import open_artefact, read_config, read_strings
 from stages.network.normalisation import scale_elevation
 from stages.network.unet import UNet
 from stages.physics.photometry import ReflectanceModel, get_model

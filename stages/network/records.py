@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from schemas.hdf5 import unpack
+from schemas.reading import unpack
 
 _HEADER = (
     21  # bytes before the codes of a scale-offset chunk: their width, the size of the minimum, the minimum, padding

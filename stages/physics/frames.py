@@ -15,7 +15,8 @@ import h5py
 import numpy as np
 
 from schemas.errors import InputError
-from schemas.hdf5 import ArtefactWriter, read_strings
+from schemas.reading import read_strings
+from schemas.writing import ArtefactWriter
 from stages.physics.bodies import Body, find_body
 from stages.physics.frame_geometry import complete_row
 from stages.physics.grid import unit_vectors

@@ -12,7 +12,7 @@ import rasterio
 import rasterio.shutil
 from rasterio.windows import Window
 
-from schemas.hdf5 import read_strings
+from schemas.reading import read_strings
 from stages.physics.grid import Grid
 
 TAGS = ("model", "quantity", "gsd_m", "body_radius_m")

@@ -21,8 +21,8 @@ from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
 from schemas.errors import InputError
-from schemas.hdf5 import atomic_path
 from schemas.locks import partial_path
+from schemas.outputs import atomic_path
 from stages.physics.grid import Grid
 
 Floats32 = NDArray[np.float32]

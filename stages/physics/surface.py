@@ -14,7 +14,7 @@ from rasterio.windows import Window
 
 from schemas.artefacts import SCENE, SVBRDF
 from schemas.errors import ArtefactError, ConfigError, InputError, RegistryError
-from schemas.hdf5 import open_artefact, read_kind, read_strings
+from schemas.reading import open_artefact, read_kind, read_strings
 from stages.physics.bodies import Body
 from stages.physics.grid import Grid, check_body, read_grid, require_crs
 from stages.physics.photometry import ReflectanceModel, get_model

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from schemas.hdf5 import check_output
+from schemas.outputs import check_output
 from stages.physics.bodies import find_body
 from stages.render.config import Config, Summary, check, inputs, output_files
 from stages.render.maps import render_map

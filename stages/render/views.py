@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
-from schemas.hdf5 import check_output
+from schemas.outputs import check_output
 from stages.physics.bodies import find_body
 from stages.physics.cameras.base import Camera
 from stages.physics.grid import Grid

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from schemas import SPLITS, UNITS, read_strings
-from schemas.hdf5 import unpack
+from schemas.reading import unpack
 from stages.report import page, pictures
 
 SPLIT_COLOURS = {"train": "#7f8a97", "validation": "#c08a2e", "test": "#3b8ecb"}

@@ -1,0 +1,174 @@
+"""Opening artefacts, of this program or another, and checking that they are what they should be."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from schemas.declaration import SCHEMAS, STRING, Schema, Variable
+from schemas.errors import ArtefactError
+from schemas.hdf5 import silence_hdf5
+
+
+def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5py.File:
+    """Open an artefact for reading after checking that it is what it should be.
+
+    ``need`` names optional variables that this caller cannot do without. Raises ArtefactError.
+    """
+    path = Path(path)
+    file = _open_hdf5(path)
+    try:
+        _check_kind(path, file, schema)
+        for variable in schema.variables:
+            if variable.name in file:
+                _check_variable(path, file, variable)
+            elif variable.required or variable.name in need:
+                raise ArtefactError(
+                    f"{path}:/{variable.name}: expected a variable ({variable.description}), found none; "
+                    f"write it again with 'lunargr {schema.stage}'."
+                )
+        for attribute in schema.attributes:
+            if attribute.required and attribute.name not in file.attrs:
+                raise ArtefactError(
+                    f"{path}: expected the root attribute '{attribute.name}' ({attribute.description}), found none; "
+                    f"write it again with 'lunargr {schema.stage}'."
+                )
+        _check_sizes(path, file, schema)
+        _check_views(path, file)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def read_kind(path: Path) -> Schema:
+    """The schema that an artefact says it follows. Raises ArtefactError."""
+    with _open_hdf5(Path(path)) as file:
+        name = _text(file.attrs.get("lunargr_schema", ""))
+    if name not in SCHEMAS:
+        raise ArtefactError(
+            f"{path}: expected a lunargr artefact (root attribute 'lunargr_schema'), found '{name or 'none'}'; "
+            f"artefacts are: {', '.join(SCHEMAS)}."
+        )
+    return SCHEMAS[name]
+
+
+def _open_hdf5(path: Path) -> h5py.File:
+    silence_hdf5()
+    if not path.exists():
+        raise ArtefactError(f"{path}: no such file; check the path or run the stage that writes it.")
+    if path.is_dir():
+        raise ArtefactError(f"{path}: expected an HDF5 file, found a folder.")
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        kind = (
+            "a damaged or truncated HDF5 file"
+            if h5py.is_hdf5(path) or "truncated" in str(error)
+            else "another kind of file"
+        )
+        raise ArtefactError(f"{path}: expected an HDF5 artefact, found {kind}; write it again.") from None
+
+
+def _check_kind(path: Path, file: h5py.File, schema: Schema) -> None:
+    found = _text(file.attrs.get("lunargr_schema", ""))
+    if not found and schema.foreign_writers:
+        return
+    if found != schema.name:
+        what = f"a '{found}'" if found else "an HDF5 file without 'lunargr_schema'"
+        raise ArtefactError(
+            f"{path}: expected a '{schema.name}' artefact (from 'lunargr {schema.stage}'), found {what}; check the order of the files."
+        )
+    version = int(file.attrs.get("schema_version", schema.version))
+    if version != schema.version:
+        raise ArtefactError(
+            f"{path}: expected version {schema.version} of '{schema.name}', found {version}; write it again with 'lunargr {schema.stage}'."
+        )
+
+
+def _check_variable(path: Path, file: h5py.File, variable: Variable) -> None:
+    where = f"{path}:/{variable.name}"
+    data = file[variable.name]
+    if not isinstance(data, h5py.Dataset) or data.ndim != len(variable.dims):
+        found = f"{data.ndim}" if isinstance(data, h5py.Dataset) else "a group"
+        raise ArtefactError(
+            f"{where}: expected {len(variable.dims)} dimensions ({', '.join(variable.dims)}), found {found}."
+        )
+    if variable.dtype == STRING:
+        return
+    if data.dtype.kind not in "iufb":
+        raise ArtefactError(f"{where}: expected numbers ({variable.dtype}), found {data.dtype}.")
+    unit = _text(data.attrs.get("units", ""))
+    allowed = (variable.unit, *variable.unit_choices)
+    if unit and unit not in allowed:
+        expected = " or ".join(f"'{u}'" for u in dict.fromkeys(allowed))
+        stage = _text(file.attrs.get("lunargr_schema", "")) or "it"
+        writer = SCHEMAS[stage].stage if stage in SCHEMAS else None
+        advice = f"write it again with 'lunargr {writer}'." if writer else "mend the writer of the file."
+        raise ArtefactError(f"{where}: expected units {expected}, found '{unit}'; {advice}")
+
+
+def _check_sizes(path: Path, file: h5py.File, schema: Schema) -> None:
+    sizes: dict[str, tuple[int, str]] = {}
+    for variable in schema.variables:
+        if variable.name not in file:
+            continue
+        for dim, size in zip(variable.dims, file[variable.name].shape, strict=True):
+            first = sizes.setdefault(dim, (size, variable.name))
+            if first[0] != size:
+                raise ArtefactError(
+                    f"{path}:/{variable.name}: expected {first[0]} along '{dim}' as in /{first[1]}, found {size}; write it again."
+                )
+
+
+def _check_views(path: Path, file: h5py.File) -> None:
+    """HDF5 reads what a lost file held as fill values, without a word: such an artefact must not look whole."""
+    for data in file.values():
+        if isinstance(data, h5py.Dataset) and data.is_virtual:
+            plan = data.id.get_create_plist()
+            for source in {plan.get_virtual_filename(k) for k in range(plan.get_virtual_count())}:
+                if not (path.resolve().parent / source).exists():
+                    raise ArtefactError(
+                        f"{path}:{data.name}: expected the file '{source}' that it is a view of, found none; "
+                        "bring it back, or merge the parts again without --virtual."
+                    )
+
+
+def _text(value: Any) -> str:
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def unpack(data: h5py.Dataset, values: Any) -> np.ndarray:
+    """Values read from ``data``, as CF means them: fill values become NaN in floats, and packed numbers are scaled.
+
+    Flags and other integers without ``scale_factor`` or ``add_offset`` stay as they are.
+    """
+    values = np.asarray(values)
+    packed = "scale_factor" in data.attrs or "add_offset" in data.attrs
+    if values.dtype.kind != "f" and not packed:
+        return values
+    fills = [data.attrs[k] for k in ("_FillValue", "missing_value") if k in data.attrs]
+    result = values.astype(np.float32 if values.dtype != np.float64 else np.float64)
+    if packed:
+        scale, offset = (float(np.ravel(data.attrs.get(k, v))[0]) for k, v in (("scale_factor", 1), ("add_offset", 0)))
+        result = (values * scale + offset).astype(np.float32)
+    for fill in fills:
+        known = values == np.asarray(np.ravel(fill)[0], values.dtype)
+        if known.any():
+            result[known] = np.nan
+    return result
+
+
+def read_strings(file: h5py.File, name: str) -> list[str]:
+    """A string variable as a list of ``str``."""
+    return [_text(v) for v in file[name][...]]
+
+
+def read_config(file: h5py.File) -> dict[str, Any]:
+    """The configuration that an artefact was made with."""
+    return json.loads(_text(file.attrs.get("config", "{}")))

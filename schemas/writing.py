@@ -1,0 +1,223 @@
+"""Writing artefacts: HDF5 that is also valid netCDF-4 / CF."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+
+from schemas.declaration import STRING, Schema, Variable
+from schemas.errors import ConfigError
+from schemas.hdf5 import UNKNOWN, lost, silence_hdf5
+from schemas.outputs import atomic_path, check_output, is_full_disk, terminate_as_exception
+from schemas.provenance import describe_run
+
+_STANDARD_NAMES = {"x": "projection_x_coordinate", "y": "projection_y_coordinate"}
+# The netCDF-4 format's marker for a dimension without a coordinate variable of its own.
+_BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable.%10d"
+_abandoned: list[h5py.File] = []
+
+
+class ArtefactWriter:
+    """Writes one artefact under a temporary name; use as a context manager.
+
+    Dimensions are sized on entry; ``None`` is not allowed. Variables are created on first use, from their declaration.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        schema: Schema,
+        sizes: Mapping[str, int],
+        *,
+        config: Mapping[str, Any] | None = None,
+        inputs: Sequence[Path] = (),
+        seed: int | None = None,
+        attributes: Mapping[str, Any] | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        check_output(path, inputs, overwrite)
+        self.path = Path(path)
+        self.schema = schema
+        self.sizes = dict(sizes)
+        self._root_attributes = describe_run(schema, config or {}, inputs, seed) | dict(attributes or {})
+        self._stack = contextlib.ExitStack()
+        self.file: h5py.File
+        # A dataset that is let go of writes what it still holds where no one hears of a failure: they all stay to the end.
+        self._kept: list[h5py.Dataset] = []
+        self._lost_before = len(lost)
+
+    def __enter__(self) -> ArtefactWriter:
+        silence_hdf5()
+        self._stack.__enter__()
+        try:
+            partial = self._partial = self._stack.enter_context(atomic_path(self.path))
+            self._stack.enter_context(terminate_as_exception())
+            try:
+                self.file = h5py.File(partial, "w", track_order=True, libver=("earliest", "v110"))
+                self._stack.callback(self._close)
+            except OSError as error:
+                if is_full_disk(error):
+                    raise
+                raise ConfigError(f"{self.path}: cannot be written ({error}); choose another --output.") from None
+            for key, value in self._root_attributes.items():
+                self.file.attrs[key] = value
+            for order, (name, size) in enumerate(self.sizes.items()):
+                if name not in self.schema:  # a coordinate variable carries its own scale
+                    scale = self.file.create_dataset(name, shape=(size,), dtype=">f4")
+                    scale.make_scale(_BARE_DIMENSION % size)
+                    scale.attrs["_Netcdf4Dimid"] = np.int32(order)
+            for name, size in self.sizes.items():
+                if name in self.schema:
+                    self._create(self.schema[name], size_of_scale=size)
+        except BaseException:
+            if self._stack.__exit__(*sys.exc_info()):
+                raise RuntimeError("an artefact's error was swallowed") from None
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            missing = [v.name for v in self.schema.variables if v.required and v.name not in self.file]
+            missing += [a.name for a in self.schema.attributes if a.required and a.name not in self.file.attrs]
+            if missing:
+                error = RuntimeError(f"{self.schema.name}: written without {', '.join(missing)}")
+                self._stack.__exit__(type(error), error, None)
+                raise error
+            error = self._flush()
+        if is_full_disk(error):
+            # Give back the room that the partial file took: HDF5 can then flush and close without failing once more.
+            os.truncate(self._partial, 0)
+        self._stack.__exit__(None if error is None else type(error), error, trace)
+        self._kept.clear()
+        if kind is None and error is not None:
+            raise error
+
+    def _flush(self) -> BaseException | None:
+        """Write everything that HDF5 still holds; what went wrong, now or where a dataset was let go of."""
+        if len(lost) > self._lost_before:
+            return lost[self._lost_before]
+        try:
+            self.file.flush()
+        except (OSError, RuntimeError) as error:
+            return error
+        return None
+
+    def _close(self) -> None:
+        if len(lost) > self._lost_before:
+            # HDF5 would follow a pointer into what it failed to let go of, and take the process down.
+            _abandoned.append(self.file)
+        else:
+            self.file.close()
+
+    def _create(
+        self,
+        variable: Variable,
+        size_of_scale: int | None = None,
+        unit: str | None = None,
+        decimals: int | None = None,
+    ) -> h5py.Dataset:
+        shape = tuple(self.sizes[d] for d in variable.dims)
+        options: dict[str, Any] = {}
+        if shape and 0 not in shape:
+            chunks = variable.chunks
+            if chunks is None and len(shape) >= 3:  # one record (a pair, a band) a chunk: random access stays fast
+                chunks = (1,) * (len(shape) - 2) + shape[-2:]
+                if decimals is not None:  # a smaller piece spans less and takes fewer bits
+                    chunks = (1,) * (len(shape) - 2) + tuple(_piece(edge) for edge in shape[-2:])
+            if chunks is not None:
+                options["chunks"] = tuple(min(c, s) for c, s in zip(chunks, shape, strict=True))
+            if variable.compress:
+                options |= {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+                options.setdefault("chunks", True)
+        if variable.dtype == STRING:
+            dtype: Any = h5py.string_dtype()
+        else:
+            dtype = np.dtype(variable.dtype)
+            if dtype.kind == "f":
+                options["fillvalue"] = np.nan
+                if decimals is not None and shape and 0 not in shape:
+                    options |= {"scaleoffset": decimals, "fillvalue": UNKNOWN}
+        data = self.file.create_dataset(variable.name, shape=shape, dtype=dtype, track_order=True, **options)
+        if size_of_scale is not None:
+            data.make_scale(variable.name)
+            if variable.name in _STANDARD_NAMES:
+                data.attrs["standard_name"] = _STANDARD_NAMES[variable.name]
+            data.attrs["_Netcdf4Dimid"] = np.int32(list(self.sizes).index(variable.name))
+        self._describe(data, variable, unit, scale=size_of_scale is not None)
+        self._kept.append(data)
+        return data
+
+    def _describe(self, data: h5py.Dataset, variable: Variable, unit: str | None, scale: bool = False) -> None:
+        if not scale:
+            for axis, dim in enumerate(variable.dims):
+                data.dims[axis].attach_scale(self.file[dim])
+        if variable.dtype != STRING:
+            data.attrs["units"] = unit or variable.unit
+            if data.dtype.kind == "f":
+                data.attrs["_FillValue"] = np.array(data.fillvalue, data.dtype)
+        data.attrs["long_name"] = variable.description
+        if variable.flags:
+            data.attrs["flag_values"] = np.array([value for _, value in variable.flags], variable.dtype)
+            data.attrs["flag_meanings"] = " ".join(meaning for meaning, _ in variable.flags)
+        if variable.georeferenced:
+            data.attrs["grid_mapping"] = "crs"
+
+    def dataset(self, name: str, unit: str | None = None, decimals: int | None = None) -> h5py.Dataset:
+        """The open dataset ``name``, created from its declaration on first use, for block-wise writing.
+
+        ``decimals`` keeps so many digits after the point, by HDF5's scale-offset filter, which every reader undoes: a
+        chunk takes as many bits a value as its range needs. Unknown values are then UNKNOWN, and never NaN.
+        """
+        if name not in self.file:
+            return self._create(self.schema[name], unit=unit, decimals=decimals)
+        return self.file[name]
+
+    def write(self, name: str, data: Any, unit: str | None = None) -> h5py.Dataset:
+        """Write a whole variable; shapes must match the declared dimensions."""
+        target = self.dataset(name, unit)
+        if self.schema[name].dtype == STRING:
+            target[...] = np.asarray(list(data), dtype=object) if target.shape else data
+        else:
+            target[...] = data
+        return target
+
+    def link(self, name: str, sources: Sequence[tuple[tuple[slice, ...], h5py.Dataset, tuple[slice, ...]]]) -> None:
+        """Make a variable a view of datasets in other files: (where it goes, whole dataset, what of it).
+
+        The files are named relative to this one, and must stay; :func:`open_artefact` checks that they are there.
+        """
+        variable = self.schema[name]
+        shape = tuple(self.sizes[d] for d in variable.dims)
+        dtype = np.dtype(variable.dtype)
+        layout = h5py.VirtualLayout(shape, dtype)
+        for target, source, part in sources:
+            file = os.path.relpath(os.path.realpath(source.file.filename), os.path.realpath(self.path.parent))
+            view = h5py.VirtualSource(file, source.name, source.shape, source.dtype)
+            layout[target] = view[part]
+        fill = sources[0][1].fillvalue if sources and sources[0][1].scaleoffset is not None else np.nan
+        data = self.file.create_virtual_dataset(name, layout, fillvalue=fill if dtype.kind == "f" else 0)
+        unit = sources[0][1].attrs.get("units") if sources and variable.unit_choices else None
+        self._describe(data, variable, str(unit) if unit is not None else None)
+
+    def write_crs(self, wkt: str, transform: Sequence[float]) -> None:
+        """The scalar ``crs`` variable that CF and GDAL look for; ``transform`` is affine (a, b, c, d, e, f)."""
+        data = self.file.create_dataset("crs", shape=(), dtype="i4", data=0)
+        a, b, c, d, e, f = (float(v) for v in transform[:6])
+        data.attrs["crs_wkt"] = wkt
+        data.attrs["spatial_ref"] = wkt
+        data.attrs["GeoTransform"] = " ".join(repr(v) for v in (c, a, b, f, d, e))
+
+
+def _piece(edge: int) -> int:
+    """The edge of a packed chunk: 64 or the nearest above it that divides ``edge``."""
+    return edge // (edge // 64) if edge > 64 and edge % (edge // 64) == 0 else edge

@@ -1,0 +1,157 @@
+"""A site made ready: weights from the residual's own scatter, texture and slopes taken out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from stages.diagnose.chain import Chain
+from stages.diagnose.columns import nominal_columns, nuisance_columns
+from stages.diagnose.data import GRAZING, Site
+from stages.diagnose.projection import Local, Projector
+
+CUT = math.radians(15)  # photometric effects are judged where neither slope nor shadow is a matter of sub-pixel relief
+DEEP = math.radians(2)  # below the horizon: shadow, whatever the DEM's errors
+OUTLIER = 7.0  # sigma
+QUIETEST = 0.002  # noise over mean brightness: an image that looks quieter is dark
+SHOT = 0.8  # share of shot noise in the noise's variance at mean brightness
+EDGE = math.radians(6.0)  # relief below the DEM's resolution blurs shadows over a band like this ...
+DOUBT = 0.3  # ... by up to this share of the lit brightness
+
+
+@dataclass
+class SiteWork:
+    """A site made ready: weights, projection, and what is left of the measurement.
+
+    residual : (n, H, W), I/F, measured minus predicted; albedo : (H, W), relative albedo of the ground beyond the
+    prediction, not whitened; static : (K, H, W), whitened maps of the residual; dynamic : (n, H, W), the residual's
+    dynamic rows once everything local and the nominal model's own freedom are taken out; slope_error : rms per axis of the
+    apparent slope errors, as tangent, by their median, NaN where images are too few
+    """
+
+    chain: Chain
+    projector: Projector
+    local: Local
+    residual: Tensor
+    albedo: Tensor
+    static: Tensor
+    dynamic: Tensor
+    slope_error: float = math.nan
+
+    def remains(self) -> Remains:
+        return Remains(self.chain.site, self.projector.weight, self.albedo, self.dynamic, self.slope_error)
+
+
+@dataclass
+class Remains:
+    """What is kept of a site's work while other sites are worked on; names as in :class:`SiteWork`."""
+
+    site: Site
+    weight: Tensor
+    albedo: Tensor
+    dynamic: Tensor
+    slope_error: float
+
+
+def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
+    """Weights from the residual's own scatter, the projector, the texture. ``wide`` keeps the pixels about shadow edges."""
+    site = chain.site
+    weight = _first_weight(chain, wide)
+    residual = torch.where(site.valid, site.image - chain.textured, 0.0)
+    level = (chain.textured * site.valid).sum((-2, -1)) / site.valid.sum((-2, -1)).clamp(min=1)
+    most = 1 / (QUIETEST * level.clamp(min=1e-6))[:, None, None]
+
+    def split() -> tuple[Projector, Tensor, Tensor]:
+        projector = Projector(chain, weight)
+        weighted = (residual * weight)[None]
+        on_basis = projector.coefficients(weighted)
+        return projector, projector.project_(weighted, on_basis)[0], projector.maps(on_basis)[0]
+
+    projector, dynamic, maps = split()
+    for _ in range(2):
+        if len(weight) < 2:  # one image: its noise and the ground's texture cannot be told apart
+            weight = weight / float((residual * weight).square()[weight > 0].mean().clamp(min=1e-12)) ** 0.5
+        else:
+            weight = weight * _rescale(dynamic, projector)[:, None, None]
+            if not wide:  # what no smooth effect can do: shadows of unknown walls, cut-off highlights, dead pixels
+                gross = dynamic.abs() > OUTLIER
+                if float(gross.sum()) < 0.3 * float((weight > 0).sum()):
+                    weight = weight * ~gross
+        weight = weight.minimum(most)
+        projector, dynamic, maps = split()
+    # the prediction moves the texture along with the ground; the static rows are about all of it
+    maps[0] += site.texture - 1
+    if len(weight) >= 3:
+        site.texture = (1 + maps[0]).clamp(0.4, 2.5)
+        chain.textured = chain.render()
+    projector.learn_spectrum(maps)
+    local = Local(projector, nuisance_columns(chain, dn))
+    slopes = float(maps[1:].square().sum(0).median() / (2 * math.log(2))) ** 0.5 if len(maps) > 1 else math.nan
+    return SiteWork(chain, projector, local, residual, maps[0], projector.whiten(maps[None])[0], dynamic, slopes)
+
+
+def left_over(chain: Chain, weight: Tensor, dn: bool) -> float:
+    """Sum of squares of the dynamic residual at given weights, without shifts, unresolved slopes, the nominal model's freedom."""
+    projector = Projector(chain, weight)
+    # values per image stay as they are, or they would have a set for each site here
+    local = Local(projector, nuisance_columns(chain, dn, named=False))
+    residual = chain.site.image - chain.textured
+    columns = torch.stack([*nominal_columns(chain), chain.unresolved_slopes(), residual]) * weight
+    on_basis = projector.coefficients(columns)
+    local.remove_(columns, on_basis)
+    projector.project_(columns, on_basis)
+    clear_of_(columns, columns.new_zeros(len(columns), 0, 1, 1), len(columns) - 1)
+    return float(columns[-1].double().square().sum())
+
+
+def _first_weight(chain: Chain, wide: bool) -> Tensor:
+    """1 / expected noise, (n, H, W): shot and read noise, and doubt where shadows end."""
+    site, state = chain.site, chain.state
+    predicted = chain.textured
+    mean = (predicted * site.valid).sum((-2, -1)) / site.valid.sum((-2, -1)).clamp(min=1)
+    mean = mean.clamp(min=1e-6)[:, None, None]
+    variance = (0.02 * mean) ** 2 * (1 - SHOT + SHOT * (predicted / mean).clamp(min=0))
+    above = chain.height_above_horizon()
+    mu0 = state.angles.cos_incidence
+    use = site.valid & ((mu0 > GRAZING) | (mu0 < -GRAZING)) & (state.angles.cos_emission > 0.15)
+    rising = torch.asin(mu0.clamp(-1, 1))  # the Sun above the facet's own plane
+    if above is not None:
+        rising = torch.minimum(above, rising)
+    else:
+        use &= mu0 > GRAZING
+    if not wide and float((use & (rising > CUT)).sum()) > 0.1 * float(use.sum()):
+        use &= (rising > CUT) | ((above < -DEEP) if above is not None else torch.zeros_like(use))
+    edge = torch.where(mu0 > 0 if above is None else above > 0, EDGE, 0.3 * EDGE)
+    doubt = DOUBT * (state.reflectance + 0.2 * mean) * torch.exp(-rising.abs() / edge)
+    variance = variance + doubt**2
+    return use * variance.clamp(min=1e-14).rsqrt()
+
+
+def _rescale(dynamic: Tensor, projector: Projector) -> Tensor:
+    """Per image, 1 / robust scatter of weighted rows that should have unit noise.
+
+    The projection takes the more from an image the larger its weight: each row is judged by the variance it has left,
+    and no image is believed to be much quieter than the others, or its weight would run away.
+    """
+    weight = projector.weight
+    left = (1 - sum(q.square() for q in projector.basis)).clamp(min=0.02).sqrt()
+    out = torch.ones(len(dynamic))
+    for k, (row, w, share) in enumerate(zip(dynamic, weight, left, strict=True)):
+        used = (row / share)[w > 0]
+        if len(used) > 50:
+            out[k] = 1 / max(1.4826 * float((used - used.median()).abs().median()), 1e-3)
+    return out.clamp(max=float(2 * out.median())).clamp(0.2, 5.0)
+
+
+def clear_of_(dynamic: Tensor, static: Tensor, count: int) -> None:
+    """Make all rows orthogonal to the first ``count``, in place."""
+    d, t = dynamic.flatten(1), static.flatten(1)
+    gram = (d[:count] @ d.T + t[:count] @ t.T).double()
+    scale = gram.diagonal().clamp(min=1e-30).rsqrt()
+    normal = gram[:, :count] * scale[:, None] * scale + 1e-6 * torch.eye(count, dtype=torch.float64)
+    share = (torch.linalg.solve(normal, scale[:, None] * gram[:, count:]) * scale[:, None]).float()
+    d[count:].addmm_(share.T, d[:count], alpha=-1)
+    t[count:].addmm_(share.T, t[:count], alpha=-1)

@@ -1,0 +1,157 @@
+"""Which grid a DEM is worked on, and how its pixels get there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rasterio.io import DatasetReader
+from rasterio.transform import Affine
+from rasterio.warp import Resampling, calculate_default_transform
+from rasterio.windows import Window
+
+from schemas import (
+    ConfigError,
+    GeometryError,
+    InputError,
+)
+from stages.physics import rasters
+from stages.physics.grid import Grid, local_metric_crs
+
+# A map whose pixels are within this of square and of the working GSD counts as metric: no resampling, only means.
+METRIC_TOLERANCE = 0.01
+LARGEST_REACH = math.radians(30)  # a local stereographic map's scale is 7 % too large there
+ANY_RELIEF = 0.006  # of the radius: Olympus Mons; Vesta's and Phobos' shapes go beyond, their DEMs' datum does not
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How the DEM reaches its grid: an integer ``factor``, or None for a reprojection."""
+
+    grid: Grid
+    factor: int | None
+    resampling: Resampling
+    radius_is_elevation: bool
+
+
+def plan_grid(dem: Path, dataset: DatasetReader, gsd: float | None, radius: float) -> Plan:
+    """Area means where the DEM's grid is metric and divides the GSD, otherwise a local metric grid."""
+    east, north = rasters.pixel_size_at(dataset, radius, dataset.height / 2, dataset.width / 2)
+    native = max(east, north)
+    if gsd is not None and not (math.isfinite(gsd) and gsd > 0):
+        raise ConfigError(f"--gsd: expected a positive number of metres, found {gsd}.")
+    if not (math.isfinite(native) and native > 0):
+        raise GeometryError(f"{dem}: its georeference puts the DEM off the body; check its CRS and transform.")
+    wanted = native if gsd is None else gsd
+    if wanted < 0.5 * native:
+        raise ConfigError(
+            f"--gsd: expected at least half the DEM's own {native:g} m, found {wanted:g}; detail cannot be invented."
+        )
+    holds_radii = _holds_radii(dem, dataset, radius)
+    t = dataset.transform
+    if dataset.crs.is_projected and t.b == t.d == 0 and t.a > 0 > t.e and _is_metre(dataset):
+        step = abs(t.a)
+        factor = max(1, round(wanted / step))
+        # At the centre and near the corners: an equirectangular map is true on one parallel only.
+        places = [(v, u) for v in (0.1, 0.5, 0.9) for u in (0.1, 0.5, 0.9)]
+        true = np.array(
+            [rasters.pixel_size_at(dataset, radius, v * dataset.height, u * dataset.width) for v, u in places]
+        )
+        true_square = (
+            bool((np.abs(true[:, 0] - true[:, 1]) <= METRIC_TOLERANCE * native).all())
+            and abs(-t.e - t.a) <= 1e-3 * step
+        )
+        true_scale = bool((np.abs(true - step) <= 2 * METRIC_TOLERANCE * step).all())
+        fits = gsd is None or abs(wanted - factor * step) <= 1e-3 * wanted
+        if true_square and true_scale and fits:
+            height, width = dataset.height // factor, dataset.width // factor
+            if min(height, width) < 1:
+                raise ConfigError(f"--gsd: {wanted:g} m is coarser than the whole DEM; choose a finer one.")
+            transform = t @ Affine.scale(factor)
+            return Plan(
+                Grid(dataset.crs.to_wkt(), transform, height, width, radius), factor, Resampling.average, holds_radii
+            )
+    whole = Grid(dataset.crs.to_wkt(), t, dataset.height, dataset.width, radius)
+    lon, lat = (float(v) for v in whole.lonlat(dataset.height / 2 - 0.5, dataset.width / 2 - 0.5))
+    reach = np.hypot(dataset.height * north, dataset.width * east) / 2 / radius
+    if not reach < LARGEST_REACH:
+        raise GeometryError(
+            f"{dem}: expected a region that one local map can hold (up to {math.degrees(2 * LARGEST_REACH):.0f} deg across), "
+            f"found {math.degrees(2 * reach):.0f} deg; cut a region out first (gdal_translate -projwin)."
+        )
+    crs = local_metric_crs(lon, lat, radius)
+    transform, width, height = calculate_default_transform(
+        dataset.crs, crs, dataset.width, dataset.height, *dataset.bounds, resolution=wanted
+    )
+    # Pixel corners at whole multiples of the GSD: two runs on overlapping DEMs then differ by whole pixels only.
+    transform = Affine(
+        wanted, 0, wanted * round(transform.c / wanted), 0, -wanted, wanted * round(transform.f / wanted)
+    )
+    coarser = wanted > 1.5 * native
+    return Plan(
+        Grid(crs.to_wkt(), transform, height, width, radius),
+        None,
+        Resampling.average if coarser else Resampling.cubic,
+        holds_radii,
+    )
+
+
+def _is_metre(dataset: DatasetReader) -> bool:
+    return abs((dataset.crs.linear_units_factor[1] if dataset.crs.is_projected else 0) - 1) < 1e-6
+
+
+def _holds_radii(dem: Path, dataset: DatasetReader, radius: float) -> bool:
+    """Whether the DEM counts from the body's centre; and whether its numbers can be metres at all."""
+    size = 256
+    windows = [
+        Window(c, r, min(size, dataset.width - c), min(size, dataset.height - r))
+        for r in np.unique(np.linspace(0, max(0, dataset.height - size), 5).astype(int))
+        for c in np.unique(np.linspace(0, max(0, dataset.width - size), 5).astype(int))
+    ]
+    samples = [rasters.read_window(dataset, w) for w in windows]
+    finite = np.concatenate([s[np.isfinite(s)] for s in samples])
+    if not finite.size and not _any_valid(dataset):
+        raise InputError(f"{dem}: expected elevations, found only nodata; is this the right band and file?")
+    if not finite.size:
+        return False
+    unit = (dataset.units[0] or "").strip().lower()
+    if unit in ("km", "kilometre", "kilometer", "kilometers", "kilometres"):
+        raise InputError(
+            f"{dem}: expected elevations in metres, found units '{unit}'; convert it (gdal_calc.py --calc='A*1000')."
+        )
+    middle = float(np.median(finite))
+    if abs(middle) > 0.5 * radius:
+        if abs(middle - radius) > 0.05 * radius:
+            raise InputError(
+                f"{dem}: expected metres above the sphere or radii near {radius:g} m, found values near {middle:g}; check units and --body."
+            )
+        return True
+    kilometres_radius = (
+        abs(middle - radius / 1000) < 0.05 * radius / 1000 and float(np.ptp(finite)) < 0.02 * radius / 1000
+    )
+    if kilometres_radius:
+        raise InputError(
+            f"{dem}: expected metres, found values near {middle:g}, the body's radius in kilometres; multiply by 1000."
+        )
+    east, north = rasters.pixel_size_at(dataset, radius, dataset.height / 2, dataset.width / 2)
+    rise = np.concatenate(
+        [np.abs(np.diff(s, axis=1)).ravel() for s in samples if s.shape[1] > 1] or [np.array([np.nan])]
+    )
+    rise = rise[np.isfinite(rise)]
+    if rise.size > 100:
+        slope = math.degrees(math.atan(float(np.sqrt(np.mean(rise**2))) / min(east, north)))
+        if slope > 80:
+            raise InputError(
+                f"{dem}: expected elevations in metres, found an rms slope of {slope:.1f} deg; are the units smaller than metres?"
+            )
+        if 0 < slope < 0.02:
+            raise InputError(
+                f"{dem}: expected elevations in metres, found an rms slope of {slope:.4f} deg; are they in kilometres?"
+            )
+    return False
+
+
+def _any_valid(dataset: DatasetReader) -> bool:
+    return any(np.isfinite(rasters.read_window(dataset, window)).any() for _, window in dataset.block_windows(1))
