@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from typing import ClassVar
 
 import torch
@@ -17,6 +18,7 @@ from stages.physics.photometry import Parameter
 CELLS = 64  # the crop is cut into at most this many cells a side: exchange of light is a smooth field
 AZIMUTHS = 12
 STEPS = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0)  # cells
+KEEP = 16  # pieces of ground whose form factors are kept, a few MB each
 
 
 @register
@@ -54,7 +56,7 @@ def _add(state: State, strength: Tensor) -> None:
 def received(elevation: Tensor, radiance: Tensor, gsd: float) -> Tensor:
     """Light that the crop's facets receive from each other, as I/F of a white diffuse facet; (B, H, W).
 
-    Crops of one piece of ground share the geometry. Terrain outside the crop is dark.
+    Crops of one piece of ground share the geometry. Terrain outside the crop is its mirror image.
     """
     rows, columns = elevation.shape[-2:]
     factor = max(1, math.ceil(max(rows, columns) / CELLS))
@@ -73,15 +75,41 @@ def received(elevation: Tensor, radiance: Tensor, gsd: float) -> Tensor:
 
 
 def gather(height: Tensor, leaving: Tensor, cell: float) -> Tensor:
-    """Irradiance over pi times the solar flux from all visible terrain; height (H, W), leaving (n, H, W) I/F -> (n, H, W).
+    """Irradiance over pi times the solar flux from all visible terrain; height (H, W), leaving (n, H, W) I/F -> (n, H, W)."""
+    factors = form_factors(height, cell).to(leaving)
+    return torch.sparse.mm(factors, leaving.flatten(1).T).T.reshape(leaving.shape)
+
+
+def form_factors(height: Tensor, cell: float) -> Tensor:
+    """Share of its whole sky that each facet sees filled by each other one, times the cosine; sparse, (H W, H W).
 
     Each azimuth is walked outwards from the facet's own plane: what rises above all before it is seen, and lights the
-    facet by the solid angle that it adds times the cosine of its incidence.
+    facet by the solid angle that it adds times the cosine of its incidence. The last few pieces of ground are kept, since
+    the same one is lit again and again.
     """
+    key = (tuple(height.shape), cell, height.cpu().numpy().tobytes())
+    with _lock:
+        factors = _kept.get(key)
+    if factors is None:
+        factors = _walk(height, cell)
+        with _lock:
+            while len(_kept) >= KEEP:
+                _kept.pop(next(iter(_kept)))
+            _kept[key] = factors
+    return factors
+
+
+_kept: dict[tuple, Tensor] = {}
+_lock = threading.Lock()  # sites are worked on side by side
+
+
+def _walk(height: Tensor, cell: float) -> Tensor:
     rows, columns = height.shape
     east, north = geometry.slopes(height, cell)
     up = torch.rsqrt(1 + east**2 + north**2)
-    total = torch.zeros_like(leaving)
+    row, column = torch.arange(rows, device=height.device), torch.arange(columns, device=height.device)
+    here = (row[:, None] * columns + column).flatten()
+    places, shares = [], []
     for k in range(AZIMUTHS):
         azimuth = 2 * math.pi * (k + 0.5) / AZIMUTHS
         to_east, to_north = math.sin(azimuth), math.cos(azimuth)
@@ -89,23 +117,21 @@ def gather(height: Tensor, leaving: Tensor, cell: float) -> Tensor:
         highest = torch.atan2(-level, up)
         for step in STEPS:
             right, down = round(step * to_east), round(-step * to_north)
-            here_r, there_r = _overlap(rows, down)
-            here_c, there_c = _overlap(columns, right)
-            if here_r.stop <= here_r.start or here_c.stop <= here_c.start:
-                break
-            here, there = (here_r, here_c), (there_r, there_c)
-            distance = math.hypot(right, down) * cell
-            angle = torch.atan((height[there] - height[here]) / distance)
-            before = highest[here]
-            top = torch.maximum(angle, before)
-            # the integral of cos(incidence) cos(h) over h from before to top
-            share = 0.5 * level[here] * ((top - before) + torch.sin(top - before) * torch.cos(top + before))
-            share = share + 0.5 * up[here] * (torch.sin(top) ** 2 - torch.sin(before) ** 2)
-            total[:, here_r, here_c] += share * leaving[:, there_r, there_c]
-            highest[here] = top
-    return total * (2 / AZIMUTHS)
+            there = _mirrored(row + down, rows)[:, None] * columns + _mirrored(column + right, columns)
+            angle = torch.atan((height.flatten()[there] - height) / (math.hypot(right, down) * cell))
+            top = torch.maximum(angle, highest)
+            # the integral of cos(incidence) cos(h) over h from the highest so far to the top
+            share = 0.5 * level * ((top - highest) + torch.sin(top - highest) * torch.cos(top + highest))
+            share = share + 0.5 * up * (torch.sin(top) ** 2 - torch.sin(highest) ** 2)
+            seen = share.flatten() > 0
+            places.append(torch.stack([here, there.flatten()])[:, seen])
+            shares.append(share.flatten()[seen])
+            highest = top
+    size, weights = (rows * columns, rows * columns), torch.cat(shares) * (2 / AZIMUTHS)
+    return torch.sparse_coo_tensor(torch.cat(places, 1), weights, size, check_invariants=False).coalesce()
 
 
-def _overlap(count: int, shift: int) -> tuple[slice, slice]:
-    """Places whose neighbour ``shift`` further on exists, and those neighbours."""
-    return slice(max(0, -shift), min(count, count - shift)), slice(max(0, shift), min(count, count + shift))
+def _mirrored(index: Tensor, count: int) -> Tensor:
+    """Indices beyond either end folded back, the end itself repeated."""
+    index = index % (2 * count)
+    return torch.minimum(index, 2 * count - 1 - index)
