@@ -45,7 +45,7 @@ bench: $(STAMP) ## speed and memory, each beside a named peer in the same run
 	for script in tests/benchmarks/bench_*.py; do echo "== $$script"; $(BIN)/python $$script; done
 
 campaign: $(STAMP) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
-	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --output results/campaign
+	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign
 
 docs: $(STAMP) ## write the generated parts of docs/ again
 	$(BIN)/python examples/photometry_page.py

@@ -1,9 +1,9 @@
 """`make campaign`: plant every effect in hidden scenes, name it blindly, and write what came out into docs.
 
-    python tests/campaign.py --seed 7 --scenes 4 --nulls 100 --output docs/diagnose_campaign
+    python tests/campaign.py --seed 7 --scenes 10 --nulls 40 --jobs 2 --output results/campaign
 
-Writes OUTPUT.json (every case), OUTPUT.md (tables) and OUTPUT.png (planted against named). Seeds of a final campaign are
-drawn once, after the code is frozen; development uses others.
+Writes OUTPUT.json (every case, as it comes), OUTPUT.md (tables) and OUTPUT.png (planted against named); cases that OUTPUT.json
+holds already are not done again. Seeds of a final campaign are drawn once, after the code is frozen; development uses others.
 """
 
 from __future__ import annotations
@@ -14,12 +14,15 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from hidden.drawn import drawn
 from hidden.scene import Layout, Scene, Truth, write_pairs
 
 # effect -> parameters at full strength; weaker plants multiply the first one
@@ -31,8 +34,8 @@ PLANTS: dict[str, dict] = {
     "sun_elevation": {"error_deg": 1.5},
     "sun_azimuth": {"error_deg": 3.0},
     "penumbra": {"radius_deg": 2.0},
-    "distant_shadow": {"height_m": 120.0, "side": "west", "distance_m": 300.0},
-    "interreflection": {"strength": 4.0},
+    "distant_shadow": {"height_m": 120.0, "side": "west", "distance_m": 300.0},  # in a campaign: by the crop's size
+    "interreflection": {"strength": 1.0},
     "earthshine": {"irradiance": 0.002, "elevation_deg": 50.0, "azimuth_deg": 120.0},
     "opposition_surge": {"B0": 0.3, "h": 0.06},
     "phase_slope": {"per_radian": 0.08},
@@ -51,6 +54,7 @@ PLANTS: dict[str, dict] = {
     "echo": {"fraction": 0.05, "lag_px": 6},
     "saturation": {"iof": 0.085},
 }
+PAIRED = ("phase_slope", "limb_darkening", "column_pattern", "image_gain", "line_jitter", "echo")
 UNKNOWN = {"banding": {"amplitude": 0.01, "period": 7.0}, "ghost": {"share": 0.03}}
 
 
@@ -89,6 +93,7 @@ def case(scene: Scene, effect: dict, seed: int, folder: Path) -> dict:
         "seed": seed,
         "scene": scene.layout.seed,
         "planted": effect,
+        "drawn": drawn(scene, Truth(effect=effect, **world), seed),
         "fid": fid,
         "possible_gain_percent": possible,
         "seconds": seconds,
@@ -219,7 +224,7 @@ def _share(part: int, whole: int) -> str:
 def _ratio(effect: str, hits: list[dict]) -> str:
     name = next(iter(PLANTS[effect]))
     found = [
-        c["answer"]["causes"][0]["parameters"][name]["value"] / c["planted"][effect][name]
+        c["answer"]["causes"][0]["parameters"][name]["value"] / c["drawn"].get(effect, c["planted"][effect][name])
         for c in hits
         if name in c["answer"]["causes"][0]["parameters"]
     ]
@@ -253,6 +258,47 @@ def picture(cases: list[dict], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
+def draw_layout(rng: np.random.Generator, options: argparse.Namespace) -> Layout:
+    """A scene: from smooth mare to rugged highland, of any scale."""
+    return Layout(
+        seed=int(rng.integers(2**31)), sites=options.sites, images=options.images, size=options.size,
+        slope_deg=float(np.exp(rng.uniform(np.log(5), np.log(16)))), gsd=float(rng.choice([2.0, 5.0, 20.0])),
+        sun_elevations=(float(rng.uniform(6, 14)), float(rng.uniform(55, 75))),
+    )  # fmt: skip
+
+
+def draw_jobs(rng: np.random.Generator, layout: Layout, options: argparse.Namespace) -> list[tuple[int, dict]]:
+    """(seed, what is hidden) of every case of a scene."""
+    jobs: list[dict] = [{} for _ in range(options.nulls)]
+    crop = layout.size * layout.gsd
+    wall = {"height_m": 0.19 * crop, "side": "west", "distance_m": 0.45 * crop}
+    for effect, values in (PLANTS | {"distant_shadow": wall}).items():
+        if options.only is not None and effect not in options.only:
+            continue
+        key = next(iter(values))
+        strengths = [1.0] if effect == "saturation" else options.strengths  # a level, not a size
+        jobs += [{effect: {**values, key: values[key] * s}} for s in strengths for _ in range(options.plants)]
+    if options.only is None:
+        jobs += [{k: v} for k, v in UNKNOWN.items() for _ in range(options.plants)]
+        for _ in range(options.doubles):
+            jobs.append({str(k): PLANTS[str(k)] for k in rng.choice(PAIRED, 2, replace=False)})
+    return [(int(rng.integers(2**31)), job) for job in jobs]
+
+
+def work(layout: Layout, cache: Path, seed: int, job: dict) -> dict:
+    """One case in a process of its own, on one thread; the scene stays for the next."""
+    import torch
+
+    torch.set_num_threads(1)
+    if _scene.get("layout") != layout:
+        _scene.update(layout=layout, scene=Scene(layout, cache))
+    with tempfile.TemporaryDirectory() as name:
+        return case(_scene["scene"], job, seed, Path(name))
+
+
+_scene: dict = {}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, required=True)
@@ -265,52 +311,35 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=12)
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--only", nargs="*", default=None)
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--output", type=Path, required=True)
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
-    cases: list[dict] = []
-    cache = Path(tempfile.gettempdir()) / "lunargr-hidden"
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
+    record = options.output.with_suffix(".json")
+    record.parent.mkdir(parents=True, exist_ok=True)
+    cases: list[dict] = json.loads(record.read_text()) if record.exists() else []
+    known = {(c["scene"], c["seed"]) for c in cases}
+    with tempfile.TemporaryDirectory() as cache, ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool:
         for _ in range(options.scenes):
-            layout = Layout(
-                seed=int(rng.integers(2**31)), sites=options.sites, images=options.images, size=options.size,
-                slope_deg=float(rng.uniform(5, 10)), gsd=float(rng.choice([2.0, 5.0, 20.0])),
-                sun_elevations=(float(rng.uniform(6, 14)), float(rng.uniform(55, 75))),
-            )  # fmt: skip
-            scene = Scene(layout, cache)
-            jobs: list[dict] = [{} for _ in range(options.nulls)]
-            crop = layout.size * layout.gsd
-            wall = {"height_m": 0.19 * crop, "side": "west", "distance_m": 0.45 * crop}
-            for effect, values in (PLANTS | {"distant_shadow": wall}).items():
-                if options.only is not None and effect not in options.only:
-                    continue
-                key = next(iter(values))
-                strengths = [1.0] if effect == "saturation" else options.strengths  # a level, not a size
-                jobs += [{effect: {**values, key: values[key] * s}} for s in strengths for _ in range(options.plants)]
-            if options.only is None:
-                jobs += [{k: v} for k, v in UNKNOWN.items() for _ in range(options.plants)]
-                for _ in range(options.doubles):
-                    pair = rng.choice(
-                        ["phase_slope", "limb_darkening", "column_pattern", "image_gain", "line_jitter", "echo"],
-                        2,
-                        replace=False,
-                    )
-                    jobs.append({str(k): PLANTS[str(k)] for k in pair})
-            for job in jobs:
-                done = case(scene, job, int(rng.integers(2**31)), folder)
+            layout = draw_layout(rng, options)
+            todo = [(s, j) for s, j in draw_jobs(rng, layout, options) if (layout.seed, s) not in known]
+            for future in as_completed([pool.submit(work, layout, Path(cache), s, j) for s, j in todo]):
+                done = future.result()
                 cases.append(done)
-                answer = done["answer"]
-                print(
-                    f"{','.join(job) or 'nothing':24s} -> {answer['verdict']:20s} "
-                    f"{[(c['effect'], {k: p['value'] for k, p in c['parameters'].items()}, round(c['gain_nats'])) for c in answer['causes']]} "
-                    f"closest {answer['closest']} blind {len(answer['blind'])} fid {done['fid']:.3f} {done['seconds']:.1f} s",
-                    flush=True,
-                )
-                options.output.with_suffix(".json").write_text(json.dumps(cases, indent=1))
+                print(_line(done), flush=True)
+                record.write_text(json.dumps(cases, indent=1))
             options.output.with_suffix(".md").write_text(summarise(cases))
             picture(cases, options.output.with_suffix(".png"))
     print(summarise(cases))
+
+
+def _line(done: dict) -> str:
+    answer = done["answer"]
+    named = [(c["effect"], {k: p["value"] for k, p in c["parameters"].items()}) for c in answer["causes"]]
+    return (
+        f"{','.join(done['planted']) or 'nothing':24s} -> {answer['verdict']:20s} {named} closest {answer['closest']} "
+        f"blind {answer['blind']} fid {done['fid']:.3f} {done['seconds']:.1f} s"
+    )
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,10 +11,13 @@ from torch import Tensor
 
 from stages.diagnose.chain import Chain
 from stages.effects import Effect, Survey, Trial, get_effect
+from stages.physics.formation import State
 
 # What every data set has a little of, always fitted along, with the size that is ordinary (multiples of the column):
 # without a bound on it a strange amount of one imitates other effects.
 BASELINE = {"dem_smoothing": 0.7, "psf_blur": 0.4}
+RELIEF = (math.radians(4.0), math.radians(12.0))  # blur of a shadow's edge by relief, at a distance of one px
+MOST_BLUR = 0.3  # rad
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,25 @@ def derivative_step(cls: type[Effect], coordinate: str, data: Survey) -> float:
                 return 0.1 * abs(column[coordinate] - cls.null()[coordinate]) or 1e-3
     parameter = next(p for p in cls.fitted() if p.name == coordinate)
     return max(0.05 * abs(parameter.default), 1e-3 * (parameter.upper - parameter.lower))
+
+
+class ReliefBlur:
+    """Shadow edges softened by errors of the DEM's heights: by an angle that falls with the distance of what casts them."""
+
+    slot = "illumination"
+
+    def __init__(self, at_one_px: float, distance: Tensor) -> None:
+        self.blur = at_one_px / distance
+
+    def apply(self, state: State) -> None:
+        disc = torch.as_tensor(state.sun_radius)
+        state.sun_radius = torch.sqrt(disc**2 + self.blur**2).clamp(max=MOST_BLUR)
+
+
+def relief_blur(chain: Chain) -> tuple[str, list[Tensor]]:
+    """Nuisance columns about shadow edges, (n, H, W) each: what relief that the DEM has not does to them."""
+    distance = chain.site.occluders()
+    return "relief", [chain.render(ReliefBlur(r, distance)) - chain.textured for r in RELIEF]
 
 
 def nominal_columns(chain: Chain) -> list[Tensor]:

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stages.diagnose.occluders import occluder_distance
 from stages.effects import Survey, fields
 from stages.network.dataset import PairReader
 from stages.physics.formation import Observation
@@ -26,6 +27,7 @@ class Site:
     pairs : (n,) indices into the file; number : the site's number in the file
     gain, offset : (n,), measured = gain x I/F + offset; 1 and 0 for calibrated images
     texture : (H, W), relative albedo of the ground beyond the nominal model, estimated along the way
+    shadow_px : (n, H, W), distance of what casts shadows, px, once asked for
     """
 
     observation: Observation
@@ -36,10 +38,17 @@ class Site:
     gain: Tensor
     offset: Tensor
     texture: Tensor
+    shadow_px: Tensor | None = None
 
     @property
     def count(self) -> int:
         return len(self.pairs)
+
+    def occluders(self) -> Tensor:
+        """(n, H, W), px: how far away what casts a shadow on each pixel stands."""
+        if self.shadow_px is None:
+            self.shadow_px = occluder_distance(self.observation)
+        return self.shadow_px
 
     @property
     def frames(self) -> NDArray[np.int64]:

@@ -7,10 +7,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import torch
-
 from stages.diagnose.chain import Chain
-from stages.diagnose.columns import BASELINE, Candidate, make_candidates, trial_columns
+from stages.diagnose.columns import BASELINE, Candidate, make_candidates, relief_blur, trial_columns
 from stages.diagnose.evidence import Evidence, best_guises, weigh
 from stages.diagnose.images import FEWEST, ImageEvidence, ImageProducts, as_effect, gather_images, weigh_images
 from stages.diagnose.pattern import PatternEvidence, weigh_pattern
@@ -21,7 +19,6 @@ from stages.diagnose.state import Search
 from stages.diagnose.statistics import Statistics, gather_site, gather_static, given, join, swap, without
 from stages.effects import get_effect
 
-RELIEF_WIDTHS = (1.6, 4.0)  # deg: relief below the DEM's resolution blurs shadow edges like discs of these radii
 LADDER = (0.72, 0.82, 0.92, 1.0, 1.08, 1.2, 1.35)  # of a wall's height ...
 DISTANCES = (0.04, 1.0, 3.0)  # ... and of its distance, about the best of the first ladder
 ALIGNMENTS = 3
@@ -37,14 +34,13 @@ class Round:
     """What one look at the data found.
 
     best : the best guise of every scene-wide effect; images : effects with values per image; pattern : a broad albedo
-    pattern; slope_error : rms of the apparent slope errors of the DEM, rad, NaN where the images are too few
+    pattern
     """
 
     works: list[Remains]
     best: dict[str, Evidence]
     images: dict[str, ImageEvidence]
     pattern: PatternEvidence | None = None
-    slope_error: float = math.nan
     others: list[Evidence] = field(default_factory=list)  # guises that lost
     edges: list[Remains] = field(default_factory=list)  # the sites with the pixels about shadow edges
     statistics: Statistics | None = None  # of the effects of lit ground
@@ -84,7 +80,7 @@ def look(state: Search, names: Sequence[str]) -> Round:
         seen.relief = [open_relief(work, name, state.data) for name in relief]
         if at_edge:
             wide = ready(chain, state.dn, wide=True)
-            seen.edges = gather_site(wide, at_edge, state.data, [_relief_blur(chain, state)])
+            seen.edges = gather_site(wide, at_edge, state.data, [relief_blur(chain)])
             seen.wide = wide.remains()
         return seen
 
@@ -110,7 +106,6 @@ def look(state: Search, names: Sequence[str]) -> Round:
         best_guises(evidence),
         weigh_images([s.images for s in every], state.frames),
         pattern,
-        _slope_error(works),
         evidence,
         edges or works,
         statistics,
@@ -136,17 +131,11 @@ def align(state: Search) -> ImageEvidence | None:
     return first
 
 
-def _relief_blur(chain: Chain, state: Search) -> tuple[str, list[torch.Tensor]]:
-    """Shadow edges blurred by relief below the DEM's resolution, by two widths: no matter of a far wall."""
-    cls = get_effect("penumbra")
-    return "relief", [chain.render(cls({"radius_deg": r}, state.data)) - chain.textured for r in RELIEF_WIDTHS]
-
-
 def _weigh_edges(state: Search, data: Statistics) -> list[Evidence]:
-    """A wall is judged beside the blur of relief; a wide Sun looks like that blur, and is judged by its size."""
+    """Walls and a wide Sun, both beside the blur of shadows that relief makes."""
     discs = [c for c in data.candidates if c.effect != "distant_shadow"]
     walls = [c for c in data.candidates if c.effect == "distant_shadow"]
-    found = weigh(without(data, [f"relief{k}" for k in range(len(RELIEF_WIDTHS))], discs)) if discs else []
+    found = _disc(weigh(without(data, [], discs))) if discs else []
     if walls:
         weighed = weigh(without(data, [], walls))
         top = max(weighed, key=lambda e: e.gain)
@@ -154,6 +143,19 @@ def _weigh_edges(state: Search, data: Statistics) -> list[Evidence]:
         if top.gain > 12 and float(top.amount[0]) > 0.005 and top.fid > 0.015:
             found += _climb(state, top)
     return found
+
+
+def _disc(found: list[Evidence]) -> list[Evidence]:
+    """The guise that fits best as what it says: a disc of its radius in full, not a share of a wider one, as relief is.
+
+    A column worth ``gain`` at its best amount a is worth gain (2 a - 1) / a^2 at amount 1.
+    """
+
+    def whole(e: Evidence) -> float:
+        amount = max(float(e.amount[0]), 0.1)
+        return e.gain * (2 * amount - 1) / amount**2
+
+    return [max(found, key=whole)]
 
 
 def _climb(state: Search, top: Evidence) -> list[Evidence]:
@@ -169,7 +171,7 @@ def _climb(state: Search, top: Evidence) -> list[Evidence]:
 
         def of(chain: Chain, candidates: list[Candidate] = candidates) -> Statistics:
             wide = ready(chain, state.dn, wide=True)
-            return gather_site(wide, candidates, state.data, [_relief_blur(chain, state)])
+            return gather_site(wide, candidates, state.data, [relief_blur(chain)])
 
         best = max(weigh(join(state.each(of))), key=lambda e: e.gain)
         if best.gain <= top.gain:
@@ -186,11 +188,6 @@ def _smooth(state: Search, evidence: Sequence[Evidence]) -> bool:
             ((name, reference),) = e.candidate.trial.columns[0].items()
             return float(e.amount[0]) * reference > 0.5 * cls.tolerance[name]
     return state.deepest < FREE_SLOPES
-
-
-def _slope_error(works: Sequence[Remains]) -> float:
-    maps = [w.slope_error for w in works if math.isfinite(w.slope_error)]
-    return float(torch.tensor(maps).square().mean().sqrt()) if maps else math.nan
 
 
 def quiet(seen: Round, named: str) -> set[str]:
@@ -210,10 +207,8 @@ def misfit(state: Search, works: Sequence[Remains]) -> float:
 
 def narrowed(seen: Round, later: Round) -> Round:
     """A later look at fewer effects, with the earlier evidence for those that it left out."""
-    # once a blur or a shift is named the DEM looks better than it is: relief below its resolution stays
-    slopes = max(seen.slope_error, later.slope_error) if math.isfinite(seen.slope_error) else later.slope_error
     best, images = {**seen.best, **later.best}, {**seen.images, **later.images}
-    return dataclasses.replace(later, best=best, images=images, slope_error=slopes)
+    return dataclasses.replace(later, best=best, images=images)
 
 
 __all__ = ["Round", "look", "narrowed"]

@@ -25,8 +25,6 @@ KEEP_SHARE = 0.8  # of a per-image effect's gain that a scene-wide effect must k
 SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to replace it
 NEAR = 0.9  # of the best gain: linear models of strong effects are no closer than that
 RIVALS = 2
-BLUR = 2.2  # radius of the discs, in rms slope errors of the DEM, that relief alone makes of the Sun
-LEAST_DISC = 0.5  # deg
 CLEAR_LAG = 4  # px
 STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
 
@@ -100,8 +98,7 @@ def worth(e: Evidence, seen: Round, count: int, ease: float = 1.0) -> bool:
         if value < 0 or (near and e.fid < 2 * FLOOR_FID):
             return False
     if e.effect == "penumbra":
-        blur = seen.slope_error if math.isfinite(seen.slope_error) else math.radians(2)
-        return value > max(BLUR * math.degrees(blur), LEAST_DISC) + 3 * error
+        return value > e.candidate.trial.fixed["relief_deg"] + 3 * error
     if e.effect == "dem_smoothing" and value < 0:  # no DEM is sharper than the ground
         return False
     if name in cls.tolerance:

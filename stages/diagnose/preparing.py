@@ -20,6 +20,7 @@ QUIETEST = 0.002  # noise over mean brightness: an image that looks quieter is d
 SHOT = 0.8  # share of shot noise in the noise's variance at mean brightness
 EDGE = math.radians(6.0)  # relief below the DEM's resolution blurs shadows over a band like this ...
 DOUBT = 0.3  # ... by up to this share of the lit brightness
+CAST = (math.radians(0.3), math.radians(24.0))  # the band about cast shadows: far away, and at a distance of one px
 
 
 @dataclass
@@ -28,8 +29,7 @@ class SiteWork:
 
     residual : (n, H, W), I/F, measured minus predicted; albedo : (H, W), relative albedo of the ground beyond the
     prediction, not whitened; static : (K, H, W), whitened maps of the residual; dynamic : (n, H, W), the residual's
-    dynamic rows once everything local and the nominal model's own freedom are taken out; slope_error : rms per axis of the
-    apparent slope errors, as tangent, by their median, NaN where images are too few
+    dynamic rows once everything local and the nominal model's own freedom are taken out
     """
 
     chain: Chain
@@ -39,10 +39,9 @@ class SiteWork:
     albedo: Tensor
     static: Tensor
     dynamic: Tensor
-    slope_error: float = math.nan
 
     def remains(self) -> Remains:
-        return Remains(self.chain.site, self.projector.weight, self.albedo, self.dynamic, self.slope_error)
+        return Remains(self.chain.site, self.projector.weight, self.albedo, self.dynamic)
 
 
 @dataclass
@@ -53,7 +52,6 @@ class Remains:
     weight: Tensor
     albedo: Tensor
     dynamic: Tensor
-    slope_error: float
 
 
 def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
@@ -89,8 +87,7 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
         chain.textured = chain.render()
     projector.learn_spectrum(maps)
     local = Local(projector, nuisance_columns(chain, dn))
-    slopes = float(maps[1:].square().sum(0).median() / (2 * math.log(2))) ** 0.5 if len(maps) > 1 else math.nan
-    return SiteWork(chain, projector, local, residual, maps[0], projector.whiten(maps[None])[0], dynamic, slopes)
+    return SiteWork(chain, projector, local, residual, maps[0], projector.whiten(maps[None])[0], dynamic)
 
 
 def left_over(chain: Chain, weight: Tensor, dn: bool) -> float:
@@ -124,9 +121,16 @@ def _first_weight(chain: Chain, wide: bool) -> Tensor:
         use &= mu0 > GRAZING
     if not wide and float((use & (rising > CUT)).sum()) > 0.1 * float(use.sum()):
         use &= (rising > CUT) | ((above < -DEEP) if above is not None else torch.zeros_like(use))
-    edge = torch.where(mu0 > 0 if above is None else above > 0, EDGE, 0.3 * EDGE)
-    doubt = DOUBT * (state.reflectance + 0.2 * mean) * torch.exp(-rising.abs() / edge)
-    variance = variance + doubt**2
+    doubt = DOUBT * (state.reflectance + 0.2 * mean)
+    if wide and above is not None:  # the further away a shadow's edge begins the better its place is known
+        far, near = CAST
+        cast = torch.sqrt(far**2 + (near / site.occluders()) ** 2)
+        own = torch.asin(mu0.clamp(-1, 1))
+        variance = variance + (doubt * torch.exp(-own.abs() / EDGE)) ** 2
+        variance = variance + (doubt * torch.exp(-above.abs() / cast)) ** 2
+    else:
+        edge = torch.where(mu0 > 0 if above is None else above > 0, EDGE, 0.3 * EDGE)
+        variance = variance + (doubt * torch.exp(-rising.abs() / edge)) ** 2
     return use * variance.clamp(min=1e-14).rsqrt()
 
 

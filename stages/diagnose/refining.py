@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.chain import Chain
-from stages.diagnose.columns import derivative_step
+from stages.diagnose.columns import derivative_step, relief_blur
 from stages.diagnose.evidence import Evidence
 from stages.diagnose.images import ImageProducts, as_effect, gather_images, weigh_images
 from stages.diagnose.preparing import ready
@@ -22,8 +22,8 @@ from stages.effects import Effect, Survey, get_effect
 WORTH_MOVING = 12.0  # nats
 # far from linear: the trial that fitted best is a better start than what a line through it says
 KEEP_TRIAL = ("distant_shadow", "saturation")
-SHAPES = ("h", "lag_px", "radius_deg", "theta_bar_deg", "height_m")  # not more than half of themselves at a time
-STILL = ("axis", "side", "distance_px", "lag_px")  # found by the search alone
+SHAPES = ("h", "lag_px", "theta_bar_deg", "height_m")  # not more than half of themselves at a time
+STILL = ("axis", "side", "distance_px", "lag_px", "radius_deg", "relief_deg")  # found by the search alone
 
 
 def start(evidence: Evidence, data: Survey) -> tuple[Effect, dict[str, float]]:
@@ -68,7 +68,8 @@ def refine(state: Search, steps: int = 2) -> None:
 
 def _gather(state: Search, chain: Chain) -> tuple[Statistics, list[Relief], ImageProducts | None]:
     """Products of further steps of all named effects at one site: scene-wide ones, the DEM's, those per image."""
-    work = ready(chain, state.dn, wide=any(c.effect.channel == "edge" for c in state.causes))
+    wide = any(c.effect.channel == "edge" for c in state.causes)
+    work = ready(chain, state.dn, wide)
     relief = []
     for place, effect in enumerate(chain.base):
         if effect.channel == "relief":
@@ -76,7 +77,7 @@ def _gather(state: Search, chain: Chain) -> tuple[Statistics, list[Relief], Imag
             step = derivative_step(type(effect), coordinate, state.data)
             relief.append(named_relief(work, place, step, state.data))
     single = [e.name for e in state.base if e.scope == "image"]
-    lit = gather_site(work, [], state.data)
+    lit = gather_site(work, [], state.data, [relief_blur(chain)] if wide else [])
     return lit, relief, gather_images(work, single, state.dn, state.data)
 
 

@@ -35,7 +35,7 @@ class Interreflection(Effect):
     confused_with = ("earthshine", "dark_bias")
     separate = "an image with the Sun so low that crater floors lie in shadow beside lit walls"
     parameters = (Parameter("strength", "1", -1.0, 5.0, 0.0, "share of the light that diffuse terrain would scatter"),)
-    strong: ClassVar = {"strength": 1.5}
+    strong: ClassVar = {"strength": 1.0}
 
     def apply(self, state: State) -> None:
         strength = self.value("strength", state)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -9,6 +11,11 @@ import torch
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation import State
 from stages.physics.photometry import Parameter
+
+# Relief below the DEM's resolution blurs far shadows like a disc of this radius, deg, and more on rugged ground:
+# by so much per change of slope over a pixel (Laplacian of the heights after a 2 px blur, times the pixel).
+RELIEF, PER_BEND = 0.9, 26.0
+RELIEF_SPREAD = 0.25  # standard deviation of that, as a share, from one piece of ground to the next
 
 
 @register
@@ -25,15 +32,32 @@ class Penumbra(Effect):
     confused_with = ("sun_elevation", "distant_shadow")
     separate = "an image with the Sun low enough to cast long shadows"
     parameters = (Parameter("radius_deg", "degree", 0.02, 3.0, 0.2666, "effective angular radius of the Sun"),)
-    strong: ClassVar = {"radius_deg": 0.7}
+    coordinates = (
+        *parameters,
+        Parameter(
+            "relief_deg", "degree", 0.0, 30.0, 0.0, "disc that relief alone makes of the Sun: in radius_deg as fitted"
+        ),
+    )
+    strong: ClassVar = {"radius_deg": 1.5}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
-        return [Trial(({"radius_deg": r},)) for r in (0.45, 0.8, 1.2, 1.8, 2.5, 3.5)]
+        relief = max(RELIEF, PER_BEND * survey.curvature[1] * survey.gsd)
+        return [Trial(({"radius_deg": r},), {"relief_deg": relief}) for r in (0.45, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0)]
 
     @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:
         return "sun_horizon" in has
+
+    @classmethod
+    def report(cls, values: Mapping[str, float], errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        """The Sun's radius, deg: variances of discs add, and relief has its share."""
+        radius, relief, least = values["radius_deg"], values["relief_deg"], cls.null()["radius_deg"]
+        if relief == 0:
+            return {"radius_deg": (radius, errors.get("radius_deg", 0.0))}
+        sun = math.sqrt(max(radius**2 - relief**2 + least**2, least**2))
+        error = math.hypot(radius * errors.get("radius_deg", 0.0), relief**2 * RELIEF_SPREAD) / sun
+        return {"radius_deg": (sun, error)}
 
     def apply(self, state: State) -> None:
         state.sun_radius = torch.deg2rad(self.value("radius_deg", state)).clamp(min=1e-4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -122,7 +123,9 @@ class Scene:
                 data = (ground.normal @ self.views[image]).reshape(ground.count, ground.count)
             if path is not None:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                np.save(path, data.astype(np.float16))
+                partial = path.with_suffix(f".{os.getpid()}.npy")  # several processes may trace at once
+                np.save(partial, data.astype(np.float16))
+                partial.rename(path)
         self._layers[key] = data
         return data
 

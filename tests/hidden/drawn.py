@@ -1,0 +1,32 @@
+"""What a scene's random draws came to: sizes of effects with values per image, as an ideal diagnosis would give them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hidden.scene import Scene, Truth
+
+
+def drawn(scene: Scene, truth: Truth, seed: int) -> dict[str, float]:
+    """Effect -> its first parameter in this world, where that is a mean size and not the value itself.
+
+    What all images have in common belongs to the ground (shifts) or to the model (gains): deviations from the mean count.
+    """
+    rng = np.random.default_rng((seed, 5))
+    for site in range(scene.layout.sites):
+        scene.given_dem(site, truth, rng)
+    frames = [scene._frame(rng, truth) for _ in range(scene.layout.images)]
+    out: dict[str, float] = {}
+    if "misregistration" in truth.effect:
+        shifts = np.array([pose.error for pose, _ in frames])
+        out["misregistration"] = float(np.sqrt(shifts.var(0, ddof=1).sum()))
+    if "image_gain" in truth.effect:
+        gains = np.array([camera.gain for _, camera in frames])
+        out["image_gain"] = float(gains.std(ddof=1) / gains.mean())
+    if "column_pattern" in truth.effect:
+        half = scene.layout.size / 2
+        seen = [camera.response(pose.first[1] + np.linspace(-half, half, 101)) for pose, camera in frames]
+        first, last = (f(pose.first[1] for pose, _ in frames) for f in (min, max))
+        columns = frames[0][1].response(np.arange(first - half, last + half))
+        out["column_pattern"] = float(columns.std() / np.mean(seen))
+    return out
