@@ -48,3 +48,11 @@ def small_artefacts(small_files, tmp_path_factory):
     sample.run(paths["scene"], paths["crops"], sample.Config(count=90, tile_m=1280, seed=3, block=100))
     project.run(paths["crops"], paths["pairs"], project.Config())
     return paths
+
+
+@pytest.fixture
+def hilly_map(rng, tmp_path):
+    """svbrdf.h5 of a hilly map, alone in the test's folder, with its grid, elevation and coefficients."""
+    from render_scene import write_hilly_map
+
+    return write_hilly_map(rng, tmp_path / "svbrdf.h5")

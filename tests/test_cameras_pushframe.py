@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import small_scene
-from test_cameras_pipeline import photograph, residual, run_all, write_image
+from raw_frames import photograph, residual, run_all, write_image
 
 from schemas.errors import GeometryError, InputError
 from stages.physics.cameras import camera_from_document, camera_kinds

@@ -7,34 +7,17 @@ import math
 import numpy as np
 import pytest
 from rasterio.transform import Affine
+from relief import RADIUS, body_point, hills, metric_grid
 
 from schemas.errors import GeometryError
 from stages.physics.chart import TOLERANCE, chart_position, fit_chart
-from stages.physics.grid import Grid, local_metric_crs, sphere_crs, unit_vectors
+from stages.physics.grid import Grid, sphere_crs, unit_vectors
 from stages.physics.hits import hit_angles, hit_points, sample_maps, surface_normals
 from stages.physics.raycast import BELOW, HIT, MISS, build_height_field, cast
 
-RADIUS = 1737400.0
 
-
-def metric_grid(size: int, gsd: float, lon: float = 12.0, lat: float = -34.0) -> Grid:
-    crs = local_metric_crs(lon, lat, RADIUS)
-    return Grid(crs.to_wkt(), Affine(gsd, 0, -size * gsd / 2, 0, -gsd, size * gsd / 2), size, size, RADIUS)
-
-
-def hills(rng: np.random.Generator, size: int, gsd: float, steepness: float = 0.35) -> np.ndarray:
-    """Smooth random relief with slopes of about ``steepness``."""
-    spectrum = np.fft.rfft2(rng.normal(size=(size, size)))
-    fy, fx = np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :]
-    wave = np.hypot(fx, fy)
-    wave[0, 0] = 1.0
-    z = np.fft.irfft2(spectrum * wave**-2.2 * np.exp(-((wave * 8) ** 2)), s=(size, size))
-    slope = np.hypot(*np.gradient(z, gsd))
-    return (z * steepness / np.sqrt((slope**2).mean())).astype(np.float32)
-
-
-def body_point(grid: Grid, row: float, col: float, height: float) -> np.ndarray:
-    return unit_vectors(*(float(v) for v in grid.lonlat(row, col))) * (grid.radius + height)
+def square_grid(size: int, gsd: float, lon: float = 12.0, lat: float = -34.0) -> Grid:
+    return metric_grid(size, size, gsd, lon, lat)
 
 
 def fan(grid: Grid, row: float, col: float, altitude: float, towards: tuple[float, float], fov: float, n: int):
@@ -58,7 +41,7 @@ def bilinear(z: np.ndarray, row: np.ndarray, col: np.ndarray) -> np.ndarray:
 
 
 def test_a_bare_sphere_is_hit_where_the_quadratic_formula_says():
-    grid = metric_grid(400, 50.0)
+    grid = square_grid(400, 50.0)
     field = build_height_field(np.full((400, 400), 120.0, np.float32), grid)
     for towards in ((200, 200), (120, 260), (20, 200)):
         origin, directions = fan(grid, 200, 200, 9000.0, towards, 0.5, 41)
@@ -78,7 +61,7 @@ def test_a_bare_sphere_is_hit_where_the_quadratic_formula_says():
     ("altitude", "towards", "fov"), [(20e3, (256, 256), 0.06), (3e3, (100, 256), 0.5), (900.0, (30, 400), 0.7)]
 )
 def test_hits_lie_on_the_bilinear_surface_of_the_projected_grid(rng, altitude, towards, fov):
-    grid = metric_grid(512, 5.0)
+    grid = square_grid(512, 5.0)
     z = hills(rng, 512, 5.0)
     field = build_height_field(z, grid)
     origin, directions = fan(grid, 256, 256, altitude + float(z.max()), towards, fov, 101)
@@ -98,7 +81,7 @@ def test_hits_lie_on_the_bilinear_surface_of_the_projected_grid(rng, altitude, t
 
 def test_no_ray_skips_a_surface_that_a_dense_march_finds(rng):
     """The pyramid must never hide a ridge: march along grazing rays in quarter-pixel steps instead."""
-    grid = metric_grid(128, 10.0)
+    grid = square_grid(128, 10.0)
     z = hills(rng, 128, 10.0, steepness=0.6)
     field = build_height_field(z, grid)
     start = float(bilinear(z, np.array([120.0]), np.array([64.0]))[0]) + 3.0
@@ -122,7 +105,7 @@ def test_no_ray_skips_a_surface_that_a_dense_march_finds(rng):
 
 
 def test_holes_and_edges_are_unknown_not_seen_through(rng):
-    grid = metric_grid(128, 10.0)
+    grid = square_grid(128, 10.0)
     z = hills(rng, 128, 10.0)
     z[40:60, 40:60] = np.nan
     field = build_height_field(z, grid)
@@ -140,7 +123,7 @@ def test_holes_and_edges_are_unknown_not_seen_through(rng):
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (150.0, 60.0), (10.0, 89.9), (-70.0, -90.0)])
 def test_the_chart_agrees_with_the_projection(rng, place):
-    grid = metric_grid(2000, 100.0, *place)
+    grid = square_grid(2000, 100.0, *place)
     chart = fit_chart(grid)
     row, col = rng.uniform(-0.5, 1999.5, (2, 400))
     local = chart.to_local(unit_vectors(*grid.lonlat(row, col)))
@@ -157,7 +140,7 @@ def test_half_the_body_is_too_much_for_one_chart():
 
 def test_angles_of_a_plane_are_those_of_its_normal(rng):
     """On a tilted plane small enough to be flat, incidence follows from slope and Sun alone."""
-    grid = metric_grid(64, 1.0)
+    grid = square_grid(64, 1.0)
     east, north = 0.3, -0.2
     c = np.arange(64.0) - 31.5
     z = (c[None, :] * east - c[:, None] * north).astype(np.float32)
@@ -177,7 +160,7 @@ def test_angles_of_a_plane_are_those_of_its_normal(rng):
 
 
 def test_samples_ignore_unknown_pixels():
-    grid = metric_grid(16, 1.0)
+    grid = square_grid(16, 1.0)
     field = build_height_field(np.zeros((16, 16), np.float32), grid)
     origin, directions = fan(grid, 7.25, 7.5, 500.0, (7.25, 7.5), 1e-6, 1)
     hits = cast(field, origin, directions)

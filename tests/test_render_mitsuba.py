@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from rasterio.transform import Affine
-from test_raycast import body_point, hills
+from relief import body_point, hills
 
 from stages.physics.formation import SUN_RADIUS
 from stages.physics.grid import Grid, local_metric_crs, unit_vectors

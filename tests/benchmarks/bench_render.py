@@ -21,7 +21,7 @@ from rasterio.transform import Affine
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from test_raycast import body_point, hills
+from relief import body_point, hills
 
 from stages.physics.grid import Grid, local_metric_crs
 from stages.physics.light import SunHorizon

@@ -1,0 +1,157 @@
+"""`lunargr render` of whole maps: closed forms on known ground, georeference to the pixel, blocks, extensions."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import rasterio
+from rasterio.transform import Affine
+from relief import RADIUS, hills
+from render_scene import LAT, LON, SUN, lunargr_render, make_grid, write_dem, write_svbrdf
+
+from schemas import DIAGNOSIS, ArtefactWriter
+from stages import render
+from stages.physics import light
+from stages.physics.grid import Grid, unit_vectors
+from stages.physics.photometry import evaluate
+from stages.physics.pictures import read_exr
+from stages.render import maps
+
+
+def test_a_level_map_has_the_angles_of_the_sphere(tmp_path):
+    """On bare ground incidence follows from the sub-solar point alone, and turns by 1 deg per 30 km."""
+    grid = make_grid(300, 400, 300.0)  # 90 x 120 km
+    path = write_svbrdf(tmp_path / "s.h5", grid, np.zeros((300, 400)), np.full((1, 300, 400), 0.2), "lambert")
+    config = render.Config(subsolar_longitude_deg=-80.0, subsolar_latitude_deg=-5.0)
+    render.run(path, tmp_path / "o.exr", config)
+    found = read_exr(tmp_path / "o.exr")
+    rows, cols = np.indices((300, 400))
+    lon, lat = grid.lonlat(rows.ravel(), cols.ravel())
+    up = unit_vectors(lon, lat)
+    sun = unit_vectors(-80.0, -5.0) * 149597870700.0 - up * RADIUS
+    sun /= np.linalg.norm(sun, axis=1, keepdims=True)
+    incidence = np.degrees(np.arccos((up * sun).sum(1))).reshape(300, 400)
+    np.testing.assert_allclose(found["incidence_deg"], incidence, atol=2e-3)
+    np.testing.assert_allclose(found["phase_deg"], incidence, atol=2e-3)
+    assert np.ptp(incidence) > 3.0
+    np.testing.assert_allclose(found["image"], 0.2 * np.cos(np.radians(incidence)), rtol=1e-4)
+    np.testing.assert_allclose(found["emission_deg"], 0.0, atol=0.05)  # acos near 1 in float32
+    np.testing.assert_allclose(found["longitude_deg"], lon.reshape(300, 400), atol=1e-4)
+    np.testing.assert_allclose(found["latitude_deg"], lat.reshape(300, 400), atol=1e-4)
+    assert (found["shadow"] == 0).all()
+
+
+def test_sun_angles_hold_at_the_middle_clockwise_from_true_north(tmp_path):
+    """A polar stereographic map's rows are not parallels: azimuth counts from true north, not from the rows."""
+    wkt = rasterio.crs.CRS.from_proj4(f"+proj=stere +lat_0=-90 +lat_ts=-90 +lon_0=0 +R={RADIUS} +units=m").to_wkt()
+    grid = Grid(wkt, Affine(20.0, 0, 60e3, 0, -20.0, 62e3), 101, 101, RADIUS)
+    # a plane that falls towards the north of the middle pixel
+    lon, lat = (float(v) for v in grid.lonlat(50, 50))
+    axes = grid.local_frames(50, 50).axes[0]
+    north = np.cross(unit_vectors(lon, lat), np.cross([0, 0, 1.0], unit_vectors(lon, lat)))
+    along = axes @ (north / np.linalg.norm(north))  # grid east, grid north of true north
+    r, c = np.indices((101, 101)) - 50.0
+    elevation = -0.2 * 20.0 * (c * along[0] - r * along[1])
+    path = write_dem(tmp_path / "d.tif", grid, elevation)
+    config = render.Config(sun_azimuth_deg=0.0, sun_elevation_deg=40.0, shadows=False)
+    render.run(path, tmp_path / "o.exr", config)
+    tilt = math.degrees(math.atan(0.2))
+    assert read_exr(tmp_path / "o.exr")["incidence_deg"][50, 50] == pytest.approx(50.0 - tilt, abs=0.05)
+
+
+def test_ortho_image_is_the_model_at_the_backplanes_angles_and_the_map_to_the_pixel(hilly_map, tmp_path):
+    path, grid, _, coefficients = hilly_map
+    config = render.Config(sun_azimuth_deg=100.0, sun_elevation_deg=35.0)
+    summary = render.run(path, tmp_path / "o.exr", config)
+    exr = read_exr(tmp_path / "o.exr")
+    angles = (np.radians(exr[f"{k}_deg"]) for k in ("incidence", "emission", "phase"))
+    expected = evaluate("M2", dict(zip("abc", coefficients, strict=True)), *angles)
+    lit = (exr["shadow"] == 0) & np.isfinite(coefficients[0])
+    assert lit.mean() > 0.5
+    np.testing.assert_allclose(exr["image"][lit], expected[lit], rtol=2e-4)
+    assert (np.isnan(exr["image"]) == np.isnan(coefficients[0])).all()
+    assert summary.known_share == pytest.approx(1 - 600 / 32000)
+    with rasterio.open(tmp_path / "o.tif") as tif:
+        assert tif.shape == (160, 200)
+        assert tif.transform.almost_equals(grid.transform)
+        assert tif.crs == grid.crs
+        assert math.isnan(tif.nodata)
+        assert tif.descriptions == ("image",)
+        assert tif.tags()["MODEL"] == "M2"
+        np.testing.assert_array_equal(tif.read(1), exr["image"])
+    picture = oiio.ImageBuf(str(tmp_path / "o.png"))
+    pixels = picture.get_pixels(oiio.UINT8)
+    assert pixels.shape == (160, 200, 2)
+    assert (pixels[20:40, 60:90] == 0).all()
+    assert (pixels[:20, :, 1] == 255).all()
+    assert 40 < np.median(pixels[..., 0]) < 240
+
+
+def test_blocks_make_no_difference(hilly_map, tmp_path, monkeypatch):
+    path, *_ = hilly_map
+    config = render.Config(sun_azimuth_deg=100.0, sun_elevation_deg=20.0)
+    render.run(path, tmp_path / "whole.exr", config)
+    monkeypatch.setattr(maps, "BAND_ROWS", 33)
+    monkeypatch.setattr(maps, "BAND_COLUMNS", 71)
+    render.run(path, tmp_path / "blocks.exr", config)
+    whole, blocks = read_exr(tmp_path / "whole.exr"), read_exr(tmp_path / "blocks.exr")
+    for name in whole:
+        np.testing.assert_allclose(
+            blocks[name], whole[name], atol=2e-3 if name.endswith("_deg") else 1e-5, err_msg=name
+        )
+
+
+def test_horizons_in_blocks_agree_with_one_sweep(hilly_map, tmp_path, monkeypatch):
+    """Large maps take the horizon block by block; the shadows must be those of the whole map."""
+    path, *_ = hilly_map
+    config = render.Config(sun_azimuth_deg=100.0, sun_elevation_deg=12.0)
+    render.run(path, tmp_path / "whole.exr", config)
+    monkeypatch.setattr(light, "WHOLE_PX", 0)
+    monkeypatch.setattr(light, "BLOCK_PX", 64)
+    render.run(path, tmp_path / "blocks.exr", config)
+    whole, blocks = (read_exr(tmp_path / f"{n}.exr")["shadow"] for n in ("whole", "blocks"))
+    assert 0.02 < (whole > 0.5).mean() < 0.6
+    assert ((whole > 0.5) != (blocks > 0.5)).mean() < 0.004
+
+
+def test_a_dem_with_one_model_everywhere(rng, tmp_path, monkeypatch, capsys):
+    grid = make_grid(64, 64, 10.0)
+    elevation = hills(rng, 64, 10.0)
+    elevation[5:9, 5:9] = np.nan
+    dem = write_dem(tmp_path / "dem.tif", grid, elevation)
+    code, error = lunargr_render(
+        monkeypatch, capsys, "--dem", dem, "--model", "minnaert", "--parameters", "albedo=0.2", *SUN, "-o", tmp_path / "o.exr",
+        "--json", tmp_path / "o.json", "--no-shadows", "--quiet",
+    )  # fmt: skip
+    assert (code, error) == (0, "")
+    exr = read_exr(tmp_path / "o.exr")
+    angles = (np.radians(exr[f"{k}_deg"]) for k in ("incidence", "emission", "phase"))
+    expected = np.where(np.isnan(elevation), np.nan, evaluate("minnaert", {"albedo": 0.2}, *angles))
+    np.testing.assert_allclose(exr["image"], expected, rtol=3e-4, atol=1e-6)
+    assert np.isnan(exr["image"][5:9, 5:9]).all()
+    assert np.isfinite(exr["image"]).sum() == 64 * 64 - 16
+    told = json.loads((tmp_path / "o.json").read_text())["views"][0]
+    assert told["mean_iof"] == pytest.approx(float(np.nanmean(exr["image"])), rel=1e-5)
+
+
+def test_extensions_reach_both_kinds_of_view(hilly_map, tmp_path):
+    """A pedestal of known height is added in the sensor slot, by the ortho view and by the camera alike."""
+    path, *_ = hilly_map
+    extension = json.dumps([{"effect": "dark_bias", "values": {"iof": 0.007}, "survey": {}}])
+    attributes = {"report": "{}", "extension": extension}
+    with ArtefactWriter(tmp_path / "diagnosis.h5", DIAGNOSIS, {"frame": 1}, attributes=attributes) as writer:
+        writer.write("image_id", ["one"])
+    sun = {"sun_azimuth_deg": 100.0, "sun_elevation_deg": 35.0}
+    view = {"view": "pinhole", "position": (LON, LAT, 4000.0), "fov_deg": 8.0, "size_px": (48, 48)}
+    for name, changes in (("map", {}), ("view", view)):
+        base, more = tmp_path / f"{name}.exr", tmp_path / f"{name}_more.exr"
+        render.run(path, base, render.Config(**sun, **changes))
+        render.run(path, more, render.Config(**sun, **changes, extension=str(tmp_path / "diagnosis.h5")))
+        difference = read_exr(more)["image"] - read_exr(base)["image"]
+        known = np.isfinite(difference)
+        assert known.mean() > 0.9
+        assert np.median(difference[known]) == pytest.approx(0.007, abs=3e-4)
