@@ -10,6 +10,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = {
     "lunargr_cli": "The command line: thin, no physics",
     "lunargr_cli/commands": "One thin file per command",
+    "lunargr_cli/fanout": "One stage's shards over processes and nodes",
     "schemas": "What artefacts hold, and how they are written and opened",
     "stages": "One module (or package) per stage of the pipeline, in the order of the data",
     "stages/physics": "Grids, bodies, geometry, light, views, registration: everything that stages share",
@@ -18,12 +19,14 @@ FOLDERS = {
     "stages/network": "The U-Net and what training and inference share",
     "stages/effects": "Candidate causes of a residual, one file each",
     "stages/simulate": "simulate",
+    "stages/ingest": "ingest",
     "stages/render": "render",
     "stages/evaluate": "evaluate",
     "stages/match": "match; one file per matcher",
     "stages/diagnose": "diagnose",
     "stages/report": "report",
     "examples": "Scripts to run and to learn from",
+    "examples/cluster": "Scripts for Slurm and Dask",
     "docs": "Pages",
     "tests": "Tests, by layer",
     "tests/hidden": "The independent generator of data with something hidden in them",
@@ -46,6 +49,9 @@ def first_line(path: Path) -> str:
 def page() -> str:
     """The whole page."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split()
+    missing = {str(Path(f).parent) for f in listed if f.endswith(".py")} - FOLDERS.keys()
+    if missing:
+        raise SystemExit(f"{Path(__file__).name}: say in FOLDERS what these are: {', '.join(sorted(missing))}")
     out = ["# Every file", "", "Written by `make docs` from the first line of each file.", ""]
     for folder, what in FOLDERS.items():
         rows = [
