@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.network import kernels
-from stages.network.kernels import channels_last, empty, pixels_of, rows_of, share_out
+from stages.network.kernels import channels_last, empty, pixels_of, rows_of
 from stages.network.layers import BatchNorm, Dropout, dropout_threshold, layer_keys, shared
+from stages.physics.threads import share_out
 
 _NO_KEYS = np.zeros((1, 2), np.uint32)
 

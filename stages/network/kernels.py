@@ -7,9 +7,6 @@ Innermost loops index by the loop's own variable alone: numba then needs no chec
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -42,21 +39,6 @@ def channels_last(x: Tensor) -> Tensor:
 def empty(crops: int, channels: int, height: int, width: int, dtype: torch.dtype) -> Tensor:
     """Channels-last."""
     return torch.empty((crops, channels, height, width), dtype=dtype, memory_format=torch.channels_last)
-
-
-_pools: dict[int, ThreadPoolExecutor] = {}
-
-
-def share_out(kernel: Callable[..., None], count: int, *arguments: Any) -> None:
-    """kernel(first, last, *arguments) over ``count`` crops or rows, on as many threads as PyTorch uses."""
-    threads = min(torch.get_num_threads(), count)
-    if threads <= 1:
-        kernel(0, count, *arguments)
-        return
-    pool = _pools.setdefault(threads, ThreadPoolExecutor(threads))
-    bounds = [count * k // threads for k in range(threads + 1)]
-    for job in [pool.submit(kernel, a, b, *arguments) for a, b in itertools.pairwise(bounds)]:
-        job.result()
 
 
 @intrinsic
