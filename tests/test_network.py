@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from stages.network.losses import Radiometry, masked_mse
+from stages.network.losses import Radiometry, masked_mse, squared_error
 from stages.network.normalisation import FILL_REACH, fill_holes, scale_elevation
 from stages.network.predictor import Predictor
 from stages.network.runtime import choose_inference_precision
@@ -182,6 +182,12 @@ def test_loss_counts_valid_pixels_only():
     valid = torch.tensor([[[True, True], [False, False]]])
     assert masked_mse(predicted, measured, valid).item() == pytest.approx(2.5)
     assert masked_mse(predicted, measured, torch.zeros_like(valid)).item() == 0
+
+
+def test_the_gradient_of_the_loss_is_that_of_its_value(rng):
+    predicted, measured = (torch.from_numpy(rng.random((2, 3, 4))) for _ in range(2))
+    valid = torch.from_numpy(rng.random((2, 3, 4)) > 0.3)
+    assert torch.autograd.gradcheck(lambda p: squared_error(p, measured, valid), predicted.requires_grad_())
 
 
 def test_radiometry_is_gain_and_offset_and_leaves_calibrated_images_alone():

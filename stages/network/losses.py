@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
 
 def squared_error(predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
-    """Sum of squared errors over valid pixels."""
-    residual = (predicted - measured) * valid
-    return (residual * residual).sum()
+    """Sum of squared errors over valid pixels; its gradient is that in ``predicted`` only."""
+    return _SquaredError.apply(predicted, measured, valid)
+
+
+class _SquaredError(torch.autograd.Function):
+    """One pass back, where autograd takes four: the residual, 0 where invalid, is its own gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
+        residual = (predicted - measured).mul_(valid)
+        ctx.save_for_backward(residual)
+        return (residual * residual).sum()
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        (residual,) = ctx.saved_tensors
+        return residual * (2 * gradients[0]), None, None
 
 
 def masked_mse(predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
