@@ -9,10 +9,10 @@ import pytest
 from rasterio.transform import Affine
 from relief import body_point, hills
 
-from stages.physics.formation import SUN_RADIUS
 from stages.physics.grid import Grid, local_metric_crs, unit_vectors
 from stages.physics.light import SunHorizon
 from stages.physics.mapview import Light
+from stages.physics.penumbra import SUN_RADIUS
 from stages.physics.perspective import make_scene, render_view
 from stages.physics.photometry import get_model
 from stages.physics.sun import Sun, sun_from_angles

@@ -11,8 +11,9 @@ from scipy.ndimage import gaussian_filter
 
 from schemas.errors import GeometryError
 from stages.physics.earthshine import earth_direction_enu, earth_irradiance
-from stages.physics.formation import SUN_RADIUS, Observation, form, sun_visibility
+from stages.physics.formation import Observation, form
 from stages.physics.horizon import horizon
+from stages.physics.penumbra import SUN_RADIUS, sun_visibility
 from stages.physics.photometry import get_model
 from stages.physics.sky import TerrainLight, sky_view, terrain_light
 from stages.physics.smooth_horizon import differentiable_horizon

@@ -6,7 +6,6 @@ Extensions (``stages/effects``) act at the slot that they name; the order of the
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -16,10 +15,10 @@ from torch import Tensor
 
 from stages.physics import geometry
 from stages.physics.geometry import Angles
+from stages.physics.penumbra import SUN_RADIUS, sun_visibility
 from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
 
 SLOTS = ("geometry", "illumination", "reflectance", "radiance", "sensor")
-SUN_RADIUS = math.radians(0.2666)  # mean angular radius of the Sun at 1 au
 
 
 @dataclass
@@ -86,21 +85,6 @@ class Extension(Protocol):
     def slot(self) -> str: ...
 
     def apply(self, state: State) -> None: ...
-
-
-def sun_visibility(sun_elevation: Tensor, horizon: Tensor, radius: float | Tensor = SUN_RADIUS) -> Tensor:
-    """Share of the Sun's light above a straight horizon, 0..1: penumbra makes cast shadows smooth.
-
-    sun_elevation, horizon : rad, broadcastable. For a disc of uniform brightness cut at height t radii above its centre
-    the share above is 1/2 - (t sqrt(1 - t^2) + asin t) / pi; linear limb darkening I = 1 - u (1 - mu) with u = 0.6
-    (Cox 2000, visible light) turns (1 - t^2)-slices from 2 sqrt(1 - t^2) into 2 (1 - u) sqrt(1 - t^2) + u pi/2 (1 - t^2).
-    """
-    u = 0.6
-    t = ((horizon - sun_elevation) / radius).clamp(-1 + 1e-6, 1 - 1e-6)
-    uniform = 0.5 - (t * torch.sqrt(1 - t * t) + torch.asin(t)) / math.pi
-    darkened = 0.5 - 0.75 * (t - t**3 / 3)  # the share for slices of weight (1 - t^2), by the same integral
-    weight = u * 2 / 3 / (1 - u / 3)  # flux of the mu-term over the whole disc's
-    return (1 - weight) * uniform + weight * darkened
 
 
 def form(

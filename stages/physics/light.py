@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stages.physics.formation import sun_visibility
 from stages.physics.grid import Grid
 from stages.physics.horizon import horizon
+from stages.physics.penumbra import sun_visibility
 from stages.physics.scene_horizon import Overview, horizon_in_scene, make_overview
 from stages.physics.sun import Sun
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
 from stages.physics.bodies import Body
-from stages.physics.formation import SUN_RADIUS
 from stages.physics.frames import ASTRONOMICAL_UNIT
 from stages.physics.grid import Grid, unit_vectors
+from stages.physics.penumbra import SUN_RADIUS
 
 Floats = NDArray[np.float64]
 

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from schemas.errors import ConfigError
 from stages.physics.bodies import Body
 from stages.physics.cameras import Camera, open_camera
-from stages.physics.formation import SUN_RADIUS
 from stages.physics.frames import ASTRONOMICAL_UNIT
 from stages.physics.light import SunHorizon
 from stages.physics.mapview import Light
+from stages.physics.penumbra import SUN_RADIUS
 from stages.physics.sun import Sun, check_sun_is_up, find_sun
 from stages.physics.surface import Surface, open_surface, open_terrain
 from stages.physics.view import look_at, pinhole_view, place, rotation_from_quaternion

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stages.physics import formation
 from stages.physics.grid import Grid
 from stages.physics.horizon import horizon
+from stages.physics.penumbra import SUN_RADIUS, sun_visibility
 from stages.physics.photometry import masked_radiance_factor
 from stages.simulate.hidden import Hidden, find
 from stages.simulate.orbits import Pass
@@ -61,7 +62,7 @@ def radiance(
     elevation_angle = math.atan2(to_sun[2], math.hypot(to_sun[0], to_sun[1]))
     skyline = _horizon(scene, window, azimuth, elevation_angle)
     penumbra = find(hidden, "penumbra")
-    sun_radius = math.radians(penumbra["radius_deg"]) if penumbra else formation.SUN_RADIUS
+    sun_radius = math.radians(penumbra["radius_deg"]) if penumbra else SUN_RADIUS
     blocks = [
         (r, c, min(BLOCK, height - r), min(BLOCK, width - c))
         for r in range(0, height, BLOCK)
@@ -127,7 +128,7 @@ def _block(
     )
     state = formation.illuminate(observation)
     sun_elevation = math.asin(float(observation.sun_direction[0, 2]))
-    visible = formation.sun_visibility(
+    visible = sun_visibility(
         torch.tensor(sun_elevation), torch.from_numpy(np.pad(skyline, 1, mode="edge"))[None], sun_radius
     )
     window = (slice(row, row + height), slice(col, col + width))

@@ -1,0 +1,34 @@
+"""How much of the Sun stands above a straight horizon: cast shadows have soft edges."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from numba.extending import register_jitable
+from torch import Tensor
+
+SUN_RADIUS = math.radians(0.2666)  # mean angular radius of the Sun at 1 au
+DARKENING = 0.6  # u of the limb darkening I = 1 - u (1 - mu) in visible light (Cox 2000)
+
+
+def sun_visibility(sun_elevation: Tensor, horizon: Tensor, radius: float | Tensor = SUN_RADIUS) -> Tensor:
+    """Share of the Sun's light above a straight horizon, 0..1: penumbra makes cast shadows smooth.
+
+    sun_elevation, horizon : rad, broadcastable
+    """
+    t = ((horizon - sun_elevation) / radius).clamp(-1 + 1e-6, 1 - 1e-6)
+    return disc_share(t, torch.sqrt(1 - t * t), torch.asin(t))
+
+
+@register_jitable
+def disc_share(t, root, angle):
+    """Share of a limb-darkened disc above a straight line ``t`` radii above its centre; tensors, or numbers in kernels.
+
+    root, angle : sqrt(1 - t^2), asin(t). For a disc of uniform brightness the share is 1/2 - (t root + angle) / pi; linear
+    limb darkening turns its slices from 2 sqrt(1 - t^2) into 2 (1 - u) sqrt(1 - t^2) + u pi/2 (1 - t^2).
+    """
+    uniform = 0.5 - (t * root + angle) / math.pi
+    darkened = 0.5 - 0.75 * (t - t**3 / 3)  # the share for slices of weight (1 - t^2), by the same integral
+    weight = DARKENING * 2 / 3 / (1 - DARKENING / 3)  # flux of the mu-term over the whole disc's
+    return (1 - weight) * uniform + weight * darkened
