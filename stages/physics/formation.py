@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from stages.physics import geometry
+from stages.physics import facets, geometry
 from stages.physics.geometry import Angles
 from stages.physics.penumbra import SUN_RADIUS, sun_visibility
 from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
@@ -98,6 +98,11 @@ def form(
     coefficients : (B, C, H, W) or anything that broadcasts to it, in the order of ``model.parameters``
     returns (B, H, W)
     """
+    if not extensions:
+        o = observation
+        known = facets.look(o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius)
+        if known is not None:
+            return model.lit(coefficients, *known)
     state = illuminate(observation, extensions)
     parameters = model.unpack(coefficients, dim=1)
     state.reflectance = masked_radiance_factor(model, parameters, state.angles)

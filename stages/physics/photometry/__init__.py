@@ -14,7 +14,6 @@ import importlib
 import math
 import pkgutil
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,29 +22,19 @@ from torch import Tensor
 
 from schemas.errors import RegistryError
 from stages.physics.geometry import Angles
-from stages.physics.photometry.base import Parameter, ReflectanceModel, get_model, model_names, register
+from stages.physics.photometry.base import (
+    Parameter,
+    ReflectanceModel,
+    get_model,
+    horizon_cosine,
+    masked_radiance_factor,
+    model_names,
+    register,
+)
 from stages.physics.photometry.published import ParameterSet, get_set, published_sets
 
 for _module in pkgutil.iter_modules(__path__):
     importlib.import_module(f"{__name__}.{_module.name}")
-
-
-def horizon_cosine(dtype: torch.dtype) -> float:
-    """Cosines at or under this count as 0: cos(90 deg) is 6e-17, not 0, in float64, and -4e-8 in float32."""
-    return 1e-12 if dtype == torch.float64 else 1e-7
-
-
-def masked_radiance_factor(model: ReflectanceModel, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
-    """I/F, exactly 0 (with zero gradient, never NaN) where the Sun or the camera is behind the surface."""
-    mu0, mu = angles.cos_incidence, angles.cos_emission
-    floor = horizon_cosine(mu0.dtype)
-    lit = (mu0 > floor) & (mu > floor)
-    if not model.finite:
-        # torch.where passes gradient 0 to the branch not taken, and 0 * inf is NaN: the formula must not see angles
-        # at which it or its slope is infinite.
-        angles = replace(angles, cos_incidence=mu0.clamp(min=floor), cos_emission=mu.clamp(min=floor))
-    value = model.radiance_factor(parameters, angles)
-    return torch.where(lit, value, torch.zeros((), dtype=value.dtype, device=value.device))
 
 
 def evaluate(model: str, parameters: Mapping[str, Any], incidence: Any, emission: Any, phase: Any) -> Any:
@@ -92,6 +81,7 @@ __all__ = [
     "evaluate",
     "get_model",
     "get_set",
+    "horizon_cosine",
     "masked_radiance_factor",
     "model_names",
     "published_sets",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
@@ -71,8 +71,33 @@ class ReflectanceModel(ABC):
         # unbind and not select: its backward is one stack, where select writes a full stack of zeros per parameter
         return dict(zip((p.name for p in self.parameters), coefficients.unbind(dim), strict=True))
 
+    def lit(self, coefficients: Tensor, angles: Angles, light: Tensor) -> Tensor:
+        """I/F of facets that receive the share ``light`` of the Sun, 0 where Sun or camera are behind them.
+
+        coefficients : (B, C, H, W) or what broadcasts to it, in the order of ``parameters``; light : (B, H, W), 0..1
+        """
+        return masked_radiance_factor(self, self.unpack(coefficients, dim=1), angles) * light
+
     def defaults(self) -> dict[str, float]:
         return {p.name: p.default for p in self.parameters}
+
+
+def horizon_cosine(dtype: torch.dtype) -> float:
+    """Cosines at or under this count as 0: cos(90 deg) is 6e-17, not 0, in float64, and -4e-8 in float32."""
+    return 1e-12 if dtype == torch.float64 else 1e-7
+
+
+def masked_radiance_factor(model: ReflectanceModel, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    """I/F, exactly 0 (with zero gradient, never NaN) where the Sun or the camera is behind the surface."""
+    mu0, mu = angles.cos_incidence, angles.cos_emission
+    floor = horizon_cosine(mu0.dtype)
+    lit = (mu0 > floor) & (mu > floor)
+    if not model.finite:
+        # torch.where passes gradient 0 to the branch not taken, and 0 * inf is NaN: the formula must not see angles
+        # at which it or its slope is infinite.
+        angles = replace(angles, cos_incidence=mu0.clamp(min=floor), cos_emission=mu.clamp(min=floor))
+    value = model.radiance_factor(parameters, angles)
+    return torch.where(lit, value, torch.zeros((), dtype=value.dtype, device=value.device))
 
 
 _MODELS: dict[str, ReflectanceModel] = {}

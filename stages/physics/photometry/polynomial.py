@@ -12,7 +12,10 @@ paper's polynomials give r up to a constant factor and contain cos(incidence) al
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -43,64 +46,69 @@ def coefficient(name: str, of: str, default: float) -> Parameter:
     return Parameter(name, "1", -1.0, 2.0, default, f"coefficient of {of}")
 
 
+class IncidencePhasePolynomial(CosinePolynomial):
+    """I/F = sum of coefficient x cos(i)^p x cos(g)^q, with one (p, q) per parameter in ``powers``."""
+
+    reciprocal = False
+    powers: ClassVar[tuple[tuple[int, int], ...]]
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        terms = []
+        for parameter, (p, q) in zip(self.parameters, self.powers, strict=True):
+            factors = [parameters[parameter.name]] + p * [angles.cos_incidence] + q * [angles.cos_phase]
+            terms.append(functools.reduce(operator.mul, factors))
+        return functools.reduce(operator.add, terms)
+
+    def lit(self, coefficients: Tensor, angles: Angles, light: Tensor) -> Tensor:
+        # numba takes a quarter of a second to load, which `lunargr models` has no use for
+        from stages.physics.cosine_sums import cosine_sum, fits
+
+        geometry = angles.cos_incidence, angles.cos_phase, light
+        if not fits(coefficients, *geometry):
+            return super().lit(coefficients, angles, light)
+        return cosine_sum(coefficients, *geometry, self.powers)
+
+
 @register
-class M1(CosinePolynomial):
+class M1(IncidencePhasePolynomial):
     name = "M1"
     title = "Lunar-G2R M1"
     formula = "a cos(i) + b cos(g)"
-    reciprocal = False
+    powers = ((1, 0), (0, 1))
     parameters = (coefficient("a", "cos(i)", 0.06), coefficient("b", "cos(g)", 0.02))
-
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
-        return parameters["a"] * angles.cos_incidence + parameters["b"] * angles.cos_phase
 
 
 @register
-class M2(CosinePolynomial):
+class M2(IncidencePhasePolynomial):
     name = "M2"
     title = "Lunar-G2R M2"
     formula = "a cos(i) + b cos(g) + c"
-    reciprocal = False
+    powers = (*M1.powers, (0, 0))
     parameters = (*M1.parameters, coefficient("c", "1", 0.01))
-
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
-        return parameters["a"] * angles.cos_incidence + parameters["b"] * angles.cos_phase + parameters["c"]
 
 
 @register
-class M3(CosinePolynomial):
+class M3(IncidencePhasePolynomial):
     name = "M3"
     title = "Lunar-G2R M3"
     formula = "a cos(i) + b cos(g) + c cos(i) cos(g) + d"
-    reciprocal = False
+    powers = (*M1.powers, (1, 1), (0, 0))
     parameters = (*M1.parameters, coefficient("c", "cos(i) cos(g)", 0.01), coefficient("d", "1", 0.01))
-
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
-        mu0, cos_phase = angles.cos_incidence, angles.cos_phase
-        return parameters["a"] * mu0 + parameters["b"] * cos_phase + parameters["c"] * mu0 * cos_phase + parameters["d"]
 
 
 @register
-class M4(CosinePolynomial):
+class M4(IncidencePhasePolynomial):
     name = "M4"
     title = "Lunar-G2R M4"
     formula = "a cos(i) + b cos(g) + c cos(i)^2 + d"
-    reciprocal = False
+    powers = (*M1.powers, (2, 0), (0, 0))
     parameters = (*M1.parameters, coefficient("c", "cos(i)^2", 0.01), coefficient("d", "1", 0.01))
-
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
-        mu0, cos_phase = angles.cos_incidence, angles.cos_phase
-        return parameters["a"] * mu0 + parameters["b"] * cos_phase + parameters["c"] * mu0 * mu0 + parameters["d"]
 
 
 @register
-class M5(CosinePolynomial):
+class M5(IncidencePhasePolynomial):
     name = "M5"
     title = "Lunar-G2R M5"
     formula = "a cos(i) + b cos(g) + c cos(g)^2 + d"
-    reciprocal = False
+    powers = (*M1.powers, (0, 2), (0, 0))
     parameters = (*M1.parameters, coefficient("c", "cos(g)^2", 0.01), coefficient("d", "1", 0.01))
-
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
-        mu0, cos_phase = angles.cos_incidence, angles.cos_phase
-        return parameters["a"] * mu0 + parameters["b"] * cos_phase + parameters["c"] * cos_phase**2 + parameters["d"]
