@@ -26,6 +26,7 @@ from stages.physics.formation import Observation, form
 from stages.physics.photometry import get_model
 
 BATCH, SIZE, GSD, ROUNDS = 64, 128, 5.0, 9
+OTHERS = ("M5", "M6", "lunar_lambert", "hapke")
 
 
 def cpu_seconds(function: Callable[[], object]) -> float:
@@ -74,20 +75,25 @@ def main() -> None:
     predictor = Predictor(model, UNet(3), 30.0, torch.tensor([0.06, 0.02, 0.01]), 0.03).train()
     predictor.to(memory_format=torch.channels_last)
     precision = choose_precision(predictor, (SIZE, SIZE), torch.device("cpu"))
-    coefficients = (
-        torch.full((BATCH, 3, SIZE, SIZE), 0.05).contiguous(memory_format=torch.channels_last).requires_grad_()
-    )
     valid = torch.ones(z.shape, dtype=torch.bool)
 
-    def layer() -> None:
-        error = squared_error(form(observation, model, coefficients), target, valid)
-        torch.autograd.grad(error, coefficients)
+    def layer_of(name: str) -> Callable[[], None]:
+        reflectance = get_model(name)
+        values = torch.tensor([p.default for p in reflectance.parameters]).view(1, -1, 1, 1)
+        maps = values.expand(BATCH, -1, SIZE, SIZE).contiguous(memory_format=torch.channels_last).requires_grad_()
+
+        def layer() -> None:
+            error = squared_error(form(observation, reflectance, maps), target, valid)
+            torch.autograd.grad(error, maps)
+
+        return layer
 
     def network() -> None:
         with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
             out = predictor(z)
         out.float().square().mean().backward()
 
+    layer = layer_of(model.name)
     layer()  # compiles
     network()
     rounds = [(cpu_seconds(layer), cpu_seconds(network)) for _ in range(ROUNDS)]
@@ -98,6 +104,10 @@ def main() -> None:
         f"network, forward + backward ({precision})  : {step / BATCH * 1e3:8.3f} ms a crop; the layer is {100 * mine / step:.2f} % of it"
     )
     print(f"Mitsuba, forward only, 16 spp       : {peer * 1e3:8.3f} ms a crop; {peer / (mine / BATCH):.0f} x the layer")
+    for name in OTHERS:
+        other = layer_of(name)
+        seconds = statistics.median(cpu_seconds(other) for _ in range(ROUNDS))
+        print(f"the layer with {name:21s}: {seconds / BATCH * 1e3:8.3f} ms a crop")
 
 
 if __name__ == "__main__":
