@@ -5,9 +5,11 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 
+from stages.diagnose.columns import free_coordinates
 from stages.diagnose.data import Site
 from stages.diagnose.looking import Round, align, look, misfit, narrowed, quiet
-from stages.diagnose.naming import KEEP_SHARE, SIMPLER, choose, misaligned, with_values, worth_image
+from stages.diagnose.naming import GATE, KEEP_SHARE, SIMPLER, choose, misaligned, with_values, worth_image
+from stages.diagnose.numbers import f_tail
 from stages.diagnose.refining import refine
 from stages.diagnose.state import Cause, Saved, Search
 from stages.effects import get_effect
@@ -16,6 +18,7 @@ REFUSALS = 3
 MUCH = 0.02  # of what is left: by so much a cause for each image must do better than one for all
 SLIGHT = 0.005  # of what is left: by so much a simpler cause may do worse
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
+PAIR = 2  # scene-wide causes that are tried together in the place of gains
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
 PROMISE = 0.25  # share of the foretold gain that a cause must bring once it is in the model ...
 ALSO_STILL = ("psf_blur", "echo")  # ... but for these, part of whose gain lies in the maps of the ground
@@ -49,9 +52,10 @@ def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
             seen.best.pop(cause.effect.name, None)
             seen.images.pop(cause.effect.name, None)
             continue
+        if cause.effect.name == "image_gain" and _instead_of_gains(state, before, seen, nothing):
+            cause = state.causes[-1]
         say(f"found {cause.effect.name}: gain {cause.gain:.0f} +- {cause.gain_error:.0f} nats")
         _settle_shifts(state)
-        _settle_gains(state, seen)
         if cause.effect.scope == "site":  # the pattern of these sites' albedo was out of everything else already
             seen.pattern = None
             continue
@@ -71,21 +75,32 @@ def _settle_shifts(state: Search) -> None:
             state.causes.remove(cause)
 
 
-def _settle_gains(state: Search, seen: Round) -> None:
-    """Gains of images stand for any two scene-wide causes together; once one of these is named, the other may do."""
-    gains = next((c for c in state.causes if c.effect.name == "image_gain"), None)
-    if gains is None or gains is state.causes[-1]:
-        return
-    before, best, rms = state.save(), misfit(state, seen.works), state.residual_rms()
-    state.causes.remove(gains)
-    refine(state, 2)
+def _instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) -> bool:
+    """Gains of images can stand for any scene-wide causes that act by image; whether such causes, up to two, do as well.
+
+    A few numbers for all images against one for each: an F test over the images of what the gains gain. The state holds
+    the scene-wide causes afterwards if so (true gains may then come on top), and the gains if not.
+    """
+    gains, with_gains, rms = state.causes[-1], state.save(), state.residual_rms()
+    possible = nothing - misfit(state, seen.works)
+    images = len({int(f) for s in state.sites for f in s.frames})
+    state.load(before)
     names = [n for n in state.open_names() if get_effect(n).scope == "scene" and get_effect(n).channel == "lit"]
-    rivals = [c for c in choose(state, look(state, names)) if c.effect.scope == "scene"]
-    if rivals:
+    freedom = 0
+    for _ in range(PAIR):
+        rivals = choose(state, look(state, names))
+        if not rivals:
+            break
         cause = _contest(state, rivals, seen)
-        cause.rms_before, cause.rms_after = rms, state.residual_rms()
-    if misfit(state, seen.works) > (1 + MUCH) * best:
-        state.load(before)
+        cause.rms_before, cause.rms_after = gains.rms_before, rms
+        names.remove(cause.effect.name)
+        freedom += len(free_coordinates(cause.effect))
+        share = (nothing - misfit(state, seen.works)) / possible
+        rest = images - 1 - freedom
+        if share >= 1 or (rest > 0 and f_tail(share / (1 - share) * rest / freedom, freedom, rest) < GATE / len(names)):
+            return True
+    state.load(with_gains)
+    return False
 
 
 def _kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> bool:
