@@ -44,7 +44,6 @@ Progress = Callable[[int, int, str], None]
 
 QUANTITY = "radiance factor I/F = pi r, including cos(incidence)"
 GSD_TOLERANCE = 0.05  # relative; beyond it the network would meet terrain at a scale it never saw
-SIDE_BY_SIDE = 8  # windows at once at most: what they hold stays under 2 GB
 
 
 def run(
@@ -98,7 +97,8 @@ def run(
             writer.write("x", file["x"][...])
             writer.write("y", file["y"][...])
             writer.write("coefficient_name", names)
-            windows = _predict(file, writer, Mapper(predictor, device, precision), config, progress)
+            mapper = Mapper(predictor, device, precision, torch.get_num_threads())
+            windows = _predict(file, writer, mapper, config, progress)
             share, ranges = _statistics(writer.file, names)
             if whole:
                 with atomic_path(tiff) as partial:
@@ -120,18 +120,15 @@ def summarise(svbrdf: Path, windows: int = 0) -> Summary:
         return Summary(read_grid(file, svbrdf), str(file.attrs["model"]), share, windows, ranges)
 
 
-def _predict(
-    file: h5py.File, writer: ArtefactWriter, mapper: Mapper, config: Config, progress: Progress | None
-) -> int:
+def _predict(file: h5py.File, writer: ArtefactWriter, mapper: Mapper, config: Config, progress: Progress | None) -> int:
     """Run the network over all windows of the shard's rows; the number of windows."""
     elevation, dem_valid = file["elevation"], file["dem_valid"]
     own = own_rows(elevation.shape[0], config)
     if config.shard[1] > 1:
         writer.file.attrs["shard_rows"] = np.array(own, np.int64)
-    together = min(SIDE_BY_SIDE, torch.get_num_threads()) if mapper.in_strips else 1
     window, stride = window_and_stride(config)
     if mapper.in_strips and config.window is None and config.stride is None:
-        boxes = swaths_of(elevation.shape, config, together)
+        boxes = swaths_of(elevation.shape, config, mapper.together)
     else:
         boxes = windows_of(elevation.shape, config)
 
@@ -143,7 +140,7 @@ def _predict(
 
     outputs = Outputs(writer, elevation, dem_valid)
     blend = Blend(outputs, window - stride, own) if window > stride else None
-    found = side_by_side(boxes, work, together)
+    found = side_by_side(boxes, work, mapper.together)
     rows, done = sum(box[2] for box in boxes), 0
     begun = -1
     for number, strip in in_order(found) if blend else found:

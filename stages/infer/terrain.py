@@ -23,14 +23,13 @@ class TerrainReader:
     def __call__(self, first: int, last: int, left: int, right: int) -> NDArray[np.float32]:
         """Rows ``first`` .. ``last``, columns ``left`` .. ``right``, (last - first, right - left) float32 in m."""
         height, width = self.elevation.shape
-        a, b = (min(max(k, 0), height) for k in (first, last))
         # Beyond the map stands its last row or column: a network's input is continued to whole strides.
-        a, b = min(a, height - 1), max(b, 1)
-        c, d = min(max(left, 0), width - 1), max(min(right, width), 1)
+        a, b = min(max(first, 0), height - 1), min(max(last, 1), height)
+        c, d = min(max(left, 0), width - 1), min(max(right, 1), width)
         found = self._filled(a, b, c, d)
-        beyond = ((a - first, last - b), (c - left, right - d))
-        if any(map(any, beyond)):
-            found = np.pad(found, beyond, mode="edge")
+        if (a, b, c, d) != (first, last, left, right):
+            rows = np.clip(np.arange(first, last), a, b - 1) - a
+            found = found[rows[:, None], np.clip(np.arange(left, right), c, d - 1) - c]
         return np.ascontiguousarray(found)
 
     def _filled(self, a: int, b: int, c: int, d: int) -> NDArray[np.float32]:
@@ -42,7 +41,12 @@ class TerrainReader:
 
     def _read(self, a: int, b: int, c: int, d: int) -> NDArray[np.float32]:
         height, width = self.elevation.shape
-        r0, r1, c0, c1 = max(0, a - FILL_REACH), min(height, b + FILL_REACH), max(0, c - FILL_REACH), min(width, d + FILL_REACH)
+        r0, r1, c0, c1 = (
+            max(0, a - FILL_REACH),
+            min(height, b + FILL_REACH),
+            max(0, c - FILL_REACH),
+            min(width, d + FILL_REACH),
+        )
         valid = self.valid[r0:r1, c0:c1].astype(bool)
         if valid[a - r0 : b - r0, c - c0 : d - c0].all():
             return self.elevation[a:b, c:d]

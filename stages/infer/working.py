@@ -10,7 +10,8 @@ from typing import TypeVar
 
 import torch
 
-Job, Item = TypeVar("Job"), TypeVar("Item")
+Job = TypeVar("Job")
+Item = TypeVar("Item")
 
 
 def side_by_side(

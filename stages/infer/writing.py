@@ -78,6 +78,8 @@ class Blend:
         if b > a:
             part = slice(a - self.top, b - self.top)
             weight = self.weight[part]
-            self.outputs.put(a, 0, self.total[:, part] / np.maximum(weight, 1e-12), weight > 0)
+            values = self.total[:, part]
+            values /= np.maximum(weight, np.float32(1e-12))
+            self.outputs.put(a, 0, values, weight > 0)
         gone = bottom - self.top
         self.total, self.weight, self.top = self.total[:, gone:], self.weight[gone:], bottom

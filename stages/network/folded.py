@@ -38,9 +38,7 @@ class Conv:
         if torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_convolution_pointwise"):
             size = [1, weight.shape[1], max(8, TYPICAL[0] >> level), max(8, TYPICAL[1] >> level)]
             ones = [1, 1]
-            self.packed = torch.ops.mkldnn._reorder_convolution_weight(
-                self.weight, [0, self.pad], ones, ones, 1, size
-            )
+            self.packed = torch.ops.mkldnn._reorder_convolution_weight(self.weight, [0, self.pad], ones, ones, 1, size)
 
     def _run(self, x: Tensor, pad: int) -> Tensor:
         if self.packed is None:
@@ -87,7 +85,7 @@ class FoldedUNet:
 
     @torch.no_grad()
     def __init__(self, net: UNet, elevation_scale: float, dtype: torch.dtype) -> None:
-        self.dtype, self.levels, self.stride = dtype, len(net.down), net.stride
+        self.dtype, self.levels, self.stride, self.reach = dtype, len(net.down), net.stride, net.reach
 
         def pair(block: nn.Module, level: int) -> tuple[Conv | None, Conv]:
             assert isinstance(block, Block)

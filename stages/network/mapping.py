@@ -13,18 +13,26 @@ from stages.network import row_kernels
 from stages.network.folded import FoldedUNet
 from stages.network.kernels import pixels_of
 from stages.network.predictor import Predictor
-from stages.network.strips import Strips, Terrain
+from stages.network.strips import STRIP, Strips, Terrain
+
+MEMORY = 1024  # windows side by side x rows of a strip x bytes a value: under 2 GB where windows are 2048 px wide
 
 
 class Mapper:
-    """Coefficients of any part of a map, with all the context that the network can see. precision : fp32 or bf16"""
+    """Coefficients of any part of a map, with all the context that the network can see.
 
-    def __init__(self, predictor: Predictor, device: torch.device, precision: str) -> None:
+    precision : fp32 or bf16; threads : how many would work with it side by side, of which ``together`` do
+    """
+
+    def __init__(self, predictor: Predictor, device: torch.device, precision: str, threads: int = 1) -> None:
         self.predictor, self.device, self.precision = predictor.eval(), device, precision
         self.in_strips = device.type == "cpu"
+        self.together = 1
         self._start = predictor.start.detach().cpu().float().numpy()
         if self.in_strips:
             dtype = torch.bfloat16 if precision == "bf16" else torch.float32
+            self.together = min(threads, MEMORY // (64 * dtype.itemsize))
+            self._strip = min(STRIP, MEMORY // (self.together * dtype.itemsize))
             self._folded = FoldedUNet(predictor.net, predictor.elevation_scale, dtype)
 
     def strips(
@@ -37,7 +45,7 @@ class Mapper:
         if not self.in_strips:
             yield part[0], self._window(terrain, shape, part).float().cpu().numpy()
             return
-        strips = Strips(self._folded, terrain, shape, part, self.predictor.net.reach)
+        strips = Strips(self._folded, terrain, shape, part, self._strip)
         while (found := strips.next()) is not None:
             row, raw, first = found
             yield row, self._finish(raw, first, part[3])

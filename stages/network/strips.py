@@ -17,7 +17,7 @@ from stages.network import row_kernels
 from stages.network.folded import Conv, FoldedUNet
 from stages.network.kernels import empty, pixels_of
 
-STRIP = 256  # rows at full resolution: the context that each strip's convolutions work on once more is 1 % of it
+STRIP = 256  # rows at full resolution: what each strip's convolutions work on once more is 1.5 % of the work, of 64 rows 6 %
 MARGIN = 4  # px: upsampled to 8, less the 3 that a level's convolutions spoil at an edge, leaves more than it needs
 CARRIED = 4  # rows of its input that a block of two 3 x 3 convolutions needs again
 
@@ -72,13 +72,18 @@ class _Carried:
 class Strips:
     """Raw coefficients of the part (row, col, height, width) of a map of ``shape``, from ``terrain(r0, r1, c0, c1)``.
 
-    ``terrain`` gives float32 (r1 - r0, c1 - c0), m, continued beyond the map's edges.
+    ``terrain`` gives float32 (r1 - r0, c1 - c0), m, continued beyond the map's edges; ``strip`` : rows made at once.
     """
 
     def __init__(
-        self, net: FoldedUNet, terrain: Terrain, shape: tuple[int, int], target: tuple[int, int, int, int], reach: int
+        self,
+        net: FoldedUNet,
+        terrain: Terrain,
+        shape: tuple[int, int],
+        target: tuple[int, int, int, int],
+        strip: int = STRIP,
     ) -> None:
-        self.net, self.terrain = net, terrain
+        self.net, self.terrain, self.strip = net, terrain, strip
         stride, levels = net.stride, net.levels
         rows, columns = (-(-edge // stride) * stride for edge in shape)
         self.row, self.col, height, self.width = target
@@ -86,8 +91,8 @@ class Strips:
         self.heights = [rows >> k for k in range(levels)]
         ends = [columns >> k for k in range(levels)]
         right = self.col + self.width
-        self.x0 = max(0, (self.col - reach) // stride * stride)
-        self.x1 = min(columns, -(-(right + reach) // stride) * stride)
+        self.x0 = max(0, (self.col - net.reach) // stride * stride)
+        self.x1 = min(columns, -(-(right + net.reach) // stride) * stride)
         # Columns (first, last) of each level on the way down, of what is raised from it, and of it on the way up.
         self.wide = [(self.x0 >> k, self.x1 >> k) for k in range(levels)]
         self.cut = [
@@ -122,7 +127,7 @@ class Strips:
         row = self.row
         if row >= self.last:
             return None
-        self.row = min(self.last, (row // STRIP + 1) * STRIP)
+        self.row = min(self.last, (row // self.strip + 1) * self.strip)
         self._up_to(0, self.row)
         ((_, y),) = self.raised[0].between(row, self.row)
         self.raised[0].forget(self.row)
@@ -132,7 +137,7 @@ class Strips:
         """Let the way down of ``level`` be known up to ``row``."""
         height, kept = self.heights[level], self.kept[level]
         row = min(height, row + (row & 1)) if level < self.net.levels - 1 else row  # pairs of rows are pooled
-        step = max(2, STRIP >> level)
+        step = max(2, self.strip >> level)
         while kept.end < row:
             last = min(row, kept.end + step)
             kept.add(self._block(self.net.down[level], self._pooled, level, kept.end, last, self.wide_edges[level]))
