@@ -21,6 +21,7 @@ FOLDERS = {
     "stages/simulate": "simulate",
     "stages/ingest": "ingest",
     "stages/render": "render",
+    "stages/infer": "infer",
     "stages/evaluate": "evaluate",
     "stages/match": "match; one file per matcher",
     "stages/diagnose": "diagnose",

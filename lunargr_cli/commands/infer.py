@@ -27,7 +27,10 @@ NAME, ORDER = "infer", 60
 def command(
     terrain: Annotated[Path, typer.Argument(metavar="SCENE|DEM", help="scene.h5, or a DEM that GDAL reads.")],
     checkpoint: Annotated[Path, typer.Argument(help="checkpoint.h5 from 'lunargr train'.")],
-    window: Annotated[int, typer.Option("--window", help="Window size, px; context around it is added.")] = 1024,
+    window: Annotated[
+        int | None,
+        typer.Option("--window", help="Window size, px; context around it is added (default: what is fast)."),
+    ] = None,
     stride: Annotated[
         int | None, typer.Option("--stride", help="Step between windows, px (default: a window).")
     ] = None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
@@ -25,6 +24,8 @@ def fill_holes(elevation: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDAr
     """
     if valid.all():
         return elevation
+    import cv2  # not needed by every map, and slow to load
+
     filled = np.where(valid, elevation, 0).astype(np.float32)
     base = float(filled[valid].mean()) if valid.any() else 0.0
     filled = np.where(valid, filled - base, 0).astype(np.float64)

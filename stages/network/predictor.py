@@ -49,17 +49,6 @@ class Predictor(torch.nn.Module):
         raw = self.net(x, keys).float() * self.output_scale + self.start[None, :, None, None]
         return self.model.constrain(raw, dim=1)
 
-    @torch.no_grad()
-    def part(self, elevation: Tensor, target: tuple[int, int, int, int]) -> Tensor:
-        """(H, W) m -> (C, h, w), of the part (row, col, h, w); H and W as for :meth:`coefficients`."""
-        was = self.training
-        self.eval()
-        x = scale_elevation(self._whole_strides(elevation[None]), self.elevation_scale)
-        raw = self.net.part(x, target).float() * self.output_scale + self.start[None, :, None, None]
-        out = self.model.constrain(raw, dim=1)[0]
-        self.train(was)
-        return out
-
     def _whole_strides(self, elevation: Tensor) -> Tensor:
         stride = self.net.stride
         height, width = elevation.shape[-2:]

@@ -9,12 +9,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from stages.network.fused import join, norm_act, pool, quarter_weights
-from stages.network.kernels import channels_last
 from stages.network.layers import SLOPE, BatchNorm, Dropout, draw_keys
 
 WIDTHS = (16, 32, 64, 128, 256)
 DROPOUT = (0.1, 0.1, 0.2, 0.2, 0.3)
-MARGIN = 4  # px: upsampled to 8, less the 3 that a level's convolutions spoil at an edge, leaves more than it needs
 
 
 class HeightConv(nn.Conv2d):
@@ -154,48 +152,3 @@ class UNet(nn.Module):
             quarters = functional.conv2d(x, quarter_weights(rise.weight), rise.bias.repeat(4))
             x = block.fused(join(quarters, kept.pop()), keys, 0 if block is self.up[-1] else 1)
         return self.head(x)
-
-    @torch.no_grad()
-    def part(self, x: Tensor, target: tuple[int, int, int, int]) -> Tensor:
-        """Raw coefficients of the part (row, col, height, width) of x, in evaluation mode: what ``self(x)`` has there.
-
-        What lies around the part is dropped as soon as nothing of it can be seen any more: on the way up four pixels of
-        each level are enough, where the way down needs ``reach``. x : (1, 1, H, W), H and W multiples of ``stride``
-        """
-        top, left, height, width = target
-        if x.device.type != "cpu" or self.training:
-            return self(x)[..., top : top + height, left : left + width]
-        keys = x.new_empty(0, dtype=torch.int64)
-        # What is kept beside each level's way up, and what is raised from the level below: rows and columns of the level.
-        shapes = [(x.shape[2] // 2**k, x.shape[3] // 2**k) for k in range(len(self.down))]
-        cuts = []
-        for level, (rows, columns) in enumerate(shapes[1:], start=1):
-            cut = []
-            for first, length, edge in ((top, height, rows), (left, width, columns)):
-                cut += [max(0, (first >> level) - MARGIN), min(edge, -(-(first + length) >> level) + MARGIN)]
-            cuts.append(cut)
-        for below, cut in zip(
-            reversed(cuts[1:]), reversed(cuts[:-1]), strict=True
-        ):  # no more than is raised to a level
-            cut[0], cut[1] = max(cut[0], 2 * below[0]), min(cut[1], 2 * below[1])
-            cut[2], cut[3] = max(cut[2], 2 * below[2]), min(cut[3], 2 * below[3])
-        kept = []
-        for block, (r0, r1, c0, c1) in zip(self.down[:-1], cuts, strict=True):
-            assert isinstance(block, Block)
-            y = block.fused(x, keys, 0)
-            x = pool(y)
-            kept.append(channels_last(y[..., 2 * r0 : 2 * r1, 2 * c0 : 2 * c1]))
-            del y  # memory is what limits the window
-        bottom = self.down[-1]
-        assert isinstance(bottom, Block)
-        x = bottom.fused(x, keys, 0)
-        origin = (0, 0)  # of x at its level
-        for (r0, r1, c0, c1), rise, block in zip(reversed(cuts), self.rise, self.up, strict=True):
-            assert isinstance(rise, nn.Conv2d) and rise.bias is not None and isinstance(block, Block)
-            x = x[..., r0 - origin[0] : r1 - origin[0], c0 - origin[1] : c1 - origin[1]]
-            origin = 2 * r0, 2 * c0
-            x = channels_last(functional.pad(x, (1, 1, 1, 1), mode="replicate"))
-            x = functional.conv2d(x, quarter_weights(rise.weight), rise.bias.repeat(4))
-            x = block.fused(join(x, kept.pop()), keys, 0)
-        first, second = top - origin[0], left - origin[1]
-        return self.head(x)[..., first : first + height, second : second + width]

@@ -1,0 +1,33 @@
+"""What infer is told, and what it says of the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from stages.physics.grid import Grid
+
+
+@dataclass(frozen=True)
+class Config:
+    """window, stride : px; windows overlap by their difference and are blended; None: as large as the machine likes best;
+    offset : px, shifts their grid; precision : fp32, bf16, or auto (see ``stages.network.runtime``).
+    """
+
+    window: int | None = None
+    stride: int | None = None
+    offset: int = 0
+    device: str = "auto"
+    precision: str = "fp32"
+    any_gsd: bool = False
+    shard: tuple[int, int] = (0, 1)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Ranges of the coefficients, for the table at the end: name -> (mean, std, 1 %, 99 %)."""
+
+    grid: Grid
+    model: str
+    valid_share: float
+    windows: int
+    coefficients: dict[str, tuple[float, float, float, float]]
