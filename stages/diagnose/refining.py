@@ -54,7 +54,7 @@ def refine(state: Search, steps: int = 2) -> None:
         if joined.count > 0:
             delta, error = solve_nuisance(joined)
             for cause in state.causes:
-                _move(cause, joined.names, delta, error)
+                _move(cause, joined.names, delta, error, alone=len(state.causes) == 1)
         for collected in zip(*(relief for _, relief, _ in every), strict=True):
             for evidence in weigh_relief(collected):
                 _move_relief(state, evidence)
@@ -114,7 +114,7 @@ def solve_nuisance(data: Statistics) -> tuple[Tensor, Tensor]:
     return delta, variance.clamp(min=0).sqrt()
 
 
-def _move(cause: Cause, names: Sequence[str], delta: Tensor, error: Tensor) -> None:
+def _move(cause: Cause, names: Sequence[str], delta: Tensor, error: Tensor, alone: bool) -> None:
     cls = type(cause.effect)
     if cls.scope != "scene":
         return
@@ -125,7 +125,7 @@ def _move(cause: Cause, names: Sequence[str], delta: Tensor, error: Tensor) -> N
             continue
         cause.errors[coordinate] = float(error[k])
         step = float(delta[k])
-        if cls.linear or not math.isfinite(step):
+        if (cls.linear and alone) or not math.isfinite(step):  # known, as long as nothing else moves
             continue
         low, high = cls.bounds(coordinate)
         if coordinate in SHAPES:

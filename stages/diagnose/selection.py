@@ -8,7 +8,7 @@ from collections.abc import Callable
 from stages.diagnose.columns import free_coordinates
 from stages.diagnose.data import Site
 from stages.diagnose.looking import Round, align, look, misfit, narrowed, quiet
-from stages.diagnose.naming import GATE, KEEP_SHARE, SIMPLER, choose, misaligned, with_values, worth_image
+from stages.diagnose.naming import FLOOR_GAIN, GATE, KEEP_SHARE, SIMPLER, choose, misaligned, with_values, worth_image
 from stages.diagnose.numbers import f_tail
 from stages.diagnose.refining import refine
 from stages.diagnose.state import Cause, Saved, Search
@@ -20,12 +20,18 @@ SLIGHT = 0.005  # of what is left: by so much a simpler cause may do worse
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 PAIR = 2  # scene-wide causes that are tried together in the place of gains
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
+NEEDLESS = 0.02  # share of a cause's gain that it must still bring when all are named
 PROMISE = 0.25  # share of the foretold gain that a cause must bring once it is in the model ...
 ALSO_STILL = ("psf_blur", "echo")  # ... but for these, part of whose gain lies in the maps of the ground
 
 
 def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
-    """Name causes one after the other; returns the last look, at what is left."""
+    """Name causes one after the other, and drop what later ones made needless; returns the last look, at what is left."""
+    seen = _name(state, most, say)
+    return look(state, state.open_names()) if _prune(state, seen) else seen
+
+
+def _name(state: Search, most: int, say: Callable[[str], None]) -> Round:
     rms_as_read, state.reference = state.residual_rms(), copy.copy(state.nominal)
     shifts = align(state)
     if shifts is not None:
@@ -66,6 +72,22 @@ def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
     return seen
 
 
+def _prune(state: Search, seen: Round) -> bool:
+    """Drop causes without which the others fit as well: the first of two may have stood for the second. Whether any was."""
+    pruned = False
+    for cause in state.causes[:-1]:
+        if cause.effect.scope != "scene" or cause.effect.channel != "lit":
+            continue
+        before, best = state.save(), misfit(state, seen.works)
+        state.causes.remove(cause)
+        refine(state, 2)
+        if misfit(state, seen.works) - best < 2 * max(FLOOR_GAIN, NEEDLESS * cause.gain):
+            pruned = True
+        else:
+            state.load(before)
+    return pruned
+
+
 def _settle_shifts(state: Search) -> None:
     """Shifts that looked large before a further cause was known (jitter has a mean over any crop) may be ordinary now."""
     for cause in [c for c in state.causes if c.effect.name == "misregistration"]:
@@ -83,24 +105,35 @@ def _instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float)
     """
     gains, with_gains, rms = state.causes[-1], state.save(), state.residual_rms()
     possible = nothing - misfit(state, seen.works)
-    images = len({int(f) for s in state.sites for f in s.frames})
+    images = _effective_images(seen)
     state.load(before)
     names = [n for n in state.open_names() if get_effect(n).scope == "scene" and get_effect(n).channel == "lit"]
-    freedom = 0
+    freedom, choices = 0, 1
     for _ in range(PAIR):
         rivals = choose(state, look(state, names))
         if not rivals:
             break
         cause = _contest(state, rivals, seen)
         cause.rms_before, cause.rms_after = gains.rms_before, rms
+        choices *= len(names)
         names.remove(cause.effect.name)
         freedom += len(free_coordinates(cause.effect))
         share = (nothing - misfit(state, seen.works)) / possible
         rest = images - 1 - freedom
-        if share >= 1 or (rest > 0 and f_tail(share / (1 - share) * rest / freedom, freedom, rest) < GATE / len(names)):
+        if share >= 1 or (rest > 0 and f_tail(share / (1 - share) * rest / freedom, freedom, rest) < GATE / choices):
             return True
     state.load(with_gains)
     return False
+
+
+def _effective_images(seen: Round) -> float:
+    """How many images carry the evidence for gains: (sum of energies)^2 over the sum of their squares."""
+    energy: dict[int, float] = {}
+    for work in seen.works:
+        per_image = (work.site.image * work.weight).double().square().sum((-2, -1)).tolist()
+        for frame, amount in zip(work.site.frames.tolist(), per_image, strict=True):
+            energy[frame] = energy.get(frame, 0.0) + amount
+    return sum(energy.values()) ** 2 / max(sum(e * e for e in energy.values()), 1e-30)
 
 
 def _kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> bool:
