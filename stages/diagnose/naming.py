@@ -25,18 +25,24 @@ KEEP_SHARE = 0.8  # of a per-image effect's gain that a scene-wide effect must k
 SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to replace it
 NEAR = 0.9  # of the best gain: linear models of strong effects are no closer than that
 RIVALS = 2
+FORMS = 0.7  # of the gain, above which another form of an effect is tried as well
 CLEAR_LAG = 4  # px
+BLURRED = 0.5  # of a near echo's gain: if a blur does as well as that, it is a matter of the point spread function
+IMPERFECT = 0.12  # of the largest cause: so much of it its model may leave, which is no further cause
 STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
 
 
 def choose(state: Search, seen: Round) -> list[Cause]:
     """The next cause to name, and those that the linear model finds nearly as good; empty where there is none."""
     count = len(effect_names())
-    scene = sorted((e for e in seen.best.values() if worth(e, seen, count)), key=lambda e: -e.gain)
+    least = IMPERFECT * max((c.fid for c in state.causes if _on_lit_ground(c)), default=0.0)
+    worthy = [e for e in seen.best.values() if e.fid > least and worth(e, seen, count, state.data.slope)]
+    scene = sorted(worthy, key=lambda e: -e.gain)
     image = sorted((e for e in seen.images.values() if worth_image(e, count)), key=lambda e: -e.gain)
     if image and image[0].effect == "image_gain" and not scene:
         # a scene-wide effect that does nearly as well with a few numbers as gains do with one for each image
-        near = [e for e in seen.best.values() if e.gain > KEEP_SHARE * image[0].gain and worth(e, seen, count, 5.0)]
+        near = [e for e in seen.best.values() if e.gain > KEEP_SHARE * image[0].gain]
+        near = [e for e in near if worth(e, seen, count, state.data.slope, 5.0)]
         scene = sorted(near, key=lambda e: -e.gain)
     single = []
     if image:
@@ -67,13 +73,30 @@ def choose(state: Search, seen: Round) -> list[Cause]:
         guises = [g for g in seen.others if g.effect == e.effect and g.candidate.size < e.candidate.size]
         simpler = max(guises, key=lambda g: g.gain, default=e)
         guise = simpler if simpler.gain > SIMPLER * e.gain else e
-        effect, errors = start(guise, state.data)
-        causes.append(Cause(effect, min(1.0, e.p * count), e.gain, e.gain_error, e.fid, group, errors))
+        for form in [guise, *_other_forms(guise, seen)]:
+            effect, errors = start(form, state.data)
+            causes.append(Cause(effect, min(1.0, e.p * count), e.gain, e.gain_error, e.fid, list(group), errors))
     return causes + single
 
 
-def worth(e: Evidence, seen: Round, count: int, ease: float = 1.0) -> bool:
-    """Whether the evidence is enough for a name."""
+def _other_forms(guise: Evidence, seen: Round) -> list[Evidence]:
+    """Guises of the same effect in other coordinates, as many, that do nearly as well: a line does not tell them apart."""
+    mine = _coordinates(guise)
+    rest = [g for g in seen.others if g.effect == guise.effect and g.candidate.size == guise.candidate.size]
+    return [g for g in rest if _coordinates(g) != mine and g.gain > FORMS * guise.gain][:1]
+
+
+def _coordinates(guise: Evidence) -> set[str]:
+    return {name for column in guise.candidate.trial.columns for name in column}
+
+
+def _on_lit_ground(cause: Cause) -> bool:
+    """Whether the size of the cause is that of its marks on lit ground."""
+    return cause.effect.channel == "lit" and not cause.effect.displaces
+
+
+def worth(e: Evidence, seen: Round, count: int, slope: tuple[float, float], ease: float = 1.0) -> bool:
+    """Whether the evidence is enough for a name; slope : mean and standard deviation over the ground, as tangent."""
     cls = get_effect(e.effect)
     still = cls.channel in ("albedo", "relief")  # judged in rows of their own, where the size against noise says little
     if e.p * count > GATE * ease or min(e.gain_image, e.gain_place) <= 0:
@@ -95,14 +118,20 @@ def worth(e: Evidence, seen: Round, count: int, ease: float = 1.0) -> bool:
         return False
     if e.effect == "echo":  # near ones look like an imperfect point spread function
         near = abs(e.candidate.trial.fixed["lag_px"]) < CLEAR_LAG
-        if value < 0 or (near and e.fid < 2 * FLOOR_FID):
+        blur = seen.best.get("psf_blur")
+        if value < 0 or (near and (e.fid < 2 * FLOOR_FID or blur is None or blur.gain > BLURRED * e.gain)):
             return False
     if e.effect == "penumbra":
         return value > e.candidate.trial.fixed["relief_deg"] + 3 * error
     if e.effect == "dem_smoothing" and value < 0:  # no DEM is sharper than the ground
         return False
     if name in cls.tolerance:
-        return abs(value - cls.null()[name]) - cls.tolerance[name] > 3 * error
+        ordinary = cls.tolerance[name]
+        if e.effect == "dem_scale" and value < 0:  # relief within a pixel flattens the shading of rugged ground
+            ordinary += slope[0] ** 2 + slope[1] ** 2
+        return abs(value - cls.null()[name]) - ordinary > 3 * error
+    if e.effect == "column_pattern" and abs(unit) * float(e.amount.norm()) < cls.tolerance["rms"]:
+        return False
     if e.effect == "earthshine":  # a source above the ground, known to a third
         return float(e.amount[0]) > 3 * float(e.covariance[0, 0].clamp(min=0).sqrt())
     if e.effect in ("distant_shadow", "saturation"):  # a shadow is dark and a cut-off flat, or it is something else

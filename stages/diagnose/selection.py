@@ -73,7 +73,10 @@ def _name(state: Search, most: int, say: Callable[[str], None]) -> Round:
 
 
 def _prune(state: Search, seen: Round) -> bool:
-    """Drop causes without which the others fit as well: the first of two may have stood for the second. Whether any was."""
+    """Drop causes without which the others fit as well, or that have become ordinary: whether any was dropped.
+
+    The first of two may have stood for the second until that was known.
+    """
     pruned = False
     for cause in state.causes[:-1]:
         if cause.effect.scope != "scene" or cause.effect.channel != "lit":
@@ -81,11 +84,21 @@ def _prune(state: Search, seen: Round) -> bool:
         before, best = state.save(), misfit(state, seen.works)
         state.causes.remove(cause)
         refine(state, 2)
-        if misfit(state, seen.works) - best < 2 * max(FLOOR_GAIN, NEEDLESS * cause.gain):
+        cost = misfit(state, seen.works) - best
+        if cost < 2 * max(FLOOR_GAIN, NEEDLESS * cause.gain) or _ordinary(cause):
             pruned = True
         else:
             state.load(before)
     return pruned
+
+
+def _ordinary(cause: Cause) -> bool:
+    """Whether every data set has as much of it."""
+    effect = cause.effect
+    return bool(effect.tolerance) and all(
+        name in effect.values and abs(float(effect.values[name]) - effect.null()[name]) < size
+        for name, size in effect.tolerance.items()
+    )
 
 
 def _settle_shifts(state: Search) -> None:

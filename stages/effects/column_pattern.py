@@ -31,6 +31,7 @@ class ColumnPattern(Effect):
     parameters = (Parameter("rms", "1", 0.0, 1.0, 0.0, "rms of the response about 1"),)
     coordinates = tuple(Parameter(f"c{k}", "1", -0.5, 0.5, 0.0, f"cosine {k} over the columns") for k in ORDERS)
     strong: ClassVar = {p.name: 0.02 for p in coordinates}
+    tolerance: ClassVar = {"rms": 0.001}  # of a good flat field
 
     def response(self, count: int) -> Tensor:
         """Response at ``count`` samples from the first to the last column, (count,)."""

@@ -22,6 +22,7 @@ class DarkBias(Effect):
     separate = "an image with deep shadow, where nothing else is bright"
     parameters = (Parameter("iof", "1", -0.1, 0.1, 0.0, "added I/F, truth minus given"),)
     strong: ClassVar = {"iof": 0.004}
+    tolerance: ClassVar = {"iof": 5e-5}  # half a step of 12 bits
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
