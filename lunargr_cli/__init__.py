@@ -25,6 +25,17 @@ def raise_again() -> None:
         raise KeyboardInterrupt if signals[0] == signal.SIGINT else SystemExit(128 + signals[0])
 
 
+def quiet_interruptions() -> None:
+    """Where Python swallows an interruption it prints a traceback; ours is raised again, and that is enough."""
+    before = sys.unraisablehook
+
+    def hook(unraisable: Any) -> None:
+        if not (signals and isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit)):
+            before(unraisable)
+
+    sys.unraisablehook = hook
+
+
 def _leave(number: int, frame: Any) -> None:
     os.write(2, f"{INTERRUPTED}\n".encode())
     os._exit(130)

@@ -16,7 +16,7 @@ from typing import Any
 
 import typer
 
-from lunargr_cli import INTERRUPTED, commands, signals, stop
+from lunargr_cli import INTERRUPTED, commands, quiet_interruptions, signals, stop
 from lunargr_cli.console import say_error
 from schemas.errors import EXIT_CODE, LunargrError
 from schemas.locks import claim
@@ -82,6 +82,7 @@ def main() -> None:
     """Run the command line; a LunargrError is one line on standard error and exit code 3."""
     for number in (signal.SIGINT, signal.SIGTERM):  # a Slurm time limit or `kill` unwinds like Ctrl-C
         signal.signal(number, stop)
+    quiet_interruptions()
     try:
         app()
     except BaseException as error:

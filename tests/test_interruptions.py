@@ -37,6 +37,10 @@ def python(program: str) -> subprocess.CompletedProcess:
         # a library that makes another error of it, as numpy's and numba's imports do
         "import lunargr_cli.main as m\ndef app():\n try: os.kill(os.getpid(), signal.SIGINT)\n"
         " except KeyboardInterrupt: raise ImportError('numpy')\nm.app = app\nm.main()",
+        # where Python swallows it, and would print a traceback
+        "import lunargr_cli.main as m, weakref\nclass Kept: pass\ndef app():\n kept = Kept()\n"
+        " gone = weakref.ref(kept, lambda _: os.kill(os.getpid(), signal.SIGINT))\n del kept\n m.raise_again()\n"
+        "m.raise_again = __import__('lunargr_cli').raise_again\nm.app = app\nm.main()",
     ],
 )
 def test_ctrl_c_is_one_line_wherever_it_falls(program):
