@@ -17,6 +17,7 @@ from stages.effects import Effect, effect_names, get_effect
 
 GATE = 0.01  # family-wise
 FLOOR_FID = 0.022  # an effect smaller than this against the noise is never worth a name
+EVEN = 0.18  # rms slope, as tangent, up to which that holds
 FLOOR_IMAGE = 0.035  # the same for effects with values per image, which have more to fit with
 FLOOR_GAIN = 12.0  # nats
 AGREE = 0.95  # of the gain of an amount for each site that one amount for all must keep
@@ -79,6 +80,11 @@ def choose(state: Search, seen: Round) -> list[Cause]:
     return causes + single
 
 
+def floor_fid(slope: tuple[float, float]) -> float:
+    """Size against the noise, below which nothing is named: what relief within a pixel does grows with the slopes."""
+    return FLOOR_FID * max(1.0, math.hypot(*slope) / EVEN)
+
+
 def _other_forms(guise: Evidence, seen: Round) -> list[Evidence]:
     """Guises of the same effect in other coordinates, as many, that do nearly as well: a line does not tell them apart."""
     mine = _coordinates(guise)
@@ -104,7 +110,7 @@ def worth(e: Evidence, seen: Round, count: int, slope: tuple[float, float], ease
     if e.agreement < AGREE and not still and e.effect != "distant_shadow":
         return False
     firm = 0.0 if e.effect == "distant_shadow" else 1.5 * e.gain_error  # a wall shades one image and spares the others
-    if e.gain < max(FLOOR_GAIN, firm) or (e.fid < FLOOR_FID and not still):
+    if e.gain < max(FLOOR_GAIN, firm) or (e.fid < floor_fid(slope) and not still):
         return False
     (name, reference), *_ = e.candidate.trial.columns[0].items()
     unit = reference - cls.null()[name]
@@ -197,4 +203,4 @@ def _as_good(first: Evidence, other: Evidence) -> bool:
     return float(difference.sum()) < 2 * error and other.gain > 0.5 * first.gain
 
 
-__all__ = ["FLOOR_FID", "SIMPLER", "choose", "misaligned", "with_values", "worth", "worth_image"]
+__all__ = ["SIMPLER", "choose", "floor_fid", "misaligned", "with_values", "worth", "worth_image"]
