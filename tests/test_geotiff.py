@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 
+from stages.physics import geotiff
 from stages.physics.geotiff import _overviews, _write_levels, halve
 
 
@@ -24,10 +25,12 @@ def test_halving_is_the_mean_of_what_is_known(shape, rng):
         np.testing.assert_allclose(out, np.nanmean(squares, axis=(2, 4)), rtol=1e-5, atol=1e-6)
 
 
-def test_every_level_is_half_of_the_one_before(tmp_path, rng):
+@pytest.mark.parametrize("columns", [512, 8192])
+def test_every_level_is_half_of_the_one_before(tmp_path, rng, monkeypatch, columns):
+    monkeypatch.setattr(geotiff, "COLUMNS", columns)
     values = rng.normal(size=(2, 1100, 700)).astype(np.float32)
     levels = [tmp_path / f"{k}.tif" for k in range(_overviews(1100, 700) + 1)]
-    _write_levels(levels, 1100, 700, 2, lambda first, last: values[:, first:last])
+    _write_levels(levels, 1100, 700, 2, lambda piece: values[(slice(None), *piece.toslices())])
     shapes = []
     for level in levels:
         with rasterio.open(level) as file:

@@ -37,7 +37,8 @@ def choose(state: Search, seen: Round) -> list[Cause]:
     """The next cause to name, and those that the linear model finds nearly as good; empty where there is none."""
     count = len(effect_names())
     least = IMPERFECT * max((c.fid for c in state.causes if _on_lit_ground(c)), default=0.0)
-    worthy = [e for e in seen.best.values() if e.fid > least and worth(e, seen, count, state.data.slope)]
+    worthy = [e for e in seen.best.values() if _still(e) or e.fid > least]
+    worthy = [e for e in worthy if worth(e, seen, count, state.data.slope)]
     scene = sorted(worthy, key=lambda e: -e.gain)
     image = sorted((e for e in seen.images.values() if worth_image(e, count)), key=lambda e: -e.gain)
     if image and image[0].effect == "image_gain" and not scene:
@@ -80,6 +81,11 @@ def choose(state: Search, seen: Round) -> list[Cause]:
     return causes + single
 
 
+def _still(e: Evidence) -> bool:
+    """Whether it is judged in rows of its own, what stays with the ground, where the size against noise says little."""
+    return get_effect(e.effect).channel in ("albedo", "relief")
+
+
 def floor_fid(slope: tuple[float, float]) -> float:
     """Size against the noise, below which nothing is named: what relief within a pixel does grows with the slopes."""
     return FLOOR_FID * max(1.0, math.hypot(*slope) / EVEN)
@@ -104,7 +110,7 @@ def _on_lit_ground(cause: Cause) -> bool:
 def worth(e: Evidence, seen: Round, count: int, slope: tuple[float, float], ease: float = 1.0) -> bool:
     """Whether the evidence is enough for a name; slope : mean and standard deviation over the ground, as tangent."""
     cls = get_effect(e.effect)
-    still = cls.channel in ("albedo", "relief")  # judged in rows of their own, where the size against noise says little
+    still = _still(e)
     if e.p * count > GATE * ease or min(e.gain_image, e.gain_place) <= 0:
         return False
     if e.agreement < AGREE and not still and e.effect != "distant_shadow":

@@ -22,10 +22,10 @@ from rasterio.windows import Window
 from schemas.reading import read_strings
 from stages.physics.grid import Grid
 
-Read = Callable[[int, int], NDArray[np.float32]]  # (first, last row) -> (C, last - first, W)
+Read = Callable[[Window], NDArray[np.float32]]  # -> (C, rows, columns)
 TAGS = ("model", "quantity", "gsd_m", "body_radius_m")
 ANYWHERE = Affine.scale(2, -2)  # the virtual file above the levels says where the map lies
-BLOCK, STRIP = 256, 512  # px; strips hold whole blocks of their own level and of the next
+BLOCK, STRIP, COLUMNS = 256, 512, 8192  # px; pieces hold whole blocks of their own level and of the next
 
 
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
@@ -39,7 +39,7 @@ def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
     tags = {key: str(file.attrs[key]) for key in TAGS} | {"coefficients": json.dumps(names), "software": "lunargr"}
     try:
         coefficients = file["coefficients"]
-        _write_levels(levels, grid.height, grid.width, len(names), lambda a, b: coefficients[:, a:b])
+        _write_levels(levels, grid.height, grid.width, len(names), lambda w: coefficients[(slice(None), *w.toslices())])
         scheme.write_text(_virtual(levels, grid, names, tags), encoding="utf-8")
         # Noise does not deflate: ZSTD's lowest level takes a third of the time of DEFLATE's and is as small.
         rasterio.shutil.copy(
@@ -55,9 +55,10 @@ def _overviews(height: int, width: int) -> int:
     return max(0, math.ceil(math.log2(max(height, width) / BLOCK)))
 
 
-def _strips(height: int) -> Iterator[tuple[int, int]]:
-    for first in range(0, height, STRIP):
-        yield first, min(height, first + STRIP)
+def _pieces(height: int, width: int) -> Iterator[Window]:
+    for row in range(0, height, STRIP):
+        for column in range(0, width, COLUMNS):
+            yield Window(column, row, min(COLUMNS, width - column), min(STRIP, height - row))
 
 
 def _write_levels(levels: list[Path], height: int, width: int, count: int, read: Read) -> None:
@@ -67,21 +68,22 @@ def _write_levels(levels: list[Path], height: int, width: int, count: int, read:
         for k in range(len(levels)):
             half = (-(-shape[0] // 2), -(-shape[1] // 2))
             smaller = _create(files, levels[k + 1], *half, count) if k + 1 < len(levels) else None
-            for first, last in _strips(shape[0]):
-                values = read(first, last)
+            for piece in _pieces(*shape):
+                values = read(piece)
                 if k == 0:
-                    target.write(values, window=Window(0, first, shape[1], last - first))
+                    target.write(values, window=piece)
                 if smaller is not None:
-                    means = np.empty((count, (last - first + 1) // 2, half[1]), np.float32)
+                    means = np.empty((count, -(-piece.height // 2), -(-piece.width // 2)), np.float32)
                     halve(np.ascontiguousarray(values), means)
-                    smaller.write(means, window=Window(0, first // 2, half[1], means.shape[1]))
+                    place = Window(piece.col_off // 2, piece.row_off // 2, means.shape[2], means.shape[1])
+                    smaller.write(means, window=place)
             if smaller is not None:
                 smaller.close()
-                shape, read = half, _reader(files.enter_context(rasterio.open(levels[k + 1])), half[1])
+                shape, read = half, _reader(files.enter_context(rasterio.open(levels[k + 1])))
 
 
-def _reader(source: rasterio.DatasetReader, width: int) -> Read:
-    return lambda first, last: source.read(window=Window(0, first, width, last - first))
+def _reader(source: rasterio.DatasetReader) -> Read:
+    return lambda window: source.read(window=window)
 
 
 def _create(files: contextlib.ExitStack, path: Path, height: int, width: int, count: int) -> rasterio.io.DatasetWriter:
