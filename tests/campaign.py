@@ -293,10 +293,19 @@ def work(layout: Layout, cache: Path, seed: int, job: dict) -> dict:
     if _scene.get("layout") != layout:
         _scene.update(layout=layout, scene=Scene(layout, cache))
     with tempfile.TemporaryDirectory() as name:
-        return case(_scene["scene"], job, seed, Path(name))
+        return case(_scene["scene"], aimed(job, _scene["scene"]), seed, Path(name))
 
 
 _scene: dict = {}
+
+
+def aimed(job: dict, scene: Scene) -> dict:
+    """A far wall stands on the side of the lowest Sun: where none reaches an image there is nothing to find."""
+    if "distant_shadow" not in job:
+        return job
+    lowest = min(scene.suns, key=lambda sun: sun[2])
+    side = ("north", "east", "south", "west")[round(np.degrees(np.arctan2(lowest[0], lowest[1])) / 90) % 4]
+    return {**job, "distant_shadow": {**job["distant_shadow"], "side": side}}
 
 
 def main() -> None:
