@@ -173,6 +173,9 @@ def summarise(cases: list[dict]) -> str:
         lines.append(
             f"| held-out gain over that of the world without the effect, median of {len(worth)} | {np.median(worth):.2f} |"
         )
+    sizes = [r for c in first if c["fid"] >= 0.1 for r in _ratios(next(iter(c["planted"])), [c])]
+    close = [r for r in sizes if abs(r - 1) <= 0.1]
+    lines.append(f"| first parameter within 10 %, where at least 0.1 of the noise | {_share(len(close), len(sizes))} |")
     double = [c for c in cases if len(c["planted"]) == 2]
     both = [c for c in double if set(c["planted"]) <= {x["effect"] for x in c["answer"]["causes"]}]
     third = [c for c in double if {x["effect"] for x in c["answer"]["causes"]} - set(c["planted"])]
@@ -221,13 +224,18 @@ def _share(part: int, whole: int) -> str:
     return f"{part} of {whole} ({100 * part / whole:.0f} %)" if whole else "not run"
 
 
-def _ratio(effect: str, hits: list[dict]) -> str:
+def _ratios(effect: str, hits: list[dict]) -> list[float]:
+    """First parameter found over planted."""
     name = next(iter(PLANTS[effect]))
-    found = [
+    return [
         c["answer"]["causes"][0]["parameters"][name]["value"] / c["drawn"].get(effect, c["planted"][effect][name])
         for c in hits
         if name in c["answer"]["causes"][0]["parameters"]
     ]
+
+
+def _ratio(effect: str, hits: list[dict]) -> str:
+    found = _ratios(effect, hits)
     return f"{np.median(found):.2f} ({min(found):.2f} .. {max(found):.2f})" if found else "-"
 
 
