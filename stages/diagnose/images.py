@@ -25,6 +25,7 @@ from stages.diagnose.projection import Local
 from stages.diagnose.statistics import BLOCK
 from stages.effects import Effect, Survey, get_effect
 
+OVERSHOOT = 1.5  # texture and slopes, known from images that are not aligned yet, hide a third of each shift
 FEWEST = 3  # images of a site, below which an image's own fault and the ground's texture are one
 
 
@@ -234,4 +235,4 @@ def as_effect(evidence: ImageEvidence, known: Effect | None, data: Survey, share
     return cls(values, data)
 
 
-__all__ = ["ImageEvidence", "as_effect", "gather_images", "weigh_images"]
+__all__ = ["OVERSHOOT", "ImageEvidence", "as_effect", "gather_images", "weigh_images"]

@@ -10,7 +10,15 @@ from dataclasses import dataclass, field
 from stages.diagnose.chain import Chain
 from stages.diagnose.columns import BASELINE, Candidate, make_candidates, relief_blur, trial_columns
 from stages.diagnose.evidence import Evidence, best_guises, weigh
-from stages.diagnose.images import FEWEST, ImageEvidence, ImageProducts, as_effect, gather_images, weigh_images
+from stages.diagnose.images import (
+    FEWEST,
+    OVERSHOOT,
+    ImageEvidence,
+    ImageProducts,
+    as_effect,
+    gather_images,
+    weigh_images,
+)
 from stages.diagnose.pattern import PatternEvidence, weigh_pattern
 from stages.diagnose.preparing import Remains, left_over, ready
 from stages.diagnose.projection import FREE_SLOPES
@@ -22,7 +30,6 @@ from stages.effects import get_effect
 LADDER = (0.72, 0.82, 0.92, 1.0, 1.08, 1.2, 1.35)  # of a wall's height ...
 DISTANCES = (0.04, 1.0, 3.0)  # ... and of its distance, about the best of the first ladder
 ALIGNMENTS = 3
-OVERSHOOT = 1.5  # texture and slopes, known from images that are not aligned yet, hide a third of each shift
 ENOUGH_PX = 0.06
 SAME = 0.6  # agreement over the sites, below which shifts are something else
 QUIET_GAIN, QUIET_FID = 6.0, 0.012  # below both an effect is not looked at again

@@ -12,7 +12,7 @@ from torch import Tensor
 from stages.diagnose.chain import Chain
 from stages.diagnose.columns import derivative_step, relief_blur
 from stages.diagnose.evidence import Evidence
-from stages.diagnose.images import ImageProducts, as_effect, gather_images, weigh_images
+from stages.diagnose.images import OVERSHOOT, ImageProducts, as_effect, gather_images, weigh_images
 from stages.diagnose.preparing import ready
 from stages.diagnose.relief import Relief, named_relief, weigh_relief
 from stages.diagnose.state import Cause, Search
@@ -62,7 +62,8 @@ def refine(state: Search, steps: int = 2) -> None:
         found = weigh_images([images for _, _, images in every], state.frames)
         for name, cause in named.items():
             if name in found and found[name].gain > WORTH_MOVING:
-                cause.effect = as_effect(found[name], cause.effect, state.data)
+                share = OVERSHOOT if cause.effect.displaces else 1.0
+                cause.effect = as_effect(found[name], cause.effect, state.data, share)
     state.fit()
 
 

@@ -25,7 +25,7 @@ from stages.physics.grid import Grid
 Read = Callable[[Window], NDArray[np.float32]]  # -> (C, rows, columns)
 TAGS = ("model", "quantity", "gsd_m", "body_radius_m")
 ANYWHERE = Affine.scale(2, -2)  # the virtual file above the levels says where the map lies
-BLOCK, STRIP, COLUMNS = 256, 512, 8192  # px; pieces hold whole blocks of their own level and of the next
+BLOCK, STRIP, COLUMNS = 256, 512, 4096  # px; pieces hold whole blocks of their own level and of the next
 
 
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
