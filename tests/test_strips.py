@@ -55,9 +55,18 @@ def test_a_part_is_what_the_whole_has_there(terrain, part, threads):
     np.testing.assert_allclose(got, whole[:, row : row + height, col : col + width], rtol=1e-4, atol=1e-5)
 
 
+@pytest.fixture
+def several_threads():
+    """PyTorch with three threads, among which it would share out a convolution."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @pytest.mark.parametrize("widths", [SMALL, WIDTHS])
-def test_cuts_leave_no_trace(terrain, widths, precision):
+def test_cuts_leave_no_trace(terrain, widths, precision, several_threads):
     """Not a bit of the kernels' own, and of the convolutions far less than 1e-4 of a coefficient's spread."""
     predictor = shaken(widths)
     whole = strips(predictor, terrain, WHOLE, precision)

@@ -19,8 +19,8 @@ def side_by_side(
 ) -> Iterator[tuple[int, Item | None]]:
     """(the job's number, what ``work`` yields of it), and (number, None) after its last; in order within a job only.
 
-    ``together`` threads share PyTorch's threads among them. What they make waits for the caller, two pieces a thread at
-    most. An error in one ends all; so does leaving the loop, after the strips that are being worked on.
+    ``together`` threads, no more than PyTorch may use, have one of its threads each. What they make waits for the
+    caller, two pieces a thread at most. An error in one ends all; so does leaving the loop, after the strips that are being worked on.
     """
     threads = torch.get_num_threads()
     together = max(1, min(together, threads, len(jobs)))
@@ -51,7 +51,7 @@ def side_by_side(
         except BaseException as error:
             hand_over(error)
 
-    torch.set_num_threads(threads // together)
+    torch.set_num_threads(1)  # a convolution shared out among threads adds up in another order, which bf16 shows
     workers = [threading.Thread(target=go, name=f"strips {k}", daemon=True) for k in range(together)]
     try:
         for worker in workers:

@@ -46,9 +46,19 @@ class Mapper:
             yield part[0], self._window(terrain, shape, part).float().cpu().numpy()
             return
         strips = Strips(self._folded, terrain, shape, part, self._strip)
-        while (found := strips.next()) is not None:
+        while (found := self._next(strips)) is not None:
             row, raw, first = found
             yield row, self._finish(raw, first, part[3])
+
+    @staticmethod
+    def _next(strips: Strips) -> tuple[int, Tensor, int] | None:
+        """On one thread: shared out among several a convolution adds up in another order, and bf16 shows it."""
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            return strips.next()
+        finally:
+            torch.set_num_threads(threads)
 
     @torch.inference_mode()
     def _finish(self, raw: Tensor, first: int, width: int) -> NDArray[np.float32]:
