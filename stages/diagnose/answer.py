@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from schemas import DIAGNOSIS, ArtefactWriter
+from stages.diagnose.images import spread
 from stages.diagnose.nominal import Nominal, _scale, lit_mask
 from stages.diagnose.state import Cause
 from stages.effects import Effect, get_effect
@@ -152,13 +153,9 @@ def parameters(cause: Cause) -> dict[str, dict[str, Any]]:
                 size, 1e-12
             )
         else:
-            table = torch.stack([torch.as_tensor(v) for v in effect.values.values()], 1)
-            seen = table.abs().sum(1) > 0
-            size = float(table[seen].square().sum(1).mean().sqrt()) if bool(seen.any()) else 0.0
-            seen_by = cause.image_evidence
-            error = seen_by.rms_error if seen_by else 0.0
-            if seen_by and seen_by.together > 1:  # what all images of a site have in common belongs to the ground
-                size *= math.sqrt(seen_by.together / (seen_by.together - 1))
+            table = torch.stack([torch.as_tensor(v, dtype=torch.float64) for v in effect.values.values()], 1)
+            evidence = cause.image_evidence
+            size, error = spread(table, evidence), evidence.rms_error if evidence else 0.0
         found = {name: (size, error)}
     return {k: {"value": _number(v), "error": _number(e), "unit": units[k]} for k, (v, e) in found.items()}
 

@@ -63,6 +63,7 @@ class Chain:
         self.site, self.model, self.coefficients, self.base = site, model, coefficients, list(base)
         self.moved = list(moved)
         self.free = free
+        self._measured = torch.where(site.valid, site.image, torch.nan)
         self._sharp = SharpSlopes(site.observation.gsd, site.observation.body_radius)
         self._state = self._illuminate(self.base)
         self._state.reflectance = self._surface(self._state)
@@ -85,6 +86,7 @@ class Chain:
         state = copy.copy(state)
         state.further_light = list(state.further_light)
         state.reflectance = reflectance * self.site.texture if texture else reflectance
+        state.measured = self._measured if texture else None
         return formation.expose(state, effects)
 
     def predict(self) -> Tensor:
@@ -146,6 +148,11 @@ class Chain:
             state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
             out += 0.25 * self._expose(state, self._surface(state), self.base)
         return out
+
+    def lit(self) -> Tensor:
+        """(n, H, W) bool: ground that the Sun's centre shines on."""
+        above, facing = self.height_above_horizon(), self._state.angles.cos_incidence > 0
+        return facing if above is None else facing & (above > 0)
 
     def height_above_horizon(self) -> Tensor | None:
         """rad, (n, H, W): the Sun's centre above the terrain horizon."""

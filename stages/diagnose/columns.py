@@ -53,7 +53,11 @@ def nuisance_columns(chain: Chain, dn: bool, named: bool = True) -> Tensor:
 
 
 def image_columns(chain: Chain, cls: type[Effect], place: int | None = None) -> list[Tensor]:
-    """d image / d coordinate for an effect with one value per image, (n, H, W) each."""
+    """d image / d coordinate for an effect with one value per image, (n, H, W) each.
+
+    Shifts show on lit ground alone: in shadow their template is all of neighbouring edges, whose place is not known so well.
+    """
+    lit = chain.lit() if cls.displaces else 1.0
     frames = int(chain.site.observation.frame.max()) + 1
     out = []
     for parameter in cls.fitted():
@@ -64,7 +68,7 @@ def image_columns(chain: Chain, cls: type[Effect], place: int | None = None) -> 
             values = dict(chain.base[place].values)
             values[parameter.name] = values[parameter.name] + step
             moved = chain.replace(place, cls(values, chain.base[place].survey))
-        out.append((moved - chain.textured) / step)
+        out.append((moved - chain.textured) * lit / step)
     return out
 
 

@@ -26,12 +26,17 @@ from stages.diagnose.statistics import BLOCK
 from stages.effects import Effect, Survey, get_effect
 
 OVERSHOOT = 1.5  # texture and slopes, known from images that are not aligned yet, hide a third of each shift
+COSTS_NOTHING = 0.005  # of a gain: a prior that costs more shrinks what is known (by the root of it)
+STEPS = 2  # in which values are found: each leaves of a value what it draws to nothing
 FEWEST = 3  # images of a site, below which an image's own fault and the ground's texture are one
 
 
 @dataclass
 class ImageEvidence:
-    """values, errors : (frames, K), NaN-free; rms : of the values; together : images of the site that has most."""
+    """values, errors : (frames, K), NaN-free; rms : of the values; together : images of the site that has most.
+
+    known : (frames, K), share of each value that the data fix, the rest being drawn to nothing
+    """
 
     effect: str
     values: Tensor
@@ -44,6 +49,7 @@ class ImageEvidence:
     fid: float
     frames: int
     together: int
+    known: Tensor
     agreement: float = 1.0  # gain of values that hold for all sites over that of values for each
 
 
@@ -201,7 +207,7 @@ def _weigh(name: str, folds: list[_Fold], frames: int, rows: float, together: in
         tried.append((gain, penalty))
     top = max(g for g, _ in tried)
     # the strictest prior that loses next to nothing: what the nominal model can imitate costs nothing and means nothing
-    gain, penalty = next((g, q) for g, q in tried if g >= top - max(0.03 * abs(top), 2.0))
+    gain, penalty = next((g, q) for g, q in tried if g >= top - max(COSTS_NOTHING * abs(top), 2.0))
     a, b = solve(folds[0], penalty), solve(folds[1], penalty)
     # the halves are compared in units of what they change in the image, not of the values themselves
     power, axes = torch.linalg.eigh(total.gram)
@@ -214,14 +220,15 @@ def _weigh(name: str, folds: list[_Fold], frames: int, rows: float, together: in
     flat = solve(total, penalty)
     values = flat.view(frames, k)
     matrix = total.gram + penalty * torch.eye(len(total.gram), dtype=torch.float64)
-    errors = torch.linalg.inv(matrix).diagonal().clamp(min=0).sqrt().view(frames, k)
+    variance = torch.linalg.inv(matrix).diagonal().clamp(min=0)
+    errors, known = variance.sqrt().view(frames, k), (1 - penalty * variance).clamp(min=0).view(frames, k)
     values = torch.where(seen[:, None], values, 0.0)
     rms = math.sqrt(float(values[seen].square().sum(1).mean())) if count else 0.0
-    spread = math.sqrt(float(errors[seen].square().sum(1).mean()) / max(count, 1)) if count else 0.0
+    uncertain = math.sqrt(float(errors[seen].square().sum(1).mean()) / max(count, 1)) if count else 0.0
     return ImageEvidence(
-        name, values.float(), errors.float(), rms, spread, gain,
+        name, values.float(), errors.float(), rms, uncertain, gain,
         math.sqrt(2 * max(gain, 0.0) + count * k), p,
-        math.sqrt(max(float(flat @ total.gram @ flat), 0.0) / max(rows, 1.0)), count, together,
+        math.sqrt(max(float(flat @ total.gram @ flat), 0.0) / max(rows, 1.0)), count, together, torch.where(seen[:, None], known, 0.0),
     )  # fmt: skip
 
 
@@ -235,4 +242,19 @@ def as_effect(evidence: ImageEvidence, known: Effect | None, data: Survey, share
     return cls(values, data)
 
 
-__all__ = ["OVERSHOOT", "ImageEvidence", "as_effect", "gather_images", "weigh_images"]
+def spread(values: Tensor, evidence: ImageEvidence | None) -> float:
+    """rms length of the values per image (frames, K), images that say little of theirs left out.
+
+    What all images of a site have in common belongs to the ground.
+    """
+    seen = values.abs().sum(1) > 0
+    if not bool(seen.any()):
+        return 0.0
+    known = torch.ones_like(values) if evidence is None else evidence.known.to(values)
+    known = 1 - (1 - known) ** STEPS
+    size = float(values[seen].square().sum() / known[seen].square().mean(1).sum().clamp(min=1e-3)) ** 0.5
+    together = evidence.together if evidence is not None else 1
+    return size * math.sqrt(together / (together - 1)) if together > 1 else size
+
+
+__all__ = ["FEWEST", "OVERSHOOT", "ImageEvidence", "as_effect", "gather_images", "spread", "weigh_images"]

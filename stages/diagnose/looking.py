@@ -22,6 +22,7 @@ from stages.diagnose.images import (
 from stages.diagnose.pattern import PatternEvidence, weigh_pattern
 from stages.diagnose.preparing import Remains, left_over, ready
 from stages.diagnose.projection import FREE_SLOPES
+from stages.diagnose.refining import start
 from stages.diagnose.relief import ALONG, Relief, open_relief, weigh_relief
 from stages.diagnose.state import Search
 from stages.diagnose.statistics import Statistics, gather_site, gather_static, given, join, swap, without
@@ -107,6 +108,7 @@ def look(state: Search, names: Sequence[str]) -> Round:
         evidence += weigh(without(blurred, drop, blurred.candidates))
     if at_edge:
         evidence += _weigh_edges(state, join([s.edges for s in every if s.edges is not None]))
+    evidence = [e for e in evidence if _plausible(e, state)]
     pattern = weigh_pattern(works) if "albedo_map" in kinds else None
     return Round(
         works,
@@ -187,6 +189,11 @@ def _climb(state: Search, top: Evidence) -> list[Evidence]:
     return [top]
 
 
+def _plausible(e: Evidence, state: Search) -> bool:
+    effect, _ = start(e, state.data)
+    return effect.plausible(effect.values, state.data)
+
+
 def _smooth(state: Search, evidence: Sequence[Evidence]) -> bool:
     """Whether the DEM is, or may be, smoother than every DEM."""
     cls = get_effect("dem_smoothing")
@@ -206,10 +213,18 @@ def quiet(seen: Round, named: str) -> set[str]:
     return {n for n, e in left.items() if e.gain < QUIET_GAIN and e.fid < QUIET_FID}
 
 
-def misfit(state: Search, works: Sequence[Remains]) -> float:
-    """Weighted sum of squares that all free parameters together leave, with the weights of an earlier look."""
+def misfit(state: Search, works: Sequence[Remains], edges: bool = False) -> float:
+    """Weighted sum of squares that all free parameters together leave, with the weights of an earlier look.
+
+    edges : the weights count shadow edges too; what relief does to them is then fitted along
+    """
     weights = {id(w.site): w.weight for w in works}
-    return sum(state.each(lambda chain: left_over(chain, weights[id(chain.site)] * chain.site.valid, state.dn)))
+
+    def of(chain: Chain) -> float:
+        extra = relief_blur(chain)[1] if edges else []
+        return left_over(chain, weights[id(chain.site)] * chain.site.valid, state.dn, extra)
+
+    return sum(state.each(of))
 
 
 def narrowed(seen: Round, later: Round) -> Round:

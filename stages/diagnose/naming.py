@@ -21,6 +21,7 @@ EVEN = 0.18  # rms slope, as tangent, up to which that holds
 FLOOR_IMAGE = 0.035  # the same for effects with values per image, which have more to fit with
 FLOOR_GAIN = 12.0  # nats
 AGREE = 0.95  # of the gain of an amount for each site that one amount for all must keep
+AGREE_PARTLY = 0.85  # ... where a first look sees but a part of the effect, and not the same at every site
 RIVAL_SHARE = 0.6  # of the gain between a scene-wide effect and one per image, above which both are tried
 KEEP_SHARE = 0.8  # of a per-image effect's gain that a scene-wide effect must keep to replace it
 SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to replace it
@@ -30,13 +31,17 @@ FORMS = 0.7  # of the gain, above which another form of an effect is tried as we
 CLEAR_LAG = 4  # px
 BLURRED = 0.5  # of a near echo's gain: if a blur does as well as that, it is a matter of the point spread function
 IMPERFECT = 0.12  # of the largest cause: so much of it its model may leave, which is no further cause
+UNDERRATED = {
+    "psf_blur": 0.4
+}  # effect -> share of its size that a first look may see: texture and slopes take the rest
+IMPERFECT_SHIFTS = 0.06  # ... after shifts, which resampling undoes well
 STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
 
 
 def choose(state: Search, seen: Round) -> list[Cause]:
     """The next cause to name, and those that the linear model finds nearly as good; empty where there is none."""
     count = len(effect_names())
-    least = IMPERFECT * max((c.fid for c in state.causes if _on_lit_ground(c)), default=0.0)
+    least = _least(state)
     worthy = [e for e in seen.best.values() if _still(e) or e.fid > least]
     worthy = [e for e in worthy if worth(e, seen, count, state.data.slope)]
     scene = sorted(worthy, key=lambda e: -e.gain)
@@ -81,6 +86,12 @@ def choose(state: Search, seen: Round) -> list[Cause]:
     return causes + single
 
 
+def _least(state: Search) -> float:
+    """Size against the noise of what the models of the named causes may leave behind."""
+    lit = [IMPERFECT * c.fid for c in state.causes if _on_lit_ground(c)]
+    return max([*lit, *(IMPERFECT_SHIFTS * c.fid for c in state.causes if c.effect.displaces)], default=0.0)
+
+
 def _still(e: Evidence) -> bool:
     """Whether it is judged in rows of its own, what stays with the ground, where the size against noise says little."""
     return get_effect(e.effect).channel in ("albedo", "relief")
@@ -113,9 +124,10 @@ def worth(e: Evidence, seen: Round, count: int, slope: tuple[float, float], ease
     still = _still(e)
     if e.p * count > GATE * ease or min(e.gain_image, e.gain_place) <= 0:
         return False
-    if e.agreement < AGREE and not still and e.effect != "distant_shadow":
+    agree = AGREE_PARTLY if e.effect in UNDERRATED else AGREE
+    if e.agreement < agree and not still and e.effect != "distant_shadow":
         return False
-    firm = 0.0 if e.effect == "distant_shadow" else 1.5 * e.gain_error  # a wall shades one image and spares the others
+    firm = 0.0 if e.effect == "distant_shadow" else 1.25 * e.gain_error  # a wall shades one image and spares the others
     if e.gain < max(FLOOR_GAIN, firm) or (e.fid < floor_fid(slope) and not still):
         return False
     (name, reference), *_ = e.candidate.trial.columns[0].items()
@@ -138,10 +150,7 @@ def worth(e: Evidence, seen: Round, count: int, slope: tuple[float, float], ease
     if e.effect == "dem_smoothing" and value < 0:  # no DEM is sharper than the ground
         return False
     if name in cls.tolerance:
-        ordinary = cls.tolerance[name]
-        if e.effect == "dem_scale" and value < 0:  # relief within a pixel flattens the shading of rugged ground
-            ordinary += slope[0] ** 2 + slope[1] ** 2
-        return abs(value - cls.null()[name]) - ordinary > 3 * error
+        return abs(value - cls.null()[name]) - UNDERRATED.get(e.effect, 1.0) * cls.tolerance[name] > 3 * error
     if e.effect == "column_pattern" and abs(unit) * float(e.amount.norm()) < cls.tolerance["rms"]:
         return False
     if e.effect == "earthshine":  # a source above the ground, known to a third

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,9 +14,11 @@ from stages.diagnose.columns import nominal_columns, nuisance_columns
 from stages.diagnose.data import GRAZING, Site
 from stages.diagnose.projection import Local, Projector
 
-CUT = math.radians(15)  # photometric effects are judged where neither slope nor shadow is a matter of sub-pixel relief
+CUT = math.radians(15)  # photometric effects are judged where neither slope nor shadow is a matter of sub-pixel relief,
+RUGGED = 1.35  # ... which on rugged ground takes more: this many times its rms slope
 DEEP = math.radians(2)  # below the horizon: shadow, whatever the DEM's errors
-OUTLIER = 7.0  # sigma
+OUTLIER = 7.0  # sigma ...
+STRAY = 0.2  # ... but in shadow as much light as this, of the mean brightness: what strays there is evidence
 QUIETEST = 0.002  # noise over mean brightness: an image that looks quieter is dark
 SHOT = 0.8  # share of shot noise in the noise's variance at mean brightness
 EDGE = math.radians(6.0)  # relief below the DEM's resolution blurs shadows over a band like this ...
@@ -61,6 +64,7 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
     residual = torch.where(site.valid, site.image - chain.textured, 0.0)
     level = (chain.textured * site.valid).sum((-2, -1)) / site.valid.sum((-2, -1)).clamp(min=1)
     most = 1 / (QUIETEST * level.clamp(min=1e-6))[:, None, None]
+    shaded = chain.textured < 0.1 * level[:, None, None]
 
     def split() -> tuple[Projector, Tensor, Tensor]:
         projector = Projector(chain, weight)
@@ -75,7 +79,9 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
         else:
             weight = weight * _rescale(dynamic, projector)[:, None, None]
             if not wide:  # what no smooth effect can do: shadows of unknown walls, cut-off highlights, dead pixels
-                gross = dynamic.abs() > OUTLIER
+                gross = dynamic.abs() > torch.where(shaded, STRAY * level[:, None, None] * weight, 0.0).clamp(
+                    min=OUTLIER
+                )
                 if float(gross.sum()) < 0.3 * float((weight > 0).sum()):
                     weight = weight * ~gross
         weight = weight.minimum(most)
@@ -90,13 +96,16 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
     return SiteWork(chain, projector, local, residual, maps[0], projector.whiten(maps[None])[0], dynamic)
 
 
-def left_over(chain: Chain, weight: Tensor, dn: bool) -> float:
-    """Sum of squares of the dynamic residual at given weights, without shifts, unresolved slopes, the nominal model's freedom."""
+def left_over(chain: Chain, weight: Tensor, dn: bool, extra: Sequence[Tensor] = ()) -> float:
+    """Sum of squares of the dynamic residual at given weights, without shifts, unresolved slopes, the nominal model's freedom.
+
+    extra : further columns (n, H, W) that may be fitted along
+    """
     projector = Projector(chain, weight)
     # values per image stay as they are, or they would have a set for each site here
     local = Local(projector, nuisance_columns(chain, dn, named=False))
     residual = chain.site.image - chain.textured
-    columns = torch.stack([*nominal_columns(chain), chain.unresolved_slopes(), residual]) * weight
+    columns = torch.stack([*nominal_columns(chain), chain.unresolved_slopes(), *extra, residual]) * weight
     on_basis = projector.coefficients(columns)
     local.remove_(columns, on_basis)
     projector.project_(columns, on_basis)
@@ -119,8 +128,9 @@ def _first_weight(chain: Chain, wide: bool) -> Tensor:
         rising = torch.minimum(above, rising)
     else:
         use &= mu0 > GRAZING
-    if not wide and float((use & (rising > CUT)).sum()) > 0.1 * float(use.sum()):
-        use &= (rising > CUT) | ((above < -DEEP) if above is not None else torch.zeros_like(use))
+    cut = max(CUT, RUGGED * _rms_slope(chain))
+    if not wide and float((use & (rising > cut)).sum()) > 0.1 * float(use.sum()):
+        use &= (rising > cut) | ((above < -DEEP) if above is not None else torch.zeros_like(use))
     doubt = DOUBT * (state.reflectance + 0.2 * mean)
     if wide and above is not None:  # the further away a shadow's edge begins the better its place is known
         far, near = CAST
@@ -132,6 +142,12 @@ def _first_weight(chain: Chain, wide: bool) -> Tensor:
         edge = torch.where(mu0 > 0 if above is None else above > 0, EDGE, 0.3 * EDGE)
         variance = variance + (doubt * torch.exp(-rising.abs() / edge)) ** 2
     return use * variance.clamp(min=1e-14).rsqrt()
+
+
+def _rms_slope(chain: Chain) -> float:
+    """Of the site's ground, rad."""
+    east, north = chain.state.slopes
+    return math.atan(float((east.square() + north.square()).mean().sqrt()))
 
 
 def _rescale(dynamic: Tensor, projector: Projector) -> Tensor:

@@ -20,6 +20,7 @@ from stages.diagnose.statistics import Statistics, gather_site, join
 from stages.effects import Effect, Survey, get_effect
 
 WORTH_MOVING = 12.0  # nats
+SETTLED = 0.002  # of a cause's gain: what gains less only drifts along what the nominal model can imitate
 # far from linear: the trial that fitted best is a better start than what a line through it says
 KEEP_TRIAL = ("distant_shadow", "saturation")
 SHAPES = ("h", "lag_px", "theta_bar_deg", "height_m")  # not more than half of themselves at a time
@@ -45,8 +46,11 @@ def start(evidence: Evidence, data: Survey) -> tuple[Effect, dict[str, float]]:
     return effect, errors
 
 
-def refine(state: Search, steps: int = 2) -> None:
-    """Gauss-Newton on all named scene-wide coordinates together; values per image are estimated anew."""
+def refine(state: Search, steps: int = 2, known: bool = True) -> None:
+    """Gauss-Newton on all named scene-wide coordinates together; values per image are estimated anew.
+
+    known : a linear effect that is alone has the value that fits best already
+    """
     for step in range(steps):
         state.fit(again=step > 0)
         every = state.each(lambda chain: _gather(state, chain))
@@ -54,14 +58,14 @@ def refine(state: Search, steps: int = 2) -> None:
         if joined.count > 0:
             delta, error = solve_nuisance(joined)
             for cause in state.causes:
-                _move(cause, joined.names, delta, error, alone=len(state.causes) == 1)
+                _move(cause, joined.names, delta, error, alone=known and len(state.causes) == 1)
         for collected in zip(*(relief for _, relief, _ in every), strict=True):
             for evidence in weigh_relief(collected):
                 _move_relief(state, evidence)
         named = {c.effect.name: c for c in state.causes if c.effect.scope == "image"}
         found = weigh_images([images for _, _, images in every], state.frames)
         for name, cause in named.items():
-            if name in found and found[name].gain > WORTH_MOVING:
+            if name in found and found[name].gain > max(WORTH_MOVING, SETTLED * cause.gain):
                 share = OVERSHOOT if cause.effect.displaces else 1.0
                 cause.effect = as_effect(found[name], cause.effect, state.data, share)
     state.fit()

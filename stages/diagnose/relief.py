@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,15 +14,21 @@ from stages.diagnose.statistics import Statistics, gather_static, join
 from stages.effects import Survey, Trial, get_effect
 
 ALONG = {"dem_smoothing": (), "dem_scale": ("dem_smoothing",)}  # effect -> nuisances fitted along
-MOST_HIDDEN = 0.05  # of the given slopes' variance, that is taken for noise at most
+NOISE = math.tan(math.radians(1.2))  # rms of the given slopes, that is taken for noise at most
+MOST_HIDDEN = 0.05  # ... and of their variance
+FLATTENED = 0.3  # of the slopes' variance: what relief within a pixel takes off the shading
 
 
 @dataclass
 class Relief:
-    """Products of one site, and the sum of squares that the images' noise leaves in its maps."""
+    """Products of one site.
+
+    noise : sum of squares that the images' noise leaves in its maps; steepness : mean squared slope of the ground
+    """
 
     products: Statistics
     noise: float
+    steepness: float
 
 
 def open_relief(work: SiteWork, name: str, data: Survey) -> Relief:
@@ -48,15 +55,17 @@ def _gather(work: SiteWork, candidates, columns, name: str, data: Survey) -> Rel
         if other not in named
     ]
     products = gather_static(work, candidates, columns, along, nominal=True, maps=slice(1, None))
-    return Relief(products, work.projector.slope_noise())
+    return Relief(products, work.projector.slope_noise(), data.slope[0] ** 2 + data.slope[1] ** 2)
 
 
 def weigh_relief(parts: Sequence[Relief]) -> list[Evidence]:
-    """Evidence from the maps of slope errors of all sites, a DEM's scale corrected for the DEM's own noise.
+    """Evidence from the maps of slope errors of all sites, a DEM's scale corrected for what imitates one.
 
     Slopes that the DEM has and the ground has not draw the regression of slope errors on given slopes to smaller
     scales, by their share of the given slopes' variance (Fuller 1987, Measurement Error Models, ch. 1). That share is
-    estimated from what the fit leaves of the maps beyond the images' noise.
+    estimated from what the fit leaves of the maps beyond the images' noise. Relief within a pixel flattens the shading:
+    facets of slope variance s^2 per axis dim the level ground by s^2 and the contrast of slopes by 2 s^2, and natural
+    ground has about a seventh of its slopes' variance within a pixel, more or less.
     """
     data = join([p.products for p in parts])
     evidence = weigh(data)
@@ -68,10 +77,15 @@ def weigh_relief(parts: Sequence[Relief]) -> list[Evidence]:
         place = m + 1 + e.candidate.columns.start
         left = float(sums[m, m]) - 2 * e.gain - sum(p.noise for p in parts)
         (reference,) = e.candidate.trial.columns[0].values()
+        steepness = parts[0].steepness
         hidden = reference**2 * max(left, 0.0) / max(float(sums[place, place]), 1e-30)
-        hidden = min(hidden, MOST_HIDDEN)
-        covariance = e.covariance + (0.5 * hidden / reference) ** 2  # half of it may be the ground's own detail
-        evidence[k] = dataclasses.replace(e, amount=e.amount + hidden / reference, covariance=covariance)
+        hidden = min(hidden, MOST_HIDDEN, NOISE**2 / max(steepness, 1e-12))
+        flattened = FLATTENED * steepness
+        # any share of what is left may be the ground's own detail; relief below the DEM's resolution is known to half
+        covariance = e.covariance + ((0.5 * hidden) ** 2 + (0.5 * flattened) ** 2) / reference**2
+        evidence[k] = dataclasses.replace(
+            e, amount=e.amount + (0.5 * hidden + flattened) / reference, covariance=covariance
+        )
     return evidence
 
 

@@ -8,7 +8,19 @@ from collections.abc import Callable
 from stages.diagnose.columns import free_coordinates
 from stages.diagnose.data import Site
 from stages.diagnose.looking import Round, align, look, misfit, narrowed, quiet
-from stages.diagnose.naming import FLOOR_GAIN, GATE, KEEP_SHARE, SIMPLER, choose, misaligned, with_values, worth_image
+from stages.diagnose.naming import (
+    FLOOR_GAIN,
+    GATE,
+    IMPERFECT,
+    KEEP_SHARE,
+    SIMPLER,
+    UNDERRATED,
+    choose,
+    floor_fid,
+    misaligned,
+    with_values,
+    worth_image,
+)
 from stages.diagnose.numbers import f_tail
 from stages.diagnose.refining import refine
 from stages.diagnose.state import Cause, Saved, Search
@@ -75,17 +87,18 @@ def _name(state: Search, most: int, say: Callable[[str], None]) -> Round:
 def _prune(state: Search, seen: Round) -> bool:
     """Drop causes without which the others fit as well, or that have become ordinary: whether any was dropped.
 
-    The first of two may have stood for the second until that was known.
+    What is left of a cause must be worth a name of its own: the first of two may have stood for the second until that was known.
     """
-    pruned = False
+    pruned, rows = False, seen.statistics.rows if seen.statistics is not None else 0.0
     for cause in state.causes[:-1]:
         if cause.effect.scope != "scene" or cause.effect.channel != "lit":
             continue
         before, best = state.save(), misfit(state, seen.works)
         state.causes.remove(cause)
-        refine(state, 2)
+        refine(state, 2, known=False)
         cost = misfit(state, seen.works) - best
-        if cost < 2 * max(FLOOR_GAIN, NEEDLESS * cause.gain) or _ordinary(cause):
+        least = max(floor_fid(state.data.slope), IMPERFECT * max(c.fid for c in state.causes))
+        if cost < max(2 * FLOOR_GAIN, 2 * NEEDLESS * cause.gain, least**2 * rows) or _ordinary(cause) or _faint(cause):
             pruned = True
         else:
             state.load(before)
@@ -98,6 +111,15 @@ def _ordinary(cause: Cause) -> bool:
     return bool(effect.tolerance) and all(
         name in effect.values and abs(float(effect.values[name]) - effect.null()[name]) < size
         for name, size in effect.tolerance.items()
+    )
+
+
+def _faint(cause: Cause) -> bool:
+    """Whether no free coordinate is three errors away from doing nothing."""
+    null = cause.effect.null()
+    return all(
+        abs(float(cause.effect.values[name]) - null[name]) < 3 * cause.errors.get(name, 0.0)
+        for name in free_coordinates(cause.effect)
     )
 
 
@@ -153,6 +175,8 @@ def _kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> b
     """Whether the model with the cause in it fits better by what its linear estimate said."""
     if cause.effect.channel in ("albedo", "relief"):  # the rows that are free of the ground do not know them
         return True
+    if cause.effect.name in UNDERRATED and _ordinary(cause):
+        return False
     if cause.effect.channel == "edge":  # judged in pixels that are masked here
         return cause.rms_after < WORSE * cause.rms_before
     promised = 0.0 if cause.effect.name in ALSO_STILL else PROMISE * 2 * cause.gain
@@ -172,13 +196,13 @@ def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
     per_image = [k for k, c in enumerate(rivals) if c.effect.scope == "image"]  # free to follow any junk at the edges
     moves = any(c.effect.name in MOVES_SHADOWS for c in rivals) and not per_image
     works = seen.edges if moves else seen.works
-    before, nothing = state.save(), misfit(state, works)
+    before, nothing = state.save(), misfit(state, works, moves)
     tried: list[tuple[float, int, Saved]] = []
     for cause in rivals:
         state.load(before)
         state.causes.append(cause)
         refine(state, 2 if cause.effect.displaces else 1)
-        tried.append((nothing - misfit(state, works), _freedom(cause), state.save()))
+        tried.append((nothing - misfit(state, works, moves), _freedom(cause), state.save()))
     if per_image and len(per_image) < len(rivals):  # a number for each image must do much better than one for all
         alone = max(tried[k][0] for k in range(len(rivals)) if k not in per_image)
         single = max(tried[k][0] for k in per_image)

@@ -92,19 +92,21 @@ def gather_static(
     errors into the static ones. Clusters are blocks of ground.
 
     columns : (n, H, W) each, the candidates'; nuisance : name, ordinary size and column
-    nominal : take out what the nominal model, fitted to images that hold the effect, took of it
+    nominal : take the nominal model's own freedom out of everything, the residual included: its fit, with other weights
+    and to all sites, took an unknown part of the effect
     maps : which of the static maps count: albedo, and slopes to the east and south
     """
-    weighted = torch.stack([*(column for _, _, column in nuisance), *columns]) * work.projector.weight
+    projector, first = work.projector, len(nuisance)
+    weighted = torch.stack([*(column for _, _, column in nuisance), work.residual, *columns]) * projector.weight
     if nominal:
-        tangents = torch.stack(work.chain.surface_tangents()).mul_(work.projector.weight).flatten(1)
+        tangents = torch.stack(work.chain.surface_tangents()).mul_(projector.weight).flatten(1)
         gram = (tangents @ tangents.T).double()
         ridge = 1e-9 * torch.diag(gram.diagonal().clamp(min=1e-12))
         share = torch.linalg.solve(gram + ridge, (tangents @ weighted.flatten(1).T).double()).float()
         weighted.flatten(1).addmm_(share.T, tangents, alpha=-1)
-    rows = work.projector.whiten(work.projector.maps(work.projector.coefficients(weighted)))
-    first = len(nuisance)
-    static = torch.cat([rows[:first], work.static[None], rows[first:]])
+    static = projector.whiten(projector.maps(projector.coefficients(weighted)))
+    if not nominal:
+        static[first] = work.static
     names, bounds = [n for n, _, _ in nuisance], [b for _, b, _ in nuisance]
     out = _reduce(work, candidates, names, bounds, static[:, :0], static[:, maps])
     out.image = out.place

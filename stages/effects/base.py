@@ -118,6 +118,11 @@ class Effect(ABC):
         return True
 
     @classmethod
+    def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
+        """Whether anything real has these values; a fit that ends elsewhere stands for something else."""
+        return True
+
+    @classmethod
     def report(cls, values: Mapping[str, float], errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Reported parameter -> (value, standard error), from the fitted coordinates (of scene scope)."""
         return {p.name: (values[p.name], errors.get(p.name, 0.0)) for p in cls.parameters}

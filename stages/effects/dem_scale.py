@@ -26,7 +26,7 @@ class DemScale(Effect):
     separate = "an image with the Sun much lower, where shadow lengths give heights"
     parameters = (Parameter("relative", "1", -0.5, 1.0, 0.0, "relative error of heights, truth minus given"),)
     strong: ClassVar = {"relative": 0.1}
-    tolerance: ClassVar = {"relative": 0.05}
+    tolerance: ClassVar = {"relative": 0.02}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -46,5 +46,8 @@ class Echo(Effect):
         axes = detector_axes(observation.detector_sample, observation.detector_line, len(state.image))
         step = axes[int(self.values["axis"])]
         lag = torch.as_tensor(self.values["lag_px"], dtype=state.image.dtype)
-        repeated = displace(state.image, -(lag * step[:, 0])[:, None, None], -(lag * step[:, 1])[:, None, None])
+        source = state.image
+        if state.measured is not None:  # the DEM does not know where shadows end as well as the image does
+            source = torch.where(state.measured.isfinite(), state.measured, source)
+        repeated = displace(source, -(lag * step[:, 0])[:, None, None], -(lag * step[:, 1])[:, None, None])
         state.image = state.image + self.value("fraction", state) * repeated

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -33,6 +35,13 @@ class Nonlinearity(Effect):
     def trials(cls, survey: Survey) -> list[Trial]:
         quadratic, log = {"quadratic": 0.02 / survey.brightness}, {"log": 0.02}
         return [Trial((quadratic,)), Trial((log,)), Trial((quadratic, log))]
+
+    @classmethod
+    def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
+        """A response that rises, by half to twice as much as a straight one, over the brightness that the data have."""
+        levels = [0.2 * survey.brightness, survey.brightness, max(survey.brightness_quantiles)]
+        rise = [1 + 2 * values["quadratic"] * x + values["log"] * (1 + math.log(max(x, 1e-6))) for x in levels]
+        return min(rise) > 0 and max(rise) < 4 * min(rise)
 
     def apply(self, state: State) -> None:
         image = state.image

@@ -58,7 +58,8 @@ class State:
                   of the state, run once the directly lit radiance is known; each adds to it)
     reflectance   sees also angles, sun_visibility; may change: reflectance (I/F of a lit facet)
     radiance      may change: radiance (I/F that reaches the camera)
-    sensor        may change: image
+    sensor        may change: image; sees measured, (B, H, W) with NaN where invalid, where a measurement is being explained:
+                  what repeats the light repeats what came in, shadows in their true places
     """
 
     observation: Observation
@@ -76,6 +77,7 @@ class State:
     reflectance: Tensor = field(default=None)  # type: ignore[assignment]
     radiance: Tensor = field(default=None)  # type: ignore[assignment]
     image: Tensor = field(default=None)  # type: ignore[assignment]
+    measured: Tensor | None = None
 
 
 class Extension(Protocol):
