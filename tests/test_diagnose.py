@@ -19,9 +19,9 @@ from stages.effects import load_extension
 # What two sites of 64 px in ten images can show, with the first parameter's relative error where it is recovered.
 SHOWN = {
     "misregistration": None,  # the campaign plants a mean size; the drawn shifts are compared below
-    "dem_smoothing": 0.35,
-    "dem_scale": 0.5,
-    "line_jitter": 0.3,
+    "dem_smoothing": 0.15,
+    "dem_scale": 0.15,
+    "line_jitter": 0.1,
     "sun_elevation": 0.15,
     "sun_azimuth": 0.1,
     "penumbra": 0.4,
@@ -38,8 +38,8 @@ SHOWN = {
     "azimuthal_anisotropy": 0.1,
     "image_gain": 0.35,
     "dark_bias": 0.1,
-    "nonlinearity": 0.35,
-    "psf_blur": 0.25,
+    "nonlinearity": 0.1,
+    "psf_blur": 0.1,
     "column_pattern": None,  # its rms is over the columns that these crops happen to show
     "echo": 0.15,
     "saturation": 0.05,

@@ -243,7 +243,7 @@ def as_effect(evidence: ImageEvidence, known: Effect | None, data: Survey, share
 
 
 def spread(values: Tensor, evidence: ImageEvidence | None) -> float:
-    """rms length of the values per image (frames, K), images that say little of theirs left out.
+    """rms length of the values per image (frames, K); the less an image says of its own the less it counts.
 
     What all images of a site have in common belongs to the ground.
     """
@@ -251,8 +251,8 @@ def spread(values: Tensor, evidence: ImageEvidence | None) -> float:
     if not bool(seen.any()):
         return 0.0
     known = torch.ones_like(values) if evidence is None else evidence.known.to(values)
-    known = 1 - (1 - known) ** STEPS
-    size = float(values[seen].square().sum() / known[seen].square().mean(1).sum().clamp(min=1e-3)) ** 0.5
+    share = (1 - (1 - known[seen]) ** STEPS).square().mean(1)
+    size = float((share * values[seen].square().sum(1)).sum() / share.square().sum().clamp(min=1e-3)) ** 0.5
     together = evidence.together if evidence is not None else 1
     return size * math.sqrt(together / (together - 1)) if together > 1 else size
 

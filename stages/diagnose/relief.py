@@ -18,17 +18,21 @@ NOISE = math.tan(math.radians(1.2))  # rms of the given slopes, that is taken fo
 MOST_HIDDEN = 0.05  # ... and of their variance
 FLATTENED = 0.3  # of the slopes' variance: what relief within a pixel takes off the shading
 
+SHARPENED = 0.02  # scale per px^2: no DEM is smoothed by a perfect Gaussian
+
 
 @dataclass
 class Relief:
     """Products of one site.
 
     noise : sum of squares that the images' noise leaves in its maps; steepness : mean squared slope of the ground
+    sharpened : smoothing of the DEM that the model undoes already, px^2
     """
 
     products: Statistics
     noise: float
     steepness: float
+    sharpened: float
 
 
 def open_relief(work: SiteWork, name: str, data: Survey) -> Relief:
@@ -55,7 +59,9 @@ def _gather(work: SiteWork, candidates, columns, name: str, data: Survey) -> Rel
         if other not in named
     ]
     products = gather_static(work, candidates, columns, along, nominal=True, maps=slice(1, None))
-    return Relief(products, work.projector.slope_noise(), data.slope[0] ** 2 + data.slope[1] ** 2)
+    steepness = data.slope[0] ** 2 + data.slope[1] ** 2
+    sharpened = sum(abs(float(e.values["sigma2_px2"])) for e in work.chain.base if e.name == "dem_smoothing")
+    return Relief(products, work.projector.slope_noise(), steepness, sharpened)
 
 
 def weigh_relief(parts: Sequence[Relief]) -> list[Evidence]:
@@ -82,7 +88,8 @@ def weigh_relief(parts: Sequence[Relief]) -> list[Evidence]:
         hidden = min(hidden, MOST_HIDDEN, NOISE**2 / max(steepness, 1e-12))
         flattened = FLATTENED * steepness
         # any share of what is left may be the ground's own detail; relief below the DEM's resolution is known to half
-        covariance = e.covariance + ((0.5 * hidden) ** 2 + (0.5 * flattened) ** 2) / reference**2
+        doubt = (0.5 * hidden) ** 2 + (0.5 * flattened) ** 2 + (SHARPENED * parts[0].sharpened) ** 2
+        covariance = e.covariance + doubt / reference**2
         evidence[k] = dataclasses.replace(
             e, amount=e.amount + (0.5 * hidden + flattened) / reference, covariance=covariance
         )

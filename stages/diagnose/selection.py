@@ -90,7 +90,9 @@ def _prune(state: Search, seen: Round) -> bool:
     What is left of a cause must be worth a name of its own: the first of two may have stood for the second until that was known.
     """
     pruned, rows = False, seen.statistics.rows if seen.statistics is not None else 0.0
-    for cause in state.causes[:-1]:
+    for cause in list(state.causes):
+        if cause is state.causes[-1] and not (len(state.causes) > 1 and _faint(cause)):
+            continue
         if cause.effect.scope != "scene" or cause.effect.channel != "lit":
             continue
         before, best = state.save(), misfit(state, seen.works)

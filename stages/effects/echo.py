@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
+from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.effects.fields import detector_axes
-from stages.physics.formation import State, displace
+from stages.physics.formation import Observation, State, displace
 from stages.physics.photometry import Parameter
 
 
@@ -43,11 +45,23 @@ class Echo(Effect):
 
     def apply(self, state: State) -> None:
         observation = state.observation
-        axes = detector_axes(observation.detector_sample, observation.detector_line, len(state.image))
-        step = axes[int(self.values["axis"])]
+        step = _axes(observation, len(state.image))[int(self.values["axis"])]
         lag = torch.as_tensor(self.values["lag_px"], dtype=state.image.dtype)
         source = state.image
         if state.measured is not None:  # the DEM does not know where shadows end as well as the image does
             source = torch.where(state.measured.isfinite(), state.measured, source)
         repeated = displace(source, -(lag * step[:, 0])[:, None, None], -(lag * step[:, 1])[:, None, None])
         state.image = state.image + self.value("fraction", state) * repeated
+
+
+def _axes(observation: Observation, count: int) -> tuple[Tensor, Tensor]:
+    """Of the detector, kept: the same observation is asked again for every lag."""
+    sample = observation.detector_sample
+    if sample is None:
+        return detector_axes(None, None, count)
+    if sample not in _known:
+        _known[sample] = detector_axes(sample, observation.detector_line, count)
+    return _known[sample]
+
+
+_known = WeakTensorKeyDictionary()
