@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import importlib
 import inspect
 import os
@@ -83,6 +84,9 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):  # a Slurm time limit or `kill` unwinds like Ctrl-C
         signal.signal(number, stop)
     quiet_interruptions()
+    gc.set_threshold(
+        10_000, 10, 10
+    )  # what PyTorch's import makes is looked through again and again: a third of the start
     try:
         app()
     except BaseException as error:

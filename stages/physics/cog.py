@@ -39,6 +39,7 @@ KINDS = {SHORT: "<u2", LONG: "<u4", LONG8: "<u8"}
 SUBFILE, TILE_OFFSETS, TILE_COUNTS = 254, 324, 325
 GEOREFERENCE = (33550, 33922, 34264, 34735, 34736, 34737)  # an overview has that of the map
 AROUND = 8  # bytes around a tile
+CLASSIC = 1 << 32  # bytes, at which a TIFF's own places end: a BigTIFF's go on
 STRUCTURE = (
     "LAYOUT=IFDS_BEFORE_DATA\nBLOCK_ORDER=ROW_MAJOR\nBLOCK_LEADER=SIZE_AS_UINT4\nBLOCK_TRAILER=LAST_4_BYTES_REPEATED\n"
     "KNOWN_INCOMPATIBLE_EDITION=NO\n "  # room for YES, which other programs put there
@@ -66,7 +67,7 @@ def join(levels: Sequence[Path], target: Path) -> None:
                 level.tags.pop(code, None)
             level.tags[SUBFILE] = (LONG, 1, struct.pack("<I", 1))
         head, length = _head_and_length(found, big=False)
-        if length >= 1 << 32:
+        if length >= CLASSIC:
             head, _ = _head_and_length(found, big=True)
         out = files.enter_context(open(target, "wb"))
         out.write(head)
