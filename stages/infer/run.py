@@ -103,7 +103,7 @@ def run(
             picture = None
             if config.shard[1] == 1:  # a shard holds some rows only; the GeoTIFF is made of the merged whole
                 partial = stack.enter_context(atomic_path(tiff))
-                picture = stack.enter_context(MapTiff(partial, grid, names, attributes, mapper.together))
+                picture = stack.enter_context(MapTiff(partial, grid, names, attributes))
             windows = _predict(file, writer, picture, mapper, config, progress)
             share, ranges = _statistics(writer.file, names)
     return Summary(grid, predictor.model.name, share, windows, ranges)

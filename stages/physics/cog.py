@@ -7,6 +7,7 @@ level first, each between its size and its last bytes: https://gdal.org/drivers/
 from __future__ import annotations
 
 import contextlib
+import errno
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -99,7 +100,7 @@ def _move_tiles(level: _Level, out: BinaryIO) -> None:
         level.file.seek(offset)
         tile = level.file.read(count)
         if not 4 <= len(tile) == count:
-            raise OSError(f"{level.file.name}: a tile of the map was not written")
+            raise OSError(errno.ENOSPC, "GDAL could not write all tiles", level.file.name)
         out.writelines((struct.pack("<I", count), tile, tile[-4:]))
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ import rasterio
 import rasterio.io
 from numba import njit
 from numpy.typing import NDArray
+from rasterio.errors import RasterioIOError
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
@@ -32,13 +35,11 @@ EVEN = 1 << DIRECT  # px
 class MapTiff:
     """A GeoTIFF that is written as its map is made: one band per coefficient, named; nodata NaN. Use as a context manager.
 
-    Overviews are means of what is known. Every level grows in a file of its own beside ``path``; ``threads`` pack tiles.
+    Overviews are means of what is known. Every level grows in a file of its own beside ``path``;
     """
 
-    def __init__(
-        self, path: Path, grid: Grid, names: Sequence[str], attributes: Mapping[str, Any], threads: int = 1
-    ) -> None:
-        self.path, self.grid, self.names, self.threads = path, grid, list(names), threads
+    def __init__(self, path: Path, grid: Grid, names: Sequence[str], attributes: Mapping[str, Any]) -> None:
+        self.path, self.grid, self.names = path, grid, list(names)
         self.tags = {key: str(attributes[key]) for key in TAGS}
         self.tags |= {"coefficients": json.dumps(self.names), "software": "lunargr"}
         overviews = max(
@@ -60,18 +61,25 @@ class MapTiff:
     def __exit__(self, kind: type[BaseException] | None, *rest: Any) -> None:
         with self._stack:
             if kind is None:
-                for file in self._open:
-                    file.close()
-                for k in range(len(self._open) - 1, len(self.levels) - 1):
-                    self._halve(k)
+                with _told():
+                    for file in self._open:
+                        file.close()
+                    for k in range(len(self._open) - 1, len(self.levels) - 1):
+                        self._halve(k)
                 cog.join(self.levels, self.path)
+            else:
+                for level in self.levels[: len(self._open)]:
+                    os.truncate(
+                        level, 0
+                    )  # room for what GDAL still holds, and would say of each tile that there is none
 
     def put(self, row: int, col: int, values: NDArray[np.float32]) -> None:
         """values : (C, n, w) of the map, from a row and column on, and up to such or the map's end, that are multiples of EVEN."""
         for k, level in enumerate(self._open):
             if k:
                 row, col, values = row // 2, col // 2, halved(values)
-            level.write(values, window=Window(col, row, values.shape[2], values.shape[1]))
+            with _told():
+                level.write(values, window=Window(col, row, values.shape[2], values.shape[1]))
 
     def put_all(self, coefficients: h5py.Dataset) -> None:
         """coefficients : (C, H, W)"""
@@ -85,7 +93,7 @@ class MapTiff:
         file = rasterio.open(
             self.levels[level], "w", driver="GTiff", height=height, width=width, count=len(self.names), dtype="float32",
             nodata=math.nan, tiled=True, blockxsize=BLOCK, blockysize=BLOCK, interleave="pixel", compress="ZSTD", zstd_level=1,
-            predictor=3, BIGTIFF="YES", ENDIANNESS="LITTLE", num_threads=self.threads, **place,
+            predictor=3, BIGTIFF="YES", ENDIANNESS="LITTLE", **place,
         )  # fmt: skip
         if level == 0:
             file.update_tags(**self.tags)
@@ -98,6 +106,15 @@ class MapTiff:
                 means = halved(source.read(window=piece))
                 place = Window(piece.col_off // 2, piece.row_off // 2, means.shape[2], means.shape[1])
                 target.write(means, window=place)
+
+
+@contextlib.contextmanager
+def _told() -> Iterator[None]:
+    """GDAL says that it could not write, and not why: the disk is full, or what comes to the same."""
+    try:
+        yield
+    except RasterioIOError as error:
+        raise OSError(errno.ENOSPC, str(error.__cause__ or error)) from None
 
 
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
