@@ -84,9 +84,8 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):  # a Slurm time limit or `kill` unwinds like Ctrl-C
         signal.signal(number, stop)
     quiet_interruptions()
-    gc.set_threshold(
-        10_000, 10, 10
-    )  # what PyTorch's import makes is looked through again and again: a third of the start
+    # What PyTorch's import makes would be looked through again and again: a sixth of the start.
+    gc.set_threshold(10_000, 10, 10)
     try:
         app()
     except BaseException as error:

@@ -42,9 +42,8 @@ class MapTiff:
         self.path, self.grid, self.names = path, grid, list(names)
         self.tags = {key: str(attributes[key]) for key in TAGS}
         self.tags |= {"coefficients": json.dumps(self.names), "software": "lunargr"}
-        overviews = max(
-            0, math.ceil(math.log2(max(grid.height, grid.width) / BLOCK))
-        )  # halved until it fits into a block
+        # Halved until it fits into a block.
+        overviews = max(0, math.ceil(math.log2(max(grid.height, grid.width) / BLOCK)))
         self.shapes = [(-(-grid.height >> k), -(-grid.width >> k)) for k in range(overviews + 1)]
         self.levels = [path.with_name(f"{path.name}.level{k}.tif") for k in range(overviews + 1)]
         self._stack = contextlib.ExitStack()
@@ -68,10 +67,10 @@ class MapTiff:
                         self._halve(k)
                 cog.join(self.levels, self.path)
             else:
+                # Room for what GDAL still holds: it would say of each tile that there is none.
                 for level in self.levels[: len(self._open)]:
-                    os.truncate(
-                        level, 0
-                    )  # room for what GDAL still holds, and would say of each tile that there is none
+                    with contextlib.suppress(OSError):
+                        os.truncate(level, 0)
 
     def put(self, row: int, col: int, values: NDArray[np.float32]) -> None:
         """values : (C, n, w) of the map, from a row and column on, and up to such or the map's end, that are multiples of EVEN."""
