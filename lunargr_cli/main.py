@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import importlib
 import inspect
 import os
@@ -83,6 +84,8 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):  # a Slurm time limit or `kill` unwinds like Ctrl-C
         signal.signal(number, stop)
     quiet_interruptions()
+    # What PyTorch's import makes would be looked through again and again: a sixth of the start.
+    gc.set_threshold(10_000, 10, 10)
     try:
         app()
     except BaseException as error:

@@ -14,8 +14,12 @@ import h5py
 import numpy as np
 import pytest
 from cluster_scene import assert_same, environment, finish, lunargr, start
+from rasterio.crs import CRS
+from rasterio.transform import Affine
 
-from schemas import SVBRDF, ArtefactWriter, InputError
+from schemas import SVBRDF, ArtefactWriter, InputError, atomic_path
+from stages.physics.geotiff import MapTiff
+from stages.physics.grid import Grid
 
 LINE = "lunargr: interrupted; nothing half-written was kept.\n"
 
@@ -112,6 +116,23 @@ def test_a_failure_where_a_dataset_is_let_go_of_is_not_lost(tmp_path):
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, env=environment())
     assert done.returncode == 3 and "disk is full" in done.stdout, done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("size", [100_000, 1_000_000, 5_000_000])  # while tiles are written, and while they are joined
+def test_a_disk_that_fills_under_a_geotiff_leaves_nothing(tmp_path, rng, size):
+    values = rng.normal(size=(2, 768, 768)).astype(np.float32)
+    path, transform = tmp_path / "map.tif", Affine(5, 0, 0, 0, -5, 0)
+    grid = Grid(CRS.from_proj4("+proj=eqc +R=1737400").to_wkt(), transform, 768, 768, 1737400.0)
+    attributes = {"gsd_m": 5.0, "body_radius_m": 1737400.0, "model": "M2", "quantity": "I/F"}
+    with (
+        file_size_limit(size),
+        pytest.raises(InputError, match=r"map\.tif: the disk is full"),
+        atomic_path(path) as partial,
+        MapTiff(partial, grid, ["a", "b"], attributes) as tiff,
+    ):
+        for row in range(0, 768, 256):
+            tiff.put(row, 0, values[:, row : row + 256])
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_full_disk_keeps_the_parts(small_artefacts, tmp_path):

@@ -106,7 +106,7 @@ def test_what_is_not_valid_is_not_worked_on():
     valid = np.zeros((3000, 50), np.uint8)
     assert valid_part(valid, (0, 0, 3000, 50)) is None
     valid[1500:2100, 20] = 1
-    assert valid_part(valid, (10, 5, 2900, 40)) == (1500, 20, 600, 1)
+    assert valid_part(valid, (10, 5, 2900, 40)) == (1498, 13, 608, 8)  # in steps of eight from the box's corner
 
 
 def test_side_by_side_hands_over_everything_and_every_error():

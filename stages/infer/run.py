@@ -6,6 +6,7 @@ then exactly what one pass over the whole map would give: no squares at window b
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -37,7 +38,7 @@ from stages.network.mapping import Mapper
 from stages.network.normalisation import fill_holes
 from stages.network.predictor import choose_device, load_predictor
 from stages.network.runtime import choose_inference_precision, keep_freed_memory
-from stages.physics.geotiff import write_geotiff
+from stages.physics.geotiff import EVEN, MapTiff
 from stages.physics.grid import read_grid
 
 Progress = Callable[[int, int, str], None]
@@ -64,8 +65,6 @@ def run(
     keep_freed_memory()
     predictor = load_predictor(checkpoint, device)
     precision = config.precision
-    # A shard holds some rows only; the GeoTIFF is made of the merged whole.
-    whole = config.shard[1] == 1
     with open_artefact(scene, SCENE) as file:
         grid = read_grid(file, scene)
         if not config.any_gsd and abs(grid.gsd - predictor.gsd) > GSD_TOLERANCE * predictor.gsd:
@@ -84,25 +83,29 @@ def run(
             "quantity": QUANTITY,
             "precision": precision,
         }
-        with ArtefactWriter(
-            output,
-            SVBRDF,
-            sizes,
-            config=asdict(config),
-            inputs=[scene, checkpoint],
-            attributes=attributes,
-            overwrite=overwrite,
-        ) as writer:
+        with contextlib.ExitStack() as stack:
+            writer = stack.enter_context(
+                ArtefactWriter(
+                    output,
+                    SVBRDF,
+                    sizes,
+                    config=asdict(config),
+                    inputs=[scene, checkpoint],
+                    attributes=attributes,
+                    overwrite=overwrite,
+                )
+            )
             writer.write_crs(grid.crs_wkt, grid.transform)
             writer.write("x", file["x"][...])
             writer.write("y", file["y"][...])
             writer.write("coefficient_name", names)
             mapper = Mapper(predictor, device, precision, torch.get_num_threads())
-            windows = _predict(file, writer, mapper, config, progress)
+            picture = None
+            if config.shard[1] == 1:  # a shard holds some rows only; the GeoTIFF is made of the merged whole
+                partial = stack.enter_context(atomic_path(tiff))
+                picture = stack.enter_context(MapTiff(partial, grid, names, attributes))
+            windows = _predict(file, writer, picture, mapper, config, progress)
             share, ranges = _statistics(writer.file, names)
-            if whole:
-                with atomic_path(tiff) as partial:
-                    write_geotiff(partial, writer.file, grid)
     return Summary(grid, predictor.model.name, share, windows, ranges)
 
 
@@ -120,7 +123,14 @@ def summarise(svbrdf: Path, windows: int = 0) -> Summary:
         return Summary(read_grid(file, svbrdf), str(file.attrs["model"]), share, windows, ranges)
 
 
-def _predict(file: h5py.File, writer: ArtefactWriter, mapper: Mapper, config: Config, progress: Progress | None) -> int:
+def _predict(
+    file: h5py.File,
+    writer: ArtefactWriter,
+    picture: MapTiff | None,
+    mapper: Mapper,
+    config: Config,
+    progress: Progress | None,
+) -> int:
     """Run the network over all windows of the shard's rows; the number of windows."""
     elevation, dem_valid = file["elevation"], file["dem_valid"]
     own = own_rows(elevation.shape[0], config)
@@ -138,7 +148,9 @@ def _predict(file: h5py.File, writer: ArtefactWriter, mapper: Mapper, config: Co
             for row, values in mapper.strips(TerrainReader(elevation, dem_valid), elevation.shape, part):
                 yield row, part[1], values
 
-    outputs = Outputs(writer, elevation, dem_valid)
+    # The GeoTIFF takes strips as they come where its overviews can be made of each by itself.
+    at_once = window == stride and all(row % EVEN == 0 and col % EVEN == 0 for row, col, _, _ in boxes)
+    outputs = Outputs(writer, elevation, dem_valid, own, picture if at_once else None)
     blend = Blend(outputs, window - stride, own) if window > stride else None
     found = side_by_side(boxes, work, mapper.together)
     rows, done = sum(box[2] for box in boxes), 0
@@ -157,9 +169,13 @@ def _predict(file: h5py.File, writer: ArtefactWriter, mapper: Mapper, config: Co
             blend.add(boxes[number], row, col, values)
         else:
             outputs.put(row, col, values)
+        outputs.copy_elevation()
     if blend:
         blend.flush(own[1])
-    outputs.copy_elevation(*own)
+    while outputs.copy_elevation():
+        pass
+    if picture and not at_once:
+        picture.put_all(outputs.coefficients)
     if progress:
         progress(rows, rows, "rows of windows")
     return len(boxes)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.network.normalisation import FILL_REACH, fill_holes
+from stages.physics.geotiff import EVEN
 
 READ = 1024  # rows read at once: what filling holes needs around them is read again with the next
 
@@ -54,7 +55,7 @@ class TerrainReader:
 
 
 def valid_part(dem_valid: Any, box: tuple[int, int, int, int]) -> tuple[int, int, int, int] | None:
-    """The smallest box (row, col, height, width) around what is valid in a box; None where nothing is."""
+    """The smallest box (row, col, height, width) around what is valid in a box, in steps of EVEN; None where nothing is."""
     row, col, height, width = box
     rows, columns = np.zeros(height, bool), np.zeros(width, bool)
     for first in range(row, row + height, READ):
@@ -63,5 +64,12 @@ def valid_part(dem_valid: Any, box: tuple[int, int, int, int]) -> tuple[int, int
         columns |= part.any(axis=0)
     if not rows.any():
         return None
-    top, left = int(rows.argmax()), int(columns.argmax())
-    return row + top, col + left, height - top - int(rows[::-1].argmax()), width - left - int(columns[::-1].argmax())
+    (top, high), (left, wide) = (_extent(known) for known in (rows, columns))
+    return row + top, col + left, high, wide
+
+
+def _extent(known: NDArray[np.bool_]) -> tuple[int, int]:
+    """(first, length) of what is known along an axis, in steps of EVEN."""
+    first = int(known.argmax()) // EVEN * EVEN
+    last = known.size - int(known[::-1].argmax())
+    return first, min(known.size, -(-last // EVEN) * EVEN) - first

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,8 @@ from stages.infer.config import Config
 Box = tuple[int, int, int, int]  # row, col, height, width
 
 BAND = 1024  # rows, by which shards share a map out; the window where the network cannot run strip by strip
-# Context costs a wide window little, and one that runs from north to south nothing but at its ends.
-WIDEST, TALLEST, SHORTEST = 2048, 4096, 512
+# Context costs a wide window little, and one that runs from north to south nothing but at its ends. Memory follows the width.
+WIDEST, TALLEST, SHORTEST = 4096, 8192, 512
 CHUNK = 256  # px of the artefact's chunks, which are best written whole
 
 
@@ -81,8 +82,9 @@ def swaths_of(shape: tuple[int, int], config: Config, together: int) -> list[Box
         columns = axis_windows(shape[1], WIDEST, WIDEST, config.offset)
     else:
         columns = _even(0, shape[1], WIDEST)
-    pieces = -(-together // len(columns))
-    tallest = min(TALLEST, max(SHORTEST, -(-(last - first) // pieces)))
+    share = together // math.gcd(together, len(columns))  # pieces that give every thread as many windows
+    pieces = -(-(last - first) // (TALLEST * share)) * share
+    tallest = max(SHORTEST, -(-(last - first) // pieces))
     return [(a, c, b - a, d - c) for a, b in _even(first, last, tallest) for c, d in columns]
 
 

@@ -8,22 +8,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import ArtefactWriter
-from stages.infer.windows import Box, blend_weights
+from stages.infer.windows import CHUNK, Box, blend_weights
+from stages.physics.geotiff import MapTiff
 
 
 class Outputs:
-    """The three fields of a map in its artefact, and the DEM that they are made of."""
+    """The three fields of a map in its artefact, and the DEM that they are made of. own : (first, last) row
 
-    def __init__(self, writer: ArtefactWriter, elevation: Any, dem_valid: Any) -> None:
+    tiff : gets the coefficients too, where strips begin and end as it needs them to
+    """
+
+    def __init__(
+        self, writer: ArtefactWriter, elevation: Any, dem_valid: Any, own: tuple[int, int], tiff: MapTiff | None = None
+    ) -> None:
         self.coefficients, self.valid = writer.dataset("coefficients"), writer.dataset("valid")
         self.copied = writer.dataset("elevation")
-        self.elevation, self.dem_valid = elevation, dem_valid
+        self.elevation, self.dem_valid, self.tiff = elevation, dem_valid, tiff
+        self._to_copy = iter(range(own[0], own[1], CHUNK))
+        self._end = own[1]
 
-    def copy_elevation(self, first: int, last: int) -> None:
-        """All columns, a row of chunks at a time."""
-        for row in range(first, last, 256):
-            part = slice(row, min(last, row + 256))
+    def copy_elevation(self) -> bool:
+        """The next row of chunks, all columns; whether there was one: the network works on while some strips are written."""
+        for row in self._to_copy:
+            part = slice(row, min(self._end, row + CHUNK))
             self.copied[part] = self.elevation[part]
+            return True
+        return False
 
     def put(self, row: int, col: int, values: NDArray[np.float32], known: NDArray[np.bool_] | None = None) -> None:
         """values : (C, n, w), which are changed; ``known`` : (n, w), where there is something to write besides a valid DEM"""
@@ -35,6 +45,8 @@ class Outputs:
             values[:, ~mask] = np.nan
         self.coefficients[(slice(None), *part)] = values
         self.valid[part] = mask
+        if self.tiff:
+            self.tiff.put(row, col, values)
 
 
 class Blend:

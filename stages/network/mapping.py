@@ -32,7 +32,9 @@ class Mapper:
         if self.in_strips:
             dtype = torch.bfloat16 if precision == "bf16" else torch.float32
             self.together = min(threads, MEMORY // (64 * dtype.itemsize))
-            self._strip = min(STRIP, MEMORY // (self.together * dtype.itemsize))
+            self._strip = STRIP
+            while self._strip * self.together * dtype.itemsize > MEMORY:
+                self._strip //= 2
             self._folded = FoldedUNet(predictor.net, predictor.elevation_scale, dtype)
 
     def strips(

@@ -128,16 +128,23 @@ class Strips:
         if row >= self.last:
             return None
         self.row = min(self.last, (row // self.strip + 1) * self.strip)
-        self._up_to(0, self.row)
-        ((_, y),) = self.raised[0].between(row, self.row)
-        self.raised[0].forget(self.row)
-        return row, self.net.head(y), self.col - self.narrow[0][0]
+        self._quarters_to(0, self._quarters_for(self.row))
+        found = []
+        for first in range(row, self.row, self.strip // 2):  # half a strip: nothing is as large as this level
+            last = min(self.row, first + self.strip // 2)
+            self._up_to(0, last)
+            ((_, y),) = self.raised[0].between(first, last)
+            self.raised[0].forget(last)
+            found.append(self.net.head(y))
+            del y
+        raw = torch.cat(found, dim=2).contiguous(memory_format=torch.channels_last)
+        return row, raw, self.col - self.narrow[0][0]
 
     def _down_to(self, level: int, row: int) -> None:
         """Let the way down of ``level`` be known up to ``row``."""
         height, kept = self.heights[level], self.kept[level]
         row = min(height, row + (row & 1)) if level < self.net.levels - 1 else row  # pairs of rows are pooled
-        step = max(2, self.strip >> level)
+        step = max(2, self.strip >> max(1, level))
         while kept.end < row:
             last = min(row, kept.end + step)
             kept.add(self._block(self.net.down[level], self._pooled, level, kept.end, last, self.wide_edges[level]))
@@ -196,7 +203,7 @@ class Strips:
         out, row = self.into_up[level].extend(first, last, (channels + beside, b - a), self.net.dtype)
         end = min(height, last)
         quarters = self.quarters[level]
-        self._quarters_to(level, (end - 1) // 2 + (end - 1) % 2 + 1)
+        self._quarters_to(level, self._quarters_for(end))
         self._down_to(level, end)
         field = pixels_of(out)[0]
         for start, piece in quarters.between((row + 1) // 2, quarters.end):
@@ -210,6 +217,11 @@ class Strips:
         quarters.forget((end + 1) // 2)
         self.joined_to[level] = end
         return self._edged(out, first, last, height, self.into_up[level])
+
+    @staticmethod
+    def _quarters_for(row: int) -> int:
+        """How many rows of quarters the rows before ``row`` are made of."""
+        return row // 2 + 1
 
     def _quarters_to(self, level: int, row: int) -> None:
         """Raise the level below as far as ``row`` of its quarters, each of which sees the row above it and its own."""

@@ -3,56 +3,123 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from xml.sax.saxutils import escape, quoteattr
+from typing import Any
 
 import h5py
 import numpy as np
 import rasterio
 import rasterio.io
-import rasterio.shutil
 from numba import njit
 from numpy.typing import NDArray
+from rasterio.errors import RasterioIOError
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from schemas.reading import read_strings
+from stages.physics import cog
 from stages.physics.grid import Grid
 
-Read = Callable[[Window], NDArray[np.float32]]  # -> (C, rows, columns)
 TAGS = ("model", "quantity", "gsd_m", "body_radius_m")
-ANYWHERE = Affine.scale(2, -2)  # the virtual file above the levels says where the map lies
+ANYWHERE = Affine.scale(2, -2)  # the map says where its overviews lie
 BLOCK, STRIP, COLUMNS = 256, 512, 4096  # px; pieces hold whole blocks of their own level and of the next
+DIRECT = 3  # overviews made of what is at hand; the smaller ones, a 64th of the map, are made of the last of these
+EVEN = 1 << DIRECT  # px
+
+
+class MapTiff:
+    """A GeoTIFF that is written as its map is made: one band per coefficient, named; nodata NaN. Use as a context manager.
+
+    Overviews are means of what is known. Every level grows in a file of its own beside ``path``;
+    """
+
+    def __init__(self, path: Path, grid: Grid, names: Sequence[str], attributes: Mapping[str, Any]) -> None:
+        self.path, self.grid, self.names = path, grid, list(names)
+        self.tags = {key: str(attributes[key]) for key in TAGS}
+        self.tags |= {"coefficients": json.dumps(self.names), "software": "lunargr"}
+        # Halved until it fits into a block.
+        overviews = max(0, math.ceil(math.log2(max(grid.height, grid.width) / BLOCK)))
+        self.shapes = [(-(-grid.height >> k), -(-grid.width >> k)) for k in range(overviews + 1)]
+        self.levels = [path.with_name(f"{path.name}.level{k}.tif") for k in range(overviews + 1)]
+        self._stack = contextlib.ExitStack()
+        self._open: list[rasterio.io.DatasetWriter] = []
+
+    def __enter__(self) -> MapTiff:
+        with contextlib.ExitStack() as stack:
+            for level in self.levels:
+                stack.callback(level.unlink, missing_ok=True)
+            self._open = [stack.enter_context(self._create(k)) for k in range(min(DIRECT + 1, len(self.levels)))]
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: Any) -> None:
+        with self._stack:
+            if kind is None:
+                with _told():
+                    for file in self._open:
+                        file.close()
+                    for k in range(len(self._open) - 1, len(self.levels) - 1):
+                        self._halve(k)
+                cog.join(self.levels, self.path)
+            else:
+                # Room for what GDAL still holds: it would say of each tile that there is none.
+                for level in self.levels[: len(self._open)]:
+                    with contextlib.suppress(OSError):
+                        os.truncate(level, 0)
+
+    def put(self, row: int, col: int, values: NDArray[np.float32]) -> None:
+        """values : (C, n, w) of the map, from a row and column on, and up to such or the map's end, that are multiples of EVEN."""
+        for k, level in enumerate(self._open):
+            if k:
+                row, col, values = row // 2, col // 2, halved(values)
+            with _told():
+                level.write(values, window=Window(col, row, values.shape[2], values.shape[1]))
+
+    def put_all(self, coefficients: h5py.Dataset) -> None:
+        """coefficients : (C, H, W)"""
+        for piece in _pieces(*self.shapes[0]):
+            self.put(piece.row_off, piece.col_off, coefficients[(slice(None), *piece.toslices())])
+
+    def _create(self, level: int) -> rasterio.io.DatasetWriter:
+        height, width = self.shapes[level]
+        place = {"transform": ANYWHERE} if level else {"transform": self.grid.transform, "crs": self.grid.crs}
+        # Noise does not deflate: ZSTD's lowest level takes a third of the time of DEFLATE's and is as small.
+        file = rasterio.open(
+            self.levels[level], "w", driver="GTiff", height=height, width=width, count=len(self.names), dtype="float32",
+            nodata=math.nan, tiled=True, blockxsize=BLOCK, blockysize=BLOCK, interleave="pixel", compress="ZSTD", zstd_level=1,
+            predictor=3, BIGTIFF="YES", ENDIANNESS="LITTLE", **place,
+        )  # fmt: skip
+        if level == 0:
+            file.update_tags(**self.tags)
+            file.descriptions = self.names
+        return file
+
+    def _halve(self, level: int) -> None:
+        with rasterio.open(self.levels[level]) as source, self._create(level + 1) as target:
+            for piece in _pieces(*self.shapes[level]):
+                means = halved(source.read(window=piece))
+                place = Window(piece.col_off // 2, piece.row_off // 2, means.shape[2], means.shape[1])
+                target.write(means, window=place)
+
+
+@contextlib.contextmanager
+def _told() -> Iterator[None]:
+    """GDAL says that it could not write, and not why: the disk is full, or what comes to the same."""
+    try:
+        yield
+    except RasterioIOError as error:
+        raise OSError(errno.ENOSPC, str(error.__cause__ or error)) from None
 
 
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
-    """The maps as a cloud-optimised GeoTIFF: one band per coefficient, named; nodata NaN; model and quantity as tags.
-
-    Overviews are means of what is known. GDAL would take longer to make them than the network's map takes to write.
-    """
-    names = read_strings(file, "coefficient_name")
-    levels = [path.with_name(f"{path.name}.plain{k}.tif") for k in range(_overviews(grid.height, grid.width) + 1)]
-    scheme = path.with_name(path.name + ".vrt")
-    tags = {key: str(file.attrs[key]) for key in TAGS} | {"coefficients": json.dumps(names), "software": "lunargr"}
-    try:
-        coefficients = file["coefficients"]
-        _write_levels(levels, grid.height, grid.width, len(names), lambda w: coefficients[(slice(None), *w.toslices())])
-        scheme.write_text(_virtual(levels, grid, names, tags), encoding="utf-8")
-        # Noise does not deflate: ZSTD's lowest level takes a third of the time of DEFLATE's and is as small.
-        rasterio.shutil.copy(
-            scheme, path, driver="COG", compress="ZSTD", level="1", predictor="3", blocksize=str(BLOCK), num_threads="ALL_CPUS",
-        )  # fmt: skip
-    finally:
-        for temporary in (*levels, scheme):
-            temporary.unlink(missing_ok=True)
-
-
-def _overviews(height: int, width: int) -> int:
-    """How often a map is halved until it fits into a block."""
-    return max(0, math.ceil(math.log2(max(height, width) / BLOCK)))
+    """The map that an open artefact holds, as a cloud-optimised GeoTIFF."""
+    with MapTiff(path, grid, read_strings(file, "coefficient_name"), file.attrs) as tiff:
+        tiff.put_all(file["coefficients"])
 
 
 def _pieces(height: int, width: int) -> Iterator[Window]:
@@ -61,57 +128,12 @@ def _pieces(height: int, width: int) -> Iterator[Window]:
             yield Window(column, row, min(COLUMNS, width - column), min(STRIP, height - row))
 
 
-def _write_levels(levels: list[Path], height: int, width: int, count: int, read: Read) -> None:
-    """Each level, not compressed. While one is written the next is made of it; GDAL's cache holds what is read again."""
-    with contextlib.ExitStack() as files:
-        shape, target = (height, width), _create(files, levels[0], height, width, count)
-        for k in range(len(levels)):
-            half = (-(-shape[0] // 2), -(-shape[1] // 2))
-            smaller = _create(files, levels[k + 1], *half, count) if k + 1 < len(levels) else None
-            for piece in _pieces(*shape):
-                values = read(piece)
-                if k == 0:
-                    target.write(values, window=piece)
-                if smaller is not None:
-                    means = np.empty((count, -(-piece.height // 2), -(-piece.width // 2)), np.float32)
-                    halve(np.ascontiguousarray(values), means)
-                    place = Window(piece.col_off // 2, piece.row_off // 2, means.shape[2], means.shape[1])
-                    smaller.write(means, window=place)
-            if smaller is not None:
-                smaller.close()
-                shape, read = half, _reader(files.enter_context(rasterio.open(levels[k + 1])))
-
-
-def _reader(source: rasterio.DatasetReader) -> Read:
-    return lambda window: source.read(window=window)
-
-
-def _create(files: contextlib.ExitStack, path: Path, height: int, width: int, count: int) -> rasterio.io.DatasetWriter:
-    return files.enter_context(
-        rasterio.open(
-            path, "w", driver="GTiff", height=height, width=width, count=count, dtype="float32", nodata=math.nan, tiled=True,
-            blockxsize=BLOCK, blockysize=BLOCK, BIGTIFF="IF_SAFER", transform=ANYWHERE,
-        )
-    )  # fmt: skip
-
-
-def _virtual(levels: list[Path], grid: Grid, names: list[str], tags: dict[str, str]) -> str:
-    """A GDAL virtual file: the first level with its place and names, the others as its overviews."""
-    files = [f'<SourceFilename relativeToVRT="1">{escape(level.name)}</SourceFilename>' for level in levels]
-    bands = []
-    for k, name in enumerate(names, start=1):
-        band = f"<SourceBand>{k}</SourceBand>"
-        overviews = "".join(f"<Overview>{file}{band}</Overview>" for file in files[1:])
-        bands.append(
-            f'<VRTRasterBand dataType="Float32" band="{k}"><Description>{escape(name)}</Description>'
-            f"<NoDataValue>nan</NoDataValue><SimpleSource>{files[0]}{band}</SimpleSource>{overviews}</VRTRasterBand>"
-        )
-    items = "".join(f"<MDI key={quoteattr(key)}>{escape(value)}</MDI>" for key, value in tags.items())
-    transform = ", ".join(repr(float(v)) for v in grid.transform.to_gdal())
-    return (
-        f'<VRTDataset rasterXSize="{grid.width}" rasterYSize="{grid.height}"><SRS>{escape(grid.crs.to_wkt())}</SRS>'
-        f"<GeoTransform>{transform}</GeoTransform><Metadata>{items}</Metadata>{''.join(bands)}</VRTDataset>"
-    )
+def halved(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means of what is not NaN in squares of 2 x 2: (C, H, W) -> (C, ceil(H / 2), ceil(W / 2))."""
+    count, height, width = values.shape
+    out = np.empty((count, -(-height // 2), -(-width // 2)), np.float32)
+    halve(np.ascontiguousarray(values), out)
+    return out
 
 
 @njit(nogil=True, cache=True)
