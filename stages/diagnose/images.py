@@ -26,6 +26,8 @@ from stages.diagnose.statistics import BLOCK
 from stages.effects import Effect, Survey, get_effect
 
 OVERSHOOT = 1.5  # texture and slopes, known from images that are not aligned yet, hide a third of each shift
+PRIORS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+SMALL = PRIORS[:3]  # once most is known: what is hardly seen must not drift
 COSTS_NOTHING = 0.005  # of a gain: a prior that costs more shrinks what is known (by the root of it)
 STEPS = 2  # in which values are found: each leaves of a value what it draws to nothing
 FEWEST = 3  # images of a site, below which an image's own fault and the ground's texture are one
@@ -75,8 +77,13 @@ def gather_images(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) 
     return ImageProducts(work.chain.site.frames, work.projector.dynamic_rows, _site_folds(work, names, dn, data))
 
 
-def weigh_images(every: Sequence[ImageProducts | None], frames: int) -> dict[str, ImageEvidence]:
-    """Evidence for each effect of image scope, from the sites with enough images."""
+def weigh_images(
+    every: Sequence[ImageProducts | None], frames: int, priors: Sequence[float] = PRIORS
+) -> dict[str, ImageEvidence]:
+    """Evidence for each effect of image scope, from the sites with enough images.
+
+    priors : standard deviations over a realistic size, of which held-out blocks choose
+    """
     sums: dict[str, list[_Fold]] = {}
     parts: dict[str, list[tuple[Tensor, _Fold]]] = {}
     deep = [site for site in every if site is not None]
@@ -95,7 +102,7 @@ def weigh_images(every: Sequence[ImageProducts | None], frames: int) -> dict[str
                 into.gram[place[:, None], place[None]] += fold.gram
                 into.score[place] += fold.score
     rows, together = sum(site.rows for site in deep), max((len(site.frames) for site in deep), default=1)
-    found = {name: _weigh(name, folds, frames, rows, together) for name, folds in sums.items()}
+    found = {name: _weigh(name, folds, frames, rows, together, priors) for name, folds in sums.items()}
     for name, e in found.items():
         e.agreement = _agreement(e.values.flatten().double(), parts[name])
     return found
@@ -184,7 +191,9 @@ def _without(folds: list[Tensor], nuisance: np.ndarray, wanted: np.ndarray) -> l
     return out
 
 
-def _weigh(name: str, folds: list[_Fold], frames: int, rows: float, together: int) -> ImageEvidence:
+def _weigh(
+    name: str, folds: list[_Fold], frames: int, rows: float, together: int, priors: Sequence[float]
+) -> ImageEvidence:
     k = len(get_effect(name).fitted())
     total = _Fold(sum(f.gram for f in folds), sum(f.score for f in folds))  # type: ignore[arg-type]
     seen = total.gram.diagonal().view(frames, k).sum(1) > 0
@@ -198,7 +207,7 @@ def _weigh(name: str, folds: list[_Fold], frames: int, rows: float, together: in
     cls = get_effect(name)
     typical = max(cls.strong.values())
     tried = []
-    for level in (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0):  # prior standard deviation over a realistic size
+    for level in priors:
         penalty = 1 / (level * typical) ** 2
         gain = 0.0
         for fold, other in ((folds[0], folds[1]), (folds[1], folds[0])):
@@ -257,4 +266,4 @@ def spread(values: Tensor, evidence: ImageEvidence | None) -> float:
     return size * math.sqrt(together / (together - 1)) if together > 1 else size
 
 
-__all__ = ["FEWEST", "OVERSHOOT", "ImageEvidence", "as_effect", "gather_images", "spread", "weigh_images"]
+__all__ = ["FEWEST", "OVERSHOOT", "SMALL", "ImageEvidence", "as_effect", "gather_images", "spread", "weigh_images"]

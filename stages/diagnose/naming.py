@@ -13,7 +13,7 @@ from stages.diagnose.looking import Round
 from stages.diagnose.pattern import PatternEvidence
 from stages.diagnose.refining import start
 from stages.diagnose.state import Cause, Search
-from stages.effects import Effect, effect_names, get_effect
+from stages.effects import Effect, Survey, effect_names, get_effect
 
 GATE = 0.01  # family-wise
 FLOOR_FID = 0.022  # an effect smaller than this against the noise is never worth a name
@@ -34,7 +34,7 @@ IMPERFECT = 0.12  # of the largest cause: so much of it its model may leave, whi
 UNDERRATED = {
     "psf_blur": 0.4
 }  # effect -> share of its size that a first look may see: texture and slopes take the rest
-IMPERFECT_SHIFTS = 0.06  # ... after shifts, which resampling undoes well
+IMPERFECT_SHIFTS = 0.09  # ... after shifts, which resampling undoes well
 STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
 
 
@@ -43,13 +43,13 @@ def choose(state: Search, seen: Round) -> list[Cause]:
     count = len(effect_names())
     least = _least(state)
     worthy = [e for e in seen.best.values() if _still(e) or e.fid > least]
-    worthy = [e for e in worthy if worth(e, seen, count, state.data.slope)]
+    worthy = [e for e in worthy if worth(e, seen, count, state.data)]
     scene = sorted(worthy, key=lambda e: -e.gain)
     image = sorted((e for e in seen.images.values() if worth_image(e, count)), key=lambda e: -e.gain)
     if image and image[0].effect == "image_gain" and not scene:
         # a scene-wide effect that does nearly as well with a few numbers as gains do with one for each image
         near = [e for e in seen.best.values() if e.gain > KEEP_SHARE * image[0].gain]
-        near = [e for e in near if worth(e, seen, count, state.data.slope, 5.0)]
+        near = [e for e in near if worth(e, seen, count, state.data, 5.0)]
         scene = sorted(near, key=lambda e: -e.gain)
     single = []
     if image:
@@ -82,7 +82,9 @@ def choose(state: Search, seen: Round) -> list[Cause]:
         guise = simpler if simpler.gain > SIMPLER * e.gain else e
         for form in [guise, *_other_forms(guise, seen)]:
             effect, errors = start(form, state.data)
-            causes.append(Cause(effect, min(1.0, e.p * count), e.gain, e.gain_error, e.fid, list(group), errors))
+            causes.append(
+                Cause(effect, family_wise(e, count, state.data), e.gain, e.gain_error, e.fid, list(group), errors)
+            )
     return causes + single
 
 
@@ -118,17 +120,22 @@ def _on_lit_ground(cause: Cause) -> bool:
     return cause.effect.channel == "lit" and not cause.effect.displaces
 
 
-def worth(e: Evidence, seen: Round, count: int, slope: tuple[float, float], ease: float = 1.0) -> bool:
-    """Whether the evidence is enough for a name; slope : mean and standard deviation over the ground, as tangent."""
+def family_wise(e: Evidence, count: int, data: Survey) -> float:
+    """p after Bonferroni: over ``count`` effects, and over the guises of this one, of which the best was taken."""
+    return min(1.0, e.p * count * len(get_effect(e.effect).trials(data)))
+
+
+def worth(e: Evidence, seen: Round, count: int, data: Survey, ease: float = 1.0) -> bool:
+    """Whether the evidence is enough for a name, among ``count`` effects that were looked for."""
     cls = get_effect(e.effect)
     still = _still(e)
-    if e.p * count > GATE * ease or min(e.gain_image, e.gain_place) <= 0:
+    if family_wise(e, count, data) > GATE * ease or min(e.gain_image, e.gain_place) <= 0:
         return False
     agree = AGREE_PARTLY if e.effect in UNDERRATED else AGREE
     if e.agreement < agree and not still and e.effect != "distant_shadow":
         return False
     firm = 0.0 if e.effect == "distant_shadow" else 1.25 * e.gain_error  # a wall shades one image and spares the others
-    if e.gain < max(FLOOR_GAIN, firm) or (e.fid < floor_fid(slope) and not still):
+    if e.gain < max(FLOOR_GAIN, firm) or (e.fid < floor_fid(data.slope) and not still):
         return False
     (name, reference), *_ = e.candidate.trial.columns[0].items()
     unit = reference - cls.null()[name]

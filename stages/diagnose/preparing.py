@@ -17,6 +17,7 @@ from stages.diagnose.projection import Local, Projector
 CUT = math.radians(15)  # photometric effects are judged where neither slope nor shadow is a matter of sub-pixel relief,
 RUGGED = 1.35  # ... which on rugged ground takes more: this many times its rms slope
 DEEP = math.radians(2)  # below the horizon: shadow, whatever the DEM's errors
+SHORE = 1  # px of shadow next to light, where the place of the edge decides
 OUTLIER = 7.0  # sigma ...
 STRAY = 0.2  # ... but in shadow as much light as this, of the mean brightness: what strays there is evidence
 QUIETEST = 0.002  # noise over mean brightness: an image that looks quieter is dark
@@ -130,7 +131,7 @@ def _first_weight(chain: Chain, wide: bool) -> Tensor:
         use &= mu0 > GRAZING
     cut = max(CUT, RUGGED * _rms_slope(chain))
     if not wide and float((use & (rising > cut)).sum()) > 0.1 * float(use.sum()):
-        use &= (rising > cut) | ((above < -DEEP) if above is not None else torch.zeros_like(use))
+        use &= (rising > cut) | (_inner(above < -DEEP) if above is not None else torch.zeros_like(use))
     doubt = DOUBT * (state.reflectance + 0.2 * mean)
     if wide and above is not None:  # the further away a shadow's edge begins the better its place is known
         far, near = CAST
@@ -142,6 +143,13 @@ def _first_weight(chain: Chain, wide: bool) -> Tensor:
         edge = torch.where(mu0 > 0 if above is None else above > 0, EDGE, 0.3 * EDGE)
         variance = variance + (doubt * torch.exp(-rising.abs() / edge)) ** 2
     return use * variance.clamp(min=1e-14).rsqrt()
+
+
+def _inner(shadow: Tensor) -> Tensor:
+    """(n, H, W) bool: shadow that no blur carries light into, nor the DEM's errors."""
+    size = 2 * SHORE + 1
+    lit = torch.nn.functional.max_pool2d((~shadow)[:, None].float(), size, stride=1, padding=SHORE)
+    return lit[:, 0] == 0
 
 
 def _rms_slope(chain: Chain) -> float:

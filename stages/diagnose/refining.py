@@ -12,7 +12,7 @@ from torch import Tensor
 from stages.diagnose.chain import Chain
 from stages.diagnose.columns import derivative_step, relief_blur
 from stages.diagnose.evidence import Evidence
-from stages.diagnose.images import OVERSHOOT, ImageProducts, as_effect, gather_images, weigh_images
+from stages.diagnose.images import OVERSHOOT, SMALL, ImageProducts, as_effect, gather_images, weigh_images
 from stages.diagnose.preparing import ready
 from stages.diagnose.relief import Relief, named_relief, weigh_relief
 from stages.diagnose.state import Cause, Search
@@ -63,7 +63,7 @@ def refine(state: Search, steps: int = 2, known: bool = True) -> None:
             for evidence in weigh_relief(collected):
                 _move_relief(state, evidence)
         named = {c.effect.name: c for c in state.causes if c.effect.scope == "image"}
-        found = weigh_images([images for _, _, images in every], state.frames)
+        found = weigh_images([images for _, _, images in every], state.frames, SMALL)
         for name, cause in named.items():
             if name in found and found[name].gain > max(WORTH_MOVING, SETTLED * cause.gain):
                 share = OVERSHOOT if cause.effect.displaces else 1.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 
+from stages.diagnose.answer import parameters
 from stages.diagnose.columns import free_coordinates
 from stages.diagnose.data import Site
 from stages.diagnose.looking import Round, align, look, misfit, narrowed, quiet
@@ -28,7 +29,7 @@ from stages.effects import get_effect
 
 REFUSALS = 3
 MUCH = 0.02  # of what is left: by so much a cause for each image must do better than one for all
-SLIGHT = 0.005  # of what is left: by so much a simpler cause may do worse
+SLIGHT = 0.0015  # of what is left: by so much a simpler cause may do worse
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 PAIR = 2  # scene-wide causes that are tried together in the place of gains
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
@@ -91,9 +92,9 @@ def _prune(state: Search, seen: Round) -> bool:
     """
     pruned, rows = False, seen.statistics.rows if seen.statistics is not None else 0.0
     for cause in list(state.causes):
-        if cause is state.causes[-1] and not (len(state.causes) > 1 and _faint(cause)):
-            continue
         if cause.effect.scope != "scene" or cause.effect.channel != "lit":
+            continue
+        if cause is state.causes[-1] and (len(state.causes) == 1 or not _faint(cause)):
             continue
         before, best = state.save(), misfit(state, seen.works)
         state.causes.remove(cause)
@@ -109,10 +110,10 @@ def _prune(state: Search, seen: Round) -> bool:
 
 def _ordinary(cause: Cause) -> bool:
     """Whether every data set has as much of it."""
-    effect = cause.effect
-    return bool(effect.tolerance) and all(
-        name in effect.values and abs(float(effect.values[name]) - effect.null()[name]) < size
-        for name, size in effect.tolerance.items()
+    cls, found = type(cause.effect), parameters(cause)
+    null = {p.name: p.default for p in cls.parameters}
+    return bool(cls.tolerance) and all(
+        abs(found[name]["value"] - null[name]) < size for name, size in cls.tolerance.items()
     )
 
 
