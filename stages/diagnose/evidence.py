@@ -38,6 +38,7 @@ class Evidence:
     left: float  # share of the template's energy that the nuisances leave
     unit: float = 0.0  # size over noise of the first column at amount 1
     agreement: float = 1.0  # gain of one amount for all sites over that of an amount for each
+    moving: float = 1.0  # share of the gain in the dynamic rows, the rest being in maps of the ground
 
     @property
     def effect(self) -> str:
@@ -57,6 +58,7 @@ def weigh(data: Statistics, only: slice = slice(None)) -> list[Evidence]:
     score = score - (cross[:, :, 0] - n @ delta) @ gamma
     places, cells = _groups(data.place), _groups(data.image)
     sites = _groups(data.place // SITE)
+    moving = torch.from_numpy(~data.static)
     out = []
     for candidate in data.candidates[only]:
         part = candidate.columns
@@ -69,6 +71,8 @@ def weigh(data: Statistics, only: slice = slice(None)) -> list[Evidence]:
         # the pull of the bounds on the nuisances belongs to no cluster: it is small and left out
         found = _weigh_one(candidate, score[:, part], gram, places, cells, data.rows, energy)
         found.agreement = _agreement(found.amount, score[:, part], gram, sites)
+        if found.gain > 0:
+            found.moving = min(max(float(found.share[moving].sum()) / found.gain, 0.0), 1.0)
         out.append(found)
     return out
 

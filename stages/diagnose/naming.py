@@ -14,6 +14,7 @@ from stages.diagnose.pattern import PatternEvidence
 from stages.diagnose.refining import start
 from stages.diagnose.state import Cause, Search
 from stages.effects import Effect, Survey, effect_names, get_effect
+from stages.effects.echo import CLEAR_LAG
 
 GATE = 0.01  # family-wise
 FLOOR_FID = 0.022  # an effect smaller than this against the noise is never worth a name
@@ -28,8 +29,8 @@ SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to
 NEAR = 0.9  # of the best gain: linear models of strong effects are no closer than that
 RIVALS = 2
 FORMS = 0.7  # of the gain, above which another form of an effect is tried as well
-CLEAR_LAG = 4  # px
-BLURRED = 0.5  # of a near echo's gain: if a blur does as well as that, it is a matter of the point spread function
+SOFT = ("psf_blur", "penumbra")
+SOFTENED = 0.5  # of a near echo's gain: if one of these does as well as that, it is a matter of theirs
 IMPERFECT = 0.12  # of the largest cause: so much of it its model may leave, which is no further cause
 UNDERRATED = {
     "psf_blur": 0.4
@@ -83,7 +84,16 @@ def choose(state: Search, seen: Round) -> list[Cause]:
         for form in [guise, *_other_forms(guise, seen)]:
             effect, errors = start(form, state.data)
             causes.append(
-                Cause(effect, family_wise(e, count, state.data), e.gain, e.gain_error, e.fid, list(group), errors)
+                Cause(
+                    effect,
+                    family_wise(e, count, state.data),
+                    e.gain,
+                    e.gain_error,
+                    e.fid,
+                    list(group),
+                    errors,
+                    promised=e.gain * e.moving,
+                )
             )
     return causes + single
 
@@ -147,10 +157,10 @@ def worth(e: Evidence, seen: Round, count: int, data: Survey, ease: float = 1.0)
         return False
     if cls.null()[name] == 0 and low < 0 < high and not 0.9 * low < value < 0.9 * high:
         return False
-    if e.effect == "echo":  # near ones look like an imperfect point spread function
+    if e.effect == "echo":  # near ones look like an imperfect point spread function, or like soft shadow edges
         near = abs(e.candidate.trial.fixed["lag_px"]) < CLEAR_LAG
-        blur = seen.best.get("psf_blur")
-        if value < 0 or (near and (e.fid < 2 * FLOOR_FID or blur is None or blur.gain > BLURRED * e.gain)):
+        soft = max((seen.best[n].gain for n in SOFT if n in seen.best), default=math.inf)
+        if value < 0 or (near and (e.fid < 2 * FLOOR_FID or soft > SOFTENED * e.gain)):
             return False
     if e.effect == "penumbra":
         return value > e.candidate.trial.fixed["relief_deg"] + 3 * error

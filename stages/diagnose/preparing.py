@@ -17,9 +17,11 @@ from stages.diagnose.projection import Local, Projector
 CUT = math.radians(15)  # photometric effects are judged where neither slope nor shadow is a matter of sub-pixel relief,
 RUGGED = 1.35  # ... which on rugged ground takes more: this many times its rms slope
 DEEP = math.radians(2)  # below the horizon: shadow, whatever the DEM's errors
+UNRESOLVED_SLOPES = 1.0  # ordinary amount of the column of unresolved slopes
 SHORE = 1  # px of shadow next to light, where the place of the edge decides
+FAR = 3  # px of shadow, into which neither a blur carries light nor an error of the DEM
 OUTLIER = 7.0  # sigma ...
-STRAY = 0.2  # ... but in shadow as much light as this, of the mean brightness: what strays there is evidence
+STRAY = 0.2  # ... but far in shadow as much light as this, of the mean brightness: what strays there is evidence
 QUIETEST = 0.002  # noise over mean brightness: an image that looks quieter is dark
 SHOT = 0.8  # share of shot noise in the noise's variance at mean brightness
 EDGE = math.radians(6.0)  # relief below the DEM's resolution blurs shadows over a band like this ...
@@ -65,7 +67,7 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
     residual = torch.where(site.valid, site.image - chain.textured, 0.0)
     level = (chain.textured * site.valid).sum((-2, -1)) / site.valid.sum((-2, -1)).clamp(min=1)
     most = 1 / (QUIETEST * level.clamp(min=1e-6))[:, None, None]
-    shaded = chain.textured < 0.1 * level[:, None, None]
+    shaded = _inner_shadow(chain, FAR)
 
     def split() -> tuple[Projector, Tensor, Tensor]:
         projector = Projector(chain, weight)
@@ -98,7 +100,7 @@ def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
 
 
 def left_over(chain: Chain, weight: Tensor, dn: bool, extra: Sequence[Tensor] = ()) -> float:
-    """Sum of squares of the dynamic residual at given weights, without shifts, unresolved slopes, the nominal model's freedom.
+    """Sum of squares of the dynamic residual at given weights, without shifts, ordinary relief, the nominal model's freedom.
 
     extra : further columns (n, H, W) that may be fitted along
     """
@@ -106,12 +108,16 @@ def left_over(chain: Chain, weight: Tensor, dn: bool, extra: Sequence[Tensor] = 
     # values per image stay as they are, or they would have a set for each site here
     local = Local(projector, nuisance_columns(chain, dn, named=False))
     residual = chain.site.image - chain.textured
-    columns = torch.stack([*nominal_columns(chain), chain.unresolved_slopes(), *extra, residual]) * weight
+    free = [*nominal_columns(chain), *extra]
+    columns = torch.stack([*free, chain.unresolved_slopes(), residual]) * weight
     on_basis = projector.coefficients(columns)
     local.remove_(columns, on_basis)
     projector.project_(columns, on_basis)
-    clear_of_(columns, columns.new_zeros(len(columns), 0, 1, 1), len(columns) - 1)
-    return float(columns[-1].double().square().sum())
+    clear_of_(columns, columns.new_zeros(len(columns), 0, 1, 1), len(free))
+    unresolved, left = columns[-2].flatten().double(), columns[-1].flatten().double()
+    # no more relief than is ordinary: without a bound it imitates other effects
+    energy, cross = float(unresolved @ unresolved) + UNRESOLVED_SLOPES**-2, float(unresolved @ left)
+    return float(left @ left) - cross**2 / energy
 
 
 def _first_weight(chain: Chain, wide: bool) -> Tensor:
@@ -131,7 +137,7 @@ def _first_weight(chain: Chain, wide: bool) -> Tensor:
         use &= mu0 > GRAZING
     cut = max(CUT, RUGGED * _rms_slope(chain))
     if not wide and float((use & (rising > cut)).sum()) > 0.1 * float(use.sum()):
-        use &= (rising > cut) | (_inner(above < -DEEP) if above is not None else torch.zeros_like(use))
+        use &= (rising > cut) | _inner_shadow(chain, SHORE)
     doubt = DOUBT * (state.reflectance + 0.2 * mean)
     if wide and above is not None:  # the further away a shadow's edge begins the better its place is known
         far, near = CAST
@@ -145,11 +151,15 @@ def _first_weight(chain: Chain, wide: bool) -> Tensor:
     return use * variance.clamp(min=1e-14).rsqrt()
 
 
-def _inner(shadow: Tensor) -> Tensor:
-    """(n, H, W) bool: shadow that no blur carries light into, nor the DEM's errors."""
-    size = 2 * SHORE + 1
-    lit = torch.nn.functional.max_pool2d((~shadow)[:, None].float(), size, stride=1, padding=SHORE)
-    return lit[:, 0] == 0
+def _inner_shadow(chain: Chain, distance: int) -> Tensor:
+    """(n, H, W) bool: shadow more than so many pixels from light."""
+    above = chain.height_above_horizon()
+    if above is None:
+        return torch.zeros_like(chain.site.valid)
+    near = torch.nn.functional.max_pool2d(
+        (above > -DEEP)[:, None].float(), 2 * distance + 1, stride=1, padding=distance
+    )
+    return near[:, 0] == 0
 
 
 def _rms_slope(chain: Chain) -> float:

@@ -29,12 +29,12 @@ from stages.effects import get_effect
 
 REFUSALS = 3
 MUCH = 0.02  # of what is left: by so much a cause for each image must do better than one for all
-SLIGHT = 0.0015  # of what is left: by so much a simpler cause may do worse
+SLIGHT = 0.0005  # of what is left: by so much a simpler cause may do worse
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 PAIR = 2  # scene-wide causes that are tried together in the place of gains
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
 NEEDLESS = 0.02  # share of a cause's gain that it must still bring when all are named
-PROMISE = 0.25  # share of the foretold gain that a cause must bring once it is in the model ...
+PROMISE = 0.15  # share of the foretold gain that a cause must bring once it is in the model ...
 ALSO_STILL = ("psf_blur", "echo")  # ... but for these, part of whose gain lies in the maps of the ground
 
 
@@ -182,8 +182,8 @@ def _kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> b
         return False
     if cause.effect.channel == "edge":  # judged in pixels that are masked here
         return cause.rms_after < WORSE * cause.rms_before
-    promised = 0.0 if cause.effect.name in ALSO_STILL else PROMISE * 2 * cause.gain
-    return nothing - misfit(state, seen.works) > promised
+    promised = cause.gain if cause.promised is None else cause.promised
+    return nothing - misfit(state, seen.works) > (0.0 if cause.effect.name in ALSO_STILL else PROMISE * 2 * promised)
 
 
 def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:

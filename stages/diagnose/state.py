@@ -33,6 +33,7 @@ class Cause:
     group: list[str]
     errors: dict[str, float] = field(default_factory=dict)
     image_evidence: ImageEvidence | None = None
+    promised: float | None = None  # nats of the gain in the images' own rows, where that is not all of it
     rms_before: float = math.nan
     rms_after: float = math.nan
 

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.columns import BASELINE, Candidate, nominal_columns, tangent_columns, trial_columns
-from stages.diagnose.preparing import SiteWork, clear_of_
+from stages.diagnose.preparing import UNRESOLVED_SLOPES, SiteWork, clear_of_
 from stages.effects import Survey, get_effect
 
 BLOCK = 32  # px
-SITE = 10_000  # between the numbers of two sites' first blocks
-UNRESOLVED_SLOPES = 1.0
+SITE = 10_000  # between the numbers of two sites' first blocks ...
+FRAMES = 100_000  # ... and of their first images
 FREE = 1e6  # no bound
 
 
@@ -35,6 +35,11 @@ class Statistics:
     image: np.ndarray
     place: np.ndarray
     rows: float  # dynamic degrees of freedom
+
+    @property
+    def static(self) -> np.ndarray:
+        """(C,) bool: clusters of maps of the ground, as against those of images."""
+        return (self.image + 1) % FRAMES == 0
 
     @property
     def count(self) -> int:
@@ -141,7 +146,7 @@ def _reduce(
     )
     place = np.tile(np.arange(per_map), len(products)) + SITE * site.number
     # an image's faults are known for all of its sites, yet each site has a DEM error of its own
-    image = image + 100_000 * site.number
+    image = image + FRAMES * site.number
     return Statistics(
         list(candidates), list(names), torch.tensor(bound, dtype=torch.float64), torch.cat(products).double(),
         image, place, float(max(work.projector.dynamic_rows, 1)),

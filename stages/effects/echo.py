@@ -13,6 +13,8 @@ from stages.effects.fields import detector_axes
 from stages.physics.formation import Observation, State, displace
 from stages.physics.photometry import Parameter
 
+CLEAR_LAG = 4  # px, from which on an echo is no matter of the point spread function
+
 
 @register
 class Echo(Effect):
@@ -48,7 +50,8 @@ class Echo(Effect):
         step = _axes(observation, len(state.image))[int(self.values["axis"])]
         lag = torch.as_tensor(self.values["lag_px"], dtype=state.image.dtype)
         source = state.image
-        if state.measured is not None:  # the DEM does not know where shadows end as well as the image does
+        # the DEM does not know where shadows end as well as the image does, whose resampling, though, blurs near by
+        if state.measured is not None and abs(float(lag)) >= CLEAR_LAG:
             source = torch.where(state.measured.isfinite(), state.measured, source)
         repeated = displace(source, -(lag * step[:, 0])[:, None, None], -(lag * step[:, 1])[:, None, None])
         state.image = state.image + self.value("fraction", state) * repeated
