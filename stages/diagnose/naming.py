@@ -35,7 +35,8 @@ IMPERFECT = 0.12  # of the largest cause: so much of it its model may leave, whi
 UNDERRATED = {
     "psf_blur": 0.4
 }  # effect -> share of its size that a first look may see: texture and slopes take the rest
-IMPERFECT_SHIFTS = 0.09  # ... after shifts, which resampling undoes well
+IMPERFECT_SHIFTS = 0.09  # ... after shifts, which resampling undoes well ...
+IMPERFECT_GAINS = 0.015  # ... and after gains, which are what they are
 STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
 
 
@@ -100,8 +101,16 @@ def choose(state: Search, seen: Round) -> list[Cause]:
 
 def _least(state: Search) -> float:
     """Size against the noise of what the models of the named causes may leave behind."""
-    lit = [IMPERFECT * c.fid for c in state.causes if _on_lit_ground(c)]
-    return max([*lit, *(IMPERFECT_SHIFTS * c.fid for c in state.causes if c.effect.displaces)], default=0.0)
+    return max((_imperfect(c) * c.fid for c in state.causes), default=0.0)
+
+
+def _imperfect(cause: Cause) -> float:
+    """Share of a cause's size against the noise that its model may leave behind."""
+    if cause.effect.displaces:
+        return IMPERFECT_SHIFTS
+    if cause.effect.channel != "lit":
+        return 0.0
+    return IMPERFECT_GAINS if cause.effect.name == "image_gain" else IMPERFECT
 
 
 def _still(e: Evidence) -> bool:
@@ -123,11 +132,6 @@ def _other_forms(guise: Evidence, seen: Round) -> list[Evidence]:
 
 def _coordinates(guise: Evidence) -> set[str]:
     return {name for column in guise.candidate.trial.columns for name in column}
-
-
-def _on_lit_ground(cause: Cause) -> bool:
-    """Whether the size of the cause is that of its marks on lit ground."""
-    return cause.effect.channel == "lit" and not cause.effect.displaces
 
 
 def family_wise(e: Evidence, count: int, data: Survey) -> float:
