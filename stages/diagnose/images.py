@@ -26,7 +26,7 @@ from stages.diagnose.statistics import BLOCK
 from stages.effects import Effect, Survey, get_effect
 
 OVERSHOOT = 1.5  # texture and slopes, known from images that are not aligned yet, hide a third of each shift
-PRIORS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+PRIORS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # standard deviations over a realistic size
 SMALL = PRIORS[:3]  # once most is known: what is hardly seen must not drift
 COSTS_NOTHING = 0.005  # of a gain: a prior that costs more shrinks what is known (by the root of it)
 STEPS = 2  # in which values are found: each leaves of a value what it draws to nothing

@@ -29,14 +29,13 @@ SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to
 NEAR = 0.9  # of the best gain: linear models of strong effects are no closer than that
 RIVALS = 2
 FORMS = 0.7  # of the gain, above which another form of an effect is tried as well
-SOFT = ("psf_blur", "penumbra")
+SOFT = ("psf_blur", "penumbra")  # what near echoes are mistaken for
 SOFTENED = 0.5  # of a near echo's gain: if one of these does as well as that, it is a matter of theirs
-IMPERFECT = 0.12  # of the largest cause: so much of it its model may leave, which is no further cause
-UNDERRATED = {
-    "psf_blur": 0.4
-}  # effect -> share of its size that a first look may see: texture and slopes take the rest
-IMPERFECT_SHIFTS = 0.09  # ... after shifts, which resampling undoes well ...
-IMPERFECT_GAINS = 0.015  # ... and after gains, which are what they are
+IMPERFECT = 0.12  # of a cause's size: so much of it its model may leave, which is no further cause ...
+IMPERFECT_SHIFTS = 0.09  # ... less after shifts, which resampling undoes well ...
+IMPERFECT_GAINS = 0.015  # ... and next to nothing after gains, which are what they are
+# effect -> share of its size that a first look may see: texture and slopes take the rest
+UNDERRATED = {"psf_blur": 0.4}
 STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
 
 
