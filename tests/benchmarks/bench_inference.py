@@ -190,8 +190,7 @@ def main() -> None:
                 for _ in range(4):
                     whole.time(fastest, jobs[fastest], tile)
                 whole.time(name, lambda line=line: subprocess.run(line, check=True), SIZE**2 / 1e6)  # type: ignore[misc]
-        memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-        print(f"{SIZE} x {SIZE}, {memory:.0f} MB at most; load {os.getloadavg()[0]:.1f}")
+        print(f"{SIZE} x {SIZE}; load {os.getloadavg()[0]:.1f}")
         for name in (fastest, *infer):
             whole.show(name, fastest)
 
