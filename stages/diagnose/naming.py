@@ -21,6 +21,7 @@ FLOOR_FID = 0.022  # an effect smaller than this against the noise is never wort
 EVEN = 0.18  # rms slope, as tangent, up to which that holds
 FLOOR_IMAGE = 0.035  # the same for effects with values per image, which have more to fit with
 FLOOR_GAIN = 12.0  # nats
+FIRM = 1.25  # standard errors of a gain
 AGREE = 0.95  # of the gain of an amount for each site that one amount for all must keep
 AGREE_PARTLY = 0.85  # ... where a first look sees but a part of the effect, and not the same at every site
 RIVAL_SHARE = 0.6  # of the gain between a scene-wide effect and one per image, above which both are tried
@@ -147,7 +148,7 @@ def worth(e: Evidence, seen: Round, count: int, data: Survey, ease: float = 1.0)
     agree = AGREE_PARTLY if e.effect in UNDERRATED else AGREE
     if e.agreement < agree and not still and e.effect != "distant_shadow":
         return False
-    firm = 0.0 if e.effect == "distant_shadow" else 1.25 * e.gain_error  # a wall shades one image and spares the others
+    firm = 0.0 if e.effect == "distant_shadow" else FIRM * e.gain_error  # a wall shades one image and spares the others
     if e.gain < max(FLOOR_GAIN, firm) or (e.fid < floor_fid(data.slope) and not still):
         return False
     (name, reference), *_ = e.candidate.trial.columns[0].items()

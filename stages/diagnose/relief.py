@@ -70,8 +70,9 @@ def weigh_relief(parts: Sequence[Relief]) -> list[Evidence]:
     Slopes that the DEM has and the ground has not draw the regression of slope errors on given slopes to smaller
     scales, by their share of the given slopes' variance (Fuller 1987, Measurement Error Models, ch. 1). That share is
     estimated from what the fit leaves of the maps beyond the images' noise. Relief within a pixel flattens the shading:
-    facets of slope variance s^2 per axis dim the level ground by s^2 and the contrast of slopes by 2 s^2, and natural
-    ground has about a seventh of its slopes' variance within a pixel, more or less.
+    facets of slope variance s^2 per axis dim the level ground by s^2 and the contrast of slopes by 2 s^2. How much of its
+    slopes' variance ground has within a pixel was read off traced terrain (amplitudes falling as the 1.8th power of the
+    frequency, and craters): about a seventh; other ground has half to one and a half of that.
     """
     data = join([p.products for p in parts])
     evidence = weigh(data)

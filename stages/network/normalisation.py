@@ -28,10 +28,7 @@ def fill_holes(elevation: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDAr
         return elevation
     import cv2  # not needed by every map, and slow to load
 
-    def stepped(z: NDArray) -> NDArray[np.float64]:
-        return np.round(np.asarray(z, np.float64) / FILL_STEP)
-
-    filled = stepped(np.where(valid, elevation, 0))
+    filled = np.round(np.where(valid, elevation, 0).astype(np.float64) / FILL_STEP)
     known = valid.astype(np.float64)
     for radius in FILL_RADII:
         size = (2 * radius + 1, 2 * radius + 1)
