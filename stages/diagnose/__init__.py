@@ -29,6 +29,7 @@ from stages.diagnose.data import group_pairs, load_site, survey
 from stages.diagnose.looking import Round
 from stages.diagnose.nominal import fit, lit_mask, load_nominal
 from stages.diagnose.plateau import CLEAR_OF, KEEP_BELOW, plateau, saturated
+from stages.diagnose.refining import refine
 from stages.diagnose.selection import enough, search
 from stages.diagnose.state import Search
 from stages.diagnose.unexplained import Structure, blind_effects, measure
@@ -161,10 +162,9 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         return held_out(hidden, tiles, models, (shifts, [*causes, *shifts]), state.dn, config.seed)
 
     answer.held_out = score(effects)
-    if effects and answer.held_out.high < -HARM:  # a model that predicts unseen ground worse explains nothing
-        answer.verdict, answer.closest, answer.causes = "unexplained", [c.effect.name for c in answer.causes], []
-        answer.unexplained_fraction = 1.0
-        answer.held_out = score([])
+    while answer.causes and answer.held_out.high < -HARM:  # what predicts unseen ground worse explains nothing
+        _withdraw_last(answer, state)
+        answer.held_out = score([c.effect for c in answer.causes])
     return Result(answer, state, seen, structure)
 
 
@@ -218,6 +218,24 @@ def _decide(answer: Answer, state: Search, seen: Round, structure: Structure) ->
         answer.verdict = "cannot_tell"
     else:
         answer.verdict = "nothing_significant"
+
+
+def _withdraw_last(answer: Answer, state: Search) -> None:
+    """Take the cause named last out of the model and of the answer; what it stood for is unexplained."""
+    names = [c.effect.name for c in answer.causes]
+    explained = sum(c.fid**2 for c in state.causes)
+    unexplained = explained * answer.unexplained_fraction / max(1 - answer.unexplained_fraction, 1e-9)
+    unexplained += state.causes.pop().fid ** 2
+    explained = sum(c.fid**2 for c in state.causes)
+    if state.causes:
+        refine(state)
+    else:
+        state.fit()
+    state.restore()
+    answer.causes = list(state.causes)
+    answer.unexplained_fraction = unexplained / (unexplained + explained)
+    if explained < unexplained:
+        answer.verdict, answer.closest, answer.causes = "unexplained", names, []
 
 
 __all__ = ["Answer", "Config", "Result", "cause_json", "diagnose", "parameters", "run"]

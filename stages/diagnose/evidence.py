@@ -38,6 +38,7 @@ class Evidence:
     left: float  # share of the template's energy that the nuisances leave
     unit: float = 0.0  # size over noise of the first column at amount 1
     agreement: float = 1.0  # gain of one amount for all sites over that of an amount for each
+    clusters: float = 0.0  # effective number, (sum of energies)^2 over the sum of their squares, that carry it
     moving: float = 1.0  # share of the gain in the dynamic rows, the rest being in maps of the ground
 
     @property
@@ -92,7 +93,7 @@ def _weigh_one(candidate, score: Tensor, gram: Tensor, places, images, rows: flo
     ridge = 1e-6 * torch.diag(total_g.diagonal().clamp(min=1e-9 * scale))
     inverse = torch.linalg.inv(total_g + ridge)
     amount = inverse @ total_u
-    halves, p, statistic, covariance = [], 0.0, math.inf, None
+    halves, p, statistic, covariance, fewest = [], 0.0, math.inf, None, math.inf
     share = torch.zeros(len(score), dtype=torch.float64)
     for labels, count in (images, places):
         u = torch.zeros(count, k, dtype=torch.float64).index_add_(0, labels, score)
@@ -108,6 +109,7 @@ def _weigh_one(candidate, score: Tensor, gram: Tensor, places, images, rows: flo
         deleted = u - torch.einsum("ckl,cl->ck", g, left_out)
         meat = deleted.T @ deleted
         effective = float(energy.sum() ** 2 / energy.square().sum().clamp(min=1e-30))
+        fewest = min(fewest, effective)
         robust = inverse @ meat @ inverse
         wald = float(amount @ torch.linalg.solve(robust + 1e-12 * torch.diag(robust.diagonal()), amount)) / k
         freedom = max(effective - k, 0.8 * (count - 1 - k), 0.5)
@@ -137,6 +139,7 @@ def _weigh_one(candidate, score: Tensor, gram: Tensor, places, images, rows: flo
         share,
         left,
         math.sqrt(max(float(total_g[0, 0]), 0.0) / max(rows, 1.0)),
+        clusters=fewest,
     )
 
 

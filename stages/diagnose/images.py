@@ -29,6 +29,7 @@ OVERSHOOT = 1.5  # texture and slopes, known from images that are not aligned ye
 PRIORS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # standard deviations over a realistic size
 SMALL = PRIORS[:3]  # once most is known: what is hardly seen must not drift
 COSTS_NOTHING = 0.005  # of a gain: a prior that costs more shrinks what is known (by the root of it)
+COMMON = 0.03  # px, ordinary mean over the images of what they can only have against each other
 STEPS = 2  # in which values are found: each leaves of a value what it draws to nothing
 FEWEST = 3  # images of a site, below which an image's own fault and the ground's texture are one
 
@@ -199,12 +200,17 @@ def _weigh(
     seen = total.gram.diagonal().view(frames, k).sum(1) > 0
     count = int(seen.sum())
 
+    cls = get_effect(name)
+    ordinary = torch.eye(frames * k, dtype=torch.float64)
+    shared = torch.zeros_like(ordinary)
+    if cls.relative and count > 1:
+        shared = torch.outer(seen.double(), seen.double()) / (COMMON * count) ** 2
+        shared = torch.kron(shared, torch.eye(k, dtype=torch.float64))
+
     def solve(fold: _Fold, penalty: float) -> Tensor:
-        matrix = fold.gram + penalty * torch.eye(len(fold.gram), dtype=torch.float64)
-        return torch.linalg.solve(matrix, fold.score)
+        return torch.linalg.solve(fold.gram + penalty * ordinary + shared, fold.score)
 
     # directions that the nominal model can nearly imitate are shrunk as far as held-out blocks ask for
-    cls = get_effect(name)
     typical = max(cls.strong.values())
     tried = []
     for level in priors:
@@ -228,8 +234,7 @@ def _weigh(
     p = 0.5 * f_tail(r * r / max(1 - r * r, 1e-12) * freedom, 1, freedom) if r > 0 else 1.0
     flat = solve(total, penalty)
     values = flat.view(frames, k)
-    matrix = total.gram + penalty * torch.eye(len(total.gram), dtype=torch.float64)
-    variance = torch.linalg.inv(matrix).diagonal().clamp(min=0)
+    variance = torch.linalg.inv(total.gram + penalty * ordinary + shared).diagonal().clamp(min=0)
     errors, known = variance.sqrt().view(frames, k), (1 - penalty * variance).clamp(min=0).view(frames, k)
     values = torch.where(seen[:, None], values, 0.0)
     rms = math.sqrt(float(values[seen].square().sum(1).mean())) if count else 0.0

@@ -204,13 +204,13 @@ def _smooth(state: Search, evidence: Sequence[Evidence]) -> bool:
     return state.deepest < FREE_SLOPES
 
 
-def quiet(seen: Round, named: str) -> set[str]:
+def quiet(seen: Round, named: str) -> dict[str, Evidence]:
     """Effects of lit ground with nothing left to say once the named one is fitted along, by the products of a look."""
     known = seen.best.get(named)
     if seen.statistics is None or known is None or all(c.effect != named for c in seen.statistics.candidates):
-        return set()
+        return {}
     left = best_guises(weigh(given(seen.statistics, known.candidate)))
-    return {n for n, e in left.items() if e.gain < QUIET_GAIN and e.fid < QUIET_FID}
+    return {n: e for n, e in left.items() if e.gain < QUIET_GAIN and e.fid < QUIET_FID}
 
 
 def misfit(state: Search, works: Sequence[Remains], edges: bool = False) -> float:
@@ -227,9 +227,9 @@ def misfit(state: Search, works: Sequence[Remains], edges: bool = False) -> floa
     return sum(state.each(of))
 
 
-def narrowed(seen: Round, later: Round) -> Round:
-    """A later look at fewer effects, with the earlier evidence for those that it left out."""
-    best, images = {**seen.best, **later.best}, {**seen.images, **later.images}
+def narrowed(seen: Round, later: Round, silent: dict[str, Evidence]) -> Round:
+    """A later look at fewer effects; those that it left out keep what little the named cause left them, or the earlier evidence."""
+    best, images = {**seen.best, **silent, **later.best}, {**seen.images, **later.images}
     return dataclasses.replace(later, best=best, images=images)
 
 

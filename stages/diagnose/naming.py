@@ -34,7 +34,8 @@ SOFT = ("psf_blur", "penumbra")  # what near echoes are mistaken for
 SOFTENED = 0.5  # of a near echo's gain: if one of these does as well as that, it is a matter of theirs
 IMPERFECT = 0.12  # of a cause's size: so much of it its model may leave, which is no further cause ...
 IMPERFECT_SHIFTS = 0.09  # ... less after shifts, which resampling undoes well ...
-IMPERFECT_GAINS = 0.015  # ... and next to nothing after gains, which are what they are
+IMPERFECT_GAINS = 0.02  # ... and next to nothing after gains, which are what they are,
+IMPERFECT_COLUMNS = 0.05  # or a smooth response over columns
 # effect -> share of its size that a first look may see: texture and slopes take the rest
 UNDERRATED = {"psf_blur": 0.4}
 STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
@@ -110,7 +111,7 @@ def _imperfect(cause: Cause) -> float:
         return IMPERFECT_SHIFTS
     if cause.effect.channel != "lit":
         return 0.0
-    return IMPERFECT_GAINS if cause.effect.name == "image_gain" else IMPERFECT
+    return {"image_gain": IMPERFECT_GAINS, "column_pattern": IMPERFECT_COLUMNS}.get(cause.effect.name, IMPERFECT)
 
 
 def _still(e: Evidence) -> bool:

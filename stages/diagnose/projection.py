@@ -19,6 +19,8 @@ ALBEDO_PRIOR = 0.1  # relative; both priors only keep badly seen pixels from blo
 SLOPE_PRIOR = math.tan(math.radians(4))
 FREE_SLOPES = 6  # images of a site from which two slopes per pixel can be spared
 BINS = 12
+LOCAL_PRIOR = 1.0  # px of a shift, all of an image's brightness
+RIDGE = 1e-6  # of a column's energy: single precision
 ALBEDO_BAND, SLOPE_BAND = 0.1, 0.15  # cycles per px
 
 
@@ -175,10 +177,13 @@ class Local:
     def remove_(self, columns: Tensor, coefficients: Tensor) -> None:
         """Take what the local columns can explain out of weighted columns and their coefficients, in place."""
         n, k = self.raw.shape[:2]
-        ridge = 1e-9 * self.gram.diagonal().mean().clamp(min=1e-30)
-        fitted = torch.linalg.solve(
-            self.gram + ridge * torch.eye(len(self.gram), dtype=torch.float64), self.cross(columns, coefficients)
-        ).float()
+        # an image that shows next to nothing bounds its values no better than what is ordinary; and what rounding
+        # leaves of a column that the ground can imitate is no column
+        energy = self.raw.double().square().sum((-2, -1)).flatten()
+        normal = self.gram + torch.diag(LOCAL_PRIOR**-2 + RIDGE * energy)
+        scale = normal.diagonal().rsqrt()
+        solved = torch.linalg.solve(normal * scale[:, None] * scale, self.cross(columns, coefficients) * scale[:, None])
+        fitted = (solved * scale[:, None]).float()
         flat, raw = columns.flatten(-2), self.raw.flatten(-2)
         for i in range(n):
             flat[:, i] -= fitted[i * k : (i + 1) * k].T @ raw[i]

@@ -63,7 +63,9 @@ def _name(state: Search, most: int, say: Callable[[str], None]) -> Round:
         before, rms, nothing = state.save(), state.residual_rms(), misfit(state, seen.works)
         cause = _contest(state, rivals, seen)
         cause.rms_before, cause.rms_after = rms, state.residual_rms()
-        if not _kept_promise(state, cause, seen, nothing):
+        kept = _kept_promise(state, cause, seen, nothing)
+        swapped = _reconsider(state, cause, before, seen, kept)
+        if not kept and not swapped:
             state.load(before)
             state.refused.add(cause.effect.name)
             if len(state.refused) > REFUSALS:
@@ -78,11 +80,35 @@ def _name(state: Search, most: int, say: Callable[[str], None]) -> Round:
         if cause.effect.scope == "site":  # the pattern of these sites' albedo was out of everything else already
             seen.pattern = None
             continue
-        silent = quiet(seen, cause.effect.name)
-        seen = narrowed(seen, look(state, [n for n in state.open_names() if n not in silent]))
+        silent = {} if swapped else quiet(seen, cause.effect.name)
+        seen = narrowed(seen, look(state, [n for n in state.open_names() if n not in silent]), silent)
         seen.best.pop(cause.effect.name, None)
         seen.images.pop(cause.effect.name, None)
     return seen
+
+
+def _reconsider(state: Search, cause: Cause, before: Saved, seen: Round, kept: bool) -> bool:
+    """Whether a rival of the cause named last does better beside the new one: alone, either may stand for both."""
+    if not before.causes or cause.effect.scope != "scene" or cause.effect.channel != "lit":
+        return False
+    now, (earlier, _, _) = state.save(), before.causes[-1]
+    if not kept:
+        state.load(before)
+    left = misfit(state, seen.works)
+    least = left - max(2 * FLOOR_GAIN, SLIGHT * left, 0.0 if kept else PROMISE * 2 * cause.gain)
+    for rival in earlier.rivals:
+        if rival.effect.name == cause.effect.name:
+            continue
+        state.load(before)
+        state.causes[-1:] = [rival, copy.copy(cause)]
+        refine(state, 2, known=False)
+        if misfit(state, seen.works) < least:
+            rival.rms_before, rival.rms_after = earlier.rms_before, earlier.rms_after
+            state.causes[-1].rms_after = state.residual_rms()
+            rival.group = [rival.effect.name, *(n for n in earlier.group if n != rival.effect.name)]
+            return True
+    state.load(now)
+    return False
 
 
 def _prune(state: Search, seen: Round) -> bool:
@@ -180,8 +206,10 @@ def _kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> b
         return True
     if cause.effect.name in UNDERRATED and _ordinary(cause):
         return False
+    if not cause.rms_after < WORSE * cause.rms_before:
+        return False
     if cause.effect.channel == "edge":  # judged in pixels that are masked here
-        return cause.rms_after < WORSE * cause.rms_before
+        return True
     promised = cause.gain if cause.promised is None else cause.promised
     return nothing - misfit(state, seen.works) > (0.0 if cause.effect.name in ALSO_STILL else PROMISE * 2 * promised)
 
@@ -221,6 +249,7 @@ def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
         default=0,
     )
     cause = rivals[place]
+    cause.rivals = [c for c in rivals if c is not cause and c.effect.scope == "scene"]
     state.load(tried[place][2])
     refine(state, 1)
     names = [c.effect.name for c in rivals if c is not cause]

@@ -23,7 +23,7 @@ R = TypeVar("R")
 
 @dataclass
 class Cause:
-    """A named cause; ``fid`` and ``gain`` as when it was named."""
+    """A named cause; ``fid`` and ``gain`` as when it was named, ``rivals`` what it won against then."""
 
     effect: Effect
     p: float
@@ -36,6 +36,7 @@ class Cause:
     promised: float | None = None  # nats of the gain in the images' own rows, where that is not all of it
     rms_before: float = math.nan
     rms_after: float = math.nan
+    rivals: list[Cause] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

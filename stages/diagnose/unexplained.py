@@ -15,6 +15,7 @@ from stages.diagnose.state import Search
 from stages.effects import effect_names, get_effect
 
 CELL = 8  # px
+CLUSTERS = 2.0  # effective number that must carry an effect: one alone could be anything's
 SEE = 4.0  # standard errors that a strong effect must reach before its absence means anything
 STRUCTURE = 0.17  # rms over noise of structure that no catalogue effect has and ordinary data do not show
 PEAK = 12.0  # power of one frequency over the median, stacked over images
@@ -107,7 +108,7 @@ def _would_show(name: str, state: Search, seen: Round) -> bool:
     if name == "saturation":  # the histogram shows it
         return not state.dn
     e = seen.best.get(name)
-    if e is None or e.left <= 0:
+    if e is None or e.left <= 0 or e.clusters < CLUSTERS:
         return False
     (coordinate, reference), *_ = e.candidate.trial.columns[0].items()
     unit = abs(reference - cls.null()[coordinate])

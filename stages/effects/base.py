@@ -68,6 +68,7 @@ class Effect(ABC):
     channel      where `diagnose` looks for it: 'lit' (fully lit ground and deep shadow), 'edge' (also about shadow
                  edges), 'albedo' or 'relief' (what stays with the ground in all images: its albedo, its slopes)
     displaces    whether it moves images against the ground: what is known of it is taken out of the measurement
+    relative     whether its values per image are known against the other images only: what all share is the ground's
     in_simulation  what a coordinate gets added in the extended model: `diagnose` judges with slopes of fourth order,
                  while the simulation's smooth the ground by about a quarter of a squared pixel themselves
     linear       whether the image is linear in the coordinates: the first estimate needs no second one
@@ -87,6 +88,7 @@ class Effect(ABC):
     tolerance: ClassVar[Mapping[str, float]] = {}
     channel: ClassVar[str] = "lit"
     displaces: ClassVar[bool] = False
+    relative: ClassVar[bool] = False
     linear: ClassVar[bool] = False
     in_simulation: ClassVar[Mapping[str, float]] = {}
 

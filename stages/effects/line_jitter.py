@@ -20,6 +20,7 @@ class LineJitter(Effect):
     slot = "geometry"
     scope = "image"
     displaces = True
+    relative = True
     title = "lines shifted against each other"
     mechanism = (
         "A line-scan camera reads lines one after the other while the platform's pointing drifts and trembles: the lines "
