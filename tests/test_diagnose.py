@@ -118,10 +118,21 @@ def test_outside_the_catalogue_is_unexplained(scene, tmp_path, what):
     assert answer.verdict == "unexplained" and not answer.causes
 
 
-def test_two_planted(scene, tmp_path):
-    planted = {k: PLANTS[k] for k in ("phase_slope", "line_jitter")}
+@pytest.mark.parametrize(
+    "both", [("phase_slope", "line_jitter"), ("limb_darkening", "phase_slope"), ("column_pattern", "echo")]
+)
+def test_two_planted(scene, tmp_path, both):
+    planted = {k: PLANTS[k] for k in both}
     answer = diagnose.run(_pairs(scene, tmp_path, planted)).answer
     assert {c.effect.name for c in answer.causes} == set(planted)
+
+
+def test_what_a_cause_explains_is_not_tried_again(scene, tmp_path):
+    """A flat field looks like a wrong Sun, a phase slope and a bent response until it is known."""
+    result = diagnose.run(_pairs(scene, tmp_path, {"column_pattern": PLANTS["column_pattern"]}))
+    assert [c.effect.name for c in result.answer.causes] == ["column_pattern"]
+    assert not result.search.refused
+    assert max(e.gain for e in result.round.best.values()) < 0.05 * result.answer.causes[0].gain
 
 
 def test_what_the_data_cannot_show_is_said(scene, tmp_path):
@@ -215,3 +226,29 @@ def test_projection_leaves_no_texture_and_no_slope_error(scene, tmp_path):
     weighted = (error * projector.weight)[None]
     dynamic = projector.project_(weighted, projector.coefficients(weighted))
     assert float(dynamic.square().sum()) < 1e-6 * float(error.square().sum())
+
+
+def test_an_image_that_shows_next_to_nothing_moves_next_to_nothing(scene, tmp_path):
+    """Three stray pixels of an image otherwise masked must not be explained by a shift of many pixels."""
+    from stages.diagnose.columns import nuisance_columns
+    from stages.diagnose.data import group_pairs, load_site
+    from stages.diagnose.nominal import fit, load_nominal
+    from stages.diagnose.projection import Local, Projector
+    from stages.network.dataset import PairReader
+
+    with PairReader(_pairs(scene, tmp_path, {})) as reader:
+        site = load_site(reader, group_pairs(reader, np.arange(reader.count), 16)[0])
+    nominal = load_nominal(None, "M2", "iof")
+    fit(nominal, [site], [], "iof", [site.image])
+    chain = nominal.chain(site, [])
+    weight = site.valid / (0.02 * chain.textured.mean())
+    first = torch.zeros_like(weight[0])
+    first[10, 10] = first[30, 40] = first[50, 20] = 1e-3 * weight[0].max()
+    weight[0] = first
+    residual = torch.zeros_like(weight)
+    residual[0] = 30.0 * (first > 0)
+    columns = residual[None].clone()
+    projector = Projector(chain, weight)
+    on_basis = projector.coefficients(columns)
+    Local(projector, nuisance_columns(chain, False)).remove_(columns, on_basis)
+    assert float((columns - residual).abs().max()) < 1.0

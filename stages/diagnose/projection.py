@@ -110,9 +110,11 @@ class Projector:
             firm.append((1 - n / smooth).clamp(min=0))
         self.firm = torch.stack(firm)  # share of each frequency's power that is not the pixels' noise
         # a given DEM's shortest slopes are noise of its own: what follows terrain is sought at longer wavelengths
-        shortest = [ALBEDO_BAND] + [SLOPE_BAND] * (len(filters) - 1)
-        self.filter = torch.stack([f * torch.exp(-((k / b) ** 2)) for f, b in zip(filters, shortest, strict=True)])
-        self.filter[:, 0, 0] = 0.0  # the mean belongs to the nominal model
+        shortest = torch.tensor([ALBEDO_BAND] + [SLOPE_BAND] * (len(filters) - 1))[:, None, None]
+        self.wavenumber = 2 * math.pi * k  # rad per px
+        self.passed = torch.exp(-((k / shortest) ** 2))
+        self.passed[:, 0, 0] = 0.0  # the mean belongs to the nominal model
+        self.filter = torch.stack(filters) * self.passed
 
     def whiten(self, maps: Tensor) -> Tensor:
         """Static maps (E, K, H, W) -> rows of unit noise."""
@@ -125,12 +127,26 @@ class Projector:
         if self.filter is None or len(self.back) < 3:
             return 0.0
         variance = (self.back[1:].square().sum(1) * self.window.square()).sum((-2, -1))
-        both = torch.full((self.filter.shape[-1],), 2.0)  # frequencies that the half plane stands for
+        passed = (self.filter[1:].square() * self._both()).sum((-2, -1)) / self.window.numel()
+        return float((variance * passed).sum())
+
+    def noise_sharpened(self, sigma2: float) -> float:
+        """Product of the given DEM's own noise and what sharpening the DEM by ``sigma2`` px^2 adds to it, in whitened slopes.
+
+        Noise is what the residual's maps have beyond the noise of the images' pixels.
+        """
+        if self.filter is None or len(self.back) < 3:
+            return 0.0
+        added = torch.expm1(0.5 * sigma2 * self.wavenumber.square())
+        return float((self.passed[1:].square() * self.firm[1:] * added * self._both()).sum())
+
+    def _both(self) -> Tensor:
+        """How many frequencies each of the half plane's stands for."""
+        both = torch.full((self.wavenumber.shape[-1],), 2.0)
         both[0] = 1.0
         if self.window.shape[-1] % 2 == 0:
             both[-1] = 1.0
-        passed = (self.filter[1:].square() * both).sum((-2, -1)) / self.window.numel()
-        return float((variance * passed).sum())
+        return both
 
 
 def _tapered(count: int) -> Tensor:

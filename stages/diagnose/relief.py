@@ -27,12 +27,14 @@ class Relief:
 
     noise : sum of squares that the images' noise leaves in its maps; steepness : mean squared slope of the ground
     sharpened : smoothing of the DEM that the model undoes already, px^2
+    roughened : product of the DEM's noise and what a trial's sharpening adds to it
     """
 
     products: Statistics
     noise: float
     steepness: float
     sharpened: float
+    roughened: float
 
 
 def open_relief(work: SiteWork, name: str, data: Survey) -> Relief:
@@ -61,11 +63,17 @@ def _gather(work: SiteWork, candidates, columns, name: str, data: Survey) -> Rel
     products = gather_static(work, candidates, columns, along, nominal=True, maps=slice(1, None))
     steepness = data.slope[0] ** 2 + data.slope[1] ** 2
     sharpened = sum(abs(float(e.values["sigma2_px2"])) for e in work.chain.base if e.name == "dem_smoothing")
-    return Relief(products, work.projector.slope_noise(), steepness, sharpened)
+    ((_, step),) = candidates[0].trial.columns[0].items()
+    # before the smoothing is named the residual's maps are full of it, and tell nothing of the DEM's noise
+    roughened = work.projector.noise_sharpened(step) if name == "dem_smoothing" and name in named else 0.0
+    return Relief(products, work.projector.slope_noise(), steepness, sharpened, roughened)
 
 
 def weigh_relief(parts: Sequence[Relief]) -> list[Evidence]:
     """Evidence from the maps of slope errors of all sites, a DEM's scale corrected for what imitates one.
+
+    Noise of the DEM lowers its smoothing too: sharpening raises it. By how much depends on its spectrum at the shortest
+    wavelengths, which the images do not give well enough for a correction: it is counted as an error.
 
     Slopes that the DEM has and the ground has not draw the regression of slope errors on given slopes to smaller
     scales, by their share of the given slopes' variance (Fuller 1987, Measurement Error Models, ch. 1). That share is
@@ -76,12 +84,14 @@ def weigh_relief(parts: Sequence[Relief]) -> list[Evidence]:
     """
     data = join([p.products for p in parts])
     evidence = weigh(data)
+    m, sums = data.count, data.products.sum(0)
     for k, e in enumerate(evidence):
+        place = m + 1 + e.candidate.columns.start
+        if e.effect == "dem_smoothing":
+            missing = sum(p.roughened for p in parts) / max(float(sums[place, place]), 1e-30)
+            evidence[k] = dataclasses.replace(e, covariance=e.covariance + missing**2)
         if e.effect != "dem_scale" or e.gain <= 0:
             continue
-        m = data.count
-        sums = data.products.sum(0)
-        place = m + 1 + e.candidate.columns.start
         left = float(sums[m, m]) - 2 * e.gain - sum(p.noise for p in parts)
         (reference,) = e.candidate.trial.columns[0].values()
         steepness = parts[0].steepness

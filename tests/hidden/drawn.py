@@ -17,6 +17,8 @@ def drawn(scene: Scene, truth: Truth, seed: int) -> dict[str, float]:
         scene.given_dem(site, truth, rng)
     frames = [scene._frame(rng, truth) for _ in range(scene.layout.images)]
     out: dict[str, float] = {}
+    if "dem_smoothing" in truth.effect:  # what every DEM is smoothed by counts in
+        out["dem_smoothing"] = truth.dem_smoothing**2 + truth.effect["dem_smoothing"]["sigma2_px2"]
     if "misregistration" in truth.effect:
         shifts = np.array([pose.error for pose, _ in frames])
         out["misregistration"] = float(np.sqrt(shifts.var(0, ddof=1).sum()))
