@@ -150,7 +150,7 @@ def worth(e: Evidence, seen: Round, count: int, data: Survey, ease: float = 1.0)
     if e.agreement < agree and not still and e.effect != "distant_shadow":
         return False
     firm = 0.0 if e.effect == "distant_shadow" else FIRM * e.gain_error  # a wall shades one image and spares the others
-    if e.gain < max(FLOOR_GAIN, firm) or (e.fid < floor_fid(data.slope) and not still):
+    if e.gain < max(FLOOR_GAIN, firm) or (e.fid < floor_fid(data.slope) * math.sqrt(e.candidate.size) and not still):
         return False
     (name, reference), *_ = e.candidate.trial.columns[0].items()
     unit = reference - cls.null()[name]

@@ -13,7 +13,6 @@ from stages.diagnose.naming import (
     FLOOR_GAIN,
     GATE,
     IMPERFECT,
-    KEEP_SHARE,
     SIMPLER,
     UNDERRATED,
     choose,
@@ -28,7 +27,8 @@ from stages.diagnose.state import Cause, Saved, Search
 from stages.effects import get_effect
 
 REFUSALS = 3
-MUCH = 0.02  # of what is left: by so much a cause for each image must do better than one for all
+MUCH = 0.05  # of what it explains: by so much a cause for each image must do better than one for all
+FOR_FREE = 2.0  # of the sum of squares, that each coordinate gains by itself (Akaike 1974)
 SLIGHT = 0.0005  # of what is left: by so much a simpler cause may do worse
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 PAIR = 2  # scene-wide causes that are tried together in the place of gains
@@ -82,8 +82,9 @@ def _name(state: Search, most: int, say: Callable[[str], None]) -> Round:
             continue
         silent = {} if swapped else quiet(seen, cause.effect.name)
         seen = narrowed(seen, look(state, [n for n in state.open_names() if n not in silent]), silent)
-        seen.best.pop(cause.effect.name, None)
-        seen.images.pop(cause.effect.name, None)
+        for named in state.causes:  # two, where scene-wide causes took the place of gains
+            seen.best.pop(named.effect.name, None)
+            seen.images.pop(named.effect.name, None)
     return seen
 
 
@@ -177,8 +178,10 @@ def _instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float)
         rivals = choose(state, look(state, names))
         if not rivals:
             break
+        known = state.save()
         cause = _contest(state, rivals, seen)
         cause.rms_before, cause.rms_after = gains.rms_before, rms
+        _reconsider(state, cause, known, seen, kept=True)
         choices *= len(names)
         names.remove(cause.effect.name)
         freedom += len(free_coordinates(cause.effect))
@@ -206,10 +209,11 @@ def _kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> b
         return True
     if cause.effect.name in UNDERRATED and _ordinary(cause):
         return False
-    if not cause.rms_after < WORSE * cause.rms_before:
+    worse = cause.rms_after > WORSE * cause.rms_before
+    if cause.effect.displaces and worse:  # it may have moved the images out of the pixels that are compared
         return False
     if cause.effect.channel == "edge":  # judged in pixels that are masked here
-        return True
+        return not worse
     promised = cause.gain if cause.promised is None else cause.promised
     return nothing - misfit(state, seen.works) > (0.0 if cause.effect.name in ALSO_STILL else PROMISE * 2 * promised)
 
@@ -236,8 +240,8 @@ def _contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
         tried.append((nothing - misfit(state, works, moves), _freedom(cause), state.save()))
     if per_image and len(per_image) < len(rivals):  # a number for each image must do much better than one for all
         alone = max(tried[k][0] for k in range(len(rivals)) if k not in per_image)
-        single = max(tried[k][0] for k in per_image)
-        drop = alone > KEEP_SHARE * single and single - alone < MUCH * (nothing - single)
+        single = max(tried[k][0] - FOR_FREE * tried[k][1] for k in per_image)
+        drop = alone > (1 - MUCH) * single
         keep = [k for k in range(len(rivals)) if (k in per_image) != drop]
         rivals, tried = [rivals[k] for k in keep], [tried[k] for k in keep]
     most = max(worth for worth, _, _ in tried)
