@@ -32,13 +32,13 @@ RIVALS = 2
 FORMS = 0.7  # of the gain, above which another form of an effect is tried as well
 SOFT = ("psf_blur", "penumbra")  # what near echoes are mistaken for
 SOFTENED = 0.5  # of a near echo's gain: if one of these does as well as that, it is a matter of theirs
-IMPERFECT = 0.12  # of a cause's size: so much of it its model may leave, which is no further cause ...
-IMPERFECT_SHIFTS = 0.09  # ... less after shifts, which resampling undoes well ...
+IMPERFECT = 0.04  # of a cause's size: so much of it its model may leave, which is no further cause ...
+IMPERFECT_SHIFTS = 0.06  # ... more after shifts, whose resampling blurs ...
 IMPERFECT_GAINS = 0.02  # ... and next to nothing after gains, which are what they are,
 IMPERFECT_COLUMNS = 0.05  # or a smooth response over columns
 # effect -> share of its size that a first look may see: texture and slopes take the rest
 UNDERRATED = {"psf_blur": 0.4}
-STANDS_OUT = 1.6  # rms of a pattern over what the texture's spectrum foretells
+STANDS_OUT = 1.4  # rms of a pattern over what the texture's spectrum foretells
 
 
 def choose(state: Search, seen: Round) -> list[Cause]:

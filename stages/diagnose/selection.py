@@ -29,6 +29,7 @@ from stages.effects import get_effect
 REFUSALS = 3
 MUCH = 0.05  # of what it explains: by so much a cause for each image must do better than one for all
 FOR_FREE = 2.0  # of the sum of squares, that each coordinate gains by itself (Akaike 1974)
+FEWER = 4  # coordinates less, which make up for doing slightly worse
 SLIGHT = 0.0005  # of what is left: by so much a simpler cause may do worse
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 PAIR = 2  # scene-wide causes that are tried together in the place of gains
@@ -82,9 +83,9 @@ def _name(state: Search, most: int, say: Callable[[str], None]) -> Round:
             continue
         silent = {} if swapped else quiet(seen, cause.effect.name)
         seen = narrowed(seen, look(state, [n for n in state.open_names() if n not in silent]), silent)
-        for named in state.causes:  # two, where scene-wide causes took the place of gains
-            seen.best.pop(named.effect.name, None)
-            seen.images.pop(named.effect.name, None)
+        for name in {*seen.best, *seen.images} - set(state.open_names()):
+            seen.best.pop(name, None)
+            seen.images.pop(name, None)
     return seen
 
 
@@ -96,10 +97,12 @@ def _reconsider(state: Search, cause: Cause, before: Saved, seen: Round, kept: b
     if not kept:
         state.load(before)
     left = misfit(state, seen.works)
-    least = left - max(2 * FLOOR_GAIN, SLIGHT * left, 0.0 if kept else PROMISE * 2 * cause.gain)
+    better = max(2 * FLOOR_GAIN, SLIGHT * left, 0.0 if kept else PROMISE * 2 * cause.gain)
     for rival in earlier.rivals:
         if rival.effect.name == cause.effect.name:
             continue
+        fewer = _freedom(earlier) - _freedom(rival)
+        least = left + FOR_FREE * fewer + SLIGHT * left if kept and fewer > FEWER else left - better
         state.load(before)
         state.causes[-1:] = [rival, copy.copy(cause)]
         refine(state, 2, known=False)

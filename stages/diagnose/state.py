@@ -18,6 +18,9 @@ from stages.diagnose.parallel import per_site
 from stages.effects import Effect, Survey, effect_names, get_effect
 from stages.physics import formation
 
+# With gains free the level of an image says nothing of the phase function, nor the contrast of slopes of their height.
+LEVEL_AGAINST_CONTRAST = {"dem_scale"}
+
 R = TypeVar("R")
 
 
@@ -158,6 +161,8 @@ class Search:
         closed = {c.effect.name for c in self.causes} | self.refused | {"misregistration"}  # judged by ``align``
         if self.dn:
             closed.add("image_gain")
+        if any(c.effect.name == "image_gain" for c in self.causes):
+            closed |= LEVEL_AGAINST_CONTRAST
         if self.deepest < FEWEST:  # one look at the ground: albedo and shading are the same thing
             closed |= {n for n in effect_names() if get_effect(n).channel in ("albedo", "relief")}
         return [n for n in effect_names() if n not in closed and get_effect(n).visible(self.data, self.has)]

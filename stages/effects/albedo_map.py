@@ -30,7 +30,7 @@ class AlbedoMap(Effect):
     parameters = (Parameter("per_std", "1", 0.0, 1.0, 0.0, "rms of the field, relative to albedo"),)
     coordinates = tuple(Parameter(f"c{m}{n}", "1", -0.5, 0.5, 0.0, f"cosine {m} down, {n} across") for m, n in ORDERS)
     strong: ClassVar = {p.name: 0.05 for p in coordinates}
-    tolerance: ClassVar = {"per_std": 0.04}
+    tolerance: ClassVar = {"per_std": 0.03}
 
     def apply(self, state: State) -> None:
         height, width = state.elevation.shape[-2:]
