@@ -252,3 +252,32 @@ def test_an_image_that_shows_next_to_nothing_moves_next_to_nothing(scene, tmp_pa
     on_basis = projector.coefficients(columns)
     Local(projector, nuisance_columns(chain, False)).remove_(columns, on_basis)
     assert float((columns - residual).abs().max()) < 1.0
+
+
+@pytest.mark.parametrize("planted", [0.0, 0.07])
+def test_a_broad_pattern_stands_out_from_red_texture_alone(planted):
+    """Albedo of a pure power law, down to the longest waves, is no pattern; seven percent of slow waves on top of it are."""
+    from types import SimpleNamespace
+
+    from stages.diagnose.naming import GATE, STANDS_OUT
+    from stages.diagnose.pattern import ORDERS, SHORTEST, weigh_pattern
+    from stages.effects.fields import cosine_field
+
+    rng, size = np.random.default_rng(5), 48
+    waves = [(m, n) for m in range(SHORTEST + 1) for n in range(SHORTEST + 1) if m + n > 0]
+    fields = torch.stack([cosine_field(o, size, size) for o in waves]).flatten(1)
+    slow = np.array([o in ORDERS for o in waves])
+    named = 0
+    for exponent in np.tile([2.0, 2.5, 3.0], 6):
+        power = np.hypot(*np.array(waves).T) ** -exponent
+        amount = rng.normal(size=(4, len(waves))) * 0.03 * np.sqrt(power / power.sum())
+        amount[:, slow] += planted / np.sqrt(slow.sum()) * rng.normal(size=(4, slow.sum()))
+        albedo = (torch.tensor(amount, dtype=torch.float32) @ fields).view(4, size, size)
+        sites = [SimpleNamespace(site=SimpleNamespace(count=9, number=k), albedo=a) for k, a in enumerate(albedo)]
+        e = weigh_pattern(sites)
+        named += (
+            e.p * 26 < GATE and np.hypot(e.rms, e.texture) > STANDS_OUT * e.texture and e.rms > 0.03 + 2 * e.rms_error
+        )
+        if planted:
+            assert e.rms == pytest.approx(planted, rel=0.35)
+    assert named == (18 if planted else 0)

@@ -16,6 +16,10 @@ from stages.effects.albedo_map import ORDERS
 from stages.effects.fields import cosine_field
 
 LONGEST, SHORTEST = 6, 16  # half waves per crop between which the texture's own spectrum is taken
+LOG_OF_MEAN, LOG_SCATTER = (
+    1.27,
+    2.22,
+)  # a chi-square of one degree: log of its mean over the mean of its log; rms of its log
 STEEPEST = -3.0  # of power against wave number: redder than any texture
 
 
@@ -35,44 +39,46 @@ class PatternEvidence:
 
 def weigh_pattern(works: Sequence[Remains]) -> PatternEvidence | None:
     """From sites with enough images to know their albedo; None where there are none."""
-    values, numbers, expected = [], [], []
+    values, numbers, powers = [], [], []
     for work in works:
         if work.site.count < FEWEST:
             continue
         albedo = work.albedo - work.albedo.mean()
         height, width = albedo.shape
         orders = [(m, n) for m in range(SHORTEST + 1) for n in range(SHORTEST + 1) if m + n > 0]
-        power = {o: float((albedo * cosine_field(o, height, width)).mean()) for o in orders}
-        values.append(torch.tensor([power[o] for o in ORDERS]))
+        amount = {o: float((albedo * cosine_field(o, height, width)).mean()) for o in orders}
+        values.append(torch.tensor([amount[o] for o in ORDERS]))
         numbers.append(work.site.number)
-        expected.append(_foretold({o: v * v for o, v in power.items()}))
+        powers.append({o: v * v for o, v in amount.items()})
     if not values:
         return None
     found = torch.stack(values).double().square()
-    ratio = float((found / torch.stack(expected)).mean())
+    # order by order: in sums over orders the longest waves, of which least is known, would be all
+    ratio = float((found / _foretold(powers)).mean())
     count = found.numel()
     # modes beyond the texture's share: log-likelihood of two variances
     gain = 0.5 * count * (ratio - 1 - math.log(max(ratio, 1e-9))) if ratio > 1 else 0.0
-    texture = math.sqrt(float(torch.stack(expected).sum(1).mean()))
     rms = math.sqrt(float(found.sum(1).mean()))
-    beyond = math.sqrt(max(rms * rms - texture * texture, 0.0))
+    texture = rms / math.sqrt(max(ratio, 1.0))
     return PatternEvidence(
-        torch.stack(values), numbers, beyond, rms / math.sqrt(2 * count), texture, gain,
+        torch.stack(values), numbers, math.sqrt(rms * rms - texture * texture), rms / math.sqrt(2 * count), texture, gain,
         math.sqrt(2 * gain + count), f_tail(ratio, count / 3, 20.0 * len(values)),
     )  # fmt: skip
 
 
-def _foretold(power: dict[tuple[int, int], float]) -> Tensor:
-    """Power of each order of the pattern, from a power law through the next shorter waves."""
-    x, y = [], []
-    for (m, n), p in power.items():
-        if (m, n) not in ORDERS and LONGEST <= math.hypot(m, n) <= SHORTEST:
-            x.append(math.log(math.hypot(m, n)))
-            y.append(math.log(max(p, 1e-16)))
-    a, b = torch.tensor(x), torch.tensor(y)
-    slope = float(((a - a.mean()) * (b - b.mean())).sum() / (a - a.mean()).square().sum())
+def _foretold(powers: Sequence[dict[tuple[int, int], float]]) -> Tensor:
+    """Power of each order of the pattern at each site, (sites, orders), from a power law through the next shorter waves.
+
+    One exponent for all sites, steeper than the fitted one by its standard error: a site's own is known to 0.6, which over
+    the step to the long waves is a factor of three.
+    """
+    waves = [o for o in powers[0] if o not in ORDERS and LONGEST <= math.hypot(*o) <= SHORTEST]
+    a = torch.tensor([math.log(math.hypot(*o)) for o in waves], dtype=torch.float64)
+    middle = a.mean()
+    a = a - middle
+    b = torch.tensor([[math.log(max(p[o], 1e-16)) for o in waves] for p in powers], dtype=torch.float64)
+    slope = float((a * b.mean(0)).sum() / a.square().sum())
+    slope -= LOG_SCATTER / math.sqrt(len(powers) * float(a.square().sum()))
     slope = min(max(slope, STEEPEST), 0.0)
-    level = float(b.mean()) + 1.27  # the mean of a log chi-square of one degree lies that far below the log of its mean
-    return torch.tensor(
-        [math.exp(level + slope * (math.log(math.hypot(*o)) - float(a.mean()))) for o in ORDERS], dtype=torch.float64
-    )
+    longer = torch.tensor([math.log(math.hypot(*o)) for o in ORDERS], dtype=torch.float64) - middle
+    return torch.exp(b.mean(1)[:, None] + LOG_OF_MEAN + slope * longer)
