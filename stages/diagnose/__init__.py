@@ -7,8 +7,9 @@ statistics   products per cluster of pixels    evidence    held-out gain and sig
 images       effects with values per image     relief      a DEM's scale and smoothing
 pattern      a broad albedo pattern            plateau     highlights that are cut off
 looking      one look at all of that           naming      what deserves a name after it
-refining     the values that fit best          selection   name, refine, look again
-state        what is known so far              parallel    sites side by side
+refining     the values that fit best          contest     nearly equal candidates, each tried in the model
+selection    name, refine, look again          state       what is known so far
+parallel     sites side by side
 unexplained  what is left, what is not seen    answer      verdict, JSON, diagnosis.h5      report   HTML
 """
 
