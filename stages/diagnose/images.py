@@ -71,11 +71,14 @@ class ImageProducts:
     folds: dict[str, list[_Fold]]
 
 
-def gather_images(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) -> ImageProducts | None:
-    """None for sites with too few images."""
+def gather_images(
+    work: SiteWork, names: Sequence[str], dn: bool, data: Survey, held: bool = False
+) -> ImageProducts | None:
+    """None for sites with too few images. held : scene-wide effects in the model stay as they are, else they may move along"""
     if work.chain.site.count < FEWEST or not names:
         return None
-    return ImageProducts(work.chain.site.frames, work.projector.dynamic_rows, _site_folds(work, names, dn, data))
+    folds = _site_folds(work, names, dn, [] if held else tangent_columns(work.chain, data)[1], data)
+    return ImageProducts(work.chain.site.frames, work.projector.dynamic_rows, folds)
 
 
 def weigh_images(
@@ -123,10 +126,12 @@ def _agreement(values: Tensor, parts: list[tuple[Tensor, _Fold]]) -> float:
     return common / max(own - chance, 1e-9)
 
 
-def _site_folds(work: SiteWork, names: Sequence[str], dn: bool, data: Survey) -> dict[str, list[_Fold]]:
+def _site_folds(
+    work: SiteWork, names: Sequence[str], dn: bool, tangents: list[Tensor], data: Survey
+) -> dict[str, list[_Fold]]:
     """Per effect, normal equations of its values on two interleaved halves of the blocks, everything else removed."""
     chain, projector = work.chain, work.projector
-    fixed = [*nominal_columns(chain), chain.unresolved_slopes(), *tangent_columns(chain, data)[1]]
+    fixed = [*nominal_columns(chain), chain.unresolved_slopes(), *tangents]
     for effect in BASELINE:
         if effect not in [e.name for e in chain.base]:
             fixed += trial_columns(chain, effect, get_effect(effect).trials(data)[0], data)
@@ -271,4 +276,14 @@ def spread(values: Tensor, evidence: ImageEvidence | None) -> float:
     return size * math.sqrt(together / (together - 1)) if together > 1 else size
 
 
-__all__ = ["FEWEST", "OVERSHOOT", "SMALL", "ImageEvidence", "as_effect", "gather_images", "spread", "weigh_images"]
+__all__ = [
+    "FEWEST",
+    "OVERSHOOT",
+    "PRIORS",
+    "SMALL",
+    "ImageEvidence",
+    "as_effect",
+    "gather_images",
+    "spread",
+    "weigh_images",
+]

@@ -51,6 +51,10 @@ def refine(state: Search, steps: int = 2, known: bool = True) -> None:
 
     known : a linear effect that is alone has the value that fits best already
     """
+    last = state.causes[-1:]
+    gains = (
+        [c for c in state.causes if c.effect.name == "image_gain"] if last and last[0].effect.scope == "scene" else []
+    )
     for step in range(steps):
         state.fit(again=step > 0)
         every = state.each(lambda chain: _gather(state, chain))
@@ -65,10 +69,25 @@ def refine(state: Search, steps: int = 2, known: bool = True) -> None:
         named = {c.effect.name: c for c in state.causes if c.effect.scope == "image"}
         found = weigh_images([images for _, _, images in every], state.frames, SMALL)
         for name, cause in named.items():
-            if name in found and found[name].gain > max(WORTH_MOVING, SETTLED * cause.gain):
+            if cause not in gains and name in found and found[name].gain > max(WORTH_MOVING, SETTLED * cause.gain):
                 share = OVERSHOOT if cause.effect.displaces else 1.0
                 cause.effect = as_effect(found[name], cause.effect, state.data, share)
+        for cause in gains:
+            _follow(state, cause)
     state.fit()
+
+
+def _follow(state: Search, gains: Cause) -> None:
+    """Gains beside scene-wide causes as these are now: they stood for all that acts by image, and may have far to go.
+
+    Together with a cause that they can nearly stand for they have no evidence of their own, and a prior would hold them.
+    """
+    state.fit(again=True)
+    name = gains.effect.name
+    every = state.each(lambda chain: gather_images(ready(chain, state.dn), [name], state.dn, state.data, held=True))
+    found = weigh_images(every, state.frames)
+    if name in found:
+        gains.effect = as_effect(found[name], gains.effect, state.data)
 
 
 def _gather(state: Search, chain: Chain) -> tuple[Statistics, list[Relief], ImageProducts | None]:
