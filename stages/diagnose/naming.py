@@ -15,6 +15,7 @@ from stages.diagnose.refining import start
 from stages.diagnose.state import Cause, Search
 from stages.effects import Effect, Survey, effect_names, get_effect
 from stages.effects.echo import CLEAR_LAG
+from stages.effects.penumbra import RELIEF_SPREAD
 
 GATE = 0.01  # family-wise
 FLOOR_FID = 0.022  # an effect smaller than this against the noise is never worth a name
@@ -30,8 +31,6 @@ SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to
 NEAR = 0.9  # of the best gain: linear models of strong effects are no closer than that
 RIVALS = 2
 FORMS = 0.7  # of the gain, above which another form of an effect is tried as well
-SOFT = ("psf_blur", "penumbra")  # what near echoes are mistaken for
-SOFTENED = 0.5  # of a near echo's gain: if one of these does as well as that, it is a matter of theirs
 IMPERFECT = 0.04  # of a cause's size: so much of it its model may leave, which is no further cause ...
 IMPERFECT_SHIFTS = 0.06  # ... more after shifts, whose resampling blurs ...
 IMPERFECT_GAINS = 0.02  # ... and next to nothing after gains, which are what they are,
@@ -162,13 +161,11 @@ def worth(e: Evidence, seen: Round, count: int, data: Survey, ease: float = 1.0)
         return False
     if cls.null()[name] == 0 and low < 0 < high and not 0.9 * low < value < 0.9 * high:
         return False
-    if e.effect == "echo":  # near ones look like an imperfect point spread function, or like soft shadow edges
-        near = abs(e.candidate.trial.fixed["lag_px"]) < CLEAR_LAG
-        soft = max((seen.best[n].gain for n in SOFT if n in seen.best), default=math.inf)
-        if value < 0 or (near and (e.fid < 2 * FLOOR_FID or soft > SOFTENED * e.gain)):
-            return False
+    if e.effect == "echo" and (value < 0 or abs(e.candidate.trial.fixed["lag_px"]) < CLEAR_LAG):
+        return False  # near ones look like an imperfect point spread function, or like soft shadow edges
     if e.effect == "penumbra":
-        return value > e.candidate.trial.fixed["relief_deg"] + 3 * error
+        relief = e.candidate.trial.fixed["relief_deg"]
+        return value > relief + math.hypot(3 * error, 2 * RELIEF_SPREAD * relief)
     if e.effect == "dem_smoothing" and value < 0:  # no DEM is sharper than the ground
         return False
     if name in cls.tolerance:

@@ -38,7 +38,7 @@ class Penumbra(Effect):
             "relief_deg", "degree", 0.0, 30.0, 0.0, "disc that relief alone makes of the Sun: in radius_deg as fitted"
         ),
     )
-    strong: ClassVar = {"radius_deg": 1.5}
+    strong: ClassVar = {"radius_deg": 2.0}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
