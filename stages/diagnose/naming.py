@@ -15,7 +15,7 @@ from stages.diagnose.refining import start
 from stages.diagnose.state import Cause, Search
 from stages.effects import Effect, Survey, effect_names, get_effect
 from stages.effects.echo import CLEAR_LAG
-from stages.effects.penumbra import RELIEF_SPREAD
+from stages.effects.penumbra import BEYOND
 
 GATE = 0.01  # family-wise
 FLOOR_FID = 0.022  # an effect smaller than this against the noise is never worth a name
@@ -164,8 +164,7 @@ def worth(e: Evidence, seen: Round, count: int, data: Survey, ease: float = 1.0)
     if e.effect == "echo" and (value < 0 or abs(e.candidate.trial.fixed["lag_px"]) < CLEAR_LAG):
         return False  # near ones look like an imperfect point spread function, or like soft shadow edges
     if e.effect == "penumbra":
-        relief = e.candidate.trial.fixed["relief_deg"]
-        return value > relief + math.hypot(3 * error, 2 * RELIEF_SPREAD * relief)
+        return value > BEYOND * e.candidate.trial.fixed["relief_deg"] + error
     if e.effect == "dem_smoothing" and value < 0:  # no DEM is sharper than the ground
         return False
     if name in cls.tolerance:

@@ -13,7 +13,7 @@ from stages.diagnose.naming import floor_fid
 from stages.diagnose.preparing import Remains
 from stages.diagnose.state import Search
 from stages.effects import effect_names, get_effect
-from stages.effects.penumbra import RELIEF_SPREAD
+from stages.effects.penumbra import BEYOND
 
 CELL = 8  # px
 CLUSTERS = 2.0  # effective number that must carry an effect: one alone could be anything's
@@ -119,5 +119,5 @@ def _would_show(name: str, state: Search, seen: Round) -> bool:
         return False
     least = cls.tolerance.get(coordinate, 0.0)
     if name == "penumbra":
-        least = (1 + 2 * RELIEF_SPREAD) * e.candidate.trial.fixed["relief_deg"] - cls.null()[coordinate]
+        least = BEYOND * e.candidate.trial.fixed["relief_deg"] - cls.null()[coordinate]
     return error * SEE < size - least

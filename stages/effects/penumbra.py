@@ -15,6 +15,7 @@ from stages.physics.photometry import Parameter
 # Relief below the DEM's resolution blurs far shadows like a disc of this radius, deg, and more on rugged ground:
 # by so much per change of slope over a pixel (Laplacian of the heights after a 2 px blur, times the pixel).
 RELIEF, PER_BEND = 0.9, 26.0
+BEYOND = 2.25  # times that: what some ground does alone, so that a wide Sun must do more
 RELIEF_SPREAD = 0.25  # standard deviation of that, as a share, from one piece of ground to the next
 
 
