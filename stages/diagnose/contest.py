@@ -141,10 +141,10 @@ def reconsider(state: Search, cause: Cause, before: Saved, seen: Round, kept: bo
 
 def kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> bool:
     """Whether the model with the cause in it fits better by what its linear estimate said."""
+    if (cause.effect.channel == "relief" or cause.effect.name in UNDERRATED) and ordinary(cause):
+        return False
     if cause.effect.channel in ("albedo", "relief"):  # the rows that are free of the ground do not know them
         return True
-    if cause.effect.name in UNDERRATED and ordinary(cause):
-        return False
     worse = cause.rms_after > WORSE * cause.rms_before
     if cause.effect.displaces and worse:  # it may have moved the images out of the pixels that are compared
         return False

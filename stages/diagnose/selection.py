@@ -82,6 +82,10 @@ def _prune(state: Search, seen: Round) -> bool:
     """
     pruned, rows = False, seen.statistics.rows if seen.statistics is not None else 0.0
     for cause in list(state.causes):
+        if cause.effect.channel == "relief" and ordinary(cause):
+            state.causes.remove(cause)
+            refine(state, 2, known=False)
+            pruned = True
         if cause.effect.scope != "scene" or cause.effect.channel != "lit":
             continue
         if cause is state.causes[-1] and (len(state.causes) == 1 or not _faint(cause)):
