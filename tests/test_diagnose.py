@@ -206,18 +206,24 @@ def test_f_tail_against_scipy():
         assert f_tail(x, a, b) == pytest.approx(f.sf(x, a, b), rel=1e-6)
 
 
-def test_projection_leaves_no_texture_and_no_slope_error(scene, tmp_path):
-    """Residuals made of a static albedo and a static slope error alone leave the dynamic rows empty."""
+def _fitted(scene, folder):
+    """A site with nothing hidden, and the nominal model of it."""
     from stages.diagnose.data import group_pairs, load_site
     from stages.diagnose.nominal import fit, load_nominal
-    from stages.diagnose.projection import Projector
     from stages.network.dataset import PairReader
 
-    with PairReader(_pairs(scene, tmp_path, {})) as reader:
+    with PairReader(_pairs(scene, folder, {})) as reader:
         site = load_site(reader, group_pairs(reader, np.arange(reader.count), 16)[0])
     nominal = load_nominal(None, "M2", "iof")
     fit(nominal, [site], [], "iof", [site.image])
-    chain = nominal.chain(site, [])
+    return site, nominal.chain(site, [])
+
+
+def test_projection_leaves_no_texture_and_no_slope_error(scene, tmp_path):
+    """Residuals made of a static albedo and a static slope error alone leave the dynamic rows empty."""
+    from stages.diagnose.projection import Projector
+
+    site, chain = _fitted(scene, tmp_path)
     east, north = chain.slope_tangents()
     torch.manual_seed(0)
     error = 0.05 * torch.randn(64, 64) * chain.textured + 0.02 * torch.randn(64, 64) * east
@@ -231,16 +237,9 @@ def test_projection_leaves_no_texture_and_no_slope_error(scene, tmp_path):
 def test_an_image_that_shows_next_to_nothing_moves_next_to_nothing(scene, tmp_path):
     """Three stray pixels of an image otherwise masked must not be explained by a shift of many pixels."""
     from stages.diagnose.columns import nuisance_columns
-    from stages.diagnose.data import group_pairs, load_site
-    from stages.diagnose.nominal import fit, load_nominal
     from stages.diagnose.projection import Local, Projector
-    from stages.network.dataset import PairReader
 
-    with PairReader(_pairs(scene, tmp_path, {})) as reader:
-        site = load_site(reader, group_pairs(reader, np.arange(reader.count), 16)[0])
-    nominal = load_nominal(None, "M2", "iof")
-    fit(nominal, [site], [], "iof", [site.image])
-    chain = nominal.chain(site, [])
+    site, chain = _fitted(scene, tmp_path)
     weight = site.valid / (0.02 * chain.textured.mean())
     first = torch.zeros_like(weight[0])
     first[10, 10] = first[30, 40] = first[50, 20] = 1e-3 * weight[0].max()
