@@ -9,7 +9,7 @@ pattern      a broad albedo pattern            plateau     highlights that are c
 looking      one look at all of that           naming      what deserves a name after it
 refining     the values that fit best          contest     nearly equal candidates, each tried in the model
 selection    name, refine, look again          state       what is known so far
-parallel     sites side by side
+parallel     sites side by side                numbers     tails of distributions
 unexplained  what is left, what is not seen    answer      verdict, JSON, diagnosis.h5      report   HTML
 """
 

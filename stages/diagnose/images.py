@@ -276,14 +276,4 @@ def spread(values: Tensor, evidence: ImageEvidence | None) -> float:
     return size * math.sqrt(together / (together - 1)) if together > 1 else size
 
 
-__all__ = [
-    "FEWEST",
-    "OVERSHOOT",
-    "PRIORS",
-    "SMALL",
-    "ImageEvidence",
-    "as_effect",
-    "gather_images",
-    "spread",
-    "weigh_images",
-]
+__all__ = ["FEWEST", "OVERSHOOT", "SMALL", "ImageEvidence", "as_effect", "gather_images", "spread", "weigh_images"]

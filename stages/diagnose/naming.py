@@ -33,8 +33,7 @@ RIVALS = 2
 FORMS = 0.7  # of the gain, above which another form of an effect is tried as well
 IMPERFECT = 0.04  # of a cause's size: so much of it its model may leave, which is no further cause ...
 IMPERFECT_SHIFTS = 0.06  # ... more after shifts, whose resampling blurs ...
-IMPERFECT_GAINS = 0.02  # ... and next to nothing after gains, which are what they are,
-IMPERFECT_COLUMNS = 0.05  # or a smooth response over columns
+IMPERFECT_GAINS = 0.02  # ... and less after gains, which are what they are
 # effect -> share of its size that a first look may see: texture and slopes take the rest
 UNDERRATED = {"psf_blur": 0.4}
 STANDS_OUT = 1.4  # rms of a pattern over what the texture's spectrum foretells
@@ -110,7 +109,7 @@ def _imperfect(cause: Cause) -> float:
         return IMPERFECT_SHIFTS
     if cause.effect.channel != "lit":
         return 0.0
-    return {"image_gain": IMPERFECT_GAINS, "column_pattern": IMPERFECT_COLUMNS}.get(cause.effect.name, IMPERFECT)
+    return IMPERFECT_GAINS if cause.effect.name == "image_gain" else IMPERFECT
 
 
 def _still(e: Evidence) -> bool:

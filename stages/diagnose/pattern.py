@@ -16,10 +16,8 @@ from stages.effects.albedo_map import ORDERS
 from stages.effects.fields import cosine_field
 
 LONGEST, SHORTEST = 6, 16  # half waves per crop between which the texture's own spectrum is taken
-LOG_OF_MEAN, LOG_SCATTER = (
-    1.27,
-    2.22,
-)  # a chi-square of one degree: log of its mean over the mean of its log; rms of its log
+LOG_OF_MEAN = 1.27  # of a chi-square of one degree, above the mean of its log
+LOG_SCATTER = 2.22  # rms of that log
 STEEPEST = -3.0  # of power against wave number: redder than any texture
 
 

@@ -51,10 +51,8 @@ def refine(state: Search, steps: int = 2, known: bool = True) -> None:
 
     known : a linear effect that is alone has the value that fits best already
     """
-    last = state.causes[-1:]
-    gains = (
-        [c for c in state.causes if c.effect.name == "image_gain"] if last and last[0].effect.scope == "scene" else []
-    )
+    beside = any(c.effect.scope == "scene" for c in state.causes[-1:])
+    gains = [c for c in state.causes if c.effect.name == "image_gain" and beside]
     for step in range(steps):
         state.fit(again=step > 0)
         every = state.each(lambda chain: _gather(state, chain))

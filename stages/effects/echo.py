@@ -37,6 +37,7 @@ class Echo(Effect):
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
+        # the nearest are there to lose to: blur and soft shadows, which look like them, would pass for an echo further off
         lags = [k for k in (2, 3, 4, 6, 8, 12, 16, 24) if k < survey.crop_px / 3]
         return [
             Trial(({"fraction": 0.03},), {"lag_px": float(sign * lag), "axis": float(axis)})
