@@ -16,7 +16,7 @@ from stages.physics.formation import State
 # What every data set has a little of, always fitted along, with the size that is ordinary (multiples of the column):
 # without a bound on it a strange amount of one imitates other effects.
 BASELINE = {"dem_smoothing": 0.7, "psf_blur": 0.4}
-RELIEF = (math.radians(4.0), math.radians(12.0))  # blur of a shadow's edge by relief, at a distance of one px
+RELIEF = (math.radians(6.0), math.radians(20.0))  # blur of a shadow's edge by relief, at a distance of one px
 MOST_BLUR = 0.3  # rad
 
 

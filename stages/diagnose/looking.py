@@ -162,7 +162,7 @@ def _disc(found: list[Evidence]) -> list[Evidence]:
 
     def whole(e: Evidence) -> float:
         amount = max(float(e.amount[0]), 0.1)
-        return e.gain * (2 * amount - 1) / amount**2
+        return e.gain * (2 * amount - 1) / amount**2 if e.gain > 0 else e.gain
 
     return [max(found, key=whole)]
 

@@ -36,6 +36,7 @@ IMPERFECT_SHIFTS = 0.06  # ... more after shifts, whose resampling blurs ...
 IMPERFECT_GAINS = 0.02  # ... and less after gains, which are what they are
 # effect -> share of its size that a first look may see: texture and slopes take the rest
 UNDERRATED = {"psf_blur": 0.4}
+FEW_PIXELS = ("penumbra",)  # seen in few pixels, and told from what is ordinary by its own value
 STANDS_OUT = 1.4  # rms of a pattern over what the texture's spectrum foretells
 
 
@@ -148,7 +149,8 @@ def worth(e: Evidence, seen: Round, count: int, data: Survey, ease: float = 1.0)
     if e.agreement < agree and not still and e.effect != "distant_shadow":
         return False
     firm = 0.0 if e.effect == "distant_shadow" else FIRM * e.gain_error  # a wall shades one image and spares the others
-    if e.gain < max(FLOOR_GAIN, firm) or (e.fid < floor_fid(data.slope) * math.sqrt(e.candidate.size) and not still):
+    small = e.fid < floor_fid(data.slope) * math.sqrt(e.candidate.size)
+    if e.gain < max(FLOOR_GAIN, firm) or (small and not still and e.effect not in FEW_PIXELS):
         return False
     (name, reference), *_ = e.candidate.trial.columns[0].items()
     unit = reference - cls.null()[name]
@@ -163,7 +165,7 @@ def worth(e: Evidence, seen: Round, count: int, data: Survey, ease: float = 1.0)
     if e.effect == "echo" and (value < 0 or abs(e.candidate.trial.fixed["lag_px"]) < CLEAR_LAG):
         return False  # near ones look like an imperfect point spread function, or like soft shadow edges
     if e.effect == "penumbra":
-        return value > BEYOND * e.candidate.trial.fixed["relief_deg"] + error
+        return value > (BEYOND * e.candidate.trial.fixed["relief_deg"]) ** 2 + error
     if e.effect == "dem_smoothing" and value < 0:  # no DEM is sharper than the ground
         return False
     if name in cls.tolerance:
@@ -235,4 +237,4 @@ def _as_good(first: Evidence, other: Evidence) -> bool:
     return float(difference.sum()) < 2 * error and other.gain > 0.5 * first.gain
 
 
-__all__ = ["SIMPLER", "choose", "floor_fid", "misaligned", "with_values", "worth", "worth_image"]
+__all__ = ["FEW_PIXELS", "SIMPLER", "choose", "floor_fid", "misaligned", "with_values", "worth", "worth_image"]

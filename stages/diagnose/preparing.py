@@ -26,6 +26,7 @@ QUIETEST = 0.002  # noise over mean brightness: an image that looks quieter is d
 SHOT = 0.8  # share of shot noise in the noise's variance at mean brightness
 EDGE = math.radians(6.0)  # relief below the DEM's resolution blurs shadows over a band like this ...
 DOUBT = 0.3  # ... by up to this share of the lit brightness
+FAR_OFF = 10.0  # px: shadows cast from nearer by show the relief that the DEM has not, and little else
 CAST = (math.radians(0.3), math.radians(24.0))  # the band about cast shadows: far away, and at a distance of one px
 
 
@@ -141,6 +142,7 @@ def _first_weight(chain: Chain, wide: bool) -> Tensor:
     doubt = DOUBT * (state.reflectance + 0.2 * mean)
     if wide and above is not None:  # the further away a shadow's edge begins the better its place is known
         far, near = CAST
+        use &= (above.abs() > EDGE) | (site.occluders() >= FAR_OFF)
         cast = torch.sqrt(far**2 + (near / site.occluders()) ** 2)
         own = torch.asin(mu0.clamp(-1, 1))
         variance = variance + (doubt * torch.exp(-own.abs() / EDGE)) ** 2

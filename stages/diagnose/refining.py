@@ -24,7 +24,7 @@ SETTLED = 0.002  # of a cause's gain: what gains less only drifts along what the
 # far from linear: the trial that fitted best is a better start than what a line through it says
 KEEP_TRIAL = ("distant_shadow", "saturation")
 SHAPES = ("h", "lag_px", "theta_bar_deg", "height_m")  # not more than half of themselves at a time
-STILL = ("axis", "side", "distance_px", "lag_px", "radius_deg", "relief_deg")  # found by the search alone
+STILL = ("axis", "side", "distance_px", "lag_px", "disc_deg2", "relief_deg")  # found by the search alone
 
 
 def start(evidence: Evidence, data: Survey) -> tuple[Effect, dict[str, float]]:

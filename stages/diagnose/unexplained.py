@@ -9,7 +9,7 @@ import torch
 
 from stages.diagnose.images import FEWEST
 from stages.diagnose.looking import Round
-from stages.diagnose.naming import floor_fid
+from stages.diagnose.naming import FEW_PIXELS, floor_fid
 from stages.diagnose.preparing import Remains
 from stages.diagnose.state import Search
 from stages.effects import effect_names, get_effect
@@ -115,9 +115,9 @@ def _would_show(name: str, state: Search, seen: Round) -> bool:
     unit = abs(reference - cls.null()[coordinate])
     error = unit * math.sqrt(max(float(e.covariance[0, 0]), 0.0))
     size = abs(cls.strong[coordinate] - cls.null()[coordinate]) or unit
-    if cls.channel in ("lit", "edge") and e.unit * size / unit < floor_fid(state.data.slope):
+    if cls.channel in ("lit", "edge") and name not in FEW_PIXELS and e.unit * size / unit < floor_fid(state.data.slope):
         return False
     least = cls.tolerance.get(coordinate, 0.0)
     if name == "penumbra":
-        least = BEYOND * e.candidate.trial.fixed["relief_deg"] - cls.null()[coordinate]
+        least = (BEYOND * e.candidate.trial.fixed["relief_deg"]) ** 2 - cls.null()[coordinate]
     return error * SEE < size - least

@@ -12,11 +12,10 @@ from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation import State
 from stages.physics.photometry import Parameter
 
-# Relief below the DEM's resolution blurs far shadows like a disc of this radius, deg, and more on rugged ground:
-# by so much per change of slope over a pixel (Laplacian of the heights after a 2 px blur, times the pixel).
-RELIEF, PER_BEND = 0.9, 26.0
-BEYOND = 2.25  # times that: what some ground does alone, so that a wide Sun must do more
-RELIEF_SPREAD = 0.25  # standard deviation of that, as a share, from one piece of ground to the next
+# Relief below the DEM's resolution blurs shadows cast from afar like a disc of this radius, deg, ...
+RELIEF = 0.75
+RELIEF_SPREAD = 0.25  # ... with this standard deviation, as a share, from one piece of ground to the next
+BEYOND = 1.4  # times that: what some ground does alone, so that a wide Sun must do more
 
 
 @register
@@ -34,17 +33,17 @@ class Penumbra(Effect):
     separate = "an image with the Sun low enough to cast long shadows"
     parameters = (Parameter("radius_deg", "degree", 0.02, 3.0, 0.2666, "effective angular radius of the Sun"),)
     coordinates = (
-        *parameters,
         Parameter(
-            "relief_deg", "degree", 0.0, 30.0, 0.0, "disc that relief alone makes of the Sun: in radius_deg as fitted"
+            "disc_deg2", "degree^2", 4e-4, 12.0, 0.2666**2, "square of the radius that shadows show: squares add"
         ),
+        Parameter("relief_deg", "degree", 0.0, 30.0, 0.0, "disc that relief alone makes of the Sun: in disc_deg2"),
     )
-    strong: ClassVar = {"radius_deg": 2.0}
+    strong: ClassVar = {"disc_deg2": 4.0}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
-        relief = max(RELIEF, PER_BEND * survey.curvature[1] * survey.gsd)
-        return [Trial(({"radius_deg": r},), {"relief_deg": relief}) for r in (0.45, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0)]
+        radii = (0.45, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0)
+        return [Trial(({"disc_deg2": r * r},), {"relief_deg": RELIEF}) for r in radii]
 
     @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:
@@ -52,13 +51,11 @@ class Penumbra(Effect):
 
     @classmethod
     def report(cls, values: Mapping[str, float], errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-        """The Sun's radius, deg: variances of discs add, and relief has its share."""
-        radius, relief, least = values["radius_deg"], values["relief_deg"], cls.null()["radius_deg"]
-        if relief == 0:
-            return {"radius_deg": (radius, errors.get("radius_deg", 0.0))}
-        sun = math.sqrt(max(radius**2 - relief**2 + least**2, least**2))
-        error = math.hypot(radius * errors.get("radius_deg", 0.0), relief**2 * RELIEF_SPREAD) / sun
+        """The Sun's radius, deg: what shadows show, without relief's share of it."""
+        square, relief, least = values["disc_deg2"], values["relief_deg"], cls.null()["disc_deg2"]
+        sun = math.sqrt(max(square - relief**2 + (least if relief else 0.0), least if relief else 0.0))
+        error = math.hypot(errors.get("disc_deg2", 0.0), 2 * relief**2 * RELIEF_SPREAD) / (2 * sun)
         return {"radius_deg": (sun, error)}
 
     def apply(self, state: State) -> None:
-        state.sun_radius = torch.deg2rad(self.value("radius_deg", state)).clamp(min=1e-4)
+        state.sun_radius = torch.deg2rad(self.value("disc_deg2", state).clamp(min=1e-6).sqrt()).clamp(min=1e-4)
