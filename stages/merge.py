@@ -62,7 +62,8 @@ def run(
     """Join ``parts``, in the order of their shards. Raises ArtefactError where they are not parts of one whole.
 
     virtual : large variables stay in the parts, which the output then needs; inputs : what the whole says it was made
-    from, in place of its parts; geotiff : where the GeoTIFF of a map goes, beside the output where None
+    from, in place of its parts; geotiff : where the GeoTIFF of a map goes (if its parts want one), beside the
+    output where None
     """
     schema = read_kind(parts[0])
     if schema.name not in (*RECORD, *MAPS):
@@ -70,8 +71,6 @@ def run(
             f"{parts[0]}: a '{schema.name}' has no parts to merge; parts are: {', '.join((*RECORD, *MAPS))}."
         )
     tiff = geotiff or output.with_suffix(".tif")
-    if schema.name in MAPS:
-        check_output(tiff, parts, overwrite)
     with contextlib.ExitStack() as stack:
         files = [stack.enter_context(open_artefact(p, schema)) for p in parts]
         order = sorted(range(len(files)), key=lambda k: _shard(files[k])[0])
@@ -90,6 +89,9 @@ def run(
         if "scene" in attributes:
             attributes["scene"] = _moved(str(attributes["scene"]), parts[0], output)
         config = read_config(files[0]) | {"shard": [0, 1]}
+        as_geotiff = schema.name in MAPS and config.get("geotiff", True)
+        if as_geotiff:
+            check_output(tiff, parts, overwrite)
         if inputs is None and len(files) > 1 and _shard(files[0])[1] > 1:
             # shards of one run: the whole is what that run in one piece would have made, from the same inputs
             attributes |= {k: files[0].attrs[k] for k in ("inputs", "provenance", "folder") if k in files[0].attrs}
@@ -145,7 +147,7 @@ def run(
                     target[...] = _known(files, name)
             if "path" in names and record == "frame":
                 _move_paths(files, parts, writer.file, output)
-            if schema.name in MAPS:
+            if as_geotiff:
                 with atomic_path(tiff) as partial:
                     write_geotiff(partial, writer.file, read_grid(writer.file, output))
             if progress:

@@ -102,6 +102,21 @@ def test_geotiff_aligns_with_the_dem_and_says_what_it_holds(small_files, small_a
         np.testing.assert_array_equal(tiff.read(1, masked=True).mask, dem.read(1, masked=True).mask)
 
 
+def test_without_a_geotiff_the_map_is_the_same(small_artefacts, checkpoint, tmp_path):
+    infer.run(small_artefacts["scene"], checkpoint, tmp_path / "both.h5", infer.Config(**FULL))
+    alone = {**FULL, "geotiff": False}
+    infer.run(small_artefacts["scene"], checkpoint, tmp_path / "alone.h5", infer.Config(**alone))
+    parts = [tmp_path / f"part{k}.h5" for k in range(2)]
+    for k, part in enumerate(parts):
+        infer.run(small_artefacts["scene"], checkpoint, part, infer.Config(window=100, shard=(k, 2), **alone))
+    merge.run(parts, tmp_path / "merged.h5")
+    assert [p.name for p in tmp_path.glob("*.tif")] == ["both.tif"]
+    with h5py.File(tmp_path / "both.h5") as both:
+        for name in ("alone", "merged"):
+            with h5py.File(tmp_path / f"{name}.h5") as file:
+                np.testing.assert_array_equal(file["coefficients"][...], both["coefficients"][...])
+
+
 def test_svbrdf_opens_in_xarray_with_coordinates(small_artefacts, checkpoint, tmp_path):
     xarray = pytest.importorskip("xarray")
     infer.run(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", infer.Config(**FULL))

@@ -109,7 +109,8 @@ def run_infer(
     terrain, checkpoint, tiff = terrain.resolve(), checkpoint.resolve(), geotiff or output.with_suffix(".tif")
     with _job(output, "infer", config, parts, [terrain, checkpoint], (), how, {"gridding": gridding}) as job:
         replace_tiff = how["overwrite"] or job.again  # an interrupted run may have got as far as that
-        check_output(tiff, [terrain, checkpoint, output], replace_tiff)
+        if config.geotiff:
+            check_output(tiff, [terrain, checkpoint, output], replace_tiff)
         scene = terrain
         if gridding is not None:
             scene = job.folder / "scene.h5"
@@ -118,7 +119,7 @@ def run_infer(
         bands = infer.count_bands(scene, config)
         cut = _cut(config, parts or math.ceil(bands / BANDS_OF_MAP), bands)
         pieces = job.fan("map", infer_part, [{"scene": scene, "checkpoint": checkpoint, "config": c} for c in cut])
-        if replace_tiff:
+        if config.geotiff and replace_tiff:
             tiff.unlink(missing_ok=True)
         merge.run(pieces, output, how["overwrite"], job.progress, inputs=[terrain, checkpoint], geotiff=tiff)
     return infer.summarise(output, len(pieces))

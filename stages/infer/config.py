@@ -10,7 +10,8 @@ from stages.physics.grid import Grid
 @dataclass(frozen=True)
 class Config:
     """window, stride : px; windows overlap by their difference and are blended; None: as large as the machine likes best;
-    offset : px, shifts their grid; precision : fp32, bf16, or auto (see ``stages.network.runtime``).
+    offset : px, shifts their grid; precision : fp32, bf16, or auto (see ``stages.network.runtime``); geotiff : whether the
+    map is written as a GeoTIFF as well.
     """
 
     window: int | None = None
@@ -20,6 +21,7 @@ class Config:
     precision: str = "fp32"
     any_gsd: bool = False
     shard: tuple[int, int] = (0, 1)
+    geotiff: bool = True
 
 
 @dataclass(frozen=True)

@@ -56,11 +56,12 @@ def run(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Summary:
-    """Write ``svbrdf.h5`` and, beside it or at ``geotiff``, a cloud-optimised GeoTIFF. Raises ConfigError, ArtefactError."""
+    """Write ``svbrdf.h5`` and, beside it or at ``geotiff``, a cloud-optimised GeoTIFF if wanted. Raises ConfigError, ArtefactError."""
     window_and_stride(config)
     tiff = geotiff or output.with_suffix(".tif")
     check_output(output, [scene, checkpoint], overwrite)
-    check_output(tiff, [scene, checkpoint, output], overwrite)
+    if config.geotiff:
+        check_output(tiff, [scene, checkpoint, output], overwrite)
     device = choose_device(config.device)
     keep_freed_memory()
     predictor = load_predictor(checkpoint, device)
@@ -101,7 +102,9 @@ def run(
             writer.write("coefficient_name", names)
             mapper = Mapper(predictor, device, precision, torch.get_num_threads())
             picture = None
-            if config.shard[1] == 1:  # a shard holds some rows only; the GeoTIFF is made of the merged whole
+            if (
+                config.geotiff and config.shard[1] == 1
+            ):  # a shard holds some rows only; the GeoTIFF is made of the merged whole
                 partial = stack.enter_context(atomic_path(tiff))
                 picture = stack.enter_context(MapTiff(partial, grid, names, attributes))
             windows = _predict(file, writer, picture, mapper, config, progress)

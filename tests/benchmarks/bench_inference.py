@@ -185,6 +185,7 @@ def main() -> None:
             f"`lunargr infer` of {Path(source).suffix}": [*command, "infer", source, str(checkpoint), "-o", out, "--overwrite", "--quiet"]
             for source in (scene, str(dem))
         }  # fmt: skip
+        infer["... without the GeoTIFF"] = [*infer["`lunargr infer` of .h5"], "--no-geotiff"]
         for _ in range(ROUNDS):
             for name, line in infer.items():
                 for _ in range(4):
