@@ -35,15 +35,15 @@ def contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
             refine(state, 3 if rivals[0].effect.displaces else 2)
         return rivals[0]
     per_image = [k for k, c in enumerate(rivals) if c.effect.scope == "image"]  # free to follow any junk at the edges
-    moves = any(c.effect.name in MOVES_SHADOWS for c in rivals) and not per_image
-    works = seen.edges if moves else seen.works
-    before, nothing = state.save(), misfit(state, works, moves)
+    moves = any(c.effect.name in MOVES_SHADOWS for c in rivals)
+    edges = moves and not per_image
+    before, nothing = state.save(), _left(state, seen, edges)
     tried: list[tuple[float, int, Saved]] = []
     for cause in rivals:
         state.load(before)
         state.causes.append(cause)
         refine(state, 2 if cause.effect.displaces else 1)
-        tried.append((nothing - misfit(state, works, moves), _freedom(cause), state.save()))
+        tried.append((nothing - _left(state, seen, edges), _freedom(cause), state.save()))
     scene_wide = [c for c in rivals if c.effect.scope == "scene"]
     if per_image and len(per_image) < len(rivals):  # a number for each image must do much better than one for all
         alone = max(tried[k][0] for k in range(len(rivals)) if k not in per_image)
@@ -51,6 +51,12 @@ def contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
         drop = alone > (1 - MUCH) * single
         keep = [k for k in range(len(rivals)) if (k in per_image) != drop]
         rivals, tried = [rivals[k] for k in keep], [tried[k] for k in keep]
+        if drop and moves and len(rivals) > 1:
+            state.load(before)
+            nothing = _left(state, seen, edges=True)
+            for k, (_, freedom, saved) in enumerate(tried):
+                state.load(saved)
+                tried[k] = (nothing - _left(state, seen, edges=True), freedom, saved)
     most = max(worth for worth, _, _ in tried)
     # a superset of another effect always does a little better; where much is explained, a little is much
     least = most - min((1 - SIMPLER) * abs(most), SLIGHT * max(nothing - most, 0.0))
@@ -70,6 +76,11 @@ def contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
         *(n for n in cause.group[1:] if n not in names),
     ]
     return cause
+
+
+def _left(state: Search, seen: Round, edges: bool) -> float:
+    """Sum of squares that the model leaves, with the pixels about shadow edges or without."""
+    return misfit(state, seen.edges if edges else seen.works, edges)
 
 
 def instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) -> bool:
