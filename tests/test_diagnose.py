@@ -189,6 +189,17 @@ def test_too_few_pixels_cannot_tell(scene, tmp_path):
     assert answer.verdict == "cannot_tell" and not answer.causes and "too few" in answer.sentence()
 
 
+def test_sites_may_have_unequal_numbers_of_images(scene, tmp_path):
+    """Stacks from a real archive: maps of slope errors come from the sites with enough images alone."""
+    data = scene.make(Truth(effect={"dem_smoothing": {"sigma2_px2": 1.5}}), 11)
+    first = np.flatnonzero(data["site"] == data["site"].min())
+    keep = np.setdiff1d(np.arange(len(data["site"])), first[3:])
+    fewer = {name: np.asarray(values)[keep] for name, values in data.items()}
+    answer = diagnose.run(write_pairs(tmp_path / "pairs.h5", fewer, scene.layout)).answer
+    assert answer.pairs == int((fewer["split"] == 0).sum())
+    assert [c.effect.name for c in answer.causes] == ["dem_smoothing"]
+
+
 def test_a_model_that_does_not_fit_names_nothing(scene, tmp_path):
     path = _pairs(scene, tmp_path, {})
     with h5py.File(path, "a") as file:

@@ -140,7 +140,7 @@ def _reduce(
     site = work.chain.site
     size = min(BLOCK, max(8, min(site.image.shape[-2:]) // 4))
     products = [_block_products(rows, size) for every in (dynamic, static) for rows in every.unbind(1)]
-    per_map = len(products[0])
+    per_map = len(products[0]) if products else 0  # a site with few images has no map of slopes
     image = np.concatenate(
         [np.repeat(site.frames[: dynamic.shape[1]], per_map), np.full(static.shape[1] * per_map, -1)]
     )
@@ -148,7 +148,7 @@ def _reduce(
     # an image's faults are known for all of its sites, yet each site has a DEM error of its own
     image = image + FRAMES * site.number
     return Statistics(
-        list(candidates), list(names), torch.tensor(bound, dtype=torch.float64), torch.cat(products).double(),
+        list(candidates), list(names), torch.tensor(bound, dtype=torch.float64), torch.cat(products or [dynamic.new_zeros(0, len(dynamic), len(dynamic))]).double(),
         image, place, float(max(work.projector.dynamic_rows, 1)),
     )  # fmt: skip
 
