@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -47,13 +48,21 @@ def open_raster(path: Path, what: str = "a raster") -> Iterator[DatasetReader]:
         raise InputError(
             f"{path}: expected {what} that GDAL reads, found something else ({_one_line(error)})."
         ) from None
-    with dataset:
-        try:
+    try:
+        with dataset:
             yield dataset
-        except RasterioError as error:
-            raise InputError(
-                f"{path}: cannot be read to the end ({_one_line(error)}); the file is damaged or truncated, fetch it again."
-            ) from None
+    except RasterioError as error:
+        raise InputError(
+            f"{path}: cannot be read to the end ({_one_line(error)}); the file is damaged or truncated, fetch it again."
+        ) from None
+    finally:
+        _return_freed_memory()
+
+
+def _return_freed_memory() -> None:
+    """Give the pieces back that a raster's blocks leave in glibc's heap: it would grow by 0.1 GB with every image."""
+    with contextlib.suppress(OSError, AttributeError):  # another C library, which has no such call
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _one_line(error: BaseException) -> str:

@@ -130,16 +130,19 @@ class Bench:
 
         return self.file(f"ground-{edge}.h5", write)
 
-    def scene(self) -> Path:
-        """A strip of ground under four long images."""
+    def scene(self, images: int = 4, lines: int = 25000) -> Path:
+        """A strip of ground under a few long images, or under many shorter ones."""
+        table = self.table(lines, images)
+        name = "scene.h5" if images == 4 else f"scene-{images}.h5"
         return self.file(
-            "scene.h5",
-            lambda p: make.lunargr("ingest", self.ground(6000), "--images", self.table(25000, 4), "-o", p, "--quiet"),
+            name, lambda p: make.lunargr("ingest", self.ground(6000), "--images", table, "-o", p, "--quiet")
         )
 
-    def crops(self, count: int) -> Path:
+    def crops(self, count: int, images: int = 4, lines: int = 25000) -> Path:
+        scene = self.scene(images, lines)
         options = ["--crop", CROP, "--count", count, "--tile-m", 2000, "--quiet"]
-        return self.file(f"crops-{count}.h5", lambda p: make.lunargr("sample", self.scene(), *options, "-o", p))
+        name = f"crops-{count}.h5" if images == 4 else f"crops-{count}-{images}.h5"
+        return self.file(name, lambda p: make.lunargr("sample", scene, *options, "-o", p))
 
     def some_pairs(self) -> Path:
         return self.file("pairs.h5", lambda p: make.lunargr("project", self.crops(256), "-o", p, "--quiet"))
@@ -206,6 +209,10 @@ STAGES = {
     "project": Stage(
         "pairs", "thousand pairs", (250, 500, 1000), (1000, 4000, 20000),
         lambda b, n: ["project", b.crops(n)], one,
+    ),
+    "project images": Stage(
+        "images of 6,000 lines, 100 pairs of each", "images", (8, 16, 32), (16, 64, 256),
+        lambda b, n: ["project", b.crops(100 * n, n, 6000)], float,
     ),
     "train": Stage(
         "pairs, one epoch of a small network", "thousand pairs", (1024, 2048, 4096), (10240, 40960, 102400),
