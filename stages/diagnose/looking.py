@@ -64,7 +64,8 @@ class _Seen:
     ground: Statistics | None = None
     relief: list[Relief] = field(default_factory=list)
     wide: Remains | None = None
-    edges: Statistics | None = None
+    walls: Statistics | None = None
+    discs: Statistics | None = None
 
 
 def look(state: Search, names: Sequence[str]) -> Round:
@@ -74,7 +75,10 @@ def look(state: Search, names: Sequence[str]) -> Round:
     edge = [n for n, c in kinds.items() if c.channel == "edge"]
     albedo = [n for n, c in kinds.items() if c.channel == "albedo" and c.scope == "scene"]
     relief = [n for n in ALONG if n in kinds and state.deepest >= FREE_SLOPES]
-    candidates, at_edge = make_candidates(lit, state.data), make_candidates(edge, state.data)
+    candidates = make_candidates(lit, state.data)
+    walls, discs = (
+        make_candidates([n for n in edge if (n == "distant_shadow") == w], state.data) for w in (True, False)
+    )
     on_ground = make_candidates(albedo, state.data)
     images = [n for n, c in kinds.items() if c.scope == "image"]
 
@@ -86,10 +90,14 @@ def look(state: Search, names: Sequence[str]) -> Round:
             columns = [c for e in on_ground for c in trial_columns(chain, e.effect, e.trial, state.data)]
             seen.ground = gather_static(work, on_ground, columns)
         seen.relief = [open_relief(work, name, state.data) for name in relief]
-        if at_edge:
+        if discs:
+            far = ready(chain, state.dn, wide=True, far=True)
+            seen.discs = gather_site(far, discs, state.data, [relief_blur(chain)])
+        if edge:
             wide = ready(chain, state.dn, wide=True)
-            seen.edges = gather_site(wide, at_edge, state.data, [relief_blur(chain)])
             seen.wide = wide.remains()
+            if walls:
+                seen.walls = gather_site(wide, walls, state.data, [relief_blur(chain)])
         return seen
 
     title = f"looking for causes, round {len(state.causes) + 1}"
@@ -106,8 +114,10 @@ def look(state: Search, names: Sequence[str]) -> Round:
         # judged beside a DEM smoother than the ground, if the maps of slopes show one: no DEM is sharper than the ground
         drop = [] if _smooth(state, evidence) else ["dem_smoothing"]
         evidence += weigh(without(blurred, drop, blurred.candidates))
-    if at_edge:
-        evidence += _weigh_edges(state, join([s.edges for s in every if s.edges is not None]))
+    if discs:
+        evidence += _disc(weigh(join([s.discs for s in every if s.discs is not None])))
+    if walls:
+        evidence += _wall(state, weigh(join([s.walls for s in every if s.walls is not None])))
     evidence = [e for e in evidence if _plausible(e, state)]
     pattern = weigh_pattern(works) if "albedo_map" in kinds else None
     return Round(
@@ -140,20 +150,6 @@ def align(state: Search) -> ImageEvidence | None:
     return first
 
 
-def _weigh_edges(state: Search, data: Statistics) -> list[Evidence]:
-    """Walls and a wide Sun, both beside the blur of shadows that relief makes."""
-    discs = [c for c in data.candidates if c.effect != "distant_shadow"]
-    walls = [c for c in data.candidates if c.effect == "distant_shadow"]
-    found = _disc(weigh(without(data, [], discs))) if discs else []
-    if walls:
-        weighed = weigh(without(data, [], walls))
-        top = max(weighed, key=lambda e: e.gain)
-        found += [top]
-        if top.gain > 12 and float(top.amount[0]) > 0.005 and top.fid > 0.015:
-            found += _climb(state, top)
-    return found
-
-
 def _disc(found: list[Evidence]) -> list[Evidence]:
     """The guise that fits best as what it says: a disc of its radius in full, not a share of a wider one, as relief is.
 
@@ -165,6 +161,13 @@ def _disc(found: list[Evidence]) -> list[Evidence]:
         return e.gain * (2 * amount - 1) / amount**2 if e.gain > 0 else e.gain
 
     return [max(found, key=whole)]
+
+
+def _wall(state: Search, found: list[Evidence]) -> list[Evidence]:
+    """The best wall, and where there may be one the best of a finer ladder about it."""
+    top = max(found, key=lambda e: e.gain)
+    seen = top.gain > 12 and float(top.amount[0]) > 0.005 and top.fid > 0.015
+    return [top, *(_climb(state, top) if seen else [])]
 
 
 def _climb(state: Search, top: Evidence) -> list[Evidence]:

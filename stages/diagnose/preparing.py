@@ -61,10 +61,13 @@ class Remains:
     dynamic: Tensor
 
 
-def ready(chain: Chain, dn: bool, wide: bool = False) -> SiteWork:
-    """Weights from the residual's own scatter, the projector, the texture. ``wide`` keeps the pixels about shadow edges."""
+def ready(chain: Chain, dn: bool, wide: bool = False, far: bool = False) -> SiteWork:
+    """Weights from the residual's own scatter, the projector, the texture.
+
+    wide : keeps the pixels about shadow edges; far : of these, only where the shadow is cast from afar
+    """
     site = chain.site
-    weight = _first_weight(chain, wide)
+    weight = _first_weight(chain, wide, far)
     residual = torch.where(site.valid, site.image - chain.textured, 0.0)
     level = (chain.textured * site.valid).sum((-2, -1)) / site.valid.sum((-2, -1)).clamp(min=1)
     most = 1 / (QUIETEST * level.clamp(min=1e-6))[:, None, None]
@@ -121,7 +124,7 @@ def left_over(chain: Chain, weight: Tensor, dn: bool, extra: Sequence[Tensor] = 
     return float(left @ left) - cross**2 / energy
 
 
-def _first_weight(chain: Chain, wide: bool) -> Tensor:
+def _first_weight(chain: Chain, wide: bool, far_off: bool = False) -> Tensor:
     """1 / expected noise, (n, H, W): shot and read noise, and doubt where shadows end."""
     site, state = chain.site, chain.state
     predicted = chain.textured
@@ -142,7 +145,8 @@ def _first_weight(chain: Chain, wide: bool) -> Tensor:
     doubt = DOUBT * (state.reflectance + 0.2 * mean)
     if wide and above is not None:  # the further away a shadow's edge begins the better its place is known
         far, near = CAST
-        use &= (above.abs() > EDGE) | (site.occluders() >= FAR_OFF)
+        if far_off:
+            use &= (above.abs() > EDGE) | (site.occluders() >= FAR_OFF)
         cast = torch.sqrt(far**2 + (near / site.occluders()) ** 2)
         own = torch.asin(mu0.clamp(-1, 1))
         variance = variance + (doubt * torch.exp(-own.abs() / EDGE)) ** 2
