@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 
+from torch import Tensor
+
 from stages.diagnose.answer import parameters
 from stages.diagnose.columns import free_coordinates
 from stages.diagnose.looking import Round, look, misfit
 from stages.diagnose.naming import FLOOR_GAIN, GATE, SIMPLER, UNDERRATED, choose
 from stages.diagnose.numbers import f_tail
-from stages.diagnose.refining import refine
+from stages.diagnose.refining import gains_left, refine
 from stages.diagnose.state import Cause, Saved, Search
 from stages.effects import get_effect
 
@@ -18,6 +20,7 @@ FOR_FREE = 2.0  # of the sum of squares, that each coordinate gains by itself (A
 FEWER = 4  # coordinates less, which make up for doing slightly worse
 SLIGHT = 0.0005  # of what is left: by so much a simpler cause may do worse
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
+TESTS = 2  # of whether scene-wide causes do as well as gains
 PAIR = 2  # scene-wide causes that are tried together in the place of gains
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
 PROMISE = 0.15  # share of the foretold gain that a cause must bring once it is in the model ...
@@ -86,10 +89,12 @@ def _left(state: Search, seen: Round, edges: bool) -> float:
 def instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) -> bool:
     """Gains of images can stand for any scene-wide causes that act by image; whether such causes, up to two, do as well.
 
-    A few numbers for all images against one for each: an F test over the images of what the gains gain. The state holds
-    the scene-wide causes afterwards if so (true gains may then come on top), and the gains if not.
+    A few numbers for all images against one for each: an F test over the images of what the gains gain, and one of the
+    gains themselves, each image counting alike: known to a thousandth, a dark image's gain says as much as a bright one's.
+    The state holds the scene-wide causes afterwards if so (true gains may then come on top), and the gains if not.
     """
     gains, with_gains, rms = state.causes[-1], state.save(), state.residual_rms()
+    scatter, count = _scatter(gains.effect.values["gain"])
     possible = nothing - misfit(state, seen.works)
     images = _effective_images(seen)
     state.load(before)
@@ -107,11 +112,27 @@ def instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) 
         names.remove(cause.effect.name)
         freedom += len(free_coordinates(cause.effect))
         share = (nothing - misfit(state, seen.works)) / possible
-        rest = images - 1 - freedom
-        if share >= 1 or (rest > 0 and f_tail(share / (1 - share) * rest / freedom, freedom, rest) < GATE / choices):
+        if share >= 1 or _explained(share, freedom, images) < GATE / (TESTS * choices):
+            return True
+        taken = 1 - _scatter(gains_left(state, gains.effect.name))[0] / scatter
+        if _explained(taken, freedom, count) < GATE / (TESTS * choices):
             return True
     state.load(with_gains)
     return False
+
+
+def _scatter(gains: Tensor) -> tuple[float, int]:
+    """(mean square of the known gains about their mean, how many there are)"""
+    known = gains[gains != 0]
+    return float(known.var(correction=0)) if len(known) > 1 else 0.0, len(known)
+
+
+def _explained(share: float, freedom: int, images: float) -> float:
+    """Chance that ``freedom`` coordinates explain this share of the variance of as many images' values."""
+    rest = images - 1 - freedom
+    if rest <= 0 or share <= 0:
+        return 1.0
+    return f_tail(share / max(1 - share, 1e-9) * rest / freedom, freedom, rest)
 
 
 def _effective_images(seen: Round) -> float:

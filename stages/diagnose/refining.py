@@ -12,7 +12,15 @@ from torch import Tensor
 from stages.diagnose.chain import Chain
 from stages.diagnose.columns import derivative_step, relief_blur
 from stages.diagnose.evidence import Evidence
-from stages.diagnose.images import OVERSHOOT, SMALL, ImageProducts, as_effect, gather_images, weigh_images
+from stages.diagnose.images import (
+    OVERSHOOT,
+    SMALL,
+    ImageEvidence,
+    ImageProducts,
+    as_effect,
+    gather_images,
+    weigh_images,
+)
 from stages.diagnose.preparing import ready
 from stages.diagnose.relief import Relief, named_relief, weigh_relief
 from stages.diagnose.state import Cause, Search
@@ -81,11 +89,21 @@ def _follow(state: Search, gains: Cause) -> None:
     Together with a cause that they can nearly stand for they have no evidence of their own, and a prior would hold them.
     """
     state.fit(again=True)
-    name = gains.effect.name
+    found = _given_the_rest(state, gains.effect.name)
+    if found is not None:
+        gains.effect = as_effect(found, gains.effect, state.data)
+
+
+def gains_left(state: Search, name: str) -> Tensor:
+    """(frames,) the gains that the images still need beside the causes as they are; 0 where nothing is known."""
+    found = _given_the_rest(state, name)
+    return torch.zeros(state.frames) if found is None else found.values[:, 0]
+
+
+def _given_the_rest(state: Search, name: str) -> ImageEvidence | None:
+    """Evidence for further values per image of an effect, all scene-wide causes held as they are."""
     every = state.each(lambda chain: gather_images(ready(chain, state.dn), [name], state.dn, state.data, held=True))
-    found = weigh_images(every, state.frames)
-    if name in found:
-        gains.effect = as_effect(found[name], gains.effect, state.data)
+    return weigh_images(every, state.frames).get(name)
 
 
 def _gather(state: Search, chain: Chain) -> tuple[Statistics, list[Relief], ImageProducts | None]:
@@ -159,4 +177,4 @@ def _move(cause: Cause, names: Sequence[str], delta: Tensor, error: Tensor, alon
     cause.effect = moved
 
 
-__all__ = ["refine", "solve_nuisance", "start"]
+__all__ = ["gains_left", "refine", "solve_nuisance", "start"]
