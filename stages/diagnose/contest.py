@@ -183,7 +183,13 @@ def kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> bo
     if cause.effect.channel == "edge":  # judged in pixels that are masked here
         return not worse
     promised = cause.gain if cause.promised is None else cause.promised
-    return nothing - misfit(state, seen.works) > (0.0 if cause.effect.name in ALSO_STILL else PROMISE * 2 * promised)
+    left = misfit(state, seen.works)
+    if (
+        cause.effect.name in ALSO_STILL
+    ):  # nothing to see in moving rows where the ground's own maps are much sharper than the images
+        better = cause.rms_after * WORSE < cause.rms_before
+        return nothing > left or (better and left - nothing < SLIGHT * left)
+    return nothing - left > PROMISE * 2 * promised
 
 
 def ordinary(cause: Cause) -> bool:
