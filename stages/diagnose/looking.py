@@ -76,9 +76,8 @@ def look(state: Search, names: Sequence[str]) -> Round:
     albedo = [n for n, c in kinds.items() if c.channel == "albedo" and c.scope == "scene"]
     relief = [n for n in ALONG if n in kinds and state.deepest >= FREE_SLOPES]
     candidates = make_candidates(lit, state.data)
-    walls, discs = (
-        make_candidates([n for n in edge if (n == "distant_shadow") == w], state.data) for w in (True, False)
-    )
+    walls = make_candidates([n for n in edge if n == "distant_shadow"], state.data)
+    discs = make_candidates([n for n in edge if n != "distant_shadow"], state.data)
     on_ground = make_candidates(albedo, state.data)
     images = [n for n, c in kinds.items() if c.scope == "image"]
 
@@ -90,7 +89,7 @@ def look(state: Search, names: Sequence[str]) -> Round:
             columns = [c for e in on_ground for c in trial_columns(chain, e.effect, e.trial, state.data)]
             seen.ground = gather_static(work, on_ground, columns)
         seen.relief = [open_relief(work, name, state.data) for name in relief]
-        if discs:
+        if discs:  # before the others: they leave the texture to them
             far = ready(chain, state.dn, wide=True, far=True)
             seen.discs = gather_site(far, discs, state.data, [relief_blur(chain)])
         if edge:

@@ -124,7 +124,7 @@ def left_over(chain: Chain, weight: Tensor, dn: bool, extra: Sequence[Tensor] = 
     return float(left @ left) - cross**2 / energy
 
 
-def _first_weight(chain: Chain, wide: bool, far_off: bool = False) -> Tensor:
+def _first_weight(chain: Chain, wide: bool, far: bool) -> Tensor:
     """1 / expected noise, (n, H, W): shot and read noise, and doubt where shadows end."""
     site, state = chain.site, chain.state
     predicted = chain.textured
@@ -144,10 +144,10 @@ def _first_weight(chain: Chain, wide: bool, far_off: bool = False) -> Tensor:
         use &= (rising > cut) | _inner_shadow(chain, SHORE)
     doubt = DOUBT * (state.reflectance + 0.2 * mean)
     if wide and above is not None:  # the further away a shadow's edge begins the better its place is known
-        far, near = CAST
-        if far_off:
+        if far:
             use &= (above.abs() > EDGE) | (site.occluders() >= FAR_OFF)
-        cast = torch.sqrt(far**2 + (near / site.occluders()) ** 2)
+        afar, near = CAST
+        cast = torch.sqrt(afar**2 + (near / site.occluders()) ** 2)
         own = torch.asin(mu0.clamp(-1, 1))
         variance = variance + (doubt * torch.exp(-own.abs() / EDGE)) ** 2
         variance = variance + (doubt * torch.exp(-above.abs() / cast)) ** 2
