@@ -9,7 +9,7 @@ from torch import Tensor
 from stages.diagnose.answer import parameters
 from stages.diagnose.columns import free_coordinates
 from stages.diagnose.looking import Round, look, misfit
-from stages.diagnose.naming import FLOOR_GAIN, GATE, SIMPLER, UNDERRATED, choose
+from stages.diagnose.naming import FLOOR_GAIN, GATE, MOVES_SHADOWS, SIMPLER, UNDERRATED, choose
 from stages.diagnose.numbers import f_tail
 from stages.diagnose.refining import gains_left, refine
 from stages.diagnose.state import Cause, Saved, Search
@@ -19,7 +19,6 @@ MUCH = 0.05  # of what it explains: by so much a cause for each image must do be
 FOR_FREE = 2.0  # of the sum of squares, that each coordinate gains by itself (Akaike 1974)
 FEWER = 4  # coordinates less, which make up for doing slightly worse
 SLIGHT = 0.0005  # of what is left: by so much a simpler cause may do worse
-MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 TESTS = 2  # of whether scene-wide causes do as well as gains
 PAIR = 2  # scene-wide causes that are tried together in the place of gains
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake

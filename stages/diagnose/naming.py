@@ -36,6 +36,7 @@ IMPERFECT_SHIFTS = 0.06  # ... more after shifts, whose resampling blurs ...
 IMPERFECT_GAINS = 0.02  # ... and less after gains, which are what they are
 # effect -> share of its size that a first look may see: texture and slopes take the rest
 UNDERRATED = {"psf_blur": 0.4}
+MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 FEW_PIXELS = ("penumbra",)  # seen in few pixels, and told from what is ordinary by its own value
 STANDS_OUT = 1.4  # rms of a pattern over what the texture's spectrum foretells
 
@@ -76,6 +77,8 @@ def choose(state: Search, seen: Round) -> list[Cause]:
     wall = [e for e in scene if e.effect == "distant_shadow"]
     first = wall[0] if wall else scene[0]  # gross as it is, a missing shadow spoils every other estimate
     near = [] if wall else [e for e in scene if e is not first and e.gain > NEAR * first.gain]
+    if first.effect == "penumbra":  # about shadow edges a wrong Sun looks like a wide one, and may show nowhere else
+        near = [e for name in MOVES_SHADOWS if (e := seen.best.get(name)) is not None and e.gain > FLOOR_GAIN]
     causes = []
     for e in [first, *near[:RIVALS]]:
         group = [e.effect, *(o.effect for o in scene if o is not e and _as_good(first, o) and _as_good(e, o))]
@@ -237,4 +240,14 @@ def _as_good(first: Evidence, other: Evidence) -> bool:
     return float(difference.sum()) < 2 * error and other.gain > 0.5 * first.gain
 
 
-__all__ = ["FEW_PIXELS", "SIMPLER", "choose", "floor_fid", "misaligned", "with_values", "worth", "worth_image"]
+__all__ = [
+    "FEW_PIXELS",
+    "MOVES_SHADOWS",
+    "SIMPLER",
+    "choose",
+    "floor_fid",
+    "misaligned",
+    "with_values",
+    "worth",
+    "worth_image",
+]
