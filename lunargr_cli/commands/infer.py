@@ -44,7 +44,7 @@ def command(
         Path | None, typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif).")
     ] = None,
     no_geotiff: Annotated[
-        bool, typer.Option("--no-geotiff", help="Write svbrdf.h5 only: a fifth of the time less on large maps.")
+        bool, typer.Option("--no-geotiff", help="Write svbrdf.h5 only: on large maps a quarter of the time less.")
     ] = False,
     body: BodyOption = None,
     device: Device = "auto",

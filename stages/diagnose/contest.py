@@ -113,7 +113,7 @@ def instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) 
         share = (nothing - misfit(state, seen.works)) / possible
         if share >= 1 or _explained(share, freedom, images) < GATE / (TESTS * choices):
             return True
-        taken = 1 - _scatter(gains_left(state, gains.effect.name))[0] / scatter
+        taken = 1 - _scatter(gains_left(state, gains.effect.name))[0] / max(scatter, 1e-30)
         if _explained(taken, freedom, count) < GATE / (TESTS * choices):
             return True
     state.load(with_gains)
@@ -183,9 +183,7 @@ def kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> bo
         return not worse
     promised = cause.gain if cause.promised is None else cause.promised
     left = misfit(state, seen.works)
-    if (
-        cause.effect.name in ALSO_STILL
-    ):  # nothing to see in moving rows where the ground's own maps are much sharper than the images
+    if cause.effect.name in ALSO_STILL:  # of a blur the rows that move between images may show nothing at all
         better = cause.rms_after * WORSE < cause.rms_before
         return nothing > left or (better and left - nothing < SLIGHT * left)
     return nothing - left > PROMISE * 2 * promised

@@ -52,8 +52,9 @@ class Penumbra(Effect):
     @classmethod
     def report(cls, values: Mapping[str, float], errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """The Sun's radius, deg: what shadows show, without relief's share of it."""
-        square, relief, least = values["disc_deg2"], values["relief_deg"], cls.null()["disc_deg2"]
-        sun = math.sqrt(max(square - relief**2 + (least if relief else 0.0), least if relief else 0.0))
+        square, relief = values["disc_deg2"], values["relief_deg"]
+        least = cls.null()["disc_deg2"] if relief else 0.0  # what relief blurs is a disc already
+        sun = math.sqrt(max(square - relief**2, 0.0) + least)
         error = math.hypot(errors.get("disc_deg2", 0.0), 2 * relief**2 * RELIEF_SPREAD) / (2 * sun)
         return {"radius_deg": (sun, error)}
 

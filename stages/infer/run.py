@@ -102,9 +102,8 @@ def run(
             writer.write("coefficient_name", names)
             mapper = Mapper(predictor, device, precision, torch.get_num_threads())
             picture = None
-            if (
-                config.geotiff and config.shard[1] == 1
-            ):  # a shard holds some rows only; the GeoTIFF is made of the merged whole
+            # a shard holds some rows only; the GeoTIFF is made of the merged whole
+            if config.geotiff and config.shard[1] == 1:
                 partial = stack.enter_context(atomic_path(tiff))
                 picture = stack.enter_context(MapTiff(partial, grid, names, attributes))
             windows = _predict(file, writer, picture, mapper, config, progress)
