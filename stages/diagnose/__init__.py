@@ -8,7 +8,8 @@ images       effects with values per image     relief      a DEM's scale and smo
 pattern      a broad albedo pattern            plateau     highlights that are cut off
 looking      one look at all of that           naming      what deserves a name after it
 refining     the values that fit best          contest     nearly equal candidates, each tried in the model
-selection    name, refine, look again          state       what is known so far
+gains        ... or what acts by image          state       what is known so far
+selection    name, refine, look again
 parallel     sites side by side                numbers     tails of distributions
 unexplained  what is left, what is not seen    answer      verdict, JSON, diagnosis.h5      report   HTML
 """

@@ -143,7 +143,8 @@ def parameters(cause: Cause) -> dict[str, dict[str, Any]]:
     units = {p.name: p.unit for p in cls.parameters}
     if cls.scope == "scene" and cls.name != "column_pattern":
         held = {k: float(v) for k, v in effect.values.items()}
-        found = cls.report(held, cause.errors)
+        errors = {k: math.hypot(e, cause.along.get(k, 0.0)) for k, e in cause.errors.items()}
+        found = cls.report(held, errors)
     else:
         name = cls.parameters[0].name
         if cls.name == "column_pattern":

@@ -4,23 +4,16 @@ from __future__ import annotations
 
 import copy
 
-from torch import Tensor
-
 from stages.diagnose.answer import parameters
-from stages.diagnose.columns import free_coordinates
-from stages.diagnose.looking import Round, look, misfit
-from stages.diagnose.naming import FLOOR_GAIN, GATE, MOVES_SHADOWS, SIMPLER, UNDERRATED, choose
-from stages.diagnose.numbers import f_tail
-from stages.diagnose.refining import gains_left, refine
+from stages.diagnose.looking import Round, misfit
+from stages.diagnose.naming import FLOOR_GAIN, MOVES_SHADOWS, SIMPLER, UNDERRATED
+from stages.diagnose.refining import refine
 from stages.diagnose.state import Cause, Saved, Search
-from stages.effects import get_effect
 
 MUCH = 0.05  # of what it explains: by so much a cause for each image must do better than one for all
 FOR_FREE = 2.0  # of the sum of squares, that each coordinate gains by itself (Akaike 1974)
 FEWER = 4  # coordinates less, which make up for doing slightly worse
 SLIGHT = 0.0005  # of what is left: by so much a simpler cause may do worse
-TESTS = 2  # of whether scene-wide causes do as well as gains
-PAIR = 2  # scene-wide causes that are tried together in the place of gains
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
 PROMISE = 0.15  # share of the foretold gain that a cause must bring once it is in the model ...
 ALSO_STILL = ("psf_blur", "echo")  # ... but for these, part of whose gain lies in the maps of the ground
@@ -85,65 +78,6 @@ def _left(state: Search, seen: Round, edges: bool) -> float:
     return misfit(state, seen.edges if edges else seen.works, edges)
 
 
-def instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) -> bool:
-    """Gains of images can stand for any scene-wide causes that act by image; whether such causes, up to two, do as well.
-
-    A few numbers for all images against one for each: an F test over the images of what the gains gain, and one of the
-    gains themselves, each image counting alike: known to a thousandth, a dark image's gain says as much as a bright one's.
-    The state holds the scene-wide causes afterwards if so (true gains may then come on top), and the gains if not.
-    """
-    gains, with_gains, rms = state.causes[-1], state.save(), state.residual_rms()
-    scatter, count = _scatter(gains.effect.values["gain"])
-    possible = nothing - misfit(state, seen.works)
-    images = _effective_images(seen)
-    state.load(before)
-    names = [n for n in state.open_names() if get_effect(n).scope == "scene" and get_effect(n).channel == "lit"]
-    freedom, choices = 0, 1
-    for _ in range(PAIR):
-        rivals = choose(state, look(state, names))
-        if not rivals:
-            break
-        known = state.save()
-        cause = contest(state, rivals, seen)
-        cause.rms_before, cause.rms_after = gains.rms_before, rms
-        reconsider(state, cause, known, seen, kept=True)
-        choices *= len(names)
-        names.remove(cause.effect.name)
-        freedom += len(free_coordinates(cause.effect))
-        share = (nothing - misfit(state, seen.works)) / possible
-        if share >= 1 or _explained(share, freedom, images) < GATE / (TESTS * choices):
-            return True
-        taken = 1 - _scatter(gains_left(state, gains.effect.name))[0] / max(scatter, 1e-30)
-        if _explained(taken, freedom, count) < GATE / (TESTS * choices):
-            return True
-    state.load(with_gains)
-    return False
-
-
-def _scatter(gains: Tensor) -> tuple[float, int]:
-    """(mean square of the known gains about their mean, how many there are)"""
-    known = gains[gains != 0]
-    return float(known.var(correction=0)) if len(known) > 1 else 0.0, len(known)
-
-
-def _explained(share: float, freedom: int, images: float) -> float:
-    """Chance that ``freedom`` coordinates explain this share of the variance of as many images' values."""
-    rest = images - 1 - freedom
-    if rest <= 0 or share <= 0:
-        return 1.0
-    return f_tail(share / max(1 - share, 1e-9) * rest / freedom, freedom, rest)
-
-
-def _effective_images(seen: Round) -> float:
-    """How many images carry the evidence for gains: (sum of energies)^2 over the sum of their squares."""
-    energy: dict[int, float] = {}
-    for work in seen.works:
-        per_image = (work.site.image * work.weight).double().square().sum((-2, -1)).tolist()
-        for frame, amount in zip(work.site.frames.tolist(), per_image, strict=True):
-            energy[frame] = energy.get(frame, 0.0) + amount
-    return sum(energy.values()) ** 2 / max(sum(e * e for e in energy.values()), 1e-30)
-
-
 def reconsider(state: Search, cause: Cause, before: Saved, seen: Round, kept: bool) -> bool:
     """Whether a rival of the cause named last does better beside the new one: alone, either may stand for both."""
     if not before.causes or cause.effect.scope != "scene" or cause.effect.channel != "lit":
@@ -205,4 +139,4 @@ def _freedom(cause: Cause) -> int:
     return seen * len([p for p in effect.fitted() if p.name not in effect.held])
 
 
-__all__ = ["contest", "instead_of_gains", "kept_promise", "ordinary", "reconsider"]
+__all__ = ["contest", "kept_promise", "ordinary", "reconsider"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -39,6 +39,7 @@ class Evidence:
     unit: float = 0.0  # size over noise of the first column at amount 1
     agreement: float = 1.0  # gain of one amount for all sites over that of an amount for each
     clusters: float = 0.0  # effective number, (sum of energies)^2 over the sum of their squares, that carry it
+    along: dict[str, float] = field(default_factory=dict)  # further errors, along what the search alone found
     moving: float = 1.0  # share of the gain in the dynamic rows, the rest being in maps of the ground
 
     @property
@@ -154,7 +155,8 @@ def _agreement(amount: Tensor, score: Tensor, gram: Tensor, sites: tuple[Tensor,
     ridge = 1e-6 * torch.diag(g.sum(0).diagonal().clamp(min=1e-12))
     own = 0.5 * float((torch.linalg.solve(g + ridge, u[..., None])[..., 0] * u).sum())
     common = float(amount @ u.sum(0) - 0.5 * amount @ g.sum(0) @ amount)
-    chance = 0.5 * k * (count - 1)  # nats that the further amounts gain from noise alone
+    # nats that the further amounts gain from noise alone: half a chi square, two standard deviations above its mean
+    chance = 0.5 * k * (count - 1) + math.sqrt(2 * k * (count - 1))
     return common / max(own - chance, 1e-9)
 
 

@@ -7,6 +7,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+import torch
+
 from stages.diagnose.chain import Chain
 from stages.diagnose.columns import BASELINE, Candidate, make_candidates, relief_blur, trial_columns
 from stages.diagnose.evidence import Evidence, best_guises, weigh
@@ -28,8 +31,12 @@ from stages.diagnose.state import Search
 from stages.diagnose.statistics import Statistics, gather_site, gather_static, given, join, swap, without
 from stages.effects import get_effect
 
-LADDER = (0.72, 0.82, 0.92, 1.0, 1.08, 1.2, 1.35)  # of a wall's height ...
-DISTANCES = (0.04, 1.0, 3.0)  # ... and of its distance, about the best of the first ladder
+# Of the elevation (its tangent) at which a wall stands above the crop's centre, and of its distance from there, about the
+# best of the ladder before: shadows tell the elevation well, and how far away it stands hardly.
+LADDERS = (
+    ((0.72, 0.82, 0.92, 1.0, 1.08, 1.2, 1.35), (0.52, 1.0, 2.0)),
+    ((0.92, 0.95, 0.975, 1.0, 1.025, 1.05, 1.08), (0.65, 0.75, 0.87, 1.0, 1.15, 1.32, 1.5)),
+)
 ALIGNMENTS = 3
 ENOUGH_PX = 0.06
 SAME = 0.6  # agreement over the sites, below which shifts are something else
@@ -170,25 +177,46 @@ def _wall(state: Search, found: list[Evidence]) -> list[Evidence]:
 
 
 def _climb(state: Search, top: Evidence) -> list[Evidence]:
-    """The wall's distance and height on a finer ladder: a shadow's edge moves with them, and no linear model follows."""
+    """The wall's distance and height on finer ladders: a shadow's edge moves with them, and no linear model follows."""
     cls, crop = get_effect("distant_shadow"), state.data.crop_px
-    for distances in (DISTANCES, (1.0,)):
+    spread = 0.0
+    for tangents, distances in LADDERS:
         ((_, height),) = top.candidate.trial.columns[0].items()
         fixed = top.candidate.trial.fixed
-        known = fixed["distance_px"] / crop
-        tangent = height / ((known + 0.5) * crop * state.data.gsd)
-        trials = [cls.trial(state.data, tangent * f, d * known, int(fixed["side"])) for d in distances for f in LADDER]
+        away = fixed["distance_px"] / crop + 0.5  # from the crop's centre, in crops
+        tangent = height / (away * crop * state.data.gsd)
+        trials = [
+            cls.trial(state.data, tangent * t, max(away * d - 0.5, 0.0), int(fixed["side"]))
+            for d in distances
+            for t in tangents
+        ]
         candidates = [Candidate(cls.name, t, slice(k, k + 1)) for k, t in enumerate(trials)]
 
         def of(chain: Chain, candidates: list[Candidate] = candidates) -> Statistics:
             wide = ready(chain, state.dn, wide=True)
             return gather_site(wide, candidates, state.data, [relief_blur(chain)])
 
-        best = max(weigh(join(state.each(of))), key=lambda e: e.gain)
+        joined = join(state.each(of))
+        found = weigh(joined)
+        best = max(found, key=lambda e: e.gain)
+        spread = _spread(found, (joined.image, joined.place))
         if best.gain <= top.gain:
             break
         top = best
-    return [top]
+    return [dataclasses.replace(top, along={"height_m": spread})]
+
+
+def _spread(rungs: list[Evidence], clusterings: Sequence[np.ndarray]) -> float:
+    """Standard error of the wall's height by which rung is best, jackknifed over clusters (Efron & Stein 1981)."""
+    height = torch.tensor([next(iter(e.candidate.trial.columns[0].values())) for e in rungs], dtype=torch.float64)
+    shares, largest = torch.stack([e.share for e in rungs]), 0.0
+    for labels in clusterings:
+        _, index = np.unique(labels, return_inverse=True)
+        count = int(index.max()) + 1
+        gains = torch.zeros(len(rungs), count, dtype=torch.float64).index_add_(1, torch.from_numpy(index), shares)
+        without = height[(gains.sum(1, keepdim=True) - gains).argmax(0)]
+        largest = max(largest, float(((count - 1) * without.var(correction=0)).sqrt()))
+    return largest
 
 
 def _plausible(e: Evidence, state: Search) -> bool:

@@ -38,6 +38,7 @@ IMPERFECT_GAINS = 0.02  # ... and less after gains, which are what they are
 UNDERRATED = {"psf_blur": 0.4}
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
 FEW_PIXELS = ("penumbra",)  # seen in few pixels, and told from what is ordinary by its own value
+IN_SHADOW = ("earthshine",)  # of its three coordinates none can follow what the model of lit ground misses
 STANDS_OUT = 1.4  # rms of a pattern over what the texture's spectrum foretells
 
 
@@ -96,6 +97,7 @@ def choose(state: Search, seen: Round) -> list[Cause]:
                     e.fid,
                     list(group),
                     errors,
+                    e.along,
                     promised=e.gain * e.moving,
                 )
             )
@@ -152,7 +154,8 @@ def worth(e: Evidence, seen: Round, count: int, data: Survey, ease: float = 1.0)
     if e.agreement < agree and not still and e.effect != "distant_shadow":
         return False
     firm = 0.0 if e.effect == "distant_shadow" else FIRM * e.gain_error  # a wall shades one image and spares the others
-    small = e.fid < floor_fid(data.slope) * math.sqrt(e.candidate.size)
+    freedom = 1 if e.effect in IN_SHADOW else e.candidate.size
+    small = e.fid < floor_fid(data.slope) * math.sqrt(freedom)
     if e.gain < max(FLOOR_GAIN, firm) or (small and not still and e.effect not in FEW_PIXELS):
         return False
     (name, reference), *_ = e.candidate.trial.columns[0].items()

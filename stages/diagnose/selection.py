@@ -6,8 +6,9 @@ import copy
 from collections.abc import Callable
 
 from stages.diagnose.columns import free_coordinates
-from stages.diagnose.contest import contest, instead_of_gains, kept_promise, ordinary, reconsider
+from stages.diagnose.contest import contest, kept_promise, ordinary, reconsider
 from stages.diagnose.data import Site
+from stages.diagnose.gains import instead_of_gains
 from stages.diagnose.looking import Round, align, look, misfit, narrowed, quiet
 from stages.diagnose.naming import (
     FLOOR_GAIN,
@@ -89,6 +90,10 @@ def _prune(state: Search, seen: Round) -> bool:
         if cause.effect.scope != "scene" or cause.effect.channel != "lit":
             continue
         if cause is state.causes[-1] and (len(state.causes) == 1 or not _faint(cause)):
+            continue
+        if cause.for_gains and any(
+            c.effect.name == "image_gain" for c in state.causes
+        ):  # that they fit as well is known
             continue
         before, best = state.save(), misfit(state, seen.works)
         state.causes.remove(cause)

@@ -35,11 +35,13 @@ class Cause:
     fid: float
     group: list[str]
     errors: dict[str, float] = field(default_factory=dict)
+    along: dict[str, float] = field(default_factory=dict)  # further errors, along coordinates that are held
     image_evidence: ImageEvidence | None = None
     promised: float | None = None  # nats of the gain in the images' own rows, where that is not all of it
     rms_before: float = math.nan
     rms_after: float = math.nan
     rivals: list[Cause] = field(default_factory=list)
+    for_gains: bool = False  # named in the place of gains, which could stand for it again
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 SUN_RADIUS_DEG = 0.2666
+NEAR_HORIZON = 0.12  # tangent of the elevation below which half of the rays for bounced light go
 
 
 def _mitsuba():
@@ -109,22 +110,28 @@ class Ground:
         shape = (self.count, self.count)
         return (self.normal @ sun).reshape(shape).astype(np.float32), (share / samples).reshape(shape)
 
-    def bounced(self, sun: np.ndarray, seed: int, depth: int = 2, samples: int = 3) -> list[np.ndarray]:
-        """Light that arrives after 1, 2, ... diffuse bounces on white ground, as I/F of a white facet."""
+    def bounced(self, sun: np.ndarray, seed: int, depth: int = 2, samples: int = 8) -> list[np.ndarray]:
+        """Light that arrives after 1, 2, ... diffuse bounces on white ground, as I/F of a white facet.
+
+        Terrain fills a per cent or so of a facet's sky, most of it close to the horizon: that is where the rays go, or the
+        scatter of the few that hit would be several times the light.
+        """
         mi, rng = self.mi, np.random.default_rng(seed)
         layers = [np.zeros(len(self.place), np.float32) for _ in range(depth)]
-        for _ in range(samples):
+        turn = rng.uniform(size=len(self.place))
+        for k in range(samples):
             place, normal = self.place, self.normal
             alive = np.ones(len(place), np.float32)
             for level in range(depth):
-                direction = _cosine(rng, normal)
+                around = (turn + k / samples if level == 0 else rng.uniform(size=len(place))) * 2 * np.pi
+                direction, weight = _along_horizon(rng, normal, around)
                 start = (place + 1e-3 * self.cell * normal).astype(np.float32)
                 ray = mi.Ray3f(mi.Point3f(*start.T.copy()), mi.Vector3f(*direction.astype(np.float32).T.copy()))
                 hit = self.scene(None).ray_intersect(ray)
                 valid = np.array(hit.is_valid()).astype(np.float32)
                 p, n = np.array(hit.p), np.array(hit.n)
                 p, n = (p.T, n.T) if p.shape[0] == 3 else (p, n)
-                alive = alive * valid
+                alive = alive * valid * weight.astype(np.float32)
                 n = np.where(valid[:, None] > 0, n, normal)
                 n = n * np.sign(n[:, 2:])
                 p = np.where(valid[:, None] > 0, p, place)
@@ -139,8 +146,14 @@ class Ground:
         return cosine.reshape(self.count, self.count).astype(np.float32)
 
 
-def _cosine(rng, normal: np.ndarray) -> np.ndarray:
-    """Directions about the normals, dense as the cosine: the normal plus a point of the unit sphere."""
-    v = rng.normal(size=normal.shape)
-    d = normal + v / np.linalg.norm(v, axis=1, keepdims=True)
-    return d / np.linalg.norm(d, axis=1, keepdims=True).clip(1e-9)
+def _along_horizon(rng, normal: np.ndarray, around: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions at azimuths ``around`` [rad], dense near the horizon (Cauchy in the tangent of elevation), with what each counts.
+
+    The weight is cosine / pi over the density per solid angle; 0 where a facet cannot look.
+    """
+    rise = NEAR_HORIZON * np.tan(np.pi * (rng.uniform(size=len(normal)) - 0.5))
+    level = 1 / np.sqrt(1 + rise**2)
+    direction = np.stack([level * np.cos(around), level * np.sin(around), level * rise], 1)
+    # density of the tangent, over azimuth and d(solid angle) / d(tangent) = level^3
+    density = NEAR_HORIZON / (np.pi * (rise**2 + NEAR_HORIZON**2)) / (2 * np.pi * level**3)
+    return direction, np.clip((direction * normal).sum(1), 0, None) / (np.pi * density)
