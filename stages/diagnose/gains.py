@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 from torch import Tensor
 
 from stages.diagnose.columns import free_coordinates
@@ -14,7 +16,8 @@ from stages.diagnose.state import Saved, Search
 from stages.effects import get_effect
 
 TESTS = 2  # of whether scene-wide causes do as well as gains
-PAIR = 2  # scene-wide causes that are tried together in the place of gains
+PAIR = 2  # scene-wide causes that are tried together in the place of gains ...
+HALF = 0.4  # ... if the first explains so much: two must explain nearly all to be believed
 
 
 def instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) -> bool:
@@ -31,8 +34,9 @@ def instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) 
     state.load(before)
     names = [n for n in state.open_names() if get_effect(n).scope == "scene" and get_effect(n).channel == "lit"]
     freedom, choices = 0, 1
-    for _ in range(PAIR):
-        rivals = choose(state, look(state, names))
+    now = dataclasses.replace(seen, best={n: e for n, e in seen.best.items() if n in names}, images={}, pattern=None)
+    for turn in range(PAIR):
+        rivals = choose(state, look(state, names) if turn else now)
         if not rivals:
             break
         known = state.save()
@@ -49,6 +53,8 @@ def instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) 
             for cause in state.causes[len(before.causes) :]:
                 cause.for_gains = True
             return True
+        if max(share, taken) < HALF:
+            break
     state.load(with_gains)
     return False
 

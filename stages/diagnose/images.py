@@ -244,6 +244,10 @@ def _weigh(
     values = torch.where(seen[:, None], values, 0.0)
     rms = math.sqrt(float(values[seen].square().sum(1).mean())) if count else 0.0
     uncertain = math.sqrt(float(errors[seen].square().sum(1).mean()) / max(count, 1)) if count else 0.0
+    # values along what the nominal model can imitate are not in the data: that many chi squares more or less
+    lost = float((penalty / (power.clamp(min=0) + penalty)).pow(STEPS).sum()) - (frames - count) * k
+    lost = max(lost - (k if cls.relative else 0), 0.0)
+    uncertain = math.hypot(uncertain, rms * math.sqrt(2 * lost) / (2 * max(count * k, 1)))
     return ImageEvidence(
         name, values.float(), errors.float(), rms, uncertain, gain,
         math.sqrt(2 * max(gain, 0.0) + count * k), p,
