@@ -389,6 +389,8 @@ DIAGNOSIS = declare(
             "axis": "east, south",
             "mode": "cosines of line jitter",
             "column": "detector samples, evenly spaced from the first to the last",
+            "site": "sites of the pairs, by their number there",
+            "term": "cosines of an albedo pattern, down and across a crop, in the order of the effect's coordinates",
         },
         variables=(
             Variable("image_id", ("frame",), STRING, "", "name of the source image"),
@@ -415,6 +417,14 @@ DIAGNOSIS = declare(
                 "f4",
                 "1",
                 "column_pattern: response over the detector samples first..last, relative to 1",
+                required=False,
+            ),
+            Variable(
+                "site_albedo",
+                ("site", "term"),
+                "f4",
+                "1",
+                "albedo_map: amplitudes of the cosines at each site, relative to its albedo; 0 for sites not looked at",
                 required=False,
             ),
         ),

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from schemas import ArtefactError
 from stages import diagnose
-from stages.effects import load_extension
+from stages.effects import get_effect, load_extension
 
 # What two sites of 64 px in ten images can show, with the first parameter's relative error where it is recovered.
 SHOWN = {
@@ -60,7 +60,12 @@ def _pairs(scene, folder, effect, seed=11, **changes):
 
 @pytest.mark.parametrize("effect", SHOWN)
 def test_planted_cause_is_named(scene, tmp_path, effect):
-    answer = diagnose.run(_pairs(scene, tmp_path, {effect: PLANTS[effect]})).answer.to_json()
+    """... and every kind of cause can be written, reported, and read back as an extension of the model."""
+    files = [tmp_path / name for name in ("d.h5", "d.json", "d.html")]
+    diagnose.run(_pairs(scene, tmp_path, {effect: PLANTS[effect]}), None, diagnose.Config(), *files)
+    answer = json.loads(files[1].read_text())
+    extended = [e.name for e in load_extension(files[0])]
+    assert extended == [c["effect"] for c in answer["causes"] if get_effect(c["effect"]).scope != "site"]
     assert answer["verdict"] == "named"
     first = answer["causes"][0]
     assert effect in first["group"]

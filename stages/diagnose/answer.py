@@ -19,7 +19,13 @@ from stages.effects import Effect, get_effect
 from stages.effects.column_pattern import ColumnPattern
 
 VERDICTS = ("named", "nothing_significant", "unexplained", "cannot_tell")
-TABLES = {"misregistration": "image_shift_px", "line_jitter": "line_jitter_px", "image_gain": "image_gain"}
+# effect -> its variable in diagnosis.h5 and what the second dimension is
+TABLES = {
+    "misregistration": ("image_shift_px", "axis"),
+    "line_jitter": ("line_jitter_px", "mode"),
+    "image_gain": ("image_gain", None),
+    "albedo_map": ("site_albedo", "term"),
+}
 RESAMPLES = 1000
 
 
@@ -195,13 +201,15 @@ def write_diagnosis(
     for cause in answer.causes:
         effect = cause.effect
         entry: dict[str, Any] = {"effect": effect.name, "survey": effect.survey.to_json(), "values": {}}
-        if effect.scope == "image":
-            variable = TABLES[effect.name]
+        if effect.name in TABLES:
+            variable, second = TABLES[effect.name]
             data = torch.stack([torch.as_tensor(v) for v in effect.values.values()], 1).numpy()
-            tables[variable] = data if data.shape[1] > 1 else data[:, 0]
+            tables[variable] = data if second else data[:, 0]
             entry["tables"] = {k: {"variable": variable, "column": j} for j, k in enumerate(effect.values)}
-            if variable != "image_gain":
-                sizes["axis" if variable == "image_shift_px" else "mode"] = data.shape[1]
+            if second:
+                sizes[second] = data.shape[1]
+            if effect.scope == "site":
+                sizes["site"] = len(data)
         else:
             entry["values"] = {k: float(v) + effect.in_simulation.get(k, 0.0) for k, v in effect.values.items()}
         if isinstance(effect, ColumnPattern):

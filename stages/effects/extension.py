@@ -28,6 +28,8 @@ def load_extension(path: Path, image_ids: Sequence[str] | None = None) -> list[E
     effects = []
     for entry in entries:
         cls = get_effect(entry["effect"])
+        if cls.scope == "site":
+            continue  # a pattern of the diagnosed ground says nothing about other ground
         values = dict(entry["values"])
         for coordinate, table in entry.get("tables", {}).items():
             column = tables[table["variable"]].reshape(len(known), -1)[:, table["column"]]
@@ -35,8 +37,6 @@ def load_extension(path: Path, image_ids: Sequence[str] | None = None) -> list[E
                 null = cls.null()[coordinate]
                 column = torch.tensor([float(column[k]) if k >= 0 else null for k in order], dtype=torch.float32)
             values[coordinate] = column
-        if cls.scope == "site":
-            continue  # a pattern of the diagnosed ground says nothing about other ground
         effects.append(cls(values, Survey.from_json(entry["survey"])))
     return effects
 
