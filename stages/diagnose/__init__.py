@@ -8,8 +8,8 @@ images       effects with values per image     relief      a DEM's scale and smo
 pattern      a broad albedo pattern            plateau     highlights that are cut off
 looking      one look at all of that           naming      what deserves a name after it
 refining     the values that fit best          contest     nearly equal candidates, each tried in the model
-gains        ... or what acts by image          state       what is known so far
-selection    name, refine, look again
+gains        ... or what acts by image          form        ... or another form of the nominal model
+selection    name, refine, look again          state       what is known so far
 parallel     sites side by side                numbers     tails of distributions
 unexplained  what is left, what is not seen    answer      verdict, JSON, diagnosis.h5      report   HTML
 """
@@ -29,7 +29,7 @@ from stages.diagnose.answer import Answer, HeldOut, cause_json, held_out, parame
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import group_pairs, load_site, survey
 from stages.diagnose.looking import Round
-from stages.diagnose.nominal import fit, lit_mask, load_nominal
+from stages.diagnose.nominal import Nominal, fit, lit_mask, load_nominal
 from stages.diagnose.plateau import CLEAR_OF, KEEP_BELOW, plateau, saturated
 from stages.diagnose.refining import refine
 from stages.diagnose.selection import enough, search
@@ -126,19 +126,26 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     for site in sites if cut is not None else []:
         site.valid &= site.image < KEEP_BELOW * cut
     measured, valid = [s.image for s in sites], [s.valid for s in sites]
-    fit(nominal, sites, [], reader.units, measured)
-    if cut is not None:  # leaving out by the measured value alone would keep the dark half of the noise
-        for site in sites:
-            site.valid &= nominal.chain(site, []).textured < CLEAR_OF * cut
-        valid = [s.valid for s in sites]
+
+    def begin(nominal: Nominal) -> Search:
+        """The search at its start, with this nominal model."""
+        for site, image, mask in zip(sites, measured, valid, strict=True):
+            site.as_read(image, mask)
         fit(nominal, sites, [], reader.units, measured)
-    data = survey(sites, len(reader.image_ids))
-    has = frozenset({"sun_horizon"})
-    state = Search(
-        nominal, sites, data, len(reader.image_ids), reader.units, has, progress, measured=measured, valid=valid
-    )
-    if cut is not None:
-        state.causes.append(saturated(cut, data, sites))
+        if cut is not None:  # leaving out by the measured value alone would keep the dark half of the noise
+            for site in sites:
+                site.valid = site.valid & (nominal.chain(site, []).textured < CLEAR_OF * cut)
+            fit(nominal, sites, [], reader.units, measured)
+        data, clear = survey(sites, len(reader.image_ids)), [s.valid for s in sites]
+        has = frozenset({"sun_horizon"})
+        state = Search(
+            nominal, sites, data, len(reader.image_ids), reader.units, has, progress, measured=measured, valid=clear
+        )
+        if cut is not None:
+            state.causes.append(saturated(cut, data, sites))
+        return state
+
+    state = begin(nominal)
     misfit = _misfit(state)
     if not misfit < MISFIT:
         answer.verdict, answer.unexplained_fraction = "unexplained", 1.0
@@ -148,6 +155,12 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         )
         return Result(answer, state, None, None)
     seen = search(state, config.most_causes, say)
+    if state.form is not None:
+        say(f"{nominal.model.name} has the wrong form: {state.form} alone explains more than it does with a cause")
+        answer.form, nominal = state.form, load_nominal(None, state.form, reader.units)
+        state = begin(nominal)
+        state.settled = True
+        seen = search(state, config.most_causes, say)
     structure = measure(seen.works)
     state.restore()
     _decide(answer, state, seen, structure)

@@ -109,6 +109,7 @@ class Answer:
     sites: int = 0
     images: int = 0
     note: str = ""
+    form: str = ""  # of the nominal model, where that asked for was replaced
     config: dict[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -121,12 +122,22 @@ class Answer:
             "held_out": self.held_out.to_json(),
             "data": {"pairs": self.pairs, "sites": self.sites, "images": self.images},
             "note": self.note,
+            "nominal": self.form or None,
             "sentence": self.sentence(),
             "config": self.config,
         }
 
     def sentence(self) -> str:
-        """The diagnosis in one plain sentence."""
+        """The diagnosis in one plain sentence, after one on the nominal model where that was replaced."""
+        if not self.form:
+            return self._finding()
+        asked = self.config.get("model", "the model")
+        return (
+            f"The reflectance does not have the form of {asked}: {self.form} alone explains more than {asked} with a cause, and "
+            f"was fitted in its place. {self._finding()}"
+        )
+
+    def _finding(self) -> str:
         if self.note:
             return self.note[0].upper() + self.note[1:] + ("" if self.note.endswith(".") else ".")
         if self.verdict == "named":

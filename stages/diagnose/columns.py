@@ -18,6 +18,7 @@ from stages.physics.formation import State
 BASELINE = {"dem_smoothing": 0.7, "psf_blur": 0.4}
 RELIEF = (math.radians(6.0), math.radians(20.0))  # blur of a shadow's edge by relief, at a distance of one px
 MOST_BLUR = 0.3  # rad
+FLAT = 1e-3  # rms texture below which ground is one albedo
 
 
 @dataclass(frozen=True)
@@ -143,9 +144,14 @@ def relief_blur(chain: Chain) -> tuple[str, list[Tensor]]:
 
 
 def nominal_columns(chain: Chain) -> list[Tensor]:
-    """The nominal model's freedom within a site: each coefficient may change and drift across the crop."""
+    """The nominal model's freedom within a site: each coefficient may change, drift across the crop, and follow the albedo.
+
+    Bright ground scatters light more often within itself: its reflectance has another shape, and not just another size.
+    """
     tangents = chain.surface_tangents()
     height, width = tangents[0].shape[-2:]
     y = torch.linspace(-1, 1, height)[:, None]
     x = torch.linspace(-1, 1, width)
-    return [t * f for t in tangents for f in (torch.ones(()), x, y)]
+    texture = chain.site.texture - 1
+    bright = texture / texture.std().clamp(min=FLAT)
+    return [t * f for t in tangents for f in (torch.ones(()), x, y, bright)]

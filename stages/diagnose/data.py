@@ -44,6 +44,12 @@ class Site:
     def count(self) -> int:
         return len(self.pairs)
 
+    def as_read(self, image: Tensor, valid: Tensor) -> None:
+        """Back to what was measured, with nothing known of it."""
+        self.image, self.valid = image, valid
+        self.gain, self.offset = torch.ones_like(self.gain), torch.zeros_like(self.offset)
+        self.texture = torch.ones_like(self.texture)
+
     def occluders(self) -> Tensor:
         """(n, H, W), px: how far away what casts a shadow on each pixel stands."""
         if self.shadow_px is None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from stages.diagnose.columns import free_coordinates
 from stages.diagnose.contest import contest, kept_promise, ordinary, reconsider
 from stages.diagnose.data import Site
+from stages.diagnose.form import better_form
 from stages.diagnose.gains import instead_of_gains
 from stages.diagnose.looking import Round, align, look, misfit, narrowed, quiet
 from stages.diagnose.naming import (
@@ -29,6 +30,8 @@ NEEDLESS = 0.02  # share of a cause's gain that it must still bring when all are
 def search(state: Search, most: int, say: Callable[[str], None]) -> Round:
     """Name causes one after the other, and drop what later ones made needless; returns the last look, at what is left."""
     seen = _name(state, most, say)
+    if state.form is not None:
+        return seen
     return look(state, state.open_names()) if _prune(state, seen) else seen
 
 
@@ -61,6 +64,9 @@ def _name(state: Search, most: int, say: Callable[[str], None]) -> Round:
             seen.best.pop(cause.effect.name, None)
             seen.images.pop(cause.effect.name, None)
             continue
+        state.form = better_form(state, before, seen, cause)
+        if state.form is not None:
+            return seen
         if cause.effect.name == "image_gain" and instead_of_gains(state, before, seen, nothing):
             cause = state.causes[-1]
         say(f"found {cause.effect.name}: gain {cause.gain:.0f} +- {cause.gain_error:.0f} nats")
@@ -83,7 +89,7 @@ def _prune(state: Search, seen: Round) -> bool:
     """
     pruned, rows = False, seen.statistics.rows if seen.statistics is not None else 0.0
     for cause in list(state.causes):
-        if cause.effect.channel == "relief" and ordinary(cause):
+        if cause.effect.channel == "relief" and (ordinary(cause) or _faint(cause)):
             state.causes.remove(cause)
             refine(state, 2, known=False)
             pruned = True

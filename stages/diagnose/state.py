@@ -70,6 +70,8 @@ class Search:
     aligned: Effect | None = None  # shifts of the images, estimated before anything else
     reference: Nominal | None = None  # the nominal model before any cause was named
     refused: set[str] = field(default_factory=set)  # looked good to the linear model, and made things worse
+    settled: bool = False  # whether the nominal model's form is not to be questioned
+    form: str | None = None  # the model that should be the nominal one instead
 
     @property
     def base(self) -> list[Effect]:
