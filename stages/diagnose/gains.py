@@ -17,7 +17,8 @@ from stages.effects import get_effect
 
 TESTS = 2  # of whether scene-wide causes do as well as gains
 PAIR = 2  # scene-wide causes that are tried together in the place of gains ...
-HALF = 0.4  # ... if the first explains so much: two must explain nearly all to be believed
+HALF = 0.4  # ... if the first explains so much of what gains do: two must explain nearly all to be believed
+LEVEL_STAYS = ("echo", "psf_blur")  # they move light about within an image
 
 
 def instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) -> bool:
@@ -33,6 +34,7 @@ def instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) 
     images = _effective_images(seen)
     state.load(before)
     names = [n for n in state.open_names() if get_effect(n).scope == "scene" and get_effect(n).channel == "lit"]
+    names = [n for n in names if n not in LEVEL_STAYS]
     freedom, choices = 0, 1
     now = dataclasses.replace(seen, best={n: e for n, e in seen.best.items() if n in names}, images={}, pattern=None)
     for turn in range(PAIR):
@@ -48,13 +50,13 @@ def instead_of_gains(state: Search, before: Saved, seen: Round, nothing: float) 
         freedom += len(free_coordinates(cause.effect))
         share = (nothing - misfit(state, seen.works)) / possible
         taken = 1 - _scatter(gains_left(state, gains.effect.name))[0] / max(scatter, 1e-30)
+        if share < HALF:  # gains that are left say nothing beside a model that does not fit
+            break
         least = GATE / (TESTS * choices)
         if share >= 1 or min(_explained(share, freedom, images), _explained(taken, freedom, count)) < least:
             for cause in state.causes[len(before.causes) :]:
                 cause.for_gains = True
             return True
-        if max(share, taken) < HALF:
-            break
     state.load(with_gains)
     return False
 

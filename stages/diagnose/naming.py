@@ -37,7 +37,8 @@ IMPERFECT_GAINS = 0.02  # ... and less after gains, which are what they are
 # effect -> share of its size that a first look may see: texture and slopes take the rest
 UNDERRATED = {"psf_blur": 0.4}
 MOVES_SHADOWS = ("sun_elevation", "sun_azimuth")
-FEW_PIXELS = ("penumbra",)  # seen in few pixels, and told from what is ordinary by its own value
+# effect -> share of that floor, whatever the slopes: seen in few pixels, and told from what is ordinary by its own value
+FEW_PIXELS = {"penumbra": 0.7}
 IN_SHADOW = ("earthshine",)  # of its three coordinates none can follow what the model of lit ground misses
 STANDS_OUT = 1.4  # rms of a pattern over what the texture's spectrum foretells
 
@@ -155,8 +156,8 @@ def worth(e: Evidence, seen: Round, count: int, data: Survey, ease: float = 1.0)
         return False
     firm = 0.0 if e.effect == "distant_shadow" else FIRM * e.gain_error  # a wall shades one image and spares the others
     freedom = 1 if e.effect in IN_SHADOW else e.candidate.size
-    small = e.fid < floor_fid(data.slope) * math.sqrt(freedom)
-    if e.gain < max(FLOOR_GAIN, firm) or (small and not still and e.effect not in FEW_PIXELS):
+    floor = FEW_PIXELS.get(e.effect, 0.0) * FLOOR_FID or floor_fid(data.slope) * math.sqrt(freedom)
+    if e.gain < max(FLOOR_GAIN, firm) or (e.fid < floor and not still):
         return False
     (name, reference), *_ = e.candidate.trial.columns[0].items()
     unit = reference - cls.null()[name]
