@@ -213,6 +213,16 @@ def test_a_model_that_does_not_fit_names_nothing(scene, tmp_path):
     assert answer.verdict == "unexplained" and not answer.causes
 
 
+@pytest.mark.parametrize("effect", ["phase_slope", "nonlinearity"])
+def test_a_wrong_form_of_the_nominal_model_is_no_cause(scene, tmp_path, effect):
+    """Ground that follows M2: Hapke's model would need other causes to look like it."""
+    pairs = _pairs(scene, tmp_path, {effect: PLANTS[effect]})
+    answer = diagnose.run(pairs, None, diagnose.Config(model="hapke")).answer
+    assert answer.form == "M2"
+    assert [c.effect.name for c in answer.causes] == [effect]
+    assert answer.to_json()["nominal"] == "M2" and "hapke" in answer.sentence()
+
+
 def test_f_tail_against_scipy():
     from scipy.stats import f
 

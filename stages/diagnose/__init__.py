@@ -28,6 +28,7 @@ from schemas import ArtefactError, ConfigError, atomic_path, check_output
 from stages.diagnose.answer import Answer, HeldOut, cause_json, held_out, parameters, write_diagnosis
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import group_pairs, load_site, survey
+from stages.diagnose.form import better_form
 from stages.diagnose.looking import Round
 from stages.diagnose.nominal import Nominal, fit, lit_mask, load_nominal
 from stages.diagnose.plateau import CLEAR_OF, KEEP_BELOW, plateau, saturated
@@ -155,13 +156,16 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         )
         return Result(answer, state, None, None)
     seen = search(state, config.most_causes, say)
+    structure = measure(seen.works)
+    if _unexplained(state, structure) > 0.5:
+        state.form = better_form(state, dataclasses.replace(state.save(), causes=[]), seen, None)
     if state.form is not None:
-        say(f"{nominal.model.name} has the wrong form: {state.form} alone explains more than it does with a cause")
+        say(f"{nominal.model.name} has the wrong form: {state.form} alone explains more")
         answer.form, nominal = state.form, load_nominal(None, state.form, reader.units)
         state = begin(nominal)
         state.settled = True
         seen = search(state, config.most_causes, say)
-    structure = measure(seen.works)
+        structure = measure(seen.works)
     state.restore()
     _decide(answer, state, seen, structure)
     hidden = [load_site(reader, g) for g in group_pairs(reader, test, config.most_images)[:64]]
@@ -217,12 +221,8 @@ def _misfit(state: Search) -> float:
 def _decide(answer: Answer, state: Search, seen: Round, structure: Structure) -> None:
     """The verdict from what was named, what is left and what could not be seen."""
     answer.blind = blind_effects(state, seen)
-    explained = sum(c.fid**2 for c in state.causes)
-    left = structure.largest**2 if structure.present else 0.0
-    if structure.present and structure.largest**2 < 1e-3:
-        left = 1e-3 * structure.peak
-    answer.unexplained_fraction = left / (left + explained) if left + explained > 0 else 0.0
-    if structure.present and explained < left:
+    answer.unexplained_fraction = _unexplained(state, structure)
+    if answer.unexplained_fraction > 0.5:
         answer.verdict = "unexplained"
         ranked = sorted(seen.best.values(), key=lambda e: -e.gain)
         answer.closest = [c.effect.name for c in state.causes] or [e.effect for e in ranked[:1]]
@@ -233,6 +233,15 @@ def _decide(answer: Answer, state: Search, seen: Round, structure: Structure) ->
         answer.verdict = "cannot_tell"
     else:
         answer.verdict = "nothing_significant"
+
+
+def _unexplained(state: Search, structure: Structure) -> float:
+    """Share of what the nominal model misses that no named cause explains; 0 where nothing more than noise is left."""
+    explained = sum(c.fid**2 for c in state.causes)
+    left = structure.largest**2 if structure.present else 0.0
+    if structure.present and structure.largest**2 < 1e-3:
+        left = 1e-3 * structure.peak
+    return left / (left + explained) if left > 0 else 0.0
 
 
 def _withdraw_last(answer: Answer, state: Search) -> None:

@@ -133,8 +133,8 @@ class Answer:
             return self._finding()
         asked = self.config.get("model", "the model")
         return (
-            f"The reflectance does not have the form of {asked}: {self.form} alone explains more than {asked} with a cause, and "
-            f"was fitted in its place. {self._finding()}"
+            f"The reflectance does not have the form of {asked}: {self.form} alone explains more than {asked} does with any cause, "
+            f"and was fitted in its place. {self._finding()}"
         )
 
     def _finding(self) -> str:

@@ -18,12 +18,12 @@ LOOKS_LIKE = (
 )
 
 
-def better_form(state: Search, before: Saved, seen: Round, cause: Cause) -> str | None:
+def better_form(state: Search, before: Saved, seen: Round, cause: Cause | None) -> str | None:
     """The model that, fitted in the place of the nominal one, leaves less than that with the cause just named; or None.
 
-    A checkpoint is judged as it is. The state stays as it was.
+    cause : None where something is left that nothing explains. A checkpoint is judged as it is. The state stays as it was.
     """
-    if state.settled or state.nominal.predictor is not None or cause.effect.name not in LOOKS_LIKE:
+    if state.settled or state.nominal.predictor is not None or (cause and cause.effect.name not in LOOKS_LIKE):
         return None
     now, mine, least = state.save(), state.nominal, misfit(state, seen.works)
     best = None
