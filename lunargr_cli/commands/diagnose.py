@@ -18,7 +18,11 @@ def command(
         Path | None, typer.Argument(help="Checkpoint from 'lunargr train'; without it --model is fitted.")
     ] = None,
     model: Annotated[
-        str, typer.Option("--model", help="Reflectance model to fit where there is no checkpoint.")
+        str,
+        typer.Option(
+            "--model",
+            help="Reflectance model to fit where there is no checkpoint; M2 or hapke, whichever explains more alone, may take its place.",
+        ),
     ] = "M2",
     output: Annotated[
         Path | None,
