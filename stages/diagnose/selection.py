@@ -95,6 +95,8 @@ def _prune(state: Search, seen: Round) -> bool:
             pruned = True
         if cause.effect.scope != "scene" or cause.effect.channel != "lit":
             continue
+        if cause.effect.name == "saturation":  # the histogram showed it; the pixels that it cuts off are left out here
+            continue
         if cause is state.causes[-1] and (len(state.causes) == 1 or not _faint(cause)):
             continue
         if cause.for_gains and any(
