@@ -157,7 +157,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         return Result(answer, state, None, None)
     seen = search(state, config.most_causes, say)
     structure = measure(seen.works)
-    if _unexplained(state, structure) > 0.5:
+    if state.form is None and _unexplained(state, structure) > 0.5:
         state.form = better_form(state, dataclasses.replace(state.save(), causes=[]), seen, None)
     if state.form is not None:
         say(f"{nominal.model.name} has the wrong form: {state.form} alone explains more")
