@@ -25,6 +25,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 
 from hidden.drawn import drawn
+from hidden.laws import LAWS
 from hidden.scene import Layout, Scene, Truth, write_pairs
 
 # effect -> parameters at full strength; weaker plants multiply the first one
@@ -81,9 +82,9 @@ def diagnose(path: Path) -> dict:
     return stage.run(path).answer.to_json()
 
 
-def case(scene: Scene, effect: dict, seed: int, folder: Path) -> dict:
+def case(scene: Scene, effect: dict, seed: int, folder: Path, law: str = "linear") -> dict:
     rng = np.random.default_rng((seed, 99))
-    world = random_world(rng)
+    world = random_world(rng) | {"law": law}
     path = write_pairs(folder / "pairs.h5", scene.make(Truth(effect=effect, **world), seed), scene.layout)
     started = time.perf_counter()
     found = diagnose(path)
@@ -91,10 +92,11 @@ def case(scene: Scene, effect: dict, seed: int, folder: Path) -> dict:
     fid, possible = 0.0, None
     if effect:
         twin = write_pairs(folder / "twin.h5", scene.make(Truth(**world), seed), scene.layout)
-        fid, possible = strength(path, twin, world["snr"])
+        fid, possible = strength(path, twin, world["snr"], "M2" if law == "linear" else "hapke")
     return {
         "seed": seed,
         "scene": scene.layout.seed,
+        "law": law,
         "planted": effect,
         "drawn": drawn(scene, Truth(effect=effect, **world), seed),
         "fid": fid,
@@ -104,7 +106,7 @@ def case(scene: Scene, effect: dict, seed: int, folder: Path) -> dict:
     }
 
 
-def strength(planted: Path, twin: Path, snr: float) -> tuple[float, float]:
+def strength(planted: Path, twin: Path, snr: float, model: str) -> tuple[float, float]:
     """What the effect leaves once nominal model and static texture are out, over the noise; and the gain of undoing it.
 
     The twin is the same world, noise included, with nothing hidden. The gain is in percent of the mean squared error on
@@ -121,8 +123,8 @@ def strength(planted: Path, twin: Path, snr: float) -> tuple[float, float]:
         with PairReader(path) as reader, torch.no_grad():
             train, test = np.flatnonzero(reader.split != 2), np.flatnonzero(reader.split == 2)
             sites = [load_site(reader, g) for g in group_pairs(reader, train, 99)]
-            nominal = load_nominal(None, "M2", reader.units)
-            fit(nominal, sites, [], reader.units, [s.image for s in sites])
+            nominal = load_nominal(None, model, reader.units)
+            fit(nominal, sites, [], reader.units, [s.image for s in sites], start=True)
             chains = [nominal.chain(s, []) for s in sites]
             residuals.append([(c.site.image - c.predict(), lit_mask(c), c.predict()) for c in chains])
             unseen = [nominal.chain(load_site(reader, g), []) for g in group_pairs(reader, test, 99)]
@@ -317,6 +319,10 @@ def draw_jobs(rng: np.random.Generator, layout: Layout, options: argparse.Namesp
     return [(int(rng.integers(2**31)), job) for job in jobs]
 
 
+def draw_law(seed: int, laws: list[str]) -> str:
+    return laws[int(np.random.default_rng((seed, 98)).integers(len(laws)))]
+
+
 def _go_with_the_parent(parent: int) -> None:
     """A worker whose campaign was killed would go on with the queue."""
 
@@ -328,7 +334,7 @@ def _go_with_the_parent(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def work(layout: Layout, cache: Path, seed: int, job: dict) -> dict:
+def work(layout: Layout, cache: Path, seed: int, job: dict, law: str) -> dict:
     """One case in a process of its own, on one thread; the scene stays for the next."""
     import torch
 
@@ -336,7 +342,7 @@ def work(layout: Layout, cache: Path, seed: int, job: dict) -> dict:
     if _scene.get("layout") != layout:
         _scene.update(layout=layout, scene=Scene(layout, cache))
     with tempfile.TemporaryDirectory() as name:
-        return case(_scene["scene"], aimed(job, _scene["scene"]), seed, Path(name))
+        return case(_scene["scene"], aimed(job, _scene["scene"]), seed, Path(name), law)
 
 
 _scene: dict = {}
@@ -363,6 +369,9 @@ def main() -> None:
     parser.add_argument("--images", type=int, default=12)
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--only", nargs="*", default=None)
+    parser.add_argument(
+        "--laws", nargs="+", choices=tuple(LAWS), default=["linear"], help="of reflectance, one drawn per case"
+    )
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--output", type=Path, required=True)
     options = parser.parse_args()
@@ -378,7 +387,9 @@ def main() -> None:
         for _ in range(options.scenes):
             layout = draw_layout(rng, options)
             todo = [(s, j) for s, j in draw_jobs(rng, layout, options) if (layout.seed, s) not in known]
-            for future in as_completed([pool.submit(work, layout, Path(cache), s, j) for s, j in todo]):
+            for future in as_completed(
+                [pool.submit(work, layout, Path(cache), s, j, draw_law(s, options.laws)) for s, j in todo]
+            ):
                 done = future.result()
                 cases.append(done)
                 print(_line(done), flush=True)

@@ -47,6 +47,7 @@ EXPECTED_NAMES = {
         "M4",
         "M5",
         "M6",
+        "kernels",
     ),
 }
 
@@ -150,6 +151,33 @@ def test_constrain_and_unconstrain(name, rng):
     unpacked = model.unpack(values, 1)
     assert list(unpacked) == [p.name for p in model.parameters]
     assert all(torch.equal(unpacked[p.name], values[:, k]) for k, p in enumerate(model.parameters))
+
+
+@pytest.mark.parametrize("law", ["hapke", "lunar_lambert", "akimov"])
+def test_kernels_follow_lunar_laws(law, rng):
+    """Least squares of the kernels to laws written elsewhere, at angles of orbital images: a few thousandths are left."""
+    from hidden.laws import LAWS
+
+    sun = np.radians(rng.uniform(10, 70, 12))
+    parts = []
+    for k in range(12):
+        view, azimuth = np.radians(rng.uniform(0, 35)), rng.uniform(0, 2 * np.pi)
+        s = np.array([np.cos(sun[k]), 0, np.sin(sun[k])])
+        v = np.array([np.sin(view) * np.cos(azimuth), np.sin(view) * np.sin(azimuth), np.cos(view)])
+        normal = np.concatenate([-rng.normal(0, 0.12, (1000, 2)), np.ones((1000, 1))], 1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        mu0, mu = normal @ s, normal @ v
+        seen = (mu0 > np.cos(np.radians(76))) & (mu > 0.3)
+        parts.append(np.stack([mu0[seen], mu[seen], np.full(seen.sum(), s @ v)]))
+    mu0, mu, cosine = np.concatenate(parts, 1)
+    truth = LAWS[law](mu0, mu, cosine, 1.0)
+    model = get_model("kernels")
+    angles = (np.arccos(c) for c in (mu0, mu, cosine))
+    i, e, g = angles
+    zero = dict.fromkeys((p.name for p in model.parameters), 0.0)
+    columns = np.stack([evaluate("kernels", {**zero, p.name: 1.0}, i, e, g) for p in model.parameters], 1)
+    fitted = columns @ np.linalg.lstsq(columns / truth[:, None], np.ones(len(truth)), rcond=None)[0]
+    assert np.sqrt(np.mean((fitted / truth - 1) ** 2)) < 0.004
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -1,17 +1,18 @@
 """`lunargr diagnose`: what the simulation gets wrong, why, and what fixing it is worth.
 
 data         measured pairs by site            chain       the forward model, rendered with small changes
-nominal      the model that is judged          projection  texture and DEM error taken out, per ground pixel
+nominal      the model that is judged          sampled     ... its start, from few pixels
+form         ... or one of another form        projection  texture and DEM error taken out, per ground pixel
 columns      what effects add to images        preparing   a site's weights, texture and slopes
 statistics   products per cluster of pixels    evidence    held-out gain and significance, scene-wide effects
 images       effects with values per image     relief      a DEM's scale and smoothing
 pattern      a broad albedo pattern            plateau     highlights that are cut off
 looking      one look at all of that           naming      what deserves a name after it
 refining     the values that fit best          contest     nearly equal candidates, each tried in the model
-gains        ... or what acts by image          form        ... or another form of the nominal model
-selection    name, refine, look again          state       what is known so far
-parallel     sites side by side                numbers     tails of distributions
-unexplained  what is left, what is not seen    answer      verdict, JSON, diagnosis.h5      report   HTML
+gains        ... or what acts by image          selection   name, refine, look again
+state        what is known so far              parallel    sites side by side
+numbers      tails of distributions            unexplained what is left, what is not seen
+answer       verdict, JSON, diagnosis.h5       report      HTML
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from schemas import ArtefactError, ConfigError, atomic_path, check_output
 from stages.diagnose.answer import Answer, HeldOut, cause_json, held_out, parameters, write_diagnosis
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import group_pairs, load_site, survey
-from stages.diagnose.form import better_form
+from stages.diagnose.form import first_form, richer_form
 from stages.diagnose.looking import Round
 from stages.diagnose.nominal import Nominal, fit, lit_mask, load_nominal
 from stages.diagnose.plateau import CLEAR_OF, KEEP_BELOW, plateau, saturated
@@ -132,7 +133,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         """The search at its start, with this nominal model."""
         for site, image, mask in zip(sites, measured, valid, strict=True):
             site.as_read(image, mask)
-        fit(nominal, sites, [], reader.units, measured)
+        fit(nominal, sites, [], reader.units, measured, start=True)
         if cut is not None:  # leaving out by the measured value alone would keep the dark half of the noise
             for site in sites:
                 site.valid = site.valid & (nominal.chain(site, []).textured < CLEAR_OF * cut)
@@ -140,13 +141,18 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         data, clear = survey(sites, len(reader.image_ids)), [s.valid for s in sites]
         has = frozenset({"sun_horizon"})
         state = Search(
-            nominal, sites, data, len(reader.image_ids), reader.units, has, progress, measured=measured, valid=clear
-        )
+            nominal, sites, data, len(reader.image_ids), reader.units, has, progress, measured=measured, valid=clear,
+            replaced=bool(answer.form),
+        )  # fmt: skip
         if cut is not None:
             state.causes.append(saturated(cut, data, sites))
         return state
 
     state = begin(nominal)
+    if not config.free and (form := first_form(state)):
+        say(f"{nominal.model.name} has the wrong form: {form} is fitted in its place")
+        answer.form, nominal = form, load_nominal(None, form, reader.units)
+        state = begin(nominal)
     misfit = _misfit(state)
     if not misfit < MISFIT:
         answer.verdict, answer.unexplained_fraction = "unexplained", 1.0
@@ -157,13 +163,10 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         return Result(answer, state, None, None)
     seen = search(state, config.most_causes, say)
     structure = measure(seen.works)
-    if state.form is None and _unexplained(state, structure) > 0.5:
-        state.form = better_form(state, dataclasses.replace(state.save(), causes=[]), seen, None)
-    if state.form is not None:
-        say(f"{nominal.model.name} has the wrong form: {state.form} alone explains more")
-        answer.form, nominal = state.form, load_nominal(None, state.form, reader.units)
+    while form := state.form or richer_form(state, seen, _unexplained(state, structure) > 0.5):
+        say(f"{nominal.model.name} has the wrong form: {form} alone explains more")
+        answer.form, nominal = form, load_nominal(None, form, reader.units)
         state = begin(nominal)
-        state.settled = True
         seen = search(state, config.most_causes, say)
         structure = measure(seen.works)
     state.restore()

@@ -68,7 +68,10 @@ class Chain:
         self._state = self._illuminate(self.base)
         self._state.reflectance = self._surface(self._state)
         self.textured = self.render()
+        # of the image that they belong to: it changes once its texture is known
         self._tangents: tuple[Tensor | None, list[Tensor]] = (None, [])
+        self._slope_tangents: tuple[Tensor | None, tuple[Tensor, Tensor]] = (None, (self.textured, self.textured))
+        self._unresolved: tuple[Tensor | None, Tensor] = (None, self.textured)
 
     @property
     def state(self) -> State:
@@ -131,22 +134,28 @@ class Chain:
 
     def slope_tangents(self) -> tuple[Tensor, Tensor]:
         """d image / d slope to the east and to the north: how an error of the DEM shows in every image."""
+        if self._slope_tangents[0] is self.textured:
+            return self._slope_tangents[1]
         east, north = self._state.slopes
         out = []
         for de, dn in ((STEP, 0.0), (0.0, STEP)):
             state = copy.copy(self._state)
             state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
             out.append((self._expose(state, self._surface(state), self.base) - self.textured) / STEP)
+        self._slope_tangents = self.textured, (out[0], out[1])
         return out[0], out[1]
 
     def unresolved_slopes(self) -> Tensor:
         """What a scatter of slopes within a pixel, or of the DEM's own slopes, does to the mean: its second order."""
+        if self._unresolved[0] is self.textured:
+            return self._unresolved[1]
         east, north = self._state.slopes
         out = -self.textured.clone()
         for de, dn in ((SCATTER, 0.0), (-SCATTER, 0.0), (0.0, SCATTER), (0.0, -SCATTER)):
             state = copy.copy(self._state)
             state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
             out += 0.25 * self._expose(state, self._surface(state), self.base)
+        self._unresolved = self.textured, out
         return out
 
     def lit(self) -> Tensor:

@@ -18,6 +18,7 @@ from stages.physics.formation import State
 BASELINE = {"dem_smoothing": 0.7, "psf_blur": 0.4}
 RELIEF = (math.radians(6.0), math.radians(20.0))  # blur of a shadow's edge by relief, at a distance of one px
 MOST_BLUR = 0.3  # rad
+DRIFTING = 4  # directions in which the nominal model may drift across a crop
 FLAT = 1e-3  # rms texture below which ground is one albedo
 
 
@@ -147,6 +148,7 @@ def nominal_columns(chain: Chain) -> list[Tensor]:
     """The nominal model's freedom within a site: each coefficient may change, drift across the crop, and follow the albedo.
 
     Bright ground scatters light more often within itself: its reflectance has another shape, and not just another size.
+    Of a model with many coefficients, which imitate each other, only the main directions drift.
     """
     tangents = chain.surface_tangents()
     height, width = tangents[0].shape[-2:]
@@ -154,4 +156,18 @@ def nominal_columns(chain: Chain) -> list[Tensor]:
     x = torch.linspace(-1, 1, width)
     texture = chain.site.texture - 1
     bright = texture / texture.std().clamp(min=FLAT)
-    return [t * f for t in tangents for f in (torch.ones(()), x, y, bright)]
+    return [*tangents, *(t * f for t in _main(tangents, chain.textured) for f in (x, y, bright))]
+
+
+def _main(tangents: list[Tensor], image: Tensor) -> list[Tensor]:
+    """At most so many combinations of the tangents as drift, those that change the images most for their brightness."""
+    if len(tangents) <= DRIFTING:
+        return tangents
+    columns = torch.stack(tangents)
+    relative = columns / image.mean((-2, -1), keepdim=True).clamp(min=1e-6)
+    flat = relative.flatten(1).double()
+    flat = flat / flat.square().sum(1, keepdim=True).sqrt().clamp(min=1e-30)  # coefficients have units of their own
+    _, axes = torch.linalg.eigh(flat @ flat.T)
+    size = relative.flatten(1).norm(dim=1).clamp(min=1e-30)
+    share = (axes[:, -DRIFTING:] / size[:, None].double()).float()
+    return list(torch.einsum("ck,cnhw->knhw", share, columns))

@@ -21,7 +21,7 @@ from stages.diagnose.columns import (
 )
 from stages.diagnose.numbers import f_tail
 from stages.diagnose.preparing import SiteWork
-from stages.diagnose.projection import Local
+from stages.diagnose.projection import Blocks, Local, cut_out
 from stages.diagnose.statistics import BLOCK
 from stages.effects import Effect, Survey, get_effect
 
@@ -150,11 +150,11 @@ def _site_folds(
     ends = np.cumsum([g.shape[1] for g in groups.values()])
     own = {name: np.arange(end - g.shape[1], end) for (name, g), end in zip(groups.items(), ends, strict=True)}
     folds = []
-    for mask in _halves(*work.residual.shape[-2:]):
-        flat = columns[..., mask].flatten(1)
-        cross = local.cross(columns, torch.zeros_like(on_basis), mask)  # the columns are projected already
+    for blocks in _halves(*work.residual.shape[-2:]):
+        flat = cut_out(columns, blocks).flatten(1)
+        cross = local.cross(columns, None, blocks)  # the columns are projected already
         top = torch.cat([(flat @ flat.T).double(), cross.T], 1)
-        folds.append(torch.cat([top, torch.cat([cross, local.products(mask)], 1)]))
+        folds.append(torch.cat([top, torch.cat([cross, local.products(blocks)], 1)]))
     first = len(columns)
 
     def places(kinds) -> np.ndarray:
@@ -174,11 +174,15 @@ def _site_folds(
     return out
 
 
-def _halves(height: int, width: int) -> list[Tensor]:
-    """A chessboard of blocks: its black and its white pixels, (H, W) bool each."""
+def _halves(height: int, width: int) -> tuple[Blocks, Blocks]:
+    """A chessboard of blocks: its black ones and its white ones."""
     size = min(BLOCK, max(8, min(height, width) // 4))
-    parity = (torch.arange(height)[:, None] // size + torch.arange(width) // size) % 2
-    return [parity == 0, parity == 1]
+    black, white = [], []
+    for i in range(-(-height // size)):
+        for j in range(-(-width // size)):
+            block = slice(i * size, (i + 1) * size), slice(j * size, (j + 1) * size)
+            (white if (i + j) % 2 else black).append(block)
+    return black, white
 
 
 def _without(folds: list[Tensor], nuisance: np.ndarray, wanted: np.ndarray) -> list[_Fold]:

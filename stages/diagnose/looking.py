@@ -41,6 +41,7 @@ ALIGNMENTS = 3
 ENOUGH_PX = 0.06
 SAME = 0.6  # agreement over the sites, below which shifts are something else
 QUIET_GAIN, QUIET_FID = 6.0, 0.012  # below both an effect is not looked at again
+DARK_ENOUGH = 0.05  # of a shadow: with a hundredth of one walls imitate what acts by image
 SURE = 0.01  # of the two halves of the blocks agreeing by chance
 
 
@@ -172,7 +173,7 @@ def _disc(found: list[Evidence]) -> list[Evidence]:
 def _wall(state: Search, found: list[Evidence]) -> list[Evidence]:
     """The best wall, and where there may be one the best of a finer ladder about it."""
     top = max(found, key=lambda e: e.gain)
-    seen = top.gain > 12 and float(top.amount[0]) > 0.005 and top.fid > 0.015
+    seen = top.gain > 12 and float(top.amount[0]) > DARK_ENOUGH and top.fid > 0.015
     return [top, *(_climb(state, top) if seen else [])]
 
 

@@ -12,7 +12,7 @@ from stages.diagnose.images import ImageEvidence, as_effect
 from stages.diagnose.looking import Round
 from stages.diagnose.pattern import PatternEvidence
 from stages.diagnose.refining import start
-from stages.diagnose.state import Cause, Search
+from stages.diagnose.state import RICH, Cause, Search
 from stages.effects import Effect, Survey, effect_names, get_effect
 from stages.effects.echo import CLEAR_LAG
 from stages.effects.penumbra import BEYOND
@@ -31,6 +31,16 @@ SIMPLER = 0.93  # of a guise's gain that one with fewer coordinates must keep to
 NEAR = 0.9  # of the best gain: linear models of strong effects are no closer than that
 RIVALS = 2
 FORMS = 0.7  # of the gain, above which another form of an effect is tried as well
+# effect -> share of the brightness that no sum of kernels follows, and that looks like it as well
+FORM_LEAVES = {
+    "azimuthal_anisotropy": 0.0025,
+    "column_pattern": 0.002,
+    "dark_bias": 0.0025,
+    "earthshine": 0.0025,
+    "interreflection": 0.0025,
+    "sun_azimuth": 0.002,
+    "sun_elevation": 0.0025,
+}
 IMPERFECT = 0.04  # of a cause's size: so much of it its model may leave, which is no further cause ...
 IMPERFECT_SHIFTS = 0.06  # ... more after shifts, whose resampling blurs ...
 IMPERFECT_GAINS = 0.02  # ... and less after gains, which are what they are
@@ -46,8 +56,9 @@ STANDS_OUT = 1.4  # rms of a pattern over what the texture's spectrum foretells
 def choose(state: Search, seen: Round) -> list[Cause]:
     """The next cause to name, and those that the linear model finds nearly as good; empty where there is none."""
     count = len(effect_names())
-    least = _least(state)
+    least, signal = _least(state), _signal(state, seen)
     worthy = [e for e in seen.best.values() if _still(e) or e.fid > least]
+    worthy = [e for e in worthy if e.fid > FORM_LEAVES.get(e.effect, 0.0) * signal]
     worthy = [e for e in worthy if worth(e, seen, count, state.data)]
     scene = sorted(worthy, key=lambda e: -e.gain)
     image = sorted((e for e in seen.images.values() if worth_image(e, count)), key=lambda e: -e.gain)
@@ -108,6 +119,17 @@ def choose(state: Search, seen: Round) -> list[Cause]:
 def _least(state: Search) -> float:
     """Size against the noise of what the models of the named causes may leave behind."""
     return max((_imperfect(c) * c.fid for c in state.causes), default=0.0)
+
+
+def _signal(state: Search, seen: Round) -> float:
+    """Brightness over noise where the nominal model is a sum of kernels, which leaves a share of it; 0 for others.
+
+    A form that was asked for is believed.
+    """
+    if state.nominal.model.name != RICH:
+        return 0.0
+    signal = torch.cat([(w.weight * w.site.image)[w.weight > 0][::17] for w in seen.works])
+    return float(signal.median()) if len(signal) else 0.0
 
 
 def _imperfect(cause: Cause) -> float:

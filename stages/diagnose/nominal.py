@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,11 +15,14 @@ from schemas.errors import ArtefactError, RegistryError
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import GRAZING, MARGIN, Site
 from stages.diagnose.parallel import per_site
+from stages.diagnose.sampled import sampled_fit
 from stages.effects import Effect
 from stages.physics.photometry import ReflectanceModel, get_model
 
 ROUNDS = 10
 PULL = 0.05
+SETTLED = 3e-4  # of the squared residual: a step that lowers it by less is the last
+DAMPING = 0.1  # at first: the coefficients of a curved model imitate each other
 DARK = 0.3  # of the predicted brightness
 
 
@@ -87,48 +91,74 @@ def fit(
     units: str,
     measured: Sequence[Tensor],
     most: int = ROUNDS,
+    start: bool = False,
 ) -> None:
     """Least squares of the coefficients (and of gain and offset per pair where images are in dn), in place.
 
     measured : the images as read, one (n, H, W) per site; ``site.image`` becomes I/F
     most : rounds at most; one is enough for a linear model that was fitted to nearly the same before
+    start : nothing is known of the coefficients yet
     """
     fitted = nominal.predictor is None
-    rounds = (ROUNDS if units == "dn" or not nominal.model.linear else 3) if fitted else (1 if units == "dn" else 0)
-    rounds = min(rounds, most)
-    damping = 1e-7 if nominal.model.linear and units == "iof" else 1e-3
-    best: tuple[float, Tensor, Tensor, Tensor] | None = None  # cost, vector, normal equations
-    for _ in range(rounds):
-        gram, score, cost, count = _normal_equations(nominal, sites, base, units, measured, fitted)
-        if not fitted:
-            continue
+    if fitted and not nominal.model.linear and start:
+        chains = per_site(lambda site: nominal.chain(site, base), sites)
+        nominal.vector = sampled_fit(
+            nominal.model,
+            nominal.vector,
+            nominal.free,
+            chains,
+            [lit_mask(c) for c in chains],
+            measured,
+            units == "dn",
+            PULL,
+        )
+    rounds = min((ROUNDS if units == "dn" or not nominal.model.linear else 3) if fitted else int(units == "dn"), most)
+    if not fitted or nominal.model.linear:
+        for _ in range(max(rounds, int(fitted))):
+            gram, score, cost, count = _normal_equations(nominal, sites, base, units, measured, fitted)
+            if (
+                fitted
+                and _step(nominal, gram, score, 1e-7 if units == "iof" else DAMPING / 100) < SETTLED * cost * count
+            ):
+                break
+        return
+    if rounds == 0:
+        _normal_equations(nominal, sites, base, units, measured, False)
+        return
+    best, damping = (math.inf, nominal.vector), DAMPING  # Levenberg (1944), Marquardt (1963)
+    for k in range(rounds + 1):
+        gram, score, cost, count = _normal_equations(nominal, sites, base, units, measured, True)
         cost += _drawn_to_published(nominal, gram, score, cost, count)
-        if best is not None and cost > best[0] and not nominal.model.linear:  # Levenberg (1944), Marquardt (1963)
-            damping *= 10
+        settled = abs(cost - best[0]) < SETTLED * best[0] or k == rounds
+        if cost < best[0]:
+            best, damping, equations = (cost, nominal.vector), max(damping / 3, 1e-7), (gram, score)
         else:
-            best, damping = (cost, nominal.vector, gram, score), max(damping / 3, 1e-7)
-        _, vector, gram, score = best
-        felt = gram.diagonal() > 1e-12 * gram.diagonal().max()  # a width without its amplitude changes nothing
-        if not bool(felt.any()):
-            continue
-        scale = gram.diagonal()[felt].rsqrt()
-        normal = gram[felt][:, felt] * scale[:, None] * scale + damping * torch.eye(len(scale), dtype=torch.float64)
-        places = torch.nonzero(nominal.free)[:, 0][felt]
-        step = torch.zeros(len(vector))
-        step[places] = (torch.linalg.solve(normal, score[felt] * scale) * scale).float()
-        nominal.vector = vector + step
-        if not nominal.model.linear:
-            low = torch.tensor([p.lower for p in nominal.model.parameters])
-            high = torch.tensor([p.upper for p in nominal.model.parameters])
-            nominal.vector = nominal.vector.clamp(min=low, max=high)
-    if fitted and not nominal.model.linear and best is not None:
-        _, _, cost, count = _normal_equations(nominal, sites, base, units, measured, False)
-        cost += _drawn_to_published(nominal, gram.clone(), score.clone(), cost, count)
-        if cost > best[0]:
-            nominal.vector = best[1]
-            _normal_equations(
-                nominal, sites, base, units, measured, False
-            )  # gains and offsets go with the coefficients
+            nominal.vector, damping = best[1], damping * 10
+        if settled or _step(nominal, *equations, damping) < SETTLED * best[0] * count * min(DAMPING / damping, 1):
+            break
+    nominal.vector = best[1]
+    if units == "dn" and cost > best[0]:  # gains and offsets go with the coefficients
+        _normal_equations(nominal, sites, base, units, measured, False)
+
+
+def _step(nominal: Nominal, gram: Tensor, score: Tensor, damping: float) -> float:
+    """Move the free coefficients by a damped step; returns by how much it lowers the sum of squares, to first order."""
+    felt = gram.diagonal() > 1e-12 * gram.diagonal().max()  # a width without its amplitude changes nothing
+    low = torch.tensor([p.lower for p in nominal.model.parameters])[nominal.free]
+    high = torch.tensor([p.upper for p in nominal.model.parameters])[nominal.free]
+    at = nominal.vector[nominal.free]
+    if not nominal.model.linear:  # at a bound, and drawn beyond it
+        felt &= ~((at <= low) & (score < 0) | (at >= high) & (score > 0))
+    if not bool(felt.any()):
+        return 0.0
+    scale = gram.diagonal()[felt].rsqrt()
+    normal = gram[felt][:, felt] * scale[:, None] * scale + damping * torch.eye(len(scale), dtype=torch.float64)
+    move = torch.linalg.solve(normal, score[felt] * scale) * scale
+    moved = at.clone()
+    moved[felt] += move.float()
+    nominal.vector = nominal.vector.clone()
+    nominal.vector[nominal.free] = moved if nominal.model.linear else moved.clamp(min=low, max=high)
+    return float(score[felt] @ move)
 
 
 def _normal_equations(

@@ -77,9 +77,9 @@ def ready(chain: Chain, dn: bool, wide: bool = False, far: bool = False) -> Site
         projector = Projector(chain, weight)
         weighted = (residual * weight)[None]
         on_basis = projector.coefficients(weighted)
-        return projector, projector.project_(weighted, on_basis)[0], projector.maps(on_basis)[0]
+        return projector, projector.project_(weighted, on_basis)[0], on_basis
 
-    projector, dynamic, maps = split()
+    projector, dynamic, on_basis = split()
     for _ in range(2):
         if len(weight) < 2:  # one image: its noise and the ground's texture cannot be told apart
             weight = weight / float((residual * weight).square()[weight > 0].mean().clamp(min=1e-12)) ** 0.5
@@ -92,7 +92,8 @@ def ready(chain: Chain, dn: bool, wide: bool = False, far: bool = False) -> Site
                 if float(gross.sum()) < 0.3 * float((weight > 0).sum()):
                     weight = weight * ~gross
         weight = weight.minimum(most)
-        projector, dynamic, maps = split()
+        projector, dynamic, on_basis = split()
+    maps = projector.maps(on_basis)[0]
     # the prediction moves the texture along with the ground; the static rows are about all of it
     maps[0] += site.texture - 1
     if len(weight) >= 3:

@@ -9,6 +9,8 @@ of relative albedo and slope error, whitened by their own spectrum: the static r
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -22,6 +24,8 @@ BINS = 12
 LOCAL_PRIOR = 1.0  # px of a shift, all of an image's brightness
 RIDGE = 1e-6  # of a column's energy: single precision
 ALBEDO_BAND, SLOPE_BAND = 0.1, 0.15  # cycles per px
+
+Blocks = Sequence[tuple[slice, slice]]  # rows and columns of each
 
 
 class Projector:
@@ -48,11 +52,16 @@ class Projector:
             upper[j, j] = norm
             basis.append(torch.where(norm > 1e-4 * weight.amax(), column / norm.clamp(min=1e-12), 0.0))
         self.basis = torch.stack(basis)  # (K, n, H, W), orthonormal per pixel
-        r = upper.permute(2, 3, 0, 1).double()
-        penalty = torch.diag(torch.tensor([1 / p**2 for p in priors], dtype=torch.float64))
-        inverse = torch.linalg.solve(r.transpose(-1, -2) @ r + penalty, r.transpose(-1, -2))
-        self.back = inverse.permute(2, 3, 0, 1).float()  # (K, K, H, W): coefficients -> maps
+        self._upper, self._priors = upper, priors
         self.filter: Tensor | None = None
+
+    @cached_property
+    def back(self) -> Tensor:
+        """(K, K, H, W): coefficients on the basis -> maps."""
+        r = self._upper.permute(2, 3, 0, 1).double()
+        penalty = torch.diag(torch.tensor([1 / p**2 for p in self._priors], dtype=torch.float64))
+        inverse = torch.linalg.solve(r.transpose(-1, -2) @ r + penalty, r.transpose(-1, -2))
+        return inverse.permute(2, 3, 0, 1).float()
 
     @property
     def dynamic_rows(self) -> int:
@@ -155,6 +164,13 @@ def _tapered(count: int) -> Tensor:
     return torch.sin(0.5 * math.pi * edge.clamp(max=1)) ** 2
 
 
+def cut_out(x: Tensor, blocks: Blocks | None) -> Tensor:
+    """(..., H, W) -> (..., N), the pixels of these blocks, or all."""
+    if blocks is None:
+        return x.flatten(-2)
+    return torch.cat([x[..., rows, columns].flatten(-2) for rows, columns in blocks], -1)
+
+
 class Local:
     """Columns that live in one image each (shifts, gains) and reach the others through the projection.
 
@@ -168,9 +184,9 @@ class Local:
         self.coefficients = (self.raw[:, :, None] * projector.basis.transpose(0, 1)[:, None]).flatten(0, 1)
         self.gram = self.products(None)
 
-    def products(self, mask: Tensor | None) -> Tensor:
-        """(n k, n k) inner products after projection, over the pixels of ``mask`` (H, W)."""
-        raw, on_basis = self._flat(self.raw, mask), self._flat(self.coefficients, mask)
+    def products(self, blocks: Blocks | None) -> Tensor:
+        """(n k, n k) inner products after projection, over the pixels of these blocks."""
+        raw, on_basis = cut_out(self.raw, blocks), cut_out(self.coefficients, blocks)
         n, k = raw.shape[:2]
         gram = -(on_basis.flatten(1) @ on_basis.flatten(1).T)
         own = raw @ raw.transpose(1, 2)
@@ -178,17 +194,14 @@ class Local:
             gram[i * k : (i + 1) * k, i * k : (i + 1) * k] += own[i]
         return gram.double()
 
-    def cross(self, columns: Tensor, coefficients: Tensor, mask: Tensor | None = None) -> Tensor:
-        """(n k, E) inner products with weighted columns (E, n, H, W) of known coefficients (E, K, H, W)."""
-        raw = self._flat(self.raw, mask)
-        x = self._flat(columns, mask)
-        own = torch.cat([r @ x[:, i].T for i, r in enumerate(raw)])
-        shared = self._flat(self.coefficients, mask).flatten(1) @ self._flat(coefficients, mask).flatten(1).T
-        return (own - shared).double()
-
-    @staticmethod
-    def _flat(x: Tensor, mask: Tensor | None) -> Tensor:
-        return x.flatten(-2) if mask is None else x[..., mask]
+    def cross(self, columns: Tensor, coefficients: Tensor | None, blocks: Blocks | None = None) -> Tensor:
+        """(n k, E) inner products with weighted columns (E, n, H, W) of known coefficients (E, K, H, W), None for zeros."""
+        raw, x = cut_out(self.raw, blocks), cut_out(columns, blocks)
+        own = torch.cat([r @ x[:, i].T for i, r in enumerate(raw)]).double()
+        if coefficients is None:
+            return own
+        shared = cut_out(self.coefficients, blocks).flatten(1) @ cut_out(coefficients, blocks).flatten(1).T
+        return own - shared
 
     def remove_(self, columns: Tensor, coefficients: Tensor) -> None:
         """Take what the local columns can explain out of weighted columns and their coefficients, in place."""

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from stages.diagnose.columns import free_coordinates
 from stages.diagnose.contest import contest, kept_promise, ordinary, reconsider
 from stages.diagnose.data import Site
-from stages.diagnose.form import better_form
+from stages.diagnose.form import simpler_form
 from stages.diagnose.gains import instead_of_gains
 from stages.diagnose.looking import Round, align, look, misfit, narrowed, quiet
 from stages.diagnose.naming import (
@@ -64,7 +64,7 @@ def _name(state: Search, most: int, say: Callable[[str], None]) -> Round:
             seen.best.pop(cause.effect.name, None)
             seen.images.pop(cause.effect.name, None)
             continue
-        state.form = better_form(state, before, seen, cause)
+        state.form = simpler_form(state, before, seen, cause)
         if state.form is not None:
             return seen
         if cause.effect.name == "image_gain" and instead_of_gains(state, before, seen, nothing):

@@ -21,6 +21,19 @@ from stages.physics import formation
 # With gains free the level of an image says nothing of the phase function, nor the contrast of slopes of their height.
 LEVEL_AGAINST_CONTRAST = {"dem_scale"}
 
+RICH = "kernels"  # any smooth reflectance, to a few thousandths ...
+# ... with what it takes for its own: whatever makes brightness go with the angles, or with the image, since each has its own
+OF_THE_FORM = frozenset(
+    {
+        "image_gain",
+        "limb_darkening",
+        "macroscopic_roughness",
+        "nonlinearity",
+        "opposition_surge",
+        "phase_slope",
+    }
+)
+
 R = TypeVar("R")
 
 
@@ -70,7 +83,7 @@ class Search:
     aligned: Effect | None = None  # shifts of the images, estimated before anything else
     reference: Nominal | None = None  # the nominal model before any cause was named
     refused: set[str] = field(default_factory=set)  # looked good to the linear model, and made things worse
-    settled: bool = False  # whether the nominal model's form is not to be questioned
+    replaced: bool = False  # whether the nominal model is another than was asked for
     form: str | None = None  # the model that should be the nominal one instead
 
     @property
@@ -104,11 +117,12 @@ class Search:
         """The named effects that do not move images: the others are taken out of the images themselves."""
         return [e for e in self.base if not e.displaces]
 
-    def fit(self, again: bool = False) -> None:
+    def fit(self, again: bool = False, start: bool = False, rounds: int | None = None) -> None:
         """Align the images by what is known of their displacement, and fit the nominal model to them.
 
         Where images are moved against each other no column per ground pixel is the same in all of them: the model
-        stays where it is, and the measurement moves. ``again``: nearly the same was fitted a moment ago.
+        stays where it is, and the measurement moves. ``again``: nearly the same was fitted a moment ago; ``start``: nothing is known of the coefficients.
+        rounds : at most, None for as many as it takes
         """
         moved = self.moved
         level = float(torch.stack([s.texture.mean() for s in self.sites]).mean())
@@ -124,8 +138,9 @@ class Search:
             if not self.dn:
                 site.image = aligned
         known = self.nominal.model.linear and not self.dn
-        rounds = (1 if known else 2) if again else (ROUNDS if known else 4)
-        fit(self.nominal, self.sites, self.still, self.units, images, rounds)
+        if rounds is None:
+            rounds = (1 if known else 2) if again else (ROUNDS if known else 4)
+        fit(self.nominal, self.sites, self.still, self.units, images, rounds, start)
 
     def save(self) -> Saved:
         """Everything that naming a cause changes."""
@@ -167,6 +182,8 @@ class Search:
             closed.add("image_gain")
         if any(c.effect.name == "image_gain" for c in self.causes):
             closed |= LEVEL_AGAINST_CONTRAST
+        if self.nominal.model.name == RICH or (self.replaced and not self.nominal.model.linear):
+            closed |= OF_THE_FORM
         if self.deepest < FEWEST:  # one look at the ground: albedo and shading are the same thing
             closed |= {n for n in effect_names() if get_effect(n).channel in ("albedo", "relief")}
         return [n for n in effect_names() if n not in closed and get_effect(n).visible(self.data, self.has)]

@@ -14,6 +14,7 @@ import numba
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
+from hidden.laws import LAWS, roughness
 from hidden.layers import SUN_RADIUS_DEG, Ground
 from hidden.sensor import Detector, Pose, shoot
 from hidden.terrain import make_terrain, red_noise
@@ -52,7 +53,7 @@ class Truth:
     seam: float = 0.15  # step along a line, m
     misregistration: float = 0.3  # px, rms length
     snr: float = 70.0
-    law: tuple[float, float, float] = (0.08, 0.02, 0.01)
+    law: str = "linear"  # of reflectance
     units: str = "iof"
 
 
@@ -199,16 +200,16 @@ class Scene:
         mu = np.maximum(self.layer("view", site, image), 1e-3)
         sun, view = self.suns[image], self.views[image]
         cosg = float(np.clip(sun @ view, -1, 1))
-        a, b, c = truth.law
         lit = mu0 > 0
         mu0 = np.maximum(mu0, 1e-4)
-        surface = self._law(a * mu0 + b * cosg + c, mu0, mu, cosg, sun, effect)
         albedo = self._albedo(site, truth)
-        total = surface * share * lit * albedo
+        surface = self._extended(LAWS[truth.law](mu0, mu, cosg, albedo), mu0, mu, cosg, sun, effect)
+        total = surface * share * lit
         if "interreflection" in effect:
-            rho = (a + b + c) * effect["interreflection"].get("strength", 1.0)
+            normal = float(LAWS[truth.law](np.ones(1), np.ones(1), 1.0, np.ones(1))[0])
+            rho = normal * effect["interreflection"].get("strength", 1.0)
             for k, light in enumerate(self.layer("bounced", site, image)):
-                total = total + albedo * rho * (a + b + c) ** (k + 1) * light / 1.0
+                total = total + albedo * rho * normal ** (k + 1) * light / 1.0
         if "earthshine" in effect:
             e = effect["earthshine"]
             direction = _unit(e["azimuth_deg"], e["elevation_deg"])
@@ -216,7 +217,7 @@ class Scene:
         return total
 
     @staticmethod
-    def _law(base, mu0, mu, cosg, sun, effect):
+    def _extended(base, mu0, mu, cosg, sun, effect):
         phase = np.arccos(cosg)
         if "opposition_surge" in effect:
             e = effect["opposition_surge"]
@@ -227,7 +228,7 @@ class Scene:
             share = effect["limb_darkening"]["share"]
             base = base * ((1 - share) + share * 2 / (mu0 + mu))
         if "macroscopic_roughness" in effect:
-            base = base * _roughness(mu0, mu, cosg, effect["macroscopic_roughness"]["theta_bar_deg"])
+            base = base * roughness(mu0, mu, cosg, effect["macroscopic_roughness"]["theta_bar_deg"])
         if "azimuthal_anisotropy" in effect:
             e = effect["azimuthal_anisotropy"]
             base = base * (1 + (e["east"] * sun[0] + e["north"] * sun[1]) / np.hypot(sun[0], sun[1]))
@@ -348,18 +349,6 @@ class Scene:
 
             camera.ghost = ghost
         return pose, camera
-
-
-def _roughness(mu0, mu, cosg, theta_deg):
-    """Hapke's (1984) roughness relative to a smooth Lommel-Seeliger surface; the published formula of the program."""
-    import torch
-
-    from stages.physics.geometry import Angles
-    from stages.physics.photometry.roughness import rough_surface
-
-    angles = Angles(torch.as_tensor(mu0), torch.as_tensor(mu), torch.full_like(torch.as_tensor(mu0), cosg))
-    x, y, shadow = (t.numpy() for t in rough_surface(angles, torch.tensor(np.radians(theta_deg))))
-    return shadow * x * y / (x + y) * (mu0 + mu) / mu0
 
 
 @numba.njit(cache=True)

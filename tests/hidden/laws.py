@@ -1,0 +1,65 @@
+"""Reflectance laws that hidden ground may follow, written here from their papers: I/F of a facet in full light.
+
+Each takes cosines of incidence, emission and phase, and the relative albedo, all of which broadcast.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def linear(mu0, mu, cosg, albedo, a=0.08, b=0.02, c=0.01):
+    """The nominal model's own form."""
+    return albedo * (a * mu0 + b * cosg + c)
+
+
+def hapke(mu0, mu, cosg, albedo, w=0.36, lobe=0.24, backward=0.3, surge=1.7, width=0.054, theta_deg=23.4):
+    """Hapke (1981, 1984, 1986) with parameters of lunar size (Sato et al. 2014); albedo is that of single scattering."""
+    phase = np.arccos(cosg)
+    w = np.clip(w * albedo, 0, 0.99)
+    front, back = (1 + 2 * s * lobe * cosg + lobe**2 for s in (1, -1))
+    single = (1 - lobe**2) * ((1 + backward) / 2 * back**-1.5 + (1 - backward) / 2 * front**-1.5)
+    hiding = surge / (1 + np.tan(phase / 2) / width)
+    root = np.sqrt(1 - w)
+    h0, h = ((1 + 2 * x) / (1 + 2 * x * root) for x in (mu0, mu))
+    smooth = w / 4 * mu0 / (mu0 + mu) * (single * (1 + hiding) + h0 * h - 1)
+    return smooth * roughness(mu0, mu, cosg, theta_deg)
+
+
+def lunar_lambert(mu0, mu, cosg, albedo, level=0.11):
+    """McEwen (1991) with the mean of McEwen (1996) for the Moon, and a phase function of lunar steepness."""
+    g = np.degrees(np.arccos(cosg))
+    share = 1 - 0.019 * g + 2.42e-4 * g**2 - 1.46e-6 * g**3
+    return albedo * level * _phase(cosg) * (share * 2 * mu0 / (mu0 + mu) + (1 - share) * mu0)
+
+
+def akimov(mu0, mu, cosg, albedo, level=0.11):
+    """The parameterless function of Akimov (Shkuratov et al. 2011, eq. 19), with the same phase function."""
+    g = np.arccos(cosg)
+    sine = np.sin(g)
+    longitude = np.arctan2(mu0 / np.maximum(mu, 1e-6) - cosg, sine)  # photometric, from the direction of the camera
+    latitude_cosine = np.clip(mu / np.maximum(np.cos(longitude), 1e-6), 0, 1)
+    shape = np.cos(g / 2) * np.cos(np.pi / (np.pi - g) * (longitude - g / 2)) / np.maximum(np.cos(longitude), 1e-6)
+    return albedo * level * _phase(cosg) * np.clip(shape, 0, None) * latitude_cosine ** (g / (np.pi - g))
+
+
+def _phase(cosg):
+    g = np.arccos(cosg)
+    return np.exp(-0.6 * g) * (1 + 0.35 / (1 + np.tan(g / 2) / 0.06))
+
+
+def roughness(mu0, mu, cosg, theta_deg):
+    """Hapke's (1984) roughness relative to a smooth Lommel-Seeliger surface; the published formula of the program."""
+    import torch
+
+    from stages.physics.geometry import Angles
+    from stages.physics.photometry.roughness import rough_surface
+
+    angles = Angles(torch.as_tensor(mu0), torch.as_tensor(mu), torch.as_tensor(cosg + 0 * mu0))
+    x, y, shadow = (t.numpy() for t in rough_surface(angles, torch.tensor(np.radians(theta_deg))))
+    return shadow * x * y / (x + y) * (mu0 + mu) / mu0
+
+
+LAWS = {"linear": linear, "hapke": hapke, "lunar_lambert": lunar_lambert, "akimov": akimov}
+
+__all__ = ["LAWS", "roughness"]
