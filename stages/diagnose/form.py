@@ -16,9 +16,8 @@ CURVED = (RICH, PHYSICAL)  # forms that real ground may have
 AS_GOOD = 1.1  # times what the rich one leaves: a model whose coefficients mean something is taken, and leaves more to be told
 GROSS = 0.1  # residual over mean brightness, from which a form is questioned before anything else ...
 HALVED = 0.5  # ... and dropped if another one leaves so little of it
-BEYOND = 0.01  # of what these causes explain: so much a true one may leave that a rich form does not ...
-CHANCE = 600.0  # ... or of the sum of squares, which the rich form's further coefficients gain by themselves
-UNNAMED = 0.005  # of the sum of squares, where no cause is named: what else is wrong with the images gains some as well
+BEYOND = 0.03  # of what these causes explain: so much a true one may leave that a rich form does not ...
+CHANCE = 0.004  # ... or of the sum of squares, which the rich form's further coefficients gain by themselves
 
 
 def first_form(state: Search) -> str | None:
@@ -72,12 +71,10 @@ def richer_form(state: Search, seen: Round, unexplained: bool) -> str | None:
     now, least = state.save(), misfit(state, seen.works)
     others = dataclasses.replace(now, causes=[c for c in now.causes if all(c[0] is not s for s in suspects)])
     left = _left(state, others, seen, RICH)
-    margin = CHANCE
+    margin = CHANCE * least
     if len(suspects) == 1 and left < least - margin:  # two of them may well be what a third form looks like
         explained = _left(state, others, seen, state.nominal.model.name) - least
         margin = max(margin, BEYOND * explained)
-    if not suspects:
-        margin = max(margin, UNNAMED * least)
     best = RICH if left < least - margin else None
     if (
         best
