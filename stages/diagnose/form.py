@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 
-import torch
-
 from stages.diagnose.looking import Round, misfit
 from stages.diagnose.nominal import load_nominal
 from stages.diagnose.state import OF_THE_FORM, RICH, Cause, Saved, Search
 
 SIMPLE = "M2"
 PHYSICAL = "hapke"
-CURVED = (RICH, PHYSICAL)  # forms that real ground may have
+LUNAR = (RICH, PHYSICAL)  # forms that real ground may have
 AS_GOOD = 1.1  # times what the rich one leaves: a model whose coefficients mean something is taken, and leaves more to be told
 GROSS = 0.1  # residual over mean brightness, from which a form is questioned before anything else ...
 HALVED = 0.5  # ... and dropped if another one leaves so little of it
@@ -26,14 +24,14 @@ def first_form(state: Search) -> str | None:
     M2 leaves a sixth of the brightness of ground that follows Hapke's, McEwen's or Akimov's law, which any cause can lessen.
     """
     mine = state.nominal
-    if mine.predictor is not None or mine.model.name in CURVED:
+    if mine.predictor is not None or mine.model.name in LUNAR:
         return None
-    light = torch.cat([site.image[site.valid] for site in state.sites])
+    light = sum(float(site.image[site.valid].sum()) for site in state.sites)
     rms = state.residual_rms()
-    if not rms > GROSS * float(light.mean().abs()):
+    if not rms > GROSS * abs(light) / sum(int(site.valid.sum()) for site in state.sites):
         return None
     now, best, least = state.save(), None, HALVED * rms
-    for name in CURVED:
+    for name in LUNAR:
         state.load(now)
         state.nominal = load_nominal(None, name, state.units)
         state.fit(start=True)

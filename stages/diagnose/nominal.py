@@ -114,16 +114,13 @@ def fit(
         )
     rounds = min((ROUNDS if units == "dn" or not nominal.model.linear else 3) if fitted else int(units == "dn"), most)
     if not fitted or nominal.model.linear:
-        for _ in range(max(rounds, int(fitted))):
+        for _ in range(rounds):
             gram, score, cost, count = _normal_equations(nominal, sites, base, units, measured, fitted)
             if (
                 fitted
                 and _step(nominal, gram, score, 1e-7 if units == "iof" else DAMPING / 100) < SETTLED * cost * count
             ):
                 break
-        return
-    if rounds == 0:
-        _normal_equations(nominal, sites, base, units, measured, False)
         return
     best, damping = (math.inf, nominal.vector), DAMPING  # Levenberg (1944), Marquardt (1963)
     for k in range(rounds + 1):

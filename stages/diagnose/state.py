@@ -117,12 +117,12 @@ class Search:
         """The named effects that do not move images: the others are taken out of the images themselves."""
         return [e for e in self.base if not e.displaces]
 
-    def fit(self, again: bool = False, start: bool = False, rounds: int | None = None) -> None:
+    def fit(self, again: bool = False, start: bool = False) -> None:
         """Align the images by what is known of their displacement, and fit the nominal model to them.
 
         Where images are moved against each other no column per ground pixel is the same in all of them: the model
-        stays where it is, and the measurement moves. ``again``: nearly the same was fitted a moment ago; ``start``: nothing is known of the coefficients.
-        rounds : at most, None for as many as it takes
+        stays where it is, and the measurement moves. ``again``: nearly the same was fitted a moment ago; ``start``: nothing
+        is known of the coefficients.
         """
         moved = self.moved
         level = float(torch.stack([s.texture.mean() for s in self.sites]).mean())
@@ -138,8 +138,7 @@ class Search:
             if not self.dn:
                 site.image = aligned
         known = self.nominal.model.linear and not self.dn
-        if rounds is None:
-            rounds = (1 if known else 2) if again else (ROUNDS if known else 4)
+        rounds = (1 if known else 2) if again else (ROUNDS if known else 4)
         fit(self.nominal, self.sites, self.still, self.units, images, rounds, start)
 
     def save(self) -> Saved:

@@ -66,9 +66,10 @@ class Kernels(ReflectanceModel):
 def _kernels(angles: Angles) -> list[Tensor]:
     """The kernels at these angles, kept with them: a fit asks for them once for each coefficient."""
     kept = angles.__dict__.get("_kernels")
-    if kept is None or angles.cos_incidence.requires_grad:
+    if kept is None:
         kept = _evaluate(angles)
-        angles.__dict__["_kernels"] = kept  # as functools.cached_property does
+        if not any(k.requires_grad for k in kept):  # a graph serves one backward pass
+            angles.__dict__["_kernels"] = kept  # as functools.cached_property does
     return kept
 
 
