@@ -403,7 +403,7 @@ def _line(done: dict) -> str:
     answer = done["answer"]
     named = [(c["effect"], {k: p["value"] for k, p in c["parameters"].items()}) for c in answer["causes"]]
     return (
-        f"{','.join(done['planted']) or 'nothing':24s} -> {answer['verdict']:20s} {named} closest {answer['closest']} "
+        f"{done['law']:13s} {','.join(done['planted']) or 'nothing':24s} -> {answer['verdict']:20s} {named} closest {answer['closest']} "
         f"blind {answer['blind']} fid {done['fid']:.3f} {done['seconds']:.1f} s"
     )
 

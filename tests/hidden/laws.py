@@ -43,6 +43,31 @@ def akimov(mu0, mu, cosg, albedo, level=0.11):
     return albedo * level * _phase(cosg) * np.clip(shape, 0, None) * latitude_cosine ** (g / (np.pi - g))
 
 
+def hapke_rough(mu0, mu, cosg, albedo):
+    """Ground as rough as 35 deg and brighter than the mean Moon, as of highlands."""
+    return hapke(mu0, mu, cosg, albedo, w=0.45, theta_deg=35.0)
+
+
+def minnaert(mu0, mu, cosg, albedo, level=0.11):
+    """Minnaert (1941), with an exponent that grows with phase as of the Moon (0.5 + 0.004 per degree)."""
+    exponent = 0.5 + 0.004 * np.degrees(np.arccos(cosg))
+    return albedo * level * _phase(cosg) * np.maximum(mu0, 1e-6) ** exponent * np.maximum(mu, 1e-6) ** (exponent - 1)
+
+
+def lroc_2014(mu0, mu, cosg, albedo):
+    """What the LROC team fitted to NAC images (ISIS lronacpho, LROC_Empirical of 2014)."""
+    g = np.degrees(np.arccos(cosg))
+    return albedo * np.exp(-2.9811422 - 0.0112862 * g - 0.8084603 * mu + 1.3248888 * mu0) * (mu0 > 0)
+
+
+def lroc_2019(mu0, mu, cosg, albedo):
+    """The LROC team's fit of 2019, on a Lommel-Seeliger base."""
+    g = np.degrees(np.arccos(cosg))
+    phase = -1.479654495 - 0.000083528 * g**2 + 0.012964707 * g - 0.237774774 * np.sqrt(g)
+    tilt = 0.556075496 * mu + 0.663671460 * mu0 - 0.439918609 * mu0**2
+    return albedo * mu0 / (mu0 + mu) * np.exp(phase + tilt)
+
+
 def _phase(cosg):
     g = np.arccos(cosg)
     return np.exp(-0.6 * g) * (1 + 0.35 / (1 + np.tan(g / 2) / 0.06))
@@ -60,6 +85,9 @@ def roughness(mu0, mu, cosg, theta_deg):
     return shadow * x * y / (x + y) * (mu0 + mu) / mu0
 
 
-LAWS = {"linear": linear, "hapke": hapke, "lunar_lambert": lunar_lambert, "akimov": akimov}
+LAWS = {
+    law.__name__: law
+    for law in (linear, hapke, hapke_rough, lunar_lambert, akimov, minnaert, lroc_2014, lroc_2019)
+}
 
 __all__ = ["LAWS", "roughness"]
