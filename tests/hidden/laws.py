@@ -86,8 +86,7 @@ def roughness(mu0, mu, cosg, theta_deg):
 
 
 LAWS = {
-    law.__name__: law
-    for law in (linear, hapke, hapke_rough, lunar_lambert, akimov, minnaert, lroc_2014, lroc_2019)
+    law.__name__: law for law in (linear, hapke, hapke_rough, lunar_lambert, akimov, minnaert, lroc_2014, lroc_2019)
 }
 
 __all__ = ["LAWS", "roughness"]
