@@ -16,6 +16,8 @@ FEWER = 4  # coordinates less, which make up for doing slightly worse
 SLIGHT = 0.0005  # of what is left: by so much a simpler cause may do worse
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
 PROMISE = 0.15  # share of the foretold gain that a cause must bring once it is in the model ...
+# ... images of a site, with fewer of which the nominal model's freedom can imitate most of what the dynamic rows keep
+ENOUGH_IMAGES = 10
 ALSO_STILL = ("psf_blur", "echo")  # ... but for these, part of whose gain lies in the maps of the ground
 
 
@@ -117,9 +119,11 @@ def kept_promise(state: Search, cause: Cause, seen: Round, nothing: float) -> bo
         return not worse
     promised = cause.gain if cause.promised is None else cause.promised
     left = misfit(state, seen.works)
+    better = cause.rms_after * WORSE < cause.rms_before
     if cause.effect.name in ALSO_STILL:  # of a blur the rows that move between images may show nothing at all
-        better = cause.rms_after * WORSE < cause.rms_before
         return nothing > left or (better and left - nothing < SLIGHT * left)
+    if better and state.deepest < ENOUGH_IMAGES and nothing - left > 2 * FLOOR_GAIN:
+        return True
     return nothing - left > PROMISE * 2 * promised
 
 

@@ -23,7 +23,7 @@ class Echo(Effect):
     title = "electronic or optical echo"
     mechanism = (
         "Cross-talk between channels, charge left behind at transfer and reflections in the optics repeat the image faintly, some "
-        "pixels away along the detector's samples or lines."
+        "pixels away along the detector's samples or lines. Less than 0.3 % is not reported: on rugged ground a blur leaves as much."
     )
     reference = "Humm et al. (2016), Space Sci. Rev. 200, 431 (echo of the LROC NACs)"
     confused_with = ("psf_blur", "misregistration")
@@ -34,6 +34,7 @@ class Echo(Effect):
     )
     coordinates = (*parameters, Parameter("axis", "1", 0.0, 1.0, 0.0, "0 along samples, 1 along lines"))
     strong: ClassVar = {"fraction": 0.05}
+    tolerance: ClassVar = {"fraction": 0.003}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
