@@ -205,6 +205,16 @@ def test_sites_may_have_unequal_numbers_of_images(scene, tmp_path):
     assert [c.effect.name for c in answer.causes] == ["dem_smoothing"]
 
 
+def test_six_images_a_site_are_enough(tmp_path):
+    """Albedo and two slopes take half of what they show: little of a phase function is left in the other half."""
+    layout = Layout(seed=1177726415, sites=8, images=6, size=96, gsd=20.0, slope_deg=5.4, sun_elevations=(11.4, 64.5))
+    few = Scene(layout)
+    answer = diagnose.run(_pairs(few, tmp_path, {"phase_slope": {"per_radian": 0.056}}, seed=3104)).answer.to_json()
+    assert answer["nominal"] is None
+    assert [c["effect"] for c in answer["causes"]] == ["phase_slope"]
+    assert answer["causes"][0]["parameters"]["per_radian"]["value"] == pytest.approx(0.056, rel=0.1)
+
+
 def test_a_model_that_does_not_fit_names_nothing(scene, tmp_path):
     path = _pairs(scene, tmp_path, {})
     with h5py.File(path, "a") as file:
