@@ -205,6 +205,14 @@ def test_sites_may_have_unequal_numbers_of_images(scene, tmp_path):
     assert [c.effect.name for c in answer.causes] == ["dem_smoothing"]
 
 
+def test_what_comes_out_within_its_errors_is_blind(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("stages.diagnose.selection._faint", lambda cause: cause.effect.name == "dem_smoothing")
+    path = _pairs(scene, tmp_path, {"dem_smoothing": PLANTS["dem_smoothing"]})
+    answer = diagnose.run(path).answer.to_json()
+    assert answer["verdict"] == "cannot_tell"
+    assert "dem_smoothing" in answer["blind"]
+
+
 def test_six_images_a_site_are_enough(tmp_path):
     """Albedo and two slopes take half of what they show: little of a phase function is left in the other half."""
     layout = Layout(seed=1177726415, sites=8, images=6, size=96, gsd=20.0, slope_deg=5.4, sun_elevations=(11.4, 64.5))

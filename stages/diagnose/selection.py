@@ -90,6 +90,8 @@ def _prune(state: Search, seen: Round) -> bool:
     pruned, rows = False, seen.statistics.rows if seen.statistics is not None else 0.0
     for cause in list(state.causes):
         if cause.effect.channel == "relief" and (ordinary(cause) or _faint(cause)):
+            if not ordinary(cause):
+                state.unsure.add(cause.effect.name)
             state.causes.remove(cause)
             refine(state, 2, known=False)
             pruned = True

@@ -83,6 +83,7 @@ class Search:
     aligned: Effect | None = None  # shifts of the images, estimated before anything else
     reference: Nominal | None = None  # the nominal model before any cause was named
     refused: set[str] = field(default_factory=set)  # looked good to the linear model, and made things worse
+    unsure: set[str] = field(default_factory=set)  # were named, and came out within their errors of doing nothing
     replaced: bool = False  # whether the nominal model is another than was asked for
     form: str | None = None  # the model that should be the nominal one instead
 

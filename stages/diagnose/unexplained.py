@@ -95,9 +95,9 @@ def _peak(power: torch.Tensor | None) -> float:
 
 
 def blind_effects(state: Search, seen: Round) -> list[str]:
-    """Effects of which these data would not show even a strong case."""
+    """Effects of which these data would not show even a strong case, or showed one within its errors."""
     named = {c.effect.name for c in state.causes}
-    return [n for n in effect_names() if n not in named and not _would_show(n, state, seen)]
+    return [n for n in effect_names() if n not in named and (n in state.unsure or not _would_show(n, state, seen))]
 
 
 def _would_show(name: str, state: Search, seen: Round) -> bool:
