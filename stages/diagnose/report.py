@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from torch import Tensor
 
 from schemas import atomic_path
 from stages.diagnose.answer import describe, parameters
@@ -17,6 +18,8 @@ from stages.effects import get_effect
 
 if TYPE_CHECKING:
     from stages.diagnose import Result
+    from stages.diagnose.data import Site
+    from stages.diagnose.state import Search
 
 STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:72em;margin:2em auto;padding:0 1em;color:#222}
 table{border-collapse:collapse}td,th{padding:.25em .8em;border-bottom:1px solid #ccc;text-align:left;vertical-align:top}
@@ -35,6 +38,9 @@ def write_report(path: Path, result: Result) -> None:
     ]
     if result.round is not None:
         parts += ["<h2>Measured, simulated, residual</h2>", _picture(_residuals(result))]
+        parts.append(
+            "<p>Before: the nominal model as it was fitted alone. Each site's mean albedo is taken out of all residuals.</p>"
+        )
         parts += ["<h2>Residual against geometry</h2>", _picture(_binned(result))]
         parts += ["<h2>Evidence for every effect, after what was named</h2>", _evidence(result)]
         s = result.structure
@@ -88,14 +94,23 @@ def _evidence(result: Result) -> str:
     return f"<table>{head}{''.join(rows)}</table>"
 
 
+def _predictions(state: Search, site: Site) -> tuple[Tensor, Tensor]:
+    """(n, H, W) each, the nominal model before any cause and with all of them, at the site's mean brightness."""
+    reference = state.reference or state.nominal
+    lit = lit_mask(reference.chain(site, []))
+    level = (site.image * lit).sum()
+    both = (reference.chain(site, []).predict(), state.nominal.chain(site, state.base).predict())
+    first, last = (p * (level / (p * lit).sum().clamp(min=1e-12)) for p in both)
+    return first, last
+
+
 def _residuals(result: Result):
     figure, axes = _figure(3, 4)
     state = result.search
     site = state.sites[0]
-    before = state.nominal.chain(site, [])
-    after = state.nominal.chain(site, state.base)
+    before, after = _predictions(state, site)
     for row, k in zip(axes, np.linspace(0, site.count - 1, 3).round().astype(int), strict=True):
-        measured, first, last = site.image[k].numpy(), before.predict()[k].numpy(), after.predict()[k].numpy()
+        measured, first, last = site.image[k].numpy(), before[k].numpy(), after[k].numpy()
         top = float(np.percentile(measured, 99))
         wide = 2.5 * float(np.std(measured - last)) or 1e-6
         shown = ((measured, "measured", 0, top), (last, "simulated", 0, top))
@@ -121,8 +136,8 @@ def _binned(result: Result):
         for name, field in zip(values, [*fields, np.broadcast_to(slope, mask.shape)], strict=True):
             values[name].append(field[mask])
         mean = site.image[lit_mask(chain)].mean()
-        for out, base in zip(residual, ([], state.base), strict=True):
-            out.append(((site.image - state.nominal.chain(site, base).predict()) / mean).numpy()[mask])
+        for out, predicted in zip(residual, _predictions(state, site), strict=True):
+            out.append(((site.image - predicted) / mean).numpy()[mask])
     for axis, (name, parts) in zip(axes[0], values.items(), strict=True):
         x = np.concatenate(parts)
         if not len(x):
