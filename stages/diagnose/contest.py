@@ -16,9 +16,8 @@ FEWER = 4  # coordinates less, which make up for doing slightly worse
 SLIGHT = 0.0005  # of what is left: by so much a simpler cause may do worse
 WORSE = 1.02  # growth of the residual that shows a cause to be a mistake
 PROMISE = 0.15  # share of the foretold gain that a cause must bring once it is in the model ...
-# ... images of a site, with fewer of which the nominal model's freedom can imitate most of what the dynamic rows keep
-ENOUGH_IMAGES = 10
 ALSO_STILL = ("psf_blur", "echo")  # ... but for these, part of whose gain lies in the maps of the ground
+ENOUGH_IMAGES = 10  # of a site: with fewer the nominal model's freedom can imitate most of what the dynamic rows keep
 
 
 def contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:

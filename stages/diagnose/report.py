@@ -97,9 +97,10 @@ def _evidence(result: Result) -> str:
 def _predictions(state: Search, site: Site) -> tuple[Tensor, Tensor]:
     """(n, H, W) each, the nominal model before any cause and with all of them, at the site's mean brightness."""
     reference = state.reference or state.nominal
-    lit = lit_mask(reference.chain(site, []))
+    alone = reference.chain(site, [])
+    lit = lit_mask(alone)
     level = (site.image * lit).sum()
-    both = (reference.chain(site, []).predict(), state.nominal.chain(site, state.base).predict())
+    both = (alone.predict(), state.nominal.chain(site, state.base).predict())
     first, last = (p * (level / (p * lit).sum().clamp(min=1e-12)) for p in both)
     return first, last
 
