@@ -213,6 +213,24 @@ def test_what_comes_out_within_its_errors_is_blind(scene, tmp_path, monkeypatch)
     assert "dem_smoothing" in answer["blind"]
 
 
+def test_what_is_sure_and_too_small_for_a_name_is_blind(scene, tmp_path, monkeypatch):
+    path = _pairs(scene, tmp_path, {"dark_bias": {"iof": 0.0005}})
+    monkeypatch.setattr("stages.diagnose.naming.floor_fid", lambda slope: 10.0)
+    answer = diagnose.run(path).answer.to_json()
+    assert answer["verdict"] == "cannot_tell"
+    assert "dark_bias" in answer["blind"]
+
+
+def test_a_fit_that_lost_to_a_simpler_one_is_in_its_group(scene, tmp_path, monkeypatch):
+    """A second source of light has three coordinates, and a bias, which looks like it, one."""
+    monkeypatch.setattr("stages.diagnose.contest.SLIGHT", 1.0)
+    monkeypatch.setattr("stages.diagnose.contest.SIMPLER", 0.5)
+    path = _pairs(scene, tmp_path, {"earthshine": PLANTS["earthshine"]})
+    (first,) = diagnose.run(path, None, diagnose.Config(most_causes=1)).answer.to_json()["causes"]
+    assert first["effect"] == "dark_bias"
+    assert first["group"][:2] == ["dark_bias", "earthshine"]
+
+
 def test_six_images_a_site_are_enough(tmp_path):
     """Albedo and two slopes take half of what they show: little of a phase function is left in the other half."""
     layout = Layout(seed=1177726415, sites=8, images=6, size=96, gsd=20.0, slope_deg=5.4, sun_elevations=(11.4, 64.5))

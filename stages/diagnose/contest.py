@@ -66,8 +66,11 @@ def contest(state: Search, rivals: list[Cause], seen: Round) -> Cause:
     state.load(tried[place][2])
     refine(state, 1)
     names = [c.effect.name for c in rivals if c is not cause]
+    # what lost for its further coordinates alone is not told apart
+    better = [c.effect.name for c, (worth, _, _) in zip(rivals, tried, strict=True) if worth > tried[place][0]]
     cause.group = [
         cause.effect.name,
+        *(n for n in dict.fromkeys(better) if n != cause.effect.name and n not in cause.group),
         *(n for n in cause.group[1:] if n in names),
         *(n for n in cause.group[1:] if n not in names),
     ]

@@ -56,16 +56,13 @@ STANDS_OUT = 1.4  # rms of a pattern over what the texture's spectrum foretells
 def choose(state: Search, seen: Round) -> list[Cause]:
     """The next cause to name, and those that the linear model finds nearly as good; empty where there is none."""
     count = len(effect_names())
-    least, signal = _least(state), _signal(state, seen)
-    worthy = [e for e in seen.best.values() if _still(e) or e.fid > least]
-    worthy = [e for e in worthy if e.fid > FORM_LEAVES.get(e.effect, 0.0) * signal]
-    worthy = [e for e in worthy if worth(e, seen, count, state.data)]
+    worthy = [e for e in _no_remains(state, seen) if worth(e, count, state.data)]
     scene = sorted(worthy, key=lambda e: -e.gain)
     image = sorted((e for e in seen.images.values() if worth_image(e, count)), key=lambda e: -e.gain)
     if image and image[0].effect == "image_gain" and not scene:
         # a scene-wide effect that does nearly as well with a few numbers as gains do with one for each image
         near = [e for e in seen.best.values() if e.gain > KEEP_SHARE * image[0].gain]
-        near = [e for e in near if worth(e, seen, count, state.data, 5.0)]
+        near = [e for e in near if worth(e, count, state.data, 5.0)]
         scene = sorted(near, key=lambda e: -e.gain)
     single = []
     if image:
@@ -114,6 +111,23 @@ def choose(state: Search, seen: Round) -> list[Cause]:
                 )
             )
     return causes + single
+
+
+def suspected(state: Search, seen: Round) -> set[str]:
+    """Effects that are there by their own errors, and too small for a name, since whatever the model leaves may look like
+    them, or not quite the same at every site.
+    """
+    count, data = len(effect_names()), state.data
+    found = [e for e in _no_remains(state, seen) if _sure(e, count, data) and not worth(e, count, data)]
+    pattern = _pattern(state, seen.pattern, 1)  # asked for alone, not as one of many
+    return {e.effect for e in found} | ({pattern.effect.name} if pattern is not None else set())
+
+
+def _no_remains(state: Search, seen: Round) -> list[Evidence]:
+    """The best evidence for each effect, where it is more than what the models of named causes and of reflectance leave."""
+    least, signal = _least(state), _signal(state, seen)
+    clear = [e for e in seen.best.values() if _still(e) or e.fid > least]
+    return [e for e in clear if e.fid > FORM_LEAVES.get(e.effect, 0.0) * signal]
 
 
 def _least(state: Search) -> float:
@@ -167,19 +181,29 @@ def family_wise(e: Evidence, count: int, data: Survey) -> float:
     return min(1.0, e.p * count * len(get_effect(e.effect).trials(data)))
 
 
-def worth(e: Evidence, seen: Round, count: int, data: Survey, ease: float = 1.0) -> bool:
+def worth(e: Evidence, count: int, data: Survey, ease: float = 1.0) -> bool:
     """Whether the evidence is enough for a name, among ``count`` effects that were looked for."""
-    cls = get_effect(e.effect)
-    still = _still(e)
-    if family_wise(e, count, data) > GATE * ease or min(e.gain_image, e.gain_place) <= 0:
-        return False
-    agree = AGREE_PARTLY if e.effect in UNDERRATED else AGREE
-    if e.agreement < agree and not still and e.effect != "distant_shadow":
-        return False
+    return not _too_small(e, data) and _alike(e) and _sure(e, count, data, ease)
+
+
+def _too_small(e: Evidence, data: Survey) -> bool:
+    """Whether what the model leaves behind anyway, and the texture, may be as large."""
     firm = 0.0 if e.effect == "distant_shadow" else FIRM * e.gain_error  # a wall shades one image and spares the others
     freedom = 1 if e.effect in IN_SHADOW else e.candidate.size
     floor = FEW_PIXELS.get(e.effect, 0.0) * FLOOR_FID or floor_fid(data.slope) * math.sqrt(freedom)
-    if e.gain < max(FLOOR_GAIN, firm) or (e.fid < floor and not still):
+    return e.gain < max(FLOOR_GAIN, firm) or (e.fid < floor and not _still(e))
+
+
+def _alike(e: Evidence, agree: float = AGREE) -> bool:
+    """Whether the sites agree about it, where what one shows the others must."""
+    least = min(agree, AGREE_PARTLY) if e.effect in UNDERRATED else agree
+    return e.agreement >= least or _still(e) or e.effect == "distant_shadow"
+
+
+def _sure(e: Evidence, count: int, data: Survey, ease: float = 1.0) -> bool:
+    """Whether it is there by its own errors, and looks like this effect, however small it is."""
+    cls = get_effect(e.effect)
+    if family_wise(e, count, data) > GATE * ease or min(e.gain_image, e.gain_place) <= 0 or not _alike(e, AGREE_PARTLY):
         return False
     (name, reference), *_ = e.candidate.trial.columns[0].items()
     unit = reference - cls.null()[name]
@@ -273,6 +297,7 @@ __all__ = [
     "choose",
     "floor_fid",
     "misaligned",
+    "suspected",
     "with_values",
     "worth",
     "worth_image",

@@ -9,7 +9,7 @@ import torch
 
 from stages.diagnose.images import FEWEST
 from stages.diagnose.looking import Round
-from stages.diagnose.naming import FEW_PIXELS, floor_fid
+from stages.diagnose.naming import FEW_PIXELS, floor_fid, suspected
 from stages.diagnose.preparing import Remains
 from stages.diagnose.state import Search
 from stages.effects import effect_names, get_effect
@@ -95,9 +95,9 @@ def _peak(power: torch.Tensor | None) -> float:
 
 
 def blind_effects(state: Search, seen: Round) -> list[str]:
-    """Effects of which these data would not show even a strong case, or showed one within its errors."""
-    named = {c.effect.name for c in state.causes}
-    return [n for n in effect_names() if n not in named and (n in state.unsure or not _would_show(n, state, seen))]
+    """Effects of which these data would not show even a strong case, or showed one within its errors or too small for a name."""
+    named, doubtful = {c.effect.name for c in state.causes}, state.unsure | suspected(state, seen)
+    return [n for n in effect_names() if n not in named and (n in doubtful or not _would_show(n, state, seen))]
 
 
 def _would_show(name: str, state: Search, seen: Round) -> bool:
