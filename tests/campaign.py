@@ -17,6 +17,7 @@ import threading
 import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -27,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from hidden.drawn import drawn
 from hidden.laws import LAWS
 from hidden.scene import Layout, Scene, Truth, write_pairs
+from hidden.worlds import WORLDS
 
 # effect -> parameters at full strength; weaker plants multiply the first one
 PLANTS: dict[str, dict] = {
@@ -82,9 +84,9 @@ def diagnose(path: Path) -> dict:
     return stage.run(path).answer.to_json()
 
 
-def case(scene: Scene, effect: dict, seed: int, folder: Path, law: str = "linear") -> dict:
+def case(scene: Scene, effect: dict, seed: int, folder: Path, law: str = "linear", kind: str = "usual") -> dict:
     rng = np.random.default_rng((seed, 99))
-    world = random_world(rng) | {"law": law}
+    world = random_world(rng) | {"law": law} | WORLDS[kind][1]
     path = write_pairs(folder / "pairs.h5", scene.make(Truth(effect=effect, **world), seed), scene.layout)
     started = time.perf_counter()
     found = diagnose(path)
@@ -97,6 +99,7 @@ def case(scene: Scene, effect: dict, seed: int, folder: Path, law: str = "linear
         "seed": seed,
         "scene": scene.layout.seed,
         "law": law,
+        "world": kind,
         "planted": effect,
         "drawn": drawn(scene, Truth(effect=effect, **world), seed),
         "fid": fid,
@@ -220,7 +223,30 @@ def summarise(cases: list[dict]) -> str:
             lines.append(
                 f"| `{effect}` | {strength:.3g} | {fid} | {len(hit)} of {len(mine)} | {blind} | {verdicts} | {_ratio(effect, hit)} |"
             )
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *_by_world(cases)]) + "\n"
+
+
+def _by_world(cases: list[dict]) -> list[str]:
+    """A table of worlds, where there is more than the usual one."""
+    worlds = list(dict.fromkeys(c["world"] for c in cases))
+    if worlds == ["usual"]:
+        return []
+    lines = [
+        "",
+        "| world | nothing hidden: named | planted: named first | another first | a further cause | neither named nor blind |",
+    ]
+    lines.append("|---|---|---|---|---|---|")
+    for world in worlds:
+        nulls = [c for c in cases if c["world"] == world and not c["planted"]]
+        single = [c for c in cases if c["world"] == world and len(c["planted"]) == 1 and c["fid"] >= 0.03]
+        right = [c for c in single if _first(c) in c["planted"]]
+        wrong = [c for c in single if _first(c) not in ("", *c["planted"])]
+        more = [c for c in right if len(c["answer"]["causes"]) > 1]
+        denied = [c for c in single if not _first(c) and not set(c["planted"]) <= set(c["answer"]["blind"])]
+        shares = [_share(sum(bool(c["answer"]["causes"]) for c in nulls), len(nulls))]
+        shares += [_share(len(part), len(single)) for part in (right, wrong, more, denied)]
+        lines.append(f"| {world} | {' | '.join(shares)} |")
+    return lines
 
 
 def _strength(c: dict) -> float:
@@ -292,13 +318,14 @@ def picture(cases: list[dict], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def draw_layout(rng: np.random.Generator, options: argparse.Namespace) -> Layout:
+def draw_layout(rng: np.random.Generator, options: argparse.Namespace, kind: str = "usual") -> Layout:
     """A scene: from smooth mare to rugged highland, of any scale."""
-    return Layout(
+    usual = Layout(
         seed=int(rng.integers(2**31)), sites=options.sites, images=options.images, size=options.size,
         slope_deg=float(np.exp(rng.uniform(np.log(5), np.log(16)))), gsd=float(rng.choice([2.0, 5.0, 20.0])),
         sun_elevations=(float(rng.uniform(6, 14)), float(rng.uniform(55, 75))),
     )  # fmt: skip
+    return replace(usual, **WORLDS[kind][0])
 
 
 def draw_jobs(rng: np.random.Generator, layout: Layout, options: argparse.Namespace) -> list[tuple[int, dict]]:
@@ -306,13 +333,16 @@ def draw_jobs(rng: np.random.Generator, layout: Layout, options: argparse.Namesp
     jobs: list[dict] = [{} for _ in range(options.nulls)]
     crop = layout.size * layout.gsd
     wall = {"height_m": 0.19 * crop, "side": "west", "distance_m": 0.45 * crop}
+    effects = list(PLANTS) if options.only is None else options.only
+    if options.draw:
+        effects = rng.choice(effects, options.draw, replace=False).tolist()
     for effect, values in (PLANTS | {"distant_shadow": wall}).items():
-        if options.only is not None and effect not in options.only:
+        if effect not in effects:
             continue
         key = next(iter(values))
         strengths = [1.0] if effect == "saturation" else options.strengths  # a level, not a size
         jobs += [{effect: {**values, key: values[key] * s}} for s in strengths for _ in range(options.plants)]
-    if options.only is None:
+    if options.only is None and not options.draw:
         jobs += [{k: v} for k, v in UNKNOWN.items() for _ in range(options.plants)]
         for _ in range(options.doubles):
             jobs.append({str(k): PLANTS[str(k)] for k in rng.choice(PAIRED, 2, replace=False)})
@@ -334,7 +364,7 @@ def _go_with_the_parent(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def work(layout: Layout, cache: Path, seed: int, job: dict, law: str) -> dict:
+def work(layout: Layout, cache: Path, seed: int, job: dict, law: str, kind: str) -> dict:
     """One case in a process of its own, on one thread; the scene stays for the next."""
     import torch
 
@@ -342,7 +372,7 @@ def work(layout: Layout, cache: Path, seed: int, job: dict, law: str) -> dict:
     if _scene.get("layout") != layout:
         _scene.update(layout=layout, scene=Scene(layout, cache))
     with tempfile.TemporaryDirectory() as name:
-        return case(_scene["scene"], aimed(job, _scene["scene"]), seed, Path(name), law)
+        return case(_scene["scene"], aimed(job, _scene["scene"]), seed, Path(name), law, kind)
 
 
 _scene: dict = {}
@@ -368,9 +398,13 @@ def main() -> None:
     parser.add_argument("--sites", type=int, default=5, help="the last one is the test split")
     parser.add_argument("--images", type=int, default=12)
     parser.add_argument("--size", type=int, default=128)
-    parser.add_argument("--only", nargs="*", default=None)
+    parser.add_argument("--only", nargs="*", default=None, help="effects; none for nulls alone")
+    parser.add_argument("--draw", type=int, default=0, help="effects per scene, drawn from these; 0 for all")
     parser.add_argument(
         "--laws", nargs="+", choices=tuple(LAWS), default=["linear"], help="of reflectance, one drawn per case"
+    )
+    parser.add_argument(
+        "--worlds", nargs="+", choices=tuple(WORLDS), default=["usual"], help="one for each scene, in turn"
     )
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--output", type=Path, required=True)
@@ -384,11 +418,12 @@ def main() -> None:
         tempfile.TemporaryDirectory() as cache,
         ProcessPoolExecutor(options.jobs, get_context("spawn"), _go_with_the_parent, (os.getpid(),)) as pool,
     ):
-        for _ in range(options.scenes):
-            layout = draw_layout(rng, options)
+        for number in range(options.scenes):
+            kind = options.worlds[number % len(options.worlds)]
+            layout = draw_layout(rng, options, kind)
             todo = [(s, j) for s, j in draw_jobs(rng, layout, options) if (layout.seed, s) not in known]
             for future in as_completed(
-                [pool.submit(work, layout, Path(cache), s, j, draw_law(s, options.laws)) for s, j in todo]
+                [pool.submit(work, layout, Path(cache), s, j, draw_law(s, options.laws), kind) for s, j in todo]
             ):
                 done = future.result()
                 cases.append(done)
@@ -403,7 +438,7 @@ def _line(done: dict) -> str:
     answer = done["answer"]
     named = [(c["effect"], {k: p["value"] for k, p in c["parameters"].items()}) for c in answer["causes"]]
     return (
-        f"{done['law']:13s} {','.join(done['planted']) or 'nothing':24s} -> {answer['verdict']:20s} {named} closest {answer['closest']} "
+        f"{done['world']:15s} {done['law']:13s} {','.join(done['planted']) or 'nothing':24s} -> {answer['verdict']:20s} {named} closest {answer['closest']} "
         f"blind {answer['blind']} fid {done['fid']:.3f} {done['seconds']:.1f} s"
     )
 

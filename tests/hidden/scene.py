@@ -17,9 +17,10 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 from hidden.laws import LAWS, roughness
 from hidden.layers import SUN_RADIUS_DEG, Ground
 from hidden.sensor import Detector, Pose, shoot
-from hidden.terrain import make_terrain, red_noise
+from hidden.terrain import make_terrain, measured_relief, patches, red_noise, units
 
 RADIUS = 1737400.0
+SHARED = Path(os.environ.get("LUNARGR_SHARED", Path(__file__).parents[3] / "shared"))
 DISTANCE = 400.0  # crop sizes: the traced camera is at infinity
 
 
@@ -39,6 +40,7 @@ class Layout:
     emissions: tuple[float, float] = (0.0, 35.0)
     opposition: int = 2  # images with phase below 10 deg
     border: int = 8
+    relief: str = ""  # a DEM under LUNARGR_SHARED's data/, whose shape the ground takes
 
 
 @dataclass
@@ -48,7 +50,9 @@ class Truth:
     effect: dict[str, Any] = field(default_factory=dict)  # effect id -> its parameters, as planted
     texture: float = 0.03  # rms of the albedo texture
     texture_power: float = 2.6
+    texture_kind: str = "red"  # or "patches", "units"
     dem_noise_deg: float = 0.6  # rms slope of the DEM's noise
+    dem_noise_px: float = 1.5  # sigma of its correlation
     dem_smoothing: float = 0.3  # sigma, px
     seam: float = 0.15  # step along a line, m
     misregistration: float = 0.3  # px, rms length
@@ -71,16 +75,18 @@ class Scene:
         key = hashlib.sha1(json.dumps(layout.__dict__, sort_keys=True).encode()).hexdigest()[:12]
         self.key = f"scene-{key}"
         rng = np.random.default_rng(layout.seed)
-        self.heights = [
-            make_terrain(rng, self._fine(), layout.gsd / layout.sub, layout.slope_deg) for _ in range(layout.sites)
-        ]
+        self.heights = [self._terrain(rng) for _ in range(layout.sites)]
         self.suns, self.views = self._geometry(rng)
         self._grounds: dict[int, Ground] = {}
         self._layers: dict[tuple, Any] = {}
         self._exact: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
-    def _fine(self) -> int:
-        return (self.layout.size + 2 * self.layout.margin) * self.layout.sub + 1
+    def _terrain(self, rng: np.random.Generator) -> np.ndarray:
+        lay = self.layout
+        size, cell = (lay.size + 2 * lay.margin) * lay.sub + 1, lay.gsd / lay.sub
+        if lay.relief:
+            return measured_relief(rng, SHARED / "data" / lay.relief, size, cell, lay.slope_deg)
+        return make_terrain(rng, size, cell, lay.slope_deg)
 
     def _geometry(self, rng):
         lay = self.layout
@@ -140,7 +146,7 @@ class Scene:
         variance = truth.dem_smoothing**2 + truth.effect.get("dem_smoothing", {}).get("sigma2_px2", 0.0)
         dem = gaussian_filter(dem, np.sqrt(variance), mode="nearest")
         dem = dem / (1 + truth.effect.get("dem_scale", {}).get("relative", 0.0))
-        noise = gaussian_filter(rng.normal(size=dem.shape), 1.5)
+        noise = gaussian_filter(rng.normal(size=dem.shape), truth.dem_noise_px)
         gy, gx = np.gradient(noise, lay.gsd)
         slope = np.sqrt((gx**2 + gy**2).mean())
         dem = dem + noise * np.tan(np.radians(truth.dem_noise_deg)) / slope
@@ -153,7 +159,7 @@ class Scene:
         lay, effect = self.layout, truth.effect
         rng = np.random.default_rng((lay.seed, site, 77))
         count = (lay.size + 2 * lay.border) * lay.sub
-        albedo = 1 + truth.texture * red_noise(rng, count, truth.texture_power)
+        albedo = 1 + truth.texture * self._texture(rng, count, truth)
         names = [n for n in ("slope_albedo", "elevation_albedo", "curvature_albedo") if n in effect]
         if names:
             fields = [self._terrain_fields(s) for s in range(lay.sites)]
@@ -167,6 +173,11 @@ class Scene:
             rays = rays + 0.5 * gaussian_filter(rng.normal(size=rays.shape), count / 8) * count / 2
             albedo = albedo * (1 + effect["albedo_map"]["per_std"] * (rays - rays.mean()) / rays.std())
         return albedo
+
+    def _texture(self, rng: np.random.Generator, count: int, truth: Truth) -> np.ndarray:
+        if truth.texture_kind == "patches":
+            return patches(rng, count, 8.0 * self.layout.sub)
+        return units(rng, count) if truth.texture_kind == "units" else red_noise(rng, count, truth.texture_power)
 
     def _terrain_fields(self, site: int) -> dict[str, np.ndarray]:
         lay = self.layout
