@@ -261,7 +261,7 @@ def test_a_wrong_form_of_the_nominal_model_is_no_cause(scene, tmp_path, effect):
     assert answer.to_json()["nominal"] == answer.form and "hapke" in answer.sentence()
 
 
-@pytest.mark.parametrize("law", ["hapke", "lunar_lambert", "akimov"])
+@pytest.mark.parametrize("law", ["hapke", pytest.param("lunar_lambert", marks=pytest.mark.slow), "akimov"])
 def test_ground_that_follows_another_law_is_no_cause(scene, tmp_path, law):
     """M2, the default, leaves a sixth of such ground's brightness: nothing but its form is wrong."""
     answer = diagnose.run(_pairs(scene, tmp_path, {}, law=law)).answer
@@ -270,7 +270,10 @@ def test_ground_that_follows_another_law_is_no_cause(scene, tmp_path, law):
     assert {"phase_slope", "opposition_surge", "image_gain"} & set(answer.blind) or answer.verdict == "unexplained"
 
 
-@pytest.mark.parametrize("law", ["hapke", "lunar_lambert", "akimov"])
+@pytest.mark.parametrize(
+    "law",
+    [pytest.param("hapke", marks=pytest.mark.slow), "lunar_lambert", pytest.param("akimov", marks=pytest.mark.slow)],
+)
 def test_a_cause_is_found_on_ground_that_follows_another_law(scene, tmp_path, law):
     answer = diagnose.run(_pairs(scene, tmp_path, {"psf_blur": PLANTS["psf_blur"]}, law=law)).answer
     assert [c.effect.name for c in answer.causes] == ["psf_blur"]
