@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from schemas import ArtefactError
 from stages import diagnose
+from stages.diagnose.selection import _faint
 from stages.effects import get_effect, load_extension
 
 # What two sites of 64 px in ten images can show, with the first parameter's relative error where it is recovered.
@@ -211,6 +212,19 @@ def test_what_comes_out_within_its_errors_is_blind(scene, tmp_path, monkeypatch)
     answer = diagnose.run(path).answer.to_json()
     assert answer["verdict"] == "cannot_tell"
     assert "dem_smoothing" in answer["blind"]
+
+
+def test_an_error_that_only_lowers_is_no_doubt_of_presence(scene, tmp_path):
+    """A DEM's noise makes its smoothing look smaller than it is: 0.8 +- 0.4 px^2 of which 0.35 are that is not nothing."""
+    answer = diagnose.run(_pairs(scene, tmp_path, {"dem_smoothing": PLANTS["dem_smoothing"]}, dem_noise_deg=1.0)).answer
+    (cause,) = answer.causes
+    error = cause.errors["sigma2_px2"]
+    assert 0 < cause.lowered["sigma2_px2"] < error
+    cause.errors["sigma2_px2"] = float(cause.effect.values["sigma2_px2"]) / 2
+    cause.lowered["sigma2_px2"] = 0.95 * cause.errors["sigma2_px2"]
+    assert not _faint(cause)
+    cause.lowered["sigma2_px2"] = 0.0
+    assert _faint(cause)
 
 
 def test_what_is_sure_and_too_small_for_a_name_is_blind(scene, tmp_path, monkeypatch):

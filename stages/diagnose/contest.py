@@ -86,7 +86,7 @@ def reconsider(state: Search, cause: Cause, before: Saved, seen: Round, kept: bo
     """Whether a rival of the cause named last does better beside the new one: alone, either may stand for both."""
     if not before.causes or cause.effect.scope != "scene" or cause.effect.channel != "lit":
         return False
-    now, (earlier, _, _) = state.save(), before.causes[-1]
+    now, (earlier, *_) = state.save(), before.causes[-1]
     if not kept:
         state.load(before)
     left = misfit(state, seen.works)

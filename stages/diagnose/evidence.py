@@ -41,6 +41,7 @@ class Evidence:
     clusters: float = 0.0  # effective number, (sum of energies)^2 over the sum of their squares, that carry it
     along: dict[str, float] = field(default_factory=dict)  # further errors, along what the search alone found
     moving: float = 1.0  # share of the gain in the dynamic rows, the rest being in maps of the ground
+    lowered: float = 0.0  # part of the first amount's error that can only have made it too small
 
     @property
     def effect(self) -> str:

@@ -129,6 +129,7 @@ def _move_relief(state: Search, evidence: Evidence) -> None:
     low, high = cls.bounds(coordinate)
     value = float(cause.effect.values[coordinate]) + float(evidence.amount[0]) * step
     cause.errors[coordinate] = abs(step) * float(evidence.covariance[0, 0].clamp(min=0)) ** 0.5
+    cause.lowered[coordinate] = abs(step) * evidence.lowered
     moved = cls({coordinate: min(max(value, low), high)}, cause.effect.survey)
     moved.held = cause.effect.held
     cause.effect = moved

@@ -89,7 +89,7 @@ def weigh_relief(parts: Sequence[Relief]) -> list[Evidence]:
         place = m + 1 + e.candidate.columns.start
         if e.effect == "dem_smoothing":
             missing = sum(p.roughened for p in parts) / max(float(sums[place, place]), 1e-30)
-            evidence[k] = dataclasses.replace(e, covariance=e.covariance + missing**2)
+            evidence[k] = dataclasses.replace(e, covariance=e.covariance + missing**2, lowered=missing)
         if e.effect != "dem_scale" or e.gain <= 0:
             continue
         left = float(sums[m, m]) - 2 * e.gain - sum(p.noise for p in parts)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 
 from stages.diagnose.columns import free_coordinates
@@ -118,12 +119,13 @@ def _prune(state: Search, seen: Round) -> bool:
 
 
 def _faint(cause: Cause) -> bool:
-    """Whether no free coordinate is three errors away from doing nothing."""
+    """Whether no free coordinate is three errors away from doing nothing; what can only have made it smaller is none here."""
     null = cause.effect.null()
-    return all(
-        abs(float(cause.effect.values[name]) - null[name]) < 3 * cause.errors.get(name, 0.0)
-        for name in free_coordinates(cause.effect)
-    )
+    for name in free_coordinates(cause.effect):
+        error, lowered = cause.errors.get(name, 0.0), cause.lowered.get(name, 0.0)
+        if abs(float(cause.effect.values[name]) - null[name]) >= 3 * math.sqrt(max(error**2 - lowered**2, 0.0)):
+            return False
+    return True
 
 
 def _settle_shifts(state: Search) -> None:

@@ -49,6 +49,7 @@ class Cause:
     group: list[str]
     errors: dict[str, float] = field(default_factory=dict)
     along: dict[str, float] = field(default_factory=dict)  # further errors, along coordinates that are held
+    lowered: dict[str, float] = field(default_factory=dict)  # parts of the errors that can only have made it too small
     image_evidence: ImageEvidence | None = None
     promised: float | None = None  # nats of the gain in the images' own rows, where that is not all of it
     rms_before: float = math.nan
@@ -62,7 +63,7 @@ class Saved:
     """A state to come back to."""
 
     vector: Tensor
-    causes: list[tuple[Cause, Effect, dict[str, float]]]
+    causes: list[tuple[Cause, Effect, dict[str, float], dict[str, float]]]
     sites: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
 
 
@@ -146,16 +147,16 @@ class Search:
         """Everything that naming a cause changes."""
         return Saved(
             self.nominal.vector,
-            [(c, c.effect, dict(c.errors)) for c in self.causes],
+            [(c, c.effect, dict(c.errors), dict(c.lowered)) for c in self.causes],
             [(s.image, s.valid, s.gain, s.offset, s.texture) for s in self.sites],
         )
 
     def load(self, saved: Saved) -> None:
         """Back to what was saved."""
         self.nominal.vector = saved.vector
-        self.causes[:] = [c for c, _, _ in saved.causes]
-        for cause, effect, errors in saved.causes:
-            cause.effect, cause.errors = effect, dict(errors)
+        self.causes[:] = [c for c, *_ in saved.causes]
+        for cause, effect, errors, lowered in saved.causes:
+            cause.effect, cause.errors, cause.lowered = effect, dict(errors), dict(lowered)
         for site, (image, valid, gain, offset, texture) in zip(self.sites, saved.sites, strict=True):
             site.image, site.valid, site.gain, site.offset, site.texture = image, valid, gain, offset, texture
 
