@@ -56,13 +56,13 @@ STANDS_OUT = 1.4  # rms of a pattern over what the texture's spectrum foretells
 def choose(state: Search, seen: Round) -> list[Cause]:
     """The next cause to name, and those that the linear model finds nearly as good; empty where there is none."""
     count = len(effect_names())
-    worthy = [e for e in _no_remains(state, seen) if worth(e, count, state.data)]
+    worthy = [e for e in _no_remains(state, seen) if _worth(e, count, state.data)]
     scene = sorted(worthy, key=lambda e: -e.gain)
     image = sorted((e for e in seen.images.values() if worth_image(e, count)), key=lambda e: -e.gain)
     if image and image[0].effect == "image_gain" and not scene:
         # a scene-wide effect that does nearly as well with a few numbers as gains do with one for each image
         near = [e for e in seen.best.values() if e.gain > KEEP_SHARE * image[0].gain]
-        near = [e for e in near if worth(e, count, state.data, 5.0)]
+        near = [e for e in near if _worth(e, count, state.data, 5.0)]
         scene = sorted(near, key=lambda e: -e.gain)
     single = []
     if image:
@@ -118,7 +118,7 @@ def suspected(state: Search, seen: Round) -> set[str]:
     them, or not quite the same at every site.
     """
     count, data = len(effect_names()), state.data
-    found = [e for e in _no_remains(state, seen) if _sure(e, count, data) and not worth(e, count, data)]
+    found = [e for e in _no_remains(state, seen) if _sure(e, count, data) and not _worth(e, count, data)]
     pattern = _pattern(state, seen.pattern, 1)  # asked for alone, not as one of many
     return {e.effect for e in found} | ({pattern.effect.name} if pattern is not None else set())
 
@@ -181,7 +181,7 @@ def family_wise(e: Evidence, count: int, data: Survey) -> float:
     return min(1.0, e.p * count * len(get_effect(e.effect).trials(data)))
 
 
-def worth(e: Evidence, count: int, data: Survey, ease: float = 1.0) -> bool:
+def _worth(e: Evidence, count: int, data: Survey, ease: float = 1.0) -> bool:
     """Whether the evidence is enough for a name, among ``count`` effects that were looked for."""
     return not _too_small(e, data) and _alike(e) and _sure(e, count, data, ease)
 
@@ -299,6 +299,5 @@ __all__ = [
     "misaligned",
     "suspected",
     "with_values",
-    "worth",
     "worth_image",
 ]
