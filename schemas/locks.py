@@ -14,6 +14,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
+from schemas.companions import remove_companions
 from schemas.errors import ConfigError
 
 # A process on another machine cannot be asked whether it lives: it touches its locks, and a lock that was not touched
@@ -68,7 +69,7 @@ def unlocked() -> Iterator[None]:
 def claim(output: Path) -> Iterator[None]:
     """Hold the lock of an output; a process may claim it again within. Raises ConfigError where another run has it.
 
-    What killed runs left beside the output under temporary names is removed.
+    What killed runs left beside the output under temporary names is removed, and so are its companions where it is absent.
     """
     lock = lock_path(output)
     if _unlocked.get() or not lock.parent.is_dir():  # a missing folder is made later, by check_output
@@ -77,10 +78,11 @@ def claim(output: Path) -> Iterator[None]:
     with _guard:
         mine = lock in _held
         if not mine:
-            _acquire(lock, output)
+            noted = _acquire(lock, output)
         _held[lock] = _held.get(lock, 0) + 1
     if not mine:
         _remove_partials(Path(os.path.abspath(output)))
+        remove_companions(noted, output)
         _keep_alive()
     try:
         yield
@@ -90,10 +92,13 @@ def claim(output: Path) -> Iterator[None]:
             if not _held[lock]:
                 del _held[lock]
                 with contextlib.suppress(OSError):
+                    remove_companions(lock.read_text(), output)
                     lock.unlink()
 
 
-def _acquire(lock: Path, output: Path) -> None:
+def _acquire(lock: Path, output: Path) -> str:
+    """Returns what the lock of a dead run said, which this one has taken over."""
+    noted = ""
     for _ in range(5):
         try:
             number = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
@@ -104,6 +109,7 @@ def _acquire(lock: Path, output: Path) -> None:
             if not _is_stale(lock, owner):
                 raise ConfigError(_refusal(output, lock, owner)) from None
             _discard(lock, seen)
+            noted = seen
             continue
         except OSError as error:
             raise ConfigError(f"{output}: cannot be written ({error.strerror}); choose another --output.") from None
@@ -115,7 +121,7 @@ def _acquire(lock: Path, output: Path) -> None:
         }
         with os.fdopen(number, "w") as stream:
             json.dump(own, stream)
-        return
+        return noted
     raise ConfigError(f"{output}: another run is taking this output at the same moment; let it finish.")
 
 
@@ -134,7 +140,7 @@ def _read(lock: Path) -> tuple[dict[str, Any] | None, str]:
     except OSError:
         return None, ""
     try:
-        owner = json.loads(text)
+        owner = json.loads(text.partition("\n")[0])  # companions may follow
         return {"host": owner["host"], "pid": int(owner["pid"]), "began": owner["began"], "since": owner["since"]}, text
     except (ValueError, KeyError, TypeError):
         return {}, text

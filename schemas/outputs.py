@@ -11,8 +11,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from schemas.companions import current_output, note_companion
 from schemas.errors import ConfigError, InputError
-from schemas.locks import claim, partial_path
+from schemas.locks import claim, lock_path, partial_path
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -61,6 +62,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     partial = partial_path(path)
     with claim(path), _whole_or_absent(path, partial):
         yield partial
+        if (output := current_output()) is not None and output != path:
+            note_companion(lock_path(output), path, partial)
         os.replace(partial, path)
 
 

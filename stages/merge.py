@@ -22,6 +22,7 @@ from schemas import (
     read_kind,
     read_strings,
 )
+from schemas.companions import companions_of
 from schemas.provenance import whole_command
 from stages.physics.frames import relative_path
 from stages.physics.geotiff import write_geotiff
@@ -148,7 +149,7 @@ def run(
             if "path" in names and record == "frame":
                 _move_paths(files, parts, writer.file, output)
             if as_geotiff:
-                with atomic_path(tiff) as partial:
+                with companions_of(output), atomic_path(tiff) as partial:
                     write_geotiff(partial, writer.file, read_grid(writer.file, output))
             if progress:
                 progress(len(names), len(names), "merging")

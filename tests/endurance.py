@@ -56,7 +56,7 @@ def interrupt(command: list[object], output: Path, how: int, after: float) -> bo
     if alive:
         process.send_signal(how)
     _, said = finish(process)
-    if "Traceback" in said:
+    if "Traceback" in said and "lunargr" in said:  # and not one of Python's own, before it has read a line of ours
         raise AssertionError(f"an interruption ended in a traceback:\n{said}")
     if output.exists() and output.suffix == ".h5":  # whole, then
         open_artefact(output, read_kind(output)).close()
@@ -84,7 +84,7 @@ def endure(name: str, command: list[object], reference: Path, seconds: float, rn
             after = rng.uniform(0.0, 1.05 * seconds)
             caught = interrupt(full, output, how, after)
             blows.append(f"{signal.Signals(how).name} at {after:.2f} s" + ("" if caught else " (too late)"))
-        code, said = lunargr(*full, "--overwrite")
+        code, said = lunargr(*full, *(["--overwrite"] if output.exists() else []))
         if code != 0:
             raise AssertionError(f"after {', '.join(blows)} the rerun ended with {code}: {said}")
         compare(name, reference, output)

@@ -13,6 +13,7 @@ import time
 import pytest
 
 from schemas import ConfigError, atomic_path
+from schemas.companions import companions_of
 from schemas.locks import SILENCE, claim, host, lock_path, unlocked
 
 
@@ -118,3 +119,56 @@ def test_one_of_many_takes_over_a_stale_lock(tmp_path):
     for process in many:
         process.join()
     assert answers == ["got it"] + ["refused"] * 5
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from schemas import atomic_path
+from schemas.companions import companions_of
+from schemas.locks import claim
+output = Path(sys.argv[1])
+with claim(output), companions_of(output):
+    for name in ("map.tif", "map.png"):
+        with atomic_path(output.with_name(name)) as partial:
+            partial.write_text("of the killed run")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_belongs_to_an_output_goes_with_a_run_that_was_killed_before_it(tmp_path):
+    output, tiff, png = (tmp_path / name for name in ("map.h5", "map.tif", "map.png"))
+    assert subprocess.run([sys.executable, "-c", KILLED, output], check=False).returncode == -signal.SIGKILL
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".map.h5.lock", "map.png", "map.tif"]
+    png.unlink()
+    png.write_text("somebody's own")
+    with claim(output):
+        assert not tiff.exists()
+        assert png.read_text() == "somebody's own"
+    assert [p.name for p in tmp_path.iterdir()] == ["map.png"]
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_what_belongs_to_an_output_goes_with_a_run_that_fails_before_it(tmp_path, whole):
+    output, tiff, before = tmp_path / "map.h5", tmp_path / "map.tif", tmp_path / "before.tif"
+    before.write_text("there before")
+    with pytest.raises(KeyboardInterrupt), claim(output):
+        with companions_of(output):
+            for path in (tiff, before):  # the second replaces a file
+                with atomic_path(path) as partial:
+                    partial.write_text("new")
+        if whole:
+            with atomic_path(output) as partial:
+                partial.write_text("whole")
+        raise KeyboardInterrupt
+    assert tiff.exists() == whole
+    assert before.read_text() == "new"
+    assert not lock_path(output).exists()
+
+
+def test_files_that_belong_to_nothing_stay(tmp_path):
+    with pytest.raises(KeyboardInterrupt), claim(tmp_path / "checkpoint.h5"):
+        with atomic_path(tmp_path / "epoch.h5") as partial:
+            partial.write_text("an epoch")
+        raise KeyboardInterrupt
+    assert [p.name for p in tmp_path.iterdir()] == ["epoch.h5"]

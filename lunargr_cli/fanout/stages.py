@@ -12,6 +12,7 @@ from typing import Any
 
 from lunargr_cli.fanout.job import open_job
 from schemas import ConfigError, atomic_path
+from schemas.companions import companions_of
 from schemas.outputs import check_output
 
 # What a part holds where --parts does not say: some minutes of work on real data.
@@ -183,7 +184,7 @@ def run_diagnose(
         (piece,) = job.fan("diagnosis", diagnose_part, [arguments])
         for made, wanted in ((".json", json_file), (".html", report), (".h5", output)):
             if wanted is not None:
-                with atomic_path(wanted) as partial:
+                with companions_of(output), atomic_path(wanted) as partial:
                     shutil.copyfile(piece.with_suffix(made), partial)
         return json.loads(piece.with_suffix(".json").read_text())
 

@@ -18,6 +18,7 @@ answer       verdict, JSON, diagnosis.h5       report      HTML
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ import numpy as np
 import torch
 
 from schemas import ArtefactError, ConfigError, atomic_path, check_output
+from schemas.companions import companions_of
 from stages.diagnose.answer import Answer, HeldOut, cause_json, held_out, parameters, write_diagnosis
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import group_pairs, load_site, survey
@@ -87,15 +89,14 @@ def run(
     with PairReader(pairs) as reader:
         result = diagnose(reader, checkpoint, config, say or (lambda _: None), progress or (lambda *_: None))
         image_ids = reader.image_ids
-    if json_file is not None:
-        import json
+    with companions_of(output):
+        if json_file is not None:
+            with atomic_path(json_file) as partial:
+                partial.write_text(json.dumps(result.answer.to_json(), indent=1))
+        if report is not None:
+            from stages.diagnose.report import write_report
 
-        with atomic_path(json_file) as partial:
-            partial.write_text(json.dumps(result.answer.to_json(), indent=1))
-    if report is not None:
-        from stages.diagnose.report import write_report
-
-        write_report(report, result)
+            write_report(report, result)
     if output is not None:  # last: where it is, the others are
         write_diagnosis(output, result.answer, image_ids, inputs, overwrite)
     return result

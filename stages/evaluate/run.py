@@ -23,6 +23,7 @@ from schemas import (
     open_artefact,
     read_config,
 )
+from schemas.companions import companions_of
 from stages.effects import load_extension
 from stages.evaluate.bootstrap import TileBootstrap
 from stages.evaluate.core import TITLES, Row, Scores, choose_fit_pairs, dn_scale, fit_renderers, layout, score
@@ -322,9 +323,10 @@ def _evaluate(
         artefact.write("ssim", scores.ssim)
         artefact.file.attrs["split"] = config.split
         artefact.file.attrs["metrics"] = json.dumps(result)
-    for report in reports:
-        with atomic_path(report) as partial:
-            partial.write_text(json.dumps(result, indent=1) + "\n")
+        with companions_of(output):
+            for report in reports:
+                with atomic_path(report) as partial:
+                    partial.write_text(json.dumps(result, indent=1) + "\n")
     if figures is not None:
         from stages.evaluate.figures import write_figures
 

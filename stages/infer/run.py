@@ -28,6 +28,7 @@ from schemas import (
     open_artefact,
     read_strings,
 )
+from schemas.companions import companions_of
 from schemas.hdf5 import silence_hdf5
 from stages.infer.config import Config, Summary
 from stages.infer.terrain import TerrainReader, valid_part
@@ -104,6 +105,7 @@ def run(
             picture = None
             # a shard holds some rows only; the GeoTIFF is made of the merged whole
             if config.geotiff and config.shard[1] == 1:
+                stack.enter_context(companions_of(output))
                 partial = stack.enter_context(atomic_path(tiff))
                 picture = stack.enter_context(MapTiff(partial, grid, names, attributes))
             windows = _predict(file, writer, picture, mapper, config, progress)
@@ -194,7 +196,7 @@ def _sample_of(scene: h5py.File, size: int = 256) -> NDArray[np.float32]:
 def _statistics(file: h5py.File, names: list[str]) -> tuple[float, dict[str, tuple[float, float, float, float]]]:
     """Mean, std and percentiles from at most half a million pixels, in few rows: each touches a chunk every 256 pixels."""
     height, width = file["valid"].shape
-    rows = range(0, height, max(1, height // 256))
+    rows = range(0, height, max(1, height // 64))
     step = max(1, math.ceil(len(rows) * width / 5e5))
     share = float(np.mean([file["valid"][r, :].mean() for r in rows]))
     ranges = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from schemas.companions import companions_of
 from schemas.outputs import check_output
 from stages.physics.bodies import find_body
 from stages.render.config import Config, Summary, check, inputs, output_files
@@ -27,7 +28,7 @@ def run(
     files = output_files(output, config.view)
     for path in files:
         check_output(path, inputs(source, config), overwrite)
-    with open_source(source, config, body) as surface:
+    with companions_of(output), open_source(source, config, body) as surface:
         relief = surface.height_range()
         if config.view == "ortho":
             light = make_light(surface, config, body, relief)
