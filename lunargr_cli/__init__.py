@@ -7,16 +7,28 @@ import multiprocessing
 import os
 import signal
 import sys
+from types import FrameType
 from typing import Any
 
 INTERRUPTED = "lunargr: interrupted; nothing half-written was kept."
+IMPORT_POLL = 0.02  # seconds
 signals: list[int] = []  # that asked this command to stop
 
 
 def stop(number: int, frame: Any) -> None:
-    """Unwind: locks are let go of, and partial files go."""
+    """Unwind: locks are let go of, and partial files go. An import ends first: libraries print what breaks theirs."""
     signals.append(number)
+    if _is_importing(frame):
+        signal.signal(signal.SIGALRM, lambda _, later: stop(number, later))
+        signal.setitimer(signal.ITIMER_REAL, IMPORT_POLL)
+        return
     raise_again()
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+        frame = frame.f_back
+    return frame is not None
 
 
 def raise_again() -> None:

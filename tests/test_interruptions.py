@@ -9,6 +9,7 @@ import resource
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -41,6 +42,9 @@ def python(program: str) -> subprocess.CompletedProcess:
         # a library that makes another error of it, as numpy's and numba's imports do
         "import lunargr_cli.main as m\ndef app():\n try: os.kill(os.getpid(), signal.SIGINT)\n"
         " except KeyboardInterrupt: raise ImportError('numpy')\nm.app = app\nm.main()",
+        # within an import, where compiled libraries print what breaks theirs
+        f"import lunargr_cli.main as m, time; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "def app():\n import interrupted_import\n time.sleep(60)\nm.app = app\nm.main()",
         # where Python swallows it, and would print a traceback
         "import lunargr_cli.main as m, weakref\nclass Kept: pass\ndef app():\n kept = Kept()\n"
         " gone = weakref.ref(kept, lambda _: os.kill(os.getpid(), signal.SIGINT))\n del kept\n m.raise_again()\n"
