@@ -196,6 +196,14 @@ def test_too_few_pixels_cannot_tell(scene, tmp_path):
     assert answer.verdict == "cannot_tell" and not answer.causes and "too few" in answer.sentence()
 
 
+def test_a_low_sun_over_rugged_ground_cannot_tell(tmp_path):
+    """Three of four such worlds with nothing hidden had a name: the DEM's errors choose which slopes seem to face the Sun."""
+    low = Scene(Layout(seed=9, sites=3, images=8, size=96, slope_deg=14.0, sun_elevations=(3.0, 25.0)))
+    answer = diagnose.run(_pairs(low, tmp_path, {"phase_slope": PLANTS["phase_slope"]})).answer
+    assert answer.verdict == "cannot_tell" and not answer.causes and "Sun is too low" in answer.sentence()
+    assert "phase_slope" in answer.blind
+
+
 def test_sites_may_have_unequal_numbers_of_images(scene, tmp_path):
     """Stacks from a real archive: maps of slope errors come from the sites with enough images alone."""
     data = scene.make(Truth(effect={"dem_smoothing": {"sigma2_px2": 1.5}}), 11)

@@ -1,18 +1,19 @@
 """`lunargr diagnose`: what the simulation gets wrong, why, and what fixing it is worth.
 
-data         measured pairs by site            chain       the forward model, rendered with small changes
-nominal      the model that is judged          sampled     ... its start, from few pixels
-form         ... or one of another form        projection  texture and DEM error taken out, per ground pixel
-columns      what effects add to images        preparing   a site's weights, texture and slopes
-statistics   products per cluster of pixels    evidence    held-out gain and significance, scene-wide effects
-images       effects with values per image     relief      a DEM's scale and smoothing
-pattern      a broad albedo pattern            plateau     highlights that are cut off
-looking      one look at all of that           naming      what deserves a name after it
-refining     the values that fit best          contest     nearly equal candidates, each tried in the model
-gains        ... or what acts by image          selection   name, refine, look again
-state        what is known so far              parallel    sites side by side
-numbers      tails of distributions            unexplained what is left, what is not seen
-answer       verdict, JSON, diagnosis.h5       report      HTML
+data         measured pairs by site                       chain        the forward model, rendered with small changes
+nominal      the model that is judged                     sampled      ... its start, from few pixels
+form         ... or one of another form                  judged       pixels clear of relief that the DEM lacks
+projection   texture and DEM error taken out, per pixel  columns      what effects add to images
+preparing    a site's weights, texture and slopes        statistics   products per cluster of pixels
+evidence     held-out gain and significance, scene-wide  images       effects with values per image
+relief       a DEM's scale and smoothing                 pattern      a broad albedo pattern
+plateau      highlights that are cut off                 looking      one look at all of that
+naming       what deserves a name after it               refining     the values that fit best
+contest      nearly equal candidates, each tried         gains        ... or what acts by image
+selection    name, refine, look again                    state        what is known so far
+parallel     sites side by side                          numbers      tails of distributions
+unexplained  what is left, what is not seen              answer       verdict, JSON, diagnosis.h5
+report       HTML
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from stages.diagnose.answer import Answer, HeldOut, cause_json, held_out, parame
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import group_pairs, load_site, survey
 from stages.diagnose.form import first_form, richer_form
+from stages.diagnose.judged import LEAST, judged_share
 from stages.diagnose.looking import Round
 from stages.diagnose.nominal import Nominal, fit, lit_mask, load_nominal
 from stages.diagnose.plateau import CLEAR_OF, KEEP_BELOW, plateau, saturated
@@ -154,6 +156,14 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         say(f"{nominal.model.name} has the wrong form: {form} is fitted in its place")
         answer.form, nominal = form, load_nominal(None, form, reader.units)
         state = begin(nominal)
+    clear = judged_share(state.each(lambda chain: chain))
+    if clear < LEAST:
+        answer.blind = effect_names()
+        answer.note = (
+            f"the Sun is too low over this ground: {100 * clear:.0f} % of the lit pixels are in images that mostly see it clear of their "
+            f"slopes and horizon ({100 * LEAST:.0f} % are the least)"
+        )
+        return Result(answer, state, None, None)
     misfit = _misfit(state)
     if not misfit < MISFIT:
         answer.verdict, answer.unexplained_fraction = "unexplained", 1.0

@@ -12,10 +12,9 @@ from torch import Tensor
 from stages.diagnose.chain import Chain
 from stages.diagnose.columns import nominal_columns, nuisance_columns
 from stages.diagnose.data import GRAZING, Site
+from stages.diagnose.judged import judged, rising
 from stages.diagnose.projection import Local, Projector
 
-CUT = math.radians(15)  # photometric effects are judged where neither slope nor shadow is a matter of sub-pixel relief,
-RUGGED = 1.35  # ... which on rugged ground takes more: this many times its rms slope
 DEEP = math.radians(2)  # below the horizon: shadow, whatever the DEM's errors
 UNRESOLVED_SLOPES = 1.0  # ordinary amount of the column of unresolved slopes
 SHORE = 1  # px of shadow next to light, where the place of the edge decides
@@ -135,14 +134,11 @@ def _first_weight(chain: Chain, wide: bool, far: bool) -> Tensor:
     above = chain.height_above_horizon()
     mu0 = state.angles.cos_incidence
     use = site.valid & ((mu0 > GRAZING) | (mu0 < -GRAZING)) & (state.angles.cos_emission > 0.15)
-    rising = torch.asin(mu0.clamp(-1, 1))  # the Sun above the facet's own plane
-    if above is not None:
-        rising = torch.minimum(above, rising)
-    else:
+    if above is None:
         use &= mu0 > GRAZING
-    cut = max(CUT, RUGGED * _rms_slope(chain))
-    if not wide and float((use & (rising > cut)).sum()) > 0.1 * float(use.sum()):
-        use &= (rising > cut) | _inner_shadow(chain, SHORE)
+    sun = rising(chain)
+    if not wide:
+        use &= judged(chain, use, sun) | _inner_shadow(chain, SHORE)
     doubt = DOUBT * (state.reflectance + 0.2 * mean)
     if wide and above is not None:  # the further away a shadow's edge begins the better its place is known
         if far:
@@ -154,7 +150,7 @@ def _first_weight(chain: Chain, wide: bool, far: bool) -> Tensor:
         variance = variance + (doubt * torch.exp(-above.abs() / cast)) ** 2
     else:
         edge = torch.where(mu0 > 0 if above is None else above > 0, EDGE, 0.3 * EDGE)
-        variance = variance + (doubt * torch.exp(-rising.abs() / edge)) ** 2
+        variance = variance + (doubt * torch.exp(-sun.abs() / edge)) ** 2
     return use * variance.clamp(min=1e-14).rsqrt()
 
 
@@ -167,12 +163,6 @@ def _inner_shadow(chain: Chain, distance: int) -> Tensor:
         (above > -DEEP)[:, None].float(), 2 * distance + 1, stride=1, padding=distance
     )
     return near[:, 0] == 0
-
-
-def _rms_slope(chain: Chain) -> float:
-    """Of the site's ground, rad."""
-    east, north = chain.state.slopes
-    return math.atan(float((east.square() + north.square()).mean().sqrt()))
 
 
 def _rescale(dynamic: Tensor, projector: Projector) -> Tensor:
