@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 from schemas import ArtefactError
 from stages import diagnose
+from stages.diagnose.images import _agreement, _Fold
 from stages.diagnose.selection import _faint
 from stages.effects import get_effect, load_extension
 
@@ -202,6 +203,16 @@ def test_a_low_sun_over_rugged_ground_cannot_tell(tmp_path):
     answer = diagnose.run(_pairs(low, tmp_path, {"phase_slope": PLANTS["phase_slope"]})).answer
     assert answer.verdict == "cannot_tell" and not answer.causes and "Sun is too low" in answer.sentence()
     assert "phase_slope" in answer.blind
+
+
+def test_a_site_that_shows_nothing_of_an_effect_changes_no_agreement():
+    gram, score = torch.diag(torch.tensor([4.0, 9.0]).double()), torch.tensor([4.0, 18.0]).double()
+    alike = [(torch.arange(2), _Fold(gram, score)) for _ in range(3)]
+    blank = (torch.arange(2), _Fold(torch.zeros_like(gram), torch.zeros_like(score)))
+    values = torch.tensor([1.0, 2.0]).double()
+    # each site alone gains (4 + 36) / 2 nats, of which chance has half a nat for every value but the two in common
+    assert _agreement(values, alike) == pytest.approx(60 / (60 - 2), rel=1e-5)
+    assert _agreement(values, [*alike, blank]) == pytest.approx(60 / (60 - 3), rel=1e-5)
 
 
 def test_sites_may_have_unequal_numbers_of_images(scene, tmp_path):

@@ -118,7 +118,7 @@ def _agreement(values: Tensor, parts: list[tuple[Tensor, _Fold]]) -> float:
         return 1.0
     own = common = 0.0
     for place, fold in parts:
-        ridge = 1e-6 * float(fold.gram.diagonal().mean()) * torch.eye(len(fold.gram), dtype=torch.float64)
+        ridge = max(1e-6 * float(fold.gram.diagonal().mean()), 1e-30) * torch.eye(len(fold.gram), dtype=torch.float64)
         own += 0.5 * float(fold.score @ torch.linalg.solve(fold.gram + ridge, fold.score))
         here = values[place]
         common += float(here @ fold.score - 0.5 * here @ fold.gram @ here)
