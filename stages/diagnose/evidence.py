@@ -113,7 +113,10 @@ def _weigh_one(candidate, score: Tensor, gram: Tensor, places, images, rows: flo
         effective = float(energy.sum() ** 2 / energy.square().sum().clamp(min=1e-30))
         fewest = min(fewest, effective)
         robust = inverse @ meat @ inverse
-        wald = float(amount @ torch.linalg.solve(robust + torch.diag(1e-12 * robust.diagonal().clamp(min=1e-200)), amount)) / k
+        wald = (
+            float(amount @ torch.linalg.solve(robust + torch.diag(1e-12 * robust.diagonal().clamp(min=1e-200)), amount))
+            / k
+        )
         freedom = max(effective - k, 0.8 * (count - 1 - k), 0.5)
         tail = f_tail(wald, k, freedom)
         if 2 * k > count:  # with about as many columns as clusters only the held-out direction can be tested

@@ -236,8 +236,8 @@ STAGES = {
         lambda b, n: ["merge", *[b.some_pairs()] * (n // 256)], one,
     ),
     "diagnose": Stage(
-        "pairs of stacks", "thousand pairs", (12, 24, 48), (48, 480, 1920),
-        lambda b, n: ["diagnose", b.stack(n), "--model", "hapke", "--pairs", n], one,
+        "pairs of the file, at most 384 looked at", "thousand pairs", (48, 96, 192), (384, 1920, 10240),
+        lambda b, n: ["diagnose", b.stack(n), "--model", "hapke"], one,
     ),
 }  # fmt: skip
 
