@@ -14,7 +14,7 @@ CUT = math.radians(15)  # the Sun above a slope and above the horizon, at least 
 RUGGED = 1.35  # ... and on rugged ground this many times its rms slope
 HARDLY_ANY = 0.1  # of a site's pixels: all are taken where no more would be left
 MOST = 0.5  # of an image's lit pixels: the DEM's errors choose fewer, slopes that only seem to face the Sun
-LEAST = 0.1  # of all lit pixels, in such images, from which anything can be told
+LEAST = 0.2  # of all lit pixels, in such images, from which anything can be told
 
 
 def rising(chain: Chain) -> Tensor:
