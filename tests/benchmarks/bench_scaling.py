@@ -237,7 +237,7 @@ STAGES = {
     ),
     "diagnose": Stage(
         "pairs of the file, at most 384 looked at", "thousand pairs", (48, 96, 192), (384, 1920, 10240),
-        lambda b, n: ["diagnose", b.stack(n), "--model", "hapke"], one,
+        lambda b, n: ["diagnose", b.stack(n), "--model", "M2"], one,
     ),
 }  # fmt: skip
 
