@@ -160,8 +160,8 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     if clear < LEAST:
         answer.blind = effect_names()
         answer.note = (
-            f"the Sun is too low over this ground: {100 * clear:.0f} % of the lit pixels are in images that mostly see it clear of their "
-            f"slopes and horizon ({100 * LEAST:.0f} % are the least)"
+            f"the Sun is too low over this ground: {100 * clear:.0f} % of the lit pixels lie in images that see most of their lit ground "
+            f"clear of its own slopes, {100 * LEAST:.0f} % are needed; add images with a higher Sun"
         )
         return Result(answer, state, None, None)
     misfit = _misfit(state)
