@@ -42,7 +42,7 @@ KINDS = {SHORT: "<u2", LONG: "<u4", LONG8: "<u8"}
 SUBFILE, TILE_OFFSETS, TILE_COUNTS = 254, 324, 325
 GEOREFERENCE = (33550, 33922, 34264, 34735, 34736, 34737)  # an overview has that of the map
 AROUND = 8  # bytes around a tile
-TOGETHER = 64  # tiles written at once
+TOGETHER = 16  # tiles written at once
 CLASSIC = 1 << 32  # bytes, at which a TIFF's own places end: a BigTIFF's go on
 STRUCTURE = (
     "LAYOUT=IFDS_BEFORE_DATA\nBLOCK_ORDER=ROW_MAJOR\nBLOCK_LEADER=SIZE_AS_UINT4\nBLOCK_TRAILER=LAST_4_BYTES_REPEATED\n"
