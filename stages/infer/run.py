@@ -41,6 +41,7 @@ from stages.network.predictor import choose_device, load_predictor
 from stages.network.runtime import choose_inference_precision, keep_freed_memory
 from stages.physics.geotiff import EVEN, MapTiff
 from stages.physics.grid import read_grid
+from stages.physics.memory import return_freed_memory
 
 Progress = Callable[[int, int, str], None]
 
@@ -151,6 +152,7 @@ def _predict(
         if part is not None:
             for row, values in mapper.strips(TerrainReader(elevation, dem_valid), elevation.shape, part):
                 yield row, part[1], values
+        return_freed_memory()  # or what windows of other sizes leave behind would grow with the map
 
     # The GeoTIFF takes strips as they come where its overviews can be made of each by itself.
     at_once = window == stride and all(row % EVEN == 0 and col % EVEN == 0 for row, col, _, _ in boxes)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +21,7 @@ from rasterio.windows import Window
 
 from schemas.errors import InputError
 from stages.physics.grid import Grid, ellipsoid_of, latitude_squash
+from stages.physics.memory import return_freed_memory
 
 # ISIS special pixels of 32-bit cubes (NULL, LRS, LIS, HIS, HRS) all lie beyond this; so do -3.4028e38 in its spellings.
 SPECIAL = 3.4e38
@@ -56,13 +56,7 @@ def open_raster(path: Path, what: str = "a raster") -> Iterator[DatasetReader]:
             f"{path}: cannot be read to the end ({_one_line(error)}); the file is damaged or truncated, fetch it again."
         ) from None
     finally:
-        _return_freed_memory()
-
-
-def _return_freed_memory() -> None:
-    """Give the pieces back that a raster's blocks leave in glibc's heap: it would grow by 0.1 GB with every image."""
-    with contextlib.suppress(OSError, AttributeError):  # another C library, which has no such call
-        ctypes.CDLL(None).malloc_trim(0)
+        return_freed_memory()  # the pieces that a raster's blocks leave would grow by 0.1 GB with every image
 
 
 def _one_line(error: BaseException) -> str:
