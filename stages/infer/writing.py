@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas import ArtefactWriter
-from stages.infer.windows import CHUNK, Box, blend_weights
+from stages.infer.windows import CHUNK, WIDEST, Box, blend_weights
 from stages.physics.geotiff import MapTiff
 
 
@@ -24,13 +25,14 @@ class Outputs:
         self.coefficients, self.valid = writer.dataset("coefficients"), writer.dataset("valid")
         self.copied = writer.dataset("elevation")
         self.elevation, self.dem_valid, self.tiff = elevation, dem_valid, tiff
-        self._to_copy = iter(range(own[0], own[1], CHUNK))
+        columns = range(0, self.copied.shape[1], WIDEST)
+        self._to_copy = itertools.product(range(own[0], own[1], CHUNK), columns)
         self._end = own[1]
 
     def copy_elevation(self) -> bool:
-        """The next row of chunks, all columns; whether there was one: the network works on while some strips are written."""
-        for row in self._to_copy:
-            part = slice(row, min(self._end, row + CHUNK))
+        """Some chunks of the next row; whether there were any: the network works on while some strips are written."""
+        for row, col in self._to_copy:
+            part = np.s_[row : min(self._end, row + CHUNK), col : col + WIDEST]
             self.copied[part] = self.elevation[part]
             return True
         return False
