@@ -1,7 +1,7 @@
 """`lunargr diagnose`: what the simulation gets wrong, why, and what fixing it is worth.
 
-data         measured pairs by site                       chain        the forward model, rendered with small changes
-nominal      the model that is judged                     sampled      ... its start, from few pixels
+data         measured pairs by site                      chain        the forward model, rendered with small changes
+nominal      the model that is judged                    sampled      ... its start, from few pixels
 form         ... or one of another form                  judged       pixels clear of relief that the DEM lacks
 projection   texture and DEM error taken out, per pixel  columns      what effects add to images
 preparing    a site's weights, texture and slopes        statistics   products per cluster of pixels
@@ -33,7 +33,7 @@ from stages.diagnose.answer import Answer, HeldOut, cause_json, held_out, parame
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import group_pairs, load_site, survey
 from stages.diagnose.form import first_form, richer_form
-from stages.diagnose.judged import LEAST, judged_share
+from stages.diagnose.judged import LEAST, clear_and_lit
 from stages.diagnose.looking import Round
 from stages.diagnose.nominal import Nominal, fit, lit_mask, load_nominal
 from stages.diagnose.plateau import CLEAR_OF, KEEP_BELOW, plateau, saturated
@@ -156,11 +156,12 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         say(f"{nominal.model.name} has the wrong form: {form} is fitted in its place")
         answer.form, nominal = form, load_nominal(None, form, reader.units)
         state = begin(nominal)
-    clear = judged_share(state.each(lambda chain: chain))
-    if clear < LEAST:
+    clear, lit = (sum(of) for of in zip(*state.each(clear_and_lit), strict=True))
+    share = clear / max(lit, 1.0)
+    if share < LEAST:
         answer.blind = effect_names()
         answer.note = (
-            f"the Sun is too low over this ground: {100 * clear:.0f} % of the lit pixels lie in images that see most of their lit ground "
+            f"the Sun is too low over this ground: {100 * share:.0f} % of the lit pixels lie in images that see most of their lit ground "
             f"clear of its own slopes, {100 * LEAST:.0f} % are needed; add images with a higher Sun"
         )
         return Result(answer, state, None, None)

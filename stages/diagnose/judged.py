@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -30,15 +29,11 @@ def judged(chain: Chain, use: Tensor, sun: Tensor) -> Tensor:
     return clear if float(clear.sum()) > HARDLY_ANY * float(use.sum()) else use
 
 
-def judged_share(chains: Iterable[Chain]) -> float:
-    """Of the lit pixels of all sites, those clear of the ground's own slopes, in images that show most of their lit ground so."""
-    all_lit = all_clear = 0.0
-    for chain in chains:
-        sun = rising(chain)
-        lit, clear = (((sun > least) & chain.site.valid).sum((-2, -1)) for least in (0.0, _rugged(chain)))
-        all_lit += float(lit.sum())
-        all_clear += float(clear[clear > MOST * lit].sum())
-    return all_clear / max(all_lit, 1.0)
+def clear_and_lit(chain: Chain) -> tuple[float, float]:
+    """Counts of lit pixels: those clear of the ground's own slopes, in images that show most of their lit ground so; and all."""
+    sun = rising(chain)
+    lit, clear = (((sun > least) & chain.site.valid).sum((-2, -1)) for least in (0.0, _rugged(chain)))
+    return float(clear[clear > MOST * lit].sum()), float(lit.sum())
 
 
 def _rugged(chain: Chain) -> float:
