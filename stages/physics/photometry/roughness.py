@@ -21,7 +21,7 @@ import math
 import torch
 from torch import Tensor
 
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 
 
 def rough_surface(angles: Angles, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
