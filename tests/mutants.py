@@ -39,7 +39,11 @@ def caught(mutant: Mutant, folder: Path) -> bool:
     tree = folder / "tree"
     shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(".venv", ".git", "demo", "results", "__pycache__"))
     plant(mutant, tree)
-    environment = os.environ | {"PYTHONPATH": str(tree), "LUNARGR_SHARED": str(_shared()), "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = os.environ | {
+        "PYTHONPATH": str(tree),
+        "LUNARGR_SHARED": str(_shared()),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *mutant.tests]
     try:
         done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=TIMEOUT)
@@ -74,11 +78,16 @@ def main() -> int:
             except ValueError as error:
                 outcome, broken = f"BROKEN: {error}", broken + 1
         noticed += outcome == "caught"
-        print(f"{number:3d}/{len(chosen)} {outcome:10s} {mutant.file}: {mutant.bug} ({time.monotonic() - started:.0f} s)", flush=True)
+        print(
+            f"{number:3d}/{len(chosen)} {outcome:10s} {mutant.file}: {mutant.bug} ({time.monotonic() - started:.0f} s)",
+            flush=True,
+        )
     if options.list:
         return 1 if broken else 0
     share = noticed / max(len(chosen), 1)
-    print(f"{noticed} of {len(chosen)} planted bugs caught ({100 * share:.0f} %, at least {100 * ENOUGH:.0f} % expected)")
+    print(
+        f"{noticed} of {len(chosen)} planted bugs caught ({100 * share:.0f} %, at least {100 * ENOUGH:.0f} % expected)"
+    )
     return 0 if share >= ENOUGH and not broken else 1
 
 

@@ -9,7 +9,7 @@ from rasterio.transform import Affine
 from small_scene import write_raster
 
 from schemas.errors import InputError
-from stages.physics.images.labels import index_images
+from stages.physics.images.pds_index import index_images
 from stages.physics.images.table import read_frames
 
 COLUMNS = (

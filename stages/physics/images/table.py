@@ -19,7 +19,7 @@ from schemas.reading import read_strings
 from schemas.writing import ArtefactWriter
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.images.frame_geometry import complete_row
-from stages.physics.images.labels import index_images
+from stages.physics.images.pds_index import index_images
 from stages.physics.maps.grid import unit_vectors
 
 ASTRONOMICAL_UNIT = 149597870700.0  # m, IAU 2012
