@@ -175,7 +175,7 @@ def test_text_of_the_user_is_escaped(page):
 
 
 def test_the_hole_in_the_dem_stays_a_hole(folder):
-    from stages.report.pictures import coloured, shaded_relief
+    from stages.common.page.pictures import coloured, shaded_relief
 
     elevation = np.linspace(0, 50, 400).reshape(20, 20)
     elevation[3:6, 3:6] = np.nan
@@ -184,7 +184,7 @@ def test_the_hole_in_the_dem_stays_a_hole(folder):
 
 
 def test_the_hillshade_is_lit_from_the_upper_left():
-    from stages.report.pictures import shaded_relief
+    from stages.common.page.pictures import shaded_relief
 
     rows, cols = np.mgrid[:60, :60]
     cone = 30.0 - np.hypot(rows - 29.5, cols - 29.5)
@@ -195,7 +195,7 @@ def test_the_hillshade_is_lit_from_the_upper_left():
 def test_large_maps_are_thinned(tmp_path):
     import h5py
 
-    from stages.report.pictures import read_thinned
+    from stages.common.page.pictures import read_thinned
 
     with h5py.File(tmp_path / "map.h5", "w") as file:
         file["map"] = np.add.outer(np.arange(2000.0), np.zeros(150))

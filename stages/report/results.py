@@ -7,8 +7,10 @@ from typing import Any
 
 import h5py
 import numpy as np
+from markupsafe import Markup
 
-from stages.report import page, pictures
+from stages.common import page
+from stages.common.page import pictures
 
 COLOURS = {"learned": "#3b8ecb", "global": "#4f9d69", "lunar_lambert": "#c08a2e", "hapke": "#c25b63"}
 UNITS = {"tile": "ground tiles", "site": "the sites of one ground tile"}
@@ -125,13 +127,13 @@ def _errors(result: dict[str, Any]) -> str:
     return pictures.chart_svg(figure, "errors")
 
 
-def _examples(file: h5py.File, names: list[str], unit: str) -> list[str]:
+def _examples(file: h5py.File, names: list[str], unit: str) -> list[Markup]:
     """Measured, rendered and residual for the first model's best, median and worst crop."""
     mse = file["mse"][0]
     order = np.argsort(mse)[: int(np.isfinite(mse).sum())]
     if not len(order):
         return []
-    parts = ["<h3>Example crops: rendered above, measured - rendered below</h3>"]
+    parts = [page.heading("Example crops: rendered above, measured - rendered below")]
     for label, k in (("best", order[0]), ("median", order[len(order) // 2]), ("worst", order[-1])):
         measured = file["measured"][k]
         low, high = pictures.limits(measured)
@@ -139,20 +141,17 @@ def _examples(file: h5py.File, names: list[str], unit: str) -> list[str]:
         spread = pictures.limits(np.abs(measured - rendered[0]), 1.0)[1]
         figures = [page.picture(pictures.data_uri(pictures.coloured(measured, low, high, "gray")), "measured")]
         for m, name in enumerate(names):
-            difference = pictures.coloured(measured - rendered[m], -spread, spread, "RdBu_r")
             above = pictures.data_uri(pictures.coloured(rendered[m], low, high, "gray"))
+            below = pictures.data_uri(pictures.coloured(measured - rendered[m], -spread, spread, "RdBu_r"))
             text = name.replace("_", " ")
-            residual = f'<img src="{pictures.data_uri(difference)}" alt="residual of {text}" style="margin-top:.3rem">'
-            figures.append(page.picture(above, f"{text}: rms {math.sqrt(file['mse'][m, k]):.4f}", bar=residual))
-        parts.append(
-            f"<h3>The {label} crop of '{names[0]}' (pair {file['pair_index'][k]})</h3>"
-            + page.crops(figures)
-            + '<div class="grid"><div>'
-            + pictures.colour_bar(low, high, "gray", "")
-            + f'<span class="soft">brightness, {unit}</span></div><div>'
-            + pictures.colour_bar(-spread, spread, "RdBu_r", "")
-            + '<span class="soft">measured - rendered</span></div></div>'
-        )
+            caption = f"{text}: rms {math.sqrt(file['mse'][m, k]):.4f}"
+            figures.append(page.picture_pair(above, below, f"residual of {text}", caption))
+        bars = [
+            (page.colour_bar(low, high, "gray", ""), f"brightness, {unit}"),
+            (page.colour_bar(-spread, spread, "RdBu_r", ""), "measured - rendered"),
+        ]
+        title = f"The {label} crop of '{names[0]}' (pair {file['pair_index'][k]})"
+        parts += [page.heading(title), page.crops(figures), page.named_bars(bars)]
     return parts
 
 

@@ -9,8 +9,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from schemas import ConfigError, InputError, atomic_path, check_output, open_artefact, read_kind
-from stages.report import page, pictures, results, sections
+from stages.common import page
+from stages.common.page import pictures
+from stages.report import results, sections
 
 BUILDERS = {
     "scene": sections.scene,
@@ -50,7 +54,7 @@ def run(
     found: list[tuple[int, page.Section]] = []
     cards: list[tuple[str, str, str]] = []
     shown: list[Path] = []
-    details: list[str] = []
+    details: list[Markup] = []
     seen: list[Any] = []  # evaluation.h5 and the evaluation.json beside it are one result
     for number, path in enumerate(sorted(files, key=lambda p: p.suffix.lower() == ".json")):
         if progress is not None:
@@ -83,7 +87,7 @@ def run(
 Part = tuple[str, page.Section | None, list[tuple[str, str, str]]]  # kind, section, headline numbers
 
 
-def _artefact(path: Path, details: list[str], seen: list[Any]) -> Part:
+def _artefact(path: Path, details: list[Markup], seen: list[Any]) -> Part:
     """The section of one HDF5 artefact; its origin is appended to ``details``, its result to ``seen``."""
     schema = read_kind(path)
     with open_artefact(path, schema) as file:
@@ -101,7 +105,7 @@ def _artefact(path: Path, details: list[str], seen: list[Any]) -> Part:
     return "scene", None, []
 
 
-def _json(path: Path, details: list[str], seen: list[Any]) -> Part:
+def _json(path: Path, details: list[Markup], seen: list[Any]) -> Part:
     """The section of a JSON result, told by its keys; none for one that is on the page already."""
     try:
         result: Any = json.loads(path.read_text())
@@ -145,7 +149,7 @@ def _gallery(paths: Sequence[Path]) -> page.Section:
     return section
 
 
-def _origin(path: Path, file: Any) -> str:
+def _origin(path: Path, file: Any) -> Markup:
     """Who made a file, from what and with which options."""
     attributes = file.attrs
     if "history" not in attributes:

@@ -9,7 +9,8 @@ import numpy as np
 
 from schemas import SPLITS, UNITS, read_strings
 from schemas.reading import unpack
-from stages.report import page, pictures
+from stages.common import page
+from stages.common.page import pictures
 
 SPLIT_COLOURS = {"train": "#7f8a97", "validation": "#c08a2e", "test": "#3b8ecb"}
 
@@ -39,12 +40,12 @@ def scene(file: h5py.File) -> page.Section:
                 page.picture(
                     pictures.data_uri(relief),
                     "Elevation above the reference sphere, with relief shading",
-                    bar=pictures.colour_bar(low, high, "cividis", "m"),
+                    below=page.colour_bar(low, high, "cividis", "m"),
                 ),
                 page.picture(
                     pictures.data_uri(pictures.coloured(cover, 0, top, "viridis")),
                     "How many images show each pixel",
-                    bar=pictures.colour_bar(0, top, "viridis", "images"),
+                    below=page.colour_bar(0, top, "viridis", "images"),
                 ),
             ]
         ),
@@ -112,7 +113,7 @@ def pairs(file: h5py.File) -> page.Section:
         low, high = pictures.limits(image)
         caption = f"pair {k}: Sun {90 - sun[k]:.0f} deg, view {tilt[k]:.0f} deg"
         figures.append(page.picture(pictures.data_uri(pictures.coloured(image, low, high, "gray")), caption))
-    section.add("<h3>Some measured crops, each in its own range</h3>", page.crops(figures))
+    section.add(page.heading("Some measured crops, each in its own range"), page.crops(figures))
     return section
 
 
@@ -173,7 +174,7 @@ def svbrdf(file: h5py.File) -> page.Section:
             page.picture(
                 pictures.data_uri(pictures.coloured(values, low, high, "magma")),
                 f"Coefficient {name}: {statistics}",
-                bar=pictures.colour_bar(low, high, "magma", ""),
+                below=page.colour_bar(low, high, "magma", ""),
             )
         )
     height, width = file["valid"].shape

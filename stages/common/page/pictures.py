@@ -68,14 +68,12 @@ def shaded_relief(elevation: np.ndarray, gsd: float) -> tuple[np.ndarray, float,
     return np.clip(picture, 0, 255).astype(np.uint8), low, high
 
 
-def colour_bar(low: float, high: float, colours: str, unit: str) -> str:
-    """A gradient with its ends in numbers, as HTML."""
+def gradient(colours: str) -> str:
+    """A matplotlib colour map as CSS colours."""
     import matplotlib
 
     stops = matplotlib.colormaps[colours](np.linspace(0, 1, 9), bytes=True)
-    gradient = ", ".join(f"rgb({r},{g},{b})" for r, g, b, _ in stops)
-    ends = "".join(f"<span>{number(v)} {unit}</span>" for v in (low, (low + high) / 2, high))
-    return f'<div class="bar" style="background:linear-gradient(90deg,{gradient})"></div><div class="ends">{ends}</div>'
+    return ", ".join(f"rgb({r},{g},{b})" for r, g, b, _ in stops)
 
 
 def number(value: float) -> str:

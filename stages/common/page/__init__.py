@@ -1,0 +1,114 @@
+"""The page that `report` and `diagnose` write: one HTML file without scripts or links to anything outside, light and dark.
+
+``parts.html.j2`` holds the parts, ``page.html.j2`` the whole, ``style.css`` the look. Functions here return finished,
+escaped HTML.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from stages.common.page import pictures
+
+
+@functools.cache
+def _templates() -> Environment:
+    return Environment(
+        loader=PackageLoader("stages.common", "page"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+
+
+def _part(name: str, *values: Any) -> Markup:
+    return Markup(getattr(_templates().get_template("parts.html.j2").module, name)(*values))
+
+
+@dataclass
+class Section:
+    """A part of the page: ``body`` is finished HTML."""
+
+    title: str
+    body: list[Markup] = field(default_factory=list)
+
+    def add(self, *parts: Markup) -> None:
+        self.body.extend(parts)
+
+
+def paragraph(text: str, kind: str = "") -> Markup:
+    return _part("paragraph", text, kind)
+
+
+def heading(text: str) -> Markup:
+    return _part("heading", text)
+
+
+def conclusions(items: Iterable[tuple[str, str]]) -> Markup:
+    """Sentences on top of the page: (text, '' | 'good' | 'bad')."""
+    return _part("conclusions", list(items))
+
+
+def cards(items: Iterable[tuple[str, str, str]]) -> Markup:
+    """Headline numbers: (value, what it is, '' | 'good' | 'bad')."""
+    return _part("cards", list(items))
+
+
+def table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[str]], best: int | None = None) -> Markup:
+    """A table; columns whose cells all look like numbers are set right; row ``best`` stands out."""
+    numeric = [all(row[k][:1] in "-+.0123456789" for row in rows) for k in range(len(columns))]
+    return _part("table", caption, columns, ["n" if n else "" for n in numeric], rows, best)
+
+
+def picture(source: str, caption: str, alt: str = "", below: str = "") -> Markup:
+    """A figure with an image (a data URI) and, where given, finished HTML such as a colour bar below it."""
+    return _part("picture", Markup(source), caption, alt, Markup(below))
+
+
+def picture_pair(above: str, below: str, alt: str, caption: str) -> Markup:
+    """Two images (data URIs) of one place, the lower described by ``alt``."""
+    return _part("pair", Markup(above), Markup(below), alt, caption)
+
+
+def named_bars(bars: Iterable[tuple[Markup, str]]) -> Markup:
+    """Colour bars side by side, each with what it shows."""
+    return _part("named_bars", list(bars))
+
+
+def chart(svg: str, caption: str) -> Markup:
+    return _part("chart", Markup(svg), caption)
+
+
+def colour_bar(low: float, high: float, colours: str, unit: str) -> Markup:
+    """A gradient of a matplotlib colour map with the numbers at its ends and middle."""
+    ends = [f"{pictures.number(v)} {unit}".rstrip() for v in (low, (low + high) / 2, high)]
+    return _part("colour_bar", pictures.gradient(colours), ends)
+
+
+def grid(figures: Iterable[Markup]) -> Markup:
+    return _part("grid", list(figures))
+
+
+def crops(figures: Iterable[Markup]) -> Markup:
+    """Small pictures in a row that scrolls."""
+    return _part("crops", list(figures))
+
+
+def disclosure(summary: str, text: str) -> Markup:
+    """Text that opens on a click."""
+    return _part("disclosure", summary, text)
+
+
+def page(title: str, subtitle: str, head: Sequence[Markup], sections: Sequence[Section], footer: str) -> str:
+    """The whole file."""
+    loader = _templates().loader
+    assert loader is not None
+    style = Markup(loader.get_source(_templates(), "style.css")[0])
+    return (
+        _templates()
+        .get_template("page.html.j2")
+        .render(title=title, subtitle=subtitle, head=head, sections=sections, footer=footer, style=style)
+    )
