@@ -181,19 +181,6 @@ def test_pieces_hold_their_own_lines(rng):
     assert np.all((following[0] % 14 >= 0.5 - 1e-9) & (following[0] % 14 <= 13.5 + 1e-9))
 
 
-@pytest.mark.parametrize("flipped", [False, True])
-def test_pose_derivatives_match_differences(rng, flipped):
-    camera = camera_from_document(isd(framelets_flipped=flipped), "isd")
-    points = camera.image_to_ground(rng.integers(0, 30, 40) * 14 + rng.uniform(4, 10, 40), rng.uniform(0, 16, 40), 50.0)
-    analytic = camera.pose_derivatives(points)
-    for k, step in enumerate([1.0] * 3 + [1e-6] * 3):
-        pose = np.zeros(6)
-        pose[k] = step
-        ahead, behind = camera.moved(pose).ground_to_image(points), camera.moved(-pose).ground_to_image(points)
-        numeric = np.stack([(ahead[i] - behind[i]) / (2 * step) for i in (0, 1)], axis=-1)
-        np.testing.assert_allclose(analytic[..., k], numeric, rtol=1e-4, atol=1e-6 * np.abs(analytic).max())
-
-
 def test_summing_and_starting_pixels_move_the_image(rng):
     """A detector read from line 8 and sample 4 on, two by two pixels in one: half as many image pixels."""
     camera = camera_from_document(

@@ -1,10 +1,7 @@
-"""What a camera is: rays out of its pixels, places on its detector, and how both move with its pose.
+"""What a camera is: rays out of its pixels, and places on its detector.
 
 Image coordinates here are CSM's: (line, sample), the first pixel's centre at (0.5, 0.5), its outer corner at (0, 0).
 ``grid.CSM_CENTRE`` converts to array indices. Body-fixed (``mcmf``) vectors are in metres.
-
-A pose has six parameters: the camera's shift in body-fixed metres (x, y, z), then a small rotation about its own
-three axes in radians.
 """
 
 from __future__ import annotations
@@ -21,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from schemas.errors import GeometryError, InputError, RegistryError
 
 Floats = NDArray[np.float64]
-POSE = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
 
 
 class Camera(ABC):
@@ -50,14 +46,6 @@ class Camera(ABC):
 
         Places beside the detector have coordinates outside it: see :meth:`inside`.
         """
-
-    @abstractmethod
-    def pose_derivatives(self, points: ArrayLike) -> Floats:
-        """d(line, sample) / d(pose) at points (..., 3): (..., 2, 6), px per m and px per rad."""
-
-    @abstractmethod
-    def moved(self, pose: ArrayLike) -> Camera:
-        """The same camera after a change of pose (6,)."""
 
     def sun_position(self, line: ArrayLike) -> Floats | None:
         """(..., 3) body-fixed place of the Sun while each line was taken, m; None where the model holds none."""
@@ -183,24 +171,6 @@ def meet_ellipsoid(
     distance = np.where(discriminant < 0, closest, distance)
     hit = (discriminant >= 0) & (distance >= 0)
     return origin + distance[..., None] * direction, hit
-
-
-def cross_matrix(vectors: Floats) -> Floats:
-    """(..., 3, 3) matrices X with X @ w = vector x w."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def small_rotation(vector: ArrayLike) -> Floats:
-    """(3, 3) rotation by |vector| radians about ``vector`` (Rodrigues)."""
-    vector = np.asarray(vector, float)
-    angle = float(np.linalg.norm(vector))
-    if angle == 0.0:
-        return np.eye(3)
-    k = cross_matrix(vector / angle)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * (k @ k)
 
 
 _CAMERAS: dict[str, type[Camera]] = {}

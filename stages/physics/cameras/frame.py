@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stages.physics.cameras.base import Camera, Floats, cross_matrix, register, small_rotation
+from stages.physics.cameras.base import Camera, Floats, register
 from stages.physics.cameras.isd import Detector, Exposure
 from stages.physics.cameras.tables import check_times
 
@@ -64,15 +64,6 @@ class Frame(Camera):
 
     def ground_to_image(self, points: ArrayLike) -> tuple[Floats, Floats]:
         return self.detector.places((np.asarray(points, float) - self.centre) @ self.rotation)
-
-    def pose_derivatives(self, points: ArrayLike) -> Floats:
-        camera = (np.asarray(points, float) - self.centre) @ self.rotation
-        shift = np.broadcast_to(-self.rotation.T, camera.shape[:-1] + (3, 3))
-        return self.detector.place_derivatives(camera) @ np.concatenate([shift, cross_matrix(camera)], axis=-1)
-
-    def moved(self, pose: ArrayLike) -> Frame:
-        pose = np.asarray(pose, float)
-        return replace(self, centre=self.centre + pose[:3], rotation=self.rotation @ small_rotation(pose[3:]))
 
     def sun_position(self, line: ArrayLike) -> Floats:
         return np.broadcast_to(self.sun, np.shape(line) + (3,))

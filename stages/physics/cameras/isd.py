@@ -101,17 +101,6 @@ class Detector:
         sample = self.to_sample[0] + self.to_sample[1] * dx + self.to_sample[2] * dy + self.centre[1] - self.start[1]
         return line / self.summing[0], sample / self.summing[1]
 
-    def place_derivatives(self, vectors: Floats) -> Floats:
-        """(..., 2, 3): d(line, sample) / d(camera vector), central differences over a millionth of the depth."""
-        step = 1e-6 * np.abs(vectors[..., 2])
-        columns = []
-        for k in range(3):
-            change = np.zeros_like(vectors)
-            change[..., k] = step
-            ahead, behind = self.places(vectors + change), self.places(vectors - change)
-            columns.append(np.stack([(ahead[i] - behind[i]) / (2 * step) for i in (0, 1)], axis=-1))
-        return np.stack(columns, axis=-1)
-
 
 @numba.njit(cache=True)
 def detector_place(x, y, z, focal, sense, to_line, to_sample, model, coefficients):

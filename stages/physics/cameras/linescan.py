@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numba
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from schemas.errors import GeometryError, InputError
 from stages.physics.cameras import document as read
-from stages.physics.cameras.base import Camera, Floats, cross_matrix, register
+from stages.physics.cameras.base import Camera, Floats, register
 from stages.physics.cameras.isd import Detector, Exposure, detector_place
 from stages.physics.cameras.tables import EvenTable, check_times, even_pointing, even_positions, lagrange
 
@@ -146,39 +146,6 @@ class LineScan(Camera):
         )
         return line.reshape(points.shape[:-1]), sample.reshape(points.shape[:-1])
 
-    def pose_derivatives(self, points: ArrayLike) -> Floats:
-        points = np.asarray(points, float)
-        line, _ = self.ground_to_image(points)
-        known = np.isfinite(line)
-        at = np.where(known, line, self.lines / 2)
-        times = self.times(at)
-        rotation = self.rotations(times)
-        camera = _into(rotation, points - self.positions.at(times))
-        by_vector = self.detector.place_derivatives(camera)
-        by_pose = by_vector @ np.concatenate([-np.swapaxes(rotation, -1, -2), cross_matrix(camera)], axis=-1)
-        # As time passes the point crosses the detector; a pose changes the line until it is back on it.
-        step = 0.02
-        ahead, behind = (
-            self.detector.places(_into(self.rotations(t), points - self.positions.at(t)))
-            for t in (self.times(at + step), self.times(at - step))
-        )
-        by_line = np.stack([(ahead[i] - behind[i]) / (2 * step) for i in (0, 1)], axis=-1)
-        d_line = -by_pose[..., 0, :] / by_line[..., 0, None]
-        d_sample = by_pose[..., 1, :] + by_line[..., 1, None] * d_line
-        return np.where(known[..., None, None], np.stack([d_line, d_sample], axis=-2), np.nan)
-
-    def moved(self, pose: ArrayLike) -> LineScan:
-        pose = np.asarray(pose, float)
-        turn = _quaternion_of(pose[3:])
-        camera = replace(
-            self,
-            positions=self.positions.shifted(self.positions.values + pose[:3]),
-            pointing=self.pointing.shifted(_quaternion_product(self.pointing.values, turn)),
-            _search=None,
-        )
-        object.__setattr__(camera, "_search", _Search.of(camera, "moved camera"))
-        return camera
-
 
 @dataclass(frozen=True)
 class _Search:
@@ -238,27 +205,6 @@ class _Search:
 def _into(rotation: Floats, vectors: Floats) -> Floats:
     """Camera vectors of body-fixed ones."""
     return (np.swapaxes(rotation, -1, -2) @ vectors[..., None])[..., 0]
-
-
-def _quaternion_of(vector: Floats) -> Floats:
-    angle = float(np.linalg.norm(vector))
-    half_sinc = 0.5 * float(np.sinc(angle / (2 * np.pi)))
-    return np.array([math.cos(angle / 2), *(half_sinc * vector)])
-
-
-def _quaternion_product(a: Floats, b: Floats) -> Floats:
-    """(n, 4) times (4,): first b, then a."""
-    w, x, y, z = a.T
-    p, q, r, s = b
-    return np.stack(
-        [
-            w * p - x * q - y * r - z * s,
-            w * q + x * p + y * s - z * r,
-            w * r - x * s + y * p + z * q,
-            w * s + x * r - y * q + z * p,
-        ],
-        axis=1,
-    )
 
 
 @numba.njit(cache=True)

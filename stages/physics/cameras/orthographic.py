@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from stages.physics.cameras import document as read
-from stages.physics.cameras.base import Camera, Floats, register, small_rotation
+from stages.physics.cameras.base import Camera, Floats, register
 
 
 @register
@@ -54,20 +54,3 @@ class Orthographic(Camera):
         sample = camera[..., 0] / self.pixel_size[0] + self.principal_point_px[0]
         line = camera[..., 1] / self.pixel_size[1] + self.principal_point_px[1]
         return line * ahead, sample * ahead
-
-    def pose_derivatives(self, points: ArrayLike) -> Floats:
-        x, y, z = np.moveaxis((np.asarray(points, float) - self.centre) @ self.rotation, -1, 0)
-        zero = np.zeros_like(z)
-        ahead = np.where(z > 0, 1.0, np.nan)
-        right, down = self.rotation[:, 0] / self.pixel_size[0], self.rotation[:, 1] / self.pixel_size[1]
-        line = np.concatenate(
-            [np.broadcast_to(-down, z.shape + (3,)), np.stack([z, zero, -x], axis=-1) / self.pixel_size[1]], axis=-1
-        )
-        sample = np.concatenate(
-            [np.broadcast_to(-right, z.shape + (3,)), np.stack([zero, -z, y], axis=-1) / self.pixel_size[0]], axis=-1
-        )
-        return np.stack([line, sample], axis=-2) * ahead[..., None, None]
-
-    def moved(self, pose: ArrayLike) -> Orthographic:
-        pose = np.asarray(pose, float)
-        return replace(self, centre=self.centre + pose[:3], rotation=self.rotation @ small_rotation(pose[3:]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from schemas.errors import GeometryError
 from stages.physics.cameras import document as read
-from stages.physics.cameras.base import Camera, Floats, cross_matrix, register, small_rotation
+from stages.physics.cameras.base import Camera, Floats, register
 
 
 @register
@@ -113,23 +113,3 @@ class Pinhole(Camera):
         sample = self.focal_px[0] * camera[..., 0] / depth + self.principal_point_px[0]
         line = self.focal_px[1] * camera[..., 1] / depth + self.principal_point_px[1]
         return line, sample
-
-    def pose_derivatives(self, points: ArrayLike) -> Floats:
-        camera = (np.asarray(points, float) - self.centre) @ self.rotation
-        x, y = camera[..., 0], camera[..., 1]
-        z = np.where(camera[..., 2] > 0, camera[..., 2], np.nan)
-        zero = np.zeros_like(z)
-        by_camera = np.stack(
-            [
-                np.stack([zero, self.focal_px[1] / z, -self.focal_px[1] * y / z**2], axis=-1),
-                np.stack([self.focal_px[0] / z, zero, -self.focal_px[0] * x / z**2], axis=-1),
-            ],
-            axis=-2,
-        )
-        # (X, Y, Z) = exp(-w) R^T (point - centre): d/d centre = -R^T, d/dw = [X]x
-        shift = np.broadcast_to(-self.rotation.T, camera.shape[:-1] + (3, 3))
-        return by_camera @ np.concatenate([shift, cross_matrix(camera)], axis=-1)
-
-    def moved(self, pose: ArrayLike) -> Pinhole:
-        pose = np.asarray(pose, float)
-        return replace(self, centre=self.centre + pose[:3], rotation=self.rotation @ small_rotation(pose[3:]))

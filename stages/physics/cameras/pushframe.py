@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError, InputError
 from stages.physics.cameras import document as read
-from stages.physics.cameras.base import Camera, Floats, cross_matrix, register, small_rotation
+from stages.physics.cameras.base import Camera, Floats, register
 from stages.physics.cameras.isd import Detector, Exposure, detector_place
 from stages.physics.cameras.tables import check_times, even_pointing, even_positions
 
@@ -176,22 +176,6 @@ class PushFrame(Camera):
         return k * self.height + np.clip(
             within, min(0.5, self.height / 2), max(self.height - 0.5, self.height / 2)
         ), sample
-
-    def pose_derivatives(self, points: ArrayLike) -> Floats:
-        points = np.asarray(points, float)
-        line, _ = self.ground_to_image(points)
-        known = np.isfinite(line)
-        k = self.piece(line)
-        camera = self._camera_vectors(points, k)
-        shift = -np.swapaxes(self.rotations[k], -1, -2)
-        change = self.detector.place_derivatives(camera) @ np.concatenate([shift, cross_matrix(camera)], axis=-1)
-        if self.flipped:
-            change[..., 0, :] *= -1
-        return np.where(known[..., None, None], change, np.nan)
-
-    def moved(self, pose: ArrayLike) -> PushFrame:
-        pose = np.asarray(pose, float)
-        return replace(self, centres=self.centres + pose[:3], rotations=self.rotations @ small_rotation(pose[3:]))
 
     def _camera_vectors(self, points: Floats, k: NDArray[np.int64]) -> Floats:
         return (np.swapaxes(self.rotations[k], -1, -2) @ (points - self.centres[k])[..., None])[..., 0]

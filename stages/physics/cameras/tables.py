@@ -7,7 +7,7 @@ times; between these, Lagrange polynomials of up to eighth order apply, of lower
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numba
@@ -81,9 +81,6 @@ class EvenTable:
         out = np.empty((times.size, self.values.shape[1]))
         _lagrange_each(self.values, self.start, self.step, np.ascontiguousarray(times).ravel(), out)
         return out.reshape(times.shape + (-1,))
-
-    def shifted(self, values: Floats) -> EvenTable:
-        return replace(self, values=values)
 
 
 def read_states(document: Mapping[str, Any], key: str, where: str, origin: float) -> States:
