@@ -47,8 +47,13 @@ bench: $(STAMP) ## speed and memory, each beside a named peer in the same run
 campaign: $(STAMP) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
 	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign
 
-docs: $(STAMP) ## write the generated parts of docs/ again
-	$(BIN)/python examples/photometry_page.py
+docs: $(STAMP) ## write the generated parts of docs/ again, and build the site in build/site
+	$(BIN)/python examples/cli_page.py
+	@if [ -d $(SHARED)/oracles ]; then $(BIN)/python examples/photometry_page.py; \
+	  else echo "docs/photometry.md stays as it is: no outside tables at $(SHARED)/oracles"; fi
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "Open $(abspath build/site/index.html)"
 
 # --- the embedded scene --------------------------------------------------------------------------------------------
 
