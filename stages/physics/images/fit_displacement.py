@@ -25,6 +25,7 @@ LEAST_SIGMA_PX = 0.02  # resampling alone is no better
 MOST_CELLS = 10  # of a field's knots along its longer side
 STIFFNESS = tuple(4.0**k for k in range(-5, 6))  # of a field, against what the blocks say
 FOLDS = 8  # of ground that is held out
+COARSE_STEPS = 5  # in which no block is left out yet
 
 
 @dataclass(frozen=True)
@@ -226,52 +227,52 @@ def _solve(blocks: _Blocks, basis: Basis, relief: bool, stiffness: float, used: 
     """Weighted least squares with outliers left out; None where too few blocks agree.
 
     A block weighs by its own covariance and by the scatter of all; it is an outlier beyond OUTLIER standard deviations.
+    Bad blocks may be a third: they first weigh little (Cauchy), and are left out once the rest agrees.
     """
     n, size = len(blocks.row), basis.size
     used = np.ones(n, bool) if used is None else used
+    design, bending = _design(blocks, basis, relief)
+    seen, free = blocks.seen[:, :2], design.shape[2]
+    least = 2 if basis.form == "constant" else 3
+    if used.sum() < min(least, n):
+        return None
+    floor = float(np.median(blocks.sigma[used]))
+    off = seen - np.median(seen[used], axis=0)
+    keep = used
+    for k in range(COARSE_STEPS + 15):
+        scatter = 1.4826 * float(np.median(np.abs(off[keep])))
+        distance = np.abs(off).max(axis=1) / np.hypot(blocks.sigma, max(scatter, floor))
+        weight = used / (1 + distance**2)
+        before = keep
+        if k >= COARSE_STEPS:
+            keep = used & (distance < OUTLIER)
+            weight = keep.astype(float)
+            if keep.sum() < min(least, n):
+                return None
+        excess = max(0.0, scatter**2 - floor**2) + LEAST_SIGMA_PX**2
+        root = np.linalg.cholesky(np.linalg.inv(blocks.covariance[:, :2, :2] + excess * np.eye(2)))
+        root = np.swapaxes(root, 1, 2) * np.sqrt(weight)[:, None, None]
+        x, y = (root @ design).reshape(2 * n, free), (root @ seen[:, :, None]).reshape(2 * n)
+        normal = x.T @ x
+        held = bending * stiffness * np.trace(normal[:size, :size]) / size
+        inverse = np.linalg.inv(normal + held + 1e-9 * np.trace(normal) / free * np.eye(free))
+        theta = inverse @ (x.T @ y)
+        last, off = off, seen - design @ theta
+        if k > COARSE_STEPS and (before == keep).all() and np.abs(off - last).max() < 1e-3:
+            break
+    share = inverse @ normal
+    freedom = (float(np.trace(share)) - relief) / 2
+    return _Solution(theta, share @ inverse, off, keep, 1.4826 * float(np.median(np.abs(off[keep]))), freedom)
+
+
+def _design(blocks: _Blocks, basis: Basis, relief: bool) -> tuple[Floats, Floats]:
+    """(n, 2, p) what dx and dy of each block are a mixture of, and (p, p) how the mixture bends."""
+    size = basis.size
     parts = basis.matrix(blocks.row, blocks.col)
-    design = np.zeros((n, 3, 2 * size + relief))
+    design = np.zeros((len(parts), 2, 2 * size + relief))
     design[:, 0, :size], design[:, 1, size : 2 * size] = parts, parts
-    seen = blocks.seen.copy()
-    if relief:
-        assert blocks.relief is not None
-        design[:, :2, -1], design[:, 2, -1] = blocks.relief, 1.0
+    if relief and blocks.relief is not None:
+        design[:, :, -1] = blocks.relief
     bending = np.zeros((design.shape[2],) * 2)
     bending[: 2 * size, : 2 * size] = np.kron(np.eye(2), basis.bending())
-    centre = np.median(seen[used, :2], axis=0)
-    off = seen[:, :2] - centre
-    # a start that a third of bad blocks does not move; what is smooth but large must not count as bad yet
-    scatter = 1.4826 * float(np.median(np.abs(off[used])))
-    keep = used.copy() if basis.form != "constant" else used & (np.abs(off).max(axis=1) < 3 * scatter + 0.15)
-    floor = float(np.median(blocks.sigma[used]))
-    for k in range(20):
-        information = _information(blocks, scatter)
-        distance = np.sqrt((off**2).sum(axis=1)) / np.hypot(blocks.sigma, max(scatter, floor))
-        weight = keep / (1 + (distance / 2) ** 2) if basis.form != "constant" and k < 5 else keep.astype(float)
-        normal = np.einsum("n,nia,nij,njb->ab", weight, design, information, design)
-        pull = np.einsum("n,nia,nij,nj->a", weight, design, information, seen)
-        held = bending * stiffness * np.trace(normal[:size, :size]) / size
-        held += 1e-9 * np.trace(normal) / len(normal) * np.eye(len(normal))
-        inverse = np.linalg.inv(normal + held)
-        theta = inverse @ pull
-        before, off = off, (seen - design @ theta)[:, :2]
-        scatter = 1.4826 * float(np.median(np.abs(off[keep])))
-        near = (np.abs(off).max(axis=1) < OUTLIER * np.hypot(blocks.sigma, max(scatter, floor))) & used
-        fresh = used if basis.form != "constant" and k < 5 else near
-        if fresh.sum() < max(size if basis.form != "field" else 3, 2):
-            return None if n > 1 else _Solution(theta, inverse, off, keep, scatter, 1.0)
-        if k > 5 and (fresh == keep).all() and np.abs(off - before).max() < 1e-3:
-            break
-        keep = fresh
-    freedom = float(np.trace(inverse @ normal)) - relief
-    return _Solution(theta, inverse @ normal @ inverse, off, keep, max(scatter, 0.0), freedom / 2)
-
-
-def _information(blocks: _Blocks, scatter: float) -> Floats:
-    """(n, 3, 3) inverse covariances of the blocks' answers, the scatter that all have in common included."""
-    n = len(blocks.row)
-    result = np.zeros((n, 3, 3))
-    excess = max(0.0, scatter**2 - float(np.median(blocks.sigma)) ** 2)
-    both = blocks.covariance[:, :2, :2] + (excess + LEAST_SIGMA_PX**2) * np.eye(2)
-    result[:, :2, :2] = np.linalg.inv(both)
-    return result
+    return design, bending
