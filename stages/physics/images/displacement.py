@@ -77,7 +77,8 @@ class Basis:
         r, c = (row - self.origin[0]) / self.step, (col - self.origin[1]) / self.step
         if self.form == "field":  # beyond its ground a field stays as it was at the edge
             r, c = np.clip(r, 0, self.cells[0]), np.clip(c, 0, self.cells[1])
-        return np.broadcast_arrays(r, c)
+        rows, cols = np.broadcast_arrays(r, c)
+        return rows, cols
 
 
 def _cubic(place: Floats, cells: int) -> Floats:

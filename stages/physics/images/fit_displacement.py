@@ -192,7 +192,7 @@ def _squares(blocks: _Blocks) -> NDArray[np.int64]:
 
 
 def _by_square(values: Floats, squares: NDArray[np.int64]) -> Floats:
-    return np.bincount(squares, weights=values, minlength=squares.max() + 1)
+    return np.asarray(np.bincount(squares, weights=values, minlength=squares.max() + 1), float)
 
 
 def _held_out(

@@ -54,7 +54,7 @@ def refine(
     """
     solid, whole = eroded(good, 7), eroded(weight > 0, 3)
     dx, dy = start
-    change = np.full(2, np.inf)
+    change, fit = np.full(2, np.inf), None
     for step in range(ITERATIONS):
         moved, use = moved_image(spline, dx, dy), whole & _seen(solid, dx, dy)
         if use.sum() < LEAST_PIXELS:
@@ -67,7 +67,7 @@ def refine(
         dx, dy = dx + float(change[0]), dy + float(change[1])
         if np.abs(change).max() < 1e-4 and step >= 2:
             break
-    if np.abs(change).max() > 0.02:
+    if fit is None or np.abs(change).max() > 0.02:
         return NOWHERE
     share, covariance = 0.0, np.full((3, 3), math.inf)
     if relief is not None:

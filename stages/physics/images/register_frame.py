@@ -39,7 +39,7 @@ def choose_blocks(row: NDArray, col: NDArray, crop: int, grid: Grid, count: int 
     Always the same ones for the same crops, spread evenly where there would be more.
     """
     height, width = min(BLOCK_PX, grid.height), min(BLOCK_PX, grid.width)
-    found = set()
+    found: set[tuple[int, int]] = set()
     for r, c in zip(np.asarray(row) - crop // 2, np.asarray(col) - crop // 2, strict=True):
         rows = range(int(r) // STEP_PX, (int(r) + crop - 1) // STEP_PX + 1)
         cols = range(int(c) // STEP_PX, (int(c) + crop - 1) // STEP_PX + 1)
@@ -156,7 +156,9 @@ def _capture_tile(
     known = np.isfinite(tile.elevation)
     pattern = None
     if relief is not None:
-        r, c = np.meshgrid(np.arange(row, row + height), np.arange(col, col + width), indexing="ij")
+        r, c = np.meshgrid(
+            np.arange(row, row + height, dtype=float), np.arange(col, col + width, dtype=float), indexing="ij"
+        )
         pattern = np.stack(relief(r, c, np.where(known, tile.elevation, _mean_height(tile.elevation))))
     patterns = [*others, *albedo_patterns(tile.elevation, rendering)]
     pictures = prepare(pixels.values, rendering, pixels.valid & known, tile.weights, patterns, pattern)
@@ -165,7 +167,8 @@ def _capture_tile(
 
 def _added(field: Field, row: float, col: float, left: Shift) -> Shift:
     """The whole shift of a block, from the one that ``field`` has left."""
-    dx, dy = (float(v) for v in field.at(row, col, tuple(np.array(v) for v in left.relief)))
+    relief = np.array(left.relief[0]), np.array(left.relief[1])
+    dx, dy = (float(v) for v in field.at(row, col, relief))
     return replace(left, dx=left.dx + dx, dy=left.dy + dy, share=left.share + field.share)
 
 

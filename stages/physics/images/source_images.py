@@ -125,8 +125,8 @@ class MapSource:
         inverse = ~self.dataset.transform
         sample = (inverse.a * x + inverse.b * y + inverse.c).reshape(r.shape)
         line = (inverse.d * x + inverse.e * y + inverse.f).reshape(r.shape)
-        corners = [sliding_window_view(v, (2, 2)) for v in (line, sample)]
-        return area_means(self._pixels, self.dataset.shape, *corners, np.ones((height, width), bool))
+        lines, samples = sliding_window_view(line, (2, 2)), sliding_window_view(sample, (2, 2))
+        return area_means(self._pixels, self.dataset.shape, lines, samples, np.ones((height, width), bool))
 
     def _relief_at(self, row: Floats, col: Floats, reference: float) -> tuple[Floats, Floats]:
         """(dx, dy) px of all the relief displacement at places in a window; unknown ground counts as level."""
