@@ -122,6 +122,11 @@ class Field:
         return not self.refused
 
     @property
+    def moves_apart(self) -> bool:
+        """Whether it differs over the ground."""
+        return self.basis.form != "constant" or self.share != 0.0
+
+    @property
     def form(self) -> str:
         """What was fitted, in words."""
         return self.basis.form + (" + relief" if self.share else "")

@@ -22,7 +22,7 @@ WORST_SCATTER_PX = 1.5
 LEAST_ACCEPTED = 0.2  # share of the blocks tried
 OUTLIER = 3.5  # standard deviations from the fit beyond which a block is left out
 LEAST_SIGMA_PX = 0.02  # resampling alone is no better
-MOST_CELLS = 10  # of a field's knots along its longer side
+MOST_CELLS = 8  # of a field's knots along its longer side
 STIFFNESS = tuple(4.0**k for k in range(-5, 6))  # of a field, against what the blocks say
 FOLDS = 8  # of ground that is held out
 COARSE_STEPS = 5  # in which no block is left out yet
@@ -46,7 +46,8 @@ class _Blocks:
 @dataclass(frozen=True)
 class _Solution:
     """theta : (2 size [+ 1],), dx's and dy's coefficients and the relief's share; covariance of it; off : (n, 2) px, what it
-    leaves; keep : (n,) bool, blocks that count; scatter : px; freedom : parameters per axis"""
+    leaves; keep : (n,) bool, blocks that count; scatter : px; freedom : parameters per axis
+    design : (n, 2, p); rows, values : (2 n, p) and (2 n,) the weighted equations; held : (p, p) what holds theta besides them"""
 
     theta: Floats
     covariance: Floats
@@ -54,6 +55,10 @@ class _Solution:
     keep: Mask
     scatter: float
     freedom: float
+    design: Floats
+    rows: Floats
+    values: Floats
+    held: Floats
 
 
 def fit_field(
@@ -153,19 +158,24 @@ def _choose(blocks: _Blocks, form: str, middle: tuple[float, float]) -> _Candida
         bases.append((Basis("affine", middle, span / 2), (0.0,)))
     if form == "field" and number >= LEAST_BLOCKS["field"] and apart:
         bases.append((_field_basis(blocks), STIFFNESS))
-    # outliers are judged, and blocks weighed, alike for all: by what the stiffest fits leave
-    freest = [_solve(blocks, basis, blocks.relief is not None, stiffness[-1]) for basis, stiffness in bases]
-    scale = np.hypot(blocks.sigma, min(s.scatter for s in (plain, *freest) if s is not None))
+    tried = [
+        (basis, relief, [f for k in stiffness if (f := _solve(blocks, basis, relief, k)) is not None])
+        for basis, stiffness in bases
+        for relief in ((False, True) if blocks.relief is not None else (False,))
+    ]
+    # blocks weigh alike for all forms: by what the closest of their fits that many blocks hold leaves
+    scatters = [f.scatter for _, _, fits in tried for f in fits if f.freedom < number / 4]
+    scale = np.hypot(blocks.sigma, min([plain.scatter, *scatters]))
+    best = _Candidate(constant, False, plain, _held_out(blocks, plain, squares, scale)[0])
+    for basis, relief, fits in tried:
+        outcomes = [(*_held_out(blocks, fit, squares, scale), fit) for fit in fits]
+        if not outcomes:
+            continue
+        loss, shares, fit = min(outcomes, key=lambda outcome: float(outcome[0].mean()))
+        lead = _by_square(best.loss - loss, squares)
+        if lead.sum() > math.sqrt(len(lead)) * lead.std(ddof=1):
+            best = _Candidate(basis, relief, fit, loss, _jackknife(shares) if relief else math.nan)
     zero = _loss(blocks.seen[:, :2], scale)
-    best = _Candidate(constant, False, plain, _held_out(blocks, constant, False, 0.0, squares, scale)[0])
-    for basis, stiffness in bases:
-        for relief in (False, True) if blocks.relief is not None else (False,):
-            tried = [_held_out(blocks, basis, relief, s, squares, scale) for s in stiffness]
-            k = int(np.argmin([loss.mean() for loss, _ in tried]))
-            lead = _by_square(best.loss - tried[k][0], squares)
-            if lead.sum() > math.sqrt(len(lead)) * lead.std(ddof=1):
-                whole = _solve(blocks, basis, relief, stiffness[k])
-                best = _Candidate(basis, relief, whole, tried[k][0], _jackknife(tried[k][1]) if relief else math.nan)
     return replace(best, held_out=1 - float(best.loss.sum()) / max(1e-12, float(zero.sum())))
 
 
@@ -195,17 +205,20 @@ def _by_square(values: Floats, squares: NDArray[np.int64]) -> Floats:
     return np.asarray(np.bincount(squares, weights=values, minlength=squares.max() + 1), float)
 
 
-def _held_out(
-    blocks: _Blocks, basis: Basis, relief: bool, stiffness: float, squares: NDArray[np.int64], scale: Floats
-) -> tuple[Floats, Floats]:
-    """(n,) the loss of each block under a fit to the other squares, and the relief's share in each of these fits."""
+def _held_out(blocks: _Blocks, fit: _Solution, squares: NDArray[np.int64], scale: Floats) -> tuple[Floats, Floats]:
+    """(n,) the loss of each block under ``fit`` made again from the other squares, and the relief's share in each of these.
+
+    Which blocks are outliers stays as it was for all of them together.
+    """
     loss, shares = _loss(blocks.seen[:, :2], scale), []
     for square in range(squares.max() + 1):
         out = squares == square
-        found = None if out.all() else _solve(blocks, basis, relief, stiffness, ~out)
-        if found is not None:
-            loss[out] = _loss(found.off[out], scale[out])
-            shares.append(found.theta[-1])
+        rest = fit.rows[np.repeat(~out, 2)], fit.values[np.repeat(~out, 2)]
+        if (fit.keep & ~out).sum() >= 3:
+            inverse = np.linalg.inv(rest[0].T @ rest[0] + fit.held)
+            theta = inverse @ (rest[0].T @ rest[1])
+            loss[out] = _loss((blocks.seen[:, :2] - fit.design @ theta)[out], scale[out])
+            shares.append(theta[-1])
     return loss, np.array(shares)
 
 
@@ -255,14 +268,16 @@ def _solve(blocks: _Blocks, basis: Basis, relief: bool, stiffness: float, used: 
         x, y = (root @ design).reshape(2 * n, free), (root @ seen[:, :, None]).reshape(2 * n)
         normal = x.T @ x
         held = bending * stiffness * np.trace(normal[:size, :size]) / size
-        inverse = np.linalg.inv(normal + held + 1e-9 * np.trace(normal) / free * np.eye(free))
+        held += 1e-9 * np.trace(normal) / free * np.eye(free)
+        inverse = np.linalg.inv(normal + held)
         theta = inverse @ (x.T @ y)
         last, off = off, seen - design @ theta
         if k > COARSE_STEPS and (before == keep).all() and np.abs(off - last).max() < 1e-3:
             break
     share = inverse @ normal
     freedom = (float(np.trace(share)) - relief) / 2
-    return _Solution(theta, share @ inverse, off, keep, 1.4826 * float(np.median(np.abs(off[keep]))), freedom)
+    scatter = 1.4826 * float(np.median(np.abs(off[keep])))
+    return _Solution(theta, share @ inverse, off, keep, scatter, freedom, design, x, y, held)
 
 
 def _design(blocks: _Blocks, basis: Basis, relief: bool) -> tuple[Floats, Floats]:

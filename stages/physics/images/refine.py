@@ -54,12 +54,16 @@ def refine(
     """
     solid, whole = eroded(good, 7), eroded(weight > 0, 3)
     dx, dy = start
-    change, fit = np.full(2, np.inf), None
+    change, fit, region = np.full(2, np.inf), None, None
     for step in range(ITERATIONS):
-        moved, use = moved_image(spline, dx, dy), whole & _seen(solid, dx, dy)
-        if use.sum() < LEAST_PIXELS:
-            return NOWHERE
-        fit = _linear_fit(moved, templates, weight, use, None)
+        moved = moved_image(spline, dx, dy)
+        cell = math.floor(dx), math.ceil(dx), math.floor(dy), math.ceil(dy)
+        if region is None or region.cell != cell:
+            use = whole & _seen(solid, cell)
+            if use.sum() < LEAST_PIXELS:
+                return NOWHERE
+            region = _Region.of(cell, use, templates, weight)
+        fit = _linear_fit(moved, region, None)
         if fit is None:
             return NOWHERE
         change = -fit.change[:2]
@@ -67,17 +71,59 @@ def refine(
         dx, dy = dx + float(change[0]), dy + float(change[1])
         if np.abs(change).max() < 1e-4 and step >= 2:
             break
-    if fit is None or np.abs(change).max() > 0.02:
+    if fit is None or region is None or np.abs(change).max() > 0.02:
         return NOWHERE
     share, covariance = 0.0, np.full((3, 3), math.inf)
     if relief is not None:
-        full = _linear_fit(moved, templates, weight, use, relief)
+        full = _linear_fit(moved, region, relief)
         if full is not None:
             # at the place that was found the two shifts' own change is what the share draws with it
             dx, dy, share = dx - full.change[0] + fit.change[0], dy - full.change[1] + fit.change[1], -full.change[2]
-            return Refined((dx, dy), share, full.covariance(use), fit.correlation)
-    covariance[:2, :2] = fit.covariance(use)
+            return Refined((dx, dy), share, full.covariance(region.use), fit.correlation)
+    covariance[:2, :2] = fit.covariance(region.use)
     return Refined((dx, dy), share, covariance, fit.correlation)
+
+
+@dataclass(frozen=True)
+class _Region:
+    """The pixels that count while the image is moved within one ``cell`` of whole pixels (dx from, to; dy from, to).
+
+    design : (n, k) templates and a constant; east, south : (n, k) their slopes; weight : (n,); projector : (k, n), of the
+    weighted least-squares mixture
+    """
+
+    cell: tuple[int, int, int, int]
+    use: Mask
+    design: Floats
+    east: Floats
+    south: Floats
+    weight: Floats
+    projector: Floats
+
+    @classmethod
+    def of(cls, cell: tuple[int, int, int, int], use: Mask, templates: Sequence[Floats], weight: Floats) -> _Region:
+        flat = np.flatnonzero(use)
+        columns = [*templates, np.ones(use.shape)]
+        design, east, south = (
+            np.stack([np.take(v, flat) for v in values], axis=1)
+            for values in (columns, [_slope(v, 1) for v in columns], [_slope(v, 0) for v in columns])
+        )
+        w = np.take(weight, flat)
+        weighted = design * w[:, None]
+        # all templates have one size, so that the normal equations are good enough
+        normal = weighted.T @ design
+        projector = np.linalg.solve(normal + 1e-10 * np.trace(normal) * np.eye(len(normal)), weighted.T)
+        return cls(cell, use, design, east, south, w, projector)
+
+
+def _slope(values: Floats, axis: int) -> Floats:
+    """Central differences, px^-1; the outermost pixels, which never count, get 0."""
+    out = np.zeros_like(values)
+    if axis:
+        out[:, 1:-1] = (values[:, 2:] - values[:, :-2]) / 2
+    else:
+        out[1:-1] = (values[2:] - values[:-2]) / 2
+    return out
 
 
 @dataclass(frozen=True)
@@ -116,37 +162,33 @@ class _Linear:
         return np.asarray(self.inverse @ noise @ self.inverse.T, float)
 
 
-def _linear_fit(
-    moved: Floats, templates: Sequence[Floats], weight: Floats, use: Mask, relief: Floats | None
-) -> _Linear | None:
+def _linear_fit(moved: Floats, region: _Region, relief: Floats | None) -> _Linear | None:
     """Displacement and strengths together: image[x + d + e] = fitted(x) leaves image[x + d] = fitted - slopes . e."""
-    w = weight[use]
-    design = np.stack([t[use] for t in templates] + [np.ones(w.size)], axis=1)
-    weighted = design * w[:, None]
-    # all templates have one size, so that the normal equations are good enough
-    ridge = 1e-10 * np.trace(weighted.T @ design) * np.eye(design.shape[1])
-    strength = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ moved[use])
-    fitted = sum(k * t for k, t in zip(strength, templates, strict=False))
-    residual = moved[use] - fitted[use] - strength[-1]
+    w, design, flat = region.weight, region.design, moved[region.use]
+    strength = region.projector @ flat
+    residual = flat - design @ strength
     scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-12
     robust = w / (1 + (residual / (3 * scale)) ** 2)  # Cauchy: craters that the DEM lacks must not pull
-    east, south = np.gradient(fitted, axis=1), np.gradient(fitted, axis=0)
-    slopes = [east[use], south[use]]
+    east, south = region.east @ strength, region.south @ strength
+    slopes = [east, south]
     if relief is not None:
-        slopes.append((east * relief[0] + south * relief[1])[use])
+        slopes.append(east * relief[0][region.use] + south * relief[1][region.use])
     free = np.stack(slopes, axis=1)
     size = np.sqrt((free**2).mean(axis=0)) + 1e-300
     free = free / size
     weighted = design * robust[:, None]
-    nuisance = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ np.column_stack([free, residual]))
+    inner = weighted.T @ design
+    inner += 1e-10 * np.trace(inner) * np.eye(len(inner))
+    nuisance = np.linalg.solve(inner, weighted.T @ np.column_stack([free, residual]))
     free, residual = free - design @ nuisance[:, :-1], residual - design @ nuisance[:, -1]
     normal = (free * robust[:, None]).T @ free
     if not np.linalg.cond(normal) < 1e8:
         return None
     inverse = np.linalg.inv(normal)
     step = inverse @ ((free * robust[:, None]).T @ residual)
-    model = fitted[use] - np.average(fitted[use], weights=w)
-    seen = moved[use] - np.average(moved[use], weights=w)
+    model = design[:, :-1] @ strength[:-1]
+    model = model - np.average(model, weights=w)
+    seen = flat - np.average(flat, weights=w)
     correlation = float((w * model * seen).sum()) / math.sqrt(
         float((w * model**2).sum()) * float((w * seen**2).sum()) + 1e-300
     )
@@ -188,11 +230,11 @@ def displaced(values: NDArray, columns: int, rows: int) -> NDArray:
     return out
 
 
-def _seen(solid: Mask, dx: float, dy: float) -> Mask:
-    """Where all pixels that a moved pixel is made of are known."""
+def _seen(solid: Mask, cell: tuple[int, int, int, int]) -> Mask:
+    """Where all pixels that a pixel moved within ``cell`` is made of are known."""
     seen = np.ones(solid.shape, bool)
-    for column in {math.floor(dx), math.ceil(dx)}:
-        for row in {math.floor(dy), math.ceil(dy)}:
+    for column in set(cell[:2]):
+        for row in set(cell[2:]):
             seen &= displaced(solid, column, row)
     return seen
 

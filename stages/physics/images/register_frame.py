@@ -80,7 +80,7 @@ def register_frame(
     """How far ``source`` lies from its rendering, px of the grid, and what each block said.
 
     elevation : (H, W) array or dataset; form : the freest of displacement.FORMS that may be taken
-    Done twice: what the first fit leaves is found in the image that it has put right, where blocks are no longer smeared by
+    Done twice where the displacement changes over the ground: what the first fit leaves is found in the image that it has put right, where blocks are no longer smeared by
     relief, and where the next crater along can no longer be taken for the right one.
     """
     tiles = [
@@ -96,7 +96,7 @@ def register_frame(
 
     shifts = _capture(tiles, blocks, source, relief, None, max_shift)
     field = fit(shifts)
-    if field.accepted:
+    if field.accepted and field.moves_apart:
         left = _capture(tiles, blocks, source, relief, field, min(max_shift, SECOND_REACH_PX))
         again = [_added(field, r, c, s) for (r, c), s in zip(middles, left, strict=True)]
         better = fit(again)
