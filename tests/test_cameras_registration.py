@@ -63,7 +63,7 @@ def rough(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("kind", "command"),
-    [("shift", ["--register"]), pytest.param("affine", ["--register", "affine"], marks=pytest.mark.slow)],
+    [("constant", ["--register"]), pytest.param("affine", ["--register", "affine"], marks=pytest.mark.slow)],
 )
 def test_a_camera_that_is_off_is_found_out_and_put_right(rough, tmp_path, kind, command):
     """The image is the true one, its camera model believes to have stood 50 m, 2.5 px, further east."""
@@ -96,7 +96,7 @@ def test_planted_shifts_of_four_pixels_come_back(rough, tmp_path, planted):
     table = write_frame(
         tmp_path, overhead_camera(planted[0] * 20, -planted[1] * 20), (image * albedo).astype(np.float32)
     )
-    summary, path = run_all(dem, table, tmp_path, register="shift")
+    summary, path = run_all(dem, table, tmp_path, register="constant")
     with h5py.File(path) as file:
         found = file["shift_col_px"][0], file["shift_row_px"][0]
         sigma = file["shift_sigma_px"][0]
@@ -117,14 +117,17 @@ def mosaic(file):
 
 def test_registration_refuses_an_image_of_something_else(rough, rng, tmp_path):
     noise = rng.random((380, 400)).astype(np.float32)
-    summary, path = run_all(rough[0], write_frame(tmp_path, overhead_camera(), noise), tmp_path, register="shift")
+    summary, path = run_all(rough[0], write_frame(tmp_path, overhead_camera(), noise), tmp_path, register="constant")
     assert "regions agree" in summary.registered[0].field.refused
     with h5py.File(path) as file:
         assert np.isnan(file["shift_col_px"][0])
 
 
 def test_registration_options_are_checked(small_artefacts, tmp_path):
-    for config, message in (({"register": "spline"}, "'shift' or 'affine'"), ({"max_shift": 99.0}, "1 to 32 px")):
+    for config, message in (
+        ({"register": "spline"}, "'constant', 'affine' or 'field'"),
+        ({"max_shift": 99.0}, "1 to 32 px"),
+    ):
         with pytest.raises(ConfigError, match=message):
             project.run(small_artefacts["crops"], tmp_path / "pairs.h5", project.Config(**config))
 
@@ -136,11 +139,11 @@ def test_shards_join_into_what_one_run_gives(rough, tmp_path):
     (tmp_path / "b.json").write_text(json.dumps(overhead_camera(50.0).to_document()))
     with table.open("a", newline="") as stream:
         csv.writer(stream).writerow(["RAW2", "raw.tif", "iof", "b.json", *small_scene.SUN, 1.0])
-    _, whole = run_all(dem, table, tmp_path, register="shift")
+    _, whole = run_all(dem, table, tmp_path, register="constant")
     parts = []
     for k in (0, 1):
         parts.append(tmp_path / f"part{k}.h5")
-        project.run(tmp_path / "crops.h5", parts[-1], project.Config(register="shift", shard=(k, 2)))
+        project.run(tmp_path / "crops.h5", parts[-1], project.Config(register="constant", shard=(k, 2)))
     merge.run(parts, tmp_path / "joined.h5")
     with h5py.File(whole) as one, h5py.File(tmp_path / "joined.h5") as joined:
         for name in ("shift_col_px", "shift_row_px", "image", "detector_line", "emission_deg"):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,21 +13,30 @@ import typer.core
 from lunargr_cli.options import Output, Overwrite, Parts, Quiet, ResumeParts, Scheduler, Shard, in_parts, parse_shard
 
 if TYPE_CHECKING:
+    from lunargr_cli.console import Console
     from stages.project import Registered
 
 NAME, ORDER = "project", 40
 
 
+FORMS = ("constant", "affine", "field")  # as in stages.physics.images.displacement, which is slow to import
+
+
 class CLASS(typer.core.TyperCommand):
-    """``--register`` alone means ``--register shift``: typer knows no option whose value may be left out."""
+    """``--register`` alone means ``--register constant``: typer knows no option whose value may be left out."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         full = []
         for k, word in enumerate(args):
             full.append(word)
-            if word == "--register" and args[k + 1 : k + 2] not in (["shift"], ["affine"]):
-                full.append("shift")
+            if word == "--register" and not _is_value(args[k + 1 : k + 2]):
+                full.append(FORMS[0])
         return super().parse_args(ctx, full)
+
+
+def _is_value(following: list[str]) -> bool:
+    """Whether what follows --register is its value: also where it is a wrong one, which then gets named."""
+    return bool(following and re.fullmatch("[a-z]+", following[0]) and not Path(following[0]).exists())
 
 
 def command(
@@ -38,15 +48,16 @@ def command(
         str | None,
         typer.Option(
             "--register",
-            metavar="[shift|affine]",
-            help="Take off how far each image lies from its rendering: one shift (default), or linear over the ground.",
+            metavar="[constant|affine|field]",
+            help="Take off how far each image lies from its rendering: one shift (default); or as much as linear over the "
+            "ground, or a smooth field, and relief displacement, where held-out blocks say so.",
         ),
     ] = None,
     max_shift: Annotated[
         float, typer.Option("--max-shift", help="How far to search when registering, px of the scene's grid.")
     ] = 8.0,
-    regions_csv: Annotated[
-        Path | None, typer.Option("--shifts", metavar="CSV", help="Also write each region's own shift to a table.")
+    blocks_csv: Annotated[
+        Path | None, typer.Option("--shifts", metavar="CSV", help="Also write each block's own shift to a table.")
     ] = None,
     exact: Annotated[
         bool, typer.Option("--exact", help="Keep all digits of float32, not those that matter: three times the size.")
@@ -65,10 +76,10 @@ def command(
     from stages import project
 
     console = Console(quiet)
-    if regions_csv is not None:
+    if blocks_csv is not None:
         if register is None:
             raise typer.BadParameter("needs --register", param_hint="--shifts")
-        check_output(regions_csv, [crops, output], overwrite)
+        check_output(blocks_csv, [crops, output], overwrite)
     config = project.Config(
         scene=str(scene) if scene else None,
         shard=parse_shard(shard),
@@ -79,10 +90,8 @@ def command(
     if in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.stages import run_project
 
-        if regions_csv is not None:
-            raise ConfigError(
-                "--shifts: parts do not keep the regions' own shifts; leave out --scheduler and --resume."
-            )
+        if blocks_csv is not None:
+            raise ConfigError("--shifts: parts do not keep the blocks' own shifts; leave out --scheduler and --resume.")
         how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
         found = run_project(crops, output, config, parts, **how)
     else:
@@ -92,31 +101,49 @@ def command(
         f"{output}: {found.pairs} pairs, {found.valid_share:.1%} of pixels valid, {found.shadowed_share:.1%} of these in cast shadow; "
         f"incidence {i0:.1f}-{i1:.1f} deg, emission {e0:.1f}-{e1:.1f} deg"
     )
-    for entry in found.registered:
+    if found.registered:
+        _say_registered(console, found.registered)
+    if blocks_csv is not None:
+        _write_blocks(blocks_csv, found.registered)
+
+
+def _say_registered(console: Console, registered: Sequence[Registered]) -> None:
+    """A line per image: what was taken off, how sure that is, and how long it took."""
+    from stages.project.register import combined_share
+
+    for entry in registered:
         if entry.field.refused:
             console.say(f"not registered: image '{entry.image_id}' stays where it was: {entry.field.refused}")
     rows = [
         (
             r.image_id,
-            f"{r.field.coefficients[0, 0]:+.2f}",
-            f"{r.field.coefficients[1, 0]:+.2f}",
+            r.field.form,
+            f"{r.field.mean[0]:+.2f}",
+            f"{r.field.mean[1]:+.2f}",
             f"{r.field.sigma:.2f}",
             f"{r.field.scatter:.2f}",
+            f"{r.field.share:.2f} +- {r.field.share_error:.2f}" if r.field.share else "-",
+            f"{r.field.held_out:.0%}",
             f"{r.field.correlation:.2f}",
             f"{r.field.used}/{r.field.regions}",
+            f"{r.seconds:.1f}",
         )
-        for r in found.registered
+        for r in registered
         if r.field.accepted
     ]
     if rows:
-        names = ("image", "east px", "south px", "sigma px", "scatter px", "correlation", "regions")
-        console.table(f"registration ({register}): the image lay there, and was moved back", names, rows)
-    if regions_csv is not None:
-        _write_regions(regions_csv, found.registered)
+        names = ["image", "form", "east px", "south px", "sigma px", "scatter px", "relief", "held out"]
+        names += ["correlation", "blocks", "seconds"]
+        console.table("registration: the image lay there, and was moved back", names, rows)
+    share, error, images = combined_share(registered)
+    if images:
+        console.say(
+            f"relief displacement: share {share:.3f} +- {error:.3f} of h tan(emission) in {images} images (not orthorectified: 1)"
+        )
 
 
-def _write_regions(path: Path, registered: Iterable[Registered]) -> None:
-    """One row per region: where it is on the scene's grid, and what it said."""
+def _write_blocks(path: Path, registered: Sequence[Registered]) -> None:
+    """One row per block: where it is on the scene's grid, and what it said."""
     import csv
 
     from schemas.files.outputs import atomic_path
@@ -125,6 +152,6 @@ def _write_regions(path: Path, registered: Iterable[Registered]) -> None:
         out = csv.writer(file)
         out.writerow(["image_id", "row", "col", "dx_px", "dy_px", "sigma_px", "correlation", "lead", "refused"])
         for image in registered:
-            for row, col, s in image.regions:
+            for row, col, s in image.blocks:
                 numbers = (f"{v:.4f}" for v in (s.dx, s.dy, s.sigma, s.correlation, s.lead))
                 out.writerow([image.image_id, row, col, *numbers, s.refused])

@@ -17,15 +17,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from stages.physics.cameras import Camera
+from stages.physics.images.area_means import ReadWindow, area_means
 from stages.physics.maps.grid import CSM_CENTRE, Grid, unit_vectors
 
 Floats = NDArray[np.float64]
-ReadWindow = Callable[[int, int, int, int], NDArray[np.float32]]
 # (row, col) arrays -> (dx, dy) px along columns and rows, as registration finds them
 Displacement = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]
 
-MAX_SAMPLES = 64  # per side of a ground pixel
-WINDOW_PX = 1 << 23  # image pixels in memory at a time
 BLOCK = 256  # px a side of the ground that is worked on at a time
 
 
@@ -98,7 +96,9 @@ def orthorectify(
             h, w = wanted[part].shape
             if wanted[part].any():
                 corners = _corners(terrain, camera, (row + r, col + c, h, w), line[part], displacement)
-                image[part], complete[part] = _resample(read_window, camera, corners, wanted[part])
+                image[part], complete[part] = area_means(
+                    read_window, (camera.lines, camera.samples), *corners, wanted[part]
+                )
     known = seen & np.isfinite(centres[..., 0])
     return Ortho(
         image=image,
@@ -153,14 +153,14 @@ def reach_px(relief: float, emission: float, gsd: float, limit: int = 2048) -> i
 
 def _ground(terrain: Terrain, row: NDArray, col: NDArray, displacement: Displacement | None = None) -> Floats:
     """(..., 3) body-fixed points of the terrain at fractional (row, col), NaN where it is unknown."""
-    height = _bilinear(terrain.elevation, row, col)
+    height = bilinear(terrain.elevation, row, col)
     if displacement is not None:
         dx, dy = displacement(np.asarray(row, float), np.asarray(col, float))
         row, col = row + dy, col + dx
     return unit_vectors(*terrain.grid.lonlat(row, col)) * (terrain.grid.radius + height)[..., None]
 
 
-def _bilinear(values: NDArray, row: NDArray, col: NDArray) -> Floats:
+def bilinear(values: NDArray, row: NDArray, col: NDArray) -> Floats:
     """Between pixel centres, continued evenly beyond the outermost; whole indices need no neighbour."""
     row, col = np.asarray(row, float), np.asarray(col, float)
     r = np.clip(np.floor(row).astype(int), 0, max(0, values.shape[0] - 2))
@@ -308,96 +308,3 @@ def _corners(
         )
     found = camera.ground_to_image(points)
     return sliding_window_view(found[0], (2, 2)), sliding_window_view(found[1], (2, 2))
-
-
-def _resample(
-    read_window: ReadWindow, camera: Camera, corners: tuple[Floats, Floats], wanted: NDArray[np.bool_]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Means of the image over the quadrilaterals between corners, and whether all that contributed was valid.
-
-    Ground that spans much of the image is taken in parts, so that a window never holds more than WINDOW_PX.
-    """
-    line, sample = corners
-    height, width = wanted.shape
-    whole = wanted & camera.inside(line, sample).all(axis=(2, 3))
-    values, complete = np.full(wanted.shape, np.nan, np.float32), np.zeros(wanted.shape, bool)
-    if not whole.any():
-        return values, complete
-    lines, samples = line[whole], sample[whole]
-    l0, l1 = max(0, math.floor(lines.min()) - 1), min(camera.lines, math.ceil(lines.max()) + 1)
-    s0, s1 = max(0, math.floor(samples.min()) - 1), min(camera.samples, math.ceil(samples.max()) + 1)
-    if (l1 - l0) * (s1 - s0) > WINDOW_PX and wanted.size > 1:
-        middle = max(height, width) // 2
-        halves = (np.s_[:middle], np.s_[middle:]) if height >= width else (np.s_[:, :middle], np.s_[:, middle:])
-        for part in halves:
-            values[part], complete[part] = _resample(read_window, camera, (line[part], sample[part]), wanted[part])
-        return values, complete
-    spans = [
-        np.hypot(np.diff(lines, axis=axis), np.diff(samples, axis=axis)).max(axis=(1, 2)) for axis in (1, 2)
-    ]  # along rows' sides, along columns'
-    n_row, n_col = _count(spans[0]), _count(spans[1])
-    pixels = read_window(l0, s0, l1 - l0, s1 - s0)
-    _average(
-        np.ascontiguousarray(pixels, np.float32),
-        line,
-        sample,
-        CSM_CENTRE + l0,
-        CSM_CENTRE + s0,
-        whole,
-        n_row,
-        n_col,
-        values,
-        complete,
-    )
-    return values, complete
-
-
-def _count(size_px: Floats) -> int:
-    """Samples per side of a ground pixel that spans so many image pixels: one where it is small, else two to a pixel.
-
-    Two to a pixel is the least that is exact for an image that is linear between its pixel centres.
-    """
-    largest = float(np.nanmax(size_px, initial=0.0))
-    return 1 if largest <= 1.0 else min(MAX_SAMPLES, math.ceil(2 * largest - 0.1))
-
-
-@numba.njit(cache=True, parallel=True)
-def _average(pixels, line, sample, first_line, first_sample, wanted, n_row, n_col, values, complete):
-    lines, samples = pixels.shape
-    for i in numba.prange(wanted.shape[0]):
-        for j in range(wanted.shape[1]):
-            if not wanted[i, j]:
-                continue
-            total = 0.0
-            good = True
-            for a in range(n_row):
-                f = (a + 0.5) / n_row
-                for b in range(n_col):
-                    g = (b + 0.5) / n_col
-                    y = (1 - f) * ((1 - g) * line[i, j, 0, 0] + g * line[i, j, 0, 1]) + f * (
-                        (1 - g) * line[i, j, 1, 0] + g * line[i, j, 1, 1]
-                    )
-                    x = (1 - f) * ((1 - g) * sample[i, j, 0, 0] + g * sample[i, j, 0, 1]) + f * (
-                        (1 - g) * sample[i, j, 1, 0] + g * sample[i, j, 1, 1]
-                    )
-                    y, x = y - first_line, x - first_sample
-                    y = min(max(y, 0.0), lines - 1.0)
-                    x = min(max(x, 0.0), samples - 1.0)
-                    y0, x0 = min(int(y), max(lines - 2, 0)), min(int(x), max(samples - 2, 0))
-                    y1, x1 = min(y0 + 1, lines - 1), min(x0 + 1, samples - 1)
-                    u, v = y - y0, x - x0
-                    value = 0.0
-                    for yy, xx, weight in (
-                        (y0, x0, (1 - u) * (1 - v)),
-                        (y0, x1, (1 - u) * v),
-                        (y1, x0, u * (1 - v)),
-                        (y1, x1, u * v),
-                    ):
-                        if weight > 0.0:
-                            value += weight * pixels[yy, xx]
-                    if not math.isfinite(value):
-                        good = False
-                    total += value
-            if good:
-                values[i, j] = total / (n_row * n_col)
-                complete[i, j] = True

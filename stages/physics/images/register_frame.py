@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -11,45 +12,59 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stages.physics.formation.chain import Observation, form
+from stages.physics.formation.chain import Observation
+from stages.physics.formation.chain import form as form_image
 from stages.physics.horizon.scene import Overview, horizon_in_scene
-from stages.physics.images.registration import Field, Shift, estimate_shift, fit_field
+from stages.physics.images.correlation import SUPPORT_PX
+from stages.physics.images.displacement import Field, Relief
+from stages.physics.images.fit_displacement import fit_field
+from stages.physics.images.registration import BLOCK_PX, Box, Shift, block_shift, prepare
 from stages.physics.images.source_images import Source
 from stages.physics.images.table import Frame
 from stages.physics.maps.grid import Grid
 from stages.physics.photometry import get_model
 
-REGION_PX = 128  # a side; smaller crops say too little each
-MOST_REGIONS = 64
+STEP_PX = 64  # from block to block
+TILE_PX = 128  # blocks within so much are read and rendered at one go
+MOST_BLOCKS = 256
+SECOND_REACH_PX = 4.0
 # Shading alone matters here: gain and offset are free, and slow changes are taken off. How the surface darkens towards the
 # limb is free too, between these two: over oblique views another law shades as if the ground lay a part of a pixel away.
 MODELS = ("lunar_lambert", "lommel_seeliger")
 
 
-def choose_regions(
-    row: NDArray, col: NDArray, grid: Grid, count: int = MOST_REGIONS
-) -> list[tuple[int, int, int, int]]:
-    """(row, col, height, width) of at most ``count`` regions about crop centres, spread over them; always the same ones."""
-    height, width = min(REGION_PX, grid.height), min(REGION_PX, grid.width)
-    corners = np.stack(
-        [
-            np.clip(row - height // 2, 0, grid.height - height),
-            np.clip(col - width // 2, 0, grid.width - width),
-        ],
-        axis=1,
-    )
-    corners = np.unique(corners, axis=0)
-    if not len(corners):
-        return []
-    chosen = [0]
-    distance = np.full(len(corners), np.inf)
-    while len(chosen) < min(count, len(corners)):
-        distance = np.minimum(distance, np.abs(corners - corners[chosen[-1]]).max(axis=1))
-        farthest = int(distance.argmax())
-        if distance[farthest] < REGION_PX / 4:  # the rest lies in what is already there
-            break
-        chosen.append(farthest)
-    return [(int(r), int(c), height, width) for r, c in corners[sorted(chosen)]]
+def choose_blocks(row: NDArray, col: NDArray, crop: int, grid: Grid, count: int = MOST_BLOCKS) -> list[Box]:
+    """(row, col, height, width) of at most ``count`` blocks of a lattice that crops about (row, col) touch.
+
+    Always the same ones for the same crops, spread evenly where there would be more.
+    """
+    height, width = min(BLOCK_PX, grid.height), min(BLOCK_PX, grid.width)
+    found: set[tuple[int, int]] = set()
+    for r, c in zip(np.asarray(row) - crop // 2, np.asarray(col) - crop // 2, strict=True):
+        rows = range(int(r) // STEP_PX, (int(r) + crop - 1) // STEP_PX + 1)
+        cols = range(int(c) // STEP_PX, (int(c) + crop - 1) // STEP_PX + 1)
+        found.update((a, b) for a in rows for b in cols)
+    corners = {
+        (min(max(0, a * STEP_PX), grid.height - height), min(max(0, b * STEP_PX), grid.width - width)) for a, b in found
+    }
+    chosen = sorted(corners)
+    if len(chosen) > count:
+        chosen = [chosen[k] for k in np.linspace(0, len(chosen) - 1, count).round().astype(int)]
+    return [(r, c, height, width) for r, c in chosen]
+
+
+@dataclass(frozen=True)
+class _Tile:
+    """A window of the grid with some blocks and their surroundings: what it should show, and what albedo may add to it.
+
+    box : (row, col, height, width) of the window; blocks : of the grid; renderings : by each of MODELS
+    """
+
+    box: Box
+    blocks: tuple[Box, ...]
+    elevation: NDArray[np.float32]
+    renderings: tuple[NDArray[np.float32], ...]
+    weights: NDArray[np.float32]
 
 
 def register_frame(
@@ -58,26 +73,103 @@ def register_frame(
     elevation: Any,
     overview: Overview,
     grid: Grid,
-    regions: Sequence[tuple[int, int, int, int]],
-    kind: str,
+    blocks: Sequence[Box],
+    form: str,
     max_shift: float,
 ) -> tuple[Field, list[Shift]]:
-    """How far ``source`` lies from its rendering, px of the grid, and what each region said.
+    """How far ``source`` lies from its rendering, px of the grid, and what each block said.
 
-    elevation : (H, W) array or dataset; kind : 'shift' or 'affine'
+    elevation : (H, W) array or dataset; form : the freest of displacement.FORMS that may be taken
+    Done twice where the displacement changes over the ground: what the first fit leaves is found in the image that it has put right, where blocks are no longer smeared by
+    relief, and where the next crater along can no longer be taken for the right one.
     """
-    shifts = []
-    for row, col, height, width in regions:
-        z = np.asarray(elevation[row : row + height, col : col + width], np.float32)
-        pixels = source.read(row, col, height, width)
-        rendering, *others, lit = render_region(frame, z, elevation, overview, grid, row, col)
-        valid = pixels.valid & np.isfinite(z)
-        # Shadows lie where they do whatever the surface is like: they count, but their inside holds no structure.
-        weights = np.where(lit > 0.05, 1.0, 0.5)
-        patterns = [*others, *albedo_patterns(z, rendering)]
-        shifts.append(estimate_shift(pixels.values, rendering, valid, weights, max_shift, patterns))
-    middles = np.array([(r + (h - 1) / 2, c + (w - 1) / 2) for r, c, h, w in regions]).reshape(-1, 2)
-    return fit_field(shifts, middles[:, 0], middles[:, 1], kind), shifts
+    tiles = [
+        _prepare_tile(frame, elevation, overview, grid, group, math.ceil(max_shift) + SUPPORT_PX)
+        for group in _groups(blocks)
+    ]
+    reference = _mean_height(*(t.elevation for t in tiles))
+    relief = source.relief(reference) if form != "constant" else None
+    middles = np.array([(r + (h - 1) / 2, c + (w - 1) / 2) for r, c, h, w in blocks]).reshape(-1, 2)
+
+    def fit(shifts: list[Shift]) -> Field:
+        return fit_field(shifts, middles[:, 0], middles[:, 1], form, None if relief is None else reference)
+
+    shifts = _capture(tiles, blocks, source, relief, None, max_shift)
+    field = fit(shifts)
+    if field.accepted and field.moves_apart:
+        left = _capture(tiles, blocks, source, relief, field, min(max_shift, SECOND_REACH_PX))
+        again = [_added(field, r, c, s) for (r, c), s in zip(middles, left, strict=True)]
+        better = fit(again)
+        if better.accepted:
+            return better, again
+    return field, shifts
+
+
+def _mean_height(*pieces: NDArray[np.float32]) -> float:
+    """Of known ground, m; 0 where there is none."""
+    known = [piece[np.isfinite(piece)] for piece in pieces]
+    return float(np.concatenate(known).mean(dtype=float)) if any(k.size for k in known) else 0.0
+
+
+def _groups(blocks: Sequence[Box]) -> list[list[Box]]:
+    """Blocks that lie together, so that their surroundings are read and rendered once."""
+    groups: dict[tuple[int, int], list[Box]] = {}
+    for box in blocks:
+        groups.setdefault((box[0] // TILE_PX, box[1] // TILE_PX), []).append(box)
+    return list(groups.values())
+
+
+def _prepare_tile(
+    frame: Frame, elevation: Any, overview: Overview, grid: Grid, blocks: list[Box], margin: int
+) -> _Tile:
+    r0, c0 = (max(0, min(b[k] for b in blocks) - margin) for k in (0, 1))
+    r1 = min(grid.height, max(b[0] + b[2] for b in blocks) + margin)
+    c1 = min(grid.width, max(b[1] + b[3] for b in blocks) + margin)
+    z = np.asarray(elevation[r0:r1, c0:c1], np.float32)
+    *renderings, lit = render_region(frame, z, elevation, overview, grid, r0, c0)
+    # Shadows lie where they do whatever the surface is like: they count, but their inside holds no structure.
+    weights = np.where(lit > 0.05, 1.0, 0.5).astype(np.float32)
+    return _Tile((r0, c0, r1 - r0, c1 - c0), tuple(blocks), z, tuple(r.astype(np.float32) for r in renderings), weights)
+
+
+def _capture(
+    tiles: list[_Tile],
+    blocks: Sequence[Box],
+    source: Source,
+    relief: Relief | None,
+    field: Field | None,
+    reach: float,
+) -> list[Shift]:
+    """The shifts of ``blocks`` in the image that ``field`` has put right."""
+    found: dict[Box, Shift] = {}
+    for tile in tiles:
+        found |= _capture_tile(tile, source, relief, field, reach)
+    return [found[box] for box in blocks]
+
+
+def _capture_tile(
+    tile: _Tile, source: Source, relief: Relief | None, field: Field | None, reach: float
+) -> dict[Box, Shift]:
+    row, col, height, width = tile.box
+    pixels = source.read(*tile.box, field)
+    rendering, *others = (r.astype(float) for r in tile.renderings)
+    known = np.isfinite(tile.elevation)
+    pattern = None
+    if relief is not None:
+        r, c = np.meshgrid(
+            np.arange(row, row + height, dtype=float), np.arange(col, col + width, dtype=float), indexing="ij"
+        )
+        pattern = np.stack(relief(r, c, np.where(known, tile.elevation, _mean_height(tile.elevation))))
+    patterns = [*others, *albedo_patterns(tile.elevation, rendering)]
+    pictures = prepare(pixels.values, rendering, pixels.valid & known, tile.weights, patterns, pattern)
+    return {box: block_shift(pictures, (box[0] - row, box[1] - col, *box[2:]), reach) for box in tile.blocks}
+
+
+def _added(field: Field, row: float, col: float, left: Shift) -> Shift:
+    """The whole shift of a block, from the one that ``field`` has left."""
+    relief = np.array(left.relief[0]), np.array(left.relief[1])
+    dx, dy = (float(v) for v in field.at(row, col, relief))
+    return replace(left, dx=left.dx + dx, dy=left.dy + dy, share=left.share + field.share)
 
 
 def albedo_patterns(z: NDArray[np.float32], rendering: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -128,7 +220,7 @@ def render_region(
     for model in map(get_model, MODELS):
         coefficients = torch.tensor([p.default for p in model.parameters])[None, :, None, None]
         with torch.no_grad():
-            images.append(form(observation, model, coefficients)[0].numpy().astype(float))
+            images.append(form_image(observation, model, coefficients)[0].numpy().astype(float))
         images[-1][~known] = np.nan
     lit = (math.asin(max(-1.0, min(1.0, float(up)))) > horizon).astype(float)
     return *images, lit

@@ -9,19 +9,29 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from rasterio.io import DatasetReader
-from rasterio.transform import Affine
+from rasterio.windows import Window
 
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras import Camera
+from stages.physics.images.area_means import area_means
 from stages.physics.images.camera_image import CameraImage, open_camera_image
+from stages.physics.images.displacement import Field, Relief, relief_displacement
 from stages.physics.images.frame_geometry import open_camera_for
-from stages.physics.images.orthorectify import Displacement, Ortho, Terrain, footprint, orthorectify, reach_px
-from stages.physics.images.registration import Field
+from stages.physics.images.orthorectify import (
+    Displacement,
+    Ortho,
+    Terrain,
+    bilinear,
+    footprint,
+    orthorectify,
+    reach_px,
+)
 from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
-from stages.physics.maps.grid import GDAL_CENTRE, Grid, check_body, require_crs
+from stages.physics.maps.grid import Grid, check_body, require_crs
 
 Floats = NDArray[np.float64]
 Box = tuple[int, int, int, int]
@@ -44,6 +54,9 @@ class Source(Protocol):
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
         """The image on a window of the grid, moved by what registration found."""
 
+    def relief(self, reference: float) -> Relief | None:
+        """How it would be displaced if it was projected onto the sphere at ``reference`` m, None where terrain was followed."""
+
 
 @contextlib.contextmanager
 def open_source(frame: Frame, grid: Grid, elevation: Any, heights: tuple[float, float]) -> Iterator[Source]:
@@ -56,7 +69,7 @@ def open_source(frame: Frame, grid: Grid, elevation: Any, heights: tuple[float, 
         with rasters.open_raster(frame.path, what) as dataset:
             require_crs(str(frame.path), dataset.crs, dataset.transform)
             check_body(str(frame.path), dataset.crs, find_body(str(grid.radius)))
-            yield MapSource(dataset, grid)
+            yield MapSource(dataset, grid, elevation, frame.camera_position(grid.radius))
         return
     camera = open_camera_for(frame.camera, grid.radius)
     with open_camera_image(frame.path, camera, what) as image:
@@ -65,10 +78,15 @@ def open_source(frame: Frame, grid: Grid, elevation: Any, heights: tuple[float, 
 
 @dataclass(frozen=True)
 class MapSource:
-    """A map-projected image."""
+    """A map-projected image, which may have been projected onto the terrain or onto the sphere.
+
+    elevation : (H, W) array or dataset on ``grid``, m; camera_position : (3,) body-fixed, m
+    """
 
     dataset: DatasetReader
     grid: Grid
+    elevation: Any
+    camera_position: Floats
 
     def box(self) -> Box | None:
         if rasters.source_window(self.dataset, self.grid, margin=0) is None:
@@ -87,19 +105,42 @@ class MapSource:
         return r0, c0, max(0, r1 - r0), max(0, c1 - c0)
 
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
-        part = self.grid.window(row, col, height, width)
-        resampling = rasters.choose_resampling(self.dataset, part)[0]
-        if field is not None and field.accepted:
-            part = _moved(part, row, col, field)
-        return Pixels(*rasters.warp(self.dataset, part, resampling), None)
+        if field is None or field.refused:
+            part = self.grid.window(row, col, height, width)
+            return Pixels(*rasters.warp(self.dataset, part, rasters.choose_resampling(self.dataset, part)[0]), None)
+        return Pixels(*self._read_moved(row, col, height, width, field), None)
 
+    def relief(self, reference: float) -> Relief | None:
+        return relief_displacement(self.grid, self.camera_position, reference)
 
-def _moved(part: Grid, row: int, col: int, field: Field) -> Grid:
-    """The same pixels, each at the place where the image shows them."""
-    (x0, xc, xr), (y0, yc, yr) = field.coefficients
-    right, down = col - GDAL_CENTRE - field.origin[1], row - GDAL_CENTRE - field.origin[0]
-    move = Affine(1 + xc, xr, x0 + xc * right + xr * down, yc, 1 + yr, y0 + yc * right + yr * down)
-    return Grid(part.crs_wkt, part.transform @ move, part.height, part.width, part.radius)
+    def _read_moved(
+        self, row: int, col: int, height: int, width: int, field: Field
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Area means over the patches of the image that show the pixels, by the places of their corners."""
+        r, c = np.meshgrid(np.arange(height + 1) + row - 0.5, np.arange(width + 1) + col - 0.5, indexing="ij")
+        relief = self._relief_at(r, c, field.reference) if field.share else None
+        dx, dy = field.at(r, c, relief)
+        x, y = self.grid.xy(r + dy, c + dx)
+        x, y = rasters.transform_points(self.grid, self.dataset, x.ravel(), y.ravel())
+        inverse = ~self.dataset.transform
+        sample = (inverse.a * x + inverse.b * y + inverse.c).reshape(r.shape)
+        line = (inverse.d * x + inverse.e * y + inverse.f).reshape(r.shape)
+        lines, samples = sliding_window_view(line, (2, 2)), sliding_window_view(sample, (2, 2))
+        return area_means(self._pixels, self.dataset.shape, lines, samples, np.ones((height, width), bool))
+
+    def _relief_at(self, row: Floats, col: Floats, reference: float) -> tuple[Floats, Floats]:
+        """(dx, dy) px of all the relief displacement at places in a window; unknown ground counts as level."""
+        r0, c0 = max(0, math.floor(row.min())), max(0, math.floor(col.min()))
+        piece = np.asarray(
+            self.elevation[r0 : math.ceil(row.max()) + 2, c0 : math.ceil(col.max()) + 2], dtype=np.float64
+        )
+        height = bilinear(piece, row - r0, col - c0)
+        return relief_displacement(self.grid, self.camera_position, reference)(
+            row, col, np.where(np.isfinite(height), height, reference)
+        )
+
+    def _pixels(self, line: int, sample: int, lines: int, samples: int) -> NDArray[np.float32]:
+        return rasters.read_window(self.dataset, Window(sample, line, samples, lines)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -118,6 +159,9 @@ class CameraSource:
 
     def box(self) -> Box | None:
         return footprint(self.camera, self.grid, self.heights)
+
+    def relief(self, reference: float) -> Relief | None:
+        return None
 
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
         r0, c0, r1, c1 = self._surroundings(row, col, height, width)

@@ -1,0 +1,245 @@
+"""A shift to a fraction of a pixel by least squares, with the error that the residual's own spectrum gives it.
+
+Gauss-Newton steps minimise the difference between the image and a gain and offset of the rendering, with the gradient of
+the rendering, which has no noise (Baker & Matthews 2004, Int. J. Comput. Vis. 56:221). Further templates (albedo that
+follows the terrain) are fitted beside the rendering: shading is a slope towards the Sun, so that bright rims and dark floors
+added to it look like the same shading a part of a pixel away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+ITERATIONS = 30
+LEAST_PIXELS = 200  # that must stay usable while the image is moved under the template
+MEMORY_PX = 16  # residuals further apart than this are taken as independent
+
+
+@dataclass(frozen=True)
+class Refined:
+    """place : (dx, dy) px; share : of ``relief`` within the region, 0 without; covariance : (3, 3) of the three, inf for a
+    share that was not asked for; correlation : between image and rendering there. None of it finite where it did not settle."""
+
+    place: tuple[float, float]
+    share: float
+    covariance: Floats
+    correlation: float
+
+
+NOWHERE = Refined((math.nan, math.nan), 0.0, np.full((3, 3), math.inf), 0.0)
+
+
+def refine(
+    spline: Floats,
+    good: Mask,
+    templates: Sequence[Floats],
+    weight: Floats,
+    start: tuple[float, float],
+    relief: Floats | None = None,
+) -> Refined:
+    """Where the image lies against ``templates[0]`` (and any mixture of the others), all (H, W), from ``start`` on.
+
+    spline : coefficients of the image's quintic spline; good : its known pixels; weight : (H, W) >= 0, 0 outside the region
+    relief : (2, H, W) px (dx, dy), a displacement pattern whose share within the region is found as well
+    """
+    solid, whole = eroded(good, 7), eroded(weight > 0, 3)
+    dx, dy = start
+    change, fit, region = np.full(2, np.inf), None, None
+    for step in range(ITERATIONS):
+        moved = moved_image(spline, dx, dy)
+        cell = math.floor(dx), math.ceil(dx), math.floor(dy), math.ceil(dy)
+        if region is None or region.cell != cell:
+            use = whole & _seen(solid, cell)
+            if use.sum() < LEAST_PIXELS:
+                return NOWHERE
+            region = _Region.of(cell, use, templates, weight)
+        fit = _linear_fit(moved, region, None)
+        if fit is None:
+            return NOWHERE
+        change = -fit.change[:2]
+        change *= min(1.0, 1.0 / max(1e-12, float(np.abs(change).max())))
+        dx, dy = dx + float(change[0]), dy + float(change[1])
+        if np.abs(change).max() < 1e-4 and step >= 2:
+            break
+    if fit is None or region is None or np.abs(change).max() > 0.02:
+        return NOWHERE
+    share, covariance = 0.0, np.full((3, 3), math.inf)
+    if relief is not None:
+        full = _linear_fit(moved, region, relief)
+        if full is not None:
+            # at the place that was found the two shifts' own change is what the share draws with it
+            dx, dy, share = dx - full.change[0] + fit.change[0], dy - full.change[1] + fit.change[1], -full.change[2]
+            return Refined((dx, dy), share, full.covariance(region.use), fit.correlation)
+    covariance[:2, :2] = fit.covariance(region.use)
+    return Refined((dx, dy), share, covariance, fit.correlation)
+
+
+@dataclass(frozen=True)
+class _Region:
+    """The pixels that count while the image is moved within one ``cell`` of whole pixels (dx from, to; dy from, to).
+
+    design : (n, k) templates and a constant; east, south : (n, k) their slopes; weight : (n,); projector : (k, n), of the
+    weighted least-squares mixture
+    """
+
+    cell: tuple[int, int, int, int]
+    use: Mask
+    design: Floats
+    east: Floats
+    south: Floats
+    weight: Floats
+    projector: Floats
+
+    @classmethod
+    def of(cls, cell: tuple[int, int, int, int], use: Mask, templates: Sequence[Floats], weight: Floats) -> _Region:
+        flat = np.flatnonzero(use)
+        columns = [*templates, np.ones(use.shape)]
+        design, east, south = (
+            np.stack([np.take(v, flat) for v in values], axis=1)
+            for values in (columns, [_slope(v, 1) for v in columns], [_slope(v, 0) for v in columns])
+        )
+        w = np.take(weight, flat)
+        weighted = design * w[:, None]
+        # all templates have one size, so that the normal equations are good enough
+        normal = weighted.T @ design
+        projector = np.linalg.solve(normal + 1e-10 * np.trace(normal) * np.eye(len(normal)), weighted.T)
+        return cls(cell, use, design, east, south, w, projector)
+
+
+def _slope(values: Floats, axis: int) -> Floats:
+    """Central differences, px^-1; the outermost pixels, which never count, get 0."""
+    out = np.zeros_like(values)
+    if axis:
+        out[:, 1:-1] = (values[:, 2:] - values[:, :-2]) / 2
+    else:
+        out[1:-1] = (values[2:] - values[:-2]) / 2
+    return out
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """One linearised fit: change (p,) of the displacement; ``columns`` (n, p) with all nuisances projected out and weighted;
+    inverse (p, p) of their normal matrix; residual (n,)."""
+
+    change: Floats
+    columns: Floats
+    inverse: Floats
+    residual: Floats
+    correlation: float
+
+    def covariance(self, use: Mask) -> Floats:
+        """(p, p): neighbouring residuals are alike, so that their autocovariance says what a sum over them is worth."""
+        height, width = use.shape
+        shape = tuple(cv2.getOptimalDFTSize(n + MEMORY_PX) for n in (height, width))
+
+        def transform(values: Floats) -> NDArray[np.complex128]:
+            spread = np.zeros(use.shape)
+            spread[use] = values
+            return np.fft.rfft2(spread, shape)
+
+        pairs = np.maximum(np.fft.irfft2(np.abs(transform(np.ones(use.sum()))) ** 2, shape), 1.0)
+        memory = np.fft.irfft2(np.abs(transform(self.residual)) ** 2, shape) / pairs
+        lag = [np.abs(np.fft.fftfreq(n, 1 / n)) / MEMORY_PX for n in shape]
+        taper = [np.where(v < 1, 0.5 + 0.5 * np.cos(np.pi * v), 0.0) for v in lag]
+        power = np.maximum(np.fft.fft2(memory * taper[0][:, None] * taper[1]).real, 0.0)[:, : shape[1] // 2 + 1]
+        # real transforms hold each frequency but the first (and the middle) once for two
+        count = np.full(power.shape[1], 2.0)
+        count[0] = 1.0
+        if shape[1] % 2 == 0:
+            count[-1] = 1.0
+        spectra = np.stack([transform(c) for c in self.columns.T])
+        noise = np.einsum("ayx,yx,x,byx->ab", spectra.conj(), power, count, spectra).real / (shape[0] * shape[1])
+        return np.asarray(self.inverse @ noise @ self.inverse.T, float)
+
+
+def _linear_fit(moved: Floats, region: _Region, relief: Floats | None) -> _Linear | None:
+    """Displacement and strengths together: image[x + d + e] = fitted(x) leaves image[x + d] = fitted - slopes . e."""
+    w, design, flat = region.weight, region.design, moved[region.use]
+    strength = region.projector @ flat
+    residual = flat - design @ strength
+    scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-12
+    robust = w / (1 + (residual / (3 * scale)) ** 2)  # Cauchy: craters that the DEM lacks must not pull
+    east, south = region.east @ strength, region.south @ strength
+    slopes = [east, south]
+    if relief is not None:
+        slopes.append(east * relief[0][region.use] + south * relief[1][region.use])
+    free = np.stack(slopes, axis=1)
+    size = np.sqrt((free**2).mean(axis=0)) + 1e-300
+    free = free / size
+    weighted = design * robust[:, None]
+    inner = weighted.T @ design
+    inner += 1e-10 * np.trace(inner) * np.eye(len(inner))
+    nuisance = np.linalg.solve(inner, weighted.T @ np.column_stack([free, residual]))
+    free, residual = free - design @ nuisance[:, :-1], residual - design @ nuisance[:, -1]
+    normal = (free * robust[:, None]).T @ free
+    if not np.linalg.cond(normal) < 1e8:
+        return None
+    inverse = np.linalg.inv(normal)
+    step = inverse @ ((free * robust[:, None]).T @ residual)
+    model = design[:, :-1] @ strength[:-1]
+    model = model - np.average(model, weights=w)
+    seen = flat - np.average(flat, weights=w)
+    correlation = float((w * model * seen).sum()) / math.sqrt(
+        float((w * model**2).sum()) * float((w * seen**2).sum()) + 1e-300
+    )
+    return _Linear(
+        step / size,
+        free * robust[:, None],
+        inverse / size[:, None],
+        residual - free @ step,
+        correlation if strength[0] > 0 else -abs(correlation),
+    )
+
+
+def moved_image(spline: Floats, dx: float, dy: float) -> Floats:
+    """The image at (row + dy, col + dx) from the coefficients of its quintic spline.
+
+    A cubic convolution's phase depends on the fraction of a pixel: it drew shifts by up to 0.05 px.
+    """
+    for axis, shift in ((0, dy), (1, dx)):
+        whole = math.floor(shift)
+        weights = [_quintic(shift - whole - k) for k in range(-2, 4)]
+        # taps reach from two before to three behind the whole pixel: correlate1d centres an even window on its fourth
+        spline = correlate1d(spline, weights, axis=axis, mode="constant", origin=-1)
+        spline = displaced(spline, *((whole, 0) if axis else (0, whole)))
+    return spline
+
+
+def _quintic(x: float) -> float:
+    """The centred B-spline of fifth order."""
+    return sum((-1) ** k * math.comb(6, k) * max(0.0, x + 3 - k) ** 5 for k in range(7)) / 120
+
+
+def displaced(values: NDArray, columns: int, rows: int) -> NDArray:
+    """values[row + rows, col + columns], zeros from outside."""
+    out = np.zeros_like(values)
+    height, width = values.shape
+    r0, r1, c0, c1 = max(0, -rows), min(height, height - rows), max(0, -columns), min(width, width - columns)
+    if r1 > r0 and c1 > c0:
+        out[r0:r1, c0:c1] = values[r0 + rows : r1 + rows, c0 + columns : c1 + columns]
+    return out
+
+
+def _seen(solid: Mask, cell: tuple[int, int, int, int]) -> Mask:
+    """Where all pixels that a pixel moved within ``cell`` is made of are known."""
+    seen = np.ones(solid.shape, bool)
+    for column in set(cell[:2]):
+        for row in set(cell[2:]):
+            seen &= displaced(solid, column, row)
+    return seen
+
+
+def eroded(mask: Mask, size: int) -> Mask:
+    """The pixels of a mask whose ``size`` x ``size`` surroundings are in it."""
+    kernel = np.ones((size, size), np.uint8)
+    return cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0

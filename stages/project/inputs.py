@@ -1,0 +1,93 @@
+"""What project reads: the crops, the scene that they come from, its far terrain, and the images."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from schemas import CROPS, SCENE, ArtefactError, open_artefact
+from schemas.provenance import sha256
+from stages.physics.horizon.scene import Overview, make_overview
+from stages.physics.images.table import load_frames
+from stages.physics.maps.grid import Grid, read_grid
+from stages.project.config import Config
+
+OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
+
+
+@dataclass(frozen=True)
+class Scene:
+    """An open scene. elevation : (H, W) dataset on ``grid``, m, NaN = unknown; heights : its least and largest value."""
+
+    path: Path
+    elevation: h5py.Dataset
+    grid: Grid
+    overview: Overview
+    heights: tuple[float, float]
+
+
+@contextmanager
+def open_scene(crops: Path, file: h5py.File, config: Config) -> Iterator[Scene]:
+    """The scene of crops. Raises ArtefactError where it is gone or another one."""
+    path = find_scene(crops, file, config)
+    if sha256(path) != file.attrs["scene_sha256"]:
+        raise ArtefactError(f"{path}: not the scene that {crops} was sampled from; run 'lunargr sample' again.")
+    with open_artefact(path, SCENE) as scene:
+        elevation = scene["elevation"]
+        overview = overview_of(path, elevation)
+        yield Scene(path, elevation, read_grid(scene, path), overview, overview_extremes(elevation, overview))
+
+
+def find_scene(crops: Path, file: h5py.File, config: Config) -> Path:
+    """The scene that an open crops.h5 was sampled from. Raises ArtefactError where it is gone."""
+    scene = Path(config.scene) if config.scene else crops.resolve().parent / str(file.attrs["scene"])
+    if not scene.exists():
+        raise ArtefactError(f"{scene}: no such file; {crops} was sampled from it. Name its new place with --scene.")
+    return scene
+
+
+def scene_of(crops: Path, config: Config) -> Path:
+    """The scene that crops were sampled from. Raises ArtefactError where it is gone."""
+    with open_artefact(crops, CROPS) as file:
+        return find_scene(crops, file, config)
+
+
+def count_pairs(crops: Path) -> int:
+    """Crops in a file."""
+    with open_artefact(crops, CROPS) as file:
+        return int(file["row"].shape[0])
+
+
+def source_files(crops: Path) -> list[Path]:
+    """The images and camera models that crops are taken from."""
+    with open_artefact(crops, CROPS) as file:
+        frames = load_frames(file, crops)
+    return [p for f in frames for p in (f.path, f.camera) if p is not None]
+
+
+_kept: dict[tuple[Any, ...], Overview] = {}
+
+
+def overview_of(scene: Path, elevation: h5py.Dataset) -> Overview:
+    """The far terrain, which takes a look at the whole DEM: the parts that one process works on share it."""
+    state = os.stat(scene)
+    key = (os.path.realpath(scene), state.st_size, state.st_mtime_ns)
+    if key not in _kept:
+        _kept.clear()
+        _kept[key] = make_overview(elevation, max(1, math.ceil(max(elevation.shape) / OVERVIEW_PX)))
+    return _kept[key]
+
+
+def overview_extremes(elevation: h5py.Dataset, overview: Overview) -> tuple[float, float]:
+    """Least and largest elevation of a scene, m: the largest is exact, the least that of block means less their relief."""
+    cells = overview.cells[np.isfinite(overview.cells)]
+    low = float(cells.min()) if cells.size else 0.0
+    return low - 0.5 * max(0.0, overview.highest - low), overview.highest

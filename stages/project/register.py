@@ -1,0 +1,93 @@
+"""Registration of the images that pairs are made of, and what pairs.h5 keeps of it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+
+import h5py
+import numpy as np
+
+from schemas import ArtefactWriter
+from stages.physics.images.displacement import Field
+from stages.physics.images.register_frame import choose_blocks, register_frame
+from stages.physics.images.source_images import Source
+from stages.physics.images.table import Frame
+from stages.project.config import Config, Registered
+from stages.project.inputs import Scene
+
+
+def register(frame: Frame, index: int, source: Source, crops: h5py.File, scene: Scene, config: Config) -> Registered:
+    """Register one image by blocks about all of its crops, whatever the shard: every shard takes off the same."""
+    began = time.monotonic()
+    mine = crops["image_index"][...] == index
+    size = crops["elevation"].shape[1]
+    blocks = choose_blocks(crops["row"][...][mine], crops["col"][...][mine], size, scene.grid)
+    field, shifts = register_frame(
+        frame, source, scene.elevation, scene.overview, scene.grid, blocks, str(config.register), config.max_shift
+    )
+    places = [(r + (h - 1) / 2, c + (w - 1) / 2) for r, c, h, w in blocks]
+    answers = tuple((r, c, s) for (r, c), s in zip(places, shifts, strict=True))
+    return Registered(frame.image_id, field, answers, time.monotonic() - began)
+
+
+def displacement_at(source: Source, field: Field, row: float, col: float, height: float) -> tuple[float, float]:
+    """(dx, dy) px that ``field`` takes off at one place of the grid, ``height`` m above the sphere."""
+    relief = source.relief(field.reference) if field.share else None
+    place = np.array([row]), np.array([col])
+    dx, dy = field.at(*place, None if relief is None else relief(*place, np.array([height])))
+    return float(dx[0]), float(dy[0])
+
+
+def combined_share(registered: Sequence[Registered]) -> tuple[float, float, int]:
+    """Share of the relief displacement over all images that have some, its standard error, and how many these are.
+
+    Weighted by the images' own errors; where they differ by more than these, the error grows with that (Birge 1932,
+    Phys. Rev. 40:207).
+    """
+    found = [(r.field.share, r.field.share_error) for r in registered if r.field.accepted and r.field.share]
+    found = [(share, error) for share, error in found if error > 0]
+    if not found:
+        return math.nan, math.nan, 0
+    share, error = np.array(found).T
+    weight = 1 / error**2
+    mean = float((weight * share).sum() / weight.sum())
+    excess = float((weight * (share - mean) ** 2).sum()) / max(1, len(share) - 1)
+    return mean, math.sqrt(max(1.0, excess) / float(weight.sum())), len(share)
+
+
+def write_registration(writer: ArtefactWriter, frames: Sequence[Frame], registered: Sequence[Registered]) -> None:
+    """One value per image of what was taken off, NaN for images that stay where they were."""
+    columns = {name: np.full(len(frames), np.nan) for name in FRAME_VARIABLES}
+    place = {frame.image_id: k for k, frame in enumerate(frames)}
+    for entry in registered:
+        field = entry.field
+        if field.accepted:
+            values = (
+                *field.mean,
+                field.sigma,
+                field.correlation,
+                field.scatter,
+                field.freedom,
+                field.held_out,
+                field.share,
+                field.share_error,
+            )
+            for name, value in zip(FRAME_VARIABLES, values, strict=True):
+                columns[name][place[entry.image_id]] = value
+    for name, column in columns.items():
+        writer.write(name, column)
+
+
+FRAME_VARIABLES = (
+    "shift_col_px",
+    "shift_row_px",
+    "shift_sigma_px",
+    "shift_correlation",
+    "shift_scatter_px",
+    "shift_freedom",
+    "shift_held_out",
+    "relief_share",
+    "relief_share_error",
+)
