@@ -10,14 +10,16 @@ import torch
 from evaluation_scene import A, B, C, KnowsTheTruth, make_scene
 
 from stages.evaluate import fit
-from stages.evaluate.core import choose_fit_pairs
+from stages.evaluate.fitting import choose_fit_pairs, sample_pixels
 from stages.evaluate.renderers import Constant, Renderer, read_batch, unit_images
-from stages.evaluate.run import Config, evaluate_pairs
+from stages.evaluate.run import Config, Task, evaluate_pairs
 from stages.physics.photometry import get_model
 
 REQUIRED = {
-    "learned", "global", "lunar_lambert", "hapke_raw", "hapke_minmax", "hapke_gain", "hapke_gain_offset"
+    "learned", "global", "kernels", "hapke_fitted", "lunar_lambert", "hapke_raw", "hapke_minmax", "hapke_gain",
+    "hapke_gain_offset",
 }  # fmt: skip
+MATCHED = {f"{n}_gain_offset" for n in ("learned", "global", "kernels", "hapke_fitted", "lunar_lambert", "hapke")}
 
 
 @pytest.fixture(scope="module")
@@ -27,14 +29,16 @@ def scene():
 
 def _evaluate(scene, units="iof", predictor=None, **options):
     wanted = np.flatnonzero(scene.split == 2)
-    config = Config(batch=7, bootstrap=300, **options)
-    return evaluate_pairs(scene, predictor or KnowsTheTruth(), wanted, scene.frame_names, units, config)
+    predictors = predictor if isinstance(predictor, list) else [predictor or KnowsTheTruth()]
+    config = Config(batch=7, **options)
+    rows, scores, scale, result = evaluate_pairs(Task(scene, predictors, wanted, scene.frame_names, units, config))
+    return result, rows, scores, scale
 
 
 def test_the_true_coefficients_leave_only_the_noise(scene):
     result, _, scores, _ = _evaluate(scene)
     models = result["models"]
-    assert set(models) >= REQUIRED
+    assert set(models) == REQUIRED | MATCHED
     assert models["learned"]["mse"] == pytest.approx(scene.noise**2, rel=0.03)
     assert models["learned"]["mse_low"] < scene.noise**2 * 1.01 < models["learned"]["mse_high"] * 1.01
     assert models["learned"]["psnr"] == pytest.approx(-20 * np.log10(scene.noise), abs=0.1)
@@ -53,7 +57,9 @@ def test_more_freedom_never_fits_a_crop_worse(scene):
     assert (mse["hapke_gain_offset"] <= mse["hapke_gain"] * (1 + 1e-5)).all()
     assert (mse["hapke_gain"] <= mse["hapke_raw"] * (1 + 1e-5)).all()
     assert (mse["hapke_gain_offset"] <= mse["hapke_minmax"] * (1 + 1e-5)).all()
-    assert (mse["learned_gain_offset"] <= mse["learned"] * (1 + 1e-5)).all()
+    assert {n for n in mse if n.endswith("gain_offset")} == MATCHED
+    for name in MATCHED - {"hapke_gain_offset"}:
+        assert (mse[name] <= mse[name.removesuffix("_gain_offset")] * (1 + 1e-5)).all(), name
 
 
 def test_the_global_set_is_the_least_squares_solution(scene):
@@ -88,8 +94,6 @@ def test_a_model_that_is_not_linear_reaches_the_same_optimum(scene):
     batch = read_batch(scene, train, 1.0)
     gram.add(unit_images(model, batch), batch.image, batch.usable, batch.frame)
     exact = fit.solve_coefficients(gram.gram)
-    from stages.evaluate.core import sample_pixels
-
     sample = sample_pixels(batch, 10**6, np.random.default_rng(0))
     assert fit.fit_nonlinear(model, sample, 4, calibrated=True) == pytest.approx(exact, abs=1e-6)
 
@@ -100,8 +104,6 @@ def test_nonlinear_fit_finds_planted_hapke_parameters(scene):
     planted[0] = 0.8 * planted[0]
     batch = read_batch(scene, np.flatnonzero(scene.split == 0), 1.0)
     batch.image = Renderer("planted", model, Constant(planted)).radiance_factor(batch)
-    from stages.evaluate.core import sample_pixels
-
     sample = sample_pixels(batch, 100, np.random.default_rng(0))
     found = fit.fit_nonlinear(model, sample, 4, calibrated=True)
     batch.memo.clear()
@@ -236,6 +238,101 @@ def test_a_single_tile_gives_flagged_intervals_over_its_sites(scene):
 
     result, *_ = _evaluate(dataclasses.replace(scene, tile=np.zeros_like(scene.tile)))
     row = result["models"]["learned"]
-    assert result["tiles"] == 1 and result["bootstrap_unit"] == "site"
+    assert result["tiles"] == 1 and result["interval_unit"] == "site"
     assert row["mse_low"] < row["mse"] < row["mse_high"]
     assert any("too narrow" in w for w in result["warnings"])
+
+
+def test_global_kernels_and_fitted_hapke_are_least_squares_fits_of_the_train_split(scene):
+    """On images of a planted Hapke law, fitted Hapke finds it and kernels come near; on those of M2 kernels contain it."""
+    import dataclasses
+
+    model = get_model("hapke")
+    planted = np.array([p.default for p in model.parameters])
+    planted[[0, 1, 7]] = 0.25, 0.3, np.radians(12)  # w, b, theta
+    everything = np.arange(len(scene.split))
+    batch = read_batch(scene, everything, 1.0)
+    images = Renderer("planted", model, Constant(planted)).radiance_factor(batch).numpy()
+    of_hapke = dataclasses.replace(scene, images=images + 1e-4 * np.random.default_rng(0).normal(size=images.shape))
+    of_hapke.images = of_hapke.images.astype(np.float32)
+    models = _evaluate(of_hapke, only=("hapke_fitted", "kernels", "hapke_raw", "lunar_lambert"))[0]["models"]
+    assert models["hapke_fitted"]["mse"] == pytest.approx(1e-8, rel=0.1)
+    assert models["kernels"]["mse"] < 1e-3 * models["lunar_lambert"]["mse"]
+    assert models["hapke_raw"]["mse"] > 100 * models["hapke_fitted"]["mse"]
+    of_m2 = _evaluate(scene, only=("global", "kernels"))[0]["models"]
+    assert of_m2["kernels"]["mse"] <= 1.02 * of_m2["global"]["mse"]
+
+
+def test_fits_know_nothing_of_the_scored_split(scene):
+    """Other images on the scored split leave every fitted number as it was, to the bit."""
+    import copy
+
+    spoiled = copy.deepcopy(scene)
+    spoiled.images[spoiled.split == 2] *= np.float32(3)
+    fitted = []
+    for data in (scene, spoiled):
+        rows = _evaluate(data)[1]
+        fitted.append({r.name: (r.renderer.coefficients, r.renderer.scale) for r in rows if "learned" not in r.name})
+    for name, (coefficients, scale) in fitted[0].items():
+        assert coefficients(None).equal(fitted[1][name][0](None)) and scale == fitted[1][name][1], name
+
+
+def test_the_strongest_baseline_is_found_and_compared_like_for_like(scene):
+    result, *_ = _evaluate(scene)
+    models = result["models"]
+    free = {n: row["mse"] for n, row in models.items() if row["freedom"] == "none" and n != "learned"}
+    matched = {n: row["mse"] for n, row in models.items() if n in MATCHED - {"learned_gain_offset"}}
+    assert set(free) == {"global", "kernels", "hapke_fitted", "lunar_lambert", "hapke_raw"}
+    assert result["strongest_baseline"] == {"none": min(free, key=free.get), "gain_offset": min(matched, key=matched.get)}
+    assert len(result["conclusions"]) == 2
+    for kind, ours, sentence in zip(
+        ("none", "gain_offset"), ("learned", "learned_gain_offset"), result["conclusions"], strict=True
+    ):
+        rival = result["strongest_baseline"][kind]
+        gain = result["gains"][ours][rival]
+        assert f"the strongest baseline, {rival} (" in sentence and f"{gain['gain_percent']:.1f} % lower" in sentence
+        assert f"{gain['gain_percent_low']:+.1f} .. {gain['gain_percent_high']:+.1f} %" in sentence
+        assert "30 pairs, 15 ground tiles, 1 training run" in sentence
+
+
+def test_a_learned_row_that_is_no_better_is_not_praised(scene):
+    class Flat(KnowsTheTruth):
+        """One set for all ground: the true mean coefficients."""
+
+        def coefficients(self, elevation):
+            return super().coefficients(elevation * 0)
+
+    class Dark(Flat):
+        def coefficients(self, elevation):
+            return 0.5 * super().coefficients(elevation)
+
+    for predictor, words in ((Flat(), "cannot be told apart from"), (Dark(), "% higher than")):
+        only = ("learned", "global")
+        result, *_ = _evaluate(scene, predictor=predictor, only=only)
+        assert words in result["conclusions"][0]
+
+
+def test_training_runs_are_averaged_and_their_spread_widens_the_interval(scene):
+    class Biased(KnowsTheTruth):
+        def __init__(self, factor):
+            super().__init__()
+            self.factor = factor
+
+        def coefficients(self, elevation):
+            return self.factor * super().coefficients(elevation)
+
+    factors = (1.02, 1.04, 1.06)
+    single = [_evaluate(scene, predictor=Biased(f), only=("learned", "global"))[0] for f in factors]
+    result, _, scores, _ = _evaluate(scene, predictor=[Biased(f) for f in factors], only=("learned", "global"))
+    row, errors = result["models"]["learned"], [s["models"]["learned"]["mse"] for s in single]
+    assert row["mse_runs"] == pytest.approx(errors) and row["mse"] == pytest.approx(np.mean(errors))
+    assert row["mse_run_std"] == pytest.approx(np.std(errors, ddof=1))
+    assert row["mse_high"] / row["mse_low"] > 3 * max(
+        s["models"]["learned"]["mse_high"] / s["models"]["learned"]["mse_low"] for s in single
+    )
+    gain = result["gains"]["learned"]["global"]
+    assert gain["gain_percent"] == pytest.approx(100 * (1 - row["mse"] / result["models"]["global"]["mse"]))
+    assert result["models"]["global"] == single[0]["models"]["global"]
+    assert result["training_runs"] == 3 and scores.runs("learned").shape == (3, 30)
+    assert any("one training run" in w for w in single[0]["warnings"])
+    assert not any("training run" in w for w in result["warnings"])

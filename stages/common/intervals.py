@@ -3,7 +3,7 @@
 Pairs on one ground tile share terrain and images, so tiles and not pairs are the independent witnesses. All that is
 compared is a ratio of sums over tiles: a mean squared error (squared errors over pixels), a gain (errors of one model
 over those of another, paired tile by tile), a share of matches (hits over matches). With the ratio R of all units and
-R_k of all but unit k, on a scale f (logarithm for positive ratios, whose errors are skewed):
+R_k of all but unit k, on a scale f (logarithm for positive ratios, whose errors are skewed; logit for shares):
 
     variance = (n - 1)/n sum (f(R_k) - f(R))^2                                       Tukey (1958), Ann. Math. Stat. 29, 614
 
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special, stats
 
 LEVEL = 0.95
 FEWEST_UNITS = 4  # coverage is tested from here on
@@ -53,7 +53,7 @@ def ratio_interval(total: NDArray, weight: NDArray, unit: NDArray, scale: str = 
 
     total : (N,) or (runs, N); weight : likewise, or (N,) for all runs; unit : (N,) labels of pieces of ground. Entries
     that are not finite do not count.
-    scale : 'log' for positive ratios, 'plain' for others
+    scale : 'log' for positive ratios, 'logit' for shares of a whole, 'plain' for others
     The value is the ratio of the means over runs.
     """
     totals, weights, labels = _known(total, weight, unit)
@@ -66,7 +66,7 @@ def ratio_interval(total: NDArray, weight: NDArray, unit: NDArray, scale: str = 
         parts.append(run_variance([float(f(_ratio(a.sum(), b.sum()))) for a, b in zip(totals, weights, strict=True)]))
     noise = join(parts)
     reach = student_quantile(noise.freedom) * math.sqrt(noise.value) if noise.freedom > 0 else math.nan
-    back: Callable[[float], float] = math.exp if f is np.log else float
+    back: Callable[[float], float] = {np.log: np.exp, special.logit: special.expit}.get(f, float)
     if not (math.isfinite(reach) and math.isfinite(value)):
         return Interval(float(value), math.nan, math.nan)
     middle = float(f(value))
@@ -146,14 +146,16 @@ def _per_unit(total: NDArray, weight: NDArray, unit: NDArray) -> tuple[NDArray, 
 
 
 def _scale(total: NDArray, weight: NDArray, unit: NDArray, scale: str) -> Callable[[NDArray], NDArray]:
-    """The logarithm where it exists for every ratio that is asked for."""
-    if scale != "log":
+    """The logarithm (logit) where it exists for every ratio that is asked for."""
+    if scale == "plain":
         return np.asarray
     totals, weights, _ = _per_unit(total, weight, unit)
     without = _ratio(totals.sum() - totals, weights.sum() - weights)
     runs = _ratio(total.sum(axis=1), weight.sum(axis=1))
-    positive = bool((np.concatenate([without, runs]) > 0).all())
-    return np.log if positive else np.asarray
+    asked = np.concatenate([without, runs])
+    if scale == "logit":
+        return special.logit if bool(((asked > 0) & (asked < 1)).all()) else np.asarray
+    return np.log if bool((asked > 0).all()) else np.asarray
 
 
 def _ratio(above: NDArray | float, below: NDArray | float) -> NDArray:
@@ -162,7 +164,5 @@ def _ratio(above: NDArray | float, below: NDArray | float) -> NDArray:
 
 
 def _bound(back: Callable[[float], float], value: float) -> float:
-    try:
-        return back(value)
-    except OverflowError:
-        return math.inf
+    with np.errstate(over="ignore"):  # few units of very unequal weight: nothing bounds the ratio
+        return float(back(value))
