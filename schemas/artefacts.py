@@ -376,7 +376,9 @@ EVALUATION = declare(
             Variable("tile", ("pair",), "i4", "1", "ground tile, the independent unit of the intervals"),
             Variable("valid_pixels", ("pair",), "i4", "1", "pixels that count"),
             Variable("mse", ("model", "pair"), "f8", "1", "mean squared error of the crop, mean over training runs"),
-            Variable("ssim", ("model", "pair"), "f8", "1", "structural similarity of the crop, mean over training runs"),
+            Variable(
+                "ssim", ("model", "pair"), "f8", "1", "structural similarity of the crop, mean over training runs"
+            ),
             Variable("run_seed", ("run",), "i8", "1", "seed of each training run", required=False),
             Variable(
                 "run_mse",
@@ -387,7 +389,14 @@ EVALUATION = declare(
                 required=False,
             ),
             Variable("measured", ("pair", "y", "x"), "f4", "1", "measured crop"),
-            Variable("rendered", ("model", "pair", "y", "x"), "f4", "1", "rendered crop, of the first training run", required=False),
+            Variable(
+                "rendered",
+                ("model", "pair", "y", "x"),
+                "f4",
+                "1",
+                "rendered crop, of the first training run",
+                required=False,
+            ),
         ),
         attributes=(Attribute("split", "which split was evaluated"), Attribute("metrics", "the table as JSON")),
     )

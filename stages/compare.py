@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from schemas import CHECKPOINT, EVALUATION, ArtefactError, ConfigError, atomic_path, open_artefact, read_strings
-from stages.common.intervals import ground_variance, join, ratio_interval, run_variance, two_sided_p
+from stages.common.intervals import ERROR, LOG, ground_variance, join, ratio_interval, run_variance, two_sided_p
 
 # Validation MSE summed over a crop of 128 x 128 px, where the Lunar-G2R paper's text gives it.
 PAPER = {"M1": 4.51, "M2": 4.06, "M6": 5.34}
@@ -62,7 +62,9 @@ def read_runs(evaluation: Path, checkpoints: Sequence[Path]) -> list[Trained]:
             model, seed = str(file.attrs["model"]), int(file.attrs["seed"])
             best, history = int(file.attrs["best_epoch"]), file["validation_loss"][...]
         if seed not in seeds:
-            raise ArtefactError(f"{evaluation}: expected seed {seed} of {checkpoint.name}, found {seeds}; evaluate again.")
+            raise ArtefactError(
+                f"{evaluation}: expected seed {seed} of {checkpoint.name}, found {seeds}; evaluate again."
+            )
         runs.append(Trained(model, seed, errors[seeds.index(seed)], pixels, tile, best, history))
     return runs
 
@@ -99,7 +101,7 @@ def compare(runs: Sequence[Trained]) -> dict[str, Any]:
 def _row(group: Sequence[Trained]) -> dict[str, Any]:
     """A model's line of the table; the interval holds the spread of ground and seeds."""
     first, several = group[0], len(group) > 1
-    found = ratio_interval(np.stack([r.squared_error for r in group]), first.pixels, first.tile)
+    found = ratio_interval(np.stack([r.squared_error for r in group]), first.pixels, first.tile, ERROR)
     sums = [r.mse_crop_sum for r in group]
     return {
         "mse": found.value,
@@ -128,8 +130,8 @@ def _difference(better: Sequence[Trained], worse: Sequence[Trained]) -> dict[str
     }
     if not a > 0:
         return found
-    errors = [np.stack([r.squared_error for r in group]).mean(axis=0)[None] for group in (better, worse)]
-    tiles = ground_variance(*errors, better[0].tile, np.log)
+    ours, other = (np.stack([r.squared_error for r in group]).mean(axis=0)[None] for group in (better, worse))
+    tiles = ground_variance(ours, other, better[0].tile, LOG)
     seeds = [run_variance([r.mse / m for r in group]) for group, m in ((better, a), (worse, b))]
     whole = join([tiles, *seeds])
     if whole.freedom > 0 and whole.value > 0:
@@ -199,7 +201,9 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     cells = []
     for name, row in result["models"].items():
         deviation = row["mse_crop_sum_seed_std"]
-        interval = "-" if row["mse_low"] is None else f"{row['mse_low']:.3e} .. {row['mse_high']:.3e}"
+        interval = (
+            "-" if None in (row["mse_low"], row["mse_high"]) else f"{row['mse_low']:.3e} .. {row['mse_high']:.3e}"
+        )
         cells.append(
             [
                 name,
@@ -211,7 +215,15 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
                 "-" if row["paper_mse_crop_sum"] is None else f"{row['paper_mse_crop_sum']:.2f}",
             ]
         )
-    return ["model", "MSE/crop", "+- seeds", "MSE", "95 % over tiles and seeds", "best epochs", "paper's MSE/crop"], cells
+    return [
+        "model",
+        "MSE/crop",
+        "+- seeds",
+        "MSE",
+        "95 % over tiles and seeds",
+        "best epochs",
+        "paper's MSE/crop",
+    ], cells
 
 
 def difference_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:

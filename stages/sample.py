@@ -181,9 +181,7 @@ def _tile_edge(grid: Grid, positions: PositionMasks, crop: int, scene_crop: int,
         metres = Geodesic(grid.radius, 0).Inverse(lat[0], lon[0], lat[1], lon[1])["s12"] / 100
         edge = round(config.tile_m / metres)
         if edge < crop:
-            raise ConfigError(
-                f"--tile-m: expected at least one crop ({crop * metres:g} m), found {config.tile_m:g} m."
-            )
+            raise ConfigError(f"--tile-m: expected at least one crop ({crop * metres:g} m), found {config.tile_m:g} m.")
         return edge
     edge = _scene_edge(positions, scene_crop, config.split)
     if edge < crop:
@@ -207,9 +205,7 @@ def _scene_edge(positions: PositionMasks, crop: int, shares: tuple[float, float,
     return math.ceil(longest / max(1, math.floor(longest / edge)))
 
 
-def _split_tiles(
-    positions: PositionMasks, grid: Grid, edge: int, config: Config, progress: Progress | None
-) -> Tiles:
+def _split_tiles(positions: PositionMasks, grid: Grid, edge: int, config: Config, progress: Progress | None) -> Tiles:
     """Give every tile with valid ground to a part, in the order of a hash, so that the parts' ground is near their shares."""
     shares = config.split
     shape = (math.ceil(grid.height / edge), math.ceil(grid.width / edge))
@@ -226,7 +222,9 @@ def _split_tiles(
     if progress:
         progress(len(positions.blocks), len(positions.blocks), "tiles")
     part = np.full(shape, -1, np.int8)
-    candidates = np.array(sorted(np.argwhere(ground > 0).tolist(), key=lambda at: _lot(config.seed, *at))).reshape(-1, 2)
+    candidates = np.array(sorted(np.argwhere(ground > 0).tolist(), key=lambda at: _lot(config.seed, *at))).reshape(
+        -1, 2
+    )
     # Whole tiles first: a sliver at the scene's edge can hold no crop and must not be all that a part gets.
     candidates = candidates[np.argsort(-np.minimum(ground[tuple(candidates.T)], 0.5 * edge * edge), kind="stable")]
     total = ground.sum()

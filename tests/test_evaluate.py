@@ -289,7 +289,10 @@ def test_the_strongest_baseline_is_found_and_compared_like_for_like(whole):
     free = {n: row["mse"] for n, row in models.items() if row["freedom"] == "none" and n != "learned"}
     matched = {n: row["mse"] for n, row in models.items() if n in MATCHED - {"learned_gain_offset"}}
     assert set(free) == {"global", "kernels", "hapke_fitted", "lunar_lambert", "hapke_raw"}
-    assert result["strongest_baseline"] == {"none": min(free, key=free.get), "gain_offset": min(matched, key=matched.get)}
+    assert result["strongest_baseline"] == {
+        "none": min(free, key=free.get),
+        "gain_offset": min(matched, key=matched.get),
+    }
     assert len(result["conclusions"]) == 2
     for kind, ours, sentence in zip(
         ("none", "gain_offset"), ("learned", "learned_gain_offset"), result["conclusions"], strict=True

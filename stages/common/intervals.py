@@ -3,7 +3,7 @@
 Pairs on one ground tile share terrain and images, so tiles and not pairs are the independent witnesses. All that is
 compared is a ratio of sums over tiles: a mean squared error (squared errors over pixels), a gain (errors of one model
 over those of another, paired tile by tile), a share of matches (hits over matches). With the ratio R of all units and
-R_k of all but unit k, on a scale f (logarithm for positive ratios, whose errors are skewed; logit for shares):
+R_k of all but unit k, on a scale f that takes out skewness (errors: -R^(-1/2); gains: logarithm; shares: logit):
 
     variance = (n - 1)/n sum (f(R_k) - f(R))^2                                       Tukey (1958), Ann. Math. Stat. 29, 614
 
@@ -43,34 +43,54 @@ class Interval:
     high: float
 
 
+@dataclass(frozen=True)
+class Scale:
+    """Where a ratio is nearly normal: there, back again, and the bounds (low, high) between which it exists."""
+
+    to: Callable[[NDArray], NDArray]
+    back: Callable[[float], float]
+    low: float = -math.inf
+    high: float = math.inf
+
+
+PLAIN = Scale(np.asarray, float)
+LOG = Scale(np.log, np.exp, 0.0)
+LOGIT = Scale(special.logit, special.expit, 0.0, 1.0)
+# Squared errors per tile scatter like a lognormal law with a deviation of 60 to 70 %: the mean of few is skewed even
+# on a logarithm. Where -R^(-1/2) reaches 0, nothing bounds the error from above.
+ERROR = Scale(lambda ratio: -(ratio**-0.5), lambda value: value**-2 if value < 0 else math.inf, 0.0)
+
+
 def choose_units(tile: NDArray, site: NDArray) -> tuple[NDArray, str]:
     """Labels of the independent pieces of ground, (N,), and their name: tiles, or the sites of a single tile."""
     return (tile, "tile") if len(np.unique(tile)) > 1 else (site, "site")
 
 
-def ratio_interval(total: NDArray, weight: NDArray, unit: NDArray, scale: str = "log") -> Interval:
+def ratio_interval(total: NDArray, weight: NDArray, unit: NDArray, scale: Scale = PLAIN) -> Interval:
     """sum(total) / sum(weight) with its 95 % interval over ground and training runs.
 
     total : (N,) or (runs, N); weight : likewise, or (N,) for all runs; unit : (N,) labels of pieces of ground. Entries
     that are not finite do not count.
-    scale : 'log' for positive ratios, 'logit' for shares of a whole, 'plain' for others
-    The value is the ratio of the means over runs.
+    The value is the ratio of the means over runs. Where a ratio does not exist on ``scale`` it stays as it is.
     """
     totals, weights, labels = _known(total, weight, unit)
     if not len(labels):
         return Interval(math.nan, math.nan, math.nan)
-    f = _scale(totals, weights, labels, scale)
-    value = _ratio(totals.mean(0).sum(), weights.mean(0).sum())
-    parts = [ground_variance(totals, weights, labels, f)]
+    value = float(_ratio(totals.mean(0).sum(), weights.mean(0).sum()))
+    runs = _ratio(totals.sum(axis=1), weights.sum(axis=1))
+    asked = np.concatenate([_without_one(totals, weights, labels), runs])
+    if not bool(((asked > scale.low) & (asked < scale.high)).all()):
+        scale = PLAIN
+    parts = [ground_variance(totals, weights, labels, scale)]
     if len(totals) > 1:
-        parts.append(run_variance([float(f(_ratio(a.sum(), b.sum()))) for a, b in zip(totals, weights, strict=True)]))
+        parts.append(run_variance(scale.to(runs)))
     noise = join(parts)
     reach = student_quantile(noise.freedom) * math.sqrt(noise.value) if noise.freedom > 0 else math.nan
-    back: Callable[[float], float] = {np.log: np.exp, special.logit: special.expit}.get(f, float)
     if not (math.isfinite(reach) and math.isfinite(value)):
-        return Interval(float(value), math.nan, math.nan)
-    middle = float(f(value))
-    return Interval(float(value), _bound(back, middle - reach), _bound(back, middle + reach))
+        return Interval(value, math.nan, math.nan)
+    middle = float(scale.to(np.asarray(value)))
+    with np.errstate(over="ignore"):  # few units of very unequal weight: nothing bounds the ratio
+        return Interval(value, float(scale.back(middle - reach)), float(scale.back(middle + reach)))
 
 
 def gain_interval(ours: NDArray, other: NDArray, unit: NDArray) -> Interval:
@@ -78,26 +98,25 @@ def gain_interval(ours: NDArray, other: NDArray, unit: NDArray) -> Interval:
 
     ours, other : (N,) or (runs, N) sums of squared errors; unit : (N,) labels of pieces of ground
     """
-    ratio = ratio_interval(ours, other, unit)
+    ratio = ratio_interval(ours, other, unit, LOG)
     return Interval(100 * (1 - ratio.value), 100 * (1 - ratio.high), 100 * (1 - ratio.low))
 
 
-def ground_variance(
-    total: NDArray, weight: NDArray, unit: NDArray, f: Callable[[NDArray], NDArray] = np.asarray
-) -> Variance:
-    """Jackknife variance of f(sum(total) / sum(weight)), means over runs; freedom 0 for less than two units.
+def ground_variance(total: NDArray, weight: NDArray, unit: NDArray, scale: Scale = PLAIN) -> Variance:
+    """Jackknife variance of sum(total) / sum(weight) on ``scale``, means over runs; freedom 0 for less than two units.
 
     total, weight : (runs, N); unit : (N,)
     """
-    totals, weights, count = _per_unit(total, weight, unit)
+    totals, weights = _per_unit(total, weight, unit)
+    count = len(weights)
     if count < 2:
         return Variance(math.nan, 0.0)
-    without = f(_ratio(totals.sum() - totals, weights.sum() - weights))
-    spread = np.square(without - f(_ratio(totals.sum(), weights.sum()))).sum() * (count - 1) / count
+    without, of_all = scale.to(_without_one(total, weight, unit)), scale.to(_ratio(totals.sum(), weights.sum()))
+    spread = np.square(without - of_all).sum() * (count - 1) / count
     return Variance(float(spread), max(1.0, effective_units(weights) - 1))
 
 
-def run_variance(values: Sequence[float]) -> Variance:
+def run_variance(values: Sequence[float] | NDArray) -> Variance:
     """Variance of the mean of independent training runs; freedom 0 for one run."""
     if len(values) < 2:
         return Variance(math.nan, 0.0)
@@ -137,32 +156,19 @@ def _known(total: NDArray, weight: NDArray, unit: NDArray) -> tuple[NDArray, NDA
     return totals[:, known], weights[:, known], np.asarray(unit)[known]
 
 
-def _per_unit(total: NDArray, weight: NDArray, unit: NDArray) -> tuple[NDArray, NDArray, int]:
+def _per_unit(total: NDArray, weight: NDArray, unit: NDArray) -> tuple[NDArray, NDArray]:
     """Sums over each unit of the means over runs, (units,) each; units without weight do not count."""
     _, index = np.unique(unit, return_inverse=True)
     totals, weights = (np.bincount(index, np.atleast_2d(v).mean(0)) for v in (total, weight))
-    counts = weights > 0
-    return totals[counts], weights[counts], int(counts.sum())
+    return totals[weights > 0], weights[weights > 0]
 
 
-def _scale(total: NDArray, weight: NDArray, unit: NDArray, scale: str) -> Callable[[NDArray], NDArray]:
-    """The logarithm (logit) where it exists for every ratio that is asked for."""
-    if scale == "plain":
-        return np.asarray
-    totals, weights, _ = _per_unit(total, weight, unit)
-    without = _ratio(totals.sum() - totals, weights.sum() - weights)
-    runs = _ratio(total.sum(axis=1), weight.sum(axis=1))
-    asked = np.concatenate([without, runs])
-    if scale == "logit":
-        return special.logit if bool(((asked > 0) & (asked < 1)).all()) else np.asarray
-    return np.log if bool((asked > 0).all()) else np.asarray
+def _without_one(total: NDArray, weight: NDArray, unit: NDArray) -> NDArray:
+    """The ratio of all units but one, (units,); empty for a single unit."""
+    totals, weights = _per_unit(total, weight, unit)
+    return _ratio(totals.sum() - totals, weights.sum() - weights)[: len(weights) * (len(weights) > 1)]
 
 
 def _ratio(above: NDArray | float, below: NDArray | float) -> NDArray:
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.asarray(np.asarray(above, float) / np.asarray(below, float))
-
-
-def _bound(back: Callable[[float], float], value: float) -> float:
-    with np.errstate(over="ignore"):  # few units of very unequal weight: nothing bounds the ratio
-        return float(back(value))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -33,7 +34,7 @@ def coverage(
         }
 
     by_incidence = []
-    for low, high in zip(bands_deg[:-1], bands_deg[1:], strict=True):
+    for low, high in itertools.pairwise(bands_deg):
         last = high == bands_deg[-1]
         band = (angle >= low) & ((angle <= high) if last else (angle < high))
         by_incidence.append({"incidence_low_deg": low, "incidence_high_deg": high} | shares(band))

@@ -99,7 +99,7 @@ def error_chart(result: dict[str, Any]) -> Any:
     for k, name in enumerate(names):
         row = result["models"][name]
         colour = next(c for key, c in COLOURS.items() if name.startswith(key))
-        if row["mse_low"] is not None:
+        if row["mse_low"] is not None and row["mse_high"] is not None:
             axes.plot(np.sqrt([row["mse_low"], row["mse_high"]]), [k, k], color=colour, linewidth=2.5, alpha=0.55)
         axes.plot(row["rmse"], k, "o", color=colour, markersize=6)
     axes.set_yticks(range(len(names)), [TITLES.get(n, n) for n in names], fontsize=8)

@@ -16,8 +16,9 @@ from stages.effects import load_extension
 from stages.evaluate.core import PER_ROW, Scores, score
 from stages.evaluate.fitting import choose_fit_pairs, dn_scale, fit_rows
 from stages.evaluate.perceptual import Perceptual
-from stages.evaluate.renderers import Constant, Predictor
+from stages.evaluate.renderers import Constant
 from stages.evaluate.rows import Row, make_renderers, make_rows
+from stages.network.predictor import Predictor as Network
 from stages.network.predictor import choose_device, load_predictor
 from stages.pairs.reader import PairReader
 
@@ -65,7 +66,7 @@ def read_fit(path: Path, rows: Sequence[Row]) -> float:
     return float(found["scale"])
 
 
-def load_predictors(checkpoints: Sequence[Path], device: str) -> list[Predictor]:
+def load_predictors(checkpoints: Sequence[Path], device: str) -> list[Network]:
     """One for each training run."""
     return [load_predictor(path, choose_device(device)) for path in checkpoints]
 

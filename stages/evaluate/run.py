@@ -205,9 +205,7 @@ def select(reader: PairReader, split: str) -> np.ndarray:
 def _notes(checkpoint: Path, predictor: Network, reader: PairReader, extend: Path | None) -> list[str]:
     notes = []
     if abs(predictor.gsd / reader.gsd - 1) > 0.01:
-        notes.append(
-            f"the checkpoint was trained at {predictor.gsd:g} m per pixel, these pairs have {reader.gsd:g} m"
-        )
+        notes.append(f"the checkpoint was trained at {predictor.gsd:g} m per pixel, these pairs have {reader.gsd:g} m")
     with open_artefact(checkpoint, CHECKPOINT) as file:
         trained_with = read_config(file).get("extend")
     if trained_with and extend is None:

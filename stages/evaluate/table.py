@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.common.intervals import gain_interval, ratio_interval
+from stages.common.intervals import ERROR, gain_interval, ratio_interval
 from stages.evaluate.core import Scores
 from stages.evaluate.metrics import psnr
 from stages.evaluate.rows import TITLES, freedom
@@ -33,7 +33,7 @@ def metric_table(scores: Scores, unit: np.ndarray) -> dict[str, dict[str, Any]]:
     table = {}
     for name in dict.fromkeys(scores.names):
         totals = scores.runs(name)
-        mse = ratio_interval(totals, pixels, unit)
+        mse = ratio_interval(totals, pixels, unit, ERROR)
         runs = totals.sum(axis=1) / pixels.sum()
         row: dict[str, Any] = {
             "mse": mse.value,
@@ -51,10 +51,10 @@ def metric_table(scores: Scores, unit: np.ndarray) -> dict[str, dict[str, Any]]:
             values = scores.runs(name, metric)
             row[metric] = _mean(values)
             if metric != "ssim_range_1":
-                found = ratio_interval(values, crops, unit, scale="plain")
+                found = ratio_interval(values, crops, unit)
                 row[f"{metric}_low"], row[f"{metric}_high"] = found.low, found.high
-        table[name] = {key: _number(value) for key, value in row.items()}
-        table[name] |= {"freedom": freedom(name), "mse_runs": runs.tolist()}
+        numbers: dict[str, Any] = {key: _number(value) for key, value in row.items()}
+        table[name] = numbers | {"freedom": freedom(name), "mse_runs": runs.tolist()}
     return table
 
 
@@ -147,7 +147,7 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     columns = ["model", "MSE", "95 % interval", "+- runs", "MSE/crop", "RMSE", "PSNR", "PSNR crop", "SSIM", "LPIPS"]
     cells = []
     for name, row in result["models"].items():
-        bounds = "-" if row["mse_low"] is None else f"{row['mse_low']:.3e} .. {row['mse_high']:.3e}"
+        bounds = bounds_text(row)
         cells.append(
             [
                 name,
@@ -163,6 +163,13 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
             ]
         )
     return columns, cells
+
+
+def bounds_text(row: dict[str, Any]) -> str:
+    """The interval of a row's MSE; so few tiles may scatter so much that nothing bounds it from above."""
+    if row["mse_low"] is None:
+        return "-"
+    return f"{row['mse_low']:.3e} .. " + ("unbounded" if row["mse_high"] is None else f"{row['mse_high']:.3e}")
 
 
 def gain_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:

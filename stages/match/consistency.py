@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stages.common.intervals import ratio_interval
+from stages.common.intervals import LOGIT, ratio_interval
 from stages.match.base import Matches
 
 THRESHOLDS = (1, 3, 5)  # px at 512 x 384
@@ -29,7 +29,7 @@ def summarise(found: list[Matches], ground: Sequence[int]) -> dict[str, float | 
     for threshold in THRESHOLDS:
         within = np.array([(e <= threshold).sum() for e in errors], float)
         key = f"within_{threshold}_px_percent"
-        share = ratio_interval(within, counts, np.asarray(ground), scale="logit")
+        share = ratio_interval(within, counts, np.asarray(ground), LOGIT)
         result[key] = 100 * share.value if len(pooled) else None
         known = len(pooled) and math.isfinite(share.low)
         result[f"{key}_low"] = max(0.0, 100 * share.low) if known else None
