@@ -116,7 +116,7 @@ def run(
         if not frames:
             raise ConfigError(f"{scene}: expected images, found none; run 'lunargr ingest' with --images.")
         positions = PositionMasks(file, grid, crop, config.block)
-        edge = _tile_edge(grid, positions, crop, int(file.attrs["crop_px"]), config)
+        edge = _tile_edge(grid, positions, config)
         tiles = _split_tiles(positions, grid, edge, config, progress)
         chosen = _choose(positions, tiles, frames, grid, config, np.random.default_rng(config.seed), progress)
         if not len(chosen):
@@ -141,7 +141,8 @@ class PositionMasks:
 
     def __init__(self, file: h5py.File, grid: Grid, crop: int, block: int) -> None:
         self.file, self.grid, self.crop = file, grid, crop
-        self.stored = int(file.attrs["crop_px"]) == crop
+        self.scene_crop = int(file.attrs["crop_px"])
+        self.stored = self.scene_crop == crop
         self.windows = file["frame_window"][...]
         self.blocks = list(blocks(grid.height, grid.width, block))
 
@@ -170,11 +171,12 @@ class _Layer:
         return self.data[(self.index, *key)]
 
 
-def _tile_edge(grid: Grid, positions: PositionMasks, crop: int, scene_crop: int, config: Config) -> int:
+def _tile_edge(grid: Grid, positions: PositionMasks, config: Config) -> int:
     """Edge of a ground tile in pixels; metres are measured along the body with a geodesic at the scene's centre.
 
     Without --tile-m it follows from the scene and the shares alone, not from the crops that are asked for.
     """
+    crop = positions.crop
     if config.tile_m is not None:
         row, col = grid.height / 2, grid.width / 2
         lon, lat = grid.lonlat([row, row], [col - 50, col + 50])
@@ -183,7 +185,7 @@ def _tile_edge(grid: Grid, positions: PositionMasks, crop: int, scene_crop: int,
         if edge < crop:
             raise ConfigError(f"--tile-m: expected at least one crop ({crop * metres:g} m), found {config.tile_m:g} m.")
         return edge
-    edge = _scene_edge(positions, scene_crop, config.split)
+    edge = _scene_edge(positions, config.split)
     if edge < crop:
         raise ConfigError(
             f"--crop: expected at most {edge} px, the ground tiles of this scene's split, found {crop}; "
@@ -192,9 +194,9 @@ def _tile_edge(grid: Grid, positions: PositionMasks, crop: int, scene_crop: int,
     return edge
 
 
-def _scene_edge(positions: PositionMasks, crop: int, shares: tuple[float, float, float]) -> int:
+def _scene_edge(positions: PositionMasks, shares: tuple[float, float, float]) -> int:
     """As large as leaves TEST_TILES for testing, between SMALLEST_TILE and LARGEST_TILE; slivers at the edge avoided."""
-    used = positions.windows[positions.windows[:, 2] > 0]
+    crop, used = positions.scene_crop, positions.windows[positions.windows[:, 2] > 0]
     if not len(used):
         return LARGEST_TILE * crop
     height = int((used[:, 0] + used[:, 2]).max() - used[:, 0].min())
@@ -206,34 +208,39 @@ def _scene_edge(positions: PositionMasks, crop: int, shares: tuple[float, float,
 
 
 def _split_tiles(positions: PositionMasks, grid: Grid, edge: int, config: Config, progress: Progress | None) -> Tiles:
-    """Give every tile with valid ground to a part, in the order of a hash, so that the parts' ground is near their shares."""
-    shares = config.split
+    """Give every tile with valid ground to a part, in the order of a hash, so that the parts' ground is near their shares.
+
+    Tiles in which no crop of the scene's own size fits train only: they would not be tested on.
+    """
     shape = (math.ceil(grid.height / edge), math.ceil(grid.width / edge))
-    ground = np.zeros(shape)
+    ground, room = np.zeros(shape), np.zeros(shape, bool)
+    before, behind = positions.scene_crop // 2, positions.scene_crop - positions.scene_crop // 2 - 1
     for number, block in enumerate(positions.blocks):
         if progress:
             progress(number, len(positions.blocks), "tiles")
         row, col, h, w = block
-        covered = np.zeros((h, w), bool)
+        part_of_scene = np.s_[row : row + h, col : col + w]
+        covered, centres = np.zeros((h, w), bool), np.zeros((h, w), bool)
         for frame in positions.frames_of(block):
-            covered |= positions.file["valid"][frame, row : row + h, col : col + w].astype(bool)
+            covered |= positions.file["valid"][frame, *part_of_scene].astype(bool)
+            centres |= positions.file["valid_position"][frame, *part_of_scene].astype(bool)
         r, c = np.nonzero(covered)
         np.add.at(ground, ((r + row) // edge, (c + col) // edge), 1)
+        r, c = (v + first for v, first in zip(np.nonzero(centres), (row, col), strict=True))
+        inside = ((r - before) // edge == (r + behind) // edge) & ((c - before) // edge == (c + behind) // edge)
+        room[r[inside] // edge, c[inside] // edge] = True
     if progress:
         progress(len(positions.blocks), len(positions.blocks), "tiles")
-    part = np.full(shape, -1, np.int8)
-    candidates = np.array(sorted(np.argwhere(ground > 0).tolist(), key=lambda at: _lot(config.seed, *at))).reshape(
-        -1, 2
-    )
-    # Whole tiles first: a sliver at the scene's edge can hold no crop and must not be all that a part gets.
-    candidates = candidates[np.argsort(-np.minimum(ground[tuple(candidates.T)], 0.5 * edge * edge), kind="stable")]
-    total = ground.sum()
-    filled = np.zeros(3)
-    for row, col in candidates:
-        deficit = np.array(shares) * total - filled
-        deficit[np.array(shares) <= 0] = -np.inf
+    if not room.any():  # tiles are smaller than the scene's crops: smaller ones will be asked for
+        room = ground > 0
+    part = np.where(ground > 0, 0 if config.split[0] > 0 else -1, -1).astype(np.int8)
+    shares = np.array(config.split)
+    total, filled = (ground * room).sum(), np.zeros(3)
+    for row, col in sorted(np.argwhere(room).tolist(), key=lambda at: _lot(config.seed, *at)):
+        deficit = shares * total - filled
+        deficit[shares <= 0] = -np.inf
         # The emptiest part relative to its share: small parts get their first tile early.
-        k = int(np.argmax(deficit / np.maximum(np.array(shares) * total, 1)))
+        k = int(np.argmax(deficit / np.maximum(shares * total, 1)))
         part[row, col] = k
         filled[k] += ground[row, col]
     return Tiles(edge, part)
