@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from schemas import CHECKPOINT, EVALUATION, ArtefactError, ConfigError, atomic_path, open_artefact, read_strings
+from stages.common.intervals import ERROR, LOG, ground_variance, join, ratio_interval, run_variance, two_sided_p
 
 # Validation MSE summed over a crop of 128 x 128 px, where the Lunar-G2R paper's text gives it.
 PAPER = {"M1": 4.51, "M2": 4.06, "M6": 5.34}
-RESAMPLES = 2000
 LEVEL = 0.05
 
 
@@ -46,25 +46,35 @@ class Trained:
         return float(self.squared_error.sum() / (self.pixels > 0).sum())
 
 
-def read_run(evaluation: Path, checkpoint: Path) -> Trained:
-    """One run from what evaluate and train wrote."""
-    with open_artefact(checkpoint, CHECKPOINT) as file:
-        model, seed = str(file.attrs["model"]), int(file.attrs["seed"])
-        best, history = int(file.attrs["best_epoch"]), file["validation_loss"][...]
+def read_runs(evaluation: Path, checkpoints: Sequence[Path]) -> list[Trained]:
+    """The training runs of one model from what train wrote and evaluate wrote of them all."""
     with open_artefact(evaluation, EVALUATION) as file:
         names = read_strings(file, "model_name")
-        if "learned" not in names:
+        if "run_mse" not in file or "run_seed" not in file:
             raise ArtefactError(f"{evaluation}: expected the row 'learned', found {', '.join(names)}; evaluate again.")
+        seeds = file["run_seed"][...].tolist()
         pixels = file["valid_pixels"][...].astype(float)
-        error = np.nan_to_num(file["mse"][names.index("learned")]) * pixels
-        return Trained(model, seed, error, pixels, file["tile"][...], best, history)
+        errors = np.nan_to_num(file["run_mse"][...]) * pixels
+        tile = file["tile"][...]
+    runs = []
+    for checkpoint in checkpoints:
+        with open_artefact(checkpoint, CHECKPOINT) as file:
+            model, seed = str(file.attrs["model"]), int(file.attrs["seed"])
+            best, history = int(file.attrs["best_epoch"]), file["validation_loss"][...]
+        if seed not in seeds:
+            raise ArtefactError(
+                f"{evaluation}: expected seed {seed} of {checkpoint.name}, found {seeds}; evaluate again."
+            )
+        runs.append(Trained(model, seed, errors[seeds.index(seed)], pixels, tile, best, history))
+    return runs
 
 
-def compare(runs: Sequence[Trained], seed: int = 0) -> dict[str, Any]:
+def compare(runs: Sequence[Trained]) -> dict[str, Any]:
     """The table of models, best first, and every pair of them with the noise of their difference.
 
-    A difference d of mean MSE has the variance s_a^2 / n_a + s_b^2 / n_b over seeds plus that of a paired bootstrap over
-    ground tiles; its p value takes Student's t with Welch's degrees of freedom, adjusted by Holm over all pairs.
+    The logarithm of the ratio of two mean MSE has the variance of both means over seeds plus that of a paired jackknife
+    over ground tiles; its p value takes Student's t with Satterthwaite's degrees of freedom, adjusted by Holm over all
+    pairs of models.
     """
     models = list(dict.fromkeys(r.model for r in runs))
     groups = {m: [r for r in runs if r.model == m] for m in models}
@@ -75,81 +85,60 @@ def compare(runs: Sequence[Trained], seed: int = 0) -> dict[str, Any]:
             "compare: expected runs on the same pairs, found different crops; evaluate on the same split."
         )
     mean = {m: float(np.mean([r.mse for r in g])) for m, g in groups.items()}
-    spread = {m: float(np.std([r.mse for r in g], ddof=1)) if len(g) > 1 else None for m, g in groups.items()}
-    draws = _tile_draws(groups, seed)
     order = sorted(models, key=mean.__getitem__)
-    table = {}
-    for m in order:
-        g = groups[m]
-        low, high = np.quantile(draws[m], (0.025, 0.975)) if draws[m].size else (math.nan, math.nan)
-        table[m] = {
-            "mse": mean[m],
-            "mse_seed_std": spread[m],
-            "mse_low": _number(low),
-            "mse_high": _number(high),
-            "mse_crop_sum": float(np.mean([r.mse_crop_sum for r in g])),
-            "mse_crop_sum_seed_std": float(np.std([r.mse_crop_sum for r in g], ddof=1)) if len(g) > 1 else None,
-            "paper_mse_crop_sum": PAPER.get(m),
-            "best_epoch": [r.best_epoch + 1 for r in g],
-            "seeds": [r.seed for r in g],
-        }
-    pairs = []
-    for a, b in combinations(order, 2):
-        difference = mean[b] - mean[a]
-        tile_variance = float(np.var(draws[b] - draws[a])) if draws[a].size else math.nan
-        p = None
-        of_a, of_b = spread[a], spread[b]
-        if of_a is not None and of_b is not None and math.isfinite(tile_variance):
-            va, vb = of_a**2 / len(groups[a]), of_b**2 / len(groups[b])
-            noise = math.sqrt(va + vb + tile_variance)
-            p = two_sided_p(difference / noise, _welch(va, vb, len(groups[a]), len(groups[b]))) if noise > 0 else 0.0
-            seeds_noise, tiles_noise = math.sqrt(va + vb), math.sqrt(tile_variance)
-        pairs.append(
-            {
-                "better": a,
-                "worse": b,
-                "difference": difference,
-                "difference_percent": 100 * difference / mean[b] if mean[b] else 0.0,
-                "noise_of_seeds": None if p is None else seeds_noise,
-                "noise_of_tiles": None if p is None else tiles_noise,
-                "p": p,
-            }
-        )
+    pairs = [_difference(groups[a], groups[b]) for a, b in combinations(order, 2)]
     _holm(pairs)
-    return {"models": table, "differences": pairs, "crops": len(runs[0].tile), "tiles": len(np.unique(runs[0].tile))}
+    tile = runs[0].tile
+    return {
+        "models": {m: _row(groups[m]) for m in order},
+        "differences": pairs,
+        "crops": len(tile),
+        "tiles": len(np.unique(tile)),
+        "seeds": max(len(g) for g in groups.values()),
+    }
 
 
-def _tile_draws(groups: dict[str, list[Trained]], seed: int) -> dict[str, np.ndarray]:
-    """Resampled seed-mean MSE of every model, with the same tiles for all; empty where there is one tile."""
-    first = next(iter(groups.values()))[0]
-    names, index = np.unique(first.tile, return_inverse=True)
-    if len(names) < 2:
-        return {m: np.empty(0) for m in groups}
-    weights = np.random.default_rng(seed).multinomial(len(names), np.full(len(names), 1 / len(names)), size=RESAMPLES)
-    draws = {}
-    for m, g in groups.items():
-        errors = np.mean([np.bincount(index, r.squared_error) for r in g], axis=0)
-        pixels = np.bincount(index, g[0].pixels)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            draws[m] = (weights @ errors) / (weights @ pixels)
-    return draws
+def _row(group: Sequence[Trained]) -> dict[str, Any]:
+    """A model's line of the table; the interval holds the spread of ground and seeds."""
+    first, several = group[0], len(group) > 1
+    found = ratio_interval(np.stack([r.squared_error for r in group]), first.pixels, first.tile, ERROR)
+    sums = [r.mse_crop_sum for r in group]
+    return {
+        "mse": found.value,
+        "mse_seed_std": float(np.std([r.mse for r in group], ddof=1)) if several else None,
+        "mse_low": _number(found.low),
+        "mse_high": _number(found.high),
+        "mse_crop_sum": float(np.mean(sums)),
+        "mse_crop_sum_seed_std": float(np.std(sums, ddof=1)) if several else None,
+        "paper_mse_crop_sum": PAPER.get(first.model),
+        "best_epoch": [r.best_epoch + 1 for r in group],
+        "seeds": [r.seed for r in group],
+    }
 
 
-def _welch(va: float, vb: float, na: int, nb: int) -> float:
-    """Welch-Satterthwaite degrees of freedom of a difference of means with variances va and vb."""
-    bottom = va**2 / (na - 1) + vb**2 / (nb - 1)
-    return (va + vb) ** 2 / bottom if bottom > 0 else float(na + nb - 2)
-
-
-def two_sided_p(t: float, freedom: float) -> float:
-    """Probability that |Student's t| exceeds |t|, by Simpson's rule on the angle atan(t / sqrt(freedom))."""
-    # With t = sqrt(v) tan(a) the density becomes cos(a)^(v - 1) up to a constant, smooth on a finite interval.
-    angle = np.linspace(math.atan(abs(t) / math.sqrt(freedom)), math.pi / 2, 2001)
-    density = np.cos(angle) ** (freedom - 1)
-    step = angle[1] - angle[0]
-    area = step / 3 * (density[0] + density[-1] + 4 * density[1:-1:2].sum() + 2 * density[2:-1:2].sum())
-    constant = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(math.pi)
-    return float(min(1.0, 2 * constant * area))
+def _difference(better: Sequence[Trained], worse: Sequence[Trained]) -> dict[str, Any]:
+    """Two models: what their difference is, and its noise on the scale of the worse one's MSE."""
+    a, b = (float(np.mean([r.mse for r in group])) for group in (better, worse))
+    found: dict[str, Any] = {
+        "better": better[0].model,
+        "worse": worse[0].model,
+        "difference": b - a,
+        "difference_percent": 100 * (b - a) / b if b else 0.0,
+        "noise_of_seeds": None,
+        "noise_of_tiles": None,
+        "p": None,
+    }
+    if not a > 0:
+        return found
+    ours, other = (np.stack([r.squared_error for r in group]).mean(axis=0)[None] for group in (better, worse))
+    tiles = ground_variance(ours, other, better[0].tile, LOG)
+    seeds = [run_variance([r.mse / m for r in group]) for group, m in ((better, a), (worse, b))]
+    whole = join([tiles, *seeds])
+    if whole.freedom > 0 and whole.value > 0:
+        found["noise_of_seeds"] = b * math.sqrt(join(seeds).value)
+        found["noise_of_tiles"] = b * math.sqrt(tiles.value)
+        found["p"] = two_sided_p(math.log(b / a) / math.sqrt(whole.value), whole.freedom)
+    return found
 
 
 def _holm(pairs: list[dict[str, Any]]) -> None:
@@ -169,10 +158,10 @@ def _number(value: float) -> float | None:
 
 
 def run(
-    files: Sequence[tuple[Path, Path]], json_file: Path | None = None, figures: Path | None = None
+    files: Sequence[tuple[Path, Sequence[Path]]], json_file: Path | None = None, figures: Path | None = None
 ) -> dict[str, Any]:
-    """Compare the runs behind (evaluation, checkpoint) files; writes JSON and the curves where asked."""
-    runs = [read_run(evaluation, checkpoint) for evaluation, checkpoint in files]
+    """Compare the runs behind (evaluation, checkpoints) of every model; writes JSON and the curves where asked."""
+    runs = [run for evaluation, checkpoints in files for run in read_runs(evaluation, checkpoints)]
     result = compare(runs)
     if json_file is not None:
         with atomic_path(json_file) as partial:
@@ -212,7 +201,9 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     cells = []
     for name, row in result["models"].items():
         deviation = row["mse_crop_sum_seed_std"]
-        interval = "-" if row["mse_low"] is None else f"{row['mse_low']:.3e} .. {row['mse_high']:.3e}"
+        interval = (
+            "-" if None in (row["mse_low"], row["mse_high"]) else f"{row['mse_low']:.3e} .. {row['mse_high']:.3e}"
+        )
         cells.append(
             [
                 name,
@@ -224,7 +215,15 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
                 "-" if row["paper_mse_crop_sum"] is None else f"{row['paper_mse_crop_sum']:.2f}",
             ]
         )
-    return ["model", "MSE/crop", "+- seeds", "MSE", "95 % over tiles", "best epochs", "paper's MSE/crop"], cells
+    return [
+        "model",
+        "MSE/crop",
+        "+- seeds",
+        "MSE",
+        "95 % over tiles and seeds",
+        "best epochs",
+        "paper's MSE/crop",
+    ], cells
 
 
 def difference_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:

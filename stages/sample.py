@@ -1,16 +1,20 @@
 """sample: crop centres per image and a geographic split in which no pixel of ground is shared.
 
-The scene is divided into square ground tiles, each given to one part of the split. A crop is kept only where every tile
-that its footprint touches belongs to one part: footprints of different parts then cannot overlap.
+The scene is divided into square ground tiles, each given to one part of the split. This split hangs on the scene, --tile-m,
+--split and --seed only, so that whatever is sampled from a scene, by image or as a stack, in crops of any size, learns from
+the same ground and is tested on the same. A training crop may lie across tiles of its part; a validation or test crop lies
+in one tile, so that tiles share no ground either and their errors are independent.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -25,8 +29,8 @@ from stages.physics.maps.positions import blocks, valid_positions
 
 Progress = Callable[[int, int, str], None]
 
-MINIMUM_TILES = 60  # where --tile-m is left to us: enough tiles for a test part that is not one odd place
-LARGEST_TILE = 4  # crops
+TEST_TILES = 20  # where --tile-m is left to us and the scene is large enough: intervals over fewer are wide
+SMALLEST_TILE, LARGEST_TILE = 1.125, 4  # of the scene's crops
 
 
 @dataclass(frozen=True)
@@ -58,13 +62,24 @@ class Part:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Square ground tiles on the scene grid: ``edge`` in pixels; ``part`` (rows, cols) int8, -1 where unused."""
+    """Square ground tiles from the scene grid's first pixel on: ``edge`` in pixels; ``part`` (rows, cols) int8, -1 where unused."""
 
     edge: int
     part: NDArray[np.int8]
 
+    def identity(self, ground_deg: tuple[float, float, float, float]) -> dict[str, Any]:
+        """What says that two samples split the same ground alike, kept in ``config`` and so in all that is made from it.
+
+        ground_deg : west, east, south, north
+        """
+        digest = hashlib.sha256(json.dumps([self.edge, self.part.shape, ground_deg]).encode() + self.part.tobytes())
+        return {"split_id": digest.hexdigest()[:16], "split_ground_deg": ground_deg}
+
     def allowed(self, row: NDArray, col: NDArray, crop: int) -> NDArray[np.int8]:
-        """Part of the split of crops centred at row (n, 1) and col (m,), -1 where the footprint touches two parts."""
+        """Part of the split of crops centred at row (n, 1) and col (m,), -1 where a crop must not be.
+
+        A footprint that touches two parts, or two tiles where it is not for training.
+        """
         half = crop // 2
         r0, r1 = (row - half) // self.edge, (row + half - 1) // self.edge
         c0, c1 = (col - half) // self.edge, (col + half - 1) // self.edge
@@ -78,7 +93,8 @@ class Tiles:
         )
         corner = self.part[r0, c0]
         same = (corner == self.part[r0, c1]) & (corner == self.part[r1, c0]) & (corner == self.part[r1, c1])
-        return np.where(same, corner, -1).astype(np.int8)
+        one_tile = (r0 == r1) & (c0 == c1)
+        return np.where(same & (one_tile | (corner == 0)), corner, -1).astype(np.int8)
 
 
 def run(
@@ -100,10 +116,9 @@ def run(
         if not frames:
             raise ConfigError(f"{scene}: expected images, found none; run 'lunargr ingest' with --images.")
         positions = PositionMasks(file, grid, crop, config.block)
-        rng = np.random.default_rng(config.seed)
-        edge = _tile_edge(grid, positions, crop, config.tile_m)
-        tiles = _split_tiles(positions, grid, edge, config.split, rng, progress)
-        chosen = _choose(positions, tiles, frames, grid, config, rng, progress)
+        edge = _tile_edge(grid, positions, config)
+        tiles = _split_tiles(positions, grid, edge, config, progress)
+        chosen = _choose(positions, tiles, frames, grid, config, np.random.default_rng(config.seed), progress)
         if not len(chosen):
             raise GeometryError(
                 f"{scene}: no crop of {crop} px fits into a tile of {edge * grid.gsd:g} m and valid data; choose a smaller --crop or other --tile-m."
@@ -126,7 +141,8 @@ class PositionMasks:
 
     def __init__(self, file: h5py.File, grid: Grid, crop: int, block: int) -> None:
         self.file, self.grid, self.crop = file, grid, crop
-        self.stored = int(file.attrs["crop_px"]) == crop
+        self.scene_crop = int(file.attrs["crop_px"])
+        self.stored = self.scene_crop == crop
         self.windows = file["frame_window"][...]
         self.blocks = list(blocks(grid.height, grid.width, block))
 
@@ -155,64 +171,84 @@ class _Layer:
         return self.data[(self.index, *key)]
 
 
-def _tile_edge(grid: Grid, positions: PositionMasks, crop: int, tile_m: float | None) -> int:
-    """Edge of a ground tile in pixels; metres are measured along the body with a geodesic at the scene's centre."""
-    if tile_m is not None:
+def _tile_edge(grid: Grid, positions: PositionMasks, config: Config) -> int:
+    """Edge of a ground tile in pixels; metres are measured along the body with a geodesic at the scene's centre.
+
+    Without --tile-m it follows from the scene and the shares alone, not from the crops that are asked for.
+    """
+    crop = positions.crop
+    if config.tile_m is not None:
         row, col = grid.height / 2, grid.width / 2
         lon, lat = grid.lonlat([row, row], [col - 50, col + 50])
         metres = Geodesic(grid.radius, 0).Inverse(lat[0], lon[0], lat[1], lon[1])["s12"] / 100
-        edge = round(tile_m / metres)
+        edge = round(config.tile_m / metres)
         if edge < crop:
-            raise ConfigError(f"--tile-m: expected at least one crop ({crop * metres:g} m), found {tile_m:g} m.")
+            raise ConfigError(f"--tile-m: expected at least one crop ({crop * metres:g} m), found {config.tile_m:g} m.")
         return edge
-    used = positions.windows[positions.windows[:, 2] > 0]
+    edge = _scene_edge(positions, config.split)
+    if edge < crop:
+        raise ConfigError(
+            f"--crop: expected at most {edge} px, the ground tiles of this scene's split, found {crop}; "
+            "name larger tiles with --tile-m here and wherever else this scene is sampled."
+        )
+    return edge
+
+
+def _scene_edge(positions: PositionMasks, shares: tuple[float, float, float]) -> int:
+    """As large as leaves TEST_TILES for testing, between SMALLEST_TILE and LARGEST_TILE; slivers at the edge avoided."""
+    crop, used = positions.scene_crop, positions.windows[positions.windows[:, 2] > 0]
     if not len(used):
         return LARGEST_TILE * crop
     height = int((used[:, 0] + used[:, 2]).max() - used[:, 0].min())
     width = int((used[:, 1] + used[:, 3]).max() - used[:, 1].min())
-    edge = LARGEST_TILE * crop
-    while edge > 1.25 * crop and math.ceil(height / edge) * math.ceil(width / edge) < MINIMUM_TILES:
-        edge -= crop // 4
-    return edge
+    tiles = TEST_TILES / min(s for s in shares if s > 0)
+    edge = min(max(math.sqrt(height * width / tiles), SMALLEST_TILE * crop), LARGEST_TILE * crop)
+    longest = max(height, width)
+    return math.ceil(longest / max(1, math.floor(longest / edge)))
 
 
-def _split_tiles(
-    positions: PositionMasks,
-    grid: Grid,
-    edge: int,
-    shares: tuple[float, float, float],
-    rng: np.random.Generator,
-    progress: Progress | None,
-) -> Tiles:
-    """Give every tile with valid ground to a part, at random, so that the parts' ground is near their shares."""
+def _split_tiles(positions: PositionMasks, grid: Grid, edge: int, config: Config, progress: Progress | None) -> Tiles:
+    """Give every tile with valid ground to a part, in the order of a hash, so that the parts' ground is near their shares.
+
+    Tiles in which no crop of the scene's own size fits train only: they would not be tested on.
+    """
     shape = (math.ceil(grid.height / edge), math.ceil(grid.width / edge))
-    ground = np.zeros(shape)
+    ground, room = np.zeros(shape), np.zeros(shape, bool)
+    before, behind = positions.scene_crop // 2, positions.scene_crop - positions.scene_crop // 2 - 1
     for number, block in enumerate(positions.blocks):
         if progress:
             progress(number, len(positions.blocks), "tiles")
         row, col, h, w = block
-        covered = np.zeros((h, w), bool)
+        part_of_scene = np.s_[row : row + h, col : col + w]
+        covered, centres = np.zeros((h, w), bool), np.zeros((h, w), bool)
         for frame in positions.frames_of(block):
-            covered |= positions.file["valid"][frame, row : row + h, col : col + w].astype(bool)
+            covered |= positions.file["valid"][frame, *part_of_scene].astype(bool)
+            centres |= positions.file["valid_position"][frame, *part_of_scene].astype(bool)
         r, c = np.nonzero(covered)
         np.add.at(ground, ((r + row) // edge, (c + col) // edge), 1)
+        r, c = (v + first for v, first in zip(np.nonzero(centres), (row, col), strict=True))
+        inside = ((r - before) // edge == (r + behind) // edge) & ((c - before) // edge == (c + behind) // edge)
+        room[r[inside] // edge, c[inside] // edge] = True
     if progress:
         progress(len(positions.blocks), len(positions.blocks), "tiles")
-    part = np.full(shape, -1, np.int8)
-    candidates = np.argwhere(ground > 0)
-    rng.shuffle(candidates)
-    # Whole tiles first: a sliver at the scene's edge can hold no crop and must not be all that a part gets.
-    candidates = candidates[np.argsort(-np.minimum(ground[tuple(candidates.T)], 0.5 * edge * edge), kind="stable")]
-    total = ground.sum()
-    filled = np.zeros(3)
-    for row, col in candidates:
-        deficit = np.array(shares) * total - filled
-        deficit[np.array(shares) <= 0] = -np.inf
+    if not room.any():  # tiles are smaller than the scene's crops: smaller ones will be asked for
+        room = ground > 0
+    part = np.where(ground > 0, 0 if config.split[0] > 0 else -1, -1).astype(np.int8)
+    shares = np.array(config.split)
+    total, filled = (ground * room).sum(), np.zeros(3)
+    for row, col in sorted(np.argwhere(room).tolist(), key=lambda at: _lot(config.seed, *at)):
+        deficit = shares * total - filled
+        deficit[shares <= 0] = -np.inf
         # The emptiest part relative to its share: small parts get their first tile early.
-        k = int(np.argmax(deficit / np.maximum(np.array(shares) * total, 1)))
+        k = int(np.argmax(deficit / np.maximum(shares * total, 1)))
         part[row, col] = k
         filled[k] += ground[row, col]
     return Tiles(edge, part)
+
+
+def _lot(seed: int, row: int, col: int) -> bytes:
+    """A tile's place in the draw: of its index and the seed, whatever is sampled and by which version of numpy."""
+    return hashlib.sha256(f"{seed} {row} {col}".encode()).digest()
 
 
 CHOSEN = np.dtype([("frame", "i4"), ("row", "i4"), ("col", "i4"), ("site", "i4"), ("tile", "i4"), ("split", "u1")])
@@ -358,6 +394,16 @@ def audit(chosen: NDArray, tiles: Tiles, grid: Grid, crop: int) -> list[Part]:
     ]
 
 
+def _bounds_deg(grid: Grid) -> tuple[float, float, float, float]:
+    """West, east, south, north of the scene, degrees to 1e-5."""
+    rows, cols = np.linspace(0, grid.height, 9), np.linspace(0, grid.width, 9)
+    lon, lat = grid.lonlat(*(v.ravel() for v in np.meshgrid(rows, cols, indexing="ij")))
+    middle = grid.lonlat([grid.height / 2], [grid.width / 2])[0][0]
+    lon = middle + (np.asarray(lon) - middle + 180) % 360 - 180
+    west, east, south, north = (round(float(v), 5) for v in (lon.min(), lon.max(), np.min(lat), np.max(lat)))
+    return west, east, south, north
+
+
 def _write(
     scene: Path,
     output: Path,
@@ -385,7 +431,7 @@ def _write(
         "pairs_in_all_shards": np.int64(len(chosen)),
         "split_audit": json.dumps([asdict(p) for p in audited]),
     }
-    stored = asdict(config) | {"crop": crop}
+    stored = asdict(config) | {"crop": crop} | tiles.identity(_bounds_deg(grid))
     half = crop // 2
     with ArtefactWriter(
         output,

@@ -91,7 +91,7 @@ def run(
     if device.type == "cuda" and ranks > 1:
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
     keep_freed_memory()
-    extensions = _load_extensions(config.extend)
+    extensions = _load_extensions(config.extend, pairs, say)
     if (
         extensions and config.augment
     ):  # an effect may belong to a direction on the ground, which turning crops would lose
@@ -126,8 +126,10 @@ def run(
         best: dict[str, Tensor] = {}
 
         sidecar = output.with_name(f"{output.stem}.resume.h5")
+        # A constant rate may go on for longer; what a cosine did in its first epochs hangs on how many there are.
+        epochs = config.epochs if config.schedule == "cosine" else None
         identity = json.dumps(
-            asdict(config) | {"device": None, "epochs": None, "pairs": sha256(pairs), "ranks": ranks}, sort_keys=True
+            asdict(config) | {"device": None, "epochs": epochs, "pairs": sha256(pairs), "ranks": ranks}, sort_keys=True
         )
         precision = config.precision
         if resume and sidecar.exists():
@@ -253,11 +255,14 @@ def _check(config: Config) -> None:
     get_model(config.model)
 
 
-def _load_extensions(path: str | None) -> list[Extension]:
+def _load_extensions(path: str | None, pairs: Path, say: Say) -> list[Extension]:
     if path is None:
         return []
     from stages.effects import load_extension
+    from stages.effects.extension import check_ground
 
+    for note in check_ground(Path(path), pairs):
+        say(f"note: {note}")
     return list(load_extension(Path(path)))
 
 

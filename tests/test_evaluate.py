@@ -10,14 +10,16 @@ import torch
 from evaluation_scene import A, B, C, KnowsTheTruth, make_scene
 
 from stages.evaluate import fit
-from stages.evaluate.core import choose_fit_pairs
+from stages.evaluate.fitting import choose_fit_pairs, sample_pixels
 from stages.evaluate.renderers import Constant, Renderer, read_batch, unit_images
-from stages.evaluate.run import Config, evaluate_pairs
+from stages.evaluate.run import Config, Task, evaluate_pairs
 from stages.physics.photometry import get_model
 
 REQUIRED = {
-    "learned", "global", "lunar_lambert", "hapke_raw", "hapke_minmax", "hapke_gain", "hapke_gain_offset"
+    "learned", "global", "kernels", "hapke_fitted", "lunar_lambert", "hapke_raw", "hapke_minmax", "hapke_gain",
+    "hapke_gain_offset",
 }  # fmt: skip
+MATCHED = {f"{n}_gain_offset" for n in ("learned", "global", "kernels", "hapke_fitted", "lunar_lambert", "hapke")}
 
 
 @pytest.fixture(scope="module")
@@ -25,16 +27,24 @@ def scene():
     return make_scene(np.random.default_rng(7))
 
 
+@pytest.fixture(scope="module")
+def whole(scene):
+    """The evaluation of all rows: (result, rows, scores, scale)."""
+    return _evaluate(scene)
+
+
 def _evaluate(scene, units="iof", predictor=None, **options):
     wanted = np.flatnonzero(scene.split == 2)
-    config = Config(batch=7, bootstrap=300, **options)
-    return evaluate_pairs(scene, predictor or KnowsTheTruth(), wanted, scene.frame_names, units, config)
+    predictors = predictor if isinstance(predictor, list) else [predictor or KnowsTheTruth()]
+    config = Config(batch=7, **options)
+    rows, scores, scale, result = evaluate_pairs(Task(scene, predictors, wanted, scene.frame_names, units, config))
+    return result, rows, scores, scale
 
 
-def test_the_true_coefficients_leave_only_the_noise(scene):
-    result, _, scores, _ = _evaluate(scene)
+def test_the_true_coefficients_leave_only_the_noise(scene, whole):
+    result, _, scores, _ = whole
     models = result["models"]
-    assert set(models) >= REQUIRED
+    assert set(models) == REQUIRED | MATCHED
     assert models["learned"]["mse"] == pytest.approx(scene.noise**2, rel=0.03)
     assert models["learned"]["mse_low"] < scene.noise**2 * 1.01 < models["learned"]["mse_high"] * 1.01
     assert models["learned"]["psnr"] == pytest.approx(-20 * np.log10(scene.noise), abs=0.1)
@@ -47,17 +57,19 @@ def test_the_true_coefficients_leave_only_the_noise(scene):
     json.dumps(result, allow_nan=False)
 
 
-def test_more_freedom_never_fits_a_crop_worse(scene):
-    _, _, scores, _ = _evaluate(scene)
+def test_more_freedom_never_fits_a_crop_worse(scene, whole):
+    _, _, scores, _ = whole
     mse = dict(zip(scores.names, scores.mse, strict=True))
     assert (mse["hapke_gain_offset"] <= mse["hapke_gain"] * (1 + 1e-5)).all()
     assert (mse["hapke_gain"] <= mse["hapke_raw"] * (1 + 1e-5)).all()
     assert (mse["hapke_gain_offset"] <= mse["hapke_minmax"] * (1 + 1e-5)).all()
-    assert (mse["learned_gain_offset"] <= mse["learned"] * (1 + 1e-5)).all()
+    assert {n for n in mse if n.endswith("gain_offset")} == MATCHED
+    for name in MATCHED - {"hapke_gain_offset"}:
+        assert (mse[name] <= mse[name.removesuffix("_gain_offset")] * (1 + 1e-5)).all(), name
 
 
-def test_the_global_set_is_the_least_squares_solution(scene):
-    _, rows, _, _ = _evaluate(scene)
+def test_the_global_set_is_the_least_squares_solution(scene, whole):
+    _, rows, _, _ = whole
     train = np.flatnonzero(scene.split == 0)
     east, north = np.gradient(scene.elevation[train].astype(float), 5.0, axis=(2, 1))
     sun = scene.sun[train]
@@ -73,8 +85,8 @@ def test_the_global_set_is_the_least_squares_solution(scene):
     assert found.numpy() == pytest.approx(expected, abs=2e-5)
 
 
-def test_lunar_lambert_gets_the_least_squares_albedo(scene):
-    _, rows, _, _ = _evaluate(scene)
+def test_lunar_lambert_gets_the_least_squares_albedo(scene, whole):
+    _, rows, _, _ = whole
     renderer = next(r for r in rows if r.name == "lunar_lambert").renderer
     batch = read_batch(scene, np.flatnonzero(scene.split == 0), 1.0)
     x, y = renderer.radiance_factor(batch)[batch.usable].double(), batch.image[batch.usable].double()
@@ -88,8 +100,6 @@ def test_a_model_that_is_not_linear_reaches_the_same_optimum(scene):
     batch = read_batch(scene, train, 1.0)
     gram.add(unit_images(model, batch), batch.image, batch.usable, batch.frame)
     exact = fit.solve_coefficients(gram.gram)
-    from stages.evaluate.core import sample_pixels
-
     sample = sample_pixels(batch, 10**6, np.random.default_rng(0))
     assert fit.fit_nonlinear(model, sample, 4, calibrated=True) == pytest.approx(exact, abs=1e-6)
 
@@ -100,8 +110,6 @@ def test_nonlinear_fit_finds_planted_hapke_parameters(scene):
     planted[0] = 0.8 * planted[0]
     batch = read_batch(scene, np.flatnonzero(scene.split == 0), 1.0)
     batch.image = Renderer("planted", model, Constant(planted)).radiance_factor(batch)
-    from stages.evaluate.core import sample_pixels
-
     sample = sample_pixels(batch, 100, np.random.default_rng(0))
     found = fit.fit_nonlinear(model, sample, 4, calibrated=True)
     batch.memo.clear()
@@ -121,7 +129,7 @@ def _uncalibrated(scene, gain, offset):
 def test_dn_images_are_scored_in_shares_of_the_full_range(scene):
     gain, offset = np.array([900.0, 1200.0, 700.0, 1000.0]), np.array([20.0, -5.0, 40.0, 0.0])
     film = _uncalibrated(scene, gain, offset)
-    result, rows, _, scale = _evaluate(film, "dn")
+    result, rows, _, scale = _evaluate(film, "dn", only=("learned", "kernels"))
     assert scale == result["dn_full_range"] == 255
     learned = next(r for r in rows if r.name == "learned").renderer
     assert learned.gain * 255 == pytest.approx(gain, rel=0.01)
@@ -175,7 +183,7 @@ def test_frames_without_train_pairs_are_flagged(scene):
     split = film.split.copy()
     split[(film.frame == 3) & (split == 0)] = 1
     film = dataclasses.replace(film, split=split)
-    result, rows, _, _ = _evaluate(film, "dn")
+    result, rows, _, _ = _evaluate(film, "dn", only=("learned",))
     assert result["frames_fitted_on_split"] == ["frame3"]
     assert any("without train pairs" in w for w in result["warnings"])
     learned = next(r for r in rows if r.name == "learned").renderer
@@ -199,7 +207,7 @@ def test_a_perfect_rendering_has_no_finite_psnr_and_stays_valid_json(rng):
         def coefficients(self, elevation):
             return super().coefficients(elevation) * 0
 
-    result, *_ = _evaluate(scene, predictor=Black())
+    result, *_ = _evaluate(scene, predictor=Black(), only=("learned", "global"))
     assert result["models"]["learned"]["mse"] == 0 and result["models"]["learned"]["psnr"] is None
     json.dumps(result, allow_nan=False)
 
@@ -234,8 +242,106 @@ def test_shared_illumination_gives_what_the_formation_chain_gives(scene):
 def test_a_single_tile_gives_flagged_intervals_over_its_sites(scene):
     import dataclasses
 
-    result, *_ = _evaluate(dataclasses.replace(scene, tile=np.zeros_like(scene.tile)))
+    one_tile = dataclasses.replace(scene, tile=np.zeros_like(scene.tile))
+    result, *_ = _evaluate(one_tile, only=("learned", "global"))
     row = result["models"]["learned"]
-    assert result["tiles"] == 1 and result["bootstrap_unit"] == "site"
+    assert result["tiles"] == 1 and result["interval_unit"] == "site"
     assert row["mse_low"] < row["mse"] < row["mse_high"]
     assert any("too narrow" in w for w in result["warnings"])
+
+
+def test_global_kernels_and_fitted_hapke_are_least_squares_fits_of_the_train_split(scene):
+    """On images of a planted Hapke law, fitted Hapke finds it and kernels come near; on those of M2 kernels contain it."""
+    import dataclasses
+
+    model = get_model("hapke")
+    planted = np.array([p.default for p in model.parameters])
+    planted[[0, 1, 7]] = 0.25, 0.3, np.radians(12)  # w, b, theta
+    everything = np.arange(len(scene.split))
+    batch = read_batch(scene, everything, 1.0)
+    images = Renderer("planted", model, Constant(planted)).radiance_factor(batch).numpy()
+    of_hapke = dataclasses.replace(scene, images=images + 1e-4 * np.random.default_rng(0).normal(size=images.shape))
+    of_hapke.images = of_hapke.images.astype(np.float32)
+    models = _evaluate(of_hapke, only=("hapke_fitted", "kernels", "hapke_raw", "lunar_lambert"))[0]["models"]
+    assert models["hapke_fitted"]["mse"] == pytest.approx(1e-8, rel=0.1)
+    assert models["kernels"]["mse"] < 1e-3 * models["lunar_lambert"]["mse"]
+    assert models["hapke_raw"]["mse"] > 100 * models["hapke_fitted"]["mse"]
+    of_m2 = _evaluate(scene, only=("global", "kernels"))[0]["models"]
+    assert of_m2["kernels"]["mse"] <= 1.02 * of_m2["global"]["mse"]
+
+
+def test_fits_know_nothing_of_the_scored_split(scene, whole):
+    """Other images on the scored split leave every fitted number as it was (but for the last bits of a sum)."""
+    import copy
+
+    spoiled = copy.deepcopy(scene)
+    spoiled.images[spoiled.split == 2] *= np.float32(3)
+    for row, again in zip(whole[1], _evaluate(spoiled)[1], strict=True):
+        if not row.name.startswith("learned"):
+            values, others = (r.renderer.coefficients(None).ravel().tolist() for r in (row, again))
+            assert values == pytest.approx(others, rel=1e-4, abs=1e-6), row.name
+            assert row.renderer.scale == pytest.approx(again.renderer.scale, rel=1e-12), row.name
+
+
+def test_the_strongest_baseline_is_found_and_compared_like_for_like(whole):
+    result, *_ = whole
+    models = result["models"]
+    free = {n: row["mse"] for n, row in models.items() if row["freedom"] == "none" and n != "learned"}
+    matched = {n: row["mse"] for n, row in models.items() if n in MATCHED - {"learned_gain_offset"}}
+    assert set(free) == {"global", "kernels", "hapke_fitted", "lunar_lambert", "hapke_raw"}
+    assert result["strongest_baseline"] == {
+        "none": min(free, key=free.get),
+        "gain_offset": min(matched, key=matched.get),
+    }
+    assert len(result["conclusions"]) == 2
+    for kind, ours, sentence in zip(
+        ("none", "gain_offset"), ("learned", "learned_gain_offset"), result["conclusions"], strict=True
+    ):
+        rival = result["strongest_baseline"][kind]
+        gain = result["gains"][ours][rival]
+        assert f"the strongest baseline, {rival} (" in sentence and f"{gain['gain_percent']:.1f} % lower" in sentence
+        assert f"{gain['gain_percent_low']:+.1f} .. {gain['gain_percent_high']:+.1f} %" in sentence
+        assert "30 pairs, 15 ground tiles, 1 training run" in sentence
+
+
+def test_a_learned_row_that_is_no_better_is_not_praised(scene):
+    class Flat(KnowsTheTruth):
+        """One set for all ground: the true mean coefficients."""
+
+        def coefficients(self, elevation):
+            return super().coefficients(elevation * 0)
+
+    class Dark(Flat):
+        def coefficients(self, elevation):
+            return 0.5 * super().coefficients(elevation)
+
+    for predictor, words in ((Flat(), "cannot be told apart from"), (Dark(), "% higher than")):
+        only = ("learned", "global")
+        result, *_ = _evaluate(scene, predictor=predictor, only=only)
+        assert words in result["conclusions"][0]
+
+
+def test_training_runs_are_averaged_and_their_spread_widens_the_interval(scene):
+    class Biased(KnowsTheTruth):
+        def __init__(self, factor):
+            super().__init__()
+            self.factor = factor
+
+        def coefficients(self, elevation):
+            return self.factor * super().coefficients(elevation)
+
+    factors = (1.02, 1.04, 1.06)
+    single = [_evaluate(scene, predictor=Biased(f), only=("learned", "global"))[0] for f in factors]
+    result, _, scores, _ = _evaluate(scene, predictor=[Biased(f) for f in factors], only=("learned", "global"))
+    row, errors = result["models"]["learned"], [s["models"]["learned"]["mse"] for s in single]
+    assert row["mse_runs"] == pytest.approx(errors) and row["mse"] == pytest.approx(np.mean(errors))
+    assert row["mse_run_std"] == pytest.approx(np.std(errors, ddof=1))
+    assert row["mse_high"] / row["mse_low"] > 3 * max(
+        s["models"]["learned"]["mse_high"] / s["models"]["learned"]["mse_low"] for s in single
+    )
+    gain = result["gains"]["learned"]["global"]
+    assert gain["gain_percent"] == pytest.approx(100 * (1 - row["mse"] / result["models"]["global"]["mse"]))
+    assert result["models"]["global"] == single[0]["models"]["global"]
+    assert result["training_runs"] == 3 and scores.runs("learned").shape == (3, 30)
+    assert any("one training run" in w for w in single[0]["warnings"])
+    assert not any("training run" in w for w in result["warnings"])

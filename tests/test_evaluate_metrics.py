@@ -1,4 +1,4 @@
-"""Metrics, matching and intervals against closed forms and scipy."""
+"""Metrics, matching and coverage against closed forms and scipy."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from stages.evaluate.bootstrap import TileBootstrap
+from stages.evaluate.coverage import coverage
 from stages.evaluate.metrics import psnr, squared_error, ssim
 from stages.physics.formation.radiometry import full_scale, match_crops
 
@@ -115,25 +115,30 @@ def test_full_scale_of_digital_numbers(largest, expected):
     assert full_scale(largest) == expected
 
 
-def test_bootstrap_interval_covers_the_mean_as_often_as_it_says(rng):
-    tiles, crops = 40, 3
-    covered = 0
-    for trial in range(300):
-        values = np.repeat(rng.normal(1.0, 0.3, tiles), crops) + 0.05 * rng.normal(size=tiles * crops)
-        bootstrap = TileBootstrap(np.repeat(np.arange(tiles), crops), 400, trial)
-        low, high = bootstrap.interval(bootstrap.draws(values, np.ones(tiles * crops)))
-        covered += low <= 1.0 <= high
-    assert 0.90 <= covered / 300 <= 0.98
+def test_coverage_of_honest_and_of_half_as_large_deviations(rng):
+    std = rng.uniform(0.002, 0.02, 200_000)
+    predicted = rng.uniform(0.05, 0.2, std.size)
+    measured = predicted + std * rng.normal(size=std.size)
+    incidence = np.radians(rng.uniform(0, 90, std.size))
+    honest = coverage(measured, predicted, std, incidence)
+    assert honest["pixels"] == std.size
+    assert (honest["within_68_percent"], honest["within_95_percent"]) == pytest.approx((68, 95), abs=0.3)
+    for band in honest["by_incidence"]:
+        assert band["within_95_percent"] == pytest.approx(95, abs=0.5)
+    bold = np.where(np.degrees(incidence) > 60, std / 2, std)
+    bands = coverage(measured, predicted, bold, incidence)["by_incidence"]
+    steep = [b["within_95_percent"] for b in bands if b["incidence_low_deg"] >= 60]
+    assert steep == pytest.approx([67.3] * len(steep), abs=1)  # P(|z| < .98)
+    assert bands[0]["within_95_percent"] == pytest.approx(95, abs=0.5)
 
 
-def test_bootstrap_resamples_tiles_and_not_crops(rng):
-    values = np.repeat(rng.normal(size=20), 50)
-    by_tile = TileBootstrap(np.repeat(np.arange(20), 50), 1000, 1)
-    by_crop = TileBootstrap(np.arange(1000), 1000, 1)
-    width = [np.ptp(b.interval(b.draws(values, np.ones(1000)))) for b in (by_tile, by_crop)]
-    assert width[0] / width[1] == pytest.approx(np.sqrt(50), rel=0.2)
-
-
-def test_one_tile_gives_no_interval():
-    bootstrap = TileBootstrap(np.zeros(5, int), 100, 0)
-    assert np.isnan(bootstrap.interval(bootstrap.draws(np.ones(5), np.ones(5)))).all()
+def test_pixels_without_a_deviation_do_not_count():
+    values = np.full(4, 0.1)
+    std = np.array([0.01, np.nan, 0.01, 0.01])
+    found = coverage(values, values + [0.0, 0.0, 0.015, 0.03], std, np.zeros(4))
+    assert found["pixels"] == 3
+    assert (found["within_68_percent"], found["within_95_percent"]) == pytest.approx((100 / 3, 200 / 3))
+    assert found["by_incidence"][-1] == {
+        "incidence_low_deg": 75.0, "incidence_high_deg": 90.0, "pixels": 0, "within_68_percent": None,
+        "within_95_percent": None,
+    }  # fmt: skip

@@ -12,6 +12,7 @@ from evaluation_scene import make_scene, run_command, write_pairs
 from schemas import ConfigError, InputError, RegistryError
 from stages import evaluate, match, train
 from stages.match.base import Matches, Models, get_matcher, matcher_names, mutual_nearest
+from stages.match.comparisons import choose
 from stages.match.consistency import summarise
 from stages.match.daisy import Field, dense_descriptors
 from stages.match.pictures import fit_size, inside, to_grey
@@ -76,13 +77,35 @@ def test_summary_of_known_errors():
         here = np.zeros((len(right), 2))
         return Matches(here, here + np.stack([right, np.zeros(len(right))], axis=1))
 
-    row = summarise([displaced(0.0, 0.5, 2.0, 4.0), displaced(10.0)])
-    assert row["matches"] == 5 and row["crops"] == 2
+    row = summarise([displaced(0.0, 0.5, 2.0, 4.0), displaced(10.0)], [4, 7])
+    assert row["matches"] == 5 and row["crops"] == 2 and row["tiles"] == 2
     assert [row[f"within_{t}_px_percent"] for t in (1, 3, 5)] == pytest.approx([40, 60, 80])
     assert row["mean_error_px"] == pytest.approx(3.3) and row["median_error_px"] == 2.0
     assert row["within_5_px_percent_low"] == pytest.approx(0) and row["within_5_px_percent_high"] == pytest.approx(100)
     assert row["median_shift_right_px"] == 2.0 and row["median_shift_down_px"] == 0.0
-    assert summarise([displaced()])["within_1_px_percent"] is None
+    assert summarise([displaced()], [0])["within_1_px_percent"] is None
+
+
+def test_crops_of_one_tile_are_one_witness():
+    """The same matches from two tiles or from ten crops of two tiles say equally much; one tile alone says no interval."""
+
+    def hits(share):
+        here = np.zeros((100, 2))
+        return Matches(here, here + [[0.0 if k < 100 * share else 9.0, 0.0] for k in range(100)])
+
+    shares = [0.4, 0.5, 0.6, 0.45]
+    few = summarise([hits(s) for s in shares], range(4))
+    many = summarise([hits(s) for s in shares for _ in range(5)], np.repeat(range(4), 5))
+    for end in ("low", "high"):
+        assert many[f"within_1_px_percent_{end}"] == pytest.approx(few[f"within_1_px_percent_{end}"])
+    assert 25 < few["within_1_px_percent_low"] < 48.75 < few["within_1_px_percent_high"] < 75
+    assert summarise([hits(s) for s in shares], [3] * 4)["within_1_px_percent_low"] is None
+
+
+def test_crops_are_drawn_from_as_many_tiles_as_there_are():
+    tile = np.repeat([0, 1, 2, 3], [40, 4, 2, 1])
+    chosen = choose(np.ones(47), tile, 8, seed=0)
+    assert np.bincount(tile[chosen]).tolist() == [3, 2, 2, 1]
 
 
 def test_a_square_crop_keeps_its_middle_four_times_as_large():
@@ -130,7 +153,7 @@ def trained(tmp_path_factory):
     write_pairs(folder / "pairs.h5", make_scene(np.random.default_rng(3), pairs=24))
     config = train.Config(epochs=2, batch=8, widths=(4, 8), dropout=(0.0, 0.0), device="cpu", precision="fp32")
     train.run(folder / "pairs.h5", folder / "checkpoint.h5", config)
-    settings = evaluate.Config(bootstrap=10, device="cpu")
+    settings = evaluate.Config(device="cpu")
     evaluate.run(folder / "pairs.h5", folder / "checkpoint.h5", folder / "evaluation.h5", settings)
     return folder
 
@@ -175,7 +198,7 @@ def test_bad_input_is_one_line(trained, texture, tmp_path, case):
     cv2.imwrite(str(second), texture[:200])
     text.write_text("no picture")
     if case == "no renderings kept":
-        settings = evaluate.Config(bootstrap=10, device="cpu", renderings=False)
+        settings = evaluate.Config(device="cpu", renderings=False)
         evaluate.run(trained / "pairs.h5", trained / "checkpoint.h5", tmp_path / "bare.h5", settings)
     files = {
         "missing image": [first, tmp_path / "absent.png"],

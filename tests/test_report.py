@@ -87,7 +87,7 @@ def folder(tmp_path_factory):
     config = train.Config(epochs=2, batch=8, widths=(4, 8), dropout=(0.0, 0.0), device="cpu", precision="fp32")
     train.run(folder / "pairs.h5", folder / "checkpoint.h5", config)
     files = (folder / "pairs.h5", folder / "checkpoint.h5")
-    evaluate.run(*files, folder / "evaluation.h5", evaluate.Config(bootstrap=50, device="cpu"))
+    evaluate.run(*files, folder / "evaluation.h5", evaluate.Config(device="cpu"))
     settings = match.Config(("sift",), count=2, device="cpu")
     match.run(list(files), settings, json_file=folder / "match.json", figures=folder)
     _write_maps(folder, rng)

@@ -26,6 +26,9 @@ def command(
         str, typer.Option("--schedule", help="Learning rate over the epochs: constant or cosine.")
     ] = "constant",
     widths: Annotated[str, typer.Option("--widths", help="Channels of each stage of the U-Net.")] = "16-32-64-128-256",
+    precision: Annotated[
+        str, typer.Option("--precision", help="fp32, bf16, or auto: bf16 where a probe finds it faster.")
+    ] = "auto",
     split: Annotated[
         str, typer.Option("--split", help="Where models are compared: validation (as in the paper) or test.")
     ] = "validation",
@@ -61,20 +64,20 @@ def command(
     except ValueError:
         raise ConfigError(f"--widths: expected numbers like 16-32-64-128-256, found '{widths}'.") from None
     settings: dict[str, Any] = {"epochs": epochs, "batch": batch, "lr": lr, "schedule": schedule, "widths": channels}
-    files: list[tuple[Path, Path]] = []
-    for seed in range(seeds):
-        for name in names:
-            checkpoint = output / f"{name}_seed{seed}.checkpoint.h5"
-            evaluation = output / f"{name}_seed{seed}.{split}.h5"
+    settings["precision"] = precision
+    files: list[tuple[Path, list[Path]]] = []
+    for number, name in enumerate(names):
+        evaluation = output / f"{name}.{split}.h5"
+        checkpoints = [output / f"{name}_seed{seed}.checkpoint.h5" for seed in range(seeds)]
+        for seed, checkpoint in enumerate(checkpoints):
             config = train.Config(model=name, seed=seed, device=device, **settings)
             if not (resume and checkpoint.exists() and _same(checkpoint, config, pairs)):
-                console.say(f"training {name}, seed {seed} ({len(files) + 1} of {seeds * len(names)})")
+                console.say(f"training {name}, seed {seed} ({number * seeds + seed + 1} of {seeds * len(names)})")
                 train.run(pairs, checkpoint, config, overwrite or resume, resume, console.say, console.progress)
-                evaluation.unlink(missing_ok=True)
-            if not (resume and evaluation.exists()):
-                scoring = evaluate.Config(split=split, renderings=False, device=device, only=("learned",))
-                evaluate.run(pairs, checkpoint, evaluation, scoring, overwrite=True, progress=console.progress)
-            files.append((evaluation, checkpoint))
+        if not (resume and evaluation.exists() and _made_from(evaluation, [pairs, *checkpoints])):
+            scoring = evaluate.Config(split=split, renderings=False, device=device, only=("learned",))
+            evaluate.run(pairs, checkpoints, evaluation, scoring, overwrite=True, progress=console.progress)
+        files.append((evaluation, checkpoints))
     result = compare.run(files, table, output / "validation_curves.png")
     if json_file is not None:
         from schemas import atomic_path
@@ -100,5 +103,17 @@ def _same(checkpoint: Path, config: Any, pairs: Path) -> bool:
     with open_artefact(checkpoint, CHECKPOINT) as file:
         found, inputs = read_config(file), json.loads(str(file.attrs["inputs"]))
     wanted = json.loads(json.dumps(asdict(config)))
-    keys = ("model", "seed", "epochs", "batch", "lr", "schedule", "widths")
+    keys = ("model", "seed", "epochs", "batch", "lr", "schedule", "widths", "precision")
     return all(found.get(k) == wanted[k] for k in keys) and inputs[0]["sha256"] == sha256(pairs)
+
+
+def _made_from(evaluation: Path, inputs: list[Path]) -> bool:
+    """Whether a finished evaluation is one of these very files."""
+    import json
+
+    from schemas import EVALUATION, open_artefact
+    from schemas.provenance import sha256
+
+    with open_artefact(evaluation, EVALUATION) as file:
+        found = json.loads(str(file.attrs["inputs"]))
+    return [entry["sha256"] for entry in found] == [sha256(path) for path in inputs]

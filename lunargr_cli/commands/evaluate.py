@@ -14,7 +14,10 @@ NAME, ORDER = "evaluate", 70
 
 def command(
     pairs: Annotated[Path, typer.Argument(help="Pairs from 'lunargr project'.")],
-    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint from 'lunargr train'.")],
+    checkpoints: Annotated[
+        list[Path],
+        typer.Argument(metavar="CHECKPOINT...", help="From 'lunargr train'; several are training runs of one model."),
+    ],
     output: Output = Path("evaluation.h5"),
     split: Annotated[str, typer.Option("--split", help="train, validation or test.")] = "test",
     extend: Annotated[
@@ -24,9 +27,6 @@ def command(
     figures: Annotated[
         Path | None, typer.Option("--figures", metavar="DIR", help="Write training curves and example crops as PNG.")
     ] = None,
-    bootstrap: Annotated[
-        int, typer.Option("--bootstrap", help="Resamples of the ground tiles for the intervals.")
-    ] = 2000,
     fit_pairs: Annotated[
         int, typer.Option("--fit-pairs", help="Most train pairs that baselines are fitted on (0: all).")
     ] = 4096,
@@ -52,30 +52,31 @@ def command(
     """Score the learned model and its baselines on one split: MSE, PSNR, SSIM, LPIPS, with 95 % intervals.
 
     The result also goes to a JSON file beside the output. Images in DN get a gain and an offset per image, fitted on
-    the train split in the same way for every model; their errors are shares of the full DN range.
+    the train split in the same way for every model; their errors are shares of the full DN range. Checkpoints of one
+    model from several seeds make the learned rows means over training runs, whose spread is part of the intervals.
     """
     from lunargr_cli.console import Console
     from stages import evaluate
-    from stages.evaluate.table import gain_lines, result_lines
+    from stages.evaluate.table import basis, gain_lines, result_lines
 
     console = Console(quiet)
-    config = evaluate.Config(split, batch, bootstrap, fit_pairs, renderings, seed, device, tuple(only or ()))
+    config = evaluate.Config(split, batch, fit_pairs, renderings, seed, device, tuple(only or ()))
     more: dict[str, Any] = {"extend": extend, "json_file": json_file, "figures": figures, "overwrite": overwrite}
     more["progress"] = console.progress
     if scheduler is not None or resume:
         from lunargr_cli.fanout.stages import run_evaluate
 
-        result = run_evaluate(pairs, checkpoint, output, config, scheduler=scheduler, say=console.say, **more)
+        result = run_evaluate(pairs, checkpoints, output, config, scheduler=scheduler, say=console.say, **more)
     else:
-        result = evaluate.run(pairs, checkpoint, output, config, **more)
+        result = evaluate.run(pairs, checkpoints, output, config, **more)
     columns, cells = result_lines(result)
     unit = "I/F" if result["image_units"] == "iof" else f"shares of {result['dn_full_range']:.0f} DN"
-    console.table(
-        f"{result['pairs']} crops of split '{split}', {result['tiles']} ground tiles, errors in {unit}", columns, cells
-    )
+    console.table(f"split '{split}': {basis(result)}; errors in {unit}", columns, cells)
     columns, cells = gain_lines(result)
     if cells:
-        console.table("what the learned reflectance gains (paired over ground tiles)", columns, cells)
+        console.table(f"what the learned reflectance gains, paired over ground: {basis(result)}", columns, cells)
+    for sentence in result["conclusions"]:
+        console.say(sentence)
     for warning in result["warnings"]:
         console.say(f"note: {warning}.")
     if result["lpips_unavailable"]:

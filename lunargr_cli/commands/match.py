@@ -58,6 +58,7 @@ def command(
         files, config, json_file=json_file, figures=figures, overwrite=overwrite, progress=console.progress
     )
     columns, cells = result_lines(result)
-    console.table(f"matching consistency over {result['crops']} picture(s) of 512 x 384", columns, cells)
+    extent = f"{result['crops']} picture(s) of 512 x 384 on {result['tiles']} ground tile(s)"
+    console.table(f"matching consistency over {extent}", columns, cells)
     if figures is not None:
         console.say(f"written: {figures}/")

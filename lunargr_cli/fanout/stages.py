@@ -135,7 +135,7 @@ def infer_part(path: Path, scene: Path, checkpoint: Path, config: Any) -> None:
 
 def run_evaluate(
     pairs: Path,
-    checkpoint: Path,
+    checkpoints: Sequence[Path],
     output: Path,
     config: Any,
     extend: Path | None,
@@ -145,12 +145,12 @@ def run_evaluate(
 ) -> Any:
     from stages import evaluate
 
-    pairs, checkpoint, extend = pairs.resolve(), checkpoint.resolve(), extend and extend.resolve()
-    inputs = [pairs, checkpoint, *([extend] if extend else [])]
+    pairs, checkpoints, extend = pairs.resolve(), [c.resolve() for c in checkpoints], extend and extend.resolve()
+    inputs = [pairs, *checkpoints, *([extend] if extend else [])]
     with _job(output, "evaluate", config, None, inputs, (), how) as job:
         return evaluate.run(
             pairs,
-            checkpoint,
+            checkpoints,
             output,
             config,
             extend=extend,

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from schemas import DIAGNOSIS, open_artefact, read_strings
+from schemas import DIAGNOSIS, ArtefactError, open_artefact, read_strings
+from schemas.provenance import read_record
 from stages.effects.base import Effect, Survey, get_effect
 
 
@@ -43,3 +45,40 @@ def load_extension(path: Path, image_ids: Sequence[str] | None = None) -> list[E
 
 def _tables(entries: list[dict], file) -> set[str]:
     return {t["variable"] for e in entries for t in e.get("tables", {}).values() if t["variable"] in file}
+
+
+def check_ground(diagnosis: Path, pairs: Path) -> list[str]:
+    """That a diagnosis did not learn from ground on which ``pairs`` are tested; returns what cannot be told, as notes.
+
+    Raises ArtefactError where both descend from samples of the same ground that were split in different ways.
+    """
+    learned, tested = _splits(diagnosis), _splits(pairs)
+    if not learned or not tested:
+        missing = diagnosis if not learned else pairs
+        return [
+            f"whether '{diagnosis.name}' learned from ground that is tested here cannot be told: {missing.name} does not "
+            "say how its ground was split"
+        ]
+    for mine in tested:
+        for other in learned:
+            if mine["split_id"] != other["split_id"] and _overlap(mine["split_ground_deg"], other["split_ground_deg"]):
+                raise ArtefactError(
+                    f"{diagnosis}: expected a diagnosis that learned from ground split as in {pairs.name} ({mine['split_id']}), "
+                    f"found split {other['split_id']}: it may have learned from the test ground; sample both with the same "
+                    "--tile-m, --split and --seed."
+                )
+    return []
+
+
+def _splits(path: Path) -> list[dict[str, Any]]:
+    """What the samples that an artefact descends from say of their splits."""
+    own, ancestors = read_record(Path(path))
+    records = [*([own] if own else []), *ancestors.values()]
+    return [r["config"] for r in records if r["schema"] == "crops" and "split_id" in r["config"]]
+
+
+def _overlap(first: Sequence[float], second: Sequence[float]) -> bool:
+    """Whether two boxes (west, east, south, north; degrees) share ground."""
+    (w1, e1, s1, n1), (w2, e2, s2, n2) = first, second
+    turned = round((w1 - w2) / 360) * 360
+    return w1 < e2 + turned and w2 + turned < e1 and s1 < n2 and s2 < n1

@@ -8,11 +8,22 @@ from typing import Any
 import numpy as np
 
 from schemas import CHECKPOINT, ConfigError, open_artefact
-from stages.evaluate.core import TITLES, Row, Scores
+from stages.evaluate.core import Scores
 from stages.evaluate.renderers import Batch, Reader, read_batch
+from stages.evaluate.rows import TITLES, Row
 
 DPI = 130
-COLOURS = {"learned": "#1b6ca8", "global": "#4f9d69", "lunar_lambert": "#c08a2e", "hapke": "#a8434b"}
+COLOURS = {
+    "learned": "#1b6ca8",
+    "global": "#4f9d69",
+    "kernels": "#7a5ba6",
+    "lunar_lambert": "#c08a2e",
+    "hapke": "#a8434b",
+}
+DRAWN = (
+    "learned", "learned_gain_offset", "learned_extended", "global", "kernels", "hapke_fitted", "hapke_minmax",
+    "hapke_gain_offset",
+)  # fmt: skip
 
 
 def write_figures(
@@ -88,7 +99,7 @@ def error_chart(result: dict[str, Any]) -> Any:
     for k, name in enumerate(names):
         row = result["models"][name]
         colour = next(c for key, c in COLOURS.items() if name.startswith(key))
-        if row["mse_low"] is not None:
+        if row["mse_low"] is not None and row["mse_high"] is not None:
             axes.plot(np.sqrt([row["mse_low"], row["mse_high"]]), [k, k], color=colour, linewidth=2.5, alpha=0.55)
         axes.plot(row["rmse"], k, "o", color=colour, markersize=6)
     axes.set_yticks(range(len(names)), [TITLES.get(n, n) for n in names], fontsize=8)
@@ -103,7 +114,7 @@ def error_chart(result: dict[str, Any]) -> Any:
 
 
 def crop_figure(batch: Batch, rows: list[Row], scores: Scores, position: int, label: str, units: str) -> Any:
-    """One crop: measured and every model above, residuals (measured - rendered) below, on shared scales."""
+    """One crop: measured and the main models above, residuals (measured - rendered) below, on shared scales."""
     import matplotlib.pyplot as plt
 
     usable = batch.usable[0].numpy()
@@ -111,19 +122,21 @@ def crop_figure(batch: Batch, rows: list[Row], scores: Scores, position: int, la
     low, high = np.nanpercentile(measured, (0.5, 99.5))
     learned = np.where(usable, measured - rows[0].renderer.image(batch, rows[0].how)[0].numpy(), np.nan)
     spread = float(np.nanpercentile(np.abs(learned), 99)) or 1e-6
-    columns = len(rows) + 1
+    drawn = [k for k, row in enumerate(rows) if k == 0 or row.name in DRAWN]
+    columns = len(drawn) + 1
     figure, axes = plt.subplots(2, columns, figsize=(1.75 * columns + 0.6, 4.4), layout="constrained")
     greys, differences = (plt.get_cmap(name).with_extremes(bad="#d9c9a3") for name in ("gray", "RdBu_r"))
     picture = axes[0, 0].imshow(measured, cmap=greys, vmin=low, vmax=high)
     axes[0, 0].set_title("measured", fontsize=8)
     axes[1, 0].imshow(np.where(usable, batch.observation.elevation[0].numpy(), np.nan), cmap="cividis")
     axes[1, 0].set_title("elevation", fontsize=8)
-    for k, row in enumerate(rows):
+    for column, k in enumerate(drawn, start=1):
+        row = rows[k]
         rendered = np.where(usable, row.renderer.image(batch, row.how)[0].numpy(), np.nan)
-        axes[0, k + 1].imshow(rendered, cmap=greys, vmin=low, vmax=high)
-        axes[0, k + 1].set_title(row.name.replace("_", " "), fontsize=8, wrap=True)
-        residual = axes[1, k + 1].imshow(measured - rendered, cmap=differences, vmin=-spread, vmax=spread)
-        axes[1, k + 1].set_title(f"rms {np.sqrt(scores.mse[k, position]):.4f}", fontsize=8)
+        axes[0, column].imshow(rendered, cmap=greys, vmin=low, vmax=high)
+        axes[0, column].set_title(row.name.replace("_", " "), fontsize=8, wrap=True)
+        residual = axes[1, column].imshow(measured - rendered, cmap=differences, vmin=-spread, vmax=spread)
+        axes[1, column].set_title(f"rms {np.sqrt(scores.mse[k, position]):.4f}", fontsize=8)
     for axis in axes.flat:
         axis.set_axis_off()
     figure.colorbar(picture, ax=axes[0], fraction=0.02, pad=0.01, label=units)

@@ -7,7 +7,7 @@ one small Gram matrix per frame, so that the fit streams and is exact.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,32 +95,68 @@ class PixelSample:
     image: Tensor
     frame: Tensor
 
+    @property
+    def angles(self) -> Angles:
+        """(1, N) float64."""
+        return Angles(*(c.double()[None] for c in (self.cos_incidence, self.cos_emission, self.cos_phase)))
+
+    def thin(self, most: int) -> PixelSample:
+        """At most ``most`` pixels, evenly taken."""
+        step = max(1, -(-len(self.image) // most))
+        return PixelSample(**{name: getattr(self, name)[::step] for name in self.__dataclass_fields__})
+
+
+def sample_gram(model: ReflectanceModel, sample: PixelSample, frames: int) -> np.ndarray:
+    """The Gram matrices of a linear model over sampled pixels, (F, K + 2, K + 2)."""
+    angles, count = sample.angles, len(model.parameters)
+    units = torch.eye(count, dtype=torch.float64)
+    images = [masked_radiance_factor(model, model.unpack(unit[None, :, None], 1), angles)[0] for unit in units]
+    gram = FrameGram(count, frames)
+    for f in torch.unique(sample.frame).tolist():
+        mine = sample.frame == f
+        features = torch.stack([(image * sample.visibility)[mine] for image in images])[None, :, None]
+        image = sample.image[mine][None, None].double()
+        gram.add(features, image, torch.ones_like(image, dtype=torch.bool), np.array([f]))
+    return gram.gram
+
 
 def fit_nonlinear(
-    model: ReflectanceModel, sample: PixelSample, frames: int, calibrated: bool, rounds: int = 60
+    model: ReflectanceModel,
+    sample: PixelSample,
+    frames: int,
+    calibrated: bool,
+    free: Sequence[str] = (),
+    rounds: int = 60,
 ) -> np.ndarray:
     """One parameter set for all pixels by Levenberg-Marquardt, within the model's bounds; (C,).
 
-    Starts at the model's defaults. Uncalibrated frames get their best gain and offset in every round.
+    Starts at the model's defaults, where parameters not in ``free`` (all where empty) stay. Uncalibrated frames get
+    their best gain and offset in every round.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # thousands of small operations: handing them to threads costs more than it saves
     try:
-        return _levenberg_marquardt(model, sample, frames, calibrated, rounds)
+        return _levenberg_marquardt(model, sample, frames, calibrated, free, rounds)
     finally:
         torch.set_num_threads(threads)
 
 
 def _levenberg_marquardt(
-    model: ReflectanceModel, sample: PixelSample, frames: int, calibrated: bool, rounds: int
+    model: ReflectanceModel, sample: PixelSample, frames: int, calibrated: bool, free: Sequence[str], rounds: int
 ) -> np.ndarray:
-    angles = Angles(
-        sample.cos_incidence.double()[None], sample.cos_emission.double()[None], sample.cos_phase.double()[None]
-    )
+    angles = sample.angles
     visibility, image = sample.visibility.double(), sample.image.double()
+    default = torch.tensor([p.default for p in model.parameters], dtype=torch.float64)
+    moves = torch.tensor([not free or p.name in free for p in model.parameters])
+    start = model.unconstrain(default[None], 1)[0].clamp(-8, 8)
+
+    def values(raw: Tensor) -> Tensor:
+        every = start.clone()
+        every[moves] = raw
+        return torch.where(moves, model.constrain(every[None], 1)[0], default)
 
     def render(raw: Tensor) -> Tensor:
-        parameters = model.unpack(model.constrain(raw[None, :, None], 1), 1)
+        parameters = model.unpack(values(raw)[None, :, None], 1)
         return masked_radiance_factor(model, parameters, angles)[0] * visibility
 
     def residual(raw: Tensor) -> tuple[Tensor, Tensor]:
@@ -138,8 +174,7 @@ def _levenberg_marquardt(
         pixel_gain = gain[sample.frame]
         return image - pixel_gain * rendered - offset[sample.frame], pixel_gain
 
-    default = torch.tensor([[p.default for p in model.parameters]], dtype=torch.float64)
-    raw = model.unconstrain(default, 1)[0].clamp(-8, 8)
+    raw = start[moves]
     damping = 1e-3
     error, pixel_gain = residual(raw)
     loss = float(error @ error)
@@ -160,7 +195,7 @@ def _levenberg_marquardt(
             damping *= 5
         if not improved or gained < 1e-7:
             break
-    return model.constrain(raw[None], 1)[0].numpy()
+    return values(raw).numpy()
 
 
 def _jacobian(render: Callable[[Tensor], Tensor], raw: Tensor, step: float = 1e-5) -> Tensor:

@@ -13,31 +13,30 @@ import numpy as np
 from schemas import atomic_path
 from schemas.files.hdf5 import silence_hdf5
 from stages.effects import load_extension
-from stages.evaluate.core import Row, Scores, choose_fit_pairs, dn_scale, fit_renderers, layout, make_renderers, score
+from stages.evaluate.core import PER_ROW, Scores, score
+from stages.evaluate.fitting import choose_fit_pairs, dn_scale, fit_rows
 from stages.evaluate.perceptual import Perceptual
-from stages.evaluate.renderers import Constant, Predictor
+from stages.evaluate.renderers import Constant
+from stages.evaluate.rows import Row, make_renderers, make_rows
+from stages.network.predictor import Predictor as Network
 from stages.network.predictor import choose_device, load_predictor
 from stages.pairs.reader import PairReader
-from stages.physics.formation.chain import Extension
 
-TABLES = ("squared_error", "ssim", "ssim_range_1", "lpips")
 COUNTS = ("pixels", "data_range")
 
 
-def write_fit(path: Path, pairs: Path, checkpoint: Path, extend: Path | None, config: Any, wanted: np.ndarray) -> None:
+def write_fit(
+    path: Path, pairs: Path, checkpoints: Sequence[Path], extend: Path | None, config: Any, wanted: np.ndarray
+) -> None:
     """Fit what is free and write it as JSON: numbers survive that to the last bit."""
     with PairReader(pairs) as reader:
-        predictor = load_predictor(checkpoint, choose_device(config.device))
-        extensions = load_extension(extend, reader.image_ids) if extend else []
+        rows = _rows(reader, checkpoints, extend, config)
         calibrated = reader.units == "iof"
         train, orphans = choose_fit_pairs(reader, wanted, config.fit_pairs, config.seed)
         everything = np.concatenate([train, orphans, wanted])
         scale = 1.0 if calibrated else dn_scale(reader, everything, config.batch)
-        orphans = np.empty(0, int) if calibrated else orphans
-        rows = fit_renderers(
-            reader, predictor, extensions, train, orphans, len(reader.image_ids), calibrated, scale, config.batch,
-            config.seed, lambda count: None, config.only,
-        )  # fmt: skip
+        frames = len(reader.image_ids)
+        fit_rows(reader, rows, train, orphans, frames, calibrated, scale, config.batch, config.seed)
     numbers = {
         row.renderer.name: {
             "coefficients": row.renderer.coefficients.values.tolist()
@@ -53,29 +52,35 @@ def write_fit(path: Path, pairs: Path, checkpoint: Path, extend: Path | None, co
         partial.write_text(json.dumps({"scale": scale, "renderers": numbers}))
 
 
-def read_fit(
-    path: Path, predictor: Predictor, extensions: Sequence[Extension], only: Sequence[str]
-) -> tuple[list[Row], float]:
-    """The rows of the table as they were fitted, and the DN scale."""
+def read_fit(path: Path, rows: Sequence[Row]) -> float:
+    """Set the renderers of ``rows`` to what was fitted; returns the DN scale."""
     found = json.loads(path.read_text())
-    start = np.array([p.default for p in predictor.model.parameters])
-    renderers = make_renderers(predictor, extensions, start)
-    for name, numbers in found["renderers"].items():
-        renderer = renderers[name]
+    for row in rows:
+        renderer, numbers = row.renderer, found["renderers"][row.renderer.name]
         if numbers["coefficients"] is not None:
             renderer.coefficients = Constant(np.array(numbers["coefficients"]))
         renderer.scale = numbers["scale"]
         renderer.gain, renderer.offset = (
             None if numbers[k] is None else np.array(numbers[k]) for k in ("gain", "offset")
         )
-    rows = [Row(n, renderers[source], how) for n, source, how in layout(bool(extensions)) if not only or n in only]
-    return rows, float(found["scale"])
+    return float(found["scale"])
+
+
+def load_predictors(checkpoints: Sequence[Path], device: str) -> list[Network]:
+    """One for each training run."""
+    return [load_predictor(path, choose_device(device)) for path in checkpoints]
+
+
+def _rows(reader: PairReader, checkpoints: Sequence[Path], extend: Path | None, config: Any) -> list[Row]:
+    predictors = load_predictors(checkpoints, config.device)
+    extensions = load_extension(extend, reader.image_ids) if extend else []
+    return make_rows(make_renderers(predictors, extensions), len(predictors), bool(extensions), config.only)
 
 
 def write_scores(
     path: Path,
     pairs: Path,
-    checkpoint: Path,
+    checkpoints: Sequence[Path],
     extend: Path | None,
     config: Any,
     fitted: Path,
@@ -85,32 +90,36 @@ def write_scores(
     """Score every row on the crops ``wanted``."""
     silence_hdf5()
     with PairReader(pairs) as reader, atomic_path(path) as partial, h5py.File(partial, "w") as file:
-        predictor = load_predictor(checkpoint, choose_device(config.device))
-        extensions = load_extension(extend, reader.image_ids) if extend else []
-        rows, scale = read_fit(fitted, predictor, extensions, config.only)
+        rows = _rows(reader, checkpoints, extend, config)
+        scale = read_fit(fitted, rows)
         shape = (len(wanted), *reader.size)
         chunks = (1, *reader.size)
         measured = file.create_dataset("measured", shape, "f4", chunks=chunks)
         rendered: h5py.Dataset | None = None
         if renderings:
-            rendered = file.create_dataset("rendered", (len(rows), *shape), "f4", chunks=(1, *chunks))
+            rendered = file.create_dataset("rendered", (len(first_runs(rows)), *shape), "f4", chunks=(1, *chunks))
 
         def keep(position: int, crops: np.ndarray, images: list[np.ndarray]) -> None:
             measured[position : position + len(crops)] = crops
             if rendered is not None:
-                for k, image in enumerate(images):
-                    rendered[k, position : position + len(crops)] = image
+                for k, row in enumerate(first_runs(rows)):
+                    rendered[k, position : position + len(crops)] = images[row]
 
         scores = score(reader, rows, wanted, scale, config.batch, Perceptual(), keep, lambda count: None)
-        for name in (*TABLES, *COUNTS):
+        for name in (*PER_ROW, *COUNTS):
             file[name] = getattr(scores, name)
+
+
+def first_runs(rows: Sequence[Row]) -> list[int]:
+    """Where in ``rows`` each name's first training run stands: its renderings are kept and drawn."""
+    return [k for k, row in enumerate(rows) if row.run == 0]
 
 
 def join_scores(
     parts: Sequence[Path], rows: Sequence[Row], measured: h5py.Dataset, rendered: h5py.Dataset | None
 ) -> Scores:
     """The scores of all parts in their order; the crops go where they belong."""
-    tables: dict[str, list[np.ndarray]] = {name: [] for name in (*TABLES, *COUNTS)}
+    tables: dict[str, list[np.ndarray]] = {name: [] for name in (*PER_ROW, *COUNTS)}
     place = 0
     for part in parts:
         with h5py.File(part, "r") as file:

@@ -65,6 +65,11 @@ def read_batch(reader: Reader, indices: np.ndarray, scale: float) -> Batch:
     return Batch(observation, state, image, usable, np.asarray(reader.frame)[np.asarray(indices)])
 
 
+def batches(indices: np.ndarray, size: int) -> Iterator[np.ndarray]:
+    for start in range(0, len(indices), size):
+        yield indices[start : start + size]
+
+
 @dataclass
 class Renderer:
     """One compared model, with gain and offset per frame (1 and 0 for calibrated images).
@@ -146,12 +151,14 @@ def learned(predictor: Predictor) -> Callable[[Batch], Tensor]:
     """The network's coefficients from the crop's elevation; computed once per batch."""
     device = next((p.device for p in predictor.parameters()), torch.device("cpu"))
 
+    key = f"coefficients of {id(predictor)}"
+
     def coefficients(batch: Batch) -> Tensor:
-        if "coefficients" not in batch.memo:
+        if key not in batch.memo:
             with torch.no_grad():
                 elevation = batch.observation.elevation.to(device)
-                batch.memo["coefficients"] = predictor.coefficients(elevation).float().cpu()
-        return batch.memo["coefficients"]
+                batch.memo[key] = predictor.coefficients(elevation).float().cpu()
+        return batch.memo[key]
 
     return coefficients
 

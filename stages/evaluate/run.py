@@ -24,22 +24,24 @@ from schemas import (
     read_config,
 )
 from schemas.files.companions import companions_of
+from stages.common.intervals import FEWEST_UNITS, choose_units
 from stages.effects import load_extension
-from stages.evaluate.bootstrap import TileBootstrap
-from stages.evaluate.core import TITLES, Row, Scores, choose_fit_pairs, dn_scale, fit_renderers, layout, score
-from stages.evaluate.parts import join_scores, read_fit, write_fit, write_scores
+from stages.effects.extension import check_ground
+from stages.evaluate.core import Scores, score
+from stages.evaluate.fitting import choose_fit_pairs, dn_scale, fit_rows, fit_steps
+from stages.evaluate.parts import first_runs, join_scores, load_predictors, read_fit, write_fit, write_scores
 from stages.evaluate.perceptual import Perceptual
 from stages.evaluate.renderers import Predictor, Reader
-from stages.evaluate.table import gain_table, metric_table
+from stages.evaluate.rows import TITLES, Row, layout, make_renderers, make_rows
+from stages.evaluate.table import conclude, gain_table, metric_table, strongest_baselines
 from stages.network.predictor import Predictor as Network
-from stages.network.predictor import choose_device, load_predictor
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import Extension
 
 RENDERINGS_LIMIT = 512 * 2**20  # bytes of rendered crops that are kept without being asked for
-MANY_TILES = 10  # fewer make percentile intervals too narrow
 
 
+Progress = Callable[[int, int, str], None]
 # (what, function, its arguments for every part, suffix) -> the parts that function(path, **arguments) wrote, in order
 Fan = Callable[[str, Callable[..., Any], Sequence[Mapping[str, Any]], str], list[Path]]
 PART_BATCHES = 32
@@ -51,7 +53,6 @@ class Config:
 
     split: str = "test"
     batch: int = 16
-    bootstrap: int = 2000
     fit_pairs: int = 4096
     renderings: bool | None = None
     seed: int = 0
@@ -59,9 +60,54 @@ class Config:
     only: tuple[str, ...] = ()
 
 
+@dataclass
+class Task:
+    """What is compared on what: several predictors are training runs of one model; ``wanted`` are indices of pairs."""
+
+    reader: Reader
+    predictors: Sequence[Predictor]
+    wanted: np.ndarray
+    frame_names: Sequence[str]
+    units: str
+    config: Config
+    extensions: Sequence[Extension] = ()
+
+    @property
+    def calibrated(self) -> bool:
+        return self.units == "iof"
+
+    def rows(self) -> list[Row]:
+        renderers = make_renderers(self.predictors, self.extensions)
+        return make_rows(renderers, len(self.predictors), bool(self.extensions), self.config.only)
+
+    def fit_pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Train pairs to fit on; pairs of uncalibrated images that no train pair shows."""
+        train, orphans = choose_fit_pairs(self.reader, self.wanted, self.config.fit_pairs, self.config.seed)
+        return train, np.empty(0, int) if self.calibrated else orphans
+
+
+@dataclass
+class Files:
+    """What is read and written."""
+
+    pairs: Path
+    checkpoints: list[Path]
+    extend: Path | None
+    output: Path
+    json_file: Path | None
+
+    @property
+    def inputs(self) -> list[Path]:
+        return [self.pairs, *self.checkpoints, *([self.extend] if self.extend else [])]
+
+    @property
+    def reports(self) -> list[Path]:
+        return [self.output.with_suffix(".json"), *([self.json_file] if self.json_file else [])]
+
+
 def run(
     pairs: Path,
-    checkpoint: Path,
+    checkpoint: Path | Sequence[Path],
     output: Path,
     config: Config,
     *,
@@ -69,58 +115,80 @@ def run(
     json_file: Path | None = None,
     figures: Path | None = None,
     overwrite: bool = False,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Progress | None = None,
     fan: Fan | None = None,
 ) -> dict[str, Any]:
-    """Evaluate a checkpoint on a split of a pairs file; returns what the JSON holds.
+    """Evaluate a checkpoint, or several training runs of one model, on a split of a pairs file; returns what the JSON holds.
 
     ``fan`` has the crops scored in parts, wherever it works on them.
 
     Writes ``output`` (evaluation artefact), the JSON beside it (and at ``json_file``), and figures where asked.
     Raises ConfigError or ArtefactError before anything is written.
     """
-    inputs = [pairs, checkpoint, *([extend] if extend else [])]
-    reports = [output.with_suffix(".json"), *([json_file] if json_file else [])]
-    check_output(output, inputs, overwrite)
-    for report in reports:
-        check_output(report, [*inputs, output], overwrite)
-    _check(config)
-    device = choose_device(config.device)
+    checkpoints = [checkpoint] if isinstance(checkpoint, Path) else list(checkpoint)
+    files = Files(pairs, checkpoints, extend, output, json_file)
+    check_output(output, files.inputs, overwrite)
+    for report in files.reports:
+        check_output(report, [*files.inputs, output], overwrite)
+    _check(config, bool(extend))
     with PairReader(pairs) as reader:
         wanted = select(reader, config.split)
-        predictor = load_predictor(checkpoint, device)
-        if reader.units == "iof" and predictor.image_units == "dn":
-            raise ArtefactError(
-                f"{checkpoint}: expected a checkpoint trained on I/F images as in {pairs.name}, found one trained on "
-                "DN, whose brightness scale is arbitrary; train on these pairs."
-            )
+        predictors = load_predictors(checkpoints, config.device)
+        _check_runs(checkpoints, predictors, reader)
+        notes = [*_notes(checkpoints[0], predictors[0], reader, extend)]
+        if extend:
+            notes += check_ground(extend, pairs)
         extensions = load_extension(extend, reader.image_ids) if extend else []
-        notes = _notes(checkpoint, predictor.gsd, reader.gsd, extend)
-        return _evaluate(
-            reader,
-            predictor,
-            extensions,
-            wanted,
-            config,
-            notes,
-            inputs,
-            output,
-            reports,
-            figures,
-            overwrite,
-            progress,
-            fan,
-        )
+        task = Task(reader, predictors, wanted, reader.image_ids, reader.units, config, extensions)
+        rows, scores, scale, result = _write(task, files, notes, overwrite, progress, fan)
+        if figures is not None:
+            from stages.evaluate.figures import write_figures
+
+            first = [rows[k] for k in first_runs(rows)]
+            write_figures(figures, reader, first, wanted, scores.mean_over_runs(), scale, result, checkpoints[0])
+    return result
 
 
-def _check(config: Config) -> None:
+def _check(config: Config, extended: bool) -> None:
     if config.split not in dict(SPLITS):
         raise ConfigError(f"--split: expected one of {', '.join(dict(SPLITS))}, found '{config.split}'.")
-    if config.batch < 1 or config.bootstrap < 0 or config.fit_pairs < 0:
+    if config.batch < 1 or config.fit_pairs < 0:
         raise ConfigError(
-            "--batch, --bootstrap, --fit-pairs: expected at least 1, 0 and 0, "
-            f"found {config.batch}, {config.bootstrap} and {config.fit_pairs}."
+            f"--batch, --fit-pairs: expected at least 1 and 0, found {config.batch} and {config.fit_pairs}."
         )
+    known = [name for name, _, _ in layout(extended)]
+    for name in config.only:
+        if name not in known:
+            raise RegistryError.unknown("row of the evaluation", name, known)
+
+
+def _check_runs(checkpoints: Sequence[Path], predictors: Sequence[Network], reader: PairReader) -> None:
+    """Several checkpoints are training runs of one model from different seeds, in the units of the pairs."""
+    seeds: dict[int, Path] = {}
+    for path, predictor in zip(checkpoints, predictors, strict=True):
+        if reader.units == "iof" and predictor.image_units == "dn":
+            raise ArtefactError(
+                f"{path}: expected a checkpoint trained on I/F images as in {reader.path.name}, found one trained on "
+                "DN, whose brightness scale is arbitrary; train on these pairs."
+            )
+        if predictor.model.name != predictors[0].model.name:
+            raise ConfigError(
+                f"{path}: expected another training run of {predictors[0].model.name} as in {checkpoints[0].name}, found "
+                f"{predictor.model.name}; 'lunargr compare' compares models."
+            )
+        seed = read_seed(path)
+        if seed in seeds:
+            raise ConfigError(
+                f"{path}: expected a training run from another seed than {seeds[seed].name}, found seed {seed} again; "
+                "train it with another --seed."
+            )
+        seeds[seed] = path
+
+
+def read_seed(checkpoint: Path) -> int:
+    """The seed that a checkpoint was trained from."""
+    with open_artefact(checkpoint, CHECKPOINT) as file:
+        return int(file.attrs["seed"])
 
 
 def select(reader: PairReader, split: str) -> np.ndarray:
@@ -134,33 +202,31 @@ def select(reader: PairReader, split: str) -> np.ndarray:
     return reader.indices(split)
 
 
-def _notes(checkpoint: Path, trained_gsd: float, gsd: float, extend: Path | None) -> list[str]:
+def _notes(checkpoint: Path, predictor: Network, reader: PairReader, extend: Path | None) -> list[str]:
     notes = []
-    if abs(trained_gsd / gsd - 1) > 0.01:
-        notes.append(f"the checkpoint was trained at {trained_gsd:g} m per pixel, these pairs have {gsd:g} m")
+    if abs(predictor.gsd / reader.gsd - 1) > 0.01:
+        notes.append(f"the checkpoint was trained at {predictor.gsd:g} m per pixel, these pairs have {reader.gsd:g} m")
     with open_artefact(checkpoint, CHECKPOINT) as file:
         trained_with = read_config(file).get("extend")
     if trained_with and extend is None:
         notes.append(f"the checkpoint was trained with the effects of '{Path(trained_with).name}': add --extend")
+    if read_config(reader.file).get("register"):
+        notes.append(
+            "the images were registered on ground of every part of the split, the scored one included (project --register)"
+        )
     return notes
 
 
 def evaluate_pairs(
-    reader: Reader,
-    predictor: Predictor,
-    wanted: np.ndarray,
-    frame_names: list[str],
-    units: str,
-    config: Config,
+    task: Task,
     *,
-    extensions: Sequence[Extension] = (),
     keep: Callable[[int, np.ndarray, list[np.ndarray]], Any] | None = None,
-    progress: Callable[[int, int, str], None] | None = None,
-) -> tuple[dict[str, Any], list[Row], Any, float]:
-    """The pure comparison: (what the JSON holds, rows, scores, DN scale)."""
-    calibrated = units == "iof"
-    train, orphans = choose_fit_pairs(reader, wanted, config.fit_pairs, config.seed)
-    total = len(train) + len(orphans) + len(wanted)
+    progress: Progress | None = None,
+) -> tuple[list[Row], Scores, float, dict[str, Any]]:
+    """The pure comparison: (rows, scores of every training run, DN scale, what the JSON holds)."""
+    train, orphans = task.fit_pairs()
+    size, wanted = task.config.batch, task.wanted
+    total = fit_steps(train, orphans, task.calibrated) + len(wanted)
     done = 0
 
     def tick(count: int) -> None:
@@ -171,128 +237,93 @@ def evaluate_pairs(
 
     if progress is not None:
         progress(0, total, "evaluate")
-    scale = 1.0 if calibrated else dn_scale(reader, np.concatenate([train, orphans, wanted]), config.batch)
-    orphans = np.empty(0, int) if calibrated else orphans
-    total = len(train) + len(orphans) + len(wanted)
-    rows = fit_renderers(
-        reader, predictor, extensions, train, orphans, len(frame_names), calibrated, scale, config.batch, config.seed,
-        tick, config.only,
-    )  # fmt: skip
-    scores = score(reader, rows, wanted, scale, config.batch, Perceptual(), keep, tick)
-    return conclude(reader, predictor, wanted, frame_names, units, config, rows, scores, scale), rows, scores, scale
+    scale = 1.0 if task.calibrated else dn_scale(task.reader, np.concatenate([train, orphans, wanted]), size)
+    rows = task.rows()
+    fit_rows(
+        task.reader, rows, train, orphans, len(task.frame_names), task.calibrated, scale, size, task.config.seed, tick
+    )
+    scores = score(task.reader, rows, wanted, scale, size, Perceptual(), keep, tick)
+    return rows, scores, scale, summarise(task, scores, scale)
 
 
-def conclude(
-    reader: Reader,
-    predictor: Predictor,
-    wanted: np.ndarray,
-    frame_names: list[str],
-    units: str,
-    config: Config,
-    rows: list[Row],
-    scores: Scores,
-    scale: float,
-) -> dict[str, Any]:
+def summarise(task: Task, scores: Scores, scale: float) -> dict[str, Any]:
     """What the JSON holds."""
-    calibrated = units == "iof"
-    train, orphans = choose_fit_pairs(reader, wanted, config.fit_pairs, config.seed)
-    orphans = np.empty(0, int) if calibrated else orphans
+    train, orphans = task.fit_pairs()
     perceptual = Perceptual()
     if not scores.pixels.any():
-        raise ArtefactError(f"split '{config.split}': expected valid pixels, found none; project the pairs again.")
-    tile = np.asarray(reader.tile)[wanted]
-    unit = "tile"
-    if len(np.unique(tile)) == 1:  # better a flagged interval over crop sites than none
-        unit, tile = "site", np.asarray(reader.site)[wanted]
-    bootstrap = TileBootstrap(tile, config.bootstrap, config.seed)
-    frames = np.asarray(reader.frame)
-    return {
-        "split": config.split,
-        "models": metric_table(scores, bootstrap),
-        "gains": gain_table(scores, bootstrap),
-        "titles": {row.name: TITLES[row.name] for row in rows},
-        "pairs": len(wanted),
+        raise ArtefactError(f"split '{task.config.split}': expected valid pixels, found none; project the pairs again.")
+    tile, site = (np.asarray(v)[task.wanted] for v in (task.reader.tile, task.reader.site))
+    unit, name = choose_units(tile, site)
+    frames = np.asarray(task.reader.frame)
+    models = metric_table(scores, unit)
+    result: dict[str, Any] = {
+        "split": task.config.split,
+        "models": models,
+        "gains": gain_table(scores, unit),
+        "strongest_baseline": strongest_baselines(models),
+        "titles": {row: TITLES[row] for row in models},
+        "pairs": len(task.wanted),
         "valid_pixels": int(scores.pixels.sum()),
-        "tiles": len(np.unique(np.asarray(reader.tile)[wanted])),
-        "bootstrap_unit": unit,
-        "bootstrap": config.bootstrap,
-        "image_units": units,
-        "dn_full_range": None if calibrated else scale,
-        "model": predictor.model.name,
+        "tiles": len(np.unique(tile)),
+        "sites": len(np.unique(site)),
+        "training_runs": len(task.predictors),
+        "interval_unit": name,
+        "intervals": "delete-one-unit jackknife, Student's t, 95 %",
+        "image_units": task.units,
+        "dn_full_range": None if task.calibrated else scale,
+        "model": task.predictors[0].model.name,
         "fitted_on_pairs": len(train),
-        "frames_fitted_on_split": sorted({frame_names[f] for f in frames[orphans]}),
+        "frames_fitted_on_split": sorted({task.frame_names[f] for f in frames[orphans]}),
         "lpips_unavailable": None if perceptual.available else perceptual.reason,
-        "warnings": _warnings(bootstrap, unit, frames, orphans),
+        "warnings": _warnings(name, len(np.unique(unit)), len(task.predictors), len(np.unique(frames[orphans]))),
     }
+    return result | {"conclusions": conclude(result)}
 
 
-def _in_parts(
-    fan: Fan,
-    inputs: list[Path],
-    config: Config,
-    wanted: np.ndarray,
-    predictor: Network,
-    extensions: Sequence[Any],
-    measured: Any,
-    rendered: Any,
-) -> tuple[list[Row], float, Scores]:
-    files: dict[str, Any] = {
-        "pairs": inputs[0],
-        "checkpoint": inputs[1],
-        "extend": inputs[2] if len(inputs) > 2 else None,
-    }
-    files |= {"config": config}
-    [fitted] = fan("fit", write_fit, [files | {"wanted": wanted}], ".json")
-    rows, scale = read_fit(fitted, predictor, extensions, config.only)
-    step = PART_BATCHES * config.batch  # whole batches: the network sees the same ones whatever the parts
-    todo = [
-        files | {"fitted": fitted, "wanted": wanted[k : k + step], "renderings": rendered is not None}
-        for k in range(0, len(wanted), step)
-    ]
-    return rows, scale, join_scores(fan("scores", write_scores, todo, ".h5"), rows, measured, rendered)
-
-
-def _warnings(bootstrap: TileBootstrap, unit: str, frames: np.ndarray, orphans: np.ndarray) -> list[str]:
+def _warnings(unit: str, units: int, runs: int, orphans: int) -> list[str]:
     found = []
-    if not bootstrap.enough:
-        found.append("one site on one ground tile: there is nothing to resample, so no interval is given")
+    if units == 1:
+        found.append("one site on one ground tile: there is no spread to judge by, so no interval is given")
     elif unit == "site":
-        found.append("one ground tile: the intervals resample the sites within it and are too narrow")
-    elif bootstrap.tiles < MANY_TILES:
-        found.append(f"only {bootstrap.tiles} ground tiles: the intervals are too narrow")
-    if len(orphans):
-        count = len(np.unique(frames[orphans]))
-        found.append(f"{count} image(s) without train pairs: gain and offset fitted on the evaluated pixels themselves")
+        found.append("one ground tile: the intervals take its sites for independent and are too narrow")
+    elif units < FEWEST_UNITS:
+        found.append(f"only {units} ground tiles: the intervals are wide, and untested below {FEWEST_UNITS}")
+    if runs == 1:
+        found.append("one training run: the intervals of learned rows hold the ground's spread only, not that of seeds")
+    if orphans:
+        found.append(
+            f"{orphans} image(s) without train pairs: gain and offset fitted on the evaluated pixels themselves"
+        )
     return found
 
 
-def _evaluate(
-    reader: PairReader,
-    predictor: Network,
-    extensions: Sequence[Any],
-    wanted: np.ndarray,
-    config: Config,
-    notes: list[str],
-    inputs: list[Path],
-    output: Path,
-    reports: list[Path],
-    figures: Path | None,
-    overwrite: bool,
-    progress: Callable[[int, int, str], None] | None,
-    fan: Fan | None,
-) -> dict[str, Any]:
-    height, width = reader.size
-    rows_known = [name for name, _, _ in layout(bool(extensions))]
-    for name in config.only:
-        if name not in rows_known:
-            raise RegistryError.unknown("row of the evaluation", name, rows_known)
-    names = len(set(config.only)) or len(rows_known)
-    size = names * len(wanted) * height * width * 4
+def _in_parts(task: Task, files: Files, fan: Fan, measured: Any, rendered: Any) -> tuple[list[Row], Scores, float]:
+    shared: dict[str, Any] = {"pairs": files.pairs, "checkpoints": files.checkpoints, "extend": files.extend}
+    shared |= {"config": task.config}
+    [fitted] = fan("fit", write_fit, [shared | {"wanted": task.wanted}], ".json")
+    rows = task.rows()
+    scale = read_fit(fitted, rows)
+    step = PART_BATCHES * task.config.batch  # whole batches: the network sees the same ones whatever the parts
+    todo = [
+        shared | {"fitted": fitted, "wanted": task.wanted[k : k + step], "renderings": rendered is not None}
+        for k in range(0, len(task.wanted), step)
+    ]
+    return rows, join_scores(fan("scores", write_scores, todo, ".h5"), rows, measured, rendered), scale
+
+
+def _write(
+    task: Task, files: Files, notes: list[str], overwrite: bool, progress: Progress | None, fan: Fan | None
+) -> tuple[list[Row], Scores, float, dict[str, Any]]:
+    config, count = task.config, len(task.wanted)
+    height, width = task.reader.size  # type: ignore[attr-defined]
+    planned = task.rows()
+    first = first_runs(planned)
+    size = len(first) * count * height * width * 4
     renderings = size <= RENDERINGS_LIMIT if config.renderings is None else config.renderings
-    sizes = {"model": names, "pair": len(wanted), "y": height, "x": width}
+    sizes = {"model": len(first), "run": len(files.checkpoints), "pair": count, "y": height, "x": width}
     settings = asdict(config) | {"renderings": renderings}
     with ArtefactWriter(
-        output, EVALUATION, sizes, config=settings, inputs=inputs, seed=config.seed, overwrite=overwrite
+        files.output, EVALUATION, sizes, config=settings, inputs=files.inputs, seed=config.seed, overwrite=overwrite
     ) as artefact:
         measured = artefact.dataset("measured")
         rendered = artefact.dataset("rendered") if renderings else None
@@ -300,35 +331,32 @@ def _evaluate(
         def keep(position: int, crops: np.ndarray, images: list[np.ndarray]) -> None:
             measured[position : position + len(crops)] = crops
             if rendered is not None:
-                for k, image in enumerate(images):
-                    rendered[k, position : position + len(crops)] = image
+                for k, row in enumerate(first):
+                    rendered[k, position : position + len(crops)] = images[row]
 
         if fan is None:
-            result, rows, scores, scale = evaluate_pairs(
-                reader, predictor, wanted, reader.image_ids, reader.units, config,
-                extensions=extensions, keep=keep, progress=progress,
-            )  # fmt: skip
+            rows, scores, scale, result = evaluate_pairs(task, keep=keep, progress=progress)
         else:
-            rows, scale, scores = _in_parts(fan, inputs, config, wanted, predictor, extensions, measured, rendered)
-            result = conclude(
-                reader, predictor, wanted, reader.image_ids, reader.units, config, rows, scores, scale
-            )  # fmt: skip
-        result |= {"pairs_file": inputs[0].name, "checkpoint": inputs[1].name, "config": settings}
-        result["warnings"] = notes + result["warnings"]
-        artefact.write("model_name", scores.names)
-        artefact.write("pair_index", wanted)
-        artefact.write("tile", np.asarray(reader.tile)[wanted])
-        artefact.write("valid_pixels", scores.pixels)
-        artefact.write("mse", scores.mse)
-        artefact.write("ssim", scores.ssim)
+            rows, scores, scale = _in_parts(task, files, fan, measured, rendered)
+            result = summarise(task, scores, scale)
+        names = [path.name for path in files.checkpoints]
+        seeds = [read_seed(path) for path in files.checkpoints]
+        result |= {"pairs_file": files.pairs.name, "checkpoint": names[0], "checkpoints": names, "seeds": seeds}
+        result |= {"config": settings, "warnings": notes + result["warnings"]}
+        table = scores.mean_over_runs()
+        artefact.write("model_name", table.names)
+        artefact.write("pair_index", task.wanted)
+        artefact.write("tile", np.asarray(task.reader.tile)[task.wanted])
+        artefact.write("valid_pixels", table.pixels)
+        artefact.write("mse", table.mse)
+        artefact.write("ssim", table.ssim)
+        artefact.write("run_seed", seeds)
+        if "learned" in table.names:
+            artefact.write("run_mse", scores.runs("learned", "mse"))
         artefact.file.attrs["split"] = config.split
         artefact.file.attrs["metrics"] = json.dumps(result)
-        with companions_of(output):
-            for report in reports:
+        with companions_of(files.output):
+            for report in files.reports:
                 with atomic_path(report) as partial:
                     partial.write_text(json.dumps(result, indent=1) + "\n")
-    if figures is not None:
-        from stages.evaluate.figures import write_figures
-
-        write_figures(figures, reader, rows, wanted, scores, scale, result, inputs[1])
-    return result
+    return rows, scores, scale, result

@@ -1,4 +1,4 @@
-"""From per-crop scores to the table: pooled errors, intervals over ground tiles, gains of the learned model."""
+"""From per-crop scores to the table: pooled errors, intervals over ground and training runs, gains, conclusions."""
 
 from __future__ import annotations
 
@@ -7,70 +7,123 @@ from typing import Any
 
 import numpy as np
 
-from stages.evaluate.bootstrap import TileBootstrap
+from stages.common.intervals import ERROR, gain_interval, ratio_interval
 from stages.evaluate.core import Scores
 from stages.evaluate.metrics import psnr
+from stages.evaluate.rows import TITLES, freedom
 
 PAIRED = ("learned", "learned_gain_offset", "learned_extended", "learned_extended_gain_offset")
+# Rows that are compared like for like: they know nothing of the scored crops, or two numbers of each.
+CLASSES = {
+    "none": "Knowing nothing of the scored crops",
+    "gain_offset": "With a least-squares gain and offset for each scored crop",
+}
 
 
-def metric_table(scores: Scores, bootstrap: TileBootstrap) -> dict[str, dict[str, float | None]]:
+def metric_table(scores: Scores, unit: np.ndarray) -> dict[str, dict[str, Any]]:
     """The metrics of every row by name; a number that does not exist (or is infinite) is None.
 
+    scores : of every training run; unit : (N,) labels of independent ground
     mse, rmse, psnr : over all valid pixels; mse_crop_sum : mean over crops of the sum over the crop's pixels;
-    psnr_crop_mean, psnr_crop_range, ssim, lpips : means over crops. ``_low`` and ``_high`` bound 95 %.
+    psnr_crop_mean, psnr_crop_range, ssim, lpips : means over crops. All are means over training runs. ``_low`` and
+    ``_high`` bound 95 %; ``mse_runs`` holds each run's, ``mse_run_std`` their standard deviation.
     """
     pixels = scores.pixels.astype(float)
     crops = (pixels > 0).astype(float)
     table = {}
-    for k, name in enumerate(scores.names):
-        total = scores.squared_error[k]
-        mse = float(total.sum() / pixels.sum())
-        low, high = bootstrap.interval(bootstrap.draws(total, pixels))
-        row: dict[str, float] = {
-            "mse": mse,
-            "mse_low": low,
-            "mse_high": high,
-            "mse_crop_sum": float(total.sum() / crops.sum()),
-            "rmse": math.sqrt(mse),
-            "psnr": float(psnr(mse)),
-            "psnr_low": float(psnr(high)),
-            "psnr_high": float(psnr(low)),
-            "psnr_crop_mean": _mean(np.asarray(psnr(scores.mse[k]))),
+    for name in dict.fromkeys(scores.names):
+        totals = scores.runs(name)
+        mse = ratio_interval(totals, pixels, unit, ERROR)
+        runs = totals.sum(axis=1) / pixels.sum()
+        row: dict[str, Any] = {
+            "mse": mse.value,
+            "mse_low": max(0.0, mse.low) if math.isfinite(mse.low) else mse.low,
+            "mse_high": mse.high,
+            "mse_run_std": float(np.std(runs, ddof=1)) if len(runs) > 1 else math.nan,
+            "mse_crop_sum": float(totals.mean(axis=0).sum() / crops.sum()),
+            "rmse": math.sqrt(mse.value),
+            "psnr": float(psnr(mse.value)),
+            "psnr_low": float(psnr(mse.high)),
+            "psnr_high": float(psnr(mse.low)),
+            "psnr_crop_mean": _mean(np.asarray(psnr(scores.runs(name, "mse")))),
         }
-        for metric, values in (
-            ("psnr_crop_range", scores.psnr_crop_range[k]),
-            ("ssim", scores.ssim[k]),
-            ("ssim_range_1", scores.ssim_range_1[k]),
-            ("lpips", scores.lpips[k]),
-        ):
+        for metric in ("psnr_crop_range", "ssim", "ssim_range_1", "lpips"):
+            values = scores.runs(name, metric)
             row[metric] = _mean(values)
             if metric != "ssim_range_1":
-                row[f"{metric}_low"], row[f"{metric}_high"] = bootstrap.interval(bootstrap.draws(values, crops))
-        table[name] = {key: _number(value) for key, value in row.items()}
+                found = ratio_interval(values, crops, unit)
+                row[f"{metric}_low"], row[f"{metric}_high"] = found.low, found.high
+        numbers: dict[str, Any] = {key: _number(value) for key, value in row.items()}
+        table[name] = numbers | {"freedom": freedom(name), "mse_runs": runs.tolist()}
     return table
 
 
-def gain_table(scores: Scores, bootstrap: TileBootstrap) -> dict[str, dict[str, dict[str, float | None]]]:
+def gain_table(scores: Scores, unit: np.ndarray) -> dict[str, dict[str, dict[str, float | None]]]:
     """By how much each learned row lowers the MSE of every other row, in percent, with paired intervals."""
-    pixels = scores.pixels.astype(float)
-    pooled = scores.squared_error.sum(axis=1)
-    draws = {n: bootstrap.draws(scores.squared_error[k], pixels) for k, n in enumerate(scores.names)}
+    names = list(dict.fromkeys(scores.names))
     table: dict[str, dict[str, dict[str, float | None]]] = {}
-    for ours in (n for n in PAIRED if n in scores.names):
+    for ours in (n for n in PAIRED if n in names):
         table[ours] = {}
-        for k, other in enumerate(scores.names):
-            if other == ours:
-                continue
-            with np.errstate(invalid="ignore", divide="ignore"):
-                gain = 100 * (1 - pooled[scores.names.index(ours)] / pooled[k])
-                low, high = bootstrap.interval(100 * (1 - draws[ours] / draws[other]))
+        for other in (n for n in names if n != ours):
+            gain = gain_interval(scores.runs(ours), scores.runs(other), unit)
             table[ours][other] = {
-                "gain_percent": _number(float(gain)),
-                "gain_percent_low": _number(low),
-                "gain_percent_high": _number(high),
+                "gain_percent": _number(gain.value),
+                "gain_percent_low": _number(gain.low),
+                "gain_percent_high": _number(gain.high),
             }
     return table
+
+
+def strongest_baselines(models: dict[str, dict[str, Any]]) -> dict[str, str]:
+    """Of each class of freedom the row without a network that has the lowest MSE."""
+    found = {}
+    for kind in CLASSES:
+        rivals = [n for n, row in models.items() if row["freedom"] == kind and not n.startswith("learned")]
+        if rivals:
+            found[kind] = min(rivals, key=lambda n: models[n]["mse"])
+    return found
+
+
+def conclude(result: dict[str, Any]) -> list[str]:
+    """What the table says of each learned row against the strongest baseline of the same freedom, one sentence each."""
+    sentences = []
+    for kind, words in CLASSES.items():
+        rival = result["strongest_baseline"].get(kind)
+        for ours in (n for n in result["gains"] if rival and result["models"][n]["freedom"] == kind):
+            gain = result["gains"][ours][rival]
+            if gain["gain_percent"] is None:
+                continue
+            name = "the learned reflectance" + (" with the diagnosed effects" if "extended" in ours else "")
+            sentences.append(
+                f"{words}, {name} {_claim(gain)} the strongest baseline, {rival} ({TITLES[rival]}); {extent(result, gain)}."
+            )
+    return sentences
+
+
+def _claim(gain: dict[str, float | None]) -> str:
+    word = verdict(gain["gain_percent_low"], gain["gain_percent_high"])
+    size = abs(gain["gain_percent"] or 0.0)
+    if word == "better":
+        return f"has a squared error {size:.1f} % lower than"
+    if word == "worse":
+        return f"has a squared error {size:.1f} % higher than"
+    return "cannot be told apart from"
+
+
+def extent(result: dict[str, Any], gain: dict[str, float | None]) -> str:
+    """What a gain rests on: its interval, pairs, tiles or sites, training runs."""
+    low, high = gain["gain_percent_low"], gain["gain_percent_high"]
+    bounds = "no interval" if low is None or high is None else f"95 %: {low:+.1f} .. {high:+.1f} %"
+    return f"gain {gain['gain_percent']:+.1f} % ({bounds}; {basis(result)})"
+
+
+def basis(result: dict[str, Any]) -> str:
+    """'120 pairs, 7 ground tiles, 1 training run'."""
+    runs, tiles = result["training_runs"], result["tiles"]
+    ground = f"{tiles} ground tile{'s' * (tiles != 1)}"
+    if result["interval_unit"] == "site":
+        ground = f"{result['sites']} site{'s' * (result['sites'] != 1)} of one ground tile"
+    return f"{result['pairs']} pairs, {ground}, {runs} training run{'s' * (runs != 1)}"
 
 
 def verdict(low: float | None, high: float | None) -> str:
@@ -91,15 +144,16 @@ def _number(value: float) -> float | None:
 
 def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Columns and cells of the table on the terminal."""
-    columns = ["model", "MSE", "95 % interval", "MSE/crop", "RMSE", "PSNR", "PSNR crop", "SSIM", "LPIPS"]
+    columns = ["model", "MSE", "95 % interval", "+- runs", "MSE/crop", "RMSE", "PSNR", "PSNR crop", "SSIM", "LPIPS"]
     cells = []
     for name, row in result["models"].items():
-        bounds = "-" if row["mse_low"] is None else f"{row['mse_low']:.3e} .. {row['mse_high']:.3e}"
+        bounds = bounds_text(row)
         cells.append(
             [
                 name,
                 f"{row['mse']:.3e}",
                 bounds,
+                "-" if row["mse_run_std"] is None else f"{row['mse_run_std']:.1e}",
                 f"{row['mse_crop_sum']:.3f}",
                 f"{row['rmse']:.4f}",
                 *(
@@ -111,26 +165,33 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     return columns, cells
 
 
+def bounds_text(row: dict[str, Any]) -> str:
+    """The interval of a row's MSE; so few tiles may scatter so much that nothing bounds it from above."""
+    if row["mse_low"] is None:
+        return "-"
+    return f"{row['mse_low']:.3e} .. " + ("unbounded" if row["mse_high"] is None else f"{row['mse_high']:.3e}")
+
+
 def gain_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """What the learned model gains over each baseline; a gain whose interval holds 0 is no difference."""
+    """What the learned model gains over each baseline of the same freedom; an interval that holds 0 is no difference."""
     columns = ["model", "against", "lower MSE by", "95 % interval", "verdict"]
     cells = []
     for ours, others in result["gains"].items():
         for other, gain in others.items():
-            if other.startswith("learned") and not ours.startswith("learned_extended"):
+            if not comparable(result, ours, other):
                 continue
             if gain["gain_percent"] is None:
                 cells.append([ours, other, "-", "-", "-"])
                 continue
             low, high = gain["gain_percent_low"], gain["gain_percent_high"]
-            known = low is not None and high is not None
-            cells.append(
-                [
-                    ours,
-                    other,
-                    f"{gain['gain_percent']:+.1f} %",
-                    f"{low:+.1f} .. {high:+.1f} %" if known else "-",
-                    verdict(low, high),
-                ]
-            )
+            bounds = "-" if low is None or high is None else f"{low:+.1f} .. {high:+.1f} %"
+            cells.append([ours, other, f"{gain['gain_percent']:+.1f} %", bounds, verdict(low, high)])
     return columns, cells
+
+
+def comparable(result: dict[str, Any], ours: str, other: str) -> bool:
+    """Rows of the same freedom, and the paper's comparison: free against matched by range. Not a network with itself."""
+    if other.startswith("learned"):
+        return ours.startswith("learned_extended") and other == ours.replace("_extended", "")
+    freedoms = [result["models"][name]["freedom"] for name in (ours, other)]
+    return freedoms[0] == freedoms[1] or freedoms == ["none", "minmax"]

@@ -26,12 +26,14 @@ class Comparison:
     """One measured picture and the renderings of it: (H, W) float32, NaN where not known.
 
     common_scale : the renderings have the measured picture's units, so that one stretch serves all
+    ground : number of the piece of ground that it shows; pictures of one tile are no independent witnesses
     """
 
     label: str
     measured: np.ndarray
     rendered: dict[str, np.ndarray]
     common_scale: bool
+    ground: int = 0
 
 
 def is_artefact(path: Path) -> bool:
@@ -67,12 +69,20 @@ def from_images(measured: Path, rendered: list[Path]) -> Comparison:
     return Comparison(measured.stem, picture, others, common_scale=False)
 
 
-def choose(fraction_known: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Up to ``count`` random crops among those that are known (nearly) everywhere, or the best known ones."""
+def choose(fraction_known: np.ndarray, tile: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Up to ``count`` random crops among those that are known (nearly) everywhere, or the best known ones.
+
+    As many from every ground tile as from any other, as far as they go: intervals live on the number of tiles.
+    """
     whole = np.flatnonzero(fraction_known >= 0.99)
     if len(whole) < count:
         return np.sort(np.argsort(-fraction_known, kind="stable")[:count])
-    return np.sort(np.random.default_rng(seed).choice(whole, size=count, replace=False))
+    drawn = np.random.default_rng(seed).permutation(whole)
+    turn = np.zeros(len(drawn), int)  # how many of its tile were drawn before
+    for name in np.unique(tile[drawn]):
+        mine = tile[drawn] == name
+        turn[mine] = np.arange(mine.sum())
+    return np.sort(drawn[np.argsort(turn, kind="stable")[:count]])
 
 
 def from_evaluation(path: Path, count: int, seed: int) -> tuple[int, Iterator[Comparison]]:
@@ -89,14 +99,16 @@ def from_evaluation(path: Path, count: int, seed: int) -> tuple[int, Iterator[Co
                 "or 'lunargr match PAIRS CHECKPOINT'."
             )
         pixels = file["valid_pixels"][...] / np.prod(file["measured"].shape[1:])
-    chosen = choose(pixels, count, seed)
+        tile = file["tile"][...]
+    chosen = choose(pixels, tile, count, seed)
 
     def read() -> Iterator[Comparison]:
         with open_artefact(path, EVALUATION) as file:
             names = read_strings(file, "model_name")
             for k in chosen:
                 rendered = {n: file["rendered"][names.index(n), k] for n in SHOWN if n in names}
-                yield Comparison(f"pair {file['pair_index'][k]}", file["measured"][k], rendered, common_scale=True)
+                label = f"pair {file['pair_index'][k]}"
+                yield Comparison(label, file["measured"][k], rendered, common_scale=True, ground=int(tile[k]))
 
     return len(chosen), read()
 
@@ -114,8 +126,8 @@ def from_pairs(
         if not len(indices):
             raise ArtefactError(f"{pairs}:/split: expected '{split}' pairs to match, found none; sample more crops.")
         known = np.array([float(reader.valid([k]).float().mean()) for k in indices])
-        units = reader.units
-    chosen = indices[choose(known, count, seed)]
+        units, tile = reader.units, reader.tile
+    chosen = indices[choose(known, tile[indices], count, seed)]
     hapke = get_model("hapke")
     defaults = torch.tensor([[p.default for p in hapke.parameters]])[:, :, None, None]
 
@@ -132,8 +144,7 @@ def from_pairs(
                 baseline = match_crops(form(observation, hapke, defaults), measured, valid, "minmax")
                 mask = valid[0].numpy()
                 pictures = [np.where(mask, t[0].numpy(), np.nan) for t in (measured, learned, baseline)]
-                yield Comparison(
-                    f"pair {k}", pictures[0], dict(zip(SHOWN, pictures[1:], strict=True)), common_scale=True
-                )
+                rendered = dict(zip(SHOWN, pictures[1:], strict=True))
+                yield Comparison(f"pair {k}", pictures[0], rendered, common_scale=True, ground=int(tile[k]))
 
     return len(chosen), render()

@@ -53,9 +53,11 @@ def run(
         except OSError as error:
             raise ConfigError(f"{figures}: cannot be made a folder ({error.strerror}); choose another.") from None
     collected: dict[str, dict[str, list[Matches]]] = {m.name: {} for m in matchers}
+    ground: list[int] = []
     if progress is not None:
         progress(0, total, "match")
     for number, comparison in enumerate(source):
+        ground.append(comparison.ground)
         limits = stretch_limits(comparison.measured)
         measured, known = to_grey(comparison.measured, limits)
         pictures = {}
@@ -76,9 +78,10 @@ def run(
     result = {
         "size_px": [512, 384],
         "crops": total,
+        "tiles": len(set(ground)),
         "files": [f.name for f in files],
         "matchers": {
-            m.name: {name: summarise(found, config.seed) for name, found in collected[m.name].items()} for m in matchers
+            m.name: {name: summarise(found, ground) for name, found in collected[m.name].items()} for m in matchers
         },
     }
     if json_file is not None:

@@ -12,9 +12,18 @@ from markupsafe import Markup
 from stages.common import page
 from stages.common.page import pictures
 
-COLOURS = {"learned": "#3b8ecb", "global": "#4f9d69", "lunar_lambert": "#c08a2e", "hapke": "#c25b63"}
+COLOURS = {
+    "learned": "#3b8ecb",
+    "global": "#4f9d69",
+    "kernels": "#8d6cc0",
+    "lunar_lambert": "#c08a2e",
+    "hapke": "#c25b63",
+}
 UNITS = {"tile": "ground tiles", "site": "the sites of one ground tile"}
-FAIREST = "hapke_gain_offset"
+EXAMPLES = (
+    "learned", "learned_gain_offset", "learned_extended", "global", "kernels", "hapke_fitted", "lunar_lambert",
+    "hapke_minmax", "hapke_gain_offset",
+)  # fmt: skip
 
 
 def headline(result: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -24,17 +33,24 @@ def headline(result: dict[str, Any]) -> list[tuple[str, str, str]]:
     cards = []
     if "learned" in models:
         cards.append((f"{models['learned']['rmse']:.4f}", f"rms error of the learned reflectance, {unit}", ""))
+    strongest = result.get("strongest_baseline", {})
     for ours, other, what in (
-        ("learned", "hapke_minmax", "MSE than Hapke matched as in the paper"),
-        ("learned", "global", "MSE than the same model without spatial variation"),
-        ("learned_gain_offset", FAIREST, "MSE than Hapke, both with least-squares gain and offset per crop"),
+        ("learned", strongest.get("none"), "MSE than the strongest baseline, {}, neither knowing the scored crops"),
+        ("learned_gain_offset", strongest.get("gain_offset"), "MSE than the strongest baseline, {}, like for like"),
+        ("learned", "hapke_minmax", "MSE than Hapke matched by range as in the paper"),
     ):
-        gain = gains.get(ours, {}).get(other)
+        gain = gains.get(ours, {}).get(other or "")
         if gain and gain["gain_percent"] is not None:
             word = verdict(gain)
             kind = {"better": "good", "worse": "bad"}.get(word, "")
             way = "lower" if gain["gain_percent"] >= 0 else "higher"
-            cards.append((f"{abs(gain['gain_percent']):.1f} % {way}", f"{what} (gain, {_bounds(gain)} %)", kind))
+            cards.append(
+                (
+                    f"{abs(gain['gain_percent']):.1f} % {way}",
+                    f"{what.format(_words(other))} ({_bounds(gain)} %; {_basis(result)})",
+                    kind,
+                )
+            )
     return cards
 
 
@@ -44,6 +60,19 @@ def verdict(gain: dict[str, Any]) -> str:
     if low is None or high is None:
         return "unknown"
     return "better" if low > 0 else "worse" if high < 0 else "no difference"
+
+
+def _words(name: str | None) -> str:
+    return (name or "").replace("_", " ")
+
+
+def _basis(result: dict[str, Any]) -> str:
+    """What a gain rests on."""
+    ground = f"{result['tiles']} ground tiles"
+    if result.get("interval_unit") == "site":
+        ground = f"{result['sites']} sites of one ground tile"
+    runs = result.get("training_runs", 1)
+    return f"{result['pairs']:,} pairs, {ground}, {runs} training run{'s' * (runs != 1)}"
 
 
 def _bounds(gain: dict[str, Any]) -> str:
@@ -64,18 +93,24 @@ def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
     rows = [
         [
             titles.get(name, name), f"{m['mse']:.3e}",
-            "-" if m["mse_low"] is None else f"{m['mse_low']:.2e} .. {m['mse_high']:.2e}",
-            _cell(m["mse_crop_sum"], ".3f"), _cell(m["psnr"], ".2f"), _cell(m["psnr_crop_range"], ".2f"),
+            "-" if m["mse_low"] is None else f"{m['mse_low']:.2e} .. {_cell(m['mse_high'], '.2e')}",
+            _cell(m.get("mse_run_std"), ".1e"), _cell(m["mse_crop_sum"], ".3f"), _cell(m["psnr"], ".2f"), _cell(m["psnr_crop_range"], ".2f"),
             _cell(m["ssim"], ".3f"), _cell(m["lpips"], ".3f"),
         ]
         for name, m in models.items()
     ]  # fmt: skip
     best = int(np.argmin([m["mse"] for m in models.values()]))
-    header = ["model", "MSE", "95 % interval", "MSE per crop", "PSNR, dB", "PSNR of crop range, dB", "SSIM", "LPIPS"]
+    header = [
+        "model", "MSE", "95 % interval", "+- training runs", "MSE per crop", "PSNR, dB", "PSNR of crop range, dB",
+        "SSIM", "LPIPS",
+    ]  # fmt: skip
+    for sentence in result.get("conclusions", []):
+        section.add(page.paragraph(sentence))
     section.add(
         page.paragraph(
-            f"{result['pairs']:,} crops of the split '{result['split']}' on {result['tiles']} ground tiles; errors in {unit}. "
-            f"Intervals come from resampling {UNITS.get(result.get('bootstrap_unit', 'tile'))}."
+            f"Split '{result['split']}': {_basis(result)}; errors in {unit}. Intervals take "
+            f"{UNITS.get(result.get('interval_unit', 'tile'))} for independent (delete-one jackknife, Student's t)"
+            + (" and hold the spread of training runs." if result.get("training_runs", 1) > 1 else ".")
         ),
         page.table("Lowest MSE in bold", header, rows, best),
         page.chart(_errors(result), "Root mean squared error with 95 % intervals"),
@@ -90,12 +125,12 @@ def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
         ]
         for ours, others in result["gains"].items()
         for other, gain in others.items()
-        if not (other.startswith("learned") and not ours.startswith("learned_extended"))
+        if _like_for_like(models, ours, other)
     ]
     if rows:
         section.add(
             page.table(
-                "What the learned reflectance gains",
+                f"What the learned reflectance gains: {_basis(result)}",
                 ["model", "against", "MSE lowered by, %", "interval", "verdict"],
                 rows,
             )
@@ -109,13 +144,21 @@ def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
     return section
 
 
+def _like_for_like(models: dict[str, Any], ours: str, other: str) -> bool:
+    """Rows of the same freedom, and the paper's comparison with Hapke matched by range."""
+    if other.startswith("learned"):
+        return ours.startswith("learned_extended") and other == ours.replace("_extended", "")
+    freedoms = [models[name].get("freedom") for name in (ours, other)]
+    return freedoms[0] == freedoms[1] or freedoms == ["none", "minmax"]
+
+
 def _errors(result: dict[str, Any]) -> str:
     names = list(result["models"])
     figure, axes = pictures.new_chart(7.2, 0.36 * len(names) + 0.8)
     for k, name in enumerate(names):
         row = result["models"][name]
         colour = next((c for key, c in COLOURS.items() if name.startswith(key)), "#888888")
-        if row["mse_low"] is not None:
+        if row["mse_low"] is not None and row["mse_high"] is not None:
             axes.plot(np.sqrt([row["mse_low"], row["mse_high"]]), [k, k], color=colour, linewidth=3, alpha=0.5)
         axes.plot(row["rmse"], k, "o", color=colour, markersize=6)
     axes.set_yticks(range(len(names)), [n.replace("_", " ") for n in names], fontsize=8)
@@ -137,13 +180,14 @@ def _examples(file: h5py.File, names: list[str], unit: str) -> list[Markup]:
     for label, k in (("best", order[0]), ("median", order[len(order) // 2]), ("worst", order[-1])):
         measured = file["measured"][k]
         low, high = pictures.limits(measured)
-        rendered = [file["rendered"][m, k] for m in range(len(names))]
+        shown = [m for m, name in enumerate(names) if m == 0 or name in EXAMPLES]
+        rendered = {m: file["rendered"][m, k] for m in shown}
         spread = pictures.limits(np.abs(measured - rendered[0]), 1.0)[1]
         figures = [page.picture(pictures.data_uri(pictures.coloured(measured, low, high, "gray")), "measured")]
-        for m, name in enumerate(names):
+        for m in shown:
             above = pictures.data_uri(pictures.coloured(rendered[m], low, high, "gray"))
             below = pictures.data_uri(pictures.coloured(measured - rendered[m], -spread, spread, "RdBu_r"))
-            text = name.replace("_", " ")
+            text = _words(names[m])
             caption = f"{text}: rms {math.sqrt(file['mse'][m, k]):.4f}"
             figures.append(page.picture_pair(above, below, f"residual of {text}", caption))
         bars = [
@@ -184,7 +228,12 @@ def matching(result: dict[str, Any]) -> page.Section:
             "Measured and rendered images show the same ground, so every match should end where it began. "
             "A median shift far from zero is misregistration, which no reflectance can mend."
         ),
-        page.table(f"{result['crops']} pictures at {result['size_px'][0]} x {result['size_px'][1]} px", header, rows),
+        page.table(
+            f"{result['crops']} pictures at {result['size_px'][0]} x {result['size_px'][1]} px on "
+            f"{result.get('tiles', 1)} ground tiles",
+            header,
+            rows,
+        ),
     )
     return section
 
@@ -195,7 +244,7 @@ def comparison(result: dict[str, Any]) -> page.Section:
     rows = [
         [
             name, _cell(m["mse_crop_sum"], ".4f"), _cell(m["mse_crop_sum_seed_std"], ".4f"), _cell(m["mse"], ".4e"),
-            "-" if m["mse_low"] is None else f"{m['mse_low']:.3e} .. {m['mse_high']:.3e}",
+            "-" if m["mse_low"] is None else f"{m['mse_low']:.3e} .. {_cell(m['mse_high'], '.3e')}",
             ", ".join(map(str, m["best_epoch"])), _cell(m["paper_mse_crop_sum"], ".2f"),
         ]
         for name, m in result["models"].items()
@@ -205,11 +254,18 @@ def comparison(result: dict[str, Any]) -> page.Section:
         "MSE per crop",
         "spread of seeds",
         "MSE",
-        "95 % over tiles",
+        "95 % over tiles and seeds",
         "best epochs",
         "paper's MSE per crop",
     ]
-    section.add(page.table(f"{result['crops']} crops, {result['tiles']} ground tiles", header, rows, 0))
+    section.add(
+        page.table(
+            f"{result['crops']} crops, {result['tiles']} ground tiles, {result.get('seeds', 1)} training runs each",
+            header,
+            rows,
+            0,
+        )
+    )
     words = {True: "yes", False: "no", None: "needs two seeds and two tiles"}
     rows = [
         [

@@ -1,0 +1,174 @@
+"""95 % intervals over ground: delete-one-unit jackknife of ratios with Student's t, and the spread over training runs.
+
+Pairs on one ground tile share terrain and images, so tiles and not pairs are the independent witnesses. All that is
+compared is a ratio of sums over tiles: a mean squared error (squared errors over pixels), a gain (errors of one model
+over those of another, paired tile by tile), a share of matches (hits over matches). With the ratio R of all units and
+R_k of all but unit k, on a scale f that takes out skewness (errors: -R^(-1/2); gains: logarithm; shares: logit):
+
+    variance = (n - 1)/n sum (f(R_k) - f(R))^2                                       Tukey (1958), Ann. Math. Stat. 29, 614
+
+Units of unequal weight w count as (sum w)^2 / sum w^2 equal ones (Kish 1965, Survey Sampling, 11.7), less one for the
+degrees of freedom of t. Several training runs add the variance of their mean; degrees of freedom are joined after
+Satterthwaite (1946), Biometrics Bull. 2, 110. `tests/test_intervals.py` simulates how often such intervals hold the truth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special, stats
+
+LEVEL = 0.95
+FEWEST_UNITS = 4  # coverage is tested from here on
+
+
+@dataclass(frozen=True)
+class Variance:
+    """A variance and the degrees of freedom with which it is known."""
+
+    value: float
+    freedom: float
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate and the bounds of its 95 % interval; NaN where there is no spread to judge by."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Where a ratio is nearly normal: there, back again, and the bounds (low, high) between which it exists."""
+
+    to: Callable[[NDArray], NDArray]
+    back: Callable[[float], float]
+    low: float = -math.inf
+    high: float = math.inf
+
+
+PLAIN = Scale(np.asarray, float)
+LOG = Scale(np.log, np.exp, 0.0)
+LOGIT = Scale(special.logit, special.expit, 0.0, 1.0)
+# Squared errors per tile scatter like a lognormal law with a deviation of 60 to 70 %: the mean of few is skewed even
+# on a logarithm. Where -R^(-1/2) reaches 0, nothing bounds the error from above.
+ERROR = Scale(lambda ratio: -(ratio**-0.5), lambda value: value**-2 if value < 0 else math.inf, 0.0)
+
+
+def choose_units(tile: NDArray, site: NDArray) -> tuple[NDArray, str]:
+    """Labels of the independent pieces of ground, (N,), and their name: tiles, or the sites of a single tile."""
+    return (tile, "tile") if len(np.unique(tile)) > 1 else (site, "site")
+
+
+def ratio_interval(total: NDArray, weight: NDArray, unit: NDArray, scale: Scale = PLAIN) -> Interval:
+    """sum(total) / sum(weight) with its 95 % interval over ground and training runs.
+
+    total : (N,) or (runs, N); weight : likewise, or (N,) for all runs; unit : (N,) labels of pieces of ground. Entries
+    that are not finite do not count.
+    The value is the ratio of the means over runs. Where a ratio does not exist on ``scale`` it stays as it is.
+    """
+    totals, weights, labels = _known(total, weight, unit)
+    if not len(labels):
+        return Interval(math.nan, math.nan, math.nan)
+    value = float(_ratio(totals.mean(0).sum(), weights.mean(0).sum()))
+    runs = _ratio(totals.sum(axis=1), weights.sum(axis=1))
+    asked = np.concatenate([_without_one(totals, weights, labels), runs])
+    if not bool(((asked > scale.low) & (asked < scale.high)).all()):
+        scale = PLAIN
+    parts = [ground_variance(totals, weights, labels, scale)]
+    if len(totals) > 1:
+        parts.append(run_variance(scale.to(runs)))
+    noise = join(parts)
+    reach = student_quantile(noise.freedom) * math.sqrt(noise.value) if noise.freedom > 0 else math.nan
+    if not (math.isfinite(reach) and math.isfinite(value)):
+        return Interval(value, math.nan, math.nan)
+    middle = float(scale.to(np.asarray(value)))
+    with np.errstate(over="ignore"):  # few units of very unequal weight: nothing bounds the ratio
+        return Interval(value, float(scale.back(middle - reach)), float(scale.back(middle + reach)))
+
+
+def gain_interval(ours: NDArray, other: NDArray, unit: NDArray) -> Interval:
+    """By how many percent ``ours`` lowers the summed squared error of ``other``, paired unit by unit.
+
+    ours, other : (N,) or (runs, N) sums of squared errors; unit : (N,) labels of pieces of ground
+    """
+    ratio = ratio_interval(ours, other, unit, LOG)
+    return Interval(100 * (1 - ratio.value), 100 * (1 - ratio.high), 100 * (1 - ratio.low))
+
+
+def ground_variance(total: NDArray, weight: NDArray, unit: NDArray, scale: Scale = PLAIN) -> Variance:
+    """Jackknife variance of sum(total) / sum(weight) on ``scale``, means over runs; freedom 0 for less than two units.
+
+    total, weight : (runs, N); unit : (N,)
+    """
+    totals, weights = _per_unit(total, weight, unit)
+    count = len(weights)
+    if count < 2:
+        return Variance(math.nan, 0.0)
+    without, of_all = scale.to(_without_one(total, weight, unit)), scale.to(_ratio(totals.sum(), weights.sum()))
+    spread = np.square(without - of_all).sum() * (count - 1) / count
+    return Variance(float(spread), max(1.0, effective_units(weights) - 1))
+
+
+def run_variance(values: Sequence[float] | NDArray) -> Variance:
+    """Variance of the mean of independent training runs; freedom 0 for one run."""
+    if len(values) < 2:
+        return Variance(math.nan, 0.0)
+    return Variance(float(np.var(values, ddof=1)) / len(values), len(values) - 1.0)
+
+
+def effective_units(weights: NDArray) -> float:
+    """How many units of equal weight tell as much: (sum w)^2 / sum w^2."""
+    return float(np.square(weights.sum()) / np.square(weights).sum())
+
+
+def join(parts: Sequence[Variance]) -> Variance:
+    """The variance of a sum of independent parts; freedom 0 where a part is not known."""
+    if any(part.freedom <= 0 for part in parts):
+        return Variance(math.nan, 0.0)
+    value = sum(part.value for part in parts)
+    below = sum(part.value**2 / part.freedom for part in parts)
+    # Without any spread all freedoms are equally true.
+    return Variance(value, value**2 / below if below > 0 else max(part.freedom for part in parts))
+
+
+def student_quantile(freedom: float, level: float = LEVEL) -> float:
+    """Half width of the central interval of Student's t that holds ``level``."""
+    return float(stats.t.ppf(0.5 + level / 2, freedom))
+
+
+def two_sided_p(t: float, freedom: float) -> float:
+    """Probability that |Student's t| exceeds |t|."""
+    return float(2 * stats.t.sf(abs(t), freedom))
+
+
+def _known(total: NDArray, weight: NDArray, unit: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    totals, weights = np.broadcast_arrays(
+        np.atleast_2d(np.asarray(total, float)), np.atleast_2d(np.asarray(weight, float))
+    )
+    known = (np.isfinite(totals) & np.isfinite(weights)).all(axis=0)
+    return totals[:, known], weights[:, known], np.asarray(unit)[known]
+
+
+def _per_unit(total: NDArray, weight: NDArray, unit: NDArray) -> tuple[NDArray, NDArray]:
+    """Sums over each unit of the means over runs, (units,) each; units without weight do not count."""
+    _, index = np.unique(unit, return_inverse=True)
+    totals, weights = (np.bincount(index, np.atleast_2d(v).mean(0)) for v in (total, weight))
+    return totals[weights > 0], weights[weights > 0]
+
+
+def _without_one(total: NDArray, weight: NDArray, unit: NDArray) -> NDArray:
+    """The ratio of all units but one, (units,); empty for a single unit."""
+    totals, weights = _per_unit(total, weight, unit)
+    return _ratio(totals.sum() - totals, weights.sum() - weights)[: len(weights) * (len(weights) > 1)]
+
+
+def _ratio(above: NDArray | float, below: NDArray | float) -> NDArray:
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.asarray(above, float) / np.asarray(below, float))

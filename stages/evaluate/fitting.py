@@ -1,0 +1,179 @@
+"""What is free is fitted on train pairs: global coefficient sets, and gain and offset of uncalibrated images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+
+from stages.evaluate import fit
+from stages.evaluate.renderers import Batch, Constant, Reader, Renderer, batches, read_batch, unit_images
+from stages.evaluate.rows import HAPKE_FREE, Row
+from stages.physics.formation.radiometry import full_scale
+
+SAMPLE_PIXELS = 100_000  # for sets that are fitted to a random sample
+LEVENBERG_PIXELS = 20_000  # of these, for models that are not linear: a handful of parameters needs no more
+
+
+def choose_fit_pairs(reader: Reader, wanted: np.ndarray, limit: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Train pairs to fit on, and pairs of ``wanted`` in frames that no train pair shows. Sorted indices.
+
+    At most ``limit`` of each (0: all), drawn in proportion to the frames' pairs.
+    """
+    split, frame = np.asarray(reader.split), np.asarray(reader.frame)
+    train = np.flatnonzero(split == 0)
+    orphans = wanted[~np.isin(frame[wanted], frame[train])]
+    return _thin(train, frame, limit, seed), _thin(orphans, frame, limit, seed)
+
+
+def _thin(indices: np.ndarray, frame: np.ndarray, limit: int, seed: int) -> np.ndarray:
+    if not limit or len(indices) <= limit:
+        return indices
+    rng = np.random.default_rng(seed)
+    kept = []
+    for f in np.unique(frame[indices]):
+        mine = indices[frame[indices] == f]
+        share = max(1, round(limit * len(mine) / len(indices)))
+        kept.append(rng.choice(mine, size=min(share, len(mine)), replace=False))
+    return np.sort(np.concatenate(kept))
+
+
+def fit_rows(
+    reader: Reader,
+    rows: Sequence[Row],
+    train: np.ndarray,
+    orphans: np.ndarray,
+    frames: int,
+    calibrated: bool,
+    scale: float,
+    size: int,
+    seed: int,
+    tick: Callable[[int], None] = lambda count: None,
+) -> None:
+    """Fit everything that is free in the renderers of ``rows`` on ``train``.
+
+    Uncalibrated frames without train pairs get their gain and offset from ``orphans``, which no shared coefficient sees.
+    """
+    renderers = list({row.renderer.name: row.renderer for row in rows}.values())
+    _fit_sets(reader, renderers, train, frames, calibrated, scale, size, seed, tick)
+    if calibrated:
+        return
+    grams = {r.name: (fit.FrameGram(1, frames), fit.FrameGram(1, frames)) for r in renderers}
+    for part, indices in enumerate((train, orphans)):
+        for chosen in batches(indices, size):
+            batch = read_batch(reader, chosen, scale)
+            for renderer in renderers:
+                features = renderer.radiance_factor(batch)[:, None]
+                grams[renderer.name][part].add(features, batch.image, batch.usable, batch.frame)
+            tick(len(chosen))
+    for renderer in renderers:
+        known, own = grams[renderer.name]
+        use_own = (known.pixels == 0)[:, None, None]
+        joined = np.where(use_own, own.gram, known.gram)
+        renderer.gain, renderer.offset = fit.solve_gain_offset(joined, np.ones(1))
+
+
+def fit_steps(train: np.ndarray, orphans: np.ndarray, calibrated: bool) -> int:
+    """How many pairs ``fit_rows`` reads."""
+    return len(train) if calibrated else 2 * len(train) + len(orphans)
+
+
+def _fit_sets(
+    reader: Reader,
+    renderers: Sequence[Renderer],
+    train: np.ndarray,
+    frames: int,
+    calibrated: bool,
+    scale: float,
+    size: int,
+    seed: int,
+    tick: Callable[[int], None],
+) -> None:
+    """One coefficient set for all ground for every renderer that has one."""
+    of = {r.name: r for r in renderers}
+    shared = [of[name] for name in ("global", "global_extended") if name in of]
+    exact = bool(shared) and shared[0].model.linear
+    sampled = ({"kernels", "hapke_fitted"} & set(of)) or (shared and not exact)
+    albedo = of.get("lunar_lambert") if calibrated else None  # of uncalibrated images the gains carry it
+    gram = fit.FrameGram(len(shared[0].model.parameters), frames) if exact else None
+    albedo_gram = fit.FrameGram(1, frames)
+    samples: list[fit.PixelSample] = []
+    rng = np.random.default_rng(seed)
+    per_crop = max(1, SAMPLE_PIXELS // max(1, len(train)))
+    for chosen in batches(train, size) if exact or sampled or albedo else ():
+        batch = read_batch(reader, chosen, scale)
+        if gram is not None:
+            gram.add(unit_images(shared[0].model, batch), batch.image, batch.usable, batch.frame)
+        if albedo is not None:
+            albedo_gram.add(albedo.radiance_factor(batch)[:, None], batch.image, batch.usable, batch.frame)
+        if sampled:
+            samples.append(sample_pixels(batch, per_crop, rng))
+        tick(len(chosen))
+    if albedo is not None:
+        albedo.scale = float(fit.solve_coefficients(albedo_gram.gram)[0])
+    sample = _join(samples) if samples else None
+    if gram is not None:
+        found = Constant(_solve_linear(gram.gram, shared[0], calibrated))
+    elif shared and sample is not None:
+        thin = sample.thin(LEVENBERG_PIXELS)
+        found = Constant(fit.fit_nonlinear(shared[0].model, thin, frames, calibrated))
+    for renderer in shared:
+        renderer.coefficients = found
+    if "kernels" in of and sample is not None:
+        grams = fit.sample_gram(of["kernels"].model, sample, frames)
+        of["kernels"].coefficients = Constant(_solve_linear(grams, of["kernels"], calibrated))
+    if "hapke_fitted" in of and sample is not None:
+        hapke, thin = of["hapke_fitted"], sample.thin(LEVENBERG_PIXELS)
+        hapke.coefficients = Constant(fit.fit_nonlinear(hapke.model, thin, frames, calibrated, HAPKE_FREE))
+
+
+def _solve_linear(gram: np.ndarray, renderer: Renderer, calibrated: bool) -> np.ndarray:
+    if calibrated:
+        return fit.solve_coefficients(gram)
+    return fit.solve_uncalibrated(gram, np.array([p.default for p in renderer.model.parameters]))
+
+
+def dn_scale(reader: Reader, indices: np.ndarray, size: int) -> float:
+    """Full DN range of the images from their largest valid value."""
+    largest = 0.0
+    indices = np.unique(indices)
+    for start in range(0, len(indices), size):
+        chosen = indices[start : start + size]
+        valid = torch.as_tensor(reader.valid(chosen)).bool()
+        if valid.any():
+            largest = max(largest, float(torch.as_tensor(reader.image(chosen))[valid].max()))
+    return full_scale(largest)
+
+
+def sample_pixels(batch: Batch, per_crop: int, rng: np.random.Generator) -> fit.PixelSample:
+    """Up to ``per_crop`` usable pixels of every crop."""
+    state = batch.state
+    visibility = torch.ones_like(batch.image) if state.sun_visibility is None else state.sun_visibility
+    width = batch.image[0].numel()
+    chosen = []
+    for b, usable in enumerate(batch.usable):
+        places = np.flatnonzero(usable.reshape(-1).numpy())
+        picked = rng.choice(places, size=min(per_crop, len(places)), replace=False)
+        chosen.append(b * width + np.sort(picked))
+    index = torch.from_numpy(np.concatenate(chosen).astype(np.int64))
+    shape = batch.image.shape
+
+    def take(field: torch.Tensor) -> torch.Tensor:
+        return field.expand(shape).reshape(-1)[index]
+
+    angles = state.angles
+    frame = torch.as_tensor(batch.frame.astype(np.int64))[:, None, None]
+    return fit.PixelSample(
+        take(angles.cos_incidence),
+        take(angles.cos_emission),
+        take(angles.cos_phase),
+        take(visibility),
+        take(batch.image),
+        take(frame),
+    )
+
+
+def _join(samples: list[fit.PixelSample]) -> fit.PixelSample:
+    names = fit.PixelSample.__dataclass_fields__
+    return fit.PixelSample(**{n: torch.cat([getattr(s, n) for s in samples]) for n in names})
