@@ -122,7 +122,12 @@ def test_an_image_of_other_ground_is_refused(tmp_path):
 def test_blocks_are_those_that_crops_touch_and_no_more_than_asked_for():
     crs = CRS.from_proj4(f"+proj=eqc +R={RADIUS} +units=m +no_defs")
     grid = Grid(crs.to_wkt(), Affine(GSD, 0, 0, 0, -GSD, 0), 1000, 700, RADIUS)
-    assert choose_blocks([100], [100], 64, grid) == [(64, 64, 64, 64), (64, 128, 64, 64), (128, 64, 64, 64), (128, 128, 64, 64)]
+    assert choose_blocks([100], [100], 64, grid) == [
+        (64, 64, 64, 64),
+        (64, 128, 64, 64),
+        (128, 64, 64, 64),
+        (128, 128, 64, 64),
+    ]
     everywhere = choose_blocks(*(v.ravel() for v in np.mgrid[32:1000:20, 32:700:20]), 64, grid)
     assert all(r + h <= 1000 and c + w <= 700 for r, c, h, w in everywhere)
     assert len(choose_blocks(*(v.ravel() for v in np.mgrid[32:1000:20, 32:700:20]), 64, grid, count=20)) == 20
