@@ -120,8 +120,9 @@ $(A)/scene.h5: | $(STAMP)
 $(A)/crops.h5: $(A)/scene.h5
 	$(LUNARGR) sample $< --count 3000 --tile-m 32000 --split 70/10/20 -o $@ --overwrite
 
+# the frames were never orthorectified: relief displaces them, by up to 3 px
 $(A)/pairs.h5: $(A)/crops.h5
-	$(LUNARGR) project $< -o $@ --overwrite
+	$(LUNARGR) project $< --register field -o $@ --overwrite
 
 $(A)/checkpoint.h5: $(A)/pairs.h5
 	$(LUNARGR) train $< --model M2 --epochs 15 --batch 32 --lr 5e-4 --schedule cosine --precision fp32 -o $@ --overwrite --resume

@@ -98,6 +98,25 @@ def test_terrain_outside_the_crop_casts_its_shadow(tmp_path):
     assert checked > 0
 
 
+def test_unknown_pixels_do_not_spoil_the_rounded_ones(small_artefacts, tmp_path, monkeypatch):
+    """Where an image ends inside a crop, from its first pixel on: the rest must come back, and what is unknown as NaN."""
+    from stages.physics.images.source_images import MapSource, Pixels
+
+    whole = MapSource.read
+
+    def cut_off(self, *window):
+        pixels = whole(self, *window)
+        pixels.values[:3], pixels.valid[:3] = np.nan, False
+        return Pixels(pixels.values, pixels.valid, None)
+
+    monkeypatch.setattr(MapSource, "read", cut_off)
+    project.run(small_artefacts["crops"], tmp_path / "cut.h5", project.Config())
+    with PairReader(tmp_path / "cut.h5") as cut, PairReader(small_artefacts["pairs"]) as full:
+        found, expected = cut.batch([0, 5]), full.batch([0, 5])
+    assert not found.valid[:, :3].any() and found.valid[:, 3:].all()
+    assert torch.equal(found.image[:, 3:], expected.image[:, 3:])
+
+
 def test_moved_scene_changed_scene_and_mixed_units(small_artefacts, small_files, tmp_path):
     with pytest.raises(ArtefactError, match="--scene"):
         elsewhere = tmp_path / "crops.h5"

@@ -64,7 +64,7 @@ class PairDatasets:
             **dict(zip(DISPLACEMENT, pair.displacement, strict=True)),
         }
         for name, dataset in self.sets.items():
-            dataset[k] = values[name]
+            _put_known(dataset, k, np.asarray(values[name]))
         if pair.ortho is not None:
             ray = pair.ortho
             angles = (ray.detector_line, ray.detector_sample, np.degrees(ray.emission), np.degrees(ray.phase))
@@ -73,7 +73,7 @@ class PairDatasets:
 
 
 def _put_known(target: h5py.Dataset, k: int, values: NDArray) -> None:
-    """One pair's values, unknown ones as the dataset writes them."""
+    """One pair's values, unknown ones as the dataset writes them: a NaN among rounded values would spoil its chunk."""
     known = np.isfinite(values)
     target[k] = values if known.all() else np.where(known, values, target.fillvalue)
 
