@@ -30,6 +30,7 @@ from stages.physics.maps.positions import blocks, valid_positions
 Progress = Callable[[int, int, str], None]
 
 TEST_TILES = 20  # where --tile-m is left to us and the scene is large enough: intervals over fewer are wide
+WITH_ROOM = 0.8  # of the tiles, in which a crop fits: images end, elevations have holes
 SMALLEST_TILE, LARGEST_TILE = 1.125, 4  # of the scene's crops
 
 
@@ -201,7 +202,7 @@ def _scene_edge(positions: PositionMasks, shares: tuple[float, float, float]) ->
         return LARGEST_TILE * crop
     height = int((used[:, 0] + used[:, 2]).max() - used[:, 0].min())
     width = int((used[:, 1] + used[:, 3]).max() - used[:, 1].min())
-    tiles = TEST_TILES / min(s for s in shares if s > 0)
+    tiles = TEST_TILES / min(s for s in shares if s > 0) / WITH_ROOM
     edge = min(max(math.sqrt(height * width / tiles), SMALLEST_TILE * crop), LARGEST_TILE * crop)
     longest = max(height, width)
     return math.ceil(longest / max(1, math.floor(longest / edge)))

@@ -140,3 +140,59 @@ def test_extend_scores_the_extended_model_in_further_rows(tmp_path):
     assert biased["learned_extended"]["mse"] == pytest.approx(clean["learned"]["mse"], rel=1e-3)
     assert biased["learned"]["mse"] > 3 * biased["learned_extended"]["mse"]
     assert {"learned_extended_gain_offset", "global_extended"} <= set(biased) - set(clean)
+
+
+def test_training_runs_of_one_model_are_one_learned_row(trained, tmp_path):
+    config = train.Config(
+        epochs=1, batch=8, widths=WIDTHS, dropout=(0.0,) * 3, device="cpu", precision="fp32", lr=1e-2, seed=5
+    )
+    train.run(trained / "pairs.h5", tmp_path / "other.h5", config)
+    files = (trained / "pairs.h5", trained / "checkpoint.h5", tmp_path / "other.h5")
+    options = ("--only", "learned", "--only", "global", "--device", "cpu", "-o", tmp_path / "both.h5")
+    code, printed = run_command("evaluate", *files, *options)
+    assert code == 0 and "2 training runs" in printed
+    result = json.loads((tmp_path / "both.json").read_text())
+    row = result["models"]["learned"]
+    assert result["seeds"] == [0, 5] and row["mse"] == pytest.approx(np.mean(row["mse_runs"]))
+    with open_artefact(tmp_path / "both.h5", EVALUATION) as file:
+        assert file["run_seed"][...].tolist() == [0, 5]
+        pixels, runs = file["valid_pixels"][...], file["run_mse"][...]
+    assert (runs * pixels).sum(axis=1) / pixels.sum() == pytest.approx(row["mse_runs"])
+    code, message = run_command("evaluate", files[0], files[1], files[1], "-o", tmp_path / "twice.h5")
+    assert code == 3 and "seed 0 again" in message and "\n" not in message
+
+
+def _descends_from(path, sample_config):
+    """What an artefact says that was made from a sample with this config."""
+    record = {"schema": "crops", "config": sample_config}
+    with h5py.File(path, "a") as file:
+        file.attrs["provenance"] = json.dumps({"0" * 64: record})
+
+
+def test_a_diagnosis_that_may_have_learned_from_the_test_ground_is_refused(trained, tmp_path):
+    from schemas import DIAGNOSIS, ArtefactError, ArtefactWriter
+    from stages.effects.extension import check_ground
+
+    pairs, diagnosis = tmp_path / "pairs.h5", tmp_path / "diagnosis.h5"
+    pairs.write_bytes((trained / "pairs.h5").read_bytes())
+    content = {"report": "{}", "extension": "[]"}
+    with ArtefactWriter(diagnosis, DIAGNOSIS, {"frame": 1}, attributes=content, seed=0) as out:
+        out.write("image_id", ["frame0"])
+    assert "cannot be told" in check_ground(diagnosis, pairs)[0]
+    here, elsewhere = [10.0, 10.2, -1.0, 1.0], [50.0, 50.2, -1.0, 1.0]
+    _descends_from(pairs, {"split_id": "a", "split_ground_deg": here})
+    for ident, ground, allowed in (("a", here, True), ("b", elsewhere, True), ("b", here, False)):
+        _descends_from(diagnosis, {"split_id": ident, "split_ground_deg": ground})
+        if allowed:
+            assert check_ground(diagnosis, pairs) == []
+            continue
+        with pytest.raises(ArtefactError, match="learned from the test ground"):
+            check_ground(diagnosis, pairs)
+        commands = (
+            ("evaluate", pairs, trained / "checkpoint.h5", "--extend", diagnosis, "-o", tmp_path / "e.h5"),
+            ("train", pairs, "--extend", diagnosis, "-o", tmp_path / "c.h5"),
+        )
+        for command in commands:
+            code, message = run_command(*command, "--device", "cpu")
+            assert code == 3 and "--tile-m, --split and --seed" in message and "\n" not in message
+    assert not (tmp_path / "e.h5").exists() and not (tmp_path / "c.h5").exists()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import h5py
 import numpy as np
 import pytest
@@ -136,3 +138,51 @@ def test_impossible_requests_are_refused(small_artefacts, tmp_path):
         with pytest.raises(kind, match=words):
             sample.run(scene, out, sample.Config(**options))
         assert not out.exists()
+
+
+def test_whatever_is_sampled_from_a_scene_is_split_alike(small_artefacts, tmp_path):
+    """By image or as a stack, in crops of any size: no training ground of one sample is test ground of another."""
+    samples = {}
+    for stack, crop in ((False, 32), (True, 16), (False, 16)):
+        options = {"stack": stack, "crop": crop, "count": 150, "tile_m": None, "seed": 4, "split": (0.6, 0.15, 0.25)}
+        samples[stack, crop] = crops(small_artefacts, tmp_path, **options)[1]
+    ids = set()
+    for path in tmp_path.glob("crops*.h5"):
+        with h5py.File(path) as file:
+            ids.add(json.loads(file.attrs["config"])["split_id"])
+    assert len(ids) == 1
+    ground = [[paint(data, crop, part) for part in range(3)] for (_, crop), data in samples.items()]
+    for mine in ground:
+        for other in ground:
+            for a, b in ((0, 1), (0, 2), (1, 2)):
+                assert not (mine[a] & other[b]).any()
+
+
+def test_other_options_of_the_split_are_another_split(small_artefacts, tmp_path):
+    ids = []
+    for k, options in enumerate(({}, {"seed": 1}, {"split": (0.6, 0.2, 0.2)}, {"tile_m": 1400.0})):
+        path = tmp_path / f"{k}.h5"
+        sample.run(small_artefacts["scene"], path, sample.Config(**({"count": 40, "tile_m": 1280.0} | options)))
+        with h5py.File(path) as file:
+            ids.append(json.loads(file.attrs["config"])["split_id"])
+    assert len(set(ids)) == 4
+
+
+def test_crops_that_are_scored_lie_in_one_tile(small_artefacts, tmp_path):
+    """Tiles are the independent units of intervals: those of validation and test must not share ground."""
+    _, data = crops(small_artefacts, tmp_path, count=300)
+    scored = data["split"] > 0
+    for name in ("row", "col"):
+        first, last = data[name] - 16, data[name] + 15
+        assert (first[scored] // 64 == last[scored] // 64).all()
+        assert not (first[~scored] // 64 == last[~scored] // 64).all()
+
+
+def test_a_scene_with_room_has_twenty_test_tiles(small_artefacts, tmp_path):
+    _, data = crops(small_artefacts, tmp_path, tile_m=None, crop=16, count=600, split=(0.5, 0.25, 0.25))
+    assert len(np.unique(data["tile"][data["split"] == 2])) >= 20
+
+
+def test_a_crop_larger_than_the_scene_s_tiles_asks_for_larger_tiles(small_artefacts, tmp_path):
+    with pytest.raises(ConfigError, match="--tile-m"):
+        sample.run(small_artefacts["scene"], tmp_path / "c.h5", sample.Config(crop=256, count=5))

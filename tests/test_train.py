@@ -134,6 +134,27 @@ def test_killed_and_resumed_is_uninterrupted(small_artefacts, trained, tmp_path)
     assert not list(tmp_path.glob("*.resume.h5"))
 
 
+@pytest.mark.parametrize(("schedule", "longer"), [("constant", True), ("cosine", False)])
+def test_a_cosine_is_not_resumed_with_another_number_of_epochs(
+    small_artefacts, tmp_path, monkeypatch, schedule, longer
+):
+    """What it did in its first epochs hangs on how many there were to be; a constant rate goes on."""
+    out = tmp_path / "checkpoint.h5"
+
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(train, "_write_checkpoint", stop)
+        train.run(small_artefacts["pairs"], out, config(epochs=1, schedule=schedule))
+    again = (small_artefacts["pairs"], out, config(epochs=2, schedule=schedule))
+    if longer:
+        assert len(train.run(*again, resume=True).history.train_loss) == 2
+    else:
+        with pytest.raises(ArtefactError, match="other options"):
+            train.run(*again, resume=True)
+
+
 def test_resume_refuses_another_run(small_artefacts, tmp_path):
     out = tmp_path / "checkpoint.h5"
     train.run(small_artefacts["pairs"], out, config(epochs=1))
