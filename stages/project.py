@@ -25,6 +25,7 @@ from schemas import (
     InputError,
     open_artefact,
 )
+from schemas.files.inputs import check_file
 from schemas.provenance import sha256
 from schemas.reading import unpack
 from stages.physics.horizon.scene import Overview, horizon_in_scene, make_overview
@@ -114,10 +115,12 @@ def run(
         total = file["row"].shape[0]
         first, last = (total * k // config.shard[1] for k in (config.shard[0], config.shard[0] + 1))
         used = sorted({int(k) for k in file["image_index"][first:last]})
+        _check_sources(crops, [frames[k] for k in used])
         units = {frames[k].units for k in used} or {"iof"}
         if len(units) > 1:
             raise InputError(f"{crops}: expected one kind of units, found both 'iof' and 'dn'; ingest them apart.")
         with open_artefact(scene, SCENE) as scene_file:
+            _check_places(crops, file, scene_file["elevation"].shape)
             return _project(
                 crops,
                 scene,
@@ -245,6 +248,36 @@ def _project(
         shadowed / max(1, valid_pixels),
         tuple(registered),
     )
+
+
+def _check_sources(crops: Path, frames: list[Frame]) -> None:
+    """The images and cameras must be those that the scene's masks were made from. Raises InputError."""
+    for frame in frames:
+        for path, known in ((frame.path, frame.sha256), (frame.camera, frame.camera_sha256)):
+            if path is None or not known:
+                continue
+            check_file(path, f"a file of the image '{frame.image_id}'")
+            if sha256(path) != known:
+                raise InputError(
+                    f"{path}: expected the file of image '{frame.image_id}' that {crops} was made with, found another content; "
+                    "bring it back, or run 'lunargr ingest' and 'lunargr sample' again."
+                )
+
+
+def _check_places(crops: Path, file: h5py.File, shape: tuple[int, int]) -> None:
+    """Crops are square, even, and lie on the scene. Raises ArtefactError."""
+    height, width = file["elevation"].shape[1:]
+    if height != width or height % 2:
+        raise ArtefactError(
+            f"{crops}:/elevation: expected square crops of an even size, found {height} x {width}; run 'lunargr sample' again."
+        )
+    for name, edge in zip(("row", "col"), shape, strict=True):
+        centre = file[name][...].astype(np.int64)
+        if len(centre) and (centre.min() < height // 2 or centre.max() > edge - height // 2):
+            raise ArtefactError(
+                f"{crops}:/{name}: expected crops that lie on the scene, {height // 2} .. {edge - height // 2}, "
+                f"found {centre.min()} .. {centre.max()}; run 'lunargr sample' again."
+            )
 
 
 def _scene_of(crops: Path, file: h5py.File, config: Config) -> Path:

@@ -81,7 +81,9 @@ def command(
     )
     check_output(output, [terrain, checkpoint], overwrite)
     gridding = None
-    if not infer.open_terrain(terrain):
+    if infer.open_terrain(terrain):
+        infer.check_body(terrain, body)
+    else:
         from stages import ingest
         from stages.network.predictor import load_predictor
 

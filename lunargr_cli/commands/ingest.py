@@ -70,6 +70,10 @@ def command(
     )
     for name in found.skipped:
         console.say(f"left out: image '{name}' does not touch the DEM")
+    for frame in found.blank:
+        console.say(
+            f"warning: {frame.path}: image '{frame.image_id}' has no valid pixel on the DEM; is it all nodata there?"
+        )
     if found.frames:
         rows = [(f.image_id, f.units, f"{a:.2f}") for f, a in zip(found.frames, found.valid_area_km2, strict=True)]
         console.table(f"images: where a crop of {crop} px fits", ("image", "units", "km2"), rows)

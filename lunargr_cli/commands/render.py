@@ -152,7 +152,7 @@ def command(
         parameters=given,
         terrain_only=dem is not None,
         extension=str(extend) if extend else None,
-        body=body or "moon",
+        body=body,
         backplanes_in_tif=backplanes,
     )
     console = Console(quiet)

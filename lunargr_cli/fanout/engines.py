@@ -16,6 +16,7 @@ from schemas.errors import ConfigError, InputError, LunargrError
 
 ANSWER = 10.0  # seconds in which a scheduler must answer
 WORKERS = 300.0  # seconds in which it must have a worker: a queue may have to start it
+MOST_WORKERS = 4096  # of one machine
 DEATHS = 5  # workers that one part may take down before it is blamed
 ERRORS = 2  # times that a part is tried again after an error of the machine it ran on
 
@@ -58,11 +59,11 @@ def open_dask(scheduler: str, folder: Path) -> Iterator[Engine]:
         ) from None
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     kind, _, number = scheduler.partition(":")
+    if kind == "local" and not (number.isdecimal() and 1 <= int(number[:9]) <= MOST_WORKERS and len(number) < 9):
+        raise ConfigError(f"--scheduler: expected local:N with 1 <= N <= {MOST_WORKERS} workers, found '{scheduler}'.")
     with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set(_settings(int(number) if number.isdigit() else 1)))
+        stack.enter_context(dask.config.set(_settings(int(number) if kind == "local" else 1)))
         if kind == "local":
-            if not (number.isdigit() and int(number) > 0):
-                raise ConfigError(f"--scheduler: expected local:N with N workers, found '{scheduler}'.")
             cluster = stack.enter_context(
                 distributed.LocalCluster(
                     n_workers=int(number),

@@ -58,7 +58,7 @@ class Config:
     parameters: Mapping[str, float] = field(default_factory=dict)
     terrain_only: bool = False
     extension: str | None = None
-    body: str = "moon"
+    body: str | None = None
     backplanes_in_tif: bool = False
 
 

@@ -16,6 +16,7 @@ from stages.physics.bodies.spheres import Body
 from stages.physics.cameras import Camera, open_camera
 from stages.physics.images.table import ASTRONOMICAL_UNIT
 from stages.physics.light.sun_disc import SUN_RADIUS
+from stages.physics.maps.grid import check_same_body
 from stages.physics.terrain.shading import Light
 from stages.physics.terrain.sun import Sun, check_sun_is_up, find_sun
 from stages.physics.terrain.sun_visibility import SunHorizon
@@ -29,6 +30,7 @@ def open_source(source: Path, config: Config, body: Body) -> Iterator[Surface]:
     """The terrain and reflectance to render. Raises LunargrError."""
     opened = open_terrain if config.terrain_only else open_surface
     with opened(source, config.model, config.parameters, body) as surface:
+        check_same_body(source, surface.grid.radius, config.body)
         yield surface
 
 
@@ -57,6 +59,10 @@ def make_light(
 
 
 def _named_sun(surface: Surface, config: Config, body: Body) -> Sun:
+    if config.time is not None and config.body is None and abs(body.radius - surface.grid.radius) > 0.005 * body.radius:
+        raise ConfigError(
+            f"--time: expected --body beside it, since {surface.path} (radius {surface.grid.radius:g} m) does not show the Moon."
+        )
     return find_sun(
         surface.grid,
         Body(body.name, surface.grid.radius),

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import ConfigError, InputError
+from schemas.files.inputs import read_json
 from stages.simulate.hidden import Hidden, parse_hidden
 
 Range = tuple[float, float]
@@ -100,6 +101,14 @@ _NOT_NEGATIVE = (
     "read_noise",
     "registration_error",
 )
+LARGEST_DEM = 32768  # pixels a side: the truth is made in memory
+_COUNTS = {
+    "size_px": (64, LARGEST_DEM),
+    "images": (1, 10000),
+    "seed": (0, 2**63 - 1),
+    "dem_holes": (0, 10000),
+    "image_holes": (0, 10000),
+}
 _RANGES: dict[str, Range] = {
     "image_gsd": (0.1, 1e4),
     "altitude": (1e3, 1e7),
@@ -121,7 +130,7 @@ def make_config(values: dict[str, Any], where: str = "recipe") -> Config:
         like = getattr(default, key)
         try:
             clean[key] = _coerce(value, like)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError, AttributeError):
             raise ConfigError(f"{where}: '{key}': expected a value like {json.dumps(like)}, found {value!r}.") from None
     config = Config(**clean)
     _check(config, where)
@@ -132,7 +141,7 @@ def _coerce(value: Any, like: Any) -> Any:
     if isinstance(like, bool) or isinstance(value, bool):
         raise TypeError
     if isinstance(like, int):
-        if int(value) != float(value):
+        if isinstance(value, str) or not math.isfinite(value) or int(value) != value:
             raise ValueError
         return int(value)
     if isinstance(like, float):
@@ -167,14 +176,16 @@ def _check(config: Config, where: str) -> None:
             raise ConfigError(
                 f"{where}: '{key}': expected low <= high within {low:g}..{high:g}, found {first:g}, {last:g}."
             )
-    if config.size_px < 64:
-        raise ConfigError(f"{where}: 'size_px': expected at least 64 pixels, found {config.size_px}.")
-    if config.images < 1:
-        raise ConfigError(f"{where}: 'images': expected at least 1, found {config.images}.")
+    for key, (first, last) in _COUNTS.items():
+        if not first <= getattr(config, key) <= last:
+            raise ConfigError(f"{where}: '{key}': expected {first} .. {last}, found {getattr(config, key)}.")
+    if config.dem_size > LARGEST_DEM:
+        raise ConfigError(
+            f"{where}: 'size_px': expected at most {LARGEST_DEM // config.factor} pixels at {config.factor} DEM pixels a pixel, "
+            f"found {config.size_px}."
+        )
     if config.units not in ("iof", "dn"):
         raise ConfigError(f"{where}: 'units': expected 'iof' or 'dn', found '{config.units}'.")
-    if config.seed < 0:
-        raise ConfigError(f"{where}: 'seed': expected at least 0, found {config.seed}.")
     if not 0 <= config.oblique_share <= 1:
         raise ConfigError(f"{where}: 'oblique_share': expected 0..1, found {config.oblique_share:g}.")
     if abs(config.latitude_deg) > 89 or abs(config.longitude_deg) > 360:
@@ -197,12 +208,7 @@ def _check(config: Config, where: str) -> None:
 
 def read_recipe(path: Path) -> dict[str, Any]:
     """The keys of a recipe file. Raises InputError."""
-    if not path.exists():
-        raise InputError(f"{path}: no such file; expected a recipe ('lunargr simulate --print-recipe' writes one).")
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: expected a recipe in JSON, found something else ({error}).") from None
+    values = read_json(path, "a recipe in JSON ('lunargr simulate --print-recipe' writes one)")
     if not isinstance(values, dict):
         raise InputError(f"{path}: expected a JSON object of recipe keys, found {type(values).__name__}.")
     return values

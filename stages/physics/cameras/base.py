@@ -9,7 +9,6 @@ three axes in radians.
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError, InputError, RegistryError
+from schemas.files.inputs import read_json
 
 Floats = NDArray[np.float64]
 POSE = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
@@ -232,14 +232,7 @@ def camera_from_document(document: Mapping[str, Any], where: str) -> Camera:
 
 def read_document(path: Path) -> Mapping[str, Any]:
     """A camera's JSON document. Raises InputError."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected a camera model (JSON).") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected a camera model in JSON, cannot read it ({error}).") from None
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: expected a camera model in JSON, found something else ({error}).") from None
+    document = read_json(path, "a camera model in JSON")
     if not isinstance(document, Mapping):
         raise InputError(f"{path}: expected a JSON object that describes a camera, found a {type(document).__name__}.")
     return document

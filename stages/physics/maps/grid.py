@@ -6,6 +6,7 @@ array[r, c]. GDAL counts corners from 0 (our centre 0 is its 0.5), CSM centres f
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -19,11 +20,12 @@ from rasterio.errors import CRSError
 from rasterio.transform import Affine
 
 from schemas.errors import ArtefactError, GeometryError, InputError
-from stages.physics.bodies.spheres import Body
+from stages.physics.bodies.spheres import Body, find_body
 
 GDAL_CENTRE = 0.5  # GDAL's coordinate of the centre of the first pixel
 CSM_CENTRE = 0.5
 ISIS_CENTRE = 1.0
+BODY_TOLERANCE = 0.005  # of the radius: mean, equatorial and reference spheres of one body
 _ELLIPSOID = re.compile(r"(?:SPHEROID|ELLIPSOID)\[\"[^\"]*\",\s*([0-9.eE+]+),\s*([0-9.eE+]+)")
 
 Floats = NDArray[np.float64]
@@ -218,9 +220,17 @@ def _scaled_tangent(latitude_deg: Floats, factor: float) -> Floats:
 def check_body(where: str, crs: CRS, body: Body) -> None:
     """Refuse a CRS of another body. Raises GeometryError."""
     found = crs_radius(crs)
-    if found is not None and abs(found - body.radius) > 0.005 * body.radius:
+    if found is not None and abs(found - body.radius) > BODY_TOLERANCE * body.radius:
         raise GeometryError(
             f"{where}: expected a CRS on a sphere of {body.radius:g} m ({body.name}), found radius {found:g} m; name the body with --body."
+        )
+
+
+def check_same_body(where: object, radius: float, body: str | None) -> None:
+    """Refuse a --body that contradicts what a file says. Raises GeometryError."""
+    if body is not None and abs(find_body(body).radius - radius) > BODY_TOLERANCE * radius:
+        raise GeometryError(
+            f"{where}: lies on a body of {radius:g} m radius, found --body {body} ({find_body(body).radius:g} m); leave --body away."
         )
 
 
@@ -229,9 +239,29 @@ def read_grid(file: h5py.File, path: object) -> Grid:
     if "crs" not in file or "GeoTransform" not in file["crs"].attrs:
         raise ArtefactError(f"{path}:/crs: expected a georeference, found none; write it again.")
     attributes = file["crs"].attrs
-    c, a, b, f, d, e = (float(v) for v in str(attributes["GeoTransform"]).split())
+    try:
+        c, a, b, f, d, e = (float(v) for v in str(attributes["GeoTransform"]).split())
+        wkt, gsd = str(attributes["crs_wkt"]), float(file.attrs["gsd_m"])
+        crs = _parsed(wkt)
+        metres = crs.is_projected and abs(crs.linear_units_factor[1] - 1) < 1e-6
+    except (CRSError, KeyError, TypeError, ValueError) as error:
+        raise ArtefactError(
+            f"{path}:/crs: expected a georeference, found a damaged one ({error}); write it again."
+        ) from None
+    north_up = b == d == 0 and a > 0 > e and all(map(math.isfinite, (a, c, e, f)))
+    if not (metres and north_up and abs(a - gsd) <= 1e-3 * gsd and abs(a + e) <= 1e-2 * gsd):
+        raise ArtefactError(
+            f"{path}:/crs: expected a grid in metres, north up, with the file's gsd_m = {gsd:g}, found GeoTransform "
+            f"'{attributes['GeoTransform']}'; write it again."
+        )
+    radius = crs_radius(crs)
+    if radius is not None and abs(radius - file.attrs["body_radius_m"]) > BODY_TOLERANCE * radius:
+        raise ArtefactError(
+            f"{path}: expected body_radius_m near its CRS's radius of {radius:g} m, found {file.attrs['body_radius_m']:g}; "
+            "write it again."
+        )
     height, width = file["elevation"].shape[-2:]
-    return Grid(str(attributes["crs_wkt"]), Affine(a, b, c, d, e, f), height, width, float(file.attrs["body_radius_m"]))
+    return Grid(wkt, Affine(a, b, c, d, e, f), height, width, float(file.attrs["body_radius_m"]))
 
 
 def require_crs(where: str, crs: CRS | None, transform: Affine) -> CRS:
