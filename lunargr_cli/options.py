@@ -11,6 +11,7 @@ import typer
 
 from schemas.errors import ConfigError
 
+MOST = 2**31 - 1  # what counts pairs, pixels or crops
 MOST_PARTS = 100_000  # of one stage: beyond it a part is less than its own overhead
 
 Output = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True)]

@@ -10,7 +10,7 @@ SPLITS = (("train", 0), ("validation", 1), ("test", 2))
 VALIDITY = (("invalid", 0), ("valid", 1))
 UNITS = (("iof", 0), ("dn", 1))
 SMALLEST_GSD, LARGEST_GSD = 1e-4, 1e6  # m
-BODY_RADII = (100.0, 1e8)  # m: from Bennu to beyond Jupiter
+BODY_RADII = (100.0, 1e10)  # m: from Bennu to what is flat in any crop
 LARGEST_COUNT = 2**31 - 1
 
 _GRID = (

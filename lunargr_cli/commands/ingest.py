@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.options import (
+    MOST,
     BodyOption,
     Output,
     Overwrite,
@@ -36,7 +37,9 @@ def command(
     gsd: Annotated[
         float | None, typer.Option("--gsd", help="Working ground sample distance, m (default: the DEM's own).")
     ] = None,
-    crop: Annotated[int, typer.Option("--crop", help="Crop size in pixels that valid positions are made for.")] = 128,
+    crop: Annotated[
+        int, typer.Option("--crop", min=1, max=MOST, help="Crop size in pixels that valid positions are made for.")
+    ] = 128,
     output: Output = Path("scene.h5"),
     body: BodyOption = None,
     skip_outside: Annotated[
