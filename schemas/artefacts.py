@@ -11,6 +11,7 @@ VALIDITY = (("invalid", 0), ("valid", 1))
 UNITS = (("iof", 0), ("dn", 1))
 SMALLEST_GSD, LARGEST_GSD = 1e-4, 1e6  # m
 BODY_RADII = (100.0, 1e10)  # m: from Bennu to what is flat in any crop
+HEIGHTS = (-1e8, 1e8)  # m
 LARGEST_COUNT = 2**31 - 1
 
 _GRID = (
@@ -135,8 +136,8 @@ SCENE = declare(
         + (
             Attribute("crop_px", "crop size that valid_position was eroded for", True, "integer", 2, LARGEST_COUNT),
             Attribute("elevation_source", "name of the DEM file"),
-            Attribute("elevation_low_m", "least elevation, m", False, "number"),
-            Attribute("elevation_high_m", "largest elevation, m", False, "number"),
+            Attribute("elevation_low_m", "least elevation, m", False, "number", *HEIGHTS),
+            Attribute("elevation_high_m", "largest elevation, m", False, "number", *HEIGHTS),
             Attribute("dem_valid_px", "valid pixels of the DEM", False, "integer", 0),
         ),
         sizes=(("window", 4),),

@@ -15,6 +15,7 @@ from schemas.declaration import ROOT_ATTRIBUTES, STRING, Attribute, Schema, Vari
 from schemas.errors import ArtefactError
 
 UNIT_TOLERANCE = 1e-3  # of a unit vector's length: writers in float32, and in few decimals
+GSD_TOLERANCE = 1e-3  # relative: what writing numbers as text may cost
 LARGEST_TABLE = 100_000_000  # values of a table; beyond it a size is a slip of the pen, or worse
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
@@ -109,6 +110,27 @@ def _check_attribute(path: Path, file: h5py.File, attribute: Attribute, advice: 
         if not isinstance(found := parse_json(text, where, advice=advice), wanted):
             kind = "list" if wanted is list else "object"
             raise ArtefactError(f"{where}: expected a JSON {kind}, found {_short(found)}; {advice}.")
+
+
+def check_georeference(path: Path, file: h5py.File, schema: Schema) -> None:
+    """The numbers that place a map: north up, in pixels as large as the file says. Raises ArtefactError."""
+    if not any(v.georeferenced for v in schema.variables):
+        return
+    where, advice = f"{path}:/crs", f"write it again with 'lunargr {schema.stage}'"
+    found = file["crs"].attrs if "crs" in file else {}
+    if as_text(found.get("crs_wkt")) is None or as_text(found.get("GeoTransform")) is None:
+        raise ArtefactError(f"{where}: expected a georeference (crs_wkt, GeoTransform), found none; {advice}.")
+    text = str(found["GeoTransform"])
+    try:
+        c, a, b, f, d, e = (float(v) for v in text.split())
+    except ValueError:
+        raise ArtefactError(f"{where}: expected six numbers in GeoTransform, found '{text}'; {advice}.") from None
+    gsd = float(np.ravel(file.attrs["gsd_m"])[0])
+    north_up = b == d == 0 and a > 0 > e and all(map(math.isfinite, (a, c, e, f)))
+    if not (north_up and abs(a - gsd) <= GSD_TOLERANCE * gsd and abs(a + e) <= GSD_TOLERANCE * gsd):
+        raise ArtefactError(
+            f"{where}: expected a grid that is north up, of square pixels of gsd_m = {gsd:g}, found GeoTransform '{text}'; {advice}."
+        )
 
 
 def as_text(value: Any) -> str | None:

@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from schemas.checks import as_text, check_attributes, check_links, check_values, parse_json
+from schemas.checks import as_text, check_attributes, check_georeference, check_links, check_values, parse_json
 from schemas.declaration import SCHEMAS, STRING, Schema, Variable
 from schemas.errors import ArtefactError
 from schemas.files.hdf5 import silence_hdf5
@@ -42,6 +42,7 @@ def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5
         check_attributes(path, file, schema)
         _check_sizes(path, file, schema)
         _check_views(path, file)
+        check_georeference(path, file, schema)
         check_values(path, file, schema)
     except BaseException:
         file.close()

@@ -11,6 +11,7 @@ import argparse
 import contextlib
 import io
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -25,6 +26,7 @@ from typing import Any
 
 LIMIT = 60  # seconds a case may take; those that are refused take far less
 HUGE = 1e30
+_PROGRESS = re.compile(r": \d+/\d+ \(")  # how far a command had come
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,7 @@ def _judge(case: Case, code: int, error: str, changed: bool) -> str:
         return "traceback"
     if changed:
         return "left something"
-    lines = [line for line in error.splitlines() if line.strip()]
+    lines = [line for line in error.splitlines() if line.strip() and not _PROGRESS.search(line)]
     if code == 2:
         return "" if lines and lines[0].startswith("Usage") else "usage error without usage"
     if len(lines) != 1:
@@ -176,6 +178,8 @@ def _judge(case: Case, code: int, error: str, changed: bool) -> str:
         return "control characters"
     if case.names not in lines[0]:
         return f"does not name {case.names}"
+    if lines[0].startswith("lunargr: --"):  # the option that it names is what to change
+        return ""
     return "" if ";" in lines[0] or ". " in lines[0].rstrip(".") else "no remedy"
 
 

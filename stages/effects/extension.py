@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from schemas import DIAGNOSIS, ArtefactError, open_artefact, read_strings
+from schemas import DIAGNOSIS, ArtefactError, RegistryError, open_artefact, read_strings
 from stages.effects.base import Effect, Survey, get_effect
 
 
@@ -30,6 +30,8 @@ def load_extension(path: Path, image_ids: Sequence[str] | None = None) -> list[E
             names = _tables(entries, file)
             tables = {name: torch.from_numpy(np.asarray(file[name][...], np.float32)) for name in names}
             return _effects(entries, tables, known, image_ids)
+        except RegistryError as error:
+            raise ArtefactError(f"{path}: root attribute 'extension': {error}") from None
         except (KeyError, TypeError, ValueError, AttributeError, IndexError, RuntimeError) as error:
             raise ArtefactError(
                 f"{path}: root attribute 'extension': expected effects with their values and tables, found something else "

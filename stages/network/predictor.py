@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from schemas.artefacts import CHECKPOINT
-from schemas.errors import ArtefactError, ConfigError
+from schemas.errors import ArtefactError, ConfigError, RegistryError
 from schemas.reading import open_artefact, read_config, read_strings
 from stages.network.normalisation import scale_elevation
 from stages.network.stored import check_finite, check_weights, read_layout
@@ -102,7 +102,10 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
             raise ArtefactError(
                 f"{path}: expected a checkpoint for model '{model}', found one for '{name}'; train again or drop --model."
             )
-        reflectance = get_model(name)
+        try:
+            reflectance = get_model(name)
+        except RegistryError as error:
+            raise ArtefactError(f"{path}: root attribute 'model': {error}") from None
         found = json.loads(str(file.attrs["coefficients"]))
         expected = [p.name for p in reflectance.parameters]
         if found != expected:

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from schemas.errors import ConfigError
 from stages.physics.bodies.spheres import Body
-from stages.physics.cameras import Camera, open_camera
+from stages.physics.cameras import Camera
+from stages.physics.images.frame_geometry import open_camera_for
 from stages.physics.images.table import ASTRONOMICAL_UNIT
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import check_same_body
@@ -23,6 +24,8 @@ from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface, open_surface, open_terrain
 from stages.render.config import SUN, Config
 from stages.render.viewpoint import look_at, pinhole_view, place, rotation_from_quaternion
+
+LARGEST_VIEW = 1 << 30  # pixels; an EXR of them has 4 GB a channel
 
 
 @contextlib.contextmanager
@@ -85,8 +88,18 @@ def _three(values: Sequence[float], option: str) -> tuple[float, float, float]:
 
 def find_camera(surface: Surface, config: Config) -> Camera:
     """The camera of a view: a model from a file, or a pinhole at a place. Raises LunargrError."""
+    camera = _camera(surface, config)
+    if camera.lines * camera.samples > LARGEST_VIEW:
+        raise ConfigError(
+            f"{config.camera or '--size'}: expected a view of at most {LARGEST_VIEW:,} pixels, found "
+            f"{camera.samples} x {camera.lines}; render it in smaller pieces."
+        )
+    return camera
+
+
+def _camera(surface: Surface, config: Config) -> Camera:
     if config.camera:
-        return open_camera(config.camera)
+        return open_camera_for(Path(config.camera), surface.grid.radius)
     grid = surface.grid
     lon, lat, altitude = _three(config.position or (), "--position")
     position = place(lon, lat, altitude, grid.radius)

@@ -101,6 +101,14 @@ _NOT_NEGATIVE = (
     "read_noise",
     "registration_error",
 )
+LARGEST = 1e6  # of any length in metres or number of electrons
+_MOST = {
+    "hurst": 2.0,
+    "crater_density": 100.0,
+    "boulders_per_km2": 1e5,
+    "geometry_contrast": 100.0,
+    "free_contrast": 100.0,
+}
 LARGEST_DEM = 32768  # pixels a side: the truth is made in memory
 _COUNTS = {
     "size_px": (64, LARGEST_DEM),
@@ -164,6 +172,10 @@ def _coerce(value: Any, like: Any) -> Any:
 
 
 def _check(config: Config, where: str) -> None:
+    for key in (*_POSITIVE, *_NOT_NEGATIVE, "base_elevation"):
+        most = _MOST.get(key, LARGEST)
+        if abs(getattr(config, key)) > most:
+            raise ConfigError(f"{where}: '{key}': expected at most {most:g}, found {getattr(config, key):g}.")
     for key in _POSITIVE:
         if not getattr(config, key) > 0:
             raise ConfigError(f"{where}: '{key}': expected a number above 0, found {getattr(config, key):g}.")

@@ -89,7 +89,7 @@ def read_frames(table: Path, body: Body | None = None) -> list[Frame]:
         except csv.Error as error:
             raise InputError(f"{table}: expected a CSV table, found something else ({error}); mend the file.") from None
     if not rows:
-        raise InputError(f"{table}: expected at least one image, found none.")
+        raise InputError(f"{table}: expected at least one image, found none; mend the table.")
     return _frames(table, rows, body)
 
 
@@ -99,7 +99,7 @@ def _frames(table: Path, rows: Sequence[Mapping[str, Any]], body: Body | None) -
     seen: set[str] = set()
     for frame in frames:
         if frame.image_id in seen:
-            raise InputError(f"{table}: expected each image_id once, found '{frame.image_id}' twice.")
+            raise InputError(f"{table}: expected each image_id once, found '{frame.image_id}' twice; mend the table.")
         seen.add(frame.image_id)
     return frames
 
@@ -109,13 +109,17 @@ def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Fram
     text = {str(k): ("" if v is None else str(v).strip()) for k, v in row.items() if k is not None}
     for key in ("image_id", "path"):
         if not text.get(key):
-            raise InputError(f"{where}: expected a value in column '{key}', found none.")
+            raise InputError(f"{where}: expected a value in column '{key}', found none; mend the table.")
     for key, value in text.items():
         if has_control_characters(value):
-            raise InputError(f"{where}: expected text without control characters in column '{key}', found {value!r}.")
+            raise InputError(
+                f"{where}: expected text without control characters in column '{key}', found {value!r}; mend the table."
+            )
     units = text.get("units", "").lower()
     if units not in ("iof", "dn"):
-        raise InputError(f"{where} ({text['image_id']}): expected units 'iof' or 'dn', found '{units or 'nothing'}'.")
+        raise InputError(
+            f"{where} ({text['image_id']}): expected units 'iof' or 'dn', found '{units or 'nothing'}'; mend the table."
+        )
     camera = text.get("camera", "")
     text = complete_row(
         text,
@@ -132,10 +136,12 @@ def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Fram
             value = float(text.get(key, ""))
         except ValueError:
             raise InputError(
-                f"{where} ({text['image_id']}): expected a number in column '{key}', found '{text.get(key, '') or 'nothing'}'."
+                f"{where} ({text['image_id']}): expected a number in column '{key}', found '{text.get(key, '') or 'nothing'}'; mend the table."
             ) from None
         if not (math.isfinite(value) and low <= value <= high):
-            raise InputError(f"{where} ({text['image_id']}): expected '{key}' in {low:g}..{high:g}, found {value:g}.")
+            raise InputError(
+                f"{where} ({text['image_id']}): expected '{key}' in {low:g}..{high:g}, found {value:g}; mend the table."
+            )
         numbers[key] = value
     return Frame(
         image_id=text["image_id"],

@@ -49,7 +49,7 @@ def open_raster(path: Path, what: str = "a raster") -> Iterator[DatasetReader]:
             dataset = rasterio.open(path)
     except RasterioIOError as error:
         raise InputError(
-            f"{path}: expected {what} that GDAL reads, found something else ({_one_line(error)})."
+            f"{path}: expected {what} that GDAL reads, found something else ({_one_line(error)}); is it the right file?"
         ) from None
     try:
         with dataset:

@@ -91,7 +91,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
             kind = read_kind(path).name
             if kind not in ("svbrdf", "scene"):
                 raise ArtefactError(
-                    f"{path}: expected an 'svbrdf' (from 'lunargr infer') or a 'scene' (from 'lunargr ingest'), found a '{kind}'."
+                    f"{path}: expected an 'svbrdf' (from 'lunargr infer') or a 'scene' (from 'lunargr ingest'), found a '{kind}'; check the order of the files."
                 )
             file = stack.enter_context(open_artefact(path, SVBRDF if kind == "svbrdf" else SCENE))
             grid, elevation = read_grid(file, path), Elevation(file["elevation"])
@@ -100,7 +100,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
                     raise ConfigError(
                         f"--model: {path.name} holds its own reflectance ({file.attrs['model']}); to render its terrain with another model give --dem {path.name}."
                     )
-                reflectance = get_model(str(file.attrs["model"]))
+                reflectance = stored_model(path, str(file.attrs["model"]))
                 _check_names(path, reflectance, read_strings(file, "coefficient_name"))
                 empty = np.empty(0, np.float32)
                 yield Surface(path, grid, elevation, reflectance, file["coefficients"], empty)
@@ -129,6 +129,14 @@ def open_terrain(path: Path, model: str | None, parameters: Mapping[str, float],
         return
     with open_surface(path, model, parameters, body) as surface:
         yield surface
+
+
+def stored_model(path: Path, name: str) -> ReflectanceModel:
+    """The model that a file names. Raises ArtefactError."""
+    try:
+        return get_model(name)
+    except RegistryError as error:
+        raise ArtefactError(f"{path}: root attribute 'model': {error}") from None
 
 
 def _check_names(path: Path, model: ReflectanceModel, found: list[str]) -> None:
