@@ -85,7 +85,7 @@ def run(
 
     After every epoch the whole state goes to a file beside the output, from which ``resume`` goes on to the same result.
     """
-    _check(config)
+    check(config)
     check_output(output, [pairs], overwrite)
     rank, ranks = join_group()
     device = choose_device(config.device)
@@ -246,7 +246,8 @@ def evaluate_loss(
     return mean_over_ranks(total, pixels, ranks, device)
 
 
-def _check(config: Config) -> None:
+def check(config: Config) -> None:
+    """Refuse options that cannot be. Raises ConfigError, RegistryError."""
     if config.epochs < 1 or config.batch < 1:
         raise ConfigError(f"--epochs and --batch: expected at least 1, found {config.epochs} and {config.batch}.")
     if not (math.isfinite(config.lr) and 0 < config.lr < 1):
@@ -260,6 +261,7 @@ def _check(config: Config) -> None:
             f"--widths: expected 2 .. {DEEPEST} stages of 1 .. {WIDEST} channels, found {'-'.join(map(str, config.widths))}."
         )
     get_model(config.model)
+    choose_device(config.device)
 
 
 def _load_extensions(path: str | None) -> list[Extension]:

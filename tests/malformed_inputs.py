@@ -265,7 +265,7 @@ def raster_cases() -> Iterator[Case]:
 
     dem, render = [*INGEST, "images.csv"], ["render", "--dem", "dem.tif", *RENDER[2:]]
     step = 1e-3
-    feet = 'COMPD_CS["c",%s,VERT_CS["h",VERT_DATUM["d",2005],UNIT["US survey foot",0.304800609601219],AXIS["Up",UP]]]'
+    feet = 'COMPD_CS["c",%s,VERT_CS["NAVD88 height (ftUS)",VERT_DATUM["North American Vertical Datum 1988",2005,AUTHORITY["EPSG","5103"]],UNIT["US survey foot",0.304800609601219,AUTHORITY["EPSG","9003"]],AXIS["Gravity-related height",UP],AUTHORITY["EPSG","6360"]]]'
     wkt = local_metric_crs(small_scene.LON, small_scene.LAT, small_scene.RADIUS).to_wkt(version="WKT1_GDAL")
     changes: dict[str, dict[str, Any]] = {
         "in feet": {"unit": "ft"}, "in US survey feet": {"unit": "US survey foot"}, "in kilometres": {"unit": "km"}, "in furlongs": {"unit": "furlong"},

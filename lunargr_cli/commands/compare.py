@@ -42,7 +42,7 @@ def command(
     With --resume, runs that the folder already holds are kept and an interrupted one goes on where it stopped.
     """
     from lunargr_cli.console import Console
-    from schemas import ConfigError
+    from schemas import SPLITS, ConfigError
     from stages import compare, evaluate, train
     from stages.physics.photometry import get_model
 
@@ -63,6 +63,9 @@ def command(
     except ValueError:
         raise ConfigError(f"--widths: expected numbers like 16-32-64-128-256, found '{widths}'.") from None
     settings: dict[str, Any] = {"epochs": epochs, "batch": batch, "lr": lr, "schedule": schedule, "widths": channels}
+    train.check(train.Config(device=device, **settings))
+    if split not in dict(SPLITS):
+        raise ConfigError(f"--split: expected one of {', '.join(dict(SPLITS))}, found '{split}'.")
     files: list[tuple[Path, Path]] = []
     for seed in range(seeds):
         for name in names:

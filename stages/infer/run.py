@@ -232,4 +232,4 @@ def _names_schema(path: Path) -> bool:
         with h5py.File(path, "r") as file:
             return "lunargr_schema" in file.attrs
     except OSError:
-        return True  # damaged: let open_artefact say so
+        return path.suffix.lower() in (".h5", ".hdf5")  # damaged: let open_artefact or the raster's reader say so

@@ -82,6 +82,8 @@ def plan_grid(
     whole = Grid(dataset.crs.to_wkt(), t, dataset.height, dataset.width, radius)
     lon, lat = (float(v) for v in whole.lonlat(dataset.height / 2 - 0.5, dataset.width / 2 - 0.5))
     reach = np.hypot(dataset.height * north, dataset.width * east) / 2 / radius
+    if not (abs(lat) <= 90 and math.isfinite(lon)):
+        raise GeometryError(f"{dem}: its georeference puts the DEM off the body; check its CRS and transform.")
     if not reach < LARGEST_REACH:
         raise GeometryError(
             f"{dem}: expected a region that one local map can hold (up to {math.degrees(2 * LARGEST_REACH):.0f} deg across), "

@@ -225,8 +225,11 @@ def is_artefact(path: Path) -> bool:
     silence_hdf5()
     if not (path.is_file() and h5py.is_hdf5(path)):
         return False
-    with h5py.File(path, "r") as file:
-        return "lunargr_schema" in file.attrs
+    try:
+        with h5py.File(path, "r") as file:
+            return "lunargr_schema" in file.attrs
+    except OSError:  # damaged: whoever opens it as a raster says so
+        return False
 
 
 def _write_grid(writer: ArtefactWriter, grid: Grid) -> None:

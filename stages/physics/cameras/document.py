@@ -15,7 +15,7 @@ from stages.physics.bodies.spheres import find_body
 Floats = NDArray[np.float64]
 LARGEST_IMAGE = 100_000_000  # lines, samples: longer than any strip from orbit
 ROTATION_TOLERANCE = 1e-6
-LOWEST_CAMERA, FARTHEST_CAMERA = 0.9, 1e13  # of the radius (deep craters of small bodies); m
+LOWEST_CAMERA, FARTHEST_CAMERA = 0.5, 1e13  # of the radius (bodies are far from round), m
 QUATERNION_TOLERANCE = 1e-3  # tables keep 8 digits; further off is not a rotation
 
 

@@ -6,6 +6,7 @@ array[r, c]. GDAL counts corners from 0 (our centre 0 is its 0.5), CSM centres f
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -264,6 +265,10 @@ def require_crs(where: str, crs: CRS | None, transform: Affine) -> CRS:
     if crs is None or transform == Affine.identity():
         raise InputError(
             f"{where}: expected a georeferenced raster, found no CRS; assign one (gdal_edit.py -a_srs) or, for a raw image, give its camera."
+        )
+    if not all(map(math.isfinite, tuple(transform)[:6])) or transform.determinant == 0:
+        raise InputError(
+            f"{where}: expected pixels of a finite size, found the transform {tuple(transform)[:6]}; set it with gdal_edit.py -a_ullr."
         )
     try:
         crs.to_wkt()
