@@ -256,7 +256,7 @@ def _check_sources(crops: Path, frames: list[Frame]) -> None:
         for path, known in ((frame.path, frame.sha256), (frame.camera, frame.camera_sha256)):
             if path is None or not known:
                 continue
-            check_file(path, f"a file of the image '{frame.image_id}'")
+            check_file(path, f"a file of the image '{frame.image_id}' of {crops}")
             if sha256(path) != known:
                 raise InputError(
                     f"{path}: expected the file of image '{frame.image_id}' that {crops} was made with, found another content; "

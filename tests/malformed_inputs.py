@@ -130,7 +130,7 @@ def table_cases() -> Iterator[Case]:
     documents = ["", "5", "null", '"text"', "[1, 2]", "[[]]", "{}", "[]", '{"images": 5}', '{"images": [5]}', "{", deep, deep + "]" * 200_000,
                  '[{"image_id": "\\ud800", "path": "image0.tif"}]', '[{"image_id": {"a": 1}, "path": []}]', "[NaN]", "[{}]", "1" * 10_000]  # fmt: skip
     for number, document in enumerate(documents):
-        name = f"JSON table {number}: {document[:24]}"
+        name = f"JSON table {number}: {document[:18]}"
         yield Case(name, [*INGEST, "images.json"], "images.json", text("images.json", document))
     for path in ("nowhere.csv", ".", "/dev/zero", "/dev/null", "/dev/zero.json"):
         yield Case(f"table: --images {path}", [*INGEST, path], path)

@@ -13,7 +13,7 @@ SAMPLE = [
     "pairs: /sun_horizon_deg missing",
     "checkpoint: weights NaN",
     "checkpoint: attribute elevation_scale_m = 'nan'",
-    'checkpoint: config {"widths": [4, 4, 8], "dropout": [0.0, 0.0, 0.0],',
+    'checkpoint: config {"widths": [4, 4, 8], "dropout": [0.0, 0.0, 0.0], ',
     "image of other contents than sample saw",
     "table: subsolar_longitude_deg = ''",
     "table: start_time = 'yesterday'",
@@ -57,7 +57,7 @@ SAMPLE = [
     "simulate --size-px '1000000000'",
     "JSON table 1: 5",
     "JSON table 4: [1, 2]",
-    'JSON table 13: [{"image_id": "\\ud800",',
+    'JSON table 13: [{"image_id": "\\ud',
     # hangs, and what a terminal would obey
     "DEM sparse and all nodata, 300,000 px a side",
     "table: --images /dev/zero",
