@@ -12,7 +12,22 @@ import typer
 from schemas.errors import ConfigError
 
 MOST = 2**31 - 1  # what counts pairs, pixels or crops
+MOST_WORKERS = 4096  # of one machine
 MOST_PARTS = 100_000  # of one stage: beyond it a part is less than its own overhead
+
+
+def check_scheduler(text: str | None) -> str | None:
+    """``local:N`` with a number of workers that can be, or an address. Raises ConfigError."""
+    if text is None:
+        return None
+    kind, _, number = text.partition(":")
+    local = number.isdecimal() and len(number) < 9 and 1 <= int(number) <= MOST_WORKERS
+    if not text.strip() or (kind == "local" and not local):
+        raise ConfigError(
+            f"--scheduler: expected an address, or local:N with 1 <= N <= {MOST_WORKERS} workers, found '{text}'."
+        )
+    return text
+
 
 Output = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output.")]
@@ -33,6 +48,7 @@ Scheduler = Annotated[
     typer.Option(
         "--scheduler",
         metavar="ADDRESS|local:N",
+        callback=check_scheduler,
         help="Work in parts on Dask: N processes of this machine, or the workers of a scheduler; goes on like --resume.",
     ),
 ]

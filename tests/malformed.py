@@ -197,7 +197,7 @@ def controls() -> Iterator[Case]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", default="", help="cases whose name holds this")
+    parser.add_argument("--only", default="", help="cases whose name matches this regular expression")
     parser.add_argument("--processes", type=int, default=25, help="every so manieth case also as a process of its own")
     arguments = parser.parse_args()
     faults: list[Outcome] = []
@@ -205,13 +205,13 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         good = good_files(Path(name) / "good")
         for case in controls():
-            if arguments.only in case.name:
+            if re.search(arguments.only, case.name):
                 outcome = run_case(case, good)
                 counts["controls"] += 1
                 if outcome.code != 0:
                     faults.append(Outcome(case, outcome.code, outcome.error, outcome.seconds, "control fails"))
                     print(f"control fails  {case.name}: {outcome.error[-300:]}", flush=True)
-        cases = [c for c in all_cases() if arguments.only in c.name]
+        cases = [c for c in all_cases() if re.search(arguments.only, c.name)]
         for number, case in enumerate(cases):
             outcomes = [run_case(case, good)]
             if arguments.processes and number % arguments.processes == 0:

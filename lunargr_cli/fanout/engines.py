@@ -12,11 +12,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
+from lunargr_cli.options import check_scheduler
 from schemas.errors import ConfigError, InputError, LunargrError
 
 ANSWER = 10.0  # seconds in which a scheduler must answer
 WORKERS = 300.0  # seconds in which it must have a worker: a queue may have to start it
-MOST_WORKERS = 4096  # of one machine
 DEATHS = 5  # workers that one part may take down before it is blamed
 ERRORS = 2  # times that a part is tried again after an error of the machine it ran on
 
@@ -58,9 +58,8 @@ def open_dask(scheduler: str, folder: Path) -> Iterator[Engine]:
             f"--scheduler: needs Dask distributed ({error.name} is missing); install it with: pip install 'lunargr[cluster]'."
         ) from None
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    check_scheduler(scheduler)
     kind, _, number = scheduler.partition(":")
-    if kind == "local" and not (number.isdecimal() and 1 <= int(number[:9]) <= MOST_WORKERS and len(number) < 9):
-        raise ConfigError(f"--scheduler: expected local:N with 1 <= N <= {MOST_WORKERS} workers, found '{scheduler}'.")
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(_settings(int(number) if kind == "local" else 1)))
         if kind == "local":

@@ -110,10 +110,10 @@ def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Fram
     for key in ("image_id", "path"):
         if not text.get(key):
             raise InputError(f"{where}: expected a value in column '{key}', found none; mend the table.")
-    for key, value in text.items():
-        if has_control_characters(value):
+    for key, cell in text.items():
+        if has_control_characters(cell):
             raise InputError(
-                f"{where}: expected text without control characters in column '{key}', found {value!r}; mend the table."
+                f"{where}: expected text without control characters in column '{key}', found {cell!r}; mend the table."
             )
     units = text.get("units", "").lower()
     if units not in ("iof", "dn"):
