@@ -105,6 +105,7 @@ def run_here(arguments: Sequence[str], limit: int = LIMIT) -> tuple[int, str]:
     """(exit code, standard error) of a command in this process, as ``main`` ends it; 1 and the traceback's end for a bug."""
     from typer.testing import CliRunner
 
+    from lunargr_cli.console import one_line
     from lunargr_cli.main import app
     from schemas.errors import EXIT_CODE, LunargrError
 
@@ -120,7 +121,7 @@ def run_here(arguments: Sequence[str], limit: int = LIMIT) -> tuple[int, str]:
         signal.signal(signal.SIGALRM, before)
     error = result.exception
     if isinstance(error, LunargrError):
-        return EXIT_CODE, f"{result.stderr}lunargr: {error}\n"
+        return EXIT_CODE, f"{result.stderr}lunargr: {one_line(str(error))}\n"
     if error is not None and not isinstance(error, SystemExit):
         return 1, f"{result.stderr}Traceback: {type(error).__name__}: {error}\n"
     return result.exit_code, result.stderr

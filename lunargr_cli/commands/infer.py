@@ -92,7 +92,9 @@ def command(
         from stages import ingest
         from stages.network.predictor import load_predictor
 
-        gridding = ingest.Config(gsd=None if any_gsd else load_predictor(checkpoint).gsd, body=body or "moon")
+        gridding = ingest.Config(
+            gsd=None if any_gsd else load_predictor(checkpoint).gsd, body="moon" if body is None else body
+        )
     if in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.stages import run_infer
 

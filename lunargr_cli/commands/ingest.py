@@ -57,7 +57,9 @@ def command(
     from stages import ingest
 
     console = Console(quiet)
-    config = ingest.Config(gsd=gsd, crop=crop, body=body or "moon", skip_outside=skip_outside, shard=parse_shard(shard))
+    config = ingest.Config(
+        gsd=gsd, crop=crop, body="moon" if body is None else body, skip_outside=skip_outside, shard=parse_shard(shard)
+    )
     if in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.stages import run_ingest
 

@@ -22,10 +22,8 @@ from stages.physics.terrain.shading import Light
 from stages.physics.terrain.sun import Sun, check_sun_is_up, find_sun
 from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface, open_surface, open_terrain
-from stages.render.config import SUN, Config
+from stages.render.config import LARGEST_VIEW, SUN, Config
 from stages.render.viewpoint import look_at, pinhole_view, place, rotation_from_quaternion
-
-LARGEST_VIEW = 1 << 30  # pixels; an EXR of them has 4 GB a channel
 
 
 @contextlib.contextmanager

@@ -139,7 +139,9 @@ def make_config(values: dict[str, Any], where: str = "recipe") -> Config:
         try:
             clean[key] = _coerce(value, like)
         except (TypeError, ValueError, OverflowError, AttributeError):
-            raise ConfigError(f"{where}: '{key}': expected a value like {json.dumps(like)}, found {value!r}.") from None
+            raise ConfigError(
+                f"{where}: '{key}': expected a value like {json.dumps(like)}, found {value!r}; mend it."
+            ) from None
     config = Config(**clean)
     _check(config, where)
     return config
@@ -175,38 +177,40 @@ def _check(config: Config, where: str) -> None:
     for key in (*_POSITIVE, *_NOT_NEGATIVE, "base_elevation"):
         most = _MOST.get(key, LARGEST)
         if abs(getattr(config, key)) > most:
-            raise ConfigError(f"{where}: '{key}': expected at most {most:g}, found {getattr(config, key):g}.")
+            raise ConfigError(f"{where}: '{key}': expected at most {most:g}, found {getattr(config, key):g}; mend it.")
     for key in _POSITIVE:
         if not getattr(config, key) > 0:
-            raise ConfigError(f"{where}: '{key}': expected a number above 0, found {getattr(config, key):g}.")
+            raise ConfigError(f"{where}: '{key}': expected a number above 0, found {getattr(config, key):g}; mend it.")
     for key in _NOT_NEGATIVE:
         if getattr(config, key) < 0:
-            raise ConfigError(f"{where}: '{key}': expected a number of at least 0, found {getattr(config, key):g}.")
+            raise ConfigError(
+                f"{where}: '{key}': expected a number of at least 0, found {getattr(config, key):g}; mend it."
+            )
     for key, (low, high) in _RANGES.items():
         first, last = getattr(config, key)
         if not low <= first <= last <= high:
             raise ConfigError(
-                f"{where}: '{key}': expected low <= high within {low:g}..{high:g}, found {first:g}, {last:g}."
+                f"{where}: '{key}': expected low <= high within {low:g}..{high:g}, found {first:g}, {last:g}; mend it."
             )
     for key, (first, last) in _COUNTS.items():
         if not first <= getattr(config, key) <= last:
-            raise ConfigError(f"{where}: '{key}': expected {first} .. {last}, found {getattr(config, key)}.")
+            raise ConfigError(f"{where}: '{key}': expected {first} .. {last}, found {getattr(config, key)}; mend it.")
     if config.dem_size > LARGEST_DEM:
         raise ConfigError(
             f"{where}: 'size_px': expected at most {LARGEST_DEM // config.factor} pixels at {config.factor} DEM pixels a pixel, "
             f"found {config.size_px}."
         )
     if config.units not in ("iof", "dn"):
-        raise ConfigError(f"{where}: 'units': expected 'iof' or 'dn', found '{config.units}'.")
+        raise ConfigError(f"{where}: 'units': expected 'iof' or 'dn', found '{config.units}'; mend it.")
     if not 0 <= config.oblique_share <= 1:
-        raise ConfigError(f"{where}: 'oblique_share': expected 0..1, found {config.oblique_share:g}.")
+        raise ConfigError(f"{where}: 'oblique_share': expected 0..1, found {config.oblique_share:g}; mend it.")
     if abs(config.latitude_deg) > 89 or abs(config.longitude_deg) > 360:
         raise ConfigError(
-            f"{where}: expected a place with |latitude| <= 89, found {config.longitude_deg:g}, {config.latitude_deg:g}."
+            f"{where}: expected a place with |latitude| <= 89, found {config.longitude_deg:g}, {config.latitude_deg:g}; mend it."
         )
     if abs(config.gsd / config.dem_gsd - config.factor) > 1e-9 * config.factor:
         raise ConfigError(
-            f"{where}: expected 'gsd' to be a whole multiple of 'dem_gsd', found {config.gsd:g} and {config.dem_gsd:g}."
+            f"{where}: expected 'gsd' to be a whole multiple of 'dem_gsd', found {config.gsd:g} and {config.dem_gsd:g}; mend it."
         )
     # the Sun climbs no higher than this at the place
     highest = max(0.0, abs(config.latitude_deg) - 1.6)
@@ -222,7 +226,7 @@ def read_recipe(path: Path) -> dict[str, Any]:
     """The keys of a recipe file. Raises InputError."""
     values = read_json(path, "a recipe in JSON ('lunargr simulate --print-recipe' writes one)")
     if not isinstance(values, dict):
-        raise InputError(f"{path}: expected a JSON object of recipe keys, found {type(values).__name__}.")
+        raise InputError(f"{path}: expected a JSON object of recipe keys, found {type(values).__name__}; mend it.")
     return values
 
 

@@ -222,7 +222,7 @@ def camera_from_document(document: Mapping[str, Any], where: str) -> Camera:
     name = document.get("type", document.get("name_model"))
     if name is None:
         raise InputError(
-            f"{where}: expected a camera with the key 'type' or 'name_model' (an ALE/CSM ISD), found neither."
+            f"{where}: expected a camera with the key 'type' or 'name_model' (an ALE/CSM ISD), found neither; is it the right file?"
         )
     cls = _CAMERAS.get(str(name).lower())
     if cls is None:
@@ -234,5 +234,7 @@ def read_document(path: Path) -> Mapping[str, Any]:
     """A camera's JSON document. Raises InputError."""
     document = read_json(path, "a camera model in JSON")
     if not isinstance(document, Mapping):
-        raise InputError(f"{path}: expected a JSON object that describes a camera, found a {type(document).__name__}.")
+        raise InputError(
+            f"{path}: expected a JSON object that describes a camera, found a {type(document).__name__}; is it the right file?"
+        )
     return document

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import rasterio
 import rasterio.warp
@@ -23,6 +24,7 @@ from rasterio.warp import Resampling
 from rasterio.windows import Window
 
 from schemas.errors import InputError
+from schemas.files.hdf5 import silence_hdf5
 from schemas.files.inputs import check_file
 from stages.common.memory import return_freed_memory
 from stages.physics.maps.grid import Grid, ellipsoid_of, latitude_squash
@@ -43,6 +45,12 @@ Mask = NDArray[np.bool_]
 def open_raster(path: Path, what: str = "a raster") -> Iterator[DatasetReader]:
     """Open a raster for reading. Raises InputError for a missing, damaged or unknown file, also while reading."""
     check_file(Path(path), what)
+    silence_hdf5()
+    if h5py.is_hdf5(path):  # of a damaged one GDAL's HDF5 library would print its whole error stack
+        try:
+            h5py.File(path, "r").close()
+        except OSError:
+            raise InputError(f"{path}: expected {what}, found a damaged HDF5 file; fetch it again.") from None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)

@@ -76,7 +76,7 @@ class Surface:
             if known.size:
                 low, high = min(low, float(known.min())), max(high, float(known.max()))
         if not np.isfinite(low):
-            raise InputError(f"{self.path}: expected elevations, found only nodata.")
+            raise InputError(f"{self.path}: expected elevations, found only nodata; is it the right band and file?")
         return low, high
 
 
