@@ -27,6 +27,7 @@ Progress = Callable[[int, int, str], None]
 
 MINIMUM_TILES = 60  # where --tile-m is left to us: enough tiles for a test part that is not one odd place
 LARGEST_TILE = 4  # crops
+LARGEST = 1e9  # m of a tile, crops per km2
 MOST_CROPS = 2**31 - 1  # what an index of a pair can count
 
 
@@ -91,8 +92,8 @@ def run(
     if config.count is not None and not 1 <= config.count <= MOST_CROPS:
         raise ConfigError(f"--count: expected 1 .. {MOST_CROPS} crops, found {config.count}.")
     for option, value in (("--density", config.density), ("--tile-m", config.tile_m)):
-        if value is not None and not 0 < value < math.inf:
-            raise ConfigError(f"{option}: expected a finite number above 0, found {value:g}.")
+        if value is not None and not 0 < value <= LARGEST:
+            raise ConfigError(f"{option}: expected a number above 0, up to {LARGEST:g}, found {value:g}.")
     if len(config.split) != 3 or min(config.split) < 0 or not math.isclose(sum(config.split), 1, abs_tol=1e-6):
         raise ConfigError(f"--split: expected three shares that sum to 1, found {config.split}.")
     with open_artefact(scene, SCENE) as file:

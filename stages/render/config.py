@@ -110,7 +110,7 @@ def check(config: Config, trajectory: bool = False) -> None:
         raise ConfigError(f"--fov: expected degrees between 0 and 180, found {config.fov_deg:g}.")
     if config.solar_distance_au is not None and not 0.05 <= config.solar_distance_au <= 100:
         raise ConfigError(f"--solar-distance: expected 0.05 .. 100 au, found {config.solar_distance_au:g}.")
-    if config.quaternion is not None and abs(math.hypot(*config.quaternion) - 1) > 1e-3:
+    if config.quaternion is not None and abs(math.hypot(*config.quaternion) - 1) > 0.01:
         raise ConfigError(f"--quaternion: expected one of unit length, found {math.hypot(*config.quaternion):g}.")
     if not 0 < config.size_px[0] * config.size_px[1] <= LARGEST_VIEW:
         raise ConfigError(
