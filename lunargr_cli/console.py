@@ -10,9 +10,14 @@ from dataclasses import dataclass, field
 from lunargr_cli import raise_again
 
 
+def one_line(message: str) -> str:
+    """A message without line breaks, and without what a terminal would obey: file names and values of options hold it."""
+    return "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
+
+
 def say_error(message: str) -> None:
     """One line on standard error."""
-    print(f"lunargr: {' '.join(message.split())}", file=sys.stderr)
+    print(f"lunargr: {one_line(message)}", file=sys.stderr)
 
 
 @dataclass

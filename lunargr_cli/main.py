@@ -19,6 +19,7 @@ import typer
 
 from lunargr_cli import INTERRUPTED, commands, quiet_interruptions, signals, stop
 from lunargr_cli.console import say_error
+from lunargr_cli.options import check_numbers
 from schemas.command_line import said
 from schemas.errors import EXIT_CODE, LunargrError
 from schemas.files.locks import claim
@@ -35,6 +36,17 @@ def _command_line() -> str:
         nodes = ["--nnodes", str(processes // here)] if processes > here else []
         words = ["torchrun", *nodes, "--nproc-per-node", str(here), "-m", "lunargr_cli.main", *sys.argv[1:]]
     return shlex.join(words)
+
+
+def _checked(command: Callable[..., None]) -> Callable[..., None]:
+    """The command, which no number that is not finite reaches."""
+
+    @functools.wraps(command)
+    def run(*arguments: Any, **options: Any) -> None:
+        check_numbers(command, inspect.signature(command).bind(*arguments, **options).arguments)
+        command(*arguments, **options)
+
+    return run
 
 
 def _alone(command: Callable[..., None]) -> Callable[..., None]:
@@ -75,7 +87,7 @@ for _module in sorted(
     (importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)),
     key=lambda module: module.ORDER,
 ):
-    _command = _module.command if getattr(_module, "SHARED_OUTPUT", False) else _alone(_module.command)
+    _command = _checked(_module.command if getattr(_module, "SHARED_OUTPUT", False) else _alone(_module.command))
     app.command(name=_module.NAME, cls=getattr(_module, "CLASS", None))(_command)
 
 

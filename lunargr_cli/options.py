@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
 from schemas.errors import ConfigError
+
+MOST = 2**31 - 1  # what counts pairs, pixels or crops
+MOST_WORKERS = 4096  # of one machine
+MOST_PARTS = 100_000  # of one stage: beyond it a part is less than its own overhead
+
+
+def check_scheduler(text: str | None) -> str | None:
+    """``local:N`` with a number of workers that can be, or an address. Raises ConfigError."""
+    if text is None:
+        return None
+    kind, _, number = text.partition(":")
+    local = number.isdecimal() and len(number) < 9 and 1 <= int(number) <= MOST_WORKERS
+    if not text.strip() or (kind == "local" and not local):
+        raise ConfigError(
+            f"--scheduler: expected an address, or local:N with 1 <= N <= {MOST_WORKERS} workers, found '{text}'."
+        )
+    return text
+
 
 Output = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output.")]
@@ -28,16 +48,21 @@ Scheduler = Annotated[
     typer.Option(
         "--scheduler",
         metavar="ADDRESS|local:N",
+        callback=check_scheduler,
         help="Work in parts on Dask: N processes of this machine, or the workers of a scheduler; goes on like --resume.",
     ),
 ]
 Parts = Annotated[
     int | None,
     typer.Option(
-        "--parts", metavar="N", min=1, help="With --scheduler or --resume: how many parts (default: by size)."
+        "--parts",
+        metavar="N",
+        min=1,
+        max=MOST_PARTS,
+        help="With --scheduler or --resume: how many parts (default: by size).",
     ),
 ]
-Seed = Annotated[int, typer.Option("--seed", help="Seed of every random choice.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of every random choice.")]
 Device = Annotated[str, typer.Option("--device", help="cpu, cuda, cuda:1, ... or auto.")]
 BodyOption = Annotated[
     str | None,
@@ -49,14 +74,23 @@ Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also 
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
 
 
+def check_numbers(command: Callable[..., None], options: Mapping[str, Any]) -> None:
+    """No option of any command takes NaN or infinity. Raises ConfigError."""
+    for name, value in options.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            declared = get_type_hints(command, include_extras=True)[name].__metadata__[0].param_decls or ()
+            option = next((d for d in declared if d.startswith("--")), f"--{name.replace('_', '-')}")
+            raise ConfigError(f"{option}: expected a finite number, found {value}.")
+
+
 def parse_shard(text: str | None) -> tuple[int, int]:
     """'2/8' -> (1, 8): zero-based index and count; None -> (0, 1). Raises ConfigError."""
     if text is None:
         return 0, 1
     first, _, last = text.partition("/")
-    if first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last):
+    if all(part.isdecimal() and len(part) < 9 for part in (first, last)) and 1 <= int(first) <= int(last) <= MOST_PARTS:
         return int(first) - 1, int(last)
-    raise ConfigError(f"--shard: expected I/N with 1 <= I <= N, found '{text}'.")
+    raise ConfigError(f"--shard: expected I/N with 1 <= I <= N <= {MOST_PARTS}, found '{text}'.")
 
 
 def in_parts(scheduler: str | None, resume: bool, parts: int | None, shard: str | None) -> bool:

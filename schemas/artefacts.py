@@ -9,29 +9,50 @@ from schemas.declaration import STRING, Attribute, Schema, Variable, declare
 SPLITS = (("train", 0), ("validation", 1), ("test", 2))
 VALIDITY = (("invalid", 0), ("valid", 1))
 UNITS = (("iof", 0), ("dn", 1))
+SMALLEST_GSD, LARGEST_GSD = 1e-4, 1e6  # m
+BODY_RADII = (100.0, 1e10)  # m: from Bennu to what is flat in any crop
+HEIGHTS = (-1e8, 1e8)  # m
+LARGEST_COUNT = 2**31 - 1
 
 _GRID = (
-    Variable("y", ("y",), "f8", "m", "grid northing of the pixel centre; rows run south"),
-    Variable("x", ("x",), "f8", "m", "grid easting of the pixel centre"),
+    Variable("y", ("y",), "f8", "m", "grid northing of the pixel centre; rows run south", finite=True),
+    Variable("x", ("x",), "f8", "m", "grid easting of the pixel centre", finite=True),
 )
 _PLACE = (
-    Attribute("gsd_m", "ground sample distance of the grid, m"),
-    Attribute("body_radius_m", "radius of the reference sphere, m"),
+    Attribute("gsd_m", "ground sample distance of the grid, m", True, "number", SMALLEST_GSD, LARGEST_GSD),
+    Attribute("body_radius_m", "radius of the reference sphere, m", True, "number", *BODY_RADII),
 )
 _FRAMES = (
     Variable("image_id", ("frame",), STRING, "", "name of the source image"),
-    Variable("solar_distance_au", ("frame",), "f8", "au", "distance of the Sun", required=False),
+    Variable(
+        "solar_distance_au", ("frame",), "f8", "au", "distance of the Sun", required=False, minimum=0.05, maximum=100.0
+    ),
 )
+
+
+def _angle(name: str, dim: str, limit: float, description: str) -> Variable:
+    return Variable(name, (dim,), "f8", "degree", description, minimum=-limit, maximum=limit, finite=True)
+
+
 _FRAME_TABLE = _FRAMES + (
     Variable("path", ("frame",), STRING, "", "image file, relative to this artefact where possible"),
     Variable("camera", ("frame",), STRING, "", "camera model file, empty for map-projected images"),
     Variable("start_time", ("frame",), STRING, "", "UTC"),
     Variable("units", ("frame",), "u1", "1", "radiometric units of the image", flags=UNITS),
-    Variable("subsolar_longitude_deg", ("frame",), "f8", "degree", "east longitude of the sub-solar point"),
-    Variable("subsolar_latitude_deg", ("frame",), "f8", "degree", "latitude of the sub-solar point"),
-    Variable("spacecraft_longitude_deg", ("frame",), "f8", "degree", "east longitude below the camera"),
-    Variable("spacecraft_latitude_deg", ("frame",), "f8", "degree", "latitude below the camera"),
-    Variable("spacecraft_altitude_m", ("frame",), "f8", "m", "camera height above the reference sphere"),
+    _angle("subsolar_longitude_deg", "frame", 720.0, "east longitude of the sub-solar point"),
+    _angle("subsolar_latitude_deg", "frame", 90.0, "latitude of the sub-solar point"),
+    _angle("spacecraft_longitude_deg", "frame", 720.0, "east longitude below the camera"),
+    _angle("spacecraft_latitude_deg", "frame", 90.0, "latitude below the camera"),
+    Variable(
+        "spacecraft_altitude_m",
+        ("frame",),
+        "f8",
+        "m",
+        "camera height above the reference sphere",
+        minimum=1.0,
+        maximum=1e10,
+        finite=True,
+    ),
     Variable("sha256", ("frame",), STRING, "", "SHA-256 of the image file when it was ingested", required=False),
     Variable("camera_sha256", ("frame",), STRING, "", "SHA-256 of the camera model file, or empty", required=False),
 )
@@ -98,21 +119,34 @@ SCENE = declare(
                 "i4",
                 "1",
                 "row, column, height, width of the box that holds the image's valid pixels",
+                minimum=0,
             ),
-            Variable("valid_area_m2", ("frame",), "f8", "m2", "ground covered by valid positions"),
+            Variable(
+                "valid_area_m2",
+                ("frame",),
+                "f8",
+                "m2",
+                "ground covered by valid positions",
+                minimum=0.0,
+                finite=True,
+            ),
         )
         + _FRAME_TABLE,
         attributes=_PLACE
         + (
-            Attribute("crop_px", "crop size that valid_position was eroded for"),
+            Attribute("crop_px", "crop size that valid_position was eroded for", True, "integer", 2, LARGEST_COUNT),
             Attribute("elevation_source", "name of the DEM file"),
+            Attribute("elevation_low_m", "least elevation, m", False, "number", *HEIGHTS),
+            Attribute("elevation_high_m", "largest elevation, m", False, "number", *HEIGHTS),
+            Attribute("dem_valid_px", "valid pixels of the DEM", False, "integer", 0),
         ),
+        sizes=(("window", 4),),
     )
 )
 
 _PAIR_PLACE = (
-    Variable("longitude_deg", ("pair",), "f8", "degree", "east longitude of the crop centre"),
-    Variable("latitude_deg", ("pair",), "f8", "degree", "planetocentric latitude of the crop centre"),
+    _angle("longitude_deg", "pair", 720.0, "east longitude of the crop centre"),
+    _angle("latitude_deg", "pair", 90.0, "planetocentric latitude of the crop centre"),
     Variable(
         "row",
         ("pair",),
@@ -121,7 +155,7 @@ _PAIR_PLACE = (
         "row of the crop centre on the scene grid: the crop spans row - size/2 .. row + size/2 - 1",
     ),
     Variable("col", ("pair",), "i4", "1", "column of the crop centre on the scene grid"),
-    Variable("image_index", ("pair",), "i4", "1", "index into the frame dimension"),
+    Variable("image_index", ("pair",), "i4", "1", "index into the frame dimension", index_of="frame"),
     Variable("site", ("pair",), "i4", "1", "pairs with the same site show the same ground, pixel for pixel"),
     Variable("tile", ("pair",), "i4", "1", "ground tile of the geographic split"),
     Variable("split", ("pair",), "u1", "1", "which part of the geographic split", flags=SPLITS),
@@ -141,7 +175,8 @@ CROPS = declare(
         + (
             Attribute("scene", "the scene artefact, relative to this file"),
             Attribute("scene_sha256", "its SHA-256"),
-            Attribute("tile_m", "edge of a ground tile, m"),
+            Attribute("tile_m", "edge of a ground tile, m", True, "number", SMALLEST_GSD, LARGEST_COUNT),
+            Attribute("split_audit", "pairs, images, tiles and ground of each part, as JSON", False, "json list"),
         ),
     )
 )
@@ -164,6 +199,7 @@ PAIRS = declare(
             "enu": "east, north, up",
             "frame": "source images",
         },
+        sizes=(("enu", 3),),
         foreign_writers=True,
         variables=(
             Variable("elevation", ("pair", "y", "x"), "f4", "m", "height above the reference sphere"),
@@ -190,7 +226,6 @@ PAIRS = declare(
                 "f4",
                 "degree",
                 "elevation of the terrain horizon in the Sun's azimuth, from the whole DEM",
-                required=False,
             ),
             Variable(
                 "sky_view",
@@ -238,6 +273,7 @@ PAIRS = declare(
                 "f8",
                 "1",
                 "unit vector towards the Sun at the crop centre, along the crop's columns, rows (north) and up",
+                unit_vector=True,
             ),
             Variable(
                 "camera_position_enu",
@@ -245,6 +281,7 @@ PAIRS = declare(
                 "f8",
                 "m",
                 "camera position from the crop centre at the crop's mean elevation, same axes",
+                finite=True,
             ),
             Variable(
                 "convergence_deg",
@@ -324,21 +361,25 @@ CHECKPOINT = declare(
         title="Weights, normalisation and history of a trained network",
         dims={"epoch": "training epochs", "frame": "source images"},
         variables=(
-            Variable("train_loss", ("epoch",), "f8", "1", "mean squared error on valid training pixels"),
-            Variable("validation_loss", ("epoch",), "f8", "1", "mean squared error on valid validation pixels"),
-            Variable("epoch_seconds", ("epoch",), "f8", "s", "wall time of the epoch"),
+            Variable("train_loss", ("epoch",), "f8", "1", "mean squared error on valid training pixels", minimum=0.0),
+            Variable(
+                "validation_loss", ("epoch",), "f8", "1", "mean squared error on valid validation pixels", minimum=0.0
+            ),
+            Variable("epoch_seconds", ("epoch",), "f8", "s", "wall time of the epoch", minimum=0.0),
             Variable("image_id", ("frame",), STRING, "", "name of the source image"),
             Variable("gain", ("frame",), "f8", "1", "measured = gain x I/F + offset; 1 for calibrated images"),
             Variable("offset", ("frame",), "f8", "1", "measured = gain x I/F + offset; 0 for calibrated images"),
         ),
         attributes=(
             Attribute("model", "reflectance model whose coefficients the network predicts"),
-            Attribute("coefficients", "JSON list of coefficient names, in channel order"),
-            Attribute("elevation_scale_m", "std of the crop-centred training elevations, m"),
-            Attribute("gsd_m", "ground sample distance the network was trained at, m"),
-            Attribute("body_radius_m", "radius of the reference sphere, m"),
-            Attribute("image_units", "units of the training images: 'iof' or 'dn'"),
-            Attribute("best_epoch", "epoch whose weights are in /weights"),
+            Attribute("coefficients", "JSON list of coefficient names, in channel order", kind="json list"),
+            Attribute(
+                "elevation_scale_m", "std of the crop-centred training elevations, m", True, "number", 1e-6, LARGEST_GSD
+            ),
+            Attribute("output_scale", "factor of the network's raw output", True, "number", 0.0, LARGEST_GSD),
+            *_PLACE,
+            Attribute("image_units", "units of the training images", choices=("iof", "dn")),
+            Attribute("best_epoch", "epoch whose weights are in /weights", True, "integer", 0, LARGEST_COUNT),
         ),
     )
 )
@@ -407,9 +448,9 @@ EVALUATION = declare(
         },
         variables=(
             Variable("model_name", ("model",), STRING, "", "names of the compared models"),
-            Variable("pair_index", ("pair",), "i4", "1", "index of the crop in pairs.h5"),
+            Variable("pair_index", ("pair",), "i4", "1", "index of the crop in pairs.h5", minimum=0),
             Variable("tile", ("pair",), "i4", "1", "ground tile, the independent unit of the intervals"),
-            Variable("valid_pixels", ("pair",), "i4", "1", "pixels that count"),
+            Variable("valid_pixels", ("pair",), "i4", "1", "pixels that count", minimum=0),
             Variable("mse", ("model", "pair"), "f8", "1", "mean squared error of the crop, mean over training runs"),
             Variable(
                 "ssim", ("model", "pair"), "f8", "1", "structural similarity of the crop, mean over training runs"
@@ -433,7 +474,10 @@ EVALUATION = declare(
                 required=False,
             ),
         ),
-        attributes=(Attribute("split", "which split was evaluated"), Attribute("metrics", "the table as JSON")),
+        attributes=(
+            Attribute("split", "which split was evaluated"),
+            Attribute("metrics", "the table as JSON", kind="json"),
+        ),
     )
 )
 
@@ -488,8 +532,10 @@ DIAGNOSIS = declare(
             ),
         ),
         attributes=(
-            Attribute("report", "the diagnosis as JSON (docs: the output of diagnose)"),
-            Attribute("extension", "JSON list of the effects of the extended model with their parameters"),
+            Attribute("report", "the diagnosis as JSON (docs: the output of diagnose)", kind="json"),
+            Attribute(
+                "extension", "JSON list of the effects of the extended model with their parameters", kind="json list"
+            ),
         ),
     )
 )

@@ -15,6 +15,9 @@ class Variable:
 
     ``unit`` is a UDUNITS string, ``"1"`` for pure numbers, ``"dn"`` among ``unit_choices`` where images may be uncalibrated;
     ``flags`` maps meaning -> value for flag variables; ``compress`` is for masks, which deflate to nothing.
+    What the values must be is looked at whenever a file is opened, for all that is no map and no stack of crops:
+    ``minimum`` .. ``maximum``, ``finite`` (otherwise NaN = unknown), ``unit_vector`` along the last dimension, ``index_of``
+    a dimension; flags hold their own values only, and integers are whole.
     """
 
     name: str
@@ -28,15 +31,43 @@ class Variable:
     chunks: tuple[int, ...] | None = None
     compress: bool = False
     georeferenced: bool = False
+    minimum: float | None = None
+    maximum: float | None = None
+    finite: bool = False
+    unit_vector: bool = False
+    index_of: str = ""
+
+    @property
+    def is_table(self) -> bool:
+        """Whether it is small, and its values are checked on opening; maps and crops are looked at as they are read."""
+        return len(self.dims) <= 2 and not self.georeferenced
 
 
 @dataclass(frozen=True)
 class Attribute:
-    """One root attribute, with its unit in the name where it has one."""
+    """One root attribute, with its unit in the name where it has one.
+
+    ``kind``: 'text', 'number' (finite), 'integer', or 'json' (text that holds an object), 'json list'; ``minimum`` ..
+    ``maximum`` of numbers, ``choices`` of text.
+    """
 
     name: str
     description: str
     required: bool = True
+    kind: str = "text"
+    minimum: float | None = None
+    maximum: float | None = None
+    choices: tuple[str, ...] = ()
+
+
+# Every artefact may carry them; files of other programs need not.
+ROOT_ATTRIBUTES = (
+    Attribute("schema_version", "version of the schema", False, "integer"),
+    Attribute("seed", "seed of every random choice, -1 where nothing is random", False, "integer", -1),
+    Attribute("config", "options of the run as JSON", False, "json"),
+    Attribute("inputs", "names and SHA-256 of the inputs as JSON", False, "json list"),
+    Attribute("provenance", "records of all that the artefact descends from, as JSON", False, "json"),
+)
 
 
 @dataclass(frozen=True)
@@ -50,6 +81,7 @@ class Schema:
     dims: dict[str, str]
     variables: tuple[Variable, ...]
     attributes: tuple[Attribute, ...] = ()
+    sizes: tuple[tuple[str, int], ...] = ()  # dimensions of a fixed size
     # Other programs also write pairs.h5: such a file need not name its schema, only hold its variables.
     foreign_writers: bool = False
     _index: dict[str, Variable] = field(default_factory=dict, repr=False, compare=False)

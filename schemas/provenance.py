@@ -20,8 +20,10 @@ from typing import Any
 import h5py
 import numpy as np
 
+from schemas.checks import parse_json
 from schemas.command_line import said
 from schemas.declaration import Schema
+from schemas.errors import ArtefactError
 
 CONVENTIONS = "CF-1.11"
 SIDECAR = "record.json"  # beside files that cannot carry a record themselves: rasters and tables
@@ -109,7 +111,7 @@ def read_record(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, 
             if root.get("lunargr_schema") == "scene" and "sha256" in file and "camera_sha256" in file:
                 images, cameras = ([d.decode() for d in file[k][...]] for k in ("sha256", "camera_sha256"))
                 digests = list(zip(images, cameras, strict=True))
-    except OSError:
+    except (OSError, RuntimeError):
         return None, {}
     if "lunargr_schema" not in root:
         return None, {}
@@ -120,12 +122,40 @@ def read_record(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, 
         "folder": str(root.get("folder", "")),
         "version": str(root.get("lunargr_version", "")),
         "seed": int(root.get("seed", -1)),
-        "config": json.loads(root.get("config", "{}")),
-        "inputs": json.loads(root.get("inputs", "[]")),
+        "config": _parse(path, root, "config", "{}"),
+        "inputs": _parse(path, root, "inputs", "[]"),
     }
     if digests:
         record["images"] = {"count": len(digests), "sha256": digest_of(d for pair in digests for d in pair if d)}
-    return record, json.loads(root.get("provenance", "{}"))
+    ancestors = _parse(path, root, "provenance", "{}")
+    if not (_is_record(record) and isinstance(ancestors, dict) and all(_is_record(r) for r in ancestors.values())):
+        raise ArtefactError(
+            f"{path}: expected records of the files it descends from in 'inputs' and 'provenance', found something else; "
+            f"write it again."
+        )
+    return record, ancestors
+
+
+def _parse(path: Path, root: Mapping[str, Any], name: str, absent: str) -> Any:
+    return parse_json(str(root.get(name, absent)), f"{path}: root attribute '{name}'")
+
+
+def _is_record(record: Any) -> bool:
+    """Whether :func:`chain` and ``lunargr replay`` can follow it."""
+    if not isinstance(record, dict):
+        return False
+    inputs, images = record.get("inputs"), record.get("images")
+    keys = ("schema", "history", "command", "folder", "version")
+    return (
+        all(isinstance(record.get(k), str) for k in keys)
+        and isinstance(record.get("seed"), int)
+        and isinstance(record.get("config"), dict)
+        and isinstance(inputs, list)
+        and all(
+            isinstance(i, dict) and isinstance(i.get("name"), str) and isinstance(i.get("sha256"), str) for i in inputs
+        )
+        and (images is None or (isinstance(images, dict) and {"count", "sha256"} <= set(images)))
+    )
 
 
 def digest_of(digests: Iterable[str]) -> str:
@@ -154,8 +184,9 @@ def sidecar(stage: str, config: Mapping[str, Any], seed: int, files: Sequence[Pa
 def _read_sidecar(path: Path) -> dict[str, Any] | None:
     try:
         found = json.loads((path.parent / SIDECAR).read_text())
-        return found["record"] if found["files"].get(path.name) == sha256(path) else None
-    except (OSError, ValueError, KeyError, AttributeError):
+        good = found["files"].get(path.name) == sha256(path) and _is_record(found["record"])
+        return found["record"] if good else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
 
 

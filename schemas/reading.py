@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from schemas.checks import as_text, check_attributes, check_georeference, check_links, check_values, parse_json
 from schemas.declaration import SCHEMAS, STRING, Schema, Variable
 from schemas.errors import ArtefactError
 from schemas.files.hdf5 import silence_hdf5
@@ -23,6 +23,7 @@ def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5
     path = Path(path)
     file = _open_hdf5(path)
     try:
+        check_links(path, file)
         _check_kind(path, file, schema)
         for variable in schema.variables:
             if variable.name in file:
@@ -38,8 +39,11 @@ def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5
                     f"{path}: expected the root attribute '{attribute.name}' ({attribute.description}), found none; "
                     f"write it again with 'lunargr {schema.stage}'."
                 )
+        check_attributes(path, file, schema)
         _check_sizes(path, file, schema)
         _check_views(path, file)
+        check_georeference(path, file, schema)
+        check_values(path, file, schema)
     except BaseException:
         file.close()
         raise
@@ -49,7 +53,7 @@ def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5
 def read_kind(path: Path) -> Schema:
     """The schema that an artefact says it follows. Raises ArtefactError."""
     with _open_hdf5(Path(path)) as file:
-        name = _text(file.attrs.get("lunargr_schema", ""))
+        name = _attribute(path, file, "lunargr_schema")
     if name not in SCHEMAS:
         raise ArtefactError(
             f"{path}: expected a lunargr artefact (root attribute 'lunargr_schema'), found '{name or 'none'}'; "
@@ -63,7 +67,9 @@ def _open_hdf5(path: Path) -> h5py.File:
     if not path.exists():
         raise ArtefactError(f"{path}: no such file; check the path or run the stage that writes it.")
     if path.is_dir():
-        raise ArtefactError(f"{path}: expected an HDF5 file, found a folder.")
+        raise ArtefactError(f"{path}: expected an HDF5 file, found a folder; name the file in it.")
+    if not path.is_file():
+        raise ArtefactError(f"{path}: expected an HDF5 file, found a device or a pipe; name a file.")
     try:
         return h5py.File(path, "r")
     except OSError as error:
@@ -76,7 +82,7 @@ def _open_hdf5(path: Path) -> h5py.File:
 
 
 def _check_kind(path: Path, file: h5py.File, schema: Schema) -> None:
-    found = _text(file.attrs.get("lunargr_schema", ""))
+    found = _attribute(path, file, "lunargr_schema")
     if not found and schema.foreign_writers:
         return
     if found != schema.name:
@@ -84,11 +90,24 @@ def _check_kind(path: Path, file: h5py.File, schema: Schema) -> None:
         raise ArtefactError(
             f"{path}: expected a '{schema.name}' artefact (from 'lunargr {schema.stage}'), found {what}; check the order of the files."
         )
-    version = int(file.attrs.get("schema_version", schema.version))
-    if version != schema.version:
+    version = file.attrs.get("schema_version", schema.version)
+    if np.shape(version) not in ((), (1,)) or np.ravel(version)[0] != schema.version:
         raise ArtefactError(
             f"{path}: expected version {schema.version} of '{schema.name}', found {version}; write it again with 'lunargr {schema.stage}'."
         )
+
+
+def _attribute(path: Path, file: h5py.File, name: str) -> str:
+    """A root attribute of text, '' where absent. Raises ArtefactError."""
+    if name not in file.attrs:
+        return ""
+    try:
+        text = as_text(file.attrs[name])
+    except (OSError, TypeError, ValueError):
+        text = None
+    if text is None:
+        raise ArtefactError(f"{path}: root attribute '{name}': expected text, found something else; write it again.")
+    return text
 
 
 def _check_variable(path: Path, file: h5py.File, variable: Variable) -> None:
@@ -97,12 +116,14 @@ def _check_variable(path: Path, file: h5py.File, variable: Variable) -> None:
     if not isinstance(data, h5py.Dataset) or data.ndim != len(variable.dims):
         found = f"{data.ndim}" if isinstance(data, h5py.Dataset) else "a group"
         raise ArtefactError(
-            f"{where}: expected {len(variable.dims)} dimensions ({', '.join(variable.dims)}), found {found}."
+            f"{where}: expected {len(variable.dims)} dimensions ({', '.join(variable.dims)}), found {found}; write it again."
         )
     if variable.dtype == STRING:
+        if data.dtype.kind != "S" and h5py.check_string_dtype(data.dtype) is None:
+            raise ArtefactError(f"{where}: expected text, found {data.dtype}; write it again.")
         return
     if data.dtype.kind not in "iufb":
-        raise ArtefactError(f"{where}: expected numbers ({variable.dtype}), found {data.dtype}.")
+        raise ArtefactError(f"{where}: expected numbers ({variable.dtype}), found {data.dtype}; write it again.")
     unit = _text(data.attrs.get("units", ""))
     allowed = (variable.unit, *variable.unit_choices)
     if unit and unit not in allowed:
@@ -114,15 +135,19 @@ def _check_variable(path: Path, file: h5py.File, variable: Variable) -> None:
 
 
 def _check_sizes(path: Path, file: h5py.File, schema: Schema) -> None:
-    sizes: dict[str, tuple[int, str]] = {}
+    sizes: dict[str, tuple[int, str]] = {dim: (size, "its schema") for dim, size in schema.sizes}
     for variable in schema.variables:
         if variable.name not in file:
             continue
         for dim, size in zip(variable.dims, file[variable.name].shape, strict=True):
-            first = sizes.setdefault(dim, (size, variable.name))
+            first = sizes.setdefault(dim, (size, f"/{variable.name}"))
             if first[0] != size:
                 raise ArtefactError(
-                    f"{path}:/{variable.name}: expected {first[0]} along '{dim}' as in /{first[1]}, found {size}; write it again."
+                    f"{path}:/{variable.name}: expected {first[0]} along '{dim}' as in {first[1]}, found {size}; write it again."
+                )
+            if size == 0 and dim in ("y", "x"):
+                raise ArtefactError(
+                    f"{path}:/{variable.name}: expected pixels along '{dim}', found none; write it again."
                 )
 
 
@@ -132,7 +157,7 @@ def _check_views(path: Path, file: h5py.File) -> None:
         if isinstance(data, h5py.Dataset) and data.is_virtual:
             plan = data.id.get_create_plist()
             for source in {plan.get_virtual_filename(k) for k in range(plan.get_virtual_count())}:
-                if not (path.resolve().parent / source).exists():
+                if not (path if source == "." else path.resolve().parent / source).is_file():
                     raise ArtefactError(
                         f"{path}:{data.name}: expected the file '{source}' that it is a view of, found none; "
                         "bring it back, or merge the parts again without --virtual."
@@ -170,5 +195,5 @@ def read_strings(file: h5py.File, name: str) -> list[str]:
 
 
 def read_config(file: h5py.File) -> dict[str, Any]:
-    """The configuration that an artefact was made with."""
-    return json.loads(_text(file.attrs.get("config", "{}")))
+    """The configuration that an artefact was made with. Raises ArtefactError."""
+    return parse_json(_text(file.attrs.get("config", "{}")), f"{file.filename}: root attribute 'config'")

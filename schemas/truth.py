@@ -79,8 +79,8 @@ TRUTH = declare(
             Attribute("dem_gsd_m", "ground sample distance of the truth and of the DEM, m"),
             Attribute("body_radius_m", "radius of the reference sphere, m"),
             Attribute("model", "the truth's reflectance model"),
-            Attribute("parameters", "its constant parameters as JSON"),
-            Attribute("hidden", "JSON list of the planted effects with their parameters"),
+            Attribute("parameters", "its constant parameters as JSON", kind="json"),
+            Attribute("hidden", "JSON list of the planted effects with their parameters", kind="json list"),
             Attribute("units", "units of the images: 'iof' or 'dn'"),
         ),
     )

@@ -32,6 +32,8 @@ Progress = Callable[[int, int, str], None]
 TEST_TILES = 20  # where --tile-m is left to us and the scene is large enough: intervals over fewer are wide
 WITH_ROOM = 0.8  # of the tiles, in which a crop fits: images end, elevations have holes
 SMALLEST_TILE, LARGEST_TILE = 1.125, 4  # of the scene's crops
+LARGEST = 1e9  # m of a tile, crops per km2
+MOST_CROPS = 2**31 - 1  # what an index of a pair can count
 
 
 @dataclass(frozen=True)
@@ -104,16 +106,23 @@ def run(
     """Write ``crops.h5`` and return the audit of the split. Raises ConfigError or GeometryError."""
     if config.count is not None and config.density is not None:
         raise ConfigError("--count and --density: give one of the two.")
-    if (config.count is not None and config.count < 1) or (config.density is not None and not config.density > 0):
-        raise ConfigError("--count and --density: expected a positive number of crops.")
+    if config.count is not None and not 1 <= config.count <= MOST_CROPS:
+        raise ConfigError(f"--count: expected 1 .. {MOST_CROPS} crops, found {config.count}.")
+    for option, value in (("--density", config.density), ("--tile-m", config.tile_m)):
+        if value is not None and not 0 < value <= LARGEST:
+            raise ConfigError(f"{option}: expected a number above 0, up to {LARGEST:g}, found {value:g}.")
     if len(config.split) != 3 or min(config.split) < 0 or not math.isclose(sum(config.split), 1, abs_tol=1e-6):
         raise ConfigError(f"--split: expected three shares that sum to 1, found {config.split}.")
     with open_artefact(scene, SCENE) as file:
         grid = read_grid(file, scene)
         frames = load_frames(file, scene)
-        crop = config.crop or int(file.attrs["crop_px"])
+        crop = int(file.attrs["crop_px"]) if config.crop is None else config.crop
         if crop % 16 or crop < 16:
             raise ConfigError(f"--crop: expected a multiple of 16 px (the network halves it four times), found {crop}.")
+        if crop > min(grid.height, grid.width):
+            raise ConfigError(
+                f"--crop: expected at most {min(grid.height, grid.width)} px, the edge of {scene}, found {crop}."
+            )
         if not frames:
             raise ConfigError(f"{scene}: expected images, found none; run 'lunargr ingest' with --images.")
         positions = PositionMasks(file, grid, crop, config.block)
@@ -182,7 +191,7 @@ def _tile_edge(grid: Grid, positions: PositionMasks, config: Config) -> int:
         row, col = grid.height / 2, grid.width / 2
         lon, lat = grid.lonlat([row, row], [col - 50, col + 50])
         metres = Geodesic(grid.radius, 0).Inverse(lat[0], lon[0], lat[1], lon[1])["s12"] / 100
-        edge = round(config.tile_m / metres)
+        edge = min(round(config.tile_m / metres), 4 * max(grid.height, grid.width))
         if edge < crop:
             raise ConfigError(f"--tile-m: expected at least one crop ({crop * metres:g} m), found {config.tile_m:g} m.")
         return edge

@@ -30,6 +30,7 @@ from stages.network.predictor import Predictor, choose_device, write_state
 from stages.network.processes import join_group, mean_over_ranks, same_everywhere, sum_gradients, sum_over_ranks
 from stages.network.resume import History, restore, save, snapshot
 from stages.network.runtime import choose_precision
+from stages.network.stored import DEEPEST, WIDEST
 from stages.network.unet import DROPOUT, WIDTHS, UNet
 from stages.network.uniform import elevation_scale, fit_start
 from stages.pairs import symmetries
@@ -84,7 +85,7 @@ def run(
 
     After every epoch the whole state goes to a file beside the output, from which ``resume`` goes on to the same result.
     """
-    _check(config)
+    check(config)
     check_output(output, [pairs], overwrite)
     rank, ranks = join_group()
     device = choose_device(config.device)
@@ -103,6 +104,12 @@ def run(
             raise InputError(
                 f"{pairs}:/split: expected training pairs (split = 0), found none; sample more crops or other tiles."
             )
+        if not len(validation):
+            say(f"no validation pairs in {pairs}: the epoch with the least training loss is kept")
+        elif not any(reader.valid(validation[k : k + 1]).any() for k in range(len(validation))):
+            raise InputError(f"{pairs}: no validation pair has a valid pixel; sample more crops or other tiles.")
+        if not any(reader.valid(train[k : k + 1]).any() for k in range(len(train))):
+            raise InputError(f"{pairs}: no training pair has a valid pixel; sample more crops or other tiles.")
         stride = 2 ** (len(config.widths) - 1)
         if any(s % stride for s in reader.size):
             raise ConfigError(
@@ -241,7 +248,8 @@ def evaluate_loss(
     return mean_over_ranks(total, pixels, ranks, device)
 
 
-def _check(config: Config) -> None:
+def check(config: Config) -> None:
+    """Refuse options that cannot be. Raises ConfigError, RegistryError."""
     if config.epochs < 1 or config.batch < 1:
         raise ConfigError(f"--epochs and --batch: expected at least 1, found {config.epochs} and {config.batch}.")
     if not (math.isfinite(config.lr) and 0 < config.lr < 1):
@@ -250,9 +258,12 @@ def _check(config: Config) -> None:
         raise ConfigError(f"--schedule: expected 'constant' or 'cosine', found '{config.schedule}'.")
     if config.precision not in ("auto", "fp32", "bf16"):
         raise ConfigError(f"--precision: expected auto, fp32 or bf16, found '{config.precision}'.")
-    if len(config.widths) < 2 or min(config.widths) < 1:
-        raise ConfigError(f"--widths: expected at least two positive widths, found {config.widths}.")
+    if not 2 <= len(config.widths) <= DEEPEST or not 1 <= min(config.widths) <= max(config.widths) <= WIDEST:
+        raise ConfigError(
+            f"--widths: expected 2 .. {DEEPEST} stages of 1 .. {WIDEST} channels, found {'-'.join(map(str, config.widths))}."
+        )
     get_model(config.model)
+    choose_device(config.device)
 
 
 def _load_extensions(path: str | None, pairs: Path, say: Say) -> list[Extension]:

@@ -123,6 +123,7 @@ def write_pairs(path, scene: Scene, units: str = "1"):
         out.write("elevation", np.where(scene.mask, scene.elevation, np.nan))
         out.write("image", scene.images, unit=units)
         out.write("valid", scene.mask)
+        out.write("sun_horizon_deg", np.full(scene.images.shape, -90.0))
         out.write("sun_direction_enu", scene.sun)
         out.write("camera_position_enu", scene.camera)
         for name in ("longitude_deg", "latitude_deg", "row", "col"):

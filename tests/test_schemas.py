@@ -21,7 +21,14 @@ def write_pairs(path, **change):
         for v in PAIRS.variables:
             if v.required:
                 shape = [sizes[d] for d in v.dims]
-                writer.write(v.name, ["A"] if v.dtype == "string" else np.arange(np.prod(shape)).reshape(shape))
+                values = np.arange(np.prod(shape)).reshape(shape)
+                if v.name == "sun_direction_enu":
+                    values = np.tile([0.0, 0.6, 0.8], (sizes["pair"], 1))
+                elif v.name == "image_index":
+                    values = np.zeros(shape)
+                elif v.dtype == "u1":
+                    values = values % 2
+                writer.write(v.name, ["A"] if v.dtype == "string" else values)
     return path
 
 

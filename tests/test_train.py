@@ -71,7 +71,7 @@ def test_it_learns_what_a_uniform_surface_cannot_show(tmp_path):
     sizes = {"pair": n, "y": size, "x": size, "enu": 3, "frame": 1}
     with ArtefactWriter(path, PAIRS, sizes, attributes={"gsd_m": 20.0, "body_radius_m": 1e9}) as writer:
         for name, data in {
-            "elevation": z, "image": image, "valid": np.ones(z.shape), "sun_direction_enu": np.tile(sun, (n, 1)),
+            "elevation": z, "image": image, "valid": np.ones(z.shape), "sun_horizon_deg": np.full(z.shape, -90.0), "sun_direction_enu": np.tile(sun, (n, 1)),
             "camera_position_enu": np.tile([0.0, 0, 1e8], (n, 1)), "longitude_deg": np.zeros(n), "latitude_deg": np.zeros(n),
             "image_index": np.zeros(n), "site": np.arange(n), "split": np.repeat([0, 1, 2], [64, 16, 16]),
         }.items():  # fmt: skip

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lunargr_cli.options import Device, Json, Overwrite, Quiet, Resume
+from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Resume
 
 NAME, ORDER = "compare", 72
 
@@ -18,9 +18,11 @@ def command(
     models: Annotated[
         str, typer.Option("--models", help="Reflectance models, separated by commas.")
     ] = "M1,M2,M3,M4,M5,M6",
-    seeds: Annotated[int, typer.Option("--seeds", help="Training runs of every model, from seeds 0, 1, ...")] = 3,
-    epochs: Annotated[int, typer.Option("--epochs", help="Passes over the training pairs.")] = 20,
-    batch: Annotated[int, typer.Option("--batch", help="Pairs per training step.")] = 64,
+    seeds: Annotated[
+        int, typer.Option("--seeds", min=1, max=1000, help="Training runs of every model, from seeds 0, 1, ...")
+    ] = 3,
+    epochs: Annotated[int, typer.Option("--epochs", min=1, max=100_000, help="Passes over the training pairs.")] = 20,
+    batch: Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Pairs per training step.")] = 64,
     lr: Annotated[float, typer.Option("--lr", help="Adam's learning rate.")] = 1e-4,
     schedule: Annotated[
         str, typer.Option("--schedule", help="Learning rate over the epochs: constant or cosine.")
@@ -43,7 +45,7 @@ def command(
     With --resume, runs that the folder already holds are kept and an interrupted one goes on where it stopped.
     """
     from lunargr_cli.console import Console
-    from schemas import ConfigError
+    from schemas import SPLITS, ConfigError
     from stages import compare, evaluate, train
     from stages.physics.photometry import get_model
 
@@ -65,6 +67,9 @@ def command(
         raise ConfigError(f"--widths: expected numbers like 16-32-64-128-256, found '{widths}'.") from None
     settings: dict[str, Any] = {"epochs": epochs, "batch": batch, "lr": lr, "schedule": schedule, "widths": channels}
     settings["precision"] = precision
+    train.check(train.Config(device=device, **settings))
+    if split not in dict(SPLITS):
+        raise ConfigError(f"--split: expected one of {', '.join(dict(SPLITS))}, found '{split}'.")
     files: list[tuple[Path, list[Path]]] = []
     for number, name in enumerate(names):
         evaluation = output / f"{name}.{split}.h5"

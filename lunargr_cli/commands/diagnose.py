@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Json, Overwrite, Quiet, Scheduler, Seed
+from lunargr_cli.options import MOST, Json, Overwrite, Quiet, Scheduler, Seed
 
 NAME, ORDER = "diagnose", 80
 
@@ -36,8 +36,8 @@ def command(
         typer.Option("--free", help="Coefficients of --model that are fitted, by commas; the others stay published."),
     ] = "",
     list_effects: Annotated[bool, typer.Option("--list", help="Explain every effect and stop.")] = False,
-    most_causes: Annotated[int, typer.Option("--causes", help="Most causes to name.")] = 4,
-    most_pairs: Annotated[int, typer.Option("--pairs", help="Most pairs that the search uses.")] = 384,
+    most_causes: Annotated[int, typer.Option("--causes", min=1, max=100, help="Most causes to name.")] = 4,
+    most_pairs: Annotated[int, typer.Option("--pairs", min=1, max=MOST, help="Most pairs that the search uses.")] = 384,
     seed: Seed = 0,
     json_file: Json = None,
     scheduler: Scheduler = None,

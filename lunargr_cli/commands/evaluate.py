@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lunargr_cli.options import Device, Json, Output, Overwrite, Quiet, ResumeParts, Scheduler, Seed
+from lunargr_cli.options import MOST, Device, Json, Output, Overwrite, Quiet, ResumeParts, Scheduler, Seed
 
 NAME, ORDER = "evaluate", 70
 
@@ -28,7 +28,8 @@ def command(
         Path | None, typer.Option("--figures", metavar="DIR", help="Write training curves and example crops as PNG.")
     ] = None,
     fit_pairs: Annotated[
-        int, typer.Option("--fit-pairs", help="Most train pairs that baselines are fitted on (0: all).")
+        int,
+        typer.Option("--fit-pairs", min=0, max=MOST, help="Most train pairs that baselines are fitted on (0: all)."),
     ] = 4096,
     renderings: Annotated[
         bool | None,
@@ -40,7 +41,7 @@ def command(
         list[str] | None,
         typer.Option("--only", metavar="ROW", help="Score only this row of the table; may be repeated."),
     ] = None,
-    batch: Annotated[int, typer.Option("--batch", help="Crops in memory at a time.")] = 16,
+    batch: Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Crops in memory at a time.")] = 16,
     seed: Seed = 0,
     device: Device = "auto",
     json_file: Json = None,

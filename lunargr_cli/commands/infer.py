@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.options import (
+    MOST,
     BodyOption,
     Device,
     Output,
@@ -29,12 +30,16 @@ def command(
     checkpoint: Annotated[Path, typer.Argument(help="checkpoint.h5 from 'lunargr train'.")],
     window: Annotated[
         int | None,
-        typer.Option("--window", help="Window size, px; context around it is added (default: what is fast)."),
+        typer.Option(
+            "--window", min=16, max=MOST, help="Window size, px; context around it is added (default: what is fast)."
+        ),
     ] = None,
     stride: Annotated[
-        int | None, typer.Option("--stride", help="Step between windows, px (default: a window).")
+        int | None, typer.Option("--stride", min=1, max=MOST, help="Step between windows, px (default: a window).")
     ] = None,
-    window_offset: Annotated[int, typer.Option("--window-offset", metavar="PX", help="Shift the grid of windows.")] = 0,
+    window_offset: Annotated[
+        int, typer.Option("--window-offset", min=-MOST, max=MOST, metavar="PX", help="Shift the grid of windows.")
+    ] = 0,
     precision: Annotated[
         str,
         typer.Option("--precision", help="fp32, bf16, or auto: bf16 where the processor has it and it does no harm."),
@@ -81,11 +86,15 @@ def command(
     )
     check_output(output, [terrain, checkpoint], overwrite)
     gridding = None
-    if not infer.open_terrain(terrain):
+    if infer.open_terrain(terrain):
+        infer.check_body(terrain, body)
+    else:
         from stages import ingest
         from stages.network.predictor import load_predictor
 
-        gridding = ingest.Config(gsd=None if any_gsd else load_predictor(checkpoint).gsd, body=body or "moon")
+        gridding = ingest.Config(
+            gsd=None if any_gsd else load_predictor(checkpoint).gsd, body="moon" if body is None else body
+        )
     if in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.stages import run_infer
 

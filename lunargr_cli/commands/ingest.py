@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.options import (
+    MOST,
     BodyOption,
     Output,
     Overwrite,
@@ -36,7 +37,9 @@ def command(
     gsd: Annotated[
         float | None, typer.Option("--gsd", help="Working ground sample distance, m (default: the DEM's own).")
     ] = None,
-    crop: Annotated[int, typer.Option("--crop", help="Crop size in pixels that valid positions are made for.")] = 128,
+    crop: Annotated[
+        int, typer.Option("--crop", min=1, max=MOST, help="Crop size in pixels that valid positions are made for.")
+    ] = 128,
     output: Output = Path("scene.h5"),
     body: BodyOption = None,
     skip_outside: Annotated[
@@ -54,7 +57,9 @@ def command(
     from stages import ingest
 
     console = Console(quiet)
-    config = ingest.Config(gsd=gsd, crop=crop, body=body or "moon", skip_outside=skip_outside, shard=parse_shard(shard))
+    config = ingest.Config(
+        gsd=gsd, crop=crop, body="moon" if body is None else body, skip_outside=skip_outside, shard=parse_shard(shard)
+    )
     if in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.stages import run_ingest
 
@@ -70,6 +75,10 @@ def command(
     )
     for name in found.skipped:
         console.say(f"left out: image '{name}' does not touch the DEM")
+    for frame in found.blank:
+        console.say(
+            f"warning: {frame.path}: image '{frame.image_id}' has no valid pixel on the DEM; is it all nodata there?"
+        )
     if found.frames:
         rows = [(f.image_id, f.units, f"{a:.2f}") for f, a in zip(found.frames, found.valid_area_km2, strict=True)]
         console.table(f"images: where a crop of {crop} px fits", ("image", "units", "km2"), rows)

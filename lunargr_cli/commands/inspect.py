@@ -28,7 +28,7 @@ def command(
 
     schema = read_kind(file)
     with open_artefact(file, schema) as data:
-        attributes = {k: (v.item() if hasattr(v, "item") else v) for k, v in data.attrs.items()}
+        attributes = {k: (v.tolist() if hasattr(v, "tolist") else v) for k, v in data.attrs.items()}
         variables = {
             name: {
                 "dims": list(schema[name].dims) if name in schema else [],

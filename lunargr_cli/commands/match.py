@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Device, Json, Overwrite, Quiet, Seed
+from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Seed
 
 NAME, ORDER = "match", 71
 
@@ -25,7 +25,7 @@ def command(
         typer.Option("--matcher", help="daisy, sift, aliked or disk; may be repeated (default: daisy and sift)."),
     ] = None,
     split: Annotated[str, typer.Option("--split", help="train, validation or test (for pairs).")] = "test",
-    count: Annotated[int, typer.Option("--count", help="Crops to match, drawn at random.")] = 24,
+    count: Annotated[int, typer.Option("--count", min=1, max=MOST, help="Crops to match, drawn at random.")] = 24,
     features_model: Annotated[
         Path | None, typer.Option("--features-model", metavar="ONNX", help="Network of aliked or disk.")
     ] = None,

@@ -152,7 +152,7 @@ def command(
         parameters=given,
         terrain_only=dem is not None,
         extension=str(extend) if extend else None,
-        body=body or "moon",
+        body=body,
         backplanes_in_tif=backplanes,
     )
     console = Console(quiet)
@@ -243,7 +243,8 @@ def _numbers(text: str | None, option: str, counts: tuple[int, ...]) -> tuple[fl
 
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.replace("x", ",").partition(",")
-    if not (width.strip().isdigit() and height.strip().isdigit() and int(width) > 0 and int(height) > 0):
+    good = all(edge.strip().isdecimal() and len(edge.strip()) <= 10 and int(edge) > 0 for edge in (width, height))
+    if not good:
         raise ConfigError(f"--size: expected W,H in pixels, found '{text}'.")
     return int(width), int(height)
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Output, Overwrite, Parts, Quiet, Scheduler, Seed, Shard, in_parts, parse_shard
+from lunargr_cli.options import MOST, Output, Overwrite, Parts, Quiet, Scheduler, Seed, Shard, in_parts, parse_shard
 
 NAME, ORDER = "sample", 30
 
@@ -15,10 +15,14 @@ NAME, ORDER = "sample", 30
 def command(
     scene: Annotated[Path, typer.Argument(help="scene.h5 from 'lunargr ingest'.")],
     crop: Annotated[
-        int | None, typer.Option("--crop", help="Crop size in pixels, a multiple of 16 (default: the scene's).")
+        int | None,
+        typer.Option("--crop", min=1, max=MOST, help="Crop size in pixels, a multiple of 16 (default: the scene's)."),
     ] = None,
     count: Annotated[
-        int | None, typer.Option("--count", help="Crops in all; with --stack, places in all (default: 100 per image).")
+        int | None,
+        typer.Option(
+            "--count", min=1, max=MOST, help="Crops in all; with --stack, places in all (default: 100 per image)."
+        ),
     ] = None,
     density: Annotated[
         float | None, typer.Option("--density", help="Crops per km2 of each image's valid positions.")

@@ -41,7 +41,9 @@ def command(
         str | None, typer.Option("--units", help="iof, or dn: an unknown gain and offset per image. [default: iof]")
     ] = None,
     hidden: Annotated[str | None, typer.Option("--hidden", help=_HIDDEN_HELP)] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Seed of every random choice. [default: 1]")] = None,
+    seed: Annotated[
+        int | None, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of every random choice. [default: 1]")
+    ] = None,
     overwrite: Overwrite = False,
     json_file: Json = None,
     quiet: Quiet = False,
@@ -117,6 +119,8 @@ def _override(
     values = dict(values)
     if size_px is not None and extent_m is not None:
         raise ConfigError("--size-px and --extent-m both set the size; give one of them.")
+    if gsd is not None and gsd <= 0:
+        raise ConfigError(f"--gsd: expected a number of metres above 0, found {gsd:g}.")
     if gsd is not None:
         values["gsd"] = gsd
         values["dem_gsd"] = gsd / 2
@@ -124,7 +128,10 @@ def _override(
         if value is not None:
             values[key] = value
     if extent_m is not None:
-        values["size_px"] = round(extent_m / float(values.get("gsd", Config.gsd)))
+        step = values.get("gsd", Config.gsd)
+        if not (isinstance(step, int | float) and step > 0 and 0 < extent_m < 1e9):
+            raise ConfigError(f"--extent-m: expected 0 .. 1e9 m and a --gsd above 0, found {extent_m:g} and {step}.")
+        values["size_px"] = round(min(extent_m / step, 2.0**31))
     if hidden is not None:
         values["hidden"] = hidden_from_option(hidden)
     return values

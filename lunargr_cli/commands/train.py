@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Device, Output, Overwrite, Quiet, Resume, Seed
+from lunargr_cli.options import MOST, Device, Output, Overwrite, Quiet, Resume, Seed
 
 NAME, ORDER = "train", 50
 
@@ -17,8 +17,8 @@ def command(
     model: Annotated[
         str, typer.Option("--model", help="Reflectance model to predict; 'lunargr models' lists them.")
     ] = "M2",
-    epochs: Annotated[int, typer.Option("--epochs", help="Passes over the training pairs.")] = 20,
-    batch: Annotated[int, typer.Option("--batch", help="Pairs per step, over all processes.")] = 64,
+    epochs: Annotated[int, typer.Option("--epochs", min=1, max=100_000, help="Passes over the training pairs.")] = 20,
+    batch: Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Pairs per step, over all processes.")] = 64,
     lr: Annotated[float, typer.Option("--lr", help="Adam's learning rate.")] = 1e-4,
     schedule: Annotated[
         str, typer.Option("--schedule", help="Learning rate over the epochs: constant or cosine.")

@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
+from lunargr_cli.options import check_scheduler
 from schemas.errors import ConfigError, InputError, LunargrError
 
 ANSWER = 10.0  # seconds in which a scheduler must answer
@@ -57,12 +58,11 @@ def open_dask(scheduler: str, folder: Path) -> Iterator[Engine]:
             f"--scheduler: needs Dask distributed ({error.name} is missing); install it with: pip install 'lunargr[cluster]'."
         ) from None
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    check_scheduler(scheduler)
     kind, _, number = scheduler.partition(":")
     with contextlib.ExitStack() as stack:
-        stack.enter_context(dask.config.set(_settings(int(number) if number.isdigit() else 1)))
+        stack.enter_context(dask.config.set(_settings(int(number) if kind == "local" else 1)))
         if kind == "local":
-            if not (number.isdigit() and int(number) > 0):
-                raise ConfigError(f"--scheduler: expected local:N with N workers, found '{scheduler}'.")
             cluster = stack.enter_context(
                 distributed.LocalCluster(
                     n_workers=int(number),

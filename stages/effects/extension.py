@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from schemas import DIAGNOSIS, ArtefactError, open_artefact, read_strings
+from schemas import DIAGNOSIS, ArtefactError, RegistryError, open_artefact, read_strings
 from schemas.provenance import read_record
 from stages.effects.base import Effect, Survey, get_effect
 
@@ -25,14 +27,29 @@ def load_extension(path: Path, image_ids: Sequence[str] | None = None) -> list[E
     with open_artefact(Path(path), DIAGNOSIS) as file:
         entries = json.loads(file.attrs["extension"])
         known = {name: k for k, name in enumerate(read_strings(file, "image_id"))}
-        tables = {name: torch.from_numpy(np.asarray(file[name][...], np.float32)) for name in _tables(entries, file)}
+        try:
+            names = _tables(entries, file)
+            tables = {name: torch.from_numpy(np.asarray(file[name][...], np.float32)) for name in names}
+            return _effects(entries, tables, known, image_ids)
+        except RegistryError as error:
+            raise ArtefactError(f"{path}: root attribute 'extension': {error}") from None
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError, RuntimeError) as error:
+            raise ArtefactError(
+                f"{path}: root attribute 'extension': expected effects with their values and tables, found something else "
+                f"({type(error).__name__}: {error}); run 'lunargr diagnose' again."
+            ) from None
+
+
+def _effects(
+    entries: list[dict[str, Any]], tables: dict[str, Tensor], known: dict[str, int], image_ids: Sequence[str] | None
+) -> list[Effect]:
     order = None if image_ids is None else [known.get(str(name), -1) for name in image_ids]
     effects = []
     for entry in entries:
         cls = get_effect(entry["effect"])
         if cls.scope == "site":
             continue  # a pattern of the diagnosed ground says nothing about other ground
-        values = dict(entry["values"])
+        values = {name: _finite(value) for name, value in entry["values"].items()}
         for coordinate, table in entry.get("tables", {}).items():
             column = tables[table["variable"]].reshape(len(known), -1)[:, table["column"]]
             if order is not None and cls.scope == "image":
@@ -41,6 +58,12 @@ def load_extension(path: Path, image_ids: Sequence[str] | None = None) -> list[E
             values[coordinate] = column
         effects.append(cls(values, Survey.from_json(entry["survey"])))
     return effects
+
+
+def _finite(value: Any) -> Any:
+    if not math.isfinite(value):
+        raise ValueError(f"expected a finite number, found {value}")
+    return value
 
 
 def _tables(entries: list[dict], file) -> set[str]:

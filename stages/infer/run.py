@@ -41,7 +41,7 @@ from stages.network.predictor import choose_device, load_predictor
 from stages.network.runtime import choose_inference_precision
 from stages.pairs.holes import fill_holes
 from stages.physics.maps.geotiff import EVEN, MapTiff
-from stages.physics.maps.grid import read_grid
+from stages.physics.maps.grid import check_same_body, read_grid
 
 Progress = Callable[[int, int, str], None]
 
@@ -213,6 +213,12 @@ def _statistics(file: h5py.File, names: list[str]) -> tuple[float, dict[str, tup
     return share, ranges
 
 
+def check_body(scene: Path, body: str | None) -> None:
+    """Refuse a --body that a scene contradicts. Raises GeometryError."""
+    with open_artefact(scene, SCENE) as file:
+        check_same_body(scene, float(file.attrs["body_radius_m"]), body)
+
+
 def open_terrain(path: Path) -> bool:
     """Whether ``path`` is one of our HDF5 artefacts (otherwise a raster DEM)."""
     silence_hdf5()
@@ -226,4 +232,4 @@ def _names_schema(path: Path) -> bool:
         with h5py.File(path, "r") as file:
             return "lunargr_schema" in file.attrs
     except OSError:
-        return True  # damaged: let open_artefact say so
+        return path.suffix.lower() in (".h5", ".hdf5")  # damaged: let open_artefact or the raster's reader say so

@@ -21,8 +21,8 @@ CHUNK = 256  # px of the artefact's chunks, which are best written whole
 
 def window_and_stride(config: Config) -> tuple[int, int]:
     """Those of the lattice that shards follow. Raises ConfigError."""
-    window = config.window or BAND
-    stride = config.stride or window  # windows carry their context: they need no overlap
+    window = BAND if config.window is None else config.window
+    stride = window if config.stride is None else config.stride  # windows carry their context: they need no overlap
     if window < 16 or not 1 <= stride <= window:
         raise ConfigError(
             f"--window and --stride: expected 1 <= stride <= window and window >= 16, found {stride} and {window}."

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from rasterio.io import DatasetReader
 from rasterio.transform import Affine
 from rasterio.warp import Resampling, calculate_default_transform
@@ -17,6 +18,7 @@ from schemas import (
     GeometryError,
     InputError,
 )
+from stages.ingest.config import Progress
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, local_metric_crs
 
@@ -36,8 +38,12 @@ class Plan:
     radius_is_elevation: bool
 
 
-def plan_grid(dem: Path, dataset: DatasetReader, gsd: float | None, radius: float) -> Plan:
+def plan_grid(
+    dem: Path, dataset: DatasetReader, gsd: float | None, radius: float, progress: Progress | None = None
+) -> Plan:
     """Area means where the DEM's grid is metric and divides the GSD, otherwise a local metric grid."""
+    rasters.check_single_band(dem, dataset, "a DEM")
+    rasters.check_metres(dem, dataset)
     east, north = rasters.pixel_size_at(dataset, radius, dataset.height / 2, dataset.width / 2)
     native = max(east, north)
     if gsd is not None and not (math.isfinite(gsd) and gsd > 0):
@@ -49,7 +55,7 @@ def plan_grid(dem: Path, dataset: DatasetReader, gsd: float | None, radius: floa
         raise ConfigError(
             f"--gsd: expected at least half the DEM's own {native:g} m, found {wanted:g}; detail cannot be invented."
         )
-    holds_radii = _holds_radii(dem, dataset, radius)
+    holds_radii = _holds_radii(dem, dataset, radius, progress)
     t = dataset.transform
     if dataset.crs.is_projected and t.b == t.d == 0 and t.a > 0 > t.e and _is_metre(dataset):
         step = abs(t.a)
@@ -76,6 +82,8 @@ def plan_grid(dem: Path, dataset: DatasetReader, gsd: float | None, radius: floa
     whole = Grid(dataset.crs.to_wkt(), t, dataset.height, dataset.width, radius)
     lon, lat = (float(v) for v in whole.lonlat(dataset.height / 2 - 0.5, dataset.width / 2 - 0.5))
     reach = np.hypot(dataset.height * north, dataset.width * east) / 2 / radius
+    if not (abs(lat) <= 90 and math.isfinite(lon)):
+        raise GeometryError(f"{dem}: its georeference puts the DEM off the body; check its CRS and transform.")
     if not reach < LARGEST_REACH:
         raise GeometryError(
             f"{dem}: expected a region that one local map can hold (up to {math.degrees(2 * LARGEST_REACH):.0f} deg across), "
@@ -102,7 +110,7 @@ def _is_metre(dataset: DatasetReader) -> bool:
     return abs((dataset.crs.linear_units_factor[1] if dataset.crs.is_projected else 0) - 1) < 1e-6
 
 
-def _holds_radii(dem: Path, dataset: DatasetReader, radius: float) -> bool:
+def _holds_radii(dem: Path, dataset: DatasetReader, radius: float, progress: Progress | None) -> bool:
     """Whether the DEM counts from the body's centre; and whether its numbers can be metres at all."""
     size = 256
     windows = [
@@ -112,15 +120,9 @@ def _holds_radii(dem: Path, dataset: DatasetReader, radius: float) -> bool:
     ]
     samples = [rasters.read_window(dataset, w) for w in windows]
     finite = np.concatenate([s[np.isfinite(s)] for s in samples])
-    if not finite.size and not _any_valid(dataset):
-        raise InputError(f"{dem}: expected elevations, found only nodata; is this the right band and file?")
-    if not finite.size:
-        return False
-    unit = (dataset.units[0] or "").strip().lower()
-    if unit in ("km", "kilometre", "kilometer", "kilometers", "kilometres"):
-        raise InputError(
-            f"{dem}: expected elevations in metres, found units '{unit}'; convert it (gdal_calc.py --calc='A*1000')."
-        )
+    if not finite.size:  # what little there is tells heights from radii
+        samples = [_first_elevations(dem, dataset, progress)]
+        finite = samples[0][np.isfinite(samples[0])]
     middle = float(np.median(finite))
     if abs(middle) > 0.5 * radius:
         if abs(middle - radius) > 0.05 * radius:
@@ -153,5 +155,21 @@ def _holds_radii(dem: Path, dataset: DatasetReader, radius: float) -> bool:
     return False
 
 
-def _any_valid(dataset: DatasetReader) -> bool:
-    return any(np.isfinite(rasters.read_window(dataset, window)).any() for _, window in dataset.block_windows(1))
+def _first_elevations(dem: Path, dataset: DatasetReader, progress: Progress | None) -> NDArray[np.float64]:
+    """The first block of a raster that holds any value. Raises InputError where none does."""
+    rows, cols = dataset.block_shapes[0]
+    down, across = math.ceil(dataset.height / rows), math.ceil(dataset.width / cols)
+    for r in range(down):
+        if progress:
+            progress(r, down, "rows of blocks without elevations")
+        for c in range(across):
+            # a sparse GeoTIFF leaves out blocks of nodata: a DEM of these is looked through in seconds
+            if dataset.driver == "GTiff" and not dataset.get_tag_item(f"BLOCK_OFFSET_{c}_{r}", "TIFF", bidx=1):
+                continue
+            window = Window(
+                c * cols, r * rows, min(cols, dataset.width - c * cols), min(rows, dataset.height - r * rows)
+            )
+            values = rasters.read_window(dataset, window)
+            if np.isfinite(values).any():
+                return values
+    raise InputError(f"{dem}: expected elevations, found only nodata; is this the right band and file?")

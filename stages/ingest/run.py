@@ -35,10 +35,12 @@ from stages.physics.images.table import Frame, load_frames, read_frames, write_f
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, check_body, read_grid, require_crs
 
+LARGEST_CROP = 8192  # px: what a network can see at once, and more
+
 
 @dataclass(frozen=True)
 class Summary:
-    """What ingest found, for the table at the end."""
+    """What ingest found, for the table at the end. ``blank``: the images of which no pixel is valid on the DEM."""
 
     grid: Grid
     dem_valid_share: float
@@ -47,6 +49,7 @@ class Summary:
     valid_area_km2: tuple[float, ...]
     resampled: bool
     skipped: tuple[str, ...]
+    blank: tuple[Frame, ...] = ()
 
 
 def run(
@@ -62,12 +65,14 @@ def run(
     dem : a raster, or a scene whose grid and elevations are taken as they are. Shards are cut in two steps: of a raster
     without images, its rows; of a scene with images, the images.
     """
-    if config.crop < 16 or config.crop % 2:
-        raise ConfigError(f"--crop: expected an even number of pixels, at least 16; found {config.crop}.")
+    if config.crop < 16 or config.crop % 2 or config.crop > LARGEST_CROP:
+        raise ConfigError(f"--crop: expected an even number of pixels, 16 .. {LARGEST_CROP}; found {config.crop}.")
     body = find_body(config.body)
     frames = read_frames(images, body) if images else []
     index, count = config.shard
-    with _open_terrain(dem, images, config, body) as terrain:
+    with _open_terrain(dem, images, config, body, progress) as terrain:
+        if frames and config.crop > min(terrain.grid.height, terrain.grid.width):
+            raise _no_positions(images, config, terrain.grid.gsd)
         first, last = (len(frames) * k // count for k in (index, index + 1))
         mine, skipped = check_frames(frames[first:last], terrain.grid, config.skip_outside)
         if frames and not mine and count == 1:
@@ -116,14 +121,16 @@ def summarise(scene: Path, skipped: tuple[str, ...] = ()) -> Summary:
     with open_artefact(scene, SCENE) as file:
         grid = read_grid(file, scene)
         low, high, known = (file.attrs[k] for k in ("elevation_low_m", "elevation_high_m", "dem_valid_px"))
+        frames = tuple(load_frames(file, scene))
         return Summary(
             grid,
             float(known) / (grid.height * grid.width),
             (float(low), float(high)),
-            tuple(load_frames(file, scene)),
+            frames,
             tuple(float(a) / 1e6 for a in file["valid_area_m2"][...]),
             bool(read_config(file)["resampled"]),
             skipped,
+            tuple(f for f, window in zip(frames, file["frame_window"][...], strict=True) if not window[2]),
         )
 
 
@@ -139,7 +146,9 @@ class Terrain:
 
 
 @contextlib.contextmanager
-def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body) -> Iterator[Terrain]:
+def _open_terrain(
+    dem: Path, images: Path | None, config: Config, body: Body, progress: Progress | None
+) -> Iterator[Terrain]:
     index, count = config.shard
     if is_artefact(dem):
         if images is None:
@@ -165,7 +174,7 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body) ->
     with rasters.open_raster(dem, "a DEM") as dataset:
         crs = require_crs(str(dem), dataset.crs, dataset.transform)
         check_body(str(dem), crs, body)
-        plan = plan_grid(dem, dataset, config.gsd, body.radius)
+        plan = plan_grid(dem, dataset, config.gsd, body.radius, progress)
         attributes = {"gsd_m": plan.grid.gsd, "body_radius_m": body.radius, "elevation_source": dem.name}
         if count > 1:
             bands = math.ceil(plan.grid.height / config.block)
@@ -216,8 +225,11 @@ def is_artefact(path: Path) -> bool:
     silence_hdf5()
     if not (path.is_file() and h5py.is_hdf5(path)):
         return False
-    with h5py.File(path, "r") as file:
-        return "lunargr_schema" in file.attrs
+    try:
+        with h5py.File(path, "r") as file:
+            return "lunargr_schema" in file.attrs
+    except OSError:  # damaged: whoever opens it as a raster says so
+        return False
 
 
 def _write_grid(writer: ArtefactWriter, grid: Grid) -> None:

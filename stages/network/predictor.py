@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,9 +13,10 @@ import torch
 from torch import Tensor
 
 from schemas.artefacts import CHECKPOINT
-from schemas.errors import ArtefactError, ConfigError
+from schemas.errors import ArtefactError, ConfigError, RegistryError
 from schemas.reading import open_artefact, read_config, read_strings
 from stages.network.normalisation import scale_elevation
+from stages.network.stored import check_finite, check_weights, read_layout
 from stages.network.unet import UNet
 from stages.physics.photometry import ReflectanceModel, get_model
 
@@ -70,12 +72,14 @@ def choose_device(name: str) -> torch.device:
     """'auto', 'cpu', 'cuda', 'cuda:1' -> a device that exists. Raises ConfigError."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise ConfigError(f"--device: expected cpu, cuda, cuda:N or auto, found '{name}'.") from None
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("--device: expected a CUDA device, found none; use --device cpu.")
+    if not re.fullmatch(r"cpu|cuda(:\d{1,3})?", name, re.ASCII):
+        raise ConfigError(f"--device: expected cpu, cuda, cuda:N or auto, found '{name}'.")
+    device = torch.device(name)
+    count = torch.cuda.device_count()
+    if device.type == "cuda" and (device.index or 0) >= count:
+        raise ConfigError(
+            f"--device: expected one of {count} CUDA devices, found '{name}'; use --device cpu or another."
+        )
     return device
 
 
@@ -98,19 +102,19 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
             raise ArtefactError(
                 f"{path}: expected a checkpoint for model '{model}', found one for '{name}'; train again or drop --model."
             )
-        if "weights" not in file:
-            raise ArtefactError(
-                f"{path}:/weights: expected the network's weights, found none; write it again with 'lunargr train'."
-            )
-        reflectance = get_model(name)
+        try:
+            reflectance = get_model(name)
+        except RegistryError as error:
+            raise ArtefactError(f"{path}: root attribute 'model': {error}") from None
         found = json.loads(str(file.attrs["coefficients"]))
         expected = [p.name for p in reflectance.parameters]
         if found != expected:
             raise ArtefactError(
-                f"{path}: expected coefficients {', '.join(expected)} of '{name}', found {', '.join(found)}; train again."
+                f"{path}: expected coefficients {', '.join(expected)} of '{name}', found {', '.join(map(str, found))}; train again."
             )
-        config = read_config(file)
-        net = UNet(len(expected), config["widths"], config["dropout"])
+        widths, dropout = read_layout(path, read_config(file), name)
+        check_weights(path, file.get("weights"), len(expected), widths, dropout)
+        net = UNet(len(expected), widths, dropout)
         predictor = Predictor(
             reflectance,
             net,
@@ -119,11 +123,13 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
             float(file.attrs["output_scale"]),
         )
         try:
-            predictor.load_state_dict(read_state(file["weights"]))
-        except RuntimeError as error:
+            state = read_state(file["weights"])
+        except OSError as error:
             raise ArtefactError(
-                f"{path}:/weights: they do not fit the network ({str(error).splitlines()[0]}); train again."
+                f"{path}:/weights: cannot be read ({error}); the file is damaged, train again."
             ) from None
+        check_finite(path, state)
+        predictor.load_state_dict(state)
         ids = read_strings(file, "image_id")
         predictor.gain = dict(zip(ids, map(float, file["gain"][...]), strict=True))
         predictor.offset = dict(zip(ids, map(float, file["offset"][...]), strict=True))

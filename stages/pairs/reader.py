@@ -91,10 +91,11 @@ class PairReader:
             unpack(f[n], f[n][...]).astype(np.float32) for n in ("sun_direction_enu", "camera_position_enu")
         )
         self.image_ids = read_strings(f, "image_id")
-        if self.frame.min() < 0 or self.frame.max() >= len(self.image_ids):
+        if not (np.linalg.norm(self._camera, axis=1) > 0).all():
             raise ArtefactError(
-                f"{path}:/image_index: expected indices below {len(self.image_ids)} (frames), found {self.frame.max()}."
+                f"{path}:/camera_position_enu: expected places away from the crop, found 0; write it again."
             )
+        self._check_any_valid()
 
     def close(self) -> None:
         self._stack.close()
@@ -104,6 +105,16 @@ class PairReader:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _check_any_valid(self) -> None:
+        """One valid pixel anywhere is enough: of good files one pair is read. Raises ArtefactError."""
+        for index in range(self.count):
+            if _validity(self._read(["valid", "image", "elevation"], [index])).any():
+                return
+        raise ArtefactError(
+            f"{self.path}: expected valid pixels, found none in any pair (valid = 0, or images or elevations unknown); "
+            "write it again with 'lunargr project'."
+        )
 
     def indices(self, part: str) -> NDArray[np.int64]:
         """Pairs of 'train', 'validation' or 'test'."""

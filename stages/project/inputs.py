@@ -13,10 +13,11 @@ from typing import Any
 import h5py
 import numpy as np
 
-from schemas import CROPS, SCENE, ArtefactError, open_artefact
+from schemas import CROPS, SCENE, ArtefactError, InputError, open_artefact
+from schemas.files.inputs import check_file
 from schemas.provenance import sha256
 from stages.physics.horizon.scene import Overview, make_overview
-from stages.physics.images.table import load_frames
+from stages.physics.images.table import Frame, load_frames
 from stages.physics.maps.grid import Grid, read_grid
 from stages.project.config import Config
 
@@ -44,6 +45,36 @@ def open_scene(crops: Path, file: h5py.File, config: Config) -> Iterator[Scene]:
         elevation = scene["elevation"]
         overview = overview_of(path, elevation)
         yield Scene(path, elevation, read_grid(scene, path), overview, overview_extremes(elevation, overview))
+
+
+def check_sources(crops: Path, frames: list[Frame]) -> None:
+    """The images and cameras must be those that the scene's masks were made from. Raises InputError."""
+    for frame in frames:
+        for path, known in ((frame.path, frame.sha256), (frame.camera, frame.camera_sha256)):
+            if path is None or not known:
+                continue
+            check_file(path, f"a file of the image '{frame.image_id}' of {crops}")
+            if sha256(path) != known:
+                raise InputError(
+                    f"{path}: expected the file of image '{frame.image_id}' that {crops} was made with, found another content; "
+                    "bring it back, or run 'lunargr ingest' and 'lunargr sample' again."
+                )
+
+
+def check_places(crops: Path, file: h5py.File, shape: tuple[int, int]) -> None:
+    """Crops are square, even, and lie on the scene. Raises ArtefactError."""
+    height, width = file["elevation"].shape[1:]
+    if height != width or height % 2:
+        raise ArtefactError(
+            f"{crops}:/elevation: expected square crops of an even size, found {height} x {width}; run 'lunargr sample' again."
+        )
+    for name, edge in zip(("row", "col"), shape, strict=True):
+        centre = file[name][...].astype(np.int64)
+        if len(centre) and (centre.min() < height // 2 or centre.max() > edge - height // 2):
+            raise ArtefactError(
+                f"{crops}:/{name}: expected crops that lie on the scene, {height // 2} .. {edge - height // 2}, "
+                f"found {centre.min()} .. {centre.max()}; run 'lunargr sample' again."
+            )
 
 
 def find_scene(crops: Path, file: h5py.File, config: Config) -> Path:

@@ -18,7 +18,7 @@ from stages.physics.images.table import Frame, load_frames
 from stages.physics.maps.grid import LocalFrames
 from stages.project.config import Config, Progress, Registered, Summary
 from stages.project.geometry import Geometry, check_directions, crop_geometry
-from stages.project.inputs import Scene, open_scene
+from stages.project.inputs import Scene, check_places, check_sources, open_scene
 from stages.project.register import displacement_at, register, write_registration
 from stages.project.writing import Pair, PairDatasets, Tally, kept_decimals
 
@@ -34,6 +34,8 @@ def run(
         frames = load_frames(file, crops)
         total, size = file["elevation"].shape[:2]
         part = slice(*(total * k // config.shard[1] for k in (config.shard[0], config.shard[0] + 1)))
+        check_sources(crops, [frames[k] for k in sorted({int(k) for k in file["image_index"][part]})])
+        check_places(crops, file, scene.elevation.shape)
         units = _units(crops, file, frames, part)
         with ArtefactWriter(
             output,

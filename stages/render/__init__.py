@@ -24,7 +24,7 @@ def run(
     output : NAME.exr writes NAME.exr, NAME.png and, for ortho views, NAME.tif; NAME.tif and NAME.png leave the EXR out
     """
     check(config)
-    body = find_body(config.body)
+    body = find_body("moon" if config.body is None else config.body)
     files = output_files(output, config.view)
     for path in files:
         check_output(path, inputs(source, config), overwrite)

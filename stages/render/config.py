@@ -24,6 +24,8 @@ SUN = (
     "time",
 )
 
+LARGEST_VIEW = 1 << 30  # pixels; an EXR of them has 4 GB a channel
+
 
 @dataclass(frozen=True)
 class Config:
@@ -58,7 +60,7 @@ class Config:
     parameters: Mapping[str, float] = field(default_factory=dict)
     terrain_only: bool = False
     extension: str | None = None
-    body: str = "moon"
+    body: str | None = None
     backplanes_in_tif: bool = False
 
 
@@ -104,6 +106,16 @@ def check(config: Config, trajectory: bool = False) -> None:
         raise ConfigError(f"--view: expected one of {', '.join(VIEWS)}; found '{config.view}'.")
     if config.samples is not None and not 1 <= config.samples <= 32:
         raise ConfigError(f"--samples: expected rays per pixel and axis in 1..32, found {config.samples}.")
+    if not 0 < config.fov_deg < 180:
+        raise ConfigError(f"--fov: expected degrees between 0 and 180, found {config.fov_deg:g}.")
+    if config.solar_distance_au is not None and not 0.05 <= config.solar_distance_au <= 100:
+        raise ConfigError(f"--solar-distance: expected 0.05 .. 100 au, found {config.solar_distance_au:g}.")
+    if config.quaternion is not None and abs(math.hypot(*config.quaternion) - 1) > 0.01:
+        raise ConfigError(f"--quaternion: expected one of unit length, found {math.hypot(*config.quaternion):g}.")
+    if not 0 < config.size_px[0] * config.size_px[1] <= LARGEST_VIEW:
+        raise ConfigError(
+            f"--size: expected a view of at most {LARGEST_VIEW:,} pixels, found {config.size_px[0]} x {config.size_px[1]}."
+        )
     if config.view == "ortho" or config.camera or trajectory:
         return
     if config.position is None:

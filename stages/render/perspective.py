@@ -79,6 +79,8 @@ def look(
     lat = np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
     row, col = grid.rowcol_of_lonlat(lon, lat)
     inside = np.isfinite(row) & np.isfinite(col)
+    if not inside.any():
+        raise GeometryError(_misses(surface))
     row, col, distances = row[inside], col[inside], distances[inside]
     # beyond the map by more than its own size is no place that a neighbouring ray leads back from
     row, col = np.clip(row, -grid.height, 2 * grid.height), np.clip(col, -grid.width, 2 * grid.width)

@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 
 from schemas.errors import ConfigError
 from stages.physics.bodies.spheres import Body
-from stages.physics.cameras import Camera, open_camera
+from stages.physics.cameras import Camera
+from stages.physics.images.frame_geometry import open_camera_for
 from stages.physics.images.table import ASTRONOMICAL_UNIT
 from stages.physics.light.sun_disc import SUN_RADIUS
+from stages.physics.maps.grid import check_same_body
 from stages.physics.terrain.shading import Light
 from stages.physics.terrain.sun import Sun, check_sun_is_up, find_sun
 from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface, open_surface, open_terrain
-from stages.render.config import SUN, Config
+from stages.render.config import LARGEST_VIEW, SUN, Config
 from stages.render.viewpoint import look_at, pinhole_view, place, rotation_from_quaternion
 
 
@@ -29,6 +31,7 @@ def open_source(source: Path, config: Config, body: Body) -> Iterator[Surface]:
     """The terrain and reflectance to render. Raises LunargrError."""
     opened = open_terrain if config.terrain_only else open_surface
     with opened(source, config.model, config.parameters, body) as surface:
+        check_same_body(source, surface.grid.radius, config.body)
         yield surface
 
 
@@ -57,6 +60,10 @@ def make_light(
 
 
 def _named_sun(surface: Surface, config: Config, body: Body) -> Sun:
+    if config.time is not None and config.body is None and abs(body.radius - surface.grid.radius) > 0.005 * body.radius:
+        raise ConfigError(
+            f"--time: expected --body beside it, since {surface.path} (radius {surface.grid.radius:g} m) does not show the Moon."
+        )
     return find_sun(
         surface.grid,
         Body(body.name, surface.grid.radius),
@@ -79,8 +86,18 @@ def _three(values: Sequence[float], option: str) -> tuple[float, float, float]:
 
 def find_camera(surface: Surface, config: Config) -> Camera:
     """The camera of a view: a model from a file, or a pinhole at a place. Raises LunargrError."""
+    camera = _camera(surface, config)
+    if camera.lines * camera.samples > LARGEST_VIEW:
+        raise ConfigError(
+            f"{config.camera or '--size'}: expected a view of at most {LARGEST_VIEW:,} pixels, found "
+            f"{camera.samples} x {camera.lines}; render it in smaller pieces."
+        )
+    return camera
+
+
+def _camera(surface: Surface, config: Config) -> Camera:
     if config.camera:
-        return open_camera(config.camera)
+        return open_camera_for(Path(config.camera), surface.grid.radius)
     grid = surface.grid
     lon, lat, altitude = _three(config.position or (), "--position")
     position = place(lon, lat, altitude, grid.radius)

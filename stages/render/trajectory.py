@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from schemas.errors import InputError
+from schemas.files.inputs import read_text
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _NUMBERS = (
@@ -45,15 +46,8 @@ class ViewRow:
 
 def read_trajectory(path: Path) -> list[ViewRow]:
     """Read and check a trajectory table. Raises InputError naming the row and column."""
-    if not path.exists():
-        raise InputError(f"{path}: no such file; expected a trajectory (CSV, one row per view).")
-    try:
-        lines = [
-            line for line in path.read_text(encoding="utf-8-sig").splitlines() if not line.lstrip().startswith("#")
-        ]
-    except (OSError, UnicodeDecodeError):
-        raise InputError(f"{path}: expected a CSV table of views, found something else.") from None
-    reader = csv.DictReader(lines)
+    text = read_text(path, "a trajectory (CSV, one row per view)")
+    reader = csv.DictReader(line for line in text.splitlines() if not line.lstrip().startswith("#"))
     names = [name.strip() for name in reader.fieldnames or []]
     for name in ("longitude_deg", "latitude_deg", "altitude_m"):
         if name not in names:

@@ -47,7 +47,7 @@ def run_trajectory(
         raise ConfigError("--trajectory: expected no --camera; each row places its own pinhole camera.")
     config = replace(config, view="pinhole")
     check(config, trajectory=True)
-    body = find_body(config.body)
+    body = find_body("moon" if config.body is None else config.body)
     views = read_trajectory(table)[shard[0] :: shard[1]]
     outputs = {view.view_id: output_files(folder / f"{view.view_id}{suffix}", "pinhole") for view in views}
     done = {v.view_id for v in views if resume and all(p.exists() for p in outputs[v.view_id])}

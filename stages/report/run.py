@@ -12,6 +12,7 @@ from typing import Any
 from markupsafe import Markup
 
 from schemas import ConfigError, InputError, atomic_path, check_output, open_artefact, read_kind
+from schemas.files.inputs import check_file, read_json
 from stages.common import page
 from stages.common.page import pictures
 from stages.report import results, sections
@@ -63,7 +64,13 @@ def run(
             shown.append(path)
             continue
         load = _json if path.suffix.lower() == ".json" else _artefact
-        kind, section, more = load(path, details, seen)
+        try:
+            kind, section, more = load(path, details, seen)
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise InputError(
+                f"{path}: expected a result as its stage writes it, found other content ({type(error).__name__}: {error}); "
+                "run the stage again."
+            ) from None
         if section is not None:
             found.append((ORDER.index(kind), section))
         cards.extend(more)
@@ -107,12 +114,7 @@ def _artefact(path: Path, details: list[Markup], seen: list[Any]) -> Part:
 
 def _json(path: Path, details: list[Markup], seen: list[Any]) -> Part:
     """The section of a JSON result, told by its keys; none for one that is on the page already."""
-    try:
-        result: Any = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; check the path.") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: expected JSON, found another kind of file ({error}).") from None
+    result: Any = read_json(path, "a result in JSON")
     if result in seen:
         return "scene", None, []
     seen.append(result)
@@ -132,6 +134,7 @@ def _gallery(paths: Sequence[Path]) -> page.Section:
     section = page.Section("Pictures")
     figures = []
     for path in paths:
+        check_file(path, "a PNG or JPEG picture")
         try:
             content = path.read_bytes()
         except OSError as error:

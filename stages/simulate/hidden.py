@@ -65,7 +65,7 @@ def parse_hidden(items: Iterable[Mapping[str, Any]]) -> list[Hidden]:
     for item in items:
         if not isinstance(item, Mapping) or "effect" not in item:
             raise ConfigError(
-                f'recipe: \'hidden\': expected entries like {{"effect": "dark_bias", "iof": 0.004}}, found {json.dumps(item)}.'
+                f'recipe: \'hidden\': expected entries like {{"effect": "dark_bias", "iof": 0.004}}, found {json.dumps(item)}; mend it.'
             )
         effect = str(item["effect"])
         if effect not in CHOICES:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import ConfigError, InputError
+from schemas.files.inputs import read_json
 from stages.simulate.hidden import Hidden, parse_hidden
 
 Range = tuple[float, float]
@@ -100,6 +101,22 @@ _NOT_NEGATIVE = (
     "read_noise",
     "registration_error",
 )
+LARGEST = 1e6  # of any length in metres or number of electrons
+_MOST = {
+    "hurst": 2.0,
+    "crater_density": 100.0,
+    "boulders_per_km2": 1e5,
+    "geometry_contrast": 100.0,
+    "free_contrast": 100.0,
+}
+LARGEST_DEM = 32768  # pixels a side: the truth is made in memory
+_COUNTS = {
+    "size_px": (64, LARGEST_DEM),
+    "images": (1, 10000),
+    "seed": (0, 2**63 - 1),
+    "dem_holes": (0, 10000),
+    "image_holes": (0, 10000),
+}
 _RANGES: dict[str, Range] = {
     "image_gsd": (0.1, 1e4),
     "altitude": (1e3, 1e7),
@@ -121,8 +138,10 @@ def make_config(values: dict[str, Any], where: str = "recipe") -> Config:
         like = getattr(default, key)
         try:
             clean[key] = _coerce(value, like)
-        except (TypeError, ValueError):
-            raise ConfigError(f"{where}: '{key}': expected a value like {json.dumps(like)}, found {value!r}.") from None
+        except (TypeError, ValueError, OverflowError, AttributeError):
+            raise ConfigError(
+                f"{where}: '{key}': expected a value like {json.dumps(like)}, found {value!r}; mend it."
+            ) from None
     config = Config(**clean)
     _check(config, where)
     return config
@@ -132,7 +151,7 @@ def _coerce(value: Any, like: Any) -> Any:
     if isinstance(like, bool) or isinstance(value, bool):
         raise TypeError
     if isinstance(like, int):
-        if int(value) != float(value):
+        if isinstance(value, str) or not math.isfinite(value) or int(value) != value:
             raise ValueError
         return int(value)
     if isinstance(like, float):
@@ -155,35 +174,43 @@ def _coerce(value: Any, like: Any) -> Any:
 
 
 def _check(config: Config, where: str) -> None:
+    for key in (*_POSITIVE, *_NOT_NEGATIVE, "base_elevation"):
+        most = _MOST.get(key, LARGEST)
+        if abs(getattr(config, key)) > most:
+            raise ConfigError(f"{where}: '{key}': expected at most {most:g}, found {getattr(config, key):g}; mend it.")
     for key in _POSITIVE:
         if not getattr(config, key) > 0:
-            raise ConfigError(f"{where}: '{key}': expected a number above 0, found {getattr(config, key):g}.")
+            raise ConfigError(f"{where}: '{key}': expected a number above 0, found {getattr(config, key):g}; mend it.")
     for key in _NOT_NEGATIVE:
         if getattr(config, key) < 0:
-            raise ConfigError(f"{where}: '{key}': expected a number of at least 0, found {getattr(config, key):g}.")
+            raise ConfigError(
+                f"{where}: '{key}': expected a number of at least 0, found {getattr(config, key):g}; mend it."
+            )
     for key, (low, high) in _RANGES.items():
         first, last = getattr(config, key)
         if not low <= first <= last <= high:
             raise ConfigError(
-                f"{where}: '{key}': expected low <= high within {low:g}..{high:g}, found {first:g}, {last:g}."
+                f"{where}: '{key}': expected low <= high within {low:g}..{high:g}, found {first:g}, {last:g}; mend it."
             )
-    if config.size_px < 64:
-        raise ConfigError(f"{where}: 'size_px': expected at least 64 pixels, found {config.size_px}.")
-    if config.images < 1:
-        raise ConfigError(f"{where}: 'images': expected at least 1, found {config.images}.")
+    for key, (first, last) in _COUNTS.items():
+        if not first <= getattr(config, key) <= last:
+            raise ConfigError(f"{where}: '{key}': expected {first} .. {last}, found {getattr(config, key)}; mend it.")
+    if config.dem_size > LARGEST_DEM:
+        raise ConfigError(
+            f"{where}: 'size_px': expected at most {LARGEST_DEM // config.factor} pixels at {config.factor} DEM pixels a pixel, "
+            f"found {config.size_px}."
+        )
     if config.units not in ("iof", "dn"):
-        raise ConfigError(f"{where}: 'units': expected 'iof' or 'dn', found '{config.units}'.")
-    if config.seed < 0:
-        raise ConfigError(f"{where}: 'seed': expected at least 0, found {config.seed}.")
+        raise ConfigError(f"{where}: 'units': expected 'iof' or 'dn', found '{config.units}'; mend it.")
     if not 0 <= config.oblique_share <= 1:
-        raise ConfigError(f"{where}: 'oblique_share': expected 0..1, found {config.oblique_share:g}.")
+        raise ConfigError(f"{where}: 'oblique_share': expected 0..1, found {config.oblique_share:g}; mend it.")
     if abs(config.latitude_deg) > 89 or abs(config.longitude_deg) > 360:
         raise ConfigError(
-            f"{where}: expected a place with |latitude| <= 89, found {config.longitude_deg:g}, {config.latitude_deg:g}."
+            f"{where}: expected a place with |latitude| <= 89, found {config.longitude_deg:g}, {config.latitude_deg:g}; mend it."
         )
     if abs(config.gsd / config.dem_gsd - config.factor) > 1e-9 * config.factor:
         raise ConfigError(
-            f"{where}: expected 'gsd' to be a whole multiple of 'dem_gsd', found {config.gsd:g} and {config.dem_gsd:g}."
+            f"{where}: expected 'gsd' to be a whole multiple of 'dem_gsd', found {config.gsd:g} and {config.dem_gsd:g}; mend it."
         )
     # the Sun climbs no higher than this at the place
     highest = max(0.0, abs(config.latitude_deg) - 1.6)
@@ -197,14 +224,9 @@ def _check(config: Config, where: str) -> None:
 
 def read_recipe(path: Path) -> dict[str, Any]:
     """The keys of a recipe file. Raises InputError."""
-    if not path.exists():
-        raise InputError(f"{path}: no such file; expected a recipe ('lunargr simulate --print-recipe' writes one).")
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputError(f"{path}: expected a recipe in JSON, found something else ({error}).") from None
+    values = read_json(path, "a recipe in JSON ('lunargr simulate --print-recipe' writes one)")
     if not isinstance(values, dict):
-        raise InputError(f"{path}: expected a JSON object of recipe keys, found {type(values).__name__}.")
+        raise InputError(f"{path}: expected a JSON object of recipe keys, found {type(values).__name__}; mend it.")
     return values
 
 

@@ -74,11 +74,11 @@ def parse_utc(time_utc: str | datetime, where: str = "time") -> Time:
         year, day, hour, minute, second = match.groups()
         value, form = f"{year}:{day}:{hour or '00'}:{minute or '00'}:{second or '00'}", "yday"
     else:
-        raise InputError(f"{where}: expected a UTC time such as 2010-11-09T13:06:40.356, found '{text}'.")
+        raise InputError(f"{where}: expected a UTC time such as 2010-11-09T13:06:40.356, found '{text}'; write it so.")
     try:
         return Time(value.rstrip("."), format=form, scale="utc")
     except ValueError:
-        raise InputError(f"{where}: expected a UTC time that exists, found '{text}'.") from None
+        raise InputError(f"{where}: expected a UTC time that exists, found '{text}'; mend it.") from None
 
 
 def utc_to_et(time_utc: str | datetime) -> float:

@@ -6,7 +6,6 @@ Image coordinates here are CSM's: (line, sample), the first pixel's centre at (0
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError, InputError, RegistryError
+from schemas.files.inputs import read_json
 
 Floats = NDArray[np.float64]
 
@@ -192,7 +192,7 @@ def camera_from_document(document: Mapping[str, Any], where: str) -> Camera:
     name = document.get("type", document.get("name_model"))
     if name is None:
         raise InputError(
-            f"{where}: expected a camera with the key 'type' or 'name_model' (an ALE/CSM ISD), found neither."
+            f"{where}: expected a camera with the key 'type' or 'name_model' (an ALE/CSM ISD), found neither; is it the right file?"
         )
     cls = _CAMERAS.get(str(name).lower())
     if cls is None:
@@ -202,14 +202,9 @@ def camera_from_document(document: Mapping[str, Any], where: str) -> Camera:
 
 def read_document(path: Path) -> Mapping[str, Any]:
     """A camera's JSON document. Raises InputError."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected a camera model (JSON).") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected a camera model in JSON, cannot read it ({error}).") from None
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: expected a camera model in JSON, found something else ({error}).") from None
+    document = read_json(path, "a camera model in JSON")
     if not isinstance(document, Mapping):
-        raise InputError(f"{path}: expected a JSON object that describes a camera, found a {type(document).__name__}.")
+        raise InputError(
+            f"{path}: expected a JSON object that describes a camera, found a {type(document).__name__}; is it the right file?"
+        )
     return document

@@ -13,7 +13,9 @@ from schemas.errors import GeometryError, InputError
 from stages.physics.bodies.spheres import find_body
 
 Floats = NDArray[np.float64]
+LARGEST_IMAGE = 100_000_000  # lines, samples: longer than any strip from orbit
 ROTATION_TOLERANCE = 1e-6
+LOWEST_CAMERA, FARTHEST_CAMERA = 0.5, 1e13  # of the radius (bodies are far from round), m
 QUATERNION_TOLERANCE = 1e-3  # tables keep 8 digits; further off is not a rotation
 
 
@@ -34,9 +36,11 @@ def number(document: Mapping[str, Any], key: str, where: str, default: float | N
     try:
         result = float(found)
     except (TypeError, ValueError):
-        raise InputError(f"{where}: expected a number in '{key}', found {_short(found)}.") from None
+        raise InputError(
+            f"{where}: expected a number in '{key}', found {_short(found)}; mend the camera model."
+        ) from None
     if not math.isfinite(result):
-        raise InputError(f"{where}: expected a finite number in '{key}', found {result}.")
+        raise InputError(f"{where}: expected a finite number in '{key}', found {result}; mend the camera model.")
     return result
 
 
@@ -46,15 +50,19 @@ def array(document: Mapping[str, Any], key: str, where: str, shape: tuple[int, .
     try:
         result = np.array(found, dtype=float)
     except (TypeError, ValueError):
-        raise InputError(f"{where}: expected numbers in '{key}', found {_short(found)}.") from None
+        raise InputError(
+            f"{where}: expected numbers in '{key}', found {_short(found)}; mend the camera model."
+        ) from None
     fits = shape is None or (
         result.ndim == len(shape) and all(want in (-1, have) for want, have in zip(shape, result.shape, strict=True))
     )
     if not fits:
         wanted = " x ".join("n" if n == -1 else str(n) for n in shape or ())
-        raise InputError(f"{where}: expected {wanted} numbers in '{key}', found shape {result.shape}.")
+        raise InputError(
+            f"{where}: expected {wanted} numbers in '{key}', found shape {result.shape}; mend the camera model."
+        )
     if not np.isfinite(result).all():
-        raise InputError(f"{where}: expected finite numbers in '{key}', found NaN or infinity.")
+        raise InputError(f"{where}: expected finite numbers in '{key}', found NaN or infinity; mend the camera model.")
     return result
 
 
@@ -69,8 +77,10 @@ def has(document: Mapping[str, Any], key: str) -> bool:
 
 def size(document: Mapping[str, Any], key: str, where: str) -> int:
     result = number(document, key, where)
-    if result < 1 or result != int(result):
-        raise InputError(f"{where}: expected a whole number of pixels above 0 in '{key}', found {result:g}.")
+    if not 1 <= result <= LARGEST_IMAGE or result != int(result):
+        raise InputError(
+            f"{where}: expected a whole number of pixels, 1 .. {LARGEST_IMAGE}, in '{key}', found {result:g}; mend the camera model."
+        )
     return int(result)
 
 
@@ -82,11 +92,13 @@ def rotation(document: Mapping[str, Any], key: str, where: str) -> Floats:
     elif numbers.shape == (4,):
         return quaternion_matrix(check_quaternions(numbers, f"{where}: '{key}'")[[3, 0, 1, 2]])
     else:
-        raise InputError(f"{where}: expected a rotation of 3 x 3 or 4 numbers in '{key}', found shape {numbers.shape}.")
+        raise InputError(
+            f"{where}: expected a rotation of 3 x 3 or 4 numbers in '{key}', found shape {numbers.shape}; mend the camera model."
+        )
     off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if off > ROTATION_TOLERANCE or np.linalg.det(matrix) < 0:
         kind = "a reflection" if off <= ROTATION_TOLERANCE else f"rows that are not orthonormal (by {off:.2g})"
-        raise GeometryError(f"{where}: expected a rotation in '{key}', found {kind}.")
+        raise GeometryError(f"{where}: expected a rotation in '{key}', found {kind}; mend the camera model.")
     return matrix
 
 
@@ -97,7 +109,7 @@ def check_quaternions(quaternions: Floats, where: str) -> Floats:
     if bad.any():
         first = int(np.flatnonzero(np.ravel(bad))[0])
         raise GeometryError(
-            f"{where}: expected unit quaternions, found one of length {np.ravel(length)[first]:.6g} (number {first + 1})."
+            f"{where}: expected unit quaternions, found one of length {np.ravel(length)[first]:.6g} (number {first + 1}); mend the camera model."
         )
     return quaternions / length[..., None]
 
@@ -121,13 +133,19 @@ def own_camera(document: Mapping[str, Any], where: str) -> dict[str, Any]:
     point = array(document, "principal_point_px", where, (2,))
     samples, lines = array(document, "size_px", where, (2,))
     extent = {"samples": samples, "lines": lines}
+    centre, axes = array(document, "position_mcmf", where, (3,)), body_axes(document, where)
+    if not LOWEST_CAMERA * axes[1] < np.linalg.norm(centre) < FARTHEST_CAMERA:
+        raise GeometryError(
+            f"{where}: expected a place above a body of {axes[0]:g} m radius in 'position_mcmf' (m), found one "
+            f"{np.linalg.norm(centre):g} m from its middle; mend the camera model."
+        )
     return {
         "lines": size(extent, "lines", f"{where}: 'size_px'"),
         "samples": size(extent, "samples", f"{where}: 'size_px'"),
         "principal_point_px": (float(point[0]), float(point[1])),
-        "centre": array(document, "position_mcmf", where, (3,)),
+        "centre": centre,
         "rotation": rotation(document, "rotation_camera_to_mcmf", where),
-        "semi_axes": body_axes(document, where),
+        "semi_axes": axes,
     }
 
 
@@ -135,7 +153,7 @@ def one_or_two(document: Mapping[str, Any], key: str, where: str, what: str) -> 
     """A length along samples and lines above 0, given once or for each. Raises InputError or GeometryError."""
     found = np.atleast_1d(array(document, key, where))
     if found.size not in (1, 2) or (found <= 0).any():
-        raise GeometryError(f"{where}: expected one or two {what} in '{key}', found {found}.")
+        raise GeometryError(f"{where}: expected one or two {what} in '{key}', found {found}; mend the camera model.")
     return float(found[0]), float(found[-1])
 
 

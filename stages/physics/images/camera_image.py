@@ -60,12 +60,18 @@ def open_camera_image(path: Path, camera: Camera, what: str) -> Iterator[CameraI
     if picture is not None:
         try:
             spec = picture.spec()
+            bands = spec.nchannels - (spec.alpha_channel >= 0)
+            if bands > 1:
+                raise InputError(
+                    f"{path}: expected {what} of one band, found {bands}; take the one that is meant (gdal_translate -b N)."
+                )
             _check_size(path, camera, spec.height, spec.width)
             yield CameraImage(path, spec.height, spec.width, None, picture)
         finally:
             picture.close()
         return
     with rasters.open_raster(path, what) as dataset:
+        rasters.check_single_band(path, dataset, what)
         _check_size(path, camera, dataset.height, dataset.width)
         yield CameraImage(path, dataset.height, dataset.width, dataset, None)
 

@@ -39,6 +39,13 @@ def complete_row(
     win. Raises LunargrError for a camera model or a time that cannot be read.
     """
     full = dict(row)
+    for columns in (SUN_COLUMNS[:2], SPACECRAFT_COLUMNS[:2]):
+        given = [k for k in columns if full.get(k)]
+        if len(given) == 1:
+            raise InputError(
+                f"{where}: expected both {columns[0]} and {columns[1]}, or neither, found {given[0]} alone; half a place "
+                "cannot be completed from elsewhere."
+            )
     lacking = [k for k in (*SUN_COLUMNS, *SPACECRAFT_COLUMNS, "start_time") if not full.get(k)]
     if not lacking:
         return full

@@ -68,6 +68,7 @@ def open_source(frame: Frame, grid: Grid, elevation: Any, heights: tuple[float, 
     if frame.camera is None:
         with rasters.open_raster(frame.path, what) as dataset:
             require_crs(str(frame.path), dataset.crs, dataset.transform)
+            rasters.check_single_band(frame.path, dataset, what)
             check_body(str(frame.path), dataset.crs, find_body(str(grid.radius)))
             yield MapSource(dataset, grid, elevation, frame.camera_position(grid.radius))
         return

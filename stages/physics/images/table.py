@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -14,9 +13,12 @@ from typing import Any
 import h5py
 import numpy as np
 
+from schemas.checks import has_control_characters
 from schemas.errors import InputError
+from schemas.files.inputs import check_file, read_json, read_text
 from schemas.reading import read_strings
 from schemas.writing import ArtefactWriter
+from stages.physics.bodies.ephemeris import parse_utc
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.images.frame_geometry import complete_row
 from stages.physics.images.pds_index import index_images
@@ -69,19 +71,25 @@ def read_frames(table: Path, body: Body | None = None) -> list[Frame]:
     What the table leaves empty is taken from the camera model, the image's label or its time: see frame_geometry.
     Raises InputError naming the row and column.
     """
-    if not table.exists():
-        raise InputError(f"{table}: no such file; expected the image table (images.csv or JSON).")
-    try:
-        if table.suffix.lower() in (".tab", ".lbl"):
-            return _frames(table, index_images(table), body)
-        text = table.read_text(encoding="utf-8-sig")
-        rows = json.loads(text) if table.suffix.lower() == ".json" else list(csv.DictReader(text.splitlines()))
-    except (UnicodeDecodeError, json.JSONDecodeError, csv.Error) as error:
-        raise InputError(f"{table}: expected a CSV or JSON table, found something else ({error}).") from None
-    if isinstance(rows, Mapping):
-        rows = rows.get("images", [])
+    what = "the image table (images.csv or JSON)"
+    check_file(table, what)
+    if table.suffix.lower() in (".tab", ".lbl"):
+        return _frames(table, index_images(table), body)
+    if table.suffix.lower() == ".json":
+        rows = read_json(table, what)
+        rows = rows.get("images", []) if isinstance(rows, Mapping) else rows
+        if not (isinstance(rows, list) and all(isinstance(row, Mapping) for row in rows)):
+            raise InputError(
+                f"{table}: expected a JSON list of objects, one per image with the keys of images.csv, found another structure; "
+                "mend the file."
+            )
+    else:
+        try:
+            rows = list(csv.DictReader(read_text(table, what).splitlines()))
+        except csv.Error as error:
+            raise InputError(f"{table}: expected a CSV table, found something else ({error}); mend the file.") from None
     if not rows:
-        raise InputError(f"{table}: expected at least one image, found none.")
+        raise InputError(f"{table}: expected at least one image, found none; mend the table.")
     return _frames(table, rows, body)
 
 
@@ -91,20 +99,27 @@ def _frames(table: Path, rows: Sequence[Mapping[str, Any]], body: Body | None) -
     seen: set[str] = set()
     for frame in frames:
         if frame.image_id in seen:
-            raise InputError(f"{table}: expected each image_id once, found '{frame.image_id}' twice.")
+            raise InputError(f"{table}: expected each image_id once, found '{frame.image_id}' twice; mend the table.")
         seen.add(frame.image_id)
     return frames
 
 
 def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Frame:
     where = f"{table}: image {number}"
-    text = {k: ("" if v is None else str(v).strip()) for k, v in row.items() if k is not None}
+    text = {str(k): ("" if v is None else str(v).strip()) for k, v in row.items() if k is not None}
     for key in ("image_id", "path"):
         if not text.get(key):
-            raise InputError(f"{where}: expected a value in column '{key}', found none.")
+            raise InputError(f"{where}: expected a value in column '{key}', found none; mend the table.")
+    for key, cell in text.items():
+        if has_control_characters(cell):
+            raise InputError(
+                f"{where}: expected text without control characters in column '{key}', found {cell!r}; mend the table."
+            )
     units = text.get("units", "").lower()
     if units not in ("iof", "dn"):
-        raise InputError(f"{where} ({text['image_id']}): expected units 'iof' or 'dn', found '{units or 'nothing'}'.")
+        raise InputError(
+            f"{where} ({text['image_id']}): expected units 'iof' or 'dn', found '{units or 'nothing'}'; mend the table."
+        )
     camera = text.get("camera", "")
     text = complete_row(
         text,
@@ -113,16 +128,20 @@ def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Fram
         body,
         f"{where} ({text['image_id']})",
     )
+    if text.get("start_time"):
+        parse_utc(text["start_time"], f"{where} ({text['image_id']}): column 'start_time'")
     numbers: dict[str, Any] = {}
     for key, (low, high) in _NUMBERS.items():
         try:
             value = float(text.get(key, ""))
         except ValueError:
             raise InputError(
-                f"{where} ({text['image_id']}): expected a number in column '{key}', found '{text.get(key, '') or 'nothing'}'."
+                f"{where} ({text['image_id']}): expected a number in column '{key}', found '{text.get(key, '') or 'nothing'}'; mend the table."
             ) from None
         if not (math.isfinite(value) and low <= value <= high):
-            raise InputError(f"{where} ({text['image_id']}): expected '{key}' in {low:g}..{high:g}, found {value:g}.")
+            raise InputError(
+                f"{where} ({text['image_id']}): expected '{key}' in {low:g}..{high:g}, found {value:g}; mend the table."
+            )
         numbers[key] = value
     return Frame(
         image_id=text["image_id"],

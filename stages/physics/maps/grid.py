@@ -6,12 +6,14 @@ array[r, c]. GDAL counts corners from 0 (our centre 0 is its 0.5), CSM centres f
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import h5py
 import numpy as np
+import rasterio
 import rasterio.warp
 from numpy.typing import ArrayLike, NDArray
 from rasterio.crs import CRS
@@ -19,11 +21,12 @@ from rasterio.errors import CRSError
 from rasterio.transform import Affine
 
 from schemas.errors import ArtefactError, GeometryError, InputError
-from stages.physics.bodies.spheres import Body
+from stages.physics.bodies.spheres import Body, find_body
 
 GDAL_CENTRE = 0.5  # GDAL's coordinate of the centre of the first pixel
 CSM_CENTRE = 0.5
 ISIS_CENTRE = 1.0
+BODY_TOLERANCE = 0.005  # of the radius: mean, equatorial and reference spheres of one body
 _ELLIPSOID = re.compile(r"(?:SPHEROID|ELLIPSOID)\[\"[^\"]*\",\s*([0-9.eE+]+),\s*([0-9.eE+]+)")
 
 Floats = NDArray[np.float64]
@@ -163,7 +166,8 @@ def unit_vectors(longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> Floats:
 
 @lru_cache(maxsize=256)
 def _parsed(wkt: str) -> CRS:
-    return CRS.from_wkt(wkt)
+    with rasterio.Env():  # GDAL's own words on it stay off the terminal
+        return CRS.from_wkt(wkt)
 
 
 @lru_cache(maxsize=256)
@@ -218,20 +222,42 @@ def _scaled_tangent(latitude_deg: Floats, factor: float) -> Floats:
 def check_body(where: str, crs: CRS, body: Body) -> None:
     """Refuse a CRS of another body. Raises GeometryError."""
     found = crs_radius(crs)
-    if found is not None and abs(found - body.radius) > 0.005 * body.radius:
+    if found is not None and abs(found - body.radius) > BODY_TOLERANCE * body.radius:
         raise GeometryError(
             f"{where}: expected a CRS on a sphere of {body.radius:g} m ({body.name}), found radius {found:g} m; name the body with --body."
         )
 
 
+def check_same_body(where: object, radius: float, body: str | None) -> None:
+    """Refuse a --body that contradicts what a file says. Raises GeometryError."""
+    if body is not None and abs(find_body(body).radius - radius) > BODY_TOLERANCE * radius:
+        raise GeometryError(
+            f"{where}: lies on a body of {radius:g} m radius, found --body {body} ({find_body(body).radius:g} m); leave --body away."
+        )
+
+
 def read_grid(file: h5py.File, path: object) -> Grid:
     """The grid of an artefact with a ``crs`` variable."""
-    if "crs" not in file or "GeoTransform" not in file["crs"].attrs:
-        raise ArtefactError(f"{path}:/crs: expected a georeference, found none; write it again.")
-    attributes = file["crs"].attrs
+    attributes = file["crs"].attrs  # whose numbers were looked at when it was opened
     c, a, b, f, d, e = (float(v) for v in str(attributes["GeoTransform"]).split())
+    wkt = str(attributes["crs_wkt"])
+    try:
+        crs = _parsed(wkt)
+        metres = crs.is_projected and abs(crs.linear_units_factor[1] - 1) < 1e-6
+    except CRSError as error:
+        raise ArtefactError(
+            f"{path}:/crs: expected a CRS as WKT, found what PROJ does not read ({error}); write it again."
+        ) from None
+    if not metres:
+        raise ArtefactError(f"{path}:/crs: expected a map projection in metres, found another CRS; write it again.")
+    radius = crs_radius(crs)
+    if radius is not None and abs(radius - file.attrs["body_radius_m"]) > BODY_TOLERANCE * radius:
+        raise ArtefactError(
+            f"{path}: expected body_radius_m near its CRS's radius of {radius:g} m, found {file.attrs['body_radius_m']:g}; "
+            "write it again."
+        )
     height, width = file["elevation"].shape[-2:]
-    return Grid(str(attributes["crs_wkt"]), Affine(a, b, c, d, e, f), height, width, float(file.attrs["body_radius_m"]))
+    return Grid(wkt, Affine(a, b, c, d, e, f), height, width, float(file.attrs["body_radius_m"]))
 
 
 def require_crs(where: str, crs: CRS | None, transform: Affine) -> CRS:
@@ -239,6 +265,10 @@ def require_crs(where: str, crs: CRS | None, transform: Affine) -> CRS:
     if crs is None or transform == Affine.identity():
         raise InputError(
             f"{where}: expected a georeferenced raster, found no CRS; assign one (gdal_edit.py -a_srs) or, for a raw image, give its camera."
+        )
+    if not all(map(math.isfinite, tuple(transform)[:6])) or transform.determinant == 0:
+        raise InputError(
+            f"{where}: expected pixels of a finite size, found the transform {tuple(transform)[:6]}; set it with gdal_edit.py -a_ullr."
         )
     try:
         crs.to_wkt()

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import rasterio
 import rasterio.warp
 from numpy.typing import NDArray
 from rasterio.crs import CRS
+from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
 from rasterio.io import DatasetReader
 from rasterio.transform import Affine
@@ -20,6 +24,8 @@ from rasterio.warp import Resampling
 from rasterio.windows import Window
 
 from schemas.errors import InputError
+from schemas.files.hdf5 import silence_hdf5
+from schemas.files.inputs import check_file
 from stages.common.memory import return_freed_memory
 from stages.physics.maps.grid import Grid, ellipsoid_of, latitude_squash
 
@@ -38,18 +44,24 @@ Mask = NDArray[np.bool_]
 @contextlib.contextmanager
 def open_raster(path: Path, what: str = "a raster") -> Iterator[DatasetReader]:
     """Open a raster for reading. Raises InputError for a missing, damaged or unknown file, also while reading."""
-    if not Path(path).exists():
-        raise InputError(f"{path}: no such file; expected {what}. Check the path.")
+    check_file(Path(path), what)
+    silence_hdf5()
+    if h5py.is_hdf5(path):  # of a damaged one GDAL's HDF5 library would print its whole error stack
+        try:
+            h5py.File(path, "r").close()
+        except OSError:
+            raise InputError(f"{path}: expected {what}, found a damaged HDF5 file; fetch it again.") from None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             dataset = rasterio.open(path)
     except RasterioIOError as error:
         raise InputError(
-            f"{path}: expected {what} that GDAL reads, found something else ({_one_line(error)})."
+            f"{path}: expected {what} that GDAL reads, found something else ({_one_line(error)}); is it the right file?"
         ) from None
     try:
         with dataset:
+            _check_numbers(path, what, dataset)
             yield dataset
     except RasterioError as error:
         raise InputError(
@@ -57,6 +69,57 @@ def open_raster(path: Path, what: str = "a raster") -> Iterator[DatasetReader]:
         ) from None
     finally:
         return_freed_memory()  # the pieces that a raster's blocks leave would grow by 0.1 GB with every image
+
+
+def _check_numbers(path: Path, what: str, dataset: DatasetReader) -> None:
+    if not dataset.count:
+        raise InputError(
+            f"{path}: expected {what}, found a file without bands; name one of its subdatasets (gdalinfo)."
+        )
+    if "complex" in dataset.dtypes[0] or dataset.dtypes[0] == "cint16":
+        raise InputError(
+            f"{path}: expected {what} of real numbers, found {dataset.dtypes[0]}; take one part "
+            "(gdal_calc.py --calc='numpy.real(A)')."
+        )
+    scale, offset = dataset.scales[0], dataset.offsets[0]
+    if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
+        raise InputError(
+            f"{path}: expected a finite scale and offset, found {scale} and {offset}; set them with gdal_edit.py."
+        )
+
+
+def check_single_band(path: Path, dataset: DatasetReader, what: str) -> None:
+    """Refuse rasters of several bands: which of them is meant, nobody said. Masks (alpha) are none. Raises InputError."""
+    bands = sum(kind != ColorInterp.alpha for kind in dataset.colorinterp)
+    if bands > 1:
+        raise InputError(
+            f"{path}: expected {what} of one band, found {bands}; take the one that is meant (gdal_translate -b N)."
+        )
+
+
+_METRES = ("", "m", "metre", "metres", "meter", "meters")
+_VERTICAL = re.compile(
+    r'(?:VERT_?CRS|VERT_CS|VERTICALCRS)\[.*?(?:LENGTHUNIT|UNIT)\["([^"]*)",\s*([0-9.eE+-]+)', re.DOTALL
+)
+
+
+def check_metres(path: Path, dataset: DatasetReader) -> None:
+    """Refuse elevations that say of themselves that they are in feet, kilometres or anything else. Raises InputError."""
+    unit = (dataset.units[0] or "").strip().lower()
+    factor = 1.0
+    if not unit and dataset.crs is not None and (vertical := _VERTICAL.search(dataset.crs.to_wkt())):
+        unit, factor = vertical.group(1).lower(), float(vertical.group(2))
+    if unit in _METRES or (factor != 1.0 and abs(factor - 1) < 1e-9):
+        return
+    known = {"km": 1000.0, "kilometre": 1000.0, "kilometer": 1000.0, "kilometers": 1000.0, "kilometres": 1000.0}
+    known |= {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 12 / 39.37, "us-ft": 12 / 39.37}
+    metres = factor if factor != 1.0 else known.get(unit)
+    advice = (
+        f"convert them (gdal_calc.py --calc='A*{metres:g}')" if metres else "convert them, or set the unit that is true"
+    )
+    raise InputError(
+        f"{path}: expected elevations in metres, found the unit '{unit}'; {advice} and say so (gdal_edit.py -units m)."
+    )
 
 
 def _one_line(error: BaseException) -> str:

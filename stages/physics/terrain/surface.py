@@ -17,7 +17,7 @@ from schemas.errors import ArtefactError, ConfigError, InputError, RegistryError
 from schemas.reading import open_artefact, read_kind, read_strings
 from stages.physics.bodies.spheres import Body
 from stages.physics.maps.grid import Grid, check_body, read_grid, require_crs
-from stages.physics.maps.rasters import open_raster, pixel_size_at, read_window
+from stages.physics.maps.rasters import check_metres, check_single_band, open_raster, pixel_size_at, read_window
 from stages.physics.photometry import ReflectanceModel, get_model
 
 Floats32 = NDArray[np.float32]
@@ -76,7 +76,7 @@ class Surface:
             if known.size:
                 low, high = min(low, float(known.min())), max(high, float(known.max()))
         if not np.isfinite(low):
-            raise InputError(f"{self.path}: expected elevations, found only nodata.")
+            raise InputError(f"{self.path}: expected elevations, found only nodata; is it the right band and file?")
         return low, high
 
 
@@ -91,7 +91,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
             kind = read_kind(path).name
             if kind not in ("svbrdf", "scene"):
                 raise ArtefactError(
-                    f"{path}: expected an 'svbrdf' (from 'lunargr infer') or a 'scene' (from 'lunargr ingest'), found a '{kind}'."
+                    f"{path}: expected an 'svbrdf' (from 'lunargr infer') or a 'scene' (from 'lunargr ingest'), found a '{kind}'; check the order of the files."
                 )
             file = stack.enter_context(open_artefact(path, SVBRDF if kind == "svbrdf" else SCENE))
             grid, elevation = read_grid(file, path), Elevation(file["elevation"])
@@ -100,7 +100,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
                     raise ConfigError(
                         f"--model: {path.name} holds its own reflectance ({file.attrs['model']}); to render its terrain with another model give --dem {path.name}."
                     )
-                reflectance = get_model(str(file.attrs["model"]))
+                reflectance = stored_model(path, str(file.attrs["model"]))
                 _check_names(path, reflectance, read_strings(file, "coefficient_name"))
                 empty = np.empty(0, np.float32)
                 yield Surface(path, grid, elevation, reflectance, file["coefficients"], empty)
@@ -129,6 +129,14 @@ def open_terrain(path: Path, model: str | None, parameters: Mapping[str, float],
         return
     with open_surface(path, model, parameters, body) as surface:
         yield surface
+
+
+def stored_model(path: Path, name: str) -> ReflectanceModel:
+    """The model that a file names. Raises ArtefactError."""
+    try:
+        return get_model(name)
+    except RegistryError as error:
+        raise ArtefactError(f"{path}: root attribute 'model': {error}") from None
 
 
 def _check_names(path: Path, model: ReflectanceModel, found: list[str]) -> None:
@@ -161,6 +169,8 @@ def _middle(dataset) -> Window:
 def _metric_grid(path: Path, dataset, body: Body) -> Grid:
     """The grid of a raw DEM that can be rendered as it stands: north up, square metres."""
     crs = require_crs(str(path), dataset.crs, dataset.transform)
+    check_single_band(path, dataset, "a DEM")
+    check_metres(path, dataset)
     check_body(str(path), crs, body)
     t = dataset.transform
     advice = "bring it to a metric grid with 'lunargr ingest' and render its scene.h5."

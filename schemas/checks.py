@@ -1,0 +1,237 @@
+"""What a file's numbers, text and links must be, by its declaration: looked at once, whenever an artefact is opened."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from schemas.declaration import ROOT_ATTRIBUTES, STRING, Attribute, Schema, Variable
+from schemas.errors import ArtefactError
+
+UNIT_TOLERANCE = 1e-3  # of a unit vector's length: writers in float32, and in few decimals
+GSD_TOLERANCE = 1e-3  # relative: what writing numbers as text may cost
+LARGEST_TABLE = 100_000_000  # values of a table; beyond it a size is a slip of the pen, or worse
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
+
+
+def has_control_characters(text: str) -> bool:
+    """Whether text holds what a terminal would obey and no file can be named by."""
+    return _CONTROL.search(text) is not None
+
+
+def parse_json(text: str, where: str, error: type[Exception] = ArtefactError, advice: str = "write it again") -> Any:
+    """What JSON text holds. Raises ``error`` for anything else, for deep nesting and for text that is no Unicode."""
+    try:
+        found = json.loads(text)
+        json.dumps(found, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise error(
+            f"{where}: expected text in Unicode, found half of a surrogate pair (\\ud800 ..); {advice}."
+        ) from None
+    except RecursionError:
+        raise error(
+            f"{where}: expected JSON of a few levels, found it nested beyond what can be read; {advice}."
+        ) from None
+    except ValueError as problem:
+        raise error(f"{where}: expected JSON, found something else ({str(problem)[:120]}); {advice}.") from None
+    return found
+
+
+def check_links(path: Path, file: h5py.File) -> None:
+    """All that an artefact holds lies in it: no external file is opened for it, no link goes round. Raises ArtefactError."""
+    seen: set[int] = set()
+
+    def look(group: h5py.Group) -> None:
+        for name in group:
+            where = f"{path}:{group.name.rstrip('/')}/{name}"
+            link = group.get(name, getlink=True)
+            if isinstance(link, h5py.ExternalLink):
+                raise ArtefactError(
+                    f"{where}: expected data in this file, found a link into '{link.filename}'; copy them in with h5copy."
+                )
+            try:
+                node = group[name]
+            except (KeyError, OSError, RuntimeError):
+                raise ArtefactError(
+                    f"{where}: expected data, found a link to nothing or to itself; write it again."
+                ) from None
+            if isinstance(node, h5py.Dataset):
+                if node.external:
+                    raise ArtefactError(
+                        f"{where}: expected data in this file, found them kept in '{node.external[0][0]}'; repack it (h5repack)."
+                    )
+            elif isinstance(node, h5py.Group):
+                address = h5py.h5o.get_info(node.id).addr
+                if address not in seen:
+                    seen.add(address)
+                    look(node)
+
+    seen.add(h5py.h5o.get_info(file.id).addr)
+    look(file)
+
+
+def check_attributes(path: Path, file: h5py.File, schema: Schema) -> None:
+    """Kinds, ranges and choices of the root attributes. Raises ArtefactError."""
+    for attribute in (*ROOT_ATTRIBUTES, *schema.attributes):
+        if attribute.name in file.attrs:
+            _check_attribute(path, file, attribute, f"write it again with 'lunargr {schema.stage}'")
+
+
+def _check_attribute(path: Path, file: h5py.File, attribute: Attribute, advice: str) -> None:
+    where = f"{path}: root attribute '{attribute.name}'"
+    try:
+        value: Any = file.attrs[attribute.name]
+    except (OSError, TypeError, ValueError) as error:
+        raise ArtefactError(f"{where}: cannot be read ({error}); {advice}.") from None
+    if attribute.kind in ("number", "integer"):
+        number = np.ravel(value) if isinstance(value, np.ndarray | np.generic | int | float) else np.array(["?"])
+        good = number.size == 1 and number.dtype.kind in "iufb" and math.isfinite(number[0])
+        if good and attribute.kind == "integer":
+            good = float(number[0]).is_integer()
+        if good:
+            low, high = _bounds(attribute)
+            good = low <= number[0] <= high
+        if not good:
+            raise ArtefactError(f"{where}: expected {_wanted(attribute)}, found {_short(value)}; {advice}.")
+        return
+    text = as_text(value)
+    if text is None:
+        raise ArtefactError(f"{where}: expected text ({attribute.description}), found {_short(value)}; {advice}.")
+    if attribute.choices and text not in attribute.choices:
+        raise ArtefactError(f"{where}: expected {' or '.join(attribute.choices)}, found {_short(text)}; {advice}.")
+    if attribute.kind.startswith("json"):
+        wanted = list if attribute.kind == "json list" else dict
+        if not isinstance(found := parse_json(text, where, advice=advice), wanted):
+            kind = "list" if wanted is list else "object"
+            raise ArtefactError(f"{where}: expected a JSON {kind}, found {_short(found)}; {advice}.")
+
+
+def check_georeference(path: Path, file: h5py.File, schema: Schema) -> None:
+    """The numbers that place a map: north up, in pixels as large as the file says. Raises ArtefactError."""
+    if not any(v.georeferenced for v in schema.variables):
+        return
+    where, advice = f"{path}:/crs", f"write it again with 'lunargr {schema.stage}'"
+    found = file["crs"].attrs if "crs" in file else {}
+    if as_text(found.get("crs_wkt")) is None or as_text(found.get("GeoTransform")) is None:
+        raise ArtefactError(f"{where}: expected a georeference (crs_wkt, GeoTransform), found none; {advice}.")
+    text = str(found["GeoTransform"])
+    try:
+        c, a, b, f, d, e = (float(v) for v in text.split())
+    except ValueError:
+        raise ArtefactError(f"{where}: expected six numbers in GeoTransform, found '{text}'; {advice}.") from None
+    gsd = float(np.ravel(file.attrs["gsd_m"])[0])
+    north_up = b == d == 0 and a > 0 > e and all(map(math.isfinite, (a, c, e, f)))
+    if not (north_up and abs(a - gsd) <= GSD_TOLERANCE * gsd and abs(a + e) <= GSD_TOLERANCE * gsd):
+        raise ArtefactError(
+            f"{where}: expected a grid that is north up, of square pixels of gsd_m = {gsd:g}, found GeoTransform '{text}'; {advice}."
+        )
+
+
+def as_text(value: Any) -> str | None:
+    """An attribute's text, None where it is something else."""
+    if isinstance(value, bytes):
+        try:
+            return value.decode()
+        except UnicodeDecodeError:
+            return None
+    if isinstance(value, str):
+        return None if re.search("[\ud800-\udfff]", value) else value
+    return None
+
+
+def check_values(path: Path, file: h5py.File, schema: Schema) -> None:
+    """Ranges, flags, indices, directions and text of everything small. Raises ArtefactError."""
+    for variable in schema.variables:
+        if variable.is_table and variable.name in file:
+            data = file[variable.name]
+            where = f"{path}:/{variable.name}"
+            advice = f"write it again with 'lunargr {schema.stage}'"
+            if data.size > LARGEST_TABLE:
+                raise ArtefactError(
+                    f"{where}: expected at most {LARGEST_TABLE:,} values, found {data.size:,}; {advice}."
+                )
+            try:
+                values = data[...]
+            except (OSError, ValueError, TypeError, MemoryError) as error:
+                raise ArtefactError(
+                    f"{where}: cannot be read ({_short(error)}); the file is damaged, {advice}."
+                ) from None
+            if variable.dtype == STRING:
+                _check_strings(where, values, advice)
+            else:
+                limit = _size(file, schema, variable.index_of)
+                _check_numbers(where, variable, data, values, limit, advice)
+
+
+def _size(file: h5py.File, schema: Schema, dim: str) -> int:
+    """Length of a dimension, from any variable that has it."""
+    for variable in schema.variables:
+        if dim in variable.dims and variable.name in file:
+            return int(file[variable.name].shape[variable.dims.index(dim)])
+    return 0
+
+
+def _check_strings(where: str, values: Any, advice: str) -> None:
+    for value in np.ravel(values):
+        text = as_text(value)
+        if text is None:
+            raise ArtefactError(f"{where}: expected text in UTF-8, found {_short(value)}; {advice}.")
+        if has_control_characters(text):
+            raise ArtefactError(f"{where}: expected text without control characters, found {_short(text)}; {advice}.")
+
+
+def _check_numbers(where: str, variable: Variable, data: h5py.Dataset, values: Any, limit: int, advice: str) -> None:
+    from schemas.reading import unpack
+
+    try:
+        numbers = np.asarray(unpack(data, values), dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ArtefactError(f"{where}: its scale_factor, add_offset or _FillValue is no number; {advice}.") from None
+    whole = np.dtype(variable.dtype).kind in "iu"
+    if whole or variable.finite or variable.unit_vector:
+        _refuse(where, ~np.isfinite(numbers), numbers, "finite numbers", advice)
+    if whole:
+        _refuse(where, numbers != np.floor(numbers), numbers, "whole numbers", advice)
+    if variable.flags:
+        names = ", ".join(f"{value} = {meaning}" for meaning, value in variable.flags)
+        _refuse(where, ~np.isin(numbers, [value for _, value in variable.flags]), numbers, f"flags ({names})", advice)
+    if variable.index_of:
+        wanted = f"indices from 0 to below {limit} ({variable.index_of})"
+        _refuse(where, (numbers < 0) | (numbers >= limit), numbers, wanted, advice)
+    if variable.unit_vector and len(numbers):
+        length = np.linalg.norm(numbers, axis=-1)
+        _refuse(where, np.abs(length - 1) > UNIT_TOLERANCE, length, "vectors of length 1", advice)
+    low, high = _bounds(variable)
+    _refuse(where, (numbers < low) | (numbers > high), numbers, _wanted(variable), advice)
+
+
+def _refuse(where: str, bad: Any, numbers: Any, wanted: str, advice: str) -> None:
+    if bad.any():
+        first = np.ravel(numbers)[int(np.flatnonzero(bad)[0])]
+        place = ", ".join(map(str, np.argwhere(bad)[0]))
+        raise ArtefactError(f"{where}: expected {wanted}, found {first:g} at [{place}]; {advice}.")
+
+
+def _bounds(declared: Variable | Attribute) -> tuple[float, float]:
+    low, high = declared.minimum, declared.maximum
+    return -math.inf if low is None else low, math.inf if high is None else high
+
+
+def _wanted(declared: Variable | Attribute) -> str:
+    low, high = _bounds(declared)
+    kind = "a whole number" if isinstance(declared, Attribute) and declared.kind == "integer" else "a finite number"
+    kind = "numbers" if isinstance(declared, Variable) else kind
+    if math.isinf(low) and math.isinf(high):
+        return kind
+    return f"{kind} of {low:g} .. {high:g}" if math.isfinite(high) else f"{kind} of at least {low:g}"
+
+
+def _short(value: Any) -> str:
+    text = repr(value.tolist() if isinstance(value, np.ndarray | np.generic) else value)
+    return text if len(text) <= 80 else text[:77] + "..."
