@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
+from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
 
-Output = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True)]
+Output = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True), Writes.FILE]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")]
 Shard = Annotated[
@@ -45,7 +46,9 @@ BodyOption = Annotated[
         "--body", metavar="NAME|METRES", help="Body by name, or its radius in metres (default: the Moon, 1737400)."
     ),
 ]
-Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the result as JSON.")]
+Json = Annotated[
+    Path | None, typer.Option("--json", metavar="FILE", help="Also write the result as JSON."), Writes.FILE
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
 
 

@@ -8,13 +8,18 @@ from typing import Annotated, Any
 import typer
 
 from lunargr_cli.options import Device, Json, Overwrite, Quiet, Resume
+from lunargr_cli.paths import Writes
 
 NAME, ORDER = "compare", 72
 
 
 def command(
     pairs: Annotated[Path, typer.Argument(help="Pairs from 'lunargr project'.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for checkpoints, evaluations and the table.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Folder for checkpoints, evaluations and the table."),
+        Writes.FOLDER,
+    ],
     models: Annotated[
         str, typer.Option("--models", help="Reflectance models, separated by commas.")
     ] = "M1,M2,M3,M4,M5,M6",

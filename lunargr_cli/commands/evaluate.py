@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from lunargr_cli.options import Device, Json, Output, Overwrite, Quiet, ResumeParts, Scheduler, Seed
+from lunargr_cli.paths import Writes
 
 NAME, ORDER = "evaluate", 70
 
@@ -22,7 +23,9 @@ def command(
         typer.Option("--extend", metavar="FILE", help="Also score the extended model of 'lunargr diagnose'."),
     ] = None,
     figures: Annotated[
-        Path | None, typer.Option("--figures", metavar="DIR", help="Write training curves and example crops as PNG.")
+        Path | None,
+        typer.Option("--figures", metavar="DIR", help="Write training curves and example crops as PNG."),
+        Writes.FOLDER,
     ] = None,
     bootstrap: Annotated[
         int, typer.Option("--bootstrap", help="Resamples of the ground tiles for the intervals.")

@@ -20,6 +20,7 @@ from lunargr_cli.options import (
     in_parts,
     parse_shard,
 )
+from lunargr_cli.paths import Writes
 
 NAME, ORDER = "infer", 60
 
@@ -41,7 +42,9 @@ def command(
     ] = "auto",
     any_gsd: Annotated[bool, typer.Option("--any-gsd", help="Allow a DEM at another GSD than the training's.")] = False,
     geotiff: Annotated[
-        Path | None, typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif).")
+        Path | None,
+        typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif)."),
+        Writes.FILE,
     ] = None,
     no_geotiff: Annotated[
         bool, typer.Option("--no-geotiff", help="Write svbrdf.h5 only: on large maps a quarter of the time less.")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ def command(
     json_file: Json = None,
 ) -> None:
     """Say what an artefact is, who made it and from what; check it against its schema."""
-    from lunargr_cli.console import Console
     from schemas import atomic_path, open_artefact, read_kind
     from schemas.provenance import chain
 
@@ -40,7 +40,9 @@ def command(
             and not str(data[name].attrs.get("NAME", "")).startswith("This is a netCDF dim")
         }
     console = Console()
-    print(f"{file}: {schema.title} ('{schema.name}', version {schema.version}, written by 'lunargr {schema.stage}')\n")
+    write_out(
+        f"{file}: {schema.title} ('{schema.name}', version {schema.version}, written by 'lunargr {schema.stage}')\n"
+    )
     console.table(
         "variables",
         ("name", "shape", "type"),

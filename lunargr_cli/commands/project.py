@@ -10,6 +10,7 @@ import typer
 import typer.core
 
 from lunargr_cli.options import Output, Overwrite, Parts, Quiet, ResumeParts, Scheduler, Shard, in_parts, parse_shard
+from lunargr_cli.paths import Writes
 
 if TYPE_CHECKING:
     from stages.project import Registered
@@ -46,7 +47,9 @@ def command(
         float, typer.Option("--max-shift", help="How far to search when registering, px of the scene's grid.")
     ] = 8.0,
     regions_csv: Annotated[
-        Path | None, typer.Option("--shifts", metavar="CSV", help="Also write each region's own shift to a table.")
+        Path | None,
+        typer.Option("--shifts", metavar="CSV", help="Also write each region's own shift to a table."),
+        Writes.FILE,
     ] = None,
     exact: Annotated[
         bool, typer.Option("--exact", help="Keep all digits of float32, not those that matter: three times the size.")

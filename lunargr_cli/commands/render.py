@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from lunargr_cli.options import BodyOption, Json, Overwrite, Quiet, Resume, Shard, parse_shard
+from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
 
 NAME, ORDER = "render", 60
@@ -26,6 +27,7 @@ def command(
             "-o",
             help="NAME.exr: EXR, PNG and, for ortho, GeoTIFF; .tif or .png: without the EXR. A folder with --trajectory.",
         ),
+        Writes.EITHER,
     ] = Path("render.exr"),
     dem: Annotated[
         Path | None,

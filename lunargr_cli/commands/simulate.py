@@ -8,7 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json, Overwrite, Quiet
+from lunargr_cli.paths import Writes
 
 NAME, ORDER = "simulate", 10
 
@@ -21,7 +23,9 @@ _HIDDEN_HELP = (
 
 
 def command(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write the scene into.")] = Path("scene"),
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder to write the scene into."), Writes.FOLDER
+    ] = Path("scene"),
     recipe: Annotated[Path | None, typer.Option("--recipe", help="JSON recipe; the options below override it.")] = None,
     print_recipe: Annotated[bool, typer.Option("--print-recipe", help="Print the full recipe and stop.")] = False,
     size_px: Annotated[
@@ -56,9 +60,8 @@ def command(
     where = str(recipe) if recipe else "options"
     config = make_config(_override(values, size_px, extent_m, gsd, images, units, hidden, seed), where)
     if print_recipe:
-        print(recipe_json(config))
+        write_out(recipe_json(config))
         return
-    from lunargr_cli.console import Console
     from stages.simulate.stage import run
 
     console = Console(quiet)
