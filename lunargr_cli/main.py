@@ -133,7 +133,7 @@ def _line(error: Exception) -> str | None:
     """What to say in one line, None where the error is a bug."""
     if isinstance(error, LunargrError):
         return str(error)
-    return _lost_input(error) or _lost_stream(error)
+    return _lost_stream(error) or _lost_input(error)
 
 
 def _lost_stream(error: Exception) -> str | None:

@@ -49,8 +49,12 @@ def files_of(command: Callable[..., None], arguments: Mapping[str, Any]) -> File
 
 
 def _option(name: str, marks: tuple[Any, ...]) -> str:
-    declared = [d for mark in marks for d in getattr(mark, "param_decls", None) or () if d.startswith("--")]
-    return declared[0] if declared else f"--{name.replace('_', '-')}"
+    """How the option is spelled; within Annotated typer keeps the first spelling as the default."""
+    for mark in marks:
+        for spelled in (getattr(mark, "default", None), *(getattr(mark, "param_decls", None) or ())):
+            if isinstance(spelled, str) and spelled.startswith("--"):
+                return spelled
+    return f"--{name.replace('_', '-')}"
 
 
 @contextlib.contextmanager

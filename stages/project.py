@@ -23,6 +23,7 @@ from schemas import (
     ConfigError,
     GeometryError,
     InputError,
+    check_output,
     open_artefact,
 )
 from schemas.provenance import sha256
@@ -108,6 +109,7 @@ def run(
         raise ConfigError(f"--max-shift: expected 1 to 32 px, found {config.max_shift:g}.")
     with open_artefact(crops, CROPS) as file:
         scene = _scene_of(crops, file, config)
+        check_output(output, [crops, scene], overwrite)
         if sha256(scene) != file.attrs["scene_sha256"]:
             raise ArtefactError(f"{scene}: not the scene that {crops} was sampled from; run 'lunargr sample' again.")
         frames = load_frames(file, crops)

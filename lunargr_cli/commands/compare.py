@@ -11,6 +11,7 @@ from lunargr_cli.options import Device, Json, Overwrite, Quiet, Resume
 from lunargr_cli.paths import Writes
 
 NAME, ORDER = "compare", 72
+ENDS = ("checkpoint.h5", "checkpoint.resume.h5")  # and the evaluation's
 
 
 def command(
@@ -45,7 +46,8 @@ def command(
     With --resume, runs that the folder already holds are kept and an interrupted one goes on where it stopped.
     """
     from lunargr_cli.console import Console
-    from schemas import ConfigError
+    from schemas import ConfigError, write_json
+    from schemas.files.outputs import Target, check_outputs
     from stages import compare, evaluate, train
     from stages.physics.photometry import get_model
 
@@ -55,17 +57,20 @@ def command(
     names = list(dict.fromkeys(get_model(name.strip()).name for name in models.split(",") if name.strip()))
     if len(names) < 2:
         raise ConfigError(f"--models: expected at least two models, found '{models}'.")
-    if output.exists() and not output.is_dir():
-        raise ConfigError(f"{output}: expected a folder, found a file; choose another --output.")
-    table = output / "comparison.json"
-    for report in (table, *([json_file] if json_file else [])):
-        if report.exists() and not (overwrite or resume):
-            raise ConfigError(f"{report}: exists already; add --overwrite or --resume, or choose another --output.")
     try:
         channels = tuple(int(w) for w in widths.split("-"))
     except ValueError:
         raise ConfigError(f"--widths: expected numbers like 16-32-64-128-256, found '{widths}'.") from None
     settings: dict[str, Any] = {"epochs": epochs, "batch": batch, "lr": lr, "schedule": schedule, "widths": channels}
+    table, curves = output / "comparison.json", output / "validation_curves.png"
+    check_outputs([Target(table), Target(curves)], [pairs], overwrite or resume)
+    made = [
+        output / f"{name}_seed{k}.{end}"
+        for name in names
+        for k in range(seeds)
+        for end in (*ENDS, f"{split}.h5", f"{split}.json")
+    ]
+    check_outputs(map(Target, made), [pairs], overwrite or resume)
     files: list[tuple[Path, Path]] = []
     for seed in range(seeds):
         for name in names:
@@ -80,18 +85,15 @@ def command(
                 scoring = evaluate.Config(split=split, renderings=False, device=device, only=("learned",))
                 evaluate.run(pairs, checkpoint, evaluation, scoring, overwrite=True, progress=console.progress)
             files.append((evaluation, checkpoint))
-    result = compare.run(files, table, output / "validation_curves.png")
+    result = compare.run(files, table, curves)
     if json_file is not None:
-        from schemas import atomic_path
-
-        with atomic_path(json_file) as partial:
-            partial.write_text(table.read_text())
+        write_json(json_file, result)
     console.table(
         f"{len(names)} models x {seeds} seeds on {result['crops']} {split} crops, {result['tiles']} ground tiles",
         *compare.result_lines(result),
     )
     console.table("which differences are larger than their noise", *compare.difference_lines(result))
-    console.say(f"written: {table}, {output / 'validation_curves.png'}")
+    console.say(f"written: {table}, {curves}")
 
 
 def _same(checkpoint: Path, config: Any, pairs: Path) -> bool:

@@ -63,7 +63,7 @@ def command(
     import contextlib
 
     from lunargr_cli.console import Console
-    from schemas import ConfigError, check_output
+    from schemas import ConfigError
     from schemas.files.locks import scratch_path
     from stages import infer
 
@@ -82,7 +82,8 @@ def command(
         shard=parse_shard(shard),
         geotiff=not no_geotiff,
     )
-    check_output(output, [terrain, checkpoint], overwrite)
+    interrupted = scheduler is not None or resume  # may have got as far as the GeoTIFF: its parts tell
+    infer.check_files([terrain, checkpoint], output, geotiff, config, overwrite, replace_tiff=interrupted)
     gridding = None
     if not infer.open_terrain(terrain):
         from stages import ingest

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from lunargr_cli.console import Console, write_out
-from lunargr_cli.options import Json
+from lunargr_cli.options import Json, Overwrite
 
 NAME, ORDER = "models", 85
 
@@ -23,13 +22,16 @@ def command(
         bool, typer.Option("--markdown", help="Print the reference part of docs/photometry.md.")
     ] = False,
     json_file: Json = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """List the reflectance models: parameters, bounds, units, defaults, reference, reciprocal or not."""
     from stages.physics.photometry import catalogue, get_model
 
     chosen = None if name is None else get_model(name)
     if json_file is not None:
-        _write_json(json_file, catalogue.as_dict())
+        from schemas import write_json
+
+        write_json(json_file, catalogue.as_dict())
     if markdown:
         write_out(catalogue.markdown())
     elif sets:
@@ -89,12 +91,3 @@ def _print_conventions(model: str | None) -> None:
         for c in catalogue.related_conventions(model)
     ]
     Console().table("conventions", ("name", "model here", "bands", "formula gives"), rows)
-
-
-def _write_json(path: Path, content: dict[str, object]) -> None:
-    import json
-
-    from schemas import atomic_path
-
-    with atomic_path(path) as partial:
-        partial.write_text(json.dumps(content, indent=1))

@@ -64,14 +64,15 @@ def command(
 ) -> None:
     """Orthorectify the images onto the crops; add the Sun, the camera and the terrain's horizon."""
     from lunargr_cli.console import Console
-    from schemas import ConfigError, check_output
+    from schemas import ConfigError
+    from schemas.files.outputs import Target, check_outputs
     from stages import project
 
     console = Console(quiet)
     if regions_csv is not None:
         if register is None:
             raise typer.BadParameter("needs --register", param_hint="--shifts")
-        check_output(regions_csv, [crops, output], overwrite)
+        check_outputs([Target(output), Target(regions_csv, "--shifts")], [crops], overwrite)
     config = project.Config(
         scene=str(scene) if scene else None,
         shard=parse_shard(shard),

@@ -176,13 +176,13 @@ def command(
                 "--shard and --resume: expected together with --trajectory; a single view is one piece of work."
             )
         results = [render.run(path, output, config, overwrite=overwrite, progress=console.progress)]
+    if json_file is not None:
+        _write_json(json_file, results)
     console.table(
         "rendered",
         ("view", "pixels", "known", "mean I/F", "shadow", "incidence", "rays/px", "files"),
         map(_row, results),
     )
-    if json_file is not None:
-        _write_json(json_file, results)
 
 
 def _row(result: Any) -> tuple[str, ...]:
@@ -204,9 +204,7 @@ def _row(result: Any) -> tuple[str, ...]:
 
 
 def _write_json(path: Path, results: list[Any]) -> None:
-    import json
-
-    from schemas import atomic_path
+    from schemas import write_json
 
     def finite(value: float) -> float | None:
         return value if math.isfinite(value) else None
@@ -225,8 +223,7 @@ def _write_json(path: Path, results: list[Any]) -> None:
         }
         for r in results
     ]
-    with atomic_path(path) as partial:
-        partial.write_text(json.dumps({"views": views}, indent=1))
+    write_json(path, {"views": views})
 
 
 def _numbers(text: str | None, option: str, counts: tuple[int, ...]) -> tuple[float, ...] | None:

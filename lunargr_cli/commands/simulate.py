@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -62,6 +61,7 @@ def command(
     if print_recipe:
         write_out(recipe_json(config))
         return
+    from schemas import write_json
     from stages.simulate.stage import run
 
     console = Console(quiet)
@@ -93,14 +93,14 @@ def command(
         "mean I/F",
         "SNR",
     )
+    if json_file is not None:
+        write_json(json_file, [dict(zip(columns, row, strict=True)) for row in rows])
     console.table(f"{config.extent / 1000:.2f} km scene in {output}", columns, rows)
     planted = " + ".join(h.effect for h in summary.hidden) or "none"
     console.say(
         f"{summary.craters} craters, DEM valid {100 * summary.dem_valid:.1f} %, planted: {planted} (recorded in {output / 'truth.h5'})"
     )
     console.say(f"next: lunargr ingest {output / 'dem.tif'} --images {output / 'images.csv'} --gsd {config.gsd:g}")
-    if json_file is not None:
-        _write_json(json_file, rows, columns)
 
 
 def _override(
@@ -131,12 +131,3 @@ def _override(
     if hidden is not None:
         values["hidden"] = hidden_from_option(hidden)
     return values
-
-
-def _write_json(path: Path, rows: Sequence[Sequence[str]], columns: Sequence[str]) -> None:
-    import json
-
-    from schemas import atomic_path
-
-    with atomic_path(path) as partial:
-        partial.write_text(json.dumps([dict(zip(columns, row, strict=True)) for row in rows], indent=1))

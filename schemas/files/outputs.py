@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import signal
@@ -145,6 +146,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
         if (output := current_output()) is not None and output != path:
             note_companion(lock_path(output), path, partial)
         os.replace(partial, path)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """A result as JSON, whole or absent."""
+    with atomic_path(path) as partial:
+        partial.write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
 
 
 def _refuse_protected(path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,12 +19,12 @@ from schemas import (
     ArtefactWriter,
     ConfigError,
     RegistryError,
-    atomic_path,
-    check_output,
     open_artefact,
     read_config,
+    write_json,
 )
 from schemas.files.companions import companions_of
+from schemas.files.outputs import Target, check_outputs
 from stages.effects import load_extension
 from stages.evaluate.bootstrap import TileBootstrap
 from stages.evaluate.core import TITLES, Row, Scores, choose_fit_pairs, dn_scale, fit_renderers, layout, score
@@ -43,6 +44,7 @@ MANY_TILES = 10  # fewer make percentile intervals too narrow
 # (what, function, its arguments for every part, suffix) -> the parts that function(path, **arguments) wrote, in order
 Fan = Callable[[str, Callable[..., Any], Sequence[Mapping[str, Any]], str], list[Path]]
 PART_BATCHES = 32
+FIGURES = ("training_curves.png", "errors.png", "crop_best.png", "crop_median.png", "crop_worst.png")
 
 
 @dataclass
@@ -80,10 +82,14 @@ def run(
     Raises ConfigError or ArtefactError before anything is written.
     """
     inputs = [pairs, checkpoint, *([extend] if extend else [])]
-    reports = [output.with_suffix(".json"), *([json_file] if json_file else [])]
-    check_output(output, inputs, overwrite)
-    for report in reports:
-        check_output(report, [*inputs, output], overwrite)
+    beside = Target(output.with_suffix(".json"), what=f"the JSON beside {output.name}")
+    reports = [beside.path]
+    if json_file is not None and os.path.realpath(json_file) != os.path.realpath(beside.path):
+        reports.append(json_file)
+    targets = [Target(output), beside, *(Target(report, "--json") for report in reports[1:])]
+    if figures is not None:
+        targets += [Target(figures / name, "--figures") for name in FIGURES]
+    check_outputs(targets, inputs, overwrite)
     _check(config)
     device = choose_device(config.device)
     with PairReader(pairs) as reader:
@@ -325,8 +331,7 @@ def _evaluate(
         artefact.file.attrs["metrics"] = json.dumps(result)
         with companions_of(output):
             for report in reports:
-                with atomic_path(report) as partial:
-                    partial.write_text(json.dumps(result, indent=1) + "\n")
+                write_json(report, result)
     if figures is not None:
         from stages.evaluate.figures import write_figures
 

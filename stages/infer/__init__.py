@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from stages.infer.config import Config, Summary
-from stages.infer.run import count_bands, open_terrain, run, summarise
+from stages.infer.run import check_files, count_bands, open_terrain, run, summarise
 from stages.infer.windows import axis_windows, blend_weights
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "Summary",
     "axis_windows",
     "blend_weights",
+    "check_files",
     "count_bands",
     "open_terrain",
     "run",

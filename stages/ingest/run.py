@@ -22,6 +22,7 @@ from schemas import (
     ConfigError,
     GeometryError,
     InputError,
+    check_output,
     open_artefact,
     read_config,
 )
@@ -66,6 +67,8 @@ def run(
         raise ConfigError(f"--crop: expected an even number of pixels, at least 16; found {config.crop}.")
     body = find_body(config.body)
     frames = read_frames(images, body) if images else []
+    named = [p for f in frames for p in (f.path, f.camera) if p is not None]
+    check_output(output, [dem, *([images] if images else []), *named], overwrite)
     index, count = config.shard
     with _open_terrain(dem, images, config, body) as terrain:
         first, last = (len(frames) * k // count for k in (index, index + 1))
