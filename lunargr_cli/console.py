@@ -5,16 +5,18 @@ Names and texts come from files that others wrote: whatever is printed loses her
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import sys
 import time
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from lunargr_cli import raise_again
+from schemas.errors import InputError
 
 LIBRARIES = "LUNARGR_LIBRARY_MESSAGES"  # set: what libraries print on standard error is let through
 # Control codes, marks that turn the direction of writing, halves of surrogate pairs, line separators.
@@ -34,7 +36,29 @@ def _spelled(character: str) -> str:
 
 def write_out(text: str) -> None:
     """A line, or several, of a result on standard output."""
-    print(harmless(text))
+    with _standard_output():
+        print(harmless(text))
+
+
+@contextlib.contextmanager
+def _standard_output() -> Iterator[None]:
+    """A full disk behind ``> list.txt`` in one line. Raises InputError; BrokenPipeError where nobody reads any more."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            raise
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still held would fail once more
+        raise InputError(
+            f"standard output: cannot be written ({error.strerror}); free some space, or send it elsewhere."
+        ) from None
+
+
+def flush_out() -> None:
+    """Hand over what standard output still holds. Raises InputError, BrokenPipeError."""
+    with _standard_output():
+        sys.stdout.flush()
 
 
 def say_error(message: str) -> None:
@@ -99,7 +123,8 @@ class Console:
         for row in cells:
             table.add_row(*row)
         width = None if sys.stdout.isatty() else 160
-        RichConsole(file=sys.stdout, width=width, highlight=False, markup=False).print(table)
+        with _standard_output():
+            RichConsole(file=sys.stdout, width=width, highlight=False, markup=False).print(table)
 
     def _end_line(self) -> None:
         if self._open_line:

@@ -19,10 +19,10 @@ from typing import Any
 import typer
 
 from lunargr_cli import INTERRUPTED, commands, quiet_interruptions, signals, stop
-from lunargr_cli.console import own_streams, say_error
+from lunargr_cli.console import flush_out, own_streams, say_error
 from lunargr_cli.paths import guarded
 from schemas.command_line import said
-from schemas.errors import EXIT_CODE, FULL, InputError, LunargrError
+from schemas.errors import EXIT_CODE, InputError, LunargrError
 from schemas.files.locks import claim
 
 # Threads that wait for each other by spinning slow a busy machine down many times over. Read when torch is imported.
@@ -108,7 +108,7 @@ def main() -> None:
         try:
             app()
         finally:
-            sys.stdout.flush()
+            flush_out()
     except BaseException as error:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is left to tidy while Python ends
         # What an interruption breaks may say something else: a library that was just being imported, for one.
@@ -133,14 +133,7 @@ def _line(error: Exception) -> str | None:
     """What to say in one line, None where the error is a bug."""
     if isinstance(error, LunargrError):
         return str(error)
-    return _lost_stream(error) or _lost_input(error)
-
-
-def _lost_stream(error: Exception) -> str | None:
-    """Standard output on a full disk, as in ``lunargr inspect FILE > list.txt``."""
-    if not isinstance(error, OSError) or error.filename is not None or error.errno not in FULL:
-        return None
-    return f"standard output: cannot be written ({error.strerror}); free some space, or send it elsewhere."
+    return _lost_input(error)
 
 
 def _lost_input(error: Exception) -> str | None:

@@ -13,11 +13,9 @@ is a bug in lunargr and keeps its traceback.
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Iterable
 
 EXIT_CODE = 3
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # what the system says where there is no room
 
 
 class LunargrError(Exception):

@@ -57,7 +57,7 @@ def test_sun_angles_hold_at_the_middle_clockwise_from_true_north(tmp_path):
     r, c = np.indices((101, 101)) - 50.0
     elevation = -0.2 * 20.0 * (c * along[0] - r * along[1])
     path = write_dem(tmp_path / "d.tif", grid, elevation)
-    config = render.Config(sun_azimuth_deg=0.0, sun_elevation_deg=40.0, shadows=False)
+    config = render.Config(sun_azimuth_deg=0.0, sun_elevation_deg=40.0, shadows=False, model="lambert")
     render.run(path, tmp_path / "o.exr", config)
     tilt = math.degrees(math.atan(0.2))
     assert read_exr(tmp_path / "o.exr")["incidence_deg"][50, 50] == pytest.approx(50.0 - tilt, abs=0.05)

@@ -183,6 +183,12 @@ def command(
         ("view", "pixels", "known", "mean I/F", "shadow", "incidence", "rays/px", "files"),
         map(_row, results),
     )
+    for r in results:
+        if r.clipped:
+            share = r.clipped / (r.known_share * r.size_px[0] * r.size_px[1])
+            console.say(
+                f"{r.view_id}: the model gives I/F below 0 in {r.clipped} pixels ({share:.2%}); they are drawn as 0."
+            )
 
 
 def _row(result: Any) -> tuple[str, ...]:
@@ -220,6 +226,7 @@ def _write_json(path: Path, results: list[Any]) -> None:
             "incidence_deg": [finite(v) for v in r.incidence_deg],
             "samples": r.samples,
             "skipped": r.skipped,
+            "clipped_px": r.clipped,
         }
         for r in results
     ]

@@ -15,7 +15,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import ConfigError
+from schemas.errors import ConfigError, InputError
 from schemas.files.companions import remove_companions
 
 # A process on another machine cannot be asked whether it lives: it touches its locks, and a lock that was not touched
@@ -151,8 +151,14 @@ def _acquire(lock: Path, output: Path) -> str:
             "began": _start_of(os.getpid()),
             "since": time.strftime("%Y-%m-%d %H:%M:%S"),
         }
-        with os.fdopen(number, "w") as stream:
-            json.dump(own, stream)
+        try:
+            with os.fdopen(number, "w") as stream:
+                json.dump(own, stream)
+        except OSError as error:
+            lock.unlink(missing_ok=True)
+            raise InputError(
+                f"{output}: cannot be written ({error.strerror}); nothing is left. Free some space and run the command again."
+            ) from None
         return noted
     raise ConfigError(f"{output}: another run is taking this output at the same moment; let it finish.")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import shutil
@@ -15,11 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import FULL, ConfigError, InputError, LunargrError
+from schemas.errors import ConfigError, InputError, LunargrError
 from schemas.files.companions import current_output, note_companion
 from schemas.files.inputs import Inputs
 from schemas.files.locks import claim, lock_path, partial_path
 
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _protected: ContextVar[Inputs | None] = ContextVar("protected", default=None)
 
 
@@ -123,7 +125,7 @@ def is_full_disk(error: BaseException | None) -> bool:
     """HDF5 reports the system's error in words, and a failed close hides the failed write behind itself."""
     while error is not None:
         text = str(error).lower()
-        if getattr(error, "errno", None) in FULL or any(f"errno = {number}," in text for number in FULL):
+        if getattr(error, "errno", None) in _FULL or any(f"errno = {number}," in text for number in _FULL):
             return True
         if "no space left" in text or "disk quota" in text:
             return True
