@@ -119,7 +119,7 @@ class Console:
         cells = [[harmless(str(cell)) for cell in row] for row in rows]
         for k, column in enumerate(columns):
             numeric = cells and all(row[k][:1] in "-+.0123456789" for row in cells)
-            table.add_column(column, justify="right" if numeric else "left", overflow="fold")
+            table.add_column(harmless(column), justify="right" if numeric else "left", overflow="fold")
         for row in cells:
             table.add_row(*row)
         width = None if sys.stdout.isatty() else 160
