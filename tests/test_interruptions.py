@@ -157,17 +157,18 @@ def test_a_disk_that_fills_at_any_moment_is_one_line_and_leaves_nothing(small_ar
 @pytest.mark.parametrize("before", [False, True])
 def test_a_disk_that_fills_under_a_simulated_scene_leaves_nothing_and_replaces_nothing(tmp_path, before):
     """truth.h5 is written after DEM and images: without it they are of no use."""
-    from stages.simulate.recipe import Config
-    from stages.simulate.stage import run
-
     folder, earlier = tmp_path / "scene", {}
     if before:
         (folder / "images").mkdir(parents=True)
         for name in ("dem.tif", "truth.h5", "images/S0001O.tif"):
             earlier[folder / name] = name
             (folder / name).write_text(name)
-    with file_size_limit(80_000), pytest.raises(InputError, match=r"scene/truth\.h5: the disk is full"):
-        run(folder, Config(size_px=64, images=2), overwrite=True)
+    process = start(
+        ["simulate", "--size-px", 64, "--images", 2, "--overwrite", "--quiet", "-o", folder],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, 80_000)),
+    )
+    code, said = finish(process)
+    assert code == 3 and len(said.splitlines()) == 1 and "scene/truth.h5: the disk is full" in said
     assert {p: p.read_text() for p in tmp_path.rglob("*") if p.is_file()} == earlier
 
 
