@@ -1,23 +1,69 @@
-"""What a person sees: progress, tables and errors. Progress and messages go to standard error, results to standard output."""
+"""What a person sees: progress, tables and errors. Progress and messages go to standard error, results to standard output.
+
+Names and texts come from files that others wrote: whatever is printed loses here what would steer a terminal.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import logging
+import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+import unicodedata
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from lunargr_cli import raise_again
+from schemas.errors import InputError
+
+LIBRARIES = "LUNARGR_LIBRARY_MESSAGES"  # set: what libraries print on standard error is let through
+# Control codes, marks that turn the direction of writing, halves of surrogate pairs, line separators.
+_STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
-def one_line(message: str) -> str:
-    """A message without line breaks, and without what a terminal would obey: file names and values of options hold it."""
-    return "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
+def harmless(text: str) -> str:
+    """The text with what steers a terminal spelled out: an escape code becomes the four characters \\x1b."""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(c if c in "\n\t" or unicodedata.category(c) not in _STEERING else _spelled(c) for c in text)
+
+
+def _spelled(character: str) -> str:
+    return character.encode("unicode_escape", "surrogatepass").decode()
+
+
+def write_out(text: str) -> None:
+    """A line, or several, of a result on standard output."""
+    with _standard_output():
+        print(harmless(text))
+
+
+@contextlib.contextmanager
+def _standard_output() -> Iterator[None]:
+    """A full disk behind ``> list.txt`` in one line. Raises InputError; BrokenPipeError where nobody reads any more."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, BrokenPipeError):
+            raise
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still held would fail once more
+        raise InputError(
+            f"standard output: cannot be written ({error.strerror}); free some space, or send it elsewhere."
+        ) from None
+
+
+def flush_out() -> None:
+    """Hand over what standard output still holds. Raises InputError, BrokenPipeError."""
+    with _standard_output():
+        sys.stdout.flush()
 
 
 def say_error(message: str) -> None:
     """One line on standard error."""
-    print(f"lunargr: {one_line(message)}", file=sys.stderr)
+    print(f"lunargr: {harmless(' '.join(message.split()))}", file=sys.stderr)
 
 
 @dataclass
@@ -37,7 +83,7 @@ class Console:
         """A line for the person at the terminal."""
         if not self.quiet:
             self._end_line()
-            print(message, file=sys.stderr, flush=True)
+            print(harmless(message), file=sys.stderr, flush=True)
 
     def progress(self, done: int, total: int, what: str = "") -> None:
         """Show how far a long loop is and how long it still takes."""
@@ -51,7 +97,7 @@ class Console:
         self._shown = now
         elapsed = now - self._started
         left = f", {_duration(elapsed / done * (total - done))} left" if 0 < done < total else ""
-        line = f"{what or 'progress'}: {done}/{total} ({_duration(elapsed)}{left})"
+        line = harmless(f"{what or 'progress'}: {done}/{total} ({_duration(elapsed)}{left})")
         if terminal:
             print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
             self._open_line = True
@@ -69,20 +115,50 @@ class Console:
         from rich.console import Console as RichConsole
         from rich.table import Table
 
-        table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-        cells = [[str(cell) for cell in row] for row in rows]
+        table = Table(title=harmless(title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+        cells = [[harmless(str(cell)) for cell in row] for row in rows]
         for k, column in enumerate(columns):
             numeric = cells and all(row[k][:1] in "-+.0123456789" for row in cells)
-            table.add_column(column, justify="right" if numeric else "left", overflow="fold")
+            table.add_column(harmless(column), justify="right" if numeric else "left", overflow="fold")
         for row in cells:
             table.add_row(*row)
         width = None if sys.stdout.isatty() else 160
-        RichConsole(file=sys.stdout, width=width, highlight=False, markup=False).print(table)
+        with _standard_output():
+            RichConsole(file=sys.stdout, width=width, highlight=False, markup=False).print(table)
 
     def _end_line(self) -> None:
         if self._open_line:
             print(file=sys.stderr)
             self._open_line = False
+
+
+def own_streams() -> None:
+    """Standard output and error for our lines alone, also where the shell closed them.
+
+    PROJ, libtiff, HDF5 and others print on the error stream from C, Python's libraries by warnings and loggers. What they
+    have to say to a user our own line says; LUNARGR_LIBRARY_MESSAGES=1 lets them speak.
+    """
+    for number in (0, 1, 2):  # else the first file that is opened gets the place of a closed stream
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
+    sys.stdout = sys.stdout or open(1, "w", closefd=False)  # noqa: SIM115
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    if os.environ.get(LIBRARIES) or sys.stderr is not sys.__stderr__:  # a caller's own streams are left alone
+        return
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+    logging.lastResort = None
+    logging.raiseExceptions = False
+    own, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+    # For good: C libraries go on talking while Python ends.
+    sys.stderr = os.fdopen(own, "w", buffering=1, errors="backslashreplace")
 
 
 Progress = Callable[[int, int, str], None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import gc
 import importlib
@@ -18,10 +19,11 @@ from typing import Any
 import typer
 
 from lunargr_cli import INTERRUPTED, commands, quiet_interruptions, signals, stop
-from lunargr_cli.console import say_error
+from lunargr_cli.console import flush_out, own_streams, say_error
 from lunargr_cli.options import check_numbers
+from lunargr_cli.paths import guarded
 from schemas.command_line import said
-from schemas.errors import EXIT_CODE, LunargrError
+from schemas.errors import EXIT_CODE, InputError, LunargrError
 from schemas.files.locks import claim
 
 # Threads that wait for each other by spinning slow a busy machine down many times over. Read when torch is imported.
@@ -49,25 +51,40 @@ def _checked(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _alone(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, holding the lock of its output from its first step on and not only while it writes."""
+def _folder() -> str:
+    """The working folder. Raises InputError."""
+    try:
+        return os.getcwd()
+    except OSError:
+        raise InputError("the working folder is gone; change to one that exists and run the command again.") from None
+
+
+def _plain(text: str) -> str:
+    """Text that HDF5 and JSON can keep, whatever bytes a name has."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+def _alone(command: Callable[..., None], shared: bool) -> Callable[..., None]:
+    """The command, its inputs safe from its outputs, and holding the lock of its output from its first step on.
+
+    shared : several runs may write into the output, a folder, at once
+    """
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
-        before = said.set((_command_line(), os.getcwd()))
+        before = said.set((_plain(_command_line()), _plain(_folder())))
         try:
-            alone(*arguments, **options)
+            with guarded(command, *arguments, **options), _lock(*arguments, **options):
+                command(*arguments, **options)
         finally:
             said.reset(before)
 
-    def alone(*arguments: Any, **options: Any) -> None:
+    def _lock(*arguments: Any, **options: Any) -> contextlib.AbstractContextManager[None]:
         output = inspect.signature(command).bind(*arguments, **options).arguments.get("output")
         # Under torchrun the first process alone writes.
-        if isinstance(output, Path) and os.environ.get("RANK", "0") == "0":
-            with claim(output):
-                command(*arguments, **options)
-        else:
-            command(*arguments, **options)
+        if shared or not isinstance(output, Path) or os.environ.get("RANK", "0") != "0":
+            return contextlib.nullcontext()
+        return claim(output)
 
     return run
 
@@ -87,19 +104,23 @@ for _module in sorted(
     (importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)),
     key=lambda module: module.ORDER,
 ):
-    _command = _checked(_module.command if getattr(_module, "SHARED_OUTPUT", False) else _alone(_module.command))
+    _command = _checked(_alone(_module.command, getattr(_module, "SHARED_OUTPUT", False)))
     app.command(name=_module.NAME, cls=getattr(_module, "CLASS", None))(_command)
 
 
 def main() -> None:
     """Run the command line; a LunargrError is one line on standard error and exit code 3."""
+    own_streams()
     for number in (signal.SIGINT, signal.SIGTERM):  # a Slurm time limit or `kill` unwinds like Ctrl-C
         signal.signal(number, stop)
     quiet_interruptions()
     # What PyTorch's import makes would be looked through again and again: a sixth of the start.
     gc.set_threshold(10_000, 10, 10)
     try:
-        app()
+        try:
+            app()
+        finally:
+            flush_out()
     except BaseException as error:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is left to tidy while Python ends
         # What an interruption breaks may say something else: a library that was just being imported, for one.
@@ -107,20 +128,24 @@ def main() -> None:
             print(INTERRUPTED, file=sys.stderr, flush=True)
             # Not sys.exit: Python would end itself by the signal where one of its own parts saw the interruption.
             os._exit(130)
-        if isinstance(error, LunargrError):
-            say_error(str(error))
-            sys.stdout.flush()
-            # Not sys.exit: after a full disk HDF5 would try, and fail, to flush its files once more while Python ends.
-            os._exit(EXIT_CODE)
         if isinstance(error, BrokenPipeError):  # `lunargr inspect file | head`
-            sys.stderr.close()
-            sys.exit(141)
-        if isinstance(error, Exception) and (line := _lost_input(error)):
+            os._exit(141)
+        if isinstance(error, Exception) and (line := _line(error)):
             say_error(line)
+            with contextlib.suppress(OSError, ValueError):
+                sys.stdout.flush()
+            # Not sys.exit: after a full disk HDF5 would try, and fail, to flush its files once more while Python ends.
             os._exit(EXIT_CODE)
         raise
     finally:
         gc.freeze()  # Python would look through everything once more while it ends: a quarter of a short command's time
+
+
+def _line(error: Exception) -> str | None:
+    """What to say in one line, None where the error is a bug."""
+    if isinstance(error, LunargrError):
+        return str(error)
+    return _lost_input(error)
 
 
 def _lost_input(error: Exception) -> str | None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
+from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
 
 MOST = 2**31 - 1  # what counts pairs, pixels or crops
@@ -29,7 +30,7 @@ def check_scheduler(text: str | None) -> str | None:
     return text
 
 
-Output = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True)]
+Output = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True), Writes.FILE]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")]
 Shard = Annotated[
@@ -70,7 +71,9 @@ BodyOption = Annotated[
         "--body", metavar="NAME|METRES", help="Body by name, or its radius in metres (default: the Moon, 1737400)."
     ),
 ]
-Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the result as JSON.")]
+Json = Annotated[
+    Path | None, typer.Option("--json", metavar="FILE", help="Also write the result as JSON."), Writes.FILE
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
 
 

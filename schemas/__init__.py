@@ -27,10 +27,11 @@ _LATER = {
     "read_config": "reading",
     "read_kind": "reading",
     "read_strings": "reading",
+    "write_json": "files.outputs",
 }
 
 if TYPE_CHECKING:
-    from schemas.files.outputs import atomic_path, check_output
+    from schemas.files.outputs import atomic_path, check_output, write_json
     from schemas.reading import open_artefact, read_config, read_kind, read_strings
     from schemas.writing import ArtefactWriter
 
@@ -71,4 +72,5 @@ __all__ = [
     "read_config",
     "read_kind",
     "read_strings",
+    "write_json",
 ]

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from schemas.declaration import STRING, Schema, Variable
-from schemas.errors import ConfigError
+from schemas.errors import ConfigError, InputError
 from schemas.files.hdf5 import UNKNOWN, lost, silence_hdf5
 from schemas.files.outputs import atomic_path, check_output, is_full_disk, terminate_as_exception
 from schemas.provenance import describe_run
@@ -53,6 +53,7 @@ class ArtefactWriter:
         # A dataset that is let go of writes what it still holds where no one hears of a failure: they all stay to the end.
         self._kept: list[h5py.Dataset] = []
         self._lost_before = len(lost)
+        self._failed = False
 
     def __enter__(self) -> ArtefactWriter:
         silence_hdf5()
@@ -94,6 +95,7 @@ class ArtefactWriter:
                 self._stack.__exit__(type(error), error, None)
                 raise error
             error = self._flush()
+        self._failed = error is not None
         if is_full_disk(error):
             # Give back the room that the partial file took: HDF5 can then flush and close without failing once more.
             os.truncate(self._partial, 0)
@@ -109,15 +111,26 @@ class ArtefactWriter:
         try:
             self.file.flush()
         except (OSError, RuntimeError) as error:
-            return error
+            return error if is_full_disk(error) else self._not_whole(error)
         return None
+
+    def _not_whole(self, error: BaseException) -> InputError:
+        return InputError(
+            f"{self.path}: cannot be written whole ({error}); nothing half-written is left. "
+            "Look after the disk and run the command again."
+        )
 
     def _close(self) -> None:
         if len(lost) > self._lost_before:
             # HDF5 would follow a pointer into what it failed to let go of, and take the process down.
             _abandoned.append(self.file)
-        else:
+            return
+        try:
             self.file.close()
+        except (OSError, RuntimeError) as error:
+            _abandoned.append(self.file)
+            if not self._failed:  # else what went wrong first is what there is to say
+                raise self._not_whole(error) from None
 
     def _create(
         self,

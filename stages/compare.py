@@ -5,7 +5,6 @@ Two sources of noise count: training (the same model from several seeds) and the
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from schemas import CHECKPOINT, EVALUATION, ArtefactError, ConfigError, atomic_path, open_artefact, read_strings
+from schemas import (
+    CHECKPOINT,
+    EVALUATION,
+    ArtefactError,
+    ConfigError,
+    atomic_path,
+    open_artefact,
+    read_strings,
+    write_json,
+)
 from stages.common.intervals import ERROR, LOG, ground_variance, join, ratio_interval, run_variance, two_sided_p
 
 # Validation MSE summed over a crop of 128 x 128 px, where the Lunar-G2R paper's text gives it.
@@ -164,8 +172,7 @@ def run(
     runs = [run for evaluation, checkpoints in files for run in read_runs(evaluation, checkpoints)]
     result = compare(runs)
     if json_file is not None:
-        with atomic_path(json_file) as partial:
-            partial.write_text(json.dumps(result, indent=1) + "\n")
+        write_json(json_file, result)
     if figures is not None:
         write_curves(runs, figures)
     return result

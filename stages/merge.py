@@ -23,6 +23,7 @@ from schemas import (
     read_strings,
 )
 from schemas.files.companions import companions_of
+from schemas.files.outputs import Target, check_outputs
 from schemas.provenance import whole_command
 from stages.physics.images.table import relative_path
 from stages.physics.maps.geotiff import write_geotiff
@@ -92,7 +93,7 @@ def run(
         config = read_config(files[0]) | {"shard": [0, 1]}
         as_geotiff = schema.name in MAPS and config.get("geotiff", True)
         if as_geotiff:
-            check_output(tiff, parts, overwrite)
+            check_outputs([Target(output), Target(tiff, what=f"the GeoTIFF of {output.name}")], parts, overwrite)
         if inputs is None and len(files) > 1 and _shard(files[0])[1] > 1:
             # shards of one run: the whole is what that run in one piece would have made, from the same inputs
             attributes |= {k: files[0].attrs[k] for k in ("inputs", "provenance", "folder") if k in files[0].attrs}

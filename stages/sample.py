@@ -21,7 +21,7 @@ import numpy as np
 from geographiclib.geodesic import Geodesic
 from numpy.typing import NDArray
 
-from schemas import CROPS, SCENE, SPLITS, ArtefactWriter, ConfigError, GeometryError, open_artefact
+from schemas import CROPS, SCENE, SPLITS, ArtefactWriter, ConfigError, GeometryError, check_output, open_artefact
 from schemas.provenance import sha256
 from stages.physics.images.table import Frame, load_frames, relative_path, write_frames
 from stages.physics.maps.grid import Grid, read_grid
@@ -113,6 +113,7 @@ def run(
             raise ConfigError(f"{option}: expected a number above 0, up to {LARGEST:g}, found {value:g}.")
     if len(config.split) != 3 or min(config.split) < 0 or not math.isclose(sum(config.split), 1, abs_tol=1e-6):
         raise ConfigError(f"--split: expected three shares that sum to 1, found {config.split}.")
+    check_output(output, [scene], overwrite)
     with open_artefact(scene, SCENE) as file:
         grid = read_grid(file, scene)
         frames = load_frames(file, scene)

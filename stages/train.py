@@ -22,7 +22,8 @@ import torch.distributed as dist
 from numpy.typing import NDArray
 from torch import Tensor
 
-from schemas import CHECKPOINT, ArtefactWriter, ConfigError, InputError, check_output
+from schemas import CHECKPOINT, ArtefactWriter, ConfigError, InputError
+from schemas.files.outputs import Target, check_apart, check_outputs
 from schemas.provenance import sha256
 from stages.common.memory import keep_freed_memory
 from stages.network.losses import Radiometry, masked_mse, squared_error
@@ -86,7 +87,10 @@ def run(
     After every epoch the whole state goes to a file beside the output, from which ``resume`` goes on to the same result.
     """
     check(config)
-    check_output(output, [pairs], overwrite)
+    sidecar = output.with_name(f"{output.stem}.resume.h5")
+    inputs = [pairs, *([Path(config.extend)] if config.extend else [])]
+    check_outputs([Target(output)], inputs, overwrite)
+    check_apart([Target(output), Target(sidecar, what=f"the state of the unfinished {output.name}")], inputs)
     rank, ranks = join_group()
     device = choose_device(config.device)
     if device.type == "cuda" and ranks > 1:
@@ -132,7 +136,6 @@ def run(
         history = History()
         best: dict[str, Tensor] = {}
 
-        sidecar = output.with_name(f"{output.stem}.resume.h5")
         # A constant rate may go on for longer; what a cosine did in its first epochs hangs on how many there are.
         epochs = config.epochs if config.schedule == "cosine" else None
         identity = json.dumps(

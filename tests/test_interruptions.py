@@ -139,6 +139,57 @@ def test_a_disk_that_fills_under_a_geotiff_leaves_nothing(tmp_path, rng, size):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    "share", [0.0, 0.5, 0.999]
+)  # the lock, the middle, and what HDF5 writes when it closes the file
+def test_a_disk_that_fills_at_any_moment_is_one_line_and_leaves_nothing(small_artefacts, tmp_path, share):
+    size = int(small_artefacts["crops"].stat().st_size * share)
+    words = ["sample", small_artefacts["scene"], "--count", 90, "--tile-m", 1280, "--seed", 3, "--quiet"]
+    process = start(
+        [*words, "-o", tmp_path / "new" / "crops.h5"],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)),
+    )
+    code, said = finish(process)
+    assert code == 3 and len(said.splitlines()) == 1 and "crops.h5: " in said and "run the command again" in said, said
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_a_disk_that_fills_under_a_simulated_scene_leaves_nothing_and_replaces_nothing(tmp_path, before):
+    """truth.h5 is written after DEM and images: without it they are of no use."""
+    folder, earlier = tmp_path / "scene", {}
+    if before:
+        (folder / "images").mkdir(parents=True)
+        for name in ("dem.tif", "truth.h5", "images/S0001O.tif"):
+            earlier[folder / name] = name
+            (folder / name).write_text(name)
+    process = start(
+        ["simulate", "--size-px", 64, "--images", 2, "--overwrite", "--quiet", "-o", folder],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, 80_000)),
+    )
+    code, said = finish(process)
+    assert code == 3 and len(said.splitlines()) == 1 and "scene/truth.h5: the disk is full" in said
+    assert {p: p.read_text() for p in tmp_path.rglob("*") if p.is_file()} == earlier
+
+
+def test_an_exr_or_png_without_its_end_is_no_image(tmp_path, rng):
+    """OpenEXR and libpng say nothing when the last bytes of a file find no room."""
+    from stages.render.pictures import write_exr, write_png
+
+    image = rng.random((64, 64), dtype=np.float32)
+
+    def exr(path):
+        with write_exr(path, 64, 64, ["image"]) as file:
+            file.write({"image": image})
+
+    for suffix, write in ((".exr", exr), (".png", lambda path: write_png(path, image))):
+        write(tmp_path / f"whole{suffix}")
+        size = (tmp_path / f"whole{suffix}").stat().st_size
+        with file_size_limit(size - 6), pytest.raises(InputError, match="free some space"):
+            write(tmp_path / f"cut{suffix}")
+        assert not list(tmp_path.glob("*cut*")) and not list(tmp_path.glob(".*"))
+
+
 def test_a_full_disk_keeps_the_parts(small_artefacts, tmp_path):
     """Each part fits, the whole does not: one line, and the same command goes on when there is room."""
     output = tmp_path / "pairs.h5"

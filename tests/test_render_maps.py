@@ -19,7 +19,7 @@ from stages.physics.maps.grid import Grid, unit_vectors
 from stages.physics.photometry import evaluate
 from stages.physics.terrain import sun_visibility as light
 from stages.render import maps
-from stages.render.pictures import read_exr
+from stages.render.pictures import read_exr, stretch
 
 
 def test_a_level_map_has_the_angles_of_the_sphere(tmp_path):
@@ -57,7 +57,7 @@ def test_sun_angles_hold_at_the_middle_clockwise_from_true_north(tmp_path):
     r, c = np.indices((101, 101)) - 50.0
     elevation = -0.2 * 20.0 * (c * along[0] - r * along[1])
     path = write_dem(tmp_path / "d.tif", grid, elevation)
-    config = render.Config(sun_azimuth_deg=0.0, sun_elevation_deg=40.0, shadows=False)
+    config = render.Config(sun_azimuth_deg=0.0, sun_elevation_deg=40.0, shadows=False, model="lambert")
     render.run(path, tmp_path / "o.exr", config)
     tilt = math.degrees(math.atan(0.2))
     assert read_exr(tmp_path / "o.exr")["incidence_deg"][50, 50] == pytest.approx(50.0 - tilt, abs=0.05)
@@ -155,3 +155,51 @@ def test_extensions_reach_both_kinds_of_view(hilly_map, tmp_path):
         known = np.isfinite(difference)
         assert known.mean() > 0.9
         assert np.median(difference[known]) == pytest.approx(0.007, abs=3e-4)
+
+
+def grazing_map(rng, path):
+    """A map whose M2 falls below 0 wherever cos(i) < 1/2: 0.1 cos(i) - 0.05."""
+    grid = make_grid(64, 64, 5.0)
+    coefficients = np.broadcast_to(np.array([0.1, 0.0, -0.05])[:, None, None], (3, 64, 64))
+    return write_svbrdf(path, grid, hills(rng, 64, 5.0), coefficients)
+
+
+@pytest.mark.parametrize("extended", [False, True])
+def test_what_a_model_gives_below_0_is_drawn_as_0_and_counted(rng, tmp_path, monkeypatch, extended):
+    """M2 with such coefficients is below 0 exactly where the incidence angle is above 60 deg."""
+    path = grazing_map(rng, tmp_path / "svbrdf.h5")
+    if extended:  # through the whole formation chain, as with a diagnosis
+
+        class Nothing:
+            slot = "sensor"
+
+            def apply(self, state) -> None:
+                pass
+
+        monkeypatch.setattr("stages.effects.load_extension", lambda *_: [Nothing()])
+    config = render.Config(
+        sun_azimuth_deg=100.0, sun_elevation_deg=29.0, shadows=False, extension=str(path) if extended else None
+    )
+    summary = render.run(path, tmp_path / "o.exr", config)
+    exr = read_exr(tmp_path / "o.exr")
+    below = (exr["incidence_deg"] > 60.0) & (exr["incidence_deg"] < 90.0)
+    assert below.any() and not below.all()
+    assert float(np.nanmin(exr["image"])) == 0.0
+    assert abs(summary.clipped - int(below.sum())) <= 0.01 * below.sum()
+
+
+def test_a_camera_view_clips_each_ray_and_counts_pixels(rng, tmp_path):
+    path = grazing_map(rng, tmp_path / "svbrdf.h5")
+    config = render.Config(
+        view="pinhole", position=(LON, LAT, 2000.0), size_px=(32, 32), fov_deg=6.0, samples=2, shadows=False,
+        sun_azimuth_deg=100.0, sun_elevation_deg=29.0,
+    )  # fmt: skip
+    summary = render.run(path, tmp_path / "o.exr", config)
+    image = read_exr(tmp_path / "o.exr")["image"]
+    assert float(np.nanmin(image)) >= 0.0 and 0 < summary.clipped < image.size
+
+
+def test_black_is_0_in_a_preview_whatever_the_image_holds():
+    image = np.array([[-0.005, 0.0, 0.05, 0.1]] * 50, np.float32)
+    grey, limits = stretch(image)
+    assert limits[0] == 0.0 and (grey[:, :2] == 0).all() and (grey[:, 2:] > 100).all()

@@ -160,7 +160,7 @@ def test_a_line_scan_camera_sees_ground_that_its_own_model_projects_back(shared,
         np.testing.assert_allclose(back[0][met], line[met], atol=1e-3)
         np.testing.assert_allclose(back[1][met], sample[met], atol=1e-3)
     # the whole command, with the Sun that the camera model knows
-    config = render.Config(view="pinhole", camera=str(path), samples=1, shadows=False)
+    config = render.Config(view="pinhole", camera=str(path), samples=1, shadows=False, model="lambert")
     small = tmp_path / "strip.exr"
     summary = render.run(tmp_path / "dem.tif", small, config)
     assert summary.size_px == (5064, 400)

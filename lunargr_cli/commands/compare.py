@@ -8,13 +8,19 @@ from typing import Annotated, Any
 import typer
 
 from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Resume
+from lunargr_cli.paths import Writes
 
 NAME, ORDER = "compare", 72
+ENDS = ("checkpoint.h5", "checkpoint.resume.h5")  # and the evaluation's
 
 
 def command(
     pairs: Annotated[Path, typer.Argument(help="Pairs from 'lunargr project'.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for checkpoints, evaluations and the table.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Folder for checkpoints, evaluations and the table."),
+        Writes.FOLDER,
+    ],
     models: Annotated[
         str, typer.Option("--models", help="Reflectance models, separated by commas.")
     ] = "M1,M2,M3,M4,M5,M6",
@@ -45,7 +51,8 @@ def command(
     With --resume, runs that the folder already holds are kept and an interrupted one goes on where it stopped.
     """
     from lunargr_cli.console import Console
-    from schemas import SPLITS, ConfigError
+    from schemas import SPLITS, ConfigError, write_json
+    from schemas.files.outputs import Target, check_outputs
     from stages import compare, evaluate, train
     from stages.physics.photometry import get_model
 
@@ -55,12 +62,6 @@ def command(
     names = list(dict.fromkeys(get_model(name.strip()).name for name in models.split(",") if name.strip()))
     if len(names) < 2:
         raise ConfigError(f"--models: expected at least two models, found '{models}'.")
-    if output.exists() and not output.is_dir():
-        raise ConfigError(f"{output}: expected a folder, found a file; choose another --output.")
-    table = output / "comparison.json"
-    for report in (table, *([json_file] if json_file else [])):
-        if report.exists() and not (overwrite or resume):
-            raise ConfigError(f"{report}: exists already; add --overwrite or --resume, or choose another --output.")
     try:
         channels = tuple(int(w) for w in widths.split("-"))
     except ValueError:
@@ -70,6 +71,11 @@ def command(
     train.check(train.Config(device=device, **settings))
     if split not in dict(SPLITS):
         raise ConfigError(f"--split: expected one of {', '.join(dict(SPLITS))}, found '{split}'.")
+    table, curves = output / "comparison.json", output / "validation_curves.png"
+    check_outputs([Target(table), Target(curves)], [pairs], overwrite or resume)
+    made = [output / f"{name}_seed{k}.{end}" for name in names for k in range(seeds) for end in ENDS]
+    made += [output / f"{name}.{split}.{end}" for name in names for end in ("h5", "json")]
+    check_outputs(map(Target, made), [pairs], overwrite or resume)
     files: list[tuple[Path, list[Path]]] = []
     for number, name in enumerate(names):
         evaluation = output / f"{name}.{split}.h5"
@@ -83,18 +89,15 @@ def command(
             scoring = evaluate.Config(split=split, renderings=False, device=device, only=("learned",))
             evaluate.run(pairs, checkpoints, evaluation, scoring, overwrite=True, progress=console.progress)
         files.append((evaluation, checkpoints))
-    result = compare.run(files, table, output / "validation_curves.png")
+    result = compare.run(files, table, curves)
     if json_file is not None:
-        from schemas import atomic_path
-
-        with atomic_path(json_file) as partial:
-            partial.write_text(table.read_text())
+        write_json(json_file, result)
     console.table(
         f"{len(names)} models x {seeds} seeds on {result['crops']} {split} crops, {result['tiles']} ground tiles",
         *compare.result_lines(result),
     )
     console.table("which differences are larger than their noise", *compare.difference_lines(result))
-    console.say(f"written: {table}, {output / 'validation_curves.png'}")
+    console.say(f"written: {table}, {curves}")
 
 
 def _same(checkpoint: Path, config: Any, pairs: Path) -> bool:

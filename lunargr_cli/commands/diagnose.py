@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
+from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import MOST, Json, Overwrite, Quiet, Scheduler, Seed
+from lunargr_cli.paths import Writes
 
 NAME, ORDER = "diagnose", 80
 
@@ -27,9 +29,12 @@ def command(
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="diagnosis.h5: the extended model for train, render, evaluate."),
+        Writes.FILE,
     ] = None,
     report: Annotated[
-        Path | None, typer.Option("--report", metavar="FILE", help="One HTML file with pictures and evidence.")
+        Path | None,
+        typer.Option("--report", metavar="FILE", help="One HTML file with pictures and evidence."),
+        Writes.FILE,
     ] = None,
     free: Annotated[
         str,
@@ -45,7 +50,6 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Name the physical causes of the difference between measured and simulated images."""
-    from lunargr_cli.console import Console
     from schemas import ConfigError
 
     console = Console(quiet)
@@ -84,9 +88,9 @@ def command(
             "causes", ("effect", "parameters", "p (family)", "gain, nats", "size / noise", "equally good"), rows
         )
     if not quiet:
-        print(f"{answer['verdict']}: {answer['sentence']}")
+        write_out(f"{answer['verdict']}: {answer['sentence']}")
         if answer["blind"] and answer["verdict"] != "cannot_tell":
-            print(f"These data could not show: {', '.join(answer['blind'])}.")
+            write_out(f"These data could not show: {', '.join(answer['blind'])}.")
 
 
 def _list(console) -> None:
@@ -94,10 +98,10 @@ def _list(console) -> None:
 
     for name in effect_names():
         effect = get_effect(name)
-        print(f"{name} ({effect.slot}, per {effect.scope}): {effect.title}")
-        print(f"  {effect.mechanism}")
+        write_out(f"{name} ({effect.slot}, per {effect.scope}): {effect.title}")
+        write_out(f"  {effect.mechanism}")
         for p in effect.parameters:
             unit = "" if p.unit == "1" else f" {p.unit}"
-            print(f"  {p.name}: {p.description}; {p.lower:g} .. {p.upper:g}{unit}, null {p.default:g}")
-        print(f"  reference: {effect.reference}")
-        print(f"  confused with: {', '.join(effect.confused_with) or '-'}; told apart by {effect.separate}\n")
+            write_out(f"  {p.name}: {p.description}; {p.lower:g} .. {p.upper:g}{unit}, null {p.default:g}")
+        write_out(f"  reference: {effect.reference}")
+        write_out(f"  confused with: {', '.join(effect.confused_with) or '-'}; told apart by {effect.separate}\n")

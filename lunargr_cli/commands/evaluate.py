@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from lunargr_cli.options import MOST, Device, Json, Output, Overwrite, Quiet, ResumeParts, Scheduler, Seed
+from lunargr_cli.paths import Writes
 
 NAME, ORDER = "evaluate", 70
 
@@ -25,7 +26,9 @@ def command(
         typer.Option("--extend", metavar="FILE", help="Also score the extended model of 'lunargr diagnose'."),
     ] = None,
     figures: Annotated[
-        Path | None, typer.Option("--figures", metavar="DIR", help="Write training curves and example crops as PNG.")
+        Path | None,
+        typer.Option("--figures", metavar="DIR", help="Write training curves and example crops as PNG."),
+        Writes.FOLDER,
     ] = None,
     fit_pairs: Annotated[
         int,

@@ -21,6 +21,7 @@ from lunargr_cli.options import (
     in_parts,
     parse_shard,
 )
+from lunargr_cli.paths import Writes
 
 NAME, ORDER = "infer", 60
 
@@ -46,7 +47,9 @@ def command(
     ] = "auto",
     any_gsd: Annotated[bool, typer.Option("--any-gsd", help="Allow a DEM at another GSD than the training's.")] = False,
     geotiff: Annotated[
-        Path | None, typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif).")
+        Path | None,
+        typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif)."),
+        Writes.FILE,
     ] = None,
     no_geotiff: Annotated[
         bool, typer.Option("--no-geotiff", help="Write svbrdf.h5 only: on large maps a quarter of the time less.")
@@ -65,7 +68,7 @@ def command(
     import contextlib
 
     from lunargr_cli.console import Console
-    from schemas import ConfigError, check_output
+    from schemas import ConfigError
     from schemas.files.locks import scratch_path
     from stages import infer
 
@@ -84,7 +87,8 @@ def command(
         shard=parse_shard(shard),
         geotiff=not no_geotiff,
     )
-    check_output(output, [terrain, checkpoint], overwrite)
+    interrupted = scheduler is not None or resume  # may have got as far as the GeoTIFF: its parts tell
+    infer.check_files([terrain, checkpoint], output, geotiff, config, overwrite, replace_tiff=interrupted)
     gridding = None
     if infer.open_terrain(terrain):
         infer.check_body(terrain, body)

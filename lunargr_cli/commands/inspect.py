@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lunargr_cli.options import Json
+from lunargr_cli.console import Console, write_out
+from lunargr_cli.options import Json, Overwrite
 
 if TYPE_CHECKING:
     from schemas.provenance import Step
@@ -20,10 +21,10 @@ NAME, ORDER = "inspect", 90
 def command(
     file: Annotated[Path, typer.Argument(help="Any artefact of lunargr.")],
     json_file: Json = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Say what an artefact is, who made it and from what; check it against its schema."""
-    from lunargr_cli.console import Console
-    from schemas import atomic_path, open_artefact, read_kind
+    from schemas import open_artefact, read_kind, write_json
     from schemas.provenance import chain
 
     schema = read_kind(file)
@@ -39,32 +40,22 @@ def command(
             if hasattr(data[name], "shape")
             and not str(data[name].attrs.get("NAME", "")).startswith("This is a netCDF dim")
         }
+    steps = chain(file)
+    if json_file is not None:
+        content = {"file": file.name, "schema": schema.name, "attributes": attributes, "variables": variables}
+        write_json(json_file, content | {"chain": [asdict(s) for s in steps]})
     console = Console()
-    print(f"{file}: {schema.title} ('{schema.name}', version {schema.version}, written by 'lunargr {schema.stage}')\n")
+    write_out(
+        f"{file}: {schema.title} ('{schema.name}', version {schema.version}, written by 'lunargr {schema.stage}')\n"
+    )
     console.table(
         "variables",
         ("name", "shape", "type"),
         [(n, "x".join(map(str, v["shape"])) or "scalar", v["dtype"]) for n, v in variables.items()],
     )
-    steps = chain(file)
     shown = {k: v for k, v in attributes.items() if k != "provenance"}
     console.table("attributes", ("name", "value"), shown.items())
     console.table("made by, in this order", ("file", "command", "version", "seed", "sha256"), [_row(s) for s in steps])
-    if json_file is not None:
-        with atomic_path(json_file) as partial:
-            partial.write_text(
-                json.dumps(
-                    {
-                        "file": file.name,
-                        "schema": schema.name,
-                        "attributes": attributes,
-                        "variables": variables,
-                        "chain": [asdict(s) for s in steps],
-                    },
-                    indent=1,
-                    default=str,
-                )
-            )
 
 
 def _row(step: Step) -> tuple[object, ...]:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Seed
+from lunargr_cli.paths import Writes
 
 NAME, ORDER = "match", 71
 
@@ -33,7 +34,9 @@ def command(
         Path | None, typer.Option("--lightglue-model", metavar="ONNX", help="LightGlue's network for these features.")
     ] = None,
     figures: Annotated[
-        Path | None, typer.Option("--figures", metavar="DIR", help="Write match pictures, coloured by error, as PNG.")
+        Path | None,
+        typer.Option("--figures", metavar="DIR", help="Write match pictures, coloured by error, as PNG."),
+        Writes.FOLDER,
     ] = None,
     seed: Seed = 0,
     device: Device = "auto",

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.options import Overwrite, Quiet
+from lunargr_cli.paths import Writes
 
 NAME, ORDER = "merge", 89
 
@@ -16,7 +17,7 @@ def command(
     parts: Annotated[
         list[Path], typer.Argument(metavar="PART...", help="Every part that --shard I/N wrote, in any order.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write."), Writes.FILE],
     virtual: Annotated[
         bool, typer.Option("--virtual", help="Do not copy: the output is a view of its parts, which must stay.")
     ] = False,

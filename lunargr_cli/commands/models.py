@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Json
+from lunargr_cli.console import Console, write_out
+from lunargr_cli.options import Json, Overwrite
 
 NAME, ORDER = "models", 85
 
@@ -22,15 +22,18 @@ def command(
         bool, typer.Option("--markdown", help="Print the reference part of docs/photometry.md.")
     ] = False,
     json_file: Json = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """List the reflectance models: parameters, bounds, units, defaults, reference, reciprocal or not."""
     from stages.physics.photometry import catalogue, get_model
 
     chosen = None if name is None else get_model(name)
     if json_file is not None:
-        _write_json(json_file, catalogue.as_dict())
+        from schemas import write_json
+
+        write_json(json_file, catalogue.as_dict())
     if markdown:
-        print(catalogue.markdown())
+        write_out(catalogue.markdown())
     elif sets:
         _print_sets(catalogue.parameter_sets(None if chosen is None else chosen.name))
     elif conventions:
@@ -42,25 +45,23 @@ def command(
 
 
 def _print_all() -> None:
-    from lunargr_cli.console import Console
     from stages.physics.photometry import get_model, model_names
 
     models = [get_model(n) for n in model_names()]
     rows = [(m.name, len(m.parameters), "yes" if m.reciprocal else "no", m.formula, m.reference) for m in models]
     Console().table("reflectance models, in I/F", ("name", "params", "reciprocal", "formula", "reference"), rows)
-    print(
+    write_out(
         "lunargr models NAME shows bounds, units and defaults; --sets published values, --conventions other programs."
     )
 
 
 def _print_model(model) -> None:  # type: ignore[no-untyped-def]
-    from lunargr_cli.console import Console
     from stages.physics.photometry import catalogue
 
-    print(f"{model.name}: {model.title}\n")
-    print(f"I/F = {model.formula}")
-    print(f"source: {model.reference}")
-    print(
+    write_out(f"{model.name}: {model.title}\n")
+    write_out(f"I/F = {model.formula}")
+    write_out(f"source: {model.reference}")
+    write_out(
         f"reciprocal: {'yes' if model.reciprocal else 'no'}; linear in its parameters: {'yes' if model.linear else 'no'}"
     )
     console = Console()
@@ -76,7 +77,6 @@ def _print_model(model) -> None:  # type: ignore[no-untyped-def]
 
 
 def _print_sets(sets) -> None:  # type: ignore[no-untyped-def]
-    from lunargr_cli.console import Console
     from stages.physics.photometry import catalogue
 
     rows = [(s.name, s.model, catalogue.values_text(s), s.description, s.reference) for s in sets]
@@ -84,7 +84,6 @@ def _print_sets(sets) -> None:  # type: ignore[no-untyped-def]
 
 
 def _print_conventions(model: str | None) -> None:
-    from lunargr_cli.console import Console
     from stages.physics.photometry import catalogue
 
     rows = [
@@ -92,12 +91,3 @@ def _print_conventions(model: str | None) -> None:
         for c in catalogue.related_conventions(model)
     ]
     Console().table("conventions", ("name", "model here", "bands", "formula gives"), rows)
-
-
-def _write_json(path: Path, content: dict[str, object]) -> None:
-    import json
-
-    from schemas import atomic_path
-
-    with atomic_path(path) as partial:
-        partial.write_text(json.dumps(content, indent=1))

@@ -11,6 +11,7 @@ import typer
 import typer.core
 
 from lunargr_cli.options import Output, Overwrite, Parts, Quiet, ResumeParts, Scheduler, Shard, in_parts, parse_shard
+from lunargr_cli.paths import Writes
 
 if TYPE_CHECKING:
     from lunargr_cli.console import Console
@@ -57,7 +58,9 @@ def command(
         float, typer.Option("--max-shift", help="How far to search when registering, px of the scene's grid.")
     ] = 8.0,
     blocks_csv: Annotated[
-        Path | None, typer.Option("--shifts", metavar="CSV", help="Also write each block's own shift to a table.")
+        Path | None,
+        typer.Option("--shifts", metavar="CSV", help="Also write each block's own shift to a table."),
+        Writes.FILE,
     ] = None,
     exact: Annotated[
         bool, typer.Option("--exact", help="Keep all digits of float32, not those that matter: three times the size.")
@@ -72,14 +75,15 @@ def command(
 ) -> None:
     """Orthorectify the images onto the crops; add the Sun, the camera and the terrain's horizon."""
     from lunargr_cli.console import Console
-    from schemas import ConfigError, check_output
+    from schemas import ConfigError
+    from schemas.files.outputs import Target, check_outputs
     from stages import project
 
     console = Console(quiet)
     if blocks_csv is not None:
         if register is None:
             raise typer.BadParameter("needs --register", param_hint="--shifts")
-        check_output(blocks_csv, [crops, output], overwrite)
+        check_outputs([Target(output), Target(blocks_csv, "--shifts")], [crops], overwrite)
     config = project.Config(
         scene=str(scene) if scene else None,
         shard=parse_shard(shard),

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from lunargr_cli.options import BodyOption, Json, Overwrite, Quiet, Resume, Shard, parse_shard
+from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
 
 NAME, ORDER = "render", 60
@@ -26,6 +27,7 @@ def command(
             "-o",
             help="NAME.exr: EXR, PNG and, for ortho, GeoTIFF; .tif or .png: without the EXR. A folder with --trajectory.",
         ),
+        Writes.EITHER,
     ] = Path("render.exr"),
     dem: Annotated[
         Path | None,
@@ -174,13 +176,19 @@ def command(
                 "--shard and --resume: expected together with --trajectory; a single view is one piece of work."
             )
         results = [render.run(path, output, config, overwrite=overwrite, progress=console.progress)]
+    if json_file is not None:
+        _write_json(json_file, results)
     console.table(
         "rendered",
         ("view", "pixels", "known", "mean I/F", "shadow", "incidence", "rays/px", "files"),
         map(_row, results),
     )
-    if json_file is not None:
-        _write_json(json_file, results)
+    for r in results:
+        if r.clipped:
+            share = r.clipped / (r.known_share * r.size_px[0] * r.size_px[1])
+            console.say(
+                f"{r.view_id}: the model gives I/F below 0 in {r.clipped} pixels ({share:.2%}); they are drawn as 0."
+            )
 
 
 def _row(result: Any) -> tuple[str, ...]:
@@ -202,9 +210,7 @@ def _row(result: Any) -> tuple[str, ...]:
 
 
 def _write_json(path: Path, results: list[Any]) -> None:
-    import json
-
-    from schemas import atomic_path
+    from schemas import write_json
 
     def finite(value: float) -> float | None:
         return value if math.isfinite(value) else None
@@ -220,11 +226,11 @@ def _write_json(path: Path, results: list[Any]) -> None:
             "incidence_deg": [finite(v) for v in r.incidence_deg],
             "samples": r.samples,
             "skipped": r.skipped,
+            "clipped_px": r.clipped,
         }
         for r in results
     ]
-    with atomic_path(path) as partial:
-        partial.write_text(json.dumps({"views": views}, indent=1))
+    write_json(path, {"views": views})
 
 
 def _numbers(text: str | None, option: str, counts: tuple[int, ...]) -> tuple[float, ...] | None:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from lunargr_cli.console import write_out
+
 if TYPE_CHECKING:
     from schemas.provenance import Step
 
@@ -22,7 +24,7 @@ def command(file: Annotated[Path, typer.Argument(help="Any artefact of lunargr."
     from schemas.provenance import chain
 
     open_artefact(file, read_kind(file)).close()
-    print("\n".join(script(chain(file))))
+    write_out("\n".join(script(chain(file))))
 
 
 def script(steps: Sequence[Step]) -> Iterator[str]:

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from lunargr_cli.console import Console, write_out
+
 NAME, ORDER = "schema", 91
 
 
@@ -13,7 +15,6 @@ def command(
     name: Annotated[str | None, typer.Argument(help="scene, crops, pairs, ...; nothing lists them all.")] = None,
 ) -> None:
     """Print what an artefact holds: dimensions, variables, units, attributes."""
-    from lunargr_cli.console import Console
     from schemas import SCHEMAS, get_schema
 
     console = Console()
@@ -22,7 +23,7 @@ def command(
         console.table("artefacts", ("name", "written by", "what"), rows)
         return
     schema = get_schema(name)
-    print(f"{schema.name}, version {schema.version}, written by 'lunargr {schema.stage}': {schema.title}\n")
+    write_out(f"{schema.name}, version {schema.version}, written by 'lunargr {schema.stage}': {schema.title}\n")
     console.table("dimensions", ("name", "what"), list(schema.dims.items()))
     variables = []
     for v in schema.variables:

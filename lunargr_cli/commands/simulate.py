@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json, Overwrite, Quiet
+from lunargr_cli.paths import Writes
 
 NAME, ORDER = "simulate", 10
 
@@ -21,7 +22,9 @@ _HIDDEN_HELP = (
 
 
 def command(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write the scene into.")] = Path("scene"),
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder to write the scene into."), Writes.FOLDER
+    ] = Path("scene"),
     recipe: Annotated[Path | None, typer.Option("--recipe", help="JSON recipe; the options below override it.")] = None,
     print_recipe: Annotated[bool, typer.Option("--print-recipe", help="Print the full recipe and stop.")] = False,
     size_px: Annotated[
@@ -58,9 +61,9 @@ def command(
     where = str(recipe) if recipe else "options"
     config = make_config(_override(values, size_px, extent_m, gsd, images, units, hidden, seed), where)
     if print_recipe:
-        print(recipe_json(config))
+        write_out(recipe_json(config))
         return
-    from lunargr_cli.console import Console
+    from schemas import write_json
     from stages.simulate.stage import run
 
     console = Console(quiet)
@@ -92,14 +95,14 @@ def command(
         "mean I/F",
         "SNR",
     )
+    if json_file is not None:
+        write_json(json_file, [dict(zip(columns, row, strict=True)) for row in rows])
     console.table(f"{config.extent / 1000:.2f} km scene in {output}", columns, rows)
     planted = " + ".join(h.effect for h in summary.hidden) or "none"
     console.say(
         f"{summary.craters} craters, DEM valid {100 * summary.dem_valid:.1f} %, planted: {planted} (recorded in {output / 'truth.h5'})"
     )
     console.say(f"next: lunargr ingest {output / 'dem.tif'} --images {output / 'images.csv'} --gsd {config.gsd:g}")
-    if json_file is not None:
-        _write_json(json_file, rows, columns)
 
 
 def _override(
@@ -135,12 +138,3 @@ def _override(
     if hidden is not None:
         values["hidden"] = hidden_from_option(hidden)
     return values
-
-
-def _write_json(path: Path, rows: Sequence[Sequence[str]], columns: Sequence[str]) -> None:
-    import json
-
-    from schemas import atomic_path
-
-    with atomic_path(path) as partial:
-        partial.write_text(json.dumps([dict(zip(columns, row, strict=True)) for row in rows], indent=1))

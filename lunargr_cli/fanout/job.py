@@ -77,7 +77,7 @@ def open_job(
     options, inputs : what decides the result, with the inputs' contents; sources : files too many to read for that,
     known by size and time of change. Parts of another command are thrown away.
     """
-    check_output(output, inputs, overwrite)
+    check_output(output, [*inputs, *sources], overwrite)
     with claim(output):
         identity = _identity(stage, options, inputs, sources)
         root = output.with_name(f"{output.name}.parts")

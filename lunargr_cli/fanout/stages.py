@@ -13,7 +13,7 @@ from typing import Any
 from lunargr_cli.fanout.job import open_job
 from schemas import ConfigError, atomic_path
 from schemas.files.companions import companions_of
-from schemas.files.outputs import check_output
+from schemas.files.outputs import Target, check_outputs
 
 # What a part holds where --parts does not say: some minutes of work on real data.
 BANDS_OF_DEM, BANDS_OF_MAP, PAIRS, SAMPLES = 8, 8, 512, 4
@@ -110,8 +110,7 @@ def run_infer(
     terrain, checkpoint, tiff = terrain.resolve(), checkpoint.resolve(), geotiff or output.with_suffix(".tif")
     with _job(output, "infer", config, parts, [terrain, checkpoint], (), how, {"gridding": gridding}) as job:
         replace_tiff = how["overwrite"] or job.again  # an interrupted run may have got as far as that
-        if config.geotiff:
-            check_output(tiff, [terrain, checkpoint, output], replace_tiff)
+        infer.check_files([terrain, checkpoint], output, geotiff, config, how["overwrite"], replace_tiff)
         scene = terrain
         if gridding is not None:
             scene = job.folder / "scene.h5"
@@ -176,9 +175,8 @@ def run_diagnose(
         raise ConfigError("diagnose: expected --output with --scheduler (the part lies beside it), found none.")
     pairs, checkpoint = pairs.resolve(), checkpoint and checkpoint.resolve()
     inputs = [pairs, *([checkpoint] if checkpoint else [])]
-    for path in (json_file, report):
-        if path is not None:
-            check_output(path, inputs, how["overwrite"])
+    named = ((output, "--output"), (json_file, "--json"), (report, "--report"))
+    check_outputs([Target(path, option) for path, option in named if path is not None], inputs, how["overwrite"])
     with _job(output, "diagnose", config, None, inputs, (), how) as job:
         arguments = {"pairs": pairs, "checkpoint": checkpoint, "config": config}
         (piece,) = job.fan("diagnosis", diagnose_part, [arguments])

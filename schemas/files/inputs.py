@@ -1,46 +1,167 @@
-"""The user's own files: regular ones only, and text of a size that can be text."""
+"""The files that a run reads, under every name that they have: no output may take the place of one of them.
+
+Beside the files that were named these are the files that they name: the images and camera models of an image table, of a
+scene or of crops, the scene of crops, the parts behind a virtual artefact, the sources of a VRT, the label of an image.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import csv
+import errno
+import functools
+import json
+import os
+import stat
+import warnings
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from schemas.checks import parse_json
 from schemas.errors import InputError
+from schemas.files.locks import is_beside
 
-LARGEST_TEXT = 1 << 30  # bytes: PDS indices have hundreds of megabytes
-
-
-def check_file(path: Path, what: str) -> None:
-    """Refuse what is missing, a folder, a device or a pipe, before anything is read of it. Raises InputError."""
-    path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{path}: expected {what}, found a folder; name the file in it.")
-    if not path.exists():
-        raise InputError(f"{path}: no such file; expected {what}. Check the path.")
-    if not path.is_file():
-        raise InputError(f"{path}: expected {what}, found a device or a pipe; write it to a file and name that.")
+TABLES = (".csv", ".json")
+FILE_COLUMNS = ("path", "camera")
 
 
-def read_text(path: Path, what: str, encoding: str = "utf-8-sig") -> str:
-    """The text of a file. Raises InputError."""
-    check_file(path, what)
+class Inputs:
+    """A set of files, and what they name. Raises InputError for a link that leads to itself."""
+
+    def __init__(self, paths: Iterable[Path] = ()) -> None:
+        self._names: dict[Hashable, Path] = {}
+        self._folders: dict[str, dict[str, Path]] = {}
+        self.add(paths)
+
+    def add(self, paths: Iterable[Path]) -> None:
+        waiting = [Path(p) for p in paths]
+        while waiting:
+            path = waiting.pop()
+            if _place(path) in self._names:
+                continue
+            self.note(path)
+            waiting += files_named_in(path)
+
+    def note(self, path: Path) -> None:
+        """Add one file, without what it names."""
+        for name in _names(path):
+            self._names.setdefault(name, path)
+            if isinstance(name, str):
+                folder, _, base = name.rpartition(os.sep)
+                self._folders.setdefault(folder, {})[base] = path
+
+    def find(self, output: Path) -> Path | None:
+        """The input that is this file: of the same path, behind the same link, or the same file under another name."""
+        try:
+            return next((self._names[name] for name in _names(output) if name in self._names), None)
+        except InputError:
+            return None  # a link that leads to itself is no input; whoever writes says it
+
+    def clash(self, output: Path) -> Path | None:
+        """The input that writing ``output`` would replace or remove: itself, or by its lock, its temporary files, its parts."""
+        if (found := self.find(output)) is not None:
+            return found
+        folder, _, name = _place(output).rpartition(os.sep)
+        for base, path in self._folders.get(folder, {}).items():
+            if is_beside(name, base):
+                return path
+        parts = f"{_place(output)}.parts"
+        for place, inside in self._folders.items():
+            if place == parts or place.startswith(parts + os.sep):
+                return next(iter(inside.values()))
+        return None
+
+
+def _place(path: Path) -> str:
+    """Where a name stands, whatever folders are links; the name itself may be one."""
+    path = Path(os.path.abspath(path))
+    return os.path.join(os.path.realpath(path.parent), path.name)
+
+
+def _names(path: Path) -> list[Hashable]:
+    """Two files of one of these names are one file. Raises InputError."""
+    names: list[Hashable] = [_place(path), os.path.realpath(path)]
     try:
-        if path.stat().st_size > LARGEST_TEXT:
-            raise InputError(
-                f"{path}: expected {what}, found a file of more than {LARGEST_TEXT >> 20} MiB; is it the right one?"
-            )
-        return path.read_text(encoding=encoding)
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: expected {what}, found something else than UTF-8 text (byte {error.start}); convert it (iconv -t utf-8)."
-        ) from None
+        state = os.stat(path)
+        names.append((state.st_dev, state.st_ino))
     except OSError as error:
-        raise InputError(
-            f"{path}: expected {what}, cannot be read ({error.strerror}); check its permissions."
-        ) from None
+        if error.errno == errno.ELOOP:
+            raise InputError(f"{path}: a symbolic link that leads to itself; name the file.") from None
+    return names
 
 
-def read_json(path: Path, what: str) -> Any:
-    """What a JSON file holds. Raises InputError."""
-    return parse_json(read_text(path, what), f"{path}: expected {what}", InputError, "mend the file")
+def files_named_in(path: Path) -> tuple[Path, ...]:
+    """The other files that a file reads from. What cannot be read names none: whoever opens it says what is wrong."""
+    try:
+        state = path.stat()
+    except OSError:
+        return tuple(_in_raster(path)) if ":" in path.name else ()  # GDAL has names like NETCDF:file.nc:variable
+    return _read_names(path, state.st_size, state.st_mtime_ns) if stat.S_ISREG(state.st_mode) else ()
+
+
+@functools.lru_cache(maxsize=1 << 17)
+def _read_names(path: Path, size: int, modified: int) -> tuple[Path, ...]:
+    """Read once while a file stays as it is: a table may name thousands, and every output is checked."""
+    if path.suffix.lower() in TABLES:
+        return tuple(_in_table(path))
+    return tuple(_in_artefact(path) if _is_hdf5(path) else _in_raster(path))
+
+
+def _in_table(path: Path) -> Iterator[Path]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        rows: Any = json.loads(text) if path.suffix.lower() == ".json" else list(csv.DictReader(text.splitlines()))
+    except (OSError, ValueError, csv.Error, RecursionError):
+        return
+    rows = rows.get("images") if isinstance(rows, Mapping) else rows
+    for row in rows if isinstance(rows, list) else ():
+        for column in FILE_COLUMNS:
+            name = row.get(column) if isinstance(row, Mapping) else None
+            if isinstance(name, str) and name.strip() and "\0" not in name:
+                yield path.parent / name.strip()
+
+
+def _is_hdf5(path: Path) -> bool:
+    import h5py
+
+    try:
+        return bool(h5py.is_hdf5(path))
+    except (OSError, ValueError):
+        return False
+
+
+def _in_artefact(path: Path) -> Iterator[Path]:
+    import h5py
+
+    from schemas.files.hdf5 import silence_hdf5
+
+    silence_hdf5()
+    named: list[str] = []
+    with contextlib.suppress(OSError, RuntimeError, ValueError, KeyError, TypeError), h5py.File(path, "r") as file:
+        named += [_text(file.attrs["scene"])] if "scene" in file.attrs else []
+        for column in FILE_COLUMNS:
+            if column in file and file[column].ndim == 1:
+                named += map(_text, file[column][...])
+        for data in file.values():
+            if isinstance(data, h5py.Dataset) and data.is_virtual:
+                plan = data.id.get_create_plist()
+                named += {plan.get_virtual_filename(k) for k in range(plan.get_virtual_count())}
+    folder = Path(os.path.realpath(path)).parent
+    for name in named:
+        if name and "\0" not in name:
+            yield folder / name
+
+
+def _in_raster(path: Path) -> Iterator[Path]:
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+
+    with warnings.catch_warnings(), contextlib.suppress(RasterioError, OSError, ValueError):
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(path) as data:
+            for name in data.files:
+                yield Path(name)
+
+
+def _text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)

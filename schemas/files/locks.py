@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import socket
 import threading
 import time
@@ -14,7 +15,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import ConfigError
+from schemas.errors import ConfigError, InputError
 from schemas.files.companions import remove_companions
 
 # A process on another machine cannot be asked whether it lives: it touches its locks, and a lock that was not touched
@@ -51,6 +52,14 @@ def scratch_path(output: Path, what: str) -> Iterator[Path]:
         path.unlink(missing_ok=True)
 
 
+def is_beside(output: str, name: str) -> bool:
+    """Whether a file of this name would be taken for the lock of ``output`` or for another process' temporary file of it."""
+    stem, suffix = Path(output).stem, Path(output).suffix
+    own = partial_path(Path(output)).stem
+    partial = name.startswith(f".{stem}.partial-") and name.endswith(suffix) and not name.startswith(own)
+    return partial or name == f".{output}.lock" or name.startswith(f".{output}.lock-")
+
+
 def host() -> str:
     return socket.gethostname().split(".")[0]
 
@@ -70,11 +79,34 @@ def claim(output: Path) -> Iterator[None]:
     """Hold the lock of an output; a process may claim it again within. Raises ConfigError where another run has it.
 
     What killed runs left beside the output under temporary names is removed, and so are its companions where it is absent.
+    A missing folder is made, and goes again where nothing was written into it.
     """
     lock = lock_path(output)
-    if _unlocked.get() or not lock.parent.is_dir():  # a missing folder is made later, by check_output
+    with _folder(lock.parent):
+        if _unlocked.get():
+            yield
+        else:
+            with _hold(lock, output):
+                yield
+
+
+@contextlib.contextmanager
+def _folder(folder: Path) -> Iterator[None]:
+    missing = [p for p in (folder, *folder.parents) if not p.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made a folder ({error.strerror}); choose another --output.") from None
+    try:
         yield
-        return
+    finally:
+        with contextlib.suppress(OSError):  # not empty: it holds the output
+            for made in missing:
+                made.rmdir()
+
+
+@contextlib.contextmanager
+def _hold(lock: Path, output: Path) -> Iterator[None]:
     with _guard:
         mine = lock in _held
         if not mine:
@@ -119,8 +151,14 @@ def _acquire(lock: Path, output: Path) -> str:
             "began": _start_of(os.getpid()),
             "since": time.strftime("%Y-%m-%d %H:%M:%S"),
         }
-        with os.fdopen(number, "w") as stream:
-            json.dump(own, stream)
+        try:
+            with os.fdopen(number, "w") as stream:
+                json.dump(own, stream)
+        except OSError as error:
+            lock.unlink(missing_ok=True)
+            raise InputError(
+                f"{output}: cannot be written ({error.strerror}); nothing is left. Free some space and run the command again."
+            ) from None
         return noted
     raise ConfigError(f"{output}: another run is taking this output at the same moment; let it finish.")
 
@@ -199,7 +237,10 @@ def _remove_partials(output: Path) -> None:
     """Whoever holds the lock is the only one that writes: what lies there under temporary names is of killed runs."""
     for left in output.parent.glob(f".{_plain(output.stem)}.partial-*{_plain(output.suffix)}"):
         with contextlib.suppress(OSError):
-            left.unlink()
+            if left.is_dir():
+                shutil.rmtree(left)
+            else:
+                left.unlink()
 
 
 def _plain(name: str) -> str:

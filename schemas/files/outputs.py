@@ -4,39 +4,121 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import json
 import os
+import shutil
 import signal
+import stat
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import ConfigError, InputError
+from schemas.errors import ConfigError, InputError, LunargrError
 from schemas.files.companions import current_output, note_companion
+from schemas.files.inputs import Inputs
 from schemas.files.locks import claim, lock_path, partial_path
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_protected: ContextVar[Inputs | None] = ContextVar("protected", default=None)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A file, or a folder of files, that a run will write.
+
+    option : with which the user chooses another place; what : how a message calls it
+    """
+
+    path: Path
+    option: str = "--output"
+    what: str = "the output"
+
+
+@contextlib.contextmanager
+def protect(inputs: Iterable[Path]) -> Iterator[None]:
+    """Within this block no file is written in the place of one of these, or of one that they name, whoever writes it."""
+    token = _protected.set(Inputs(inputs))
+    try:
+        yield
+    finally:
+        _protected.reset(token)
+
+
+def check_outputs(targets: Iterable[Target], inputs: Sequence[Path] = (), overwrite: bool = False) -> None:
+    """Refuse, before any work is done, what cannot be written: in the place of an input, of each other, of what exists.
+
+    Inputs are those given, all that they name, and all that the command line names. Raises ConfigError.
+    """
+    targets = list(targets)
+    check_apart(targets, inputs)
+    for target in targets:
+        _check_place(target, overwrite)
+
+
+def check_apart(targets: Iterable[Target], inputs: Sequence[Path] = ()) -> None:
+    """The half of :func:`check_outputs` that looks at inputs and outputs only, for folders too."""
+    known = [Inputs(inputs), *([given] if (given := _protected.get()) else [])]
+    for target in targets:
+        refuse_inputs(target, known)
+    others = Inputs()
+    for target in targets:
+        if (twin := others.find(target.path)) is not None:
+            raise ConfigError(
+                f"{target.path}: {target.what} would replace {twin}, which this run also writes; choose another {target.option}."
+            )
+        others.note(target.path)
+
+
+def refuse_inputs(target: Target, known: Iterable[Inputs]) -> None:
+    """Raises ConfigError where writing ``target`` would replace or remove an input."""
+    for inputs in known:
+        if (source := inputs.clash(target.path)) is not None:
+            same = "the input of the same name" if str(source) == str(target.path) else f"the input {source}"
+            raise ConfigError(f"{target.path}: {target.what} would replace {same}; choose another {target.option}.")
 
 
 def check_output(path: Path, inputs: Sequence[Path] = (), overwrite: bool = False) -> None:
-    """Refuse, before any work is done, an output that would replace an input or an existing file.
+    """:func:`check_outputs` for the one file of ``--output``."""
+    check_outputs([Target(Path(path))], inputs, overwrite)
 
-    Raises ConfigError; the folder is created where it is missing.
-    """
-    path = Path(path)
-    for source in inputs:
-        if path.resolve() == Path(source).resolve():
-            raise ConfigError(f"{path}: the output would replace the input of the same name; choose another --output.")
-    if path.is_dir():
-        raise ConfigError(f"{path}: expected a file name, found a folder; name the file in --output.")
-    if path.exists() and not overwrite:
-        raise ConfigError(f"{path}: exists already; add --overwrite to replace it or choose another --output.")
+
+def check_folder(target: Target) -> None:
+    """Refuse a folder that cannot be one. Raises ConfigError."""
+    if target.path.exists() and not target.path.is_dir():
+        raise ConfigError(f"{target.path}: expected a folder, found a file; choose another {target.option}.")
+    _check_writable(target.path, target)
+
+
+def _check_place(target: Target, overwrite: bool) -> None:
+    path, another = target.path, f"choose another {target.option}"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        mode = stat.S_IFREG if path.is_symlink() else 0  # a link to nothing is something that would be replaced
     except OSError as error:
-        raise ConfigError(
-            f"{path.parent}: cannot be made a folder ({error.strerror}); choose another --output."
-        ) from None
+        raise ConfigError(f"{path}: cannot be written ({error.strerror}); {another}.") from None
+    if stat.S_ISDIR(mode):
+        raise ConfigError(f"{path}: expected a file name, found a folder; name the file in {target.option}.")
+    if mode and not stat.S_ISREG(mode):
+        raise ConfigError(f"{path}: expected a file name, found a device, pipe or socket; {another}.")
+    if mode and not overwrite:
+        raise ConfigError(f"{path}: exists already; add --overwrite to replace it or {another}.")
+    _check_writable(path.parent, target)
+
+
+def _check_writable(folder: Path, target: Target) -> None:
+    """The folder, or the one in which it will be made."""
+    there = Path(os.path.abspath(folder))
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if there.is_dir() and os.access(there, os.W_OK | os.X_OK):
+        return
+    why = "no permission, or a read-only file system" if there.is_dir() else f"{there} is a file"
+    what = f"{folder}: cannot be made a folder" if there != folder.absolute() else f"{target.path}: cannot be written"
+    raise ConfigError(f"{what} ({why}); choose another {target.option}.")
 
 
 def is_full_disk(error: BaseException | None) -> bool:
@@ -60,11 +142,45 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """
     path = Path(path)
     partial = partial_path(path)
+    _refuse_protected(path)
     with claim(path), _whole_or_absent(path, partial):
         yield partial
         if (output := current_output()) is not None and output != path:
             note_companion(lock_path(output), path, partial)
         os.replace(partial, path)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """A result as JSON, whole or absent."""
+    with atomic_path(path) as partial:
+        partial.write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
+
+
+def _refuse_protected(path: Path) -> None:
+    if (known := _protected.get()) is not None:
+        refuse_inputs(Target(path), [known])
+
+
+@contextlib.contextmanager
+def atomic_folder(folder: Path, last: str) -> Iterator[Path]:
+    """A temporary folder within ``folder`` whose files get their places there when the block ends well, ``last`` after all.
+
+    When it does not, nothing is left and nothing was replaced.
+    """
+    with claim(folder / last):
+        staging = partial_path(folder / last)
+        try:
+            staging.mkdir()
+            yield staging
+            made = [p.relative_to(staging) for p in sorted(staging.rglob("*")) if p.is_file()]
+            for name in sorted(made, key=lambda p: p == Path(last)):
+                _refuse_protected(folder / name)
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(staging / name, folder / name)
+        except LunargrError as error:  # says the place that the user knows
+            raise type(error)(str(error).replace(str(staging), str(folder))) from None
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
 
 
 @contextlib.contextmanager

@@ -19,7 +19,6 @@ report       HTML
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +26,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from schemas import ArtefactError, ConfigError, atomic_path, check_output
+from schemas import ArtefactError, ConfigError, write_json
 from schemas.files.companions import companions_of
+from schemas.files.outputs import Target, check_outputs
 from stages.diagnose.answer import Answer, HeldOut, cause_json, held_out, parameters, write_diagnosis
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import group_pairs, load_site, survey
@@ -85,16 +85,14 @@ def run(
     if config.most_causes < 1 or config.most_pairs < 1 or config.most_images < 1:
         raise ConfigError("diagnose: expected counts of at least 1 for causes, images and pairs.")
     inputs = [p for p in (pairs, checkpoint) if p is not None]
-    for path in (output, json_file, report):
-        if path is not None:
-            check_output(path, inputs, overwrite)
+    named = ((output, "--output"), (json_file, "--json"), (report, "--report"))
+    check_outputs([Target(path, option) for path, option in named if path is not None], inputs, overwrite)
     with PairReader(pairs) as reader:
         result = diagnose(reader, checkpoint, config, say or (lambda _: None), progress or (lambda *_: None))
         image_ids = reader.image_ids
     with companions_of(output):
         if json_file is not None:
-            with atomic_path(json_file) as partial:
-                partial.write_text(json.dumps(result.answer.to_json(), indent=1))
+            write_json(json_file, result.answer.to_json())
         if report is not None:
             from stages.diagnose.report import write_report
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas import CHECKPOINT, ConfigError, open_artefact
+from schemas import CHECKPOINT, atomic_path, open_artefact
 from stages.evaluate.core import Scores
 from stages.evaluate.renderers import Batch, Reader, read_batch
 from stages.evaluate.rows import TITLES, Row
@@ -42,14 +42,11 @@ def write_figures(
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be made a folder ({error.strerror}); choose another --figures.") from None
     written = []
 
     def save(figure: Any, name: str) -> None:
-        figure.savefig(folder / name, dpi=DPI, bbox_inches="tight", facecolor="white")
+        with atomic_path(folder / name) as partial:
+            figure.savefig(partial, dpi=DPI, bbox_inches="tight", facecolor="white")
         plt.close(figure)
         written.append(folder / name)
 

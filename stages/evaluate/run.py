@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,12 +19,12 @@ from schemas import (
     ArtefactWriter,
     ConfigError,
     RegistryError,
-    atomic_path,
-    check_output,
     open_artefact,
     read_config,
+    write_json,
 )
 from schemas.files.companions import companions_of
+from schemas.files.outputs import Target, check_outputs
 from stages.common.intervals import FEWEST_UNITS, choose_units
 from stages.effects import load_extension
 from stages.effects.extension import check_ground
@@ -45,6 +46,7 @@ Progress = Callable[[int, int, str], None]
 # (what, function, its arguments for every part, suffix) -> the parts that function(path, **arguments) wrote, in order
 Fan = Callable[[str, Callable[..., Any], Sequence[Mapping[str, Any]], str], list[Path]]
 PART_BATCHES = 32
+FIGURES = ("training_curves.png", "errors.png", "crop_best.png", "crop_median.png", "crop_worst.png")
 
 
 @dataclass
@@ -102,7 +104,9 @@ class Files:
 
     @property
     def reports(self) -> list[Path]:
-        return [self.output.with_suffix(".json"), *([self.json_file] if self.json_file else [])]
+        beside = self.output.with_suffix(".json")
+        same = self.json_file is None or os.path.realpath(self.json_file) == os.path.realpath(beside)
+        return [beside] if same or self.json_file is None else [beside, self.json_file]
 
 
 def run(
@@ -127,9 +131,12 @@ def run(
     """
     checkpoints = [checkpoint] if isinstance(checkpoint, Path) else list(checkpoint)
     files = Files(pairs, checkpoints, extend, output, json_file)
-    check_output(output, files.inputs, overwrite)
-    for report in files.reports:
-        check_output(report, [*files.inputs, output], overwrite)
+    beside, *others = files.reports
+    targets = [Target(output), Target(beside, what=f"the JSON beside {output.name}")]
+    targets += [Target(report, "--json") for report in others]
+    if figures is not None:
+        targets += [Target(figures / name, "--figures") for name in FIGURES]
+    check_outputs(targets, files.inputs, overwrite)
     _check(config, bool(extend))
     with PairReader(pairs) as reader:
         wanted = select(reader, config.split)
@@ -357,6 +364,5 @@ def _write(
         artefact.file.attrs["metrics"] = json.dumps(result)
         with companions_of(files.output):
             for report in files.reports:
-                with atomic_path(report) as partial:
-                    partial.write_text(json.dumps(result, indent=1) + "\n")
+                write_json(report, result)
     return rows, scores, scale, result

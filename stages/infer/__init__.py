@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from stages.infer.config import Config, Summary
-from stages.infer.run import check_body, count_bands, open_terrain, run, summarise
+from stages.infer.run import check_body, check_files, count_bands, open_terrain, run, summarise
 from stages.infer.windows import axis_windows, blend_weights
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "axis_windows",
     "blend_weights",
     "check_body",
+    "check_files",
     "count_bands",
     "open_terrain",
     "run",

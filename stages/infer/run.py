@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -24,12 +24,12 @@ from schemas import (
     ArtefactWriter,
     ConfigError,
     atomic_path,
-    check_output,
     open_artefact,
     read_strings,
 )
 from schemas.files.companions import companions_of
 from schemas.files.hdf5 import silence_hdf5
+from schemas.files.outputs import Target, check_apart, check_outputs
 from stages.common.memory import keep_freed_memory, return_freed_memory
 from stages.infer.config import Config, Summary
 from stages.infer.parallel import in_order, side_by_side
@@ -60,10 +60,7 @@ def run(
 ) -> Summary:
     """Write ``svbrdf.h5`` and, beside it or at ``geotiff``, a cloud-optimised GeoTIFF if wanted. Raises ConfigError, ArtefactError."""
     window_and_stride(config)
-    tiff = geotiff or output.with_suffix(".tif")
-    check_output(output, [scene, checkpoint], overwrite)
-    if config.geotiff:
-        check_output(tiff, [scene, checkpoint, output], overwrite)
+    tiff = check_files([scene, checkpoint], output, geotiff, config, overwrite)
     device = choose_device(config.device)
     keep_freed_memory()
     predictor = load_predictor(checkpoint, device)
@@ -112,6 +109,24 @@ def run(
             windows = _predict(file, writer, picture, mapper, config, progress)
             share, ranges = _statistics(writer.file, names)
     return Summary(grid, predictor.model.name, share, windows, ranges)
+
+
+def check_files(
+    inputs: Sequence[Path],
+    output: Path,
+    geotiff: Path | None,
+    config: Config,
+    overwrite: bool,
+    replace_tiff: bool = False,
+) -> Path:
+    """Where the GeoTIFF goes, if one is wanted; refuse outputs that cannot be written. Raises ConfigError."""
+    tiff = geotiff or output.with_suffix(".tif")
+    check_outputs([Target(output)], inputs, overwrite)
+    if config.geotiff:
+        picture = Target(tiff, "--geotiff (or --no-geotiff)", f"the GeoTIFF of {output.name}")
+        check_apart([Target(output), picture], inputs)
+        check_outputs([picture], inputs, overwrite or replace_tiff)
+    return tiff
 
 
 def count_bands(scene: Path, config: Config) -> int:

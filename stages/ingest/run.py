@@ -22,6 +22,7 @@ from schemas import (
     ConfigError,
     GeometryError,
     InputError,
+    check_output,
     open_artefact,
     read_config,
 )
@@ -69,6 +70,8 @@ def run(
         raise ConfigError(f"--crop: expected an even number of pixels, 16 .. {LARGEST_CROP}; found {config.crop}.")
     body = find_body(config.body)
     frames = read_frames(images, body) if images else []
+    named = [p for f in frames for p in (f.path, f.camera) if p is not None]
+    check_output(output, [dem, *([images] if images else []), *named], overwrite)
     index, count = config.shard
     with _open_terrain(dem, images, config, body, progress) as terrain:
         if frames and config.crop > min(terrain.grid.height, terrain.grid.width):

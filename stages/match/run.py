@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from schemas import ConfigError, atomic_path, check_output
+from schemas import ConfigError, atomic_path, write_json
+from schemas.files.outputs import Target, check_outputs
 from stages.match.base import Matches, Models, get_matcher
 from stages.match.comparisons import comparisons
 from stages.match.consistency import summarise
@@ -42,16 +42,15 @@ def run(
     """Match every comparison with every matcher; returns what the JSON holds. Raises LunargrError."""
     if config.count < 1:
         raise ConfigError(f"--count: expected at least 1, found {config.count}.")
-    if json_file is not None:
-        check_output(json_file, files, overwrite)
+    targets = [] if json_file is None else [Target(json_file, "--json")]
+    if figures is not None:
+        names = (figures / _picture(m, k) for m in config.matchers for k in range(FIGURES))
+        targets += [Target(path, "--figures") for path in dict.fromkeys(names)]
+    networks = [path for path in (config.features_model, config.lightglue_model) if path is not None]
+    check_outputs(targets, [*files, *networks], overwrite)
     models = Models(config.features_model, config.lightglue_model)
     matchers = [get_matcher(name, models) for name in config.matchers]
     total, source = comparisons(files, config.split, config.count, config.seed, config.device)
-    if figures is not None:
-        try:
-            figures.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(f"{figures}: cannot be made a folder ({error.strerror}); choose another.") from None
     collected: dict[str, dict[str, list[Matches]]] = {m.name: {} for m in matchers}
     ground: list[int] = []
     if progress is not None:
@@ -71,7 +70,7 @@ def run(
             if figures is not None and number < FIGURES:
                 _save(
                     match_figure(measured, pictures, found, f"{comparison.label}, {matcher.title}"),
-                    figures / f"match_{matcher.name}_{number + 1}.png",
+                    figures / _picture(matcher.name, number),
                 )
         if progress is not None:
             progress(number + 1, total, "match")
@@ -85,15 +84,19 @@ def run(
         },
     }
     if json_file is not None:
-        with atomic_path(json_file) as partial:
-            partial.write_text(json.dumps(result, indent=1) + "\n")
+        write_json(json_file, result)
     return result
+
+
+def _picture(matcher: str, number: int) -> str:
+    return f"match_{matcher}_{number + 1}.png"
 
 
 def _save(figure: Any, path: Path) -> None:
     import matplotlib.pyplot as plt
 
-    figure.savefig(path, dpi=110, facecolor="white")
+    with atomic_path(path) as partial:
+        figure.savefig(partial, dpi=110, facecolor="white")
     plt.close(figure)
 
 

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from schemas import CROPS, SCENE, ArtefactError, InputError, open_artefact
-from schemas.files.inputs import check_file
+from schemas.files.user_files import check_file
 from schemas.provenance import sha256
 from stages.physics.horizon.scene import Overview, make_overview
 from stages.physics.images.table import Frame, load_frames

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import CROPS, PAIRS, ArtefactWriter, InputError, open_artefact
+from schemas import CROPS, PAIRS, ArtefactWriter, InputError, check_output, open_artefact
 from stages.physics.horizon.scene import horizon_in_scene
 from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
@@ -18,7 +18,7 @@ from stages.physics.images.table import Frame, load_frames
 from stages.physics.maps.grid import LocalFrames
 from stages.project.config import Config, Progress, Registered, Summary
 from stages.project.geometry import Geometry, check_directions, crop_geometry
-from stages.project.inputs import Scene, check_places, check_sources, open_scene
+from stages.project.inputs import Scene, check_places, check_sources, open_scene, scene_of
 from stages.project.register import displacement_at, register, write_registration
 from stages.project.writing import Pair, PairDatasets, Tally, kept_decimals
 
@@ -30,6 +30,7 @@ def run(
 ) -> Summary:
     """Write ``pairs.h5``. Raises ArtefactError, ConfigError, InputError or GeometryError; then nothing is written."""
     config.check()
+    check_output(output, [crops, scene_of(crops, config)], overwrite)
     with open_artefact(crops, CROPS) as file, open_scene(crops, file, config) as scene:
         frames = load_frames(file, crops)
         total, size = file["elevation"].shape[:2]

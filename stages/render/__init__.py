@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from schemas.files.companions import companions_of
-from schemas.files.outputs import check_output
+from schemas.files.outputs import Target, check_outputs
 from stages.physics.bodies.spheres import find_body
 from stages.render.config import Config, Summary, check, inputs, output_files
 from stages.render.maps import render_map
@@ -26,8 +26,10 @@ def run(
     check(config)
     body = find_body("moon" if config.body is None else config.body)
     files = output_files(output, config.view)
-    for path in files:
-        check_output(path, inputs(source, config), overwrite)
+    targets = [
+        Target(path, what="the output" if path == output else f"{path.suffix} beside {output.name}") for path in files
+    ]
+    check_outputs(targets, inputs(source, config), overwrite)
     with companions_of(output), open_source(source, config, body) as surface:
         relief = surface.height_range()
         if config.view == "ortho":

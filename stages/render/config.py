@@ -77,6 +77,7 @@ class Summary:
     incidence_deg: tuple[float, float]
     samples: int
     skipped: bool = False
+    clipped: int = 0  # pixels where the model's I/F was below 0 and is drawn as 0
 
 
 def inputs(source: Path, config: Config) -> list[Path]:
@@ -134,7 +135,7 @@ class Tally:
     """Shares and means gathered from bands."""
 
     def __init__(self) -> None:
-        self.pixels = self.known = 0
+        self.pixels = self.known = self.clipped = 0
         self.total = self.dark = 0.0
         self.low, self.high = math.inf, -math.inf
 
@@ -142,6 +143,7 @@ class Tally:
         image, known = band["image"], np.isfinite(band["image"])
         self.pixels += image.size
         self.known += int(known.sum())
+        self.clipped += int((band["clipped"][known] > 0).sum())
         self.total += float(image[known].sum(dtype=np.float64))
         self.dark += float(np.nansum(np.where(known, band["shadow"], np.nan), dtype=np.float64))
         incidence = band["incidence_deg"][np.isfinite(band["incidence_deg"])]
@@ -159,4 +161,5 @@ class Tally:
             self.dark / n,
             (self.low, self.high),
             samples,
+            clipped=self.clipped,
         )

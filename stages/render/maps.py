@@ -36,6 +36,7 @@ def render_map(
     bands = channels if config.backplanes_in_tif else ["image"]
     named = {path.suffix.lower(): path for path in files}
     wanted = channels if ".exr" in named else list(dict.fromkeys([*bands, "shadow", "incidence_deg"]))
+    wanted = [*wanted, "clipped"]
     preview, tally = Preview(grid.height, grid.width), Tally()
     told = metadata(surface, config, light)
     with contextlib.ExitStack() as stack:

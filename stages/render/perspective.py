@@ -40,7 +40,7 @@ class Scene:
 
     grid : of that part; row, col : its first pixel on the surface's grid; factor : px of the surface per px here
     maps : (C, h, w) coefficients or (C, 1, 1); horizon : (h, w), rad, or None
-    lit : (h, w) I/F where extensions have shaded the ground beforehand, or None
+    lit : (2, h, w) I/F where extensions have shaded the ground beforehand, and where it was clipped at 0; or None
     """
 
     grid: Grid
@@ -157,14 +157,14 @@ def make_scene(
     if light.extensions:
         # the sensor comes last: its effects act on the camera's image, not on the ground
         ground = replace(light, extensions=[e for e in light.extensions if e.slot != "sensor"])
-        lit = form_window(surface, ground, row, col, height, width)
+        lit = np.stack(form_window(surface, ground, row, col, height, width))
         maps = np.zeros((0, 1, 1), np.float32)
     else:
         maps = surface.read_coefficients(row, col, height, width)
     if factor > 1:
         elevation = coarsen(elevation, factor)
         horizon = None if horizon is None else coarsen(horizon, factor)
-        lit = None if lit is None else coarsen(lit, factor)
+        lit = None if lit is None else np.stack([coarsen(m, factor) for m in lit])
         if maps.shape[1] > 1:
             maps = np.stack([coarsen(m, factor) for m in maps])
         coarse = grid.transform @ Affine.scale(factor)
@@ -194,7 +194,9 @@ def render_view(surface: Surface, camera: Camera, light: Light, scene: Scene) ->
         centre = _trace(camera, scene, first, count, 1)
         band = _backplanes(surface, light, scene, centre)
         fine = centre if scene.samples == 1 else _trace(camera, scene, first, count, scene.samples)
-        band["image"] = _mean(_radiance(surface, light, scene, fine), count, camera.samples, scene.samples)
+        radiance, clipped = _radiance(surface, light, scene, fine)
+        band["image"] = _mean(radiance, count, camera.samples, scene.samples)
+        band["clipped"] = (_mean(clipped, count, camera.samples, scene.samples) > 0).astype(np.float32)
         yield {k: v.reshape(count, camera.samples) for k, v in band.items()}
 
 
@@ -242,10 +244,10 @@ def _light_at(light: Light, scene: Scene, rays: _Rays) -> tuple[HitAngles, Float
     return angles, visible_share(angles.sun_elevation, horizon, light.sun.radius)
 
 
-def _radiance(surface: Surface, light: Light, scene: Scene, rays: _Rays) -> Floats32:
-    """(N,) I/F along rays: NaN where unknown, 0 in space."""
+def _radiance(surface: Surface, light: Light, scene: Scene, rays: _Rays) -> tuple[Floats32, Floats32]:
+    """(N,) I/F along rays: NaN where unknown, 0 in space; and (N,) above 0 where the model's I/F was clipped at 0."""
     if scene.lit is not None:
-        image = sample_maps(scene.lit[None], rays.hits)[0]
+        image, clipped = sample_maps(scene.lit, rays.hits)
     else:
         found, visible = _light_at(light, scene, rays)
         cosines = (torch.from_numpy(found.cos_incidence), torch.from_numpy(found.cos_emission))
@@ -256,10 +258,12 @@ def _radiance(surface: Surface, light: Light, scene: Scene, rays: _Rays) -> Floa
         else:
             coefficients = np.ascontiguousarray(scene.maps[:, :, 0])
         parameters = surface.model.unpack(torch.from_numpy(coefficients), dim=0)
-        image = masked_radiance_factor(surface.model, parameters, angles).numpy() * visible
+        image = masked_radiance_factor(surface.model, parameters, angles).numpy()
+        clipped = (image < 0).astype(np.float32)
+        image = np.maximum(image, 0) * visible
         image[(rays.hits.status != HIT) | ~np.isfinite(coefficients).all(axis=0)] = np.nan
     image[_in_space(scene, rays)] = 0.0
-    return image
+    return image, np.where(np.isfinite(image), clipped, 0)
 
 
 def _in_space(scene: Scene, rays: _Rays) -> NDArray[np.bool_]:

@@ -35,7 +35,9 @@ def _failed(path: Path, message: str) -> OSError | InputError:
         stat = os.statvfs(path.parent)
         if stat.f_bavail * stat.f_frsize < 1 << 20:
             return OSError(28, "No space left on device")
-    return InputError(f"{path}: cannot be written ({' '.join(message.split())}); choose another --output.")
+    return InputError(
+        f"{path}: cannot be written ({' '.join(message.split())}); free some space or choose another --output."
+    )
 
 
 class ExrWriter:
@@ -74,8 +76,19 @@ def write_exr(
         except BaseException:
             output.close()
             raise
-        if not output.close():
-            raise _failed(path, output.geterror())
+        if not output.close() or not _has_last_line(partial, height):
+            raise _failed(path, output.geterror() or "its last lines are not there: the disk is full or over quota")
+
+
+def _has_last_line(path: Path, height: int) -> bool:
+    """OpenEXR keeps quiet about what it could not write when it closes a file."""
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        return False
+    try:
+        return source.read_scanlines(height - 1, height, 0, 0, 1, oiio.FLOAT) is not None
+    finally:
+        source.close()
 
 
 def read_exr(path: Path) -> dict[str, Floats32]:
@@ -186,7 +199,8 @@ def stretch(
 ) -> tuple[NDArray[np.uint8], tuple[float, float]]:
     """A linear image as 8-bit grey for the eye, and the limits (black, white) that were used.
 
-    White is the 99.5th percentile, black a little under the 0.2th (0 where there are shadows), with display gamma.
+    White is the 99.5th percentile, black a little under the 0.2th and never below 0 (0 where there are shadows), with
+    display gamma.
     """
     if limits is None:
         every = max(1, image.size // 2_000_000)
@@ -196,7 +210,7 @@ def stretch(
             limits = (0.0, 1.0)
         else:
             low, high = (float(v) for v in np.percentile(known, (0.2, 99.5)))
-            low = min(0.9 * low, low)
+            low = max(0.0, 0.9 * low)
             limits = (low, max(1.05 * high - 0.05 * low, low + 1e-6))
     low, high = limits
     grey = np.empty(image.shape, np.uint8)
@@ -224,5 +238,6 @@ def write_png(path: Path, image: Floats32, limits: tuple[float, float] | None = 
             or not output.write_image(np.ascontiguousarray(pixels))
         ):
             raise _failed(path, output.geterror() if output else oiio.geterror())
-        output.close()
+        if not output.close() or b"IEND" not in partial.read_bytes()[-12:]:
+            raise _failed(path, output.geterror() or "its end is not there: the disk is full or over quota")
     return limits

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from schemas.errors import InputError
-from schemas.files.inputs import read_text
+from schemas.files.user_files import read_text
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _NUMBERS = (

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
-from schemas.files.outputs import check_output
+from schemas.files.outputs import Target, check_outputs
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras.base import Camera
 from stages.physics.maps.grid import Grid
@@ -51,10 +51,8 @@ def run_trajectory(
     views = read_trajectory(table)[shard[0] :: shard[1]]
     outputs = {view.view_id: output_files(folder / f"{view.view_id}{suffix}", "pinhole") for view in views}
     done = {v.view_id for v in views if resume and all(p.exists() for p in outputs[v.view_id])}
-    for view in views:
-        if view.view_id not in done:
-            for path in outputs[view.view_id]:
-                check_output(path, [table, *inputs(source, config)], overwrite or resume)
+    targets = [Target(path) for view in views if view.view_id not in done for path in outputs[view.view_id]]
+    check_outputs(targets, [table, *inputs(source, config)], overwrite or resume)
     results: list[Summary] = []
     with open_source(source, config, body) as surface:
         relief = surface.height_range()

@@ -12,7 +12,7 @@ from typing import Any
 from markupsafe import Markup
 
 from schemas import ConfigError, InputError, atomic_path, check_output, open_artefact, read_kind
-from schemas.files.inputs import check_file, read_json
+from schemas.files.user_files import check_file, read_json
 from stages.common import page
 from stages.common.page import pictures
 from stages.report import results, sections

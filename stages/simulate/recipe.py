@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import ConfigError, InputError
-from schemas.files.inputs import read_json
+from schemas.files.user_files import read_json
 from stages.simulate.hidden import Hidden, parse_hidden
 
 Range = tuple[float, float]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from schemas import atomic_path, check_output
+from schemas.files.outputs import Target, atomic_folder, atomic_path, check_outputs
 from schemas.provenance import SIDECAR, sidecar
 from stages.physics.images.table import ASTRONOMICAL_UNIT
 from stages.physics.maps.grid import Grid, local_metric_crs, unit_vectors
@@ -55,10 +55,23 @@ def run(folder: Path, config: Config, overwrite: bool = False, progress: Progres
     truth = Truth(config)
     shots = plan_passes(config)
     names = [f"images/{shot.image_id}.tif" for shot in shots]
-    for name in ("dem.tif", "images.csv", "truth.h5", "truth.tif", SIDECAR, *names):
-        check_output(folder / name, overwrite=overwrite)
-    say = progress or (lambda done, total, what: None)
+    made = ("dem.tif", "images.csv", "truth.h5", "truth.tif", SIDECAR, *names)
+    check_outputs([Target(folder / name) for name in made], overwrite=overwrite)
+    with atomic_folder(folder, SIDECAR) as staging:  # all of it or nothing: images without their truth are of no use
+        summary = _make_scene(staging, config, shots, names, hidden, truth, progress or (lambda *_: None))
+    return replace(summary, folder=folder)
 
+
+def _make_scene(
+    folder: Path,
+    config: Config,
+    shots: Sequence[Pass],
+    names: Sequence[str],
+    hidden: list[Hidden],
+    truth: Truth,
+    say: Progress,
+) -> Summary:
+    """Every file of the scene, in ``folder``."""
     terrain = Terrain(config)
     grid = scene_grid(config, config.dem_gsd, config.dem_size)
     with _truth_arrays(folder, config.dem_size) as (elevation, log_geometry, log_free):
@@ -74,7 +87,7 @@ def run(folder: Path, config: Config, overwrite: bool = False, progress: Progres
             rows.append(table_row(config, shot, name, hidden))
         say(len(shots), len(shots), "images")
         working = scene_grid(config, config.gsd, config.size_px)
-        write_truth(folder / "truth.h5", config, scene, working, terrain.craters, images, hidden, overwrite)
+        write_truth(folder / "truth.h5", config, scene, working, terrain.craters, images, hidden)
     write_table(folder / "images.csv", rows)
     files = [folder / name for name in ("dem.tif", "images.csv", "truth.tif")]
     with atomic_path(folder / SIDECAR) as partial:

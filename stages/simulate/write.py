@@ -144,7 +144,6 @@ def write_truth(
     craters: Any,
     images: Sequence[ImageTruth],
     hidden: list[Hidden],
-    overwrite: bool,
 ) -> None:
     """truth.h5 and, beside it, truth.tif with the mapped coefficients and the standard I/F."""
     names = scene.truth.mapped
@@ -184,7 +183,6 @@ def write_truth(
             config=dataclasses.asdict(config),
             seed=config.seed,
             attributes=attributes,
-            overwrite=overwrite,
         ) as out,
         atomic_path(raster) as partial,
         geotiff(partial, working, "float32", float("nan"), len(names) + 1, compress="deflate", predictor=3) as tif,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError, InputError, RegistryError
-from schemas.files.inputs import read_json
+from schemas.files.user_files import read_json
 
 Floats = NDArray[np.float64]
 

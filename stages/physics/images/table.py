@@ -15,7 +15,7 @@ import numpy as np
 
 from schemas.checks import has_control_characters
 from schemas.errors import InputError
-from schemas.files.inputs import check_file, read_json, read_text
+from schemas.files.user_files import check_file, read_json, read_text
 from schemas.reading import read_strings
 from schemas.writing import ArtefactWriter
 from stages.physics.bodies.ephemeris import parse_utc

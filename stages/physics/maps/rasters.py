@@ -25,7 +25,7 @@ from rasterio.windows import Window
 
 from schemas.errors import InputError
 from schemas.files.hdf5 import silence_hdf5
-from schemas.files.inputs import check_file
+from schemas.files.user_files import check_file
 from stages.common.memory import return_freed_memory
 from stages.physics.maps.grid import Grid, ellipsoid_of, latitude_squash
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stages.physics.formation.chain import Extension, Observation, form
+from stages.physics.formation.chain import Extension, Observation, State, form
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import masked_radiance_factor
 from stages.physics.terrain.ground import block_geometry
@@ -42,8 +42,27 @@ class Light:
     extensions: Sequence[Extension] = ()
 
 
+class Floor:
+    """Formulas that are fitted, such as a polynomial's, fall below 0 near the terminator; no ground does.
+
+    Clips the I/F of lit facets at 0, as the first step of the chain's reflectance; ``below`` (B, H, W) says where.
+    """
+
+    slot = "reflectance"
+
+    def __init__(self) -> None:
+        self.below: torch.Tensor | None = None
+
+    def apply(self, state: State) -> None:
+        self.below = state.reflectance < 0
+        state.reflectance = state.reflectance.clamp(min=0)
+
+
 def shade_block(surface: Surface, light: Light, row: int, col: int, height: int, width: int) -> dict[str, Floats32]:
-    """``image`` (I/F) and the backplanes of a window, each (height, width), NaN where the map is unknown."""
+    """``image`` (I/F) and the backplanes of a window, each (height, width), NaN where the map is unknown.
+
+    ``clipped`` is 1 where the model gave I/F below 0, which is drawn as 0.
+    """
     elevation = read_padded(surface, row, col, height, width, 1)
     geometry = block_geometry(surface.grid, row, col, elevation, light.sun.position, light.camera_position)
     visible = np.ones((height, width), np.float32)
@@ -51,19 +70,23 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
         sun_elevation = np.arcsin(np.clip(geometry.sun[2], -1.0, 1.0))
         visible = visible_share(sun_elevation, light.horizon.window(row, col, height, width), light.sun.radius)
     if light.extensions:
-        image = form_window(surface, light, row, col, height, width)
+        image, clipped = form_window(surface, light, row, col, height, width)
     else:
         coefficients = torch.from_numpy(np.ascontiguousarray(surface.read_coefficients(row, col, height, width)))
         parameters = surface.model.unpack(coefficients, dim=0)
         cosines = (geometry.cos_incidence, geometry.cos_emission, geometry.cos_phase)
         angles = Angles(*(torch.from_numpy(v) for v in cosines))
-        image = masked_radiance_factor(surface.model, parameters, angles).numpy() * visible
+        image = masked_radiance_factor(surface.model, parameters, angles).numpy()
+        clipped = (image < 0).astype(np.float32)
+        image = np.maximum(image, 0) * visible
         unknown = np.isnan(geometry.cos_incidence) | ~np.isfinite(coefficients.numpy()).all(axis=0)
         image[unknown] = np.nan
+        clipped[unknown] = 0
     shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
     shadow[np.isnan(geometry.cos_incidence)] = np.nan
     return {
         "image": image,
+        "clipped": clipped,
         "incidence_deg": _degrees(geometry.cos_incidence),
         "emission_deg": _degrees(geometry.cos_emission),
         "phase_deg": _degrees(geometry.cos_phase),
@@ -87,9 +110,11 @@ def read_padded(surface: Surface, row: int, col: int, height: int, width: int, m
     return result
 
 
-def form_window(surface: Surface, light: Light, row: int, col: int, height: int, width: int) -> Floats32:
-    """I/F of a window through the whole formation chain with its extensions, tile by tile with a margin."""
-    result = np.full((height, width), np.nan, np.float32)
+def form_window(
+    surface: Surface, light: Light, row: int, col: int, height: int, width: int
+) -> tuple[Floats32, Floats32]:
+    """I/F of a window through the whole formation chain with its extensions, tile by tile with a margin; where it was clipped."""
+    result = np.full((2, height, width), np.nan, np.float32)
     for r in range(0, height, TILE_PX):
         for c in range(0, width, TILE_PX):
             h, w = min(TILE_PX, height - r), min(TILE_PX, width - c)
@@ -97,18 +122,19 @@ def form_window(surface: Surface, light: Light, row: int, col: int, height: int,
             bottom = min(surface.grid.height, row + r + h + HALO_PX)
             right = min(surface.grid.width, col + c + w + HALO_PX)
             tile = _form_tile(surface, light, top, left, bottom - top, right - left)
-            inner = tile[row + r - top : row + r - top + h, col + c - left : col + c - left + w]
-            result[r : r + h, c : c + w] = inner
-    return result
+            inner = tile[:, row + r - top : row + r - top + h, col + c - left : col + c - left + w]
+            result[:, r : r + h, c : c + w] = inner
+    return result[0], result[1]
 
 
 def _form_tile(surface: Surface, light: Light, row: int, col: int, height: int, width: int) -> Floats32:
+    """(2, height, width): I/F, and 1 where the model's was clipped."""
     grid = surface.grid
     elevation = surface.elevation[row : row + height, col : col + width]
     coefficients = surface.read_coefficients(row, col, height, width)
     known = np.isfinite(elevation) & np.isfinite(coefficients).all(axis=0)
     if not known.any():
-        return np.full((height, width), np.nan, np.float32)
+        return np.stack([np.full((height, width), np.nan, np.float32), np.zeros((height, width), np.float32)])
     level = float(elevation[np.isfinite(elevation)].mean())
     axes = grid.local_frames(row + (height - 1) / 2, col + (width - 1) / 2).axes[0]
     centre = axes[2] * (grid.radius + level)
@@ -132,9 +158,13 @@ def _form_tile(surface: Surface, light: Light, row: int, col: int, height: int, 
         frame=torch.full((1,), -1),
     )
     filled = torch.from_numpy(np.nan_to_num(coefficients).astype(np.float32))[None]
+    floor = Floor()
     with torch.no_grad():
-        image = form(observation, surface.model, filled.expand(1, -1, height, width), light.extensions)[0].numpy()
-    return np.where(known, image, np.nan).astype(np.float32)
+        whole = filled.expand(1, -1, height, width)
+        image = form(observation, surface.model, whole, [floor, *light.extensions])[0].numpy()
+    assert floor.below is not None
+    below = np.broadcast_to(floor.below[0].numpy(), image.shape)
+    return np.stack([np.where(known, image, np.nan), below & known]).astype(np.float32)
 
 
 def _degrees(cosine: Floats32) -> Floats32:

@@ -22,7 +22,6 @@ from stages.physics.photometry import ReflectanceModel, get_model
 
 Floats32 = NDArray[np.float32]
 _HDF5_SUFFIXES = (".h5", ".hdf5", ".nc")
-DEFAULT_MODEL = "lambert"
 _UNEVEN = 0.01  # a raw DEM's pixels may differ in true width and height by this share
 
 
@@ -113,7 +112,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
             # LOLA cubes keep radii, not heights
             offset = body.radius if finite.size and abs(float(np.median(finite))) > 0.5 * body.radius else 0.0
             elevation = Elevation(dataset, offset)
-        reflectance = get_model(model or DEFAULT_MODEL)
+        reflectance = _named_model(path, model)
         yield Surface(path, grid, elevation, reflectance, None, _uniform(reflectance, parameters))
 
 
@@ -121,7 +120,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
 def open_terrain(path: Path, model: str | None, parameters: Mapping[str, float], body: Body) -> Iterator[Surface]:
     """Like :func:`open_surface`, but only the terrain of svbrdf.h5 is used."""
     if path.suffix.lower() in _HDF5_SUFFIXES and read_kind(path).name == "svbrdf":
-        reflectance = get_model(model or DEFAULT_MODEL)
+        reflectance = _named_model(path, model)
         with open_artefact(path, SVBRDF) as file:
             grid = read_grid(file, path)
             uniform = _uniform(reflectance, parameters)
@@ -137,6 +136,16 @@ def stored_model(path: Path, name: str) -> ReflectanceModel:
         return get_model(name)
     except RegistryError as error:
         raise ArtefactError(f"{path}: root attribute 'model': {error}") from None
+
+
+def _named_model(path: Path, model: str | None) -> ReflectanceModel:
+    """Raises ConfigError: which reflectance a picture shows is nobody's to guess."""
+    if model is None:
+        raise ConfigError(
+            f"{path}: holds a terrain and no reflectance; name one with --dem {path} --model NAME ('lunargr models' lists them), "
+            "or render the svbrdf.h5 of 'lunargr infer'."
+        )
+    return get_model(model)
 
 
 def _check_names(path: Path, model: ReflectanceModel, found: list[str]) -> None:

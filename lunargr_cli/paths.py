@@ -1,0 +1,96 @@
+"""The files of a command line: what it reads and what it writes, told from the types of a command's parameters.
+
+A parameter of type Path that does not carry :class:`Writes` is an input. No run replaces an input, so that a new command's
+output which somebody forgot to mark cannot be written at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import inspect
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from schemas.errors import ConfigError
+
+
+class Writes(enum.Enum):
+    """What a command makes of a path: a file, a folder of files, or either, as other options say."""
+
+    FILE = "file"
+    FOLDER = "folder"
+    EITHER = "either"
+
+
+@dataclass
+class Files:
+    """The files of one call. ``written`` holds (option, path, kind)."""
+
+    read: list[Path] = field(default_factory=list)
+    written: list[tuple[str, Path, Writes]] = field(default_factory=list)
+
+
+def files_of(command: Callable[..., None], arguments: Mapping[str, Any]) -> Files:
+    """What a call of ``command`` reads and writes."""
+    files, hints = Files(), get_type_hints(command, include_extras=True)
+    for name, value in arguments.items():
+        paths = [p for p in (value if isinstance(value, list | tuple) else [value]) if isinstance(p, Path)]
+        marks = getattr(hints.get(name), "__metadata__", ())
+        kind = next((mark for mark in marks if isinstance(mark, Writes)), None)
+        if kind is None:
+            files.read += paths
+        else:
+            files.written += [(_option(name, marks), path, kind) for path in paths]
+    return files
+
+
+def _option(name: str, marks: tuple[Any, ...]) -> str:
+    """How the option is spelled; within Annotated typer keeps the first spelling as the default."""
+    for mark in marks:
+        for spelled in (getattr(mark, "default", None), *(getattr(mark, "param_decls", None) or ())):
+            if isinstance(spelled, str) and spelled.startswith("--"):
+                return spelled
+    return f"--{name.replace('_', '-')}"
+
+
+@contextlib.contextmanager
+def guarded(command: Callable[..., None], *arguments: Any, **options: Any) -> Iterator[None]:
+    """Refuse, before anything is done, outputs that cannot be written; within the block no input is replaced.
+
+    Raises ConfigError, InputError.
+    """
+    bound = inspect.signature(command).bind(*arguments, **options)
+    bound.apply_defaults()
+    files = files_of(command, bound.arguments)
+    if not files.written:
+        yield
+        return
+    from schemas.files.outputs import Target, check_apart, check_folder, check_outputs, protect
+
+    for path in (*files.read, *(path for _, path, _ in files.written)):
+        _check_name(path)
+    replace = bool(bound.arguments.get("overwrite") or bound.arguments.get("resume"))  # what is resumed, stages say
+    replace |= not all(os.path.exists(path) for path in files.read)  # a wrong input is said first
+    with protect(files.read):
+        targets = [Target(path, option) for option, path, _ in files.written]
+        check_apart(targets)
+        kinds = [kind for _, _, kind in files.written]
+        check_outputs([t for t, k in zip(targets, kinds, strict=True) if k is Writes.FILE], overwrite=replace)
+        for target in (t for t, k in zip(targets, kinds, strict=True) if k is Writes.FOLDER):
+            check_folder(target)
+        yield
+
+
+def _check_name(path: Path) -> None:
+    """GDAL, HDF5 and JSON keep names as UTF-8. Raises ConfigError."""
+    name = os.fspath(path)
+    if "\0" in name or not name:
+        raise ConfigError(f"'{name}': expected the name of a file; check the options.")
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise ConfigError(f"{name}: expected a name in UTF-8, found other bytes; rename the file.") from None

@@ -1,0 +1,194 @@
+"""No output of any command takes the place of an input: named or listed in a table, by path, link or hard link."""
+
+from __future__ import annotations
+
+import gc
+import hashlib
+import importlib
+import os
+import pkgutil
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from lunargr_cli import commands
+from lunargr_cli import main as cli
+from lunargr_cli.paths import Writes, files_of
+
+SUN = ["--sun-azimuth", "100", "--sun-elevation", "35"]
+# What each command reads, and the words that have it read that. Every command that writes must be here.
+READS = {
+    "simulate": (["recipe.json"], ["--recipe", "recipe.json"]),
+    "ingest": (["dem.tif", "images.csv", "image1.tif"], ["dem.tif", "--images", "images.csv"]),
+    "sample": (["scene.h5", "image1.tif"], ["scene.h5"]),
+    "project": (["crops.h5", "scene.h5", "image1.tif"], ["crops.h5", "--register"]),
+    "train": (["pairs.h5", "diagnosis.h5"], ["pairs.h5", "--extend", "diagnosis.h5"]),
+    "infer": (["dem.tif", "checkpoint.h5"], ["dem.tif", "checkpoint.h5"]),
+    "render": (["svbrdf.h5", "camera.json"], ["svbrdf.h5", "--camera", "camera.json", *SUN]),
+    "evaluate": (["pairs.h5", "checkpoint.h5"], ["pairs.h5", "checkpoint.h5"]),
+    "match": (["measured.png", "rendered.png"], ["measured.png", "rendered.png"]),
+    "diagnose": (["pairs.h5", "checkpoint.h5"], ["pairs.h5", "checkpoint.h5"]),
+    "compare": (["pairs.h5"], ["pairs.h5", "--models", "M1,M2"]),
+    "report": (["scene.h5", "measured.png"], ["scene.h5", "measured.png"]),
+    "convert": (["maps.tif"], ["maps.tif", "--from", "lunargr:hapke", "--to", "sato:Hapke"]),
+    "merge": (["pairs.h5", "more.h5"], ["pairs.h5", "more.h5"]),
+    "inspect": (["scene.h5", "image1.tif"], ["scene.h5"]),
+    "models": ([], []),
+}
+MODULES = [importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)]
+
+
+def written_options(module) -> list[tuple[str, Writes]]:
+    """The options of a command that name what it writes."""
+    command = get_command(cli.app).commands[module.NAME]
+    some = {p.name: Path("x") for p in command.params}
+    return [(option, kind) for option, _, kind in files_of(module.command, some).written]
+
+
+@pytest.fixture(scope="session")
+def inputs(small_files, small_artefacts, tmp_path_factory) -> Path:
+    """A folder with what commands read. What is refused is never opened: only what names other files must be real."""
+    folder = tmp_path_factory.mktemp("inputs")
+    for path in small_files.folder.iterdir():
+        shutil.copy(path, folder)
+    from stages import ingest, sample
+
+    ingest.run(folder / "dem.tif", folder / "images.csv", folder / "scene.h5", ingest.Config(gsd=40, crop=16))
+    sample.run(folder / "scene.h5", folder / "crops.h5", sample.Config(count=20, tile_m=1280, seed=3))
+    shutil.copy(small_artefacts["pairs"], folder / "pairs.h5")
+    for name in ["recipe.json", "camera.json"]:
+        (folder / name).write_text("{}")
+    for name in ["more.h5", "checkpoint.h5", "diagnosis.h5", "svbrdf.h5", "maps.tif", "measured.png", "rendered.png"]:
+        (folder / name).write_bytes(name.encode())
+    return folder
+
+
+def run(monkeypatch, capsys, *arguments) -> tuple[int, list[str]]:
+    """Exit code and lines of standard error of `lunargr`."""
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    monkeypatch.setattr(gc, "freeze", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["lunargr", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    return int(stop.value.code or 0), capsys.readouterr().err.splitlines()
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Every file, what it is and what is in it."""
+    return {
+        str(p.relative_to(folder)): f"{p.is_symlink()} {hashlib.sha256(p.read_bytes()).hexdigest()}"
+        for p in sorted(folder.rglob("*"))
+        if p.is_file()
+    }
+
+
+def refused(monkeypatch, capsys, folder: Path, arguments, victim: str) -> str:
+    """Refused in one line that names no --overwrite, with every file as it was."""
+    monkeypatch.chdir(folder)
+    before = contents(folder)
+    code, lines = run(monkeypatch, capsys, *arguments)
+    assert code == 3 and len(lines) == 1, lines
+    assert "would replace" in lines[0] and victim in lines[0] and "--overwrite" not in lines[0], lines
+    assert contents(folder) == before
+    return lines[0]
+
+
+def cases():
+    for module in MODULES:
+        for option, kind in written_options(module):
+            if kind is not Writes.FOLDER:
+                for name in READS[module.NAME][0]:
+                    yield pytest.param(module.NAME, option, name, id=f"{module.NAME} {option} {name}")
+
+
+def test_every_command_that_writes_is_tried():
+    writing = {module.NAME for module in MODULES if written_options(module)}
+    assert writing == set(READS)
+
+
+@pytest.mark.parametrize(("name", "option", "victim"), list(cases()))
+@pytest.mark.parametrize("how", ["itself", "link", "hard link", "without --overwrite"])
+def test_an_output_never_replaces_an_input(monkeypatch, capsys, inputs, tmp_path, name, option, victim, how):
+    _, words = READS[name]
+    output = inputs / victim
+    if how in ("link", "hard link"):
+        output = inputs / f"other{output.suffix}"
+        output.symlink_to(victim) if how == "link" else output.hardlink_to(inputs / victim)
+    overwrite = [] if how == "without --overwrite" else ["--overwrite"]
+    needed = ["-o", tmp_path / "out"] if name in ("compare", "convert", "merge") and option != "--output" else []
+    try:
+        refused(monkeypatch, capsys, inputs, [name, *words, *needed, option, output, *overwrite], victim)
+    finally:
+        if how in ("link", "hard link"):
+            output.unlink()
+
+
+COMPANIONS = [  # what is written beside the output, and under temporary names
+    ("infer dem.tif checkpoint.h5 -o dem.h5", "dem.tif", "--geotiff"),
+    ("infer dem.tif checkpoint.h5 -o dem.h5 --resume", "dem.tif", "--geotiff"),
+    ("train x.resume.h5 -o x.h5", "x.resume.h5", "--output"),
+    ("train pairs.h5 --extend x.resume.h5 -o x.h5", "x.resume.h5", "--output"),
+    ("render svbrdf.h5 --camera camera.png --sun-azimuth 9 --sun-elevation 9 -o camera.exr", "camera.png", "--output"),
+    ("render --dem dem.tif --model lambert --sun-azimuth 9 --sun-elevation 9 -o dem.exr", "dem.tif", "--output"),
+    ("simulate --recipe dem/record.json -o dem", "record.json", "--output"),
+    ("match match_sift_1.png measured.png --matcher sift --figures .", "match_sift_1.png", "--figures"),
+    ("evaluate pairs.h5 x.json -o x.h5", "x.json", "--output"),
+    ("evaluate errors.png checkpoint.h5 -o x.h5 --figures .", "errors.png", "--figures"),
+    ("compare comparison.json -o . --models M1,M2", "comparison.json", "--output"),
+    ("sample .x.h5.lock -o x.h5", ".x.h5.lock", "--output"),
+    ("sample .x.partial-7.h5 -o x.h5", ".x.partial-7.h5", "--output"),
+    ("sample x.h5.parts/scene.h5 -o x.h5", "scene.h5", "--output"),
+]
+
+
+@pytest.mark.parametrize(("line", "victim", "option"), COMPANIONS, ids=[line for line, _, _ in COMPANIONS])
+def test_nothing_beside_an_output_replaces_an_input(monkeypatch, capsys, inputs, tmp_path, line, victim, option):
+    words = line.split()
+    for word in words[1:]:
+        source = inputs / word
+        made = tmp_path / word
+        made.parent.mkdir(exist_ok=True)
+        if source.is_file():
+            shutil.copy(source, made)
+        elif Path(word).suffix in (".h5", ".png", ".json", ".lock") and words[words.index(word) - 1] != "-o":
+            shutil.copy(inputs / ("recipe.json" if word.endswith("json") else "scene.h5"), made)
+    said = refused(monkeypatch, capsys, tmp_path, [*words, "--overwrite"], victim)
+    assert option in said
+
+
+def test_the_geotiff_of_a_merged_map_does_not_replace_a_part(monkeypatch, capsys, hilly_map, tmp_path):
+    hilly_map[0].rename(tmp_path / "x.tif")
+    refused(monkeypatch, capsys, tmp_path, ["merge", "x.tif", "-o", "x.h5", "--overwrite"], "x.tif")
+
+
+def test_the_parts_behind_a_virtual_artefact_are_inputs(monkeypatch, capsys, inputs, tmp_path):
+    """A view reads from its parts: to write over one would change the view without a word."""
+    from stages import merge, sample
+
+    for k in range(2):
+        config = sample.Config(count=20, tile_m=1280, seed=3, shard=(k, 2))
+        sample.run(inputs / "scene.h5", tmp_path / f"part{k}.h5", config)
+    merge.run([tmp_path / "part0.h5", tmp_path / "part1.h5"], tmp_path / "whole.h5", virtual=True)
+    refused(monkeypatch, capsys, tmp_path, ["project", "whole.h5", "-o", "part1.h5", "--overwrite"], "part1.h5")
+
+
+def test_an_output_that_nobody_marked_cannot_replace_anything(tmp_path):
+    """A new command whose author forgot: what it does not say it writes is an input, and no input is ever replaced."""
+    from lunargr_cli.paths import guarded
+    from schemas import ConfigError, write_json
+
+    def command(source: Path, result: Path, output: cli.Path) -> None:
+        write_json(result, 1)
+
+    from lunargr_cli.options import Output
+
+    command.__annotations__ = {"source": Path, "result": Path, "output": Output}
+    result = tmp_path / "result.json"
+    result.write_text("kept")
+    arguments = {"source": tmp_path / "source", "result": result, "output": tmp_path / "o"}
+    with pytest.raises(ConfigError, match="would replace"), guarded(command, **arguments):
+        command(**arguments)
+    assert result.read_text() == "kept"
