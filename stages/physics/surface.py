@@ -18,6 +18,7 @@ from schemas.reading import open_artefact, read_kind, read_strings
 from stages.physics.bodies import Body
 from stages.physics.grid import Grid, check_body, read_grid, require_crs
 from stages.physics.photometry import ReflectanceModel, get_model
+from stages.physics.photometry.albedo_factor import AlbedoFactor
 from stages.physics.rasters import open_raster, pixel_size_at, read_window
 
 Floats32 = NDArray[np.float32]
@@ -51,6 +52,7 @@ class Surface:
     """Terrain and reflectance on one grid.
 
     elevation : windows (h, w), m; coefficients : (C, H, W) dataset or None where ``uniform`` (C,) holds everywhere
+    albedo : (H, W) dataset of the factor that is the last parameter of ``model``, None where the map has none
     """
 
     path: Path
@@ -59,12 +61,16 @@ class Surface:
     model: ReflectanceModel
     coefficients: h5py.Dataset | None
     uniform: NDArray[np.float32]
+    albedo: h5py.Dataset | None = None
 
     def read_coefficients(self, row: int, col: int, height: int, width: int) -> Floats32:
         """(C, h, w), or (C, 1, 1) where they are the same everywhere."""
         if self.coefficients is None:
             return self.uniform[:, None, None]
-        return self.coefficients[:, row : row + height, col : col + width]
+        part = np.s_[row : row + height, col : col + width]
+        if self.albedo is None:
+            return self.coefficients[:, *part]
+        return np.concatenate([self.coefficients[:, *part], self.albedo[part][None]])
 
     def height_range(self) -> tuple[float, float]:
         """Lowest and highest elevation, m, by one pass over the DEM. Raises InputError where there is none."""
@@ -102,8 +108,11 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
                     )
                 reflectance = get_model(str(file.attrs["model"]))
                 _check_names(path, reflectance, read_strings(file, "coefficient_name"))
+                albedo = file["albedo"] if "albedo" in file else None
+                if albedo is not None:
+                    reflectance = AlbedoFactor(reflectance)
                 empty = np.empty(0, np.float32)
-                yield Surface(path, grid, elevation, reflectance, file["coefficients"], empty)
+                yield Surface(path, grid, elevation, reflectance, file["coefficients"], empty, albedo)
                 return
         else:
             dataset = stack.enter_context(open_raster(path, "a DEM, scene.h5 or svbrdf.h5"))
