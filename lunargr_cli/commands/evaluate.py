@@ -14,8 +14,19 @@ NAME, ORDER = "evaluate", 70
 
 def command(
     pairs: Annotated[Path, typer.Argument(help="Pairs from 'lunargr project'.")],
-    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint from 'lunargr train'.")],
+    checkpoint: Annotated[
+        Path,
+        typer.Argument(help="Checkpoint from 'lunargr train'; with --held-out-images a map from 'lunargr albedo'."),
+    ],
+    more_maps: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[MAPS]...", help="With --held-out-images: further maps, such as those of other folds."),
+    ] = None,
     output: Output = Path("evaluation.h5"),
+    held_out_images: Annotated[
+        bool,
+        typer.Option("--held-out-images", help="Score seen ground under images that did not make the map's albedo."),
+    ] = False,
     split: Annotated[str, typer.Option("--split", help="train, validation or test.")] = "test",
     extend: Annotated[
         Path | None,
@@ -55,10 +66,19 @@ def command(
     the train split in the same way for every model; their errors are shares of the full DN range.
     """
     from lunargr_cli.console import Console
+    from schemas import ConfigError
     from stages import evaluate
     from stages.evaluate.table import gain_lines, result_lines
 
     console = Console(quiet)
+    if held_out_images:
+        from lunargr_cli.held_out import show_held_out_images
+
+        maps = [checkpoint, *(more_maps or ())]
+        show_held_out_images(console, pairs, maps, output, (split, bootstrap, seed), json_file, overwrite)
+        return
+    if more_maps:
+        raise ConfigError(f"{more_maps[0]}: expected one checkpoint, found more files; maps need --held-out-images.")
     config = evaluate.Config(split, batch, bootstrap, fit_pairs, renderings, seed, device, tuple(only or ()))
     more: dict[str, Any] = {"extend": extend, "json_file": json_file, "figures": figures, "overwrite": overwrite}
     more["progress"] = console.progress

@@ -18,7 +18,7 @@ from stages.physics.formation import form
 from stages.physics.photometry import get_model
 from stages.physics.radiometry import match_crops
 
-SHOWN = ("learned", "hapke_minmax")  # as in the paper's table
+SHOWN = ("learned", "hapke_minmax", "terrain", "albedo")  # the first two as in the paper's table
 
 
 @dataclass
@@ -133,7 +133,7 @@ def from_pairs(
                 mask = valid[0].numpy()
                 pictures = [np.where(mask, t[0].numpy(), np.nan) for t in (measured, learned, baseline)]
                 yield Comparison(
-                    f"pair {k}", pictures[0], dict(zip(SHOWN, pictures[1:], strict=True)), common_scale=True
+                    f"pair {k}", pictures[0], dict(zip(SHOWN[:2], pictures[1:], strict=True)), common_scale=True
                 )
 
     return len(chosen), render()
