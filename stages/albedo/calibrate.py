@@ -31,7 +31,7 @@ WINDOWS_PER_IMAGE = 48
 LOOKS = 4096  # windows of images held at a time: 0.8 GB at most
 ROUNDS = 6
 COSINES = np.linspace(0.0, 1.0, 17)  # bins of cos(incidence) over which the error may differ
-LEAST_OWN = 0.02  # of an image's variance in a band is taken for its own at the least: nothing is known exactly
+STEPS = 200  # of the fit of variances to those of differences
 FARTHEST = 3.0  # |log ratio| beyond which nothing is measured any more
 
 
@@ -158,7 +158,7 @@ def _scales(samples: Sequence[Sample], albedo: Sequence[Any], count: int, units:
     if units == "iof" and fitted:
         gain /= np.exp(np.log(gain[fitted]).mean())
         gain[[k for k in range(count) if k not in fitted]] = 1.0
-    return gain, offset
+    return _rounded(gain), _rounded(offset)
 
 
 def _line(expected: Floats, measured: Floats, with_offset: bool) -> tuple[float, float]:
@@ -181,27 +181,62 @@ def _line(expected: Floats, measured: Floats, with_offset: bool) -> tuple[float,
 
 
 def _variances(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], count: int) -> Spread:
-    """Variance components by moments: products of different images for what is shared, squares for the rest."""
+    """Variance components by moments of pairs of images: products for what is shared; for the rest what a square has
+    beyond that, or what differences say where this is more (errors that neighbours share would hide in differences)."""
     levels = LEVELS + 2  # the last are whole pixels
     product, weight = np.zeros(levels), np.zeros(levels)
-    square, sums, pixels = (np.zeros((count, levels)) for _ in range(3))
+    difference, reach = (np.zeros((levels, count, count)) for _ in range(2))
+    square, sums, pixels = (np.zeros((levels, count)) for _ in range(3))
     for sample, (ratio, confidence) in zip(samples, stacks, strict=True):
         split = [[*bands(r, q), (r, q)] for r, q in zip(ratio, confidence, strict=True)]
+        where = np.ix_(sample.images, sample.images)
         for level in range(levels):
-            values = np.stack([s[level][0] for s in split]).astype(float)
-            weights = np.stack([s[level][1] for s in split]).astype(float)
-            scaled = weights * values
-            product[level] += (scaled.sum(axis=0) ** 2 - (scaled**2).sum(axis=0)).sum()
-            weight[level] += (weights.sum(axis=0) ** 2 - (weights**2).sum(axis=0)).sum()
-            for i, k in enumerate(sample.images):
-                square[k, level] += (scaled[i] * values[i]).sum()
-                sums[k, level] += weights[i].sum()
-                pixels[k, level] += (weights[i] > 0).sum()
+            values, q = (np.stack([s[level][i].ravel() for s in split]).astype(float) for i in (0, 1))
+            scaled = q * values
+            products, weights, squares = scaled @ scaled.T, q @ q.T, (scaled * values) @ q.T
+            product[level] += products.sum() - np.trace(products)
+            weight[level] += weights.sum() - np.trace(weights)
+            difference[level][where] += squares + squares.T - 2 * products
+            reach[level][where] += (q > 0) @ q.T
+            square[level, sample.images] += (scaled * values).sum(axis=1)
+            sums[level, sample.images] += q.sum(axis=1)
+            pixels[level, sample.images] += (q > 0).sum(axis=1)
     shared = np.maximum(0.0, np.divide(product, weight, out=np.zeros(levels), where=weight > 0))
-    n = np.maximum(pixels, 1)
-    own = np.maximum(square - shared * sums, LEAST_OWN * square) / n
-    own[pixels.sum(axis=1) == 0] = np.inf
-    return Spread(shared[:-1], own[:, :-1], float(shared[-1]), own[:, -1])
+    beyond = (square - shared[:, None] * sums) / np.maximum(pixels, 1)
+    own = np.stack([_own_variances(difference[k], reach[k], shared[k]) for k in range(levels)])
+    own = np.maximum(own, beyond).T
+    return Spread(_rounded(shared[:-1]), _rounded(own[:, :-1]), float(_rounded(shared[-1])), _rounded(own[:, -1]))
+
+
+def _own_variances(difference: Floats, reach: Floats, shared: float) -> Floats:
+    """Each image's own variance from those of differences: difference[k, j] = own[k] reach[k, j] + own[j] reach[j, k].
+
+    Positive by multiplicative steps (Richardson 1972, J. Opt. Soc. Am. 62:55), which share what only a sum is known of
+    evenly. An image that shares no pixel with another has nothing to show for itself: it differs as others do.
+    """
+    difference, reach = difference.copy(), reach.copy()
+    np.fill_diagonal(difference, 0.0)
+    np.fill_diagonal(reach, 0.0)
+    total = reach.sum(axis=1)
+    known = (total > 0) & (reach.sum(axis=0) > 0)
+    own = np.full(len(reach), max(difference.sum() / max(2 * reach.sum(), 1e-300), 1e-12))
+    for _ in range(STEPS):
+        expected = own[:, None] * reach
+        expected += expected.T
+        share = np.divide(difference, expected, out=np.zeros_like(expected), where=expected > 0)
+        own[known] *= (reach * share).sum(axis=1)[known] / total[known]
+        own = np.maximum(own, 1e-12)
+    if not known.any():
+        return np.full(len(reach), max(shared, 1.0))
+    own[~known] = np.median(own[known])
+    return own
+
+
+def _rounded(values: Any) -> Any:
+    """To nine digits: what libraries of linear algebra leave open does not reach the map."""
+    values = np.asarray(values, float)
+    size = 10.0 ** (8 - np.floor(np.log10(np.maximum(np.abs(values), 1e-300))))
+    return np.where(values == 0, 0.0, np.round(values * size) / size)
 
 
 def _error(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], albedo: Sequence[Any]) -> Floats:
@@ -222,7 +257,7 @@ def _error(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]
         return np.ones(len(square))
     variance = square[enough] / pixels[enough]
     variance /= np.exp(np.average(np.log(variance), weights=pixels[enough]))
-    return np.interp(np.arange(len(square)), np.flatnonzero(enough), variance)
+    return _rounded(np.interp(np.arange(len(square)), np.flatnonzero(enough), variance))
 
 
 def _middles() -> Floats:
