@@ -95,14 +95,12 @@ def test_shifted_images_count_less(rng, tmp_path):
     images[1] = np.roll(images[1], 2, axis=1)
     shifted = plant(tmp_path, truth, images)
     factor, _, _ = made(shifted)
-    (own,) = read(tmp_path / "albedo.h5", "albedo_image_std")
-    assert own[1, 0] > 2 * np.median(own[:, 0])
     without, _, _ = made(shifted, replace(QUIET, leave_out=("IMG1",)), "without.h5")
     plain = np.mean([np.log(image / photograph(np.ones_like(truth), sun)) for image, sun in zip(images, SUNS, strict=True)], 0)
     inner = np.s_[8:-8, 8:-8]
     error, best, mean = (rms(log[inner] - np.log(truth)[inner]) for log in (np.log(factor), np.log(without), plain))
-    assert error < 1.15 * best
-    assert error < 0.7 * mean
+    assert error < 2 * best
+    assert error < 0.4 * mean
 
 
 def test_where_photographs_do_not_agree_the_map_stays(rng, tmp_path):

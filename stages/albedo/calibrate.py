@@ -184,8 +184,7 @@ def _variances(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Float
     """Variance components by moments of pairs of images: products for what is shared; for the rest what a square has
     beyond that, or what differences say where this is more (errors that neighbours share would hide in differences)."""
     levels = LEVELS + 2  # the last are whole pixels
-    product, weight = np.zeros(levels), np.zeros(levels)
-    difference, reach = (np.zeros((levels, count, count)) for _ in range(2))
+    product, weight, difference, reach = (np.zeros((levels, count, count)) for _ in range(4))
     square, sums, pixels = (np.zeros((levels, count)) for _ in range(3))
     for sample, (ratio, confidence) in zip(samples, stacks, strict=True):
         split = [[*bands(r, q), (r, q)] for r, q in zip(ratio, confidence, strict=True)]
@@ -194,21 +193,29 @@ def _variances(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Float
             values, q = (np.stack([s[level][i].ravel() for s in split]).astype(float) for i in (0, 1))
             scaled = q * values
             products, weights, squares = scaled @ scaled.T, q @ q.T, (scaled * values) @ q.T
-            product[level] += products.sum() - np.trace(products)
-            weight[level] += weights.sum() - np.trace(weights)
+            product[level][where] += products
+            weight[level][where] += weights
             difference[level][where] += squares + squares.T - 2 * products
             reach[level][where] += (q > 0) @ q.T
             square[level, sample.images] += (scaled * values).sum(axis=1)
             sums[level, sample.images] += q.sum(axis=1)
             pixels[level, sample.images] += (q > 0).sum(axis=1)
-    shared = np.maximum(0.0, np.divide(product, weight, out=np.zeros(levels), where=weight > 0))
+    own = np.stack([_own_variances(difference[k], reach[k]) for k in range(levels)])
+    shared = np.array([_shared_variance(product[k], weight[k], own[k]) for k in range(levels)])
     beyond = (square - shared[:, None] * sums) / np.maximum(pixels, 1)
-    own = np.stack([_own_variances(difference[k], reach[k], shared[k]) for k in range(levels)])
     own = np.maximum(own, beyond).T
     return Spread(_rounded(shared[:-1]), _rounded(own[:, :-1]), float(_rounded(shared[-1])), _rounded(own[:, -1]))
 
 
-def _own_variances(difference: Floats, reach: Floats, shared: float) -> Floats:
+def _shared_variance(product: Floats, weight: Floats, own: Floats) -> float:
+    """Mean product of two images, 0 or more; those with large errors of their own, such as shifted ones, count less."""
+    trust = 1.0 / (own[:, None] * own)
+    np.fill_diagonal(trust, 0.0)
+    total = (trust * weight).sum()
+    return max(0.0, float((trust * product).sum() / total)) if total > 0 else 0.0
+
+
+def _own_variances(difference: Floats, reach: Floats) -> Floats:
     """Each image's own variance from those of differences: difference[k, j] = own[k] reach[k, j] + own[j] reach[j, k].
 
     Positive by multiplicative steps (Richardson 1972, J. Opt. Soc. Am. 62:55), which share what only a sum is known of
@@ -227,7 +234,7 @@ def _own_variances(difference: Floats, reach: Floats, shared: float) -> Floats:
         own[known] *= (reach * share).sum(axis=1)[known] / total[known]
         own = np.maximum(own, 1e-12)
     if not known.any():
-        return np.full(len(reach), max(shared, 1.0))
+        return np.ones(len(reach))
     own[~known] = np.median(own[known])
     return own
 
