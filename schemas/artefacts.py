@@ -328,9 +328,13 @@ _ALBEDO = (
     _of_images("albedo_offset", ("frame",), "f8", "1", "the same; 0 for calibrated images"),
     _of_images("albedo_subsolar_longitude_deg", ("frame",), "f8", "degree", "east longitude of the sub-solar point"),
     _of_images("albedo_subsolar_latitude_deg", ("frame",), "f8", "degree", "latitude of the sub-solar point"),
-    _of_images("albedo_band_px", ("band",), "f8", "px", "structure of the band is about so large, and larger in the last"),
+    _of_images(
+        "albedo_band_px", ("band",), "f8", "px", "structure of the band is about so large, and larger in the last"
+    ),
     _of_images("albedo_band_std", ("band",), "f8", "1", "std of log albedo beyond the coefficients, by band"),
-    _of_images("albedo_image_std", ("frame", "band"), "f8", "1", "std of each image's own error in log albedo, by band"),
+    _of_images(
+        "albedo_image_std", ("frame", "band"), "f8", "1", "std of each image's own error in log albedo, by band"
+    ),
 )
 
 SVBRDF = declare(

@@ -11,7 +11,7 @@ import numpy as np
 import small_scene
 from rasterio.transform import Affine
 from render_scene import write_svbrdf
-from small_scene import A, B, C, GSD, LAT, LON, RADIUS, local_crs, slopes, sun_enu, write_raster
+from small_scene import GSD, LAT, LON, RADIUS, A, B, C, local_crs, slopes, sun_enu, write_raster
 
 from stages import ingest
 from stages.physics.grid import Grid

@@ -59,7 +59,7 @@ def test_a_known_albedo_comes_back_within_its_error_bars(planted, found):
     assert rms(away - away.mean()) < 0.2 * np.log(planted.albedo)[seen].std()
     z = (factor - planted.albedo)[seen] / std[seen]
     assert 0.58 < np.mean(np.abs(z) < 1) < 0.95
-    assert 0.90 < np.mean(np.abs(z) < 1.96)
+    assert np.mean(np.abs(z) < 1.96) > 0.90
 
 
 def test_a_ray_that_terrain_does_not_show_is_in_the_map(found):
@@ -80,7 +80,7 @@ def test_where_no_photograph_looks_the_map_stays_and_the_error_bar_says_so(plant
 def test_a_shadow_or_a_cosmic_ray_in_one_image_leaves_no_mark(rng, tmp_path):
     truth = np.exp(texture(rng))
     images = photographs(rng, truth)
-    clean, std, _ = made(plant(tmp_path / "clean", truth, images))
+    clean, _, _ = made(plant(tmp_path / "clean", truth, images))
     images[2][100:130, 90:150] *= 0.1
     images[4][rng.integers(0, SIZE, 60), rng.integers(0, SIZE, 60)] = 1.0
     marked, _, _ = made(plant(tmp_path / "marked", truth, images))
@@ -96,7 +96,9 @@ def test_shifted_images_count_less(rng, tmp_path):
     shifted = plant(tmp_path, truth, images)
     factor, _, _ = made(shifted)
     without, _, _ = made(shifted, replace(QUIET, leave_out=("IMG1",)), "without.h5")
-    plain = np.mean([np.log(image / photograph(np.ones_like(truth), sun)) for image, sun in zip(images, SUNS, strict=True)], 0)
+    plain = np.mean(
+        [np.log(image / photograph(np.ones_like(truth), sun)) for image, sun in zip(images, SUNS, strict=True)], 0
+    )
     inner = np.s_[8:-8, 8:-8]
     error, best, mean = (rms(log[inner] - np.log(truth)[inner]) for log in (np.log(factor), np.log(without), plain))
     assert error < 2 * best
@@ -237,7 +239,9 @@ def test_bad_input_is_refused_in_one_line(planted, found, tmp_path):
     refused(InputError, "found I/F", svbrdf=in_dn)
     nowhere = changed(planted.scene, "nowhere", lambda f: f["frame_window"].write_direct(np.zeros((6, 4), np.int32)))
     refused(InputError, "overlap the map", scene=nowhere)
-    unknown = changed(planted.map, "unknown", lambda f: f["coefficients"].write_direct(np.full((3, SIZE, SIZE), np.nan, "f4")))
+    unknown = changed(
+        planted.map, "unknown", lambda f: f["coefficients"].write_direct(np.full((3, SIZE, SIZE), np.nan, "f4"))
+    )
     refused(InputError, "overlap the map", svbrdf=unknown)
 
 

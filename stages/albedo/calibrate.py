@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.albedo.pyramid import LEVELS, bands
 from stages.albedo.posterior import Spread, settle
+from stages.albedo.pyramid import LEVELS, bands
 from stages.albedo.references import Box, Look, References, overlap
 
 Floats = NDArray[np.float64]
@@ -85,7 +85,8 @@ def choose_windows(shape: tuple[int, int], boxes: Sequence[Box]) -> list[Box]:
     step = max(1, round(total * 0.6180339887))  # the golden section leaves no large gap at any time
     while np.gcd(step, total) != 1:
         step += 1
-    seen, looks, chosen = np.zeros(len(boxes), int), 0, []
+    seen, looks = np.zeros(len(boxes), int), 0
+    chosen: list[Box] = []
     for number in range(total):
         row, col = (WINDOW_PX * k for k in divmod(number * step % total, cols))
         box = row, col, min(WINDOW_PX, shape[0] - row), min(WINDOW_PX, shape[1] - col)

@@ -11,12 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.albedo.pyramid import LEVELS, bands, collapse, enlarge
+from stages.albedo.pyramid import LEVELS, bands, collapse, enlarge, reduce
 
 Floats32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -80,7 +79,7 @@ def _unrest(residual: Floats32, confidence: Floats32, own: float) -> Floats32:
     shapes = []
     for _ in range(LEVELS):
         shapes.append(energy.shape)
-        energy, weight = cv2.pyrDown(energy), cv2.pyrDown(weight)
+        energy, weight = reduce(energy), reduce(weight)
     ratio = np.divide(energy, weight, out=np.zeros_like(weight), where=weight > 1e-3)
     for shape in shapes[::-1]:
         ratio = enlarge(ratio, shape)

@@ -22,8 +22,8 @@ def bands(values: Floats32, confidence: Floats32) -> list[tuple[Floats32, Floats
     found = []
     value, weight = np.where(confidence > 0, values, np.float32(0)), confidence
     for _ in range(LEVELS):
-        below = cv2.pyrDown(weight)
-        coarse = np.divide(cv2.pyrDown(value * weight), below, out=np.zeros_like(below), where=below > 0)
+        below = reduce(weight)
+        coarse = np.divide(reduce(value * weight), below, out=np.zeros_like(below), where=below > 0)
         found.append((value - enlarge(coarse, value.shape), weight))
         value, weight = coarse, below
     return [*found, (value, weight)]
@@ -37,5 +37,9 @@ def collapse(levels: list[Floats32]) -> Floats32:
     return total
 
 
+def reduce(values: Floats32) -> Floats32:
+    return np.asarray(cv2.pyrDown(values), np.float32)
+
+
 def enlarge(values: Floats32, shape: tuple[int, ...]) -> Floats32:
-    return cv2.pyrUp(values, dstsize=(shape[1], shape[0]))
+    return np.asarray(cv2.pyrUp(values, dstsize=(shape[1], shape[0])), np.float32)

@@ -23,7 +23,7 @@ from stages.albedo.calibrate import Calibration, calibrate, choose_windows, take
 from stages.albedo.config import Config, Summary, used_frames
 from stages.albedo.posterior import estimate, settle
 from stages.albedo.pyramid import HALO_PX, LEVELS
-from stages.albedo.references import Box, References, overlap
+from stages.albedo.references import Box, References
 from stages.albedo.writing import Maps, copy_map, kept_attributes
 from stages.physics.bodies import find_body
 from stages.physics.frames import Frame, load_frames
@@ -64,7 +64,9 @@ def open_ground(svbrdf: Path, scene: Path, config: Config) -> Iterator[Ground]:
         frames = load_frames(terrain, scene)
         used = used_frames(frames, config) if frames else []
         chosen = [frame for frame, use in zip(frames, used, strict=True) if use]
-        boxes: list[Box] = [tuple(box) for box, use in zip(terrain["frame_window"][...].tolist(), used, strict=True) if use]
+        boxes: list[Box] = [
+            tuple(box) for box, use in zip(terrain["frame_window"][...].tolist(), used, strict=True) if use
+        ]
         if not any(box[2] and box[3] for box in boxes):
             raise InputError(f"{scene}: expected images that overlap the map {svbrdf}, found none.")
         units = _units(svbrdf, file, scene, chosen)

@@ -115,7 +115,9 @@ def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> Map:
     """A map with albedo on the ground of the pairs. Raises ArtefactError."""
     file = stack.enter_context(open_artefact(path, SVBRDF))
     if "albedo" not in file:
-        raise ArtefactError(f"{path}:/albedo: expected a map with albedo, found none; run 'lunargr albedo' with --fold.")
+        raise ArtefactError(
+            f"{path}:/albedo: expected a map with albedo, found none; run 'lunargr albedo' with --fold."
+        )
     suns = unit_vectors(file["albedo_subsolar_longitude_deg"][...], file["albedo_subsolar_latitude_deg"][...])
     found = Map(path, file, read_strings(file, "albedo_image_id"), suns)
     for name in ("row", "col"):
@@ -128,7 +130,9 @@ def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> Map:
     mine = reader.file["elevation"][0]
     same = height.shape == mine.shape and not np.nanmax(np.abs(height - mine), initial=0.0) > SAME_GROUND * reader.gsd
     if not same or abs(float(file.attrs["gsd_m"]) - reader.gsd) > 1e-6 * reader.gsd:
-        raise ArtefactError(f"{path}: expected a map of the scene of {reader.path}, found other ground at its first pair.")
+        raise ArtefactError(
+            f"{path}: expected a map of the scene of {reader.path}, found other ground at its first pair."
+        )
     return found
 
 
@@ -241,7 +245,11 @@ def _nearest_sun(reader: PairReader, one: Map, k: int) -> float:
 
 
 def _conclude(
-    reader: PairReader, maps: Sequence[Map], chosen: Sequence[tuple[int, int]], scores: dict[str, NDArray], config: Config
+    reader: PairReader,
+    maps: Sequence[Map],
+    chosen: Sequence[tuple[int, int]],
+    scores: dict[str, NDArray],
+    config: Config,
 ) -> dict[str, Any]:
     """What the JSON holds."""
     pixels = scores["pixels"].astype(float)

@@ -108,7 +108,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
                     )
                 reflectance = get_model(str(file.attrs["model"]))
                 _check_names(path, reflectance, read_strings(file, "coefficient_name"))
-                albedo = file["albedo"] if "albedo" in file else None
+                albedo = file.get("albedo")
                 if albedo is not None:
                     reflectance = AlbedoFactor(reflectance)
                 empty = np.empty(0, np.float32)
