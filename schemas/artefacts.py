@@ -384,6 +384,35 @@ CHECKPOINT = declare(
     )
 )
 
+
+def _albedo_map(name: str, dtype: str, description: str) -> Variable:
+    chunks = (256, 256)
+    return Variable(name, ("y", "x"), dtype, "1", description, required=False, chunks=chunks, georeferenced=True)
+
+
+def _of_images(name: str, dims: tuple[str, ...], dtype: str, unit: str, description: str) -> Variable:
+    return Variable(name, dims, dtype, unit, description, required=False)
+
+
+# What 'lunargr albedo' adds to a map.
+_ALBEDO = (
+    _albedo_map("albedo", "f4", "factor on the I/F of the coefficients; 1 where no photograph says otherwise"),
+    _albedo_map("albedo_std", "f4", "standard deviation of the albedo"),
+    _albedo_map("albedo_images", "u2", "images that the albedo of a pixel was made of"),
+    _of_images("albedo_image_id", ("frame",), STRING, "", "name of the image"),
+    _of_images("albedo_gain", ("frame",), "f8", "1", "measured = gain x I/F x albedo + offset"),
+    _of_images("albedo_offset", ("frame",), "f8", "1", "the same; 0 for calibrated images"),
+    _of_images("albedo_subsolar_longitude_deg", ("frame",), "f8", "degree", "east longitude of the sub-solar point"),
+    _of_images("albedo_subsolar_latitude_deg", ("frame",), "f8", "degree", "latitude of the sub-solar point"),
+    _of_images(
+        "albedo_band_px", ("band",), "f8", "px", "structure of the band is about so large, and larger in the last"
+    ),
+    _of_images("albedo_band_std", ("band",), "f8", "1", "std of log albedo beyond the coefficients, by band"),
+    _of_images(
+        "albedo_image_std", ("frame", "band"), "f8", "1", "std of each image's own error in log albedo, by band"
+    ),
+)
+
 SVBRDF = declare(
     Schema(
         name="svbrdf",
@@ -394,6 +423,8 @@ SVBRDF = declare(
             "coefficient": "coefficients of the reflectance model",
             "y": "grid rows, north to south",
             "x": "grid columns, west to east",
+            "frame": "images that the albedo was made of",
+            "band": "structure sizes, fine to coarse",
         },
         variables=_GRID
         + (
@@ -427,9 +458,14 @@ SVBRDF = declare(
                 compress=True,
                 georeferenced=True,
             ),
-        ),
+        )
+        + _ALBEDO,
         attributes=_PLACE
-        + (Attribute("model", "reflectance model"), Attribute("quantity", "what the model gives: I/F")),
+        + (
+            Attribute("model", "reflectance model"),
+            Attribute("quantity", "what the model gives: I/F"),
+            Attribute("image_units", "units of the images that the map was trained on: 'iof' or 'dn'", required=False),
+        ),
     )
 )
 

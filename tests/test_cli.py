@@ -22,6 +22,7 @@ STAGES = [
     "project",
     "train",
     "infer",
+    "albedo",
     "render",
     "evaluate",
     "match",

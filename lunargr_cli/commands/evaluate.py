@@ -17,9 +17,16 @@ def command(
     pairs: Annotated[Path, typer.Argument(help="Pairs from 'lunargr project'.")],
     checkpoints: Annotated[
         list[Path],
-        typer.Argument(metavar="CHECKPOINT...", help="From 'lunargr train'; several are training runs of one model."),
+        typer.Argument(
+            metavar="CHECKPOINT...",
+            help="From 'lunargr train', several being training runs of one model; with --held-out-images maps from 'lunargr albedo'.",
+        ),
     ],
     output: Output = Path("evaluation.h5"),
+    held_out_images: Annotated[
+        bool,
+        typer.Option("--held-out-images", help="Score seen ground under images that did not make the map's albedo."),
+    ] = False,
     split: Annotated[str, typer.Option("--split", help="train, validation or test.")] = "test",
     extend: Annotated[
         Path | None,
@@ -64,6 +71,11 @@ def command(
     from stages.evaluate.table import basis, gain_lines, result_lines
 
     console = Console(quiet)
+    if held_out_images:
+        from lunargr_cli.held_out import show_held_out_images
+
+        show_held_out_images(console, pairs, checkpoints, output, (split, seed), json_file, overwrite)
+        return
     config = evaluate.Config(split, batch, fit_pairs, renderings, seed, device, tuple(only or ()))
     more: dict[str, Any] = {"extend": extend, "json_file": json_file, "figures": figures, "overwrite": overwrite}
     more["progress"] = console.progress

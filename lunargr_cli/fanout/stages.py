@@ -13,10 +13,10 @@ from typing import Any
 from lunargr_cli.fanout.job import open_job
 from schemas import ConfigError, atomic_path
 from schemas.files.companions import companions_of
-from schemas.files.outputs import Target, check_outputs
+from schemas.files.outputs import Target, check_output, check_outputs
 
 # What a part holds where --parts does not say: some minutes of work on real data.
-BANDS_OF_DEM, BANDS_OF_MAP, PAIRS, SAMPLES = 8, 8, 512, 4
+BANDS_OF_DEM, BANDS_OF_MAP, BANDS_OF_ALBEDO, PAIRS, SAMPLES = 8, 8, 1, 512, 4
 
 
 def run_ingest(dem: Path, images: Path | None, output: Path, config: Any, parts: int | None, **how: Any) -> Any:
@@ -129,6 +129,43 @@ def infer_part(path: Path, scene: Path, checkpoint: Path, config: Any) -> None:
     from stages import infer
 
     infer.run(scene, checkpoint, path, config, overwrite=True)
+    path.with_suffix(".tif").unlink(missing_ok=True)  # where one part is the whole
+
+
+def run_albedo(
+    svbrdf: Path, scene: Path, output: Path, config: Any, geotiff: Path | None, parts: int | None, **how: Any
+) -> Any:
+    """What the images say of themselves once, then the map's rows."""
+    from stages import albedo, merge
+
+    svbrdf, scene, tiff = svbrdf.resolve(), scene.resolve(), geotiff or output.with_suffix(".tif")
+    sources = albedo.source_files(scene)
+    check_output(output, sources, how["overwrite"])
+    with _job(output, "albedo", config, parts, [svbrdf, scene], sources, how) as job:
+        replace_tiff = how["overwrite"] or job.again  # an interrupted run may have got as far as that
+        if config.geotiff:
+            check_output(tiff, [svbrdf, scene, output, *sources], replace_tiff)
+        files = {"svbrdf": svbrdf, "scene": scene}
+        [calibration] = job.fan("calibration", calibration_part, [files | {"config": config}], ".json")
+        bands = albedo.count_bands(svbrdf, scene, config)
+        cut = _cut(config, parts or math.ceil(bands / BANDS_OF_ALBEDO), bands)
+        pieces = job.fan("map", albedo_part, [files | {"config": c, "calibration": calibration} for c in cut])
+        if config.geotiff and replace_tiff:
+            tiff.unlink(missing_ok=True)
+        merge.run(pieces, output, how["overwrite"], job.progress, inputs=[svbrdf, scene], geotiff=tiff)
+    return albedo.summarise(output, scene)
+
+
+def calibration_part(path: Path, svbrdf: Path, scene: Path, config: Any) -> None:
+    from stages import albedo
+
+    albedo.calibrate_to(path, svbrdf, scene, config)
+
+
+def albedo_part(path: Path, svbrdf: Path, scene: Path, config: Any, calibration: Path) -> None:
+    from stages import albedo
+
+    albedo.run(svbrdf, scene, path, config, overwrite=True, calibration=calibration)
     path.with_suffix(".tif").unlink(missing_ok=True)  # where one part is the whole
 
 

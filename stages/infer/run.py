@@ -81,6 +81,7 @@ def run(
             "body_radius_m": grid.radius,
             "model": predictor.model.name,
             "quantity": QUANTITY,
+            "image_units": predictor.image_units,
             "precision": precision,
         }
         with contextlib.ExitStack() as stack:

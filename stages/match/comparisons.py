@@ -18,7 +18,7 @@ from stages.physics.formation.chain import form
 from stages.physics.formation.radiometry import match_crops
 from stages.physics.photometry import get_model
 
-SHOWN = ("learned", "hapke_minmax")  # as in the paper's table
+SHOWN = ("learned", "hapke_minmax", "terrain", "albedo")  # the first two as in the paper's table
 
 
 @dataclass
@@ -144,7 +144,7 @@ def from_pairs(
                 baseline = match_crops(form(observation, hapke, defaults), measured, valid, "minmax")
                 mask = valid[0].numpy()
                 pictures = [np.where(mask, t[0].numpy(), np.nan) for t in (measured, learned, baseline)]
-                rendered = dict(zip(SHOWN, pictures[1:], strict=True))
+                rendered = dict(zip(SHOWN[:2], pictures[1:], strict=True))
                 yield Comparison(f"pair {k}", pictures[0], rendered, common_scale=True, ground=int(tile[k]))
 
     return len(chosen), render()

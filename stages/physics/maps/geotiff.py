@@ -26,6 +26,7 @@ from stages.physics.maps import cog
 from stages.physics.maps.grid import Grid
 
 TAGS = ("model", "quantity", "gsd_m", "body_radius_m")
+ALBEDO_BANDS = ("albedo", "albedo_std")
 ANYWHERE = Affine.scale(2, -2)  # the map says where its overviews lie
 BLOCK, STRIP, COLUMNS = 256, 512, 4096  # px; pieces hold whole blocks of their own level and of the next
 DIRECT = 3  # overviews made of what is at hand; the smaller ones, a 64th of the map, are made of the last of these
@@ -80,10 +81,12 @@ class MapTiff:
             with _told():
                 level.write(values, window=Window(col, row, values.shape[2], values.shape[1]))
 
-    def put_all(self, coefficients: h5py.Dataset) -> None:
-        """coefficients : (C, H, W)"""
+    def put_all(self, coefficients: h5py.Dataset, *further: h5py.Dataset) -> None:
+        """coefficients : (C, H, W); further : (H, W), a band each"""
         for piece in _pieces(*self.shapes[0]):
-            self.put(piece.row_off, piece.col_off, coefficients[(slice(None), *piece.toslices())])
+            part = piece.toslices()
+            bands = [coefficients[(slice(None), *part)], *(layer[part][None] for layer in further)]
+            self.put(piece.row_off, piece.col_off, np.concatenate(bands) if further else bands[0])
 
     def _create(self, level: int) -> rasterio.io.DatasetWriter:
         height, width = self.shapes[level]
@@ -117,9 +120,10 @@ def _told() -> Iterator[None]:
 
 
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
-    """The map that an open artefact holds, as a cloud-optimised GeoTIFF."""
-    with MapTiff(path, grid, read_strings(file, "coefficient_name"), file.attrs) as tiff:
-        tiff.put_all(file["coefficients"])
+    """The map that an open artefact holds, as a cloud-optimised GeoTIFF; albedo and its error are bands more."""
+    further = [name for name in ALBEDO_BANDS if name in file]
+    with MapTiff(path, grid, [*read_strings(file, "coefficient_name"), *further], file.attrs) as tiff:
+        tiff.put_all(file["coefficients"], *(file[name] for name in further))
 
 
 def _pieces(height: int, width: int) -> Iterator[Window]:

@@ -19,6 +19,7 @@ from stages.physics.bodies.spheres import Body
 from stages.physics.maps.grid import Grid, check_body, read_grid, require_crs
 from stages.physics.maps.rasters import check_metres, check_single_band, open_raster, pixel_size_at, read_window
 from stages.physics.photometry import ReflectanceModel, get_model
+from stages.physics.photometry.albedo_factor import AlbedoFactor
 
 Floats32 = NDArray[np.float32]
 _HDF5_SUFFIXES = (".h5", ".hdf5", ".nc")
@@ -50,6 +51,7 @@ class Surface:
     """Terrain and reflectance on one grid.
 
     elevation : windows (h, w), m; coefficients : (C, H, W) dataset or None where ``uniform`` (C,) holds everywhere
+    albedo : (H, W) dataset of the factor that is the last parameter of ``model``, None where the map has none
     """
 
     path: Path
@@ -58,12 +60,16 @@ class Surface:
     model: ReflectanceModel
     coefficients: h5py.Dataset | None
     uniform: NDArray[np.float32]
+    albedo: h5py.Dataset | None = None
 
     def read_coefficients(self, row: int, col: int, height: int, width: int) -> Floats32:
         """(C, h, w), or (C, 1, 1) where they are the same everywhere."""
         if self.coefficients is None:
             return self.uniform[:, None, None]
-        return self.coefficients[:, row : row + height, col : col + width]
+        part = np.s_[row : row + height, col : col + width]
+        if self.albedo is None:
+            return self.coefficients[:, *part]
+        return np.concatenate([self.coefficients[:, *part], self.albedo[part][None]])
 
     def height_range(self) -> tuple[float, float]:
         """Lowest and highest elevation, m, by one pass over the DEM. Raises InputError where there is none."""
@@ -101,8 +107,11 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
                     )
                 reflectance = stored_model(path, str(file.attrs["model"]))
                 _check_names(path, reflectance, read_strings(file, "coefficient_name"))
+                albedo = file.get("albedo")
+                if albedo is not None:
+                    reflectance = AlbedoFactor(reflectance)
                 empty = np.empty(0, np.float32)
-                yield Surface(path, grid, elevation, reflectance, file["coefficients"], empty)
+                yield Surface(path, grid, elevation, reflectance, file["coefficients"], empty, albedo)
                 return
         else:
             dataset = stack.enter_context(open_raster(path, "a DEM, scene.h5 or svbrdf.h5"))

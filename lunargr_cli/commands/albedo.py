@@ -1,0 +1,102 @@
+"""`lunargr albedo`: svbrdf.h5 and the photographs of scene.h5 -> svbrdf.h5 with albedo, and a GeoTIFF."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import (
+    Output,
+    Overwrite,
+    Parts,
+    Quiet,
+    ResumeParts,
+    Scheduler,
+    Shard,
+    in_parts,
+    parse_shard,
+)
+from lunargr_cli.paths import Writes
+
+NAME, ORDER = "albedo", 61
+
+
+def command(
+    svbrdf: Annotated[Path, typer.Argument(metavar="SVBRDF", help="Reflectance map from 'lunargr infer'.")],
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="scene.h5 that the map was inferred from.")],
+    leave_out: Annotated[
+        str | None,
+        typer.Option("--leave-out", metavar="ID,...", help="Images that must not enter, to be evaluated on."),
+    ] = None,
+    fold: Annotated[
+        str | None,
+        typer.Option("--fold", metavar="K/N", help="Leave out every N-th image from the K-th (1-based) on."),
+    ] = None,
+    geotiff: Annotated[
+        Path | None,
+        typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif)."),
+        Writes.FILE,
+    ] = None,
+    no_geotiff: Annotated[bool, typer.Option("--no-geotiff", help="Write the HDF5 map only.")] = False,
+    shard: Shard = None,
+    output: Output = Path("svbrdf_albedo.h5"),
+    scheduler: Scheduler = None,
+    resume: ResumeParts = False,
+    parts: Parts = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Add per-pixel albedo to a reflectance map, from all photographs of the scene.
+
+    The albedo multiplies the I/F of the map. Where photographs agree it is theirs; where they do not, and where there are
+    none, it is 1 and the map stays as the terrain gave it. Rendering, evaluation and GeoTIFF take it into account.
+    """
+    from lunargr_cli.console import Console
+    from schemas import ConfigError
+    from stages import albedo
+
+    if geotiff and no_geotiff:
+        raise ConfigError(f"--geotiff {geotiff} and --no-geotiff: expected one of them, found both.")
+    console = Console(quiet)
+    config = albedo.Config(
+        leave_out=tuple(name.strip() for name in leave_out.split(",") if name.strip()) if leave_out else (),
+        fold=_fold(fold),
+        shard=parse_shard(shard),
+        geotiff=not no_geotiff,
+    )
+    if in_parts(scheduler, resume, parts, shard):
+        from lunargr_cli.fanout.stages import run_albedo
+
+        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
+        found = run_albedo(svbrdf, scene, output, config, geotiff, parts, **how)
+    else:
+        found = albedo.run(svbrdf, scene, output, config, geotiff, overwrite, console.progress)
+    mean, std, low, high = found.albedo
+    console.say(
+        f"{output}: albedo from {len(found.images)} images over {found.covered_share:.1%} of the map, "
+        f"{found.mean_images:.1f} a pixel, {mean:.3f} +- {std:.3f} ({low:.3f} .. {high:.3f}), "
+        f"median standard deviation {found.albedo_std:.3f}"
+    )
+    if found.left_out:
+        console.say(f"left out: {', '.join(found.left_out)}")
+    rows = []
+    for number, (size, shared, own) in enumerate(found.bands):
+        last = number == len(found.bands) - 1
+        rows.append((f"{'over ' if last else ''}{size:.0f}", f"{shared:.4f}", f"{own:.4f}"))
+    console.table(
+        "log albedo beyond the map, by size of structure", ("px", "shared by all images", "of one image alone"), rows
+    )
+
+
+def _fold(text: str | None) -> tuple[int, int] | None:
+    """'2/4' -> (1, 4). Raises ConfigError."""
+    from schemas import ConfigError
+
+    if text is None:
+        return None
+    first, _, last = text.partition("/")
+    if first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last) and int(last) > 1:
+        return int(first) - 1, int(last)
+    raise ConfigError(f"--fold: expected K/N with 1 <= K <= N and N of at least 2, found '{text}'.")

@@ -1,0 +1,35 @@
+"""What `lunargr evaluate --held-out-images` prints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lunargr_cli.console import Console
+
+
+def show_held_out_images(
+    console: Console,
+    pairs: Path,
+    maps: list[Path],
+    output: Path,
+    how: tuple[str, int],
+    json_file: Path | None,
+    overwrite: bool,
+) -> None:
+    """Score maps with albedo on images that did not make it. how : split, seed. Raises LunargrError."""
+    from stages.evaluate.held_out_images import Config, image_lines, result_lines, run
+
+    result = run(pairs, maps, output, Config(*how), json_file, overwrite, console.progress)
+    suns = result["nearest_used_sun_deg"]
+    columns, cells = result_lines(result)
+    console.table(
+        f"{result['claim']}: {result['pairs']} crops of split '{how[0]}', {result['tiles']} ground tiles, "
+        f"Suns {suns['least']:.1f} to {suns['most']:.1f} deg from the nearest one used",
+        columns,
+        cells,
+    )
+    console.table("by image", *image_lines(result))
+    if result["coverage_percent"] is not None:
+        found = result["coverage_percent"]
+        console.say(f"within the 68 and 95 % intervals: {found['68']:.1f} and {found['95']:.1f} % of pixels")
+    console.say(f"written: {output}, {output.with_suffix('.json')}")

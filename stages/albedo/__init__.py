@@ -1,0 +1,10 @@
+"""Stage albedo. run: the stage; references: photographs against the map; calibrate: gains and errors; pyramid: scales;
+posterior: the estimate; writing: the new map."""
+
+from __future__ import annotations
+
+from stages.albedo.calibrate import Calibration
+from stages.albedo.config import Config, Summary
+from stages.albedo.run import calibrate_to, count_bands, run, source_files, summarise
+
+__all__ = ["Calibration", "Config", "Summary", "calibrate_to", "count_bands", "run", "source_files", "summarise"]

@@ -1,0 +1,272 @@
+"""What the photographs say of themselves before any of them may say anything of the ground: gain and offset of each, how
+much of what they show beyond the map is shared, and each one's own error, by structure size.
+
+All from a sample of windows, so that it takes a bounded time and every shard finds the same. The shared variance is the
+mean product of different images over the same ground: errors of one image have no part in it, and where images do not
+agree it is 0 and the map stays as it is. (Moment estimates of variance components: Searle, Casella & McCulloch 1992,
+"Variance Components", ch. 5.)
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.albedo.posterior import Spread, settle
+from stages.albedo.pyramid import LEVELS, bands
+from stages.albedo.references import Box, Look, References, overlap
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Progress = Callable[[int, int, str], None]
+
+WINDOW_PX = 128
+WINDOWS_PER_IMAGE = 48
+LOOKS = 4096  # windows of images held at a time: 0.8 GB at most
+ROUNDS = 6
+COSINES = np.linspace(0.0, 1.0, 17)  # bins of cos(incidence) over which the error may differ
+STEPS = 200  # of the fit of variances to those of differences
+FARTHEST = 3.0  # |log ratio| beyond which nothing is measured any more
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """gain, offset : (n,), measured = gain x I/F x albedo + offset; spread : variances of log ratios;
+    error : relative variance of an image's error at the cosines of incidence ``COSINES``"""
+
+    gain: Floats
+    offset: Floats
+    spread: Spread
+    error: Floats
+
+    def ratio(self, k: int, look: Look) -> tuple[Floats32, Floats32]:
+        """(log of measured / predicted, confidence), both 0 where the image says nothing."""
+        expected = self.gain[k] * look.predicted
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.log(np.maximum((look.measured - self.offset[k]) / expected, np.exp(-FARTHEST)))
+        known = np.isfinite(ratio)
+        ratio = np.where(known, np.minimum(ratio, FARTHEST), 0).astype(np.float32)
+        confidence = 1.0 / np.interp(look.cos_incidence, _middles(), self.error)
+        return ratio, np.where(known, confidence, 0).astype(np.float32)
+
+    def write(self, path: Path) -> None:
+        values = {"gain": self.gain, "offset": self.offset, "error": self.error}
+        values |= {"shared": self.spread.shared, "own": self.spread.own, "own_px": self.spread.own_px}
+        text = {k: v.tolist() for k, v in values.items()} | {"shared_px": self.spread.shared_px}
+        path.write_text(json.dumps(text))
+
+    @staticmethod
+    def read(path: Path) -> Calibration:
+        text = json.loads(path.read_text())
+        shared_px = float(text.pop("shared_px"))
+        v = {k: np.array(values, float) for k, values in text.items()}
+        spread = Spread(v["shared"], v["own"], shared_px, v["own_px"])
+        return Calibration(v["gain"], v["offset"], spread, v["error"])
+
+
+@dataclass
+class Sample:
+    """One window with all images that see it."""
+
+    images: list[int] = field(default_factory=list)
+    looks: list[Look] = field(default_factory=list)
+
+
+def choose_windows(shape: tuple[int, int], boxes: Sequence[Box]) -> list[Box]:
+    """Windows spread over the map such that every image has WINDOWS_PER_IMAGE, as far as LOOKS allow."""
+    rows, cols = (max(1, n // WINDOW_PX) for n in shape)
+    total = rows * cols
+    step = max(1, round(total * 0.6180339887))  # the golden section leaves no large gap at any time
+    while np.gcd(step, total) != 1:
+        step += 1
+    seen, looks = np.zeros(len(boxes), int), 0
+    chosen: list[Box] = []
+    for number in range(total):
+        row, col = (WINDOW_PX * k for k in divmod(number * step % total, cols))
+        box = row, col, min(WINDOW_PX, shape[0] - row), min(WINDOW_PX, shape[1] - col)
+        images = [k for k, other in enumerate(boxes) if overlap(box, other)]
+        if not images or (seen[images] >= WINDOWS_PER_IMAGE).all():
+            continue
+        if looks + len(images) > LOOKS and chosen:
+            break
+        seen[images] += 1
+        looks += len(images)
+        chosen.append(box)
+    return chosen
+
+
+def take_samples(references: References, windows: Sequence[Box], progress: Progress | None = None) -> list[Sample]:
+    samples = []
+    for number, box in enumerate(windows):
+        if progress:
+            progress(number, len(windows), "calibration windows")
+        sample = Sample()
+        for k in references.overlapping(box):
+            look = references.look(k, box)
+            if look is not None:
+                sample.images.append(k)
+                sample.looks.append(look)
+        if sample.images:
+            samples.append(sample)
+    return samples
+
+
+def calibrate(samples: Sequence[Sample], count: int, units: str) -> Calibration:
+    """Gains, offsets and variances of ``count`` images from windows that they share; units : iof or dn"""
+    own = np.full((count, LEVELS + 1), 0.01)
+    spread = Spread(np.full(LEVELS + 1, 0.01), own, 0.01, own[:, 0].copy())
+    result = Calibration(np.ones(count), np.zeros(count), spread, np.ones(len(COSINES) - 1))
+    albedo: list[Any] = [0.0] * len(samples)
+    for _ in range(ROUNDS):
+        gain, offset = _scales(samples, albedo, count, units)
+        result = Calibration(gain, offset, result.spread, result.error)
+        stacks = [_stack(result, sample) for sample in samples]
+        albedo = [
+            settle(ratio, confidence, result.spread.of(sample.images))
+            for sample, (ratio, confidence) in zip(samples, stacks, strict=True)
+        ]
+        result = Calibration(gain, offset, _variances(samples, stacks, count), _error(samples, stacks, albedo))
+    return result
+
+
+def _stack(calibration: Calibration, sample: Sample) -> tuple[Floats32, Floats32]:
+    found = [calibration.ratio(k, look) for k, look in zip(sample.images, sample.looks, strict=True)]
+    return np.stack([f[0] for f in found]), np.stack([f[1] for f in found])
+
+
+def _scales(samples: Sequence[Sample], albedo: Sequence[Any], count: int, units: str) -> tuple[Floats, Floats]:
+    """Gain and offset of every image against the prediction times the albedo so far, on every 7th pixel.
+
+    Images in I/F have the mean gain 1: what they all are brighter than the map is the ground's.
+    """
+    pairs: list[list[tuple[Floats, Floats]]] = [[] for _ in range(count)]
+    for sample, log_albedo in zip(samples, albedo, strict=True):
+        for k, look in zip(sample.images, sample.looks, strict=True):
+            known = np.isfinite(look.measured)
+            expected = (look.predicted * np.exp(log_albedo))[known]
+            pairs[k].append((expected[::7].astype(float), look.measured[known][::7].astype(float)))
+    gain, offset = np.ones(count), np.zeros(count)
+    fitted = [k for k in range(count) if sum(len(p[0]) for p in pairs[k]) > 0]
+    for k in fitted:
+        expected, measured = (np.concatenate([p[i] for p in pairs[k]]) for i in (0, 1))
+        gain[k], offset[k] = _line(expected, measured, units == "dn")
+    if units == "iof" and fitted:
+        gain /= np.exp(np.log(gain[fitted]).mean())
+        gain[[k for k in range(count) if k not in fitted]] = 1.0
+    return _rounded(gain), _rounded(offset)
+
+
+def _line(expected: Floats, measured: Floats, with_offset: bool) -> tuple[float, float]:
+    """measured = gain x expected + offset by Huber's weights (1.345 robust standard deviations)."""
+    weights = np.ones(len(expected))
+    gain = offset = 0.0
+    for _ in range(10):
+        total = weights.sum()
+        x0, y0 = ((weights * v).sum() / total if with_offset else 0.0 for v in (expected, measured))
+        x, y = expected - x0, measured - y0
+        square = (weights * x * x).sum()
+        gain = (weights * x * y).sum() / square if square > 0 else 0.0
+        offset = y0 - gain * x0
+        if not gain > 0:  # the map says nothing of this image: its level alone
+            gain, offset = max(float(np.median(measured) / np.median(expected)), 1e-12), 0.0
+        residual = np.abs(measured - gain * expected - offset)
+        scale = 1.4826 * float(np.median(residual))
+        weights = np.minimum(1.0, 1.345 * max(scale, 1e-300) / np.maximum(residual, 1e-300))
+    return gain, offset
+
+
+def _variances(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], count: int) -> Spread:
+    """Variance components by moments of pairs of images: products for what is shared; for the rest what a square has
+    beyond that, or what differences say where this is more (errors that neighbours share would hide in differences)."""
+    levels = LEVELS + 2  # the last are whole pixels
+    product, weight, difference, reach = (np.zeros((levels, count, count)) for _ in range(4))
+    square, sums, pixels = (np.zeros((levels, count)) for _ in range(3))
+    for sample, (ratio, confidence) in zip(samples, stacks, strict=True):
+        split = [[*bands(r, q), (r, q)] for r, q in zip(ratio, confidence, strict=True)]
+        where = np.ix_(sample.images, sample.images)
+        for level in range(levels):
+            values, q = (np.stack([s[level][i].ravel() for s in split]).astype(float) for i in (0, 1))
+            scaled = q * values
+            products, weights, squares = scaled @ scaled.T, q @ q.T, (scaled * values) @ q.T
+            product[level][where] += products
+            weight[level][where] += weights
+            difference[level][where] += squares + squares.T - 2 * products
+            reach[level][where] += (q > 0) @ q.T
+            square[level, sample.images] += (scaled * values).sum(axis=1)
+            sums[level, sample.images] += q.sum(axis=1)
+            pixels[level, sample.images] += (q > 0).sum(axis=1)
+    own = np.stack([_own_variances(difference[k], reach[k]) for k in range(levels)])
+    shared = np.array([_shared_variance(product[k], weight[k], own[k]) for k in range(levels)])
+    beyond = (square - shared[:, None] * sums) / np.maximum(pixels, 1)
+    own = np.maximum(own, beyond).T
+    return Spread(_rounded(shared[:-1]), _rounded(own[:, :-1]), float(_rounded(shared[-1])), _rounded(own[:, -1]))
+
+
+def _shared_variance(product: Floats, weight: Floats, own: Floats) -> float:
+    """Mean product of two images, 0 or more; those with large errors of their own, such as shifted ones, count less."""
+    trust = 1.0 / (own[:, None] * own)
+    np.fill_diagonal(trust, 0.0)
+    total = (trust * weight).sum()
+    return max(0.0, float((trust * product).sum() / total)) if total > 0 else 0.0
+
+
+def _own_variances(difference: Floats, reach: Floats) -> Floats:
+    """Each image's own variance from those of differences: difference[k, j] = own[k] reach[k, j] + own[j] reach[j, k].
+
+    Positive by multiplicative steps (Richardson 1972, J. Opt. Soc. Am. 62:55), which share what only a sum is known of
+    evenly. An image that shares no pixel with another has nothing to show for itself: it differs as others do.
+    """
+    difference, reach = difference.copy(), reach.copy()
+    np.fill_diagonal(difference, 0.0)
+    np.fill_diagonal(reach, 0.0)
+    total = reach.sum(axis=1)
+    known = (total > 0) & (reach.sum(axis=0) > 0)
+    own = np.full(len(reach), max(difference.sum() / max(2 * reach.sum(), 1e-300), 1e-12))
+    for _ in range(STEPS):
+        expected = own[:, None] * reach
+        expected += expected.T
+        share = np.divide(difference, expected, out=np.zeros_like(expected), where=expected > 0)
+        own[known] *= (reach * share).sum(axis=1)[known] / total[known]
+        own = np.maximum(own, 1e-12)
+    if not known.any():
+        return np.ones(len(reach))
+    own[~known] = np.median(own[known])
+    return own
+
+
+def _rounded(values: Any) -> Any:
+    """To nine digits: what libraries of linear algebra leave open does not reach the map."""
+    values = np.asarray(values, float)
+    size = 10.0 ** (8 - np.floor(np.log10(np.maximum(np.abs(values), 1e-300))))
+    return np.where(values == 0, 0.0, np.round(values * size) / size)
+
+
+def _error(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], albedo: Sequence[Any]) -> Floats:
+    """Variance of images about what they agree on by cos(incidence), relative to the median bin's."""
+    square, pixels = np.zeros(len(COSINES) - 1), np.zeros(len(COSINES) - 1)
+    for sample, (ratio, confidence), location in zip(samples, stacks, albedo, strict=True):
+        several = (confidence > 0).sum(axis=0) > 1
+        for look, values, known in zip(sample.looks, ratio, confidence > 0, strict=True):
+            use = known & several
+            bins = np.clip(np.digitize(look.cos_incidence[use], COSINES) - 1, 0, len(square) - 1)
+            # the middle of a distribution with long tails: squares up to 9 robust variances
+            residual = (values - location)[use].astype(float)
+            bound = 3 * 1.4826 * float(np.median(np.abs(residual))) if residual.size else 0.0
+            square += np.bincount(bins, np.minimum(np.abs(residual), bound) ** 2, len(square))
+            pixels += np.bincount(bins, minlength=len(square))
+    enough = (pixels > 200) & (square > 0)
+    if not enough.any():
+        return np.ones(len(square))
+    variance = square[enough] / pixels[enough]
+    variance /= np.exp(np.average(np.log(variance), weights=pixels[enough]))
+    return _rounded(np.interp(np.arange(len(square)), np.flatnonzero(enough), variance))
+
+
+def _middles() -> Floats:
+    return 0.5 * (COSINES[1:] + COSINES[:-1])

@@ -1,0 +1,127 @@
+"""The albedo of a window from its photographs: where they agree it is theirs, where they do not it is the map's.
+
+Log ratios of measured to predicted I/F are split into bands of structure size. In every band the albedo that all images
+share has a variance, and each image an error of its own on top (see ``calibrate``); the mean of the posterior weighs
+images and the prior, log albedo 0, by the inverse of these. Before that, each pixel of each image gets a weight by how
+far it lies from what the others say, as residuals of Student's distribution do (Lange, Little & Taylor 1989,
+J. Am. Stat. Assoc. 84:881): a shadow or a cosmic ray in one image leaves no mark.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.albedo.pyramid import LEVELS, bands, collapse, enlarge, reduce
+
+Floats32 = NDArray[np.float32]
+Floats = NDArray[np.float64]
+
+FREEDOM = 4.0  # degrees of freedom of Student's distribution, as Lange et al. recommend
+ITERATIONS = 8
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Variances of log ratios. shared : (LEVELS + 1,) of the albedo that all images show, by band; own : (n, LEVELS + 1)
+    of each image's error; shared_px, own_px : (), (n,) of whole pixels"""
+
+    shared: Floats
+    own: Floats
+    shared_px: float
+    own_px: Floats
+
+    def of(self, images: list[int]) -> Spread:
+        return Spread(self.shared, self.own[images], self.shared_px, self.own_px[images])
+
+
+def settle(ratio: Floats32, confidence: Floats32, spread: Spread) -> Floats32:
+    """What the images of a window say pixel by pixel; lowers ``confidence`` in place where one differs from the rest.
+
+    ratio, confidence : (n, H, W), log of measured / predicted and 0 where unknown; returns (H, W)
+    """
+    location = np.zeros(ratio.shape[1:], np.float32)
+    own = np.maximum(spread.own_px, 1e-12)
+    _settle(ratio, confidence, own, 1.0 / max(spread.shared_px, 1e-12), location)
+    for k in range(len(ratio)):
+        confidence[k] /= _unrest(ratio[k] - location, confidence[k], own[k])
+    return location
+
+
+def estimate(ratio: Floats32, confidence: Floats32, spread: Spread) -> tuple[Floats32, Floats32]:
+    """(log albedo, its standard deviation), (H, W), from ratios whose confidence ``settle`` has seen."""
+    height, width = ratio.shape[1:]
+    shapes = [(height, width)]
+    for _ in range(LEVELS):
+        shapes.append((-(-shapes[-1][0] // 2), -(-shapes[-1][1] // 2)))
+    sums = [np.zeros(shape, np.float32) for shape in shapes]
+    precision = [np.zeros(shape, np.float32) for shape in shapes]
+    for k in range(len(ratio)):
+        for level, (values, weight) in enumerate(bands(ratio[k], confidence[k])):
+            scaled = weight * np.float32(1.0 / max(spread.own[k, level], 1e-12))
+            sums[level] += scaled * values
+            precision[level] += scaled
+    means, variances = [], []
+    for level in range(LEVELS + 1):
+        shared = np.float32(spread.shared[level])
+        variance = shared / (1.0 + shared * precision[level])
+        means.append(variance * sums[level])
+        variances.append(variance)
+    return collapse(means), np.sqrt(np.maximum(collapse(variances), 0))
+
+
+def _unrest(residual: Floats32, confidence: Floats32, own: float) -> Floats32:
+    """By how much an image's residuals exceed their usual size hereabouts, at least 1: poorly registered blocks count less."""
+    energy, weight = confidence * residual * residual / np.float32(own), (confidence > 0).astype(np.float32)
+    shapes = []
+    for _ in range(LEVELS):
+        shapes.append(energy.shape)
+        energy, weight = reduce(energy), reduce(weight)
+    ratio = np.divide(energy, weight, out=np.zeros_like(weight), where=weight > 1e-3)
+    for shape in shapes[::-1]:
+        ratio = enlarge(ratio, shape)
+    return np.maximum(ratio, np.float32(1))
+
+
+@numba.njit(cache=True, nogil=True)
+def _settle(ratio, confidence, own, prior, location):
+    """Iteratively reweighted mean of every pixel with the prior at 0, started at the weighted median."""
+    count, height, width = ratio.shape
+    values, precision, weights = np.empty(count + 1), np.empty(count + 1), np.empty(count)
+    for r in range(height):
+        for c in range(width):
+            n = 0
+            for k in range(count):
+                if confidence[k, r, c] > 0:
+                    values[n] = ratio[k, r, c]
+                    precision[n] = confidence[k, r, c] / own[k]
+                    n += 1
+            if n == 0:
+                location[r, c] = 0.0
+                continue
+            values[n], precision[n] = 0.0, prior
+            order = np.argsort(values[: n + 1])
+            half, total = 0.5 * precision[: n + 1].sum(), 0.0
+            middle = 0.0
+            for i in range(n + 1):
+                total += precision[order[i]]
+                if total >= half:
+                    middle = values[order[i]]
+                    break
+            for _ in range(ITERATIONS):
+                top, bottom = 0.0, prior
+                for i in range(n):
+                    away = values[i] - middle
+                    weights[i] = (FREEDOM + 1.0) / (FREEDOM + away * away * precision[i])
+                    top += weights[i] * precision[i] * values[i]
+                    bottom += weights[i] * precision[i]
+                middle = top / bottom
+            location[r, c] = middle
+            i = 0
+            for k in range(count):
+                if confidence[k, r, c] > 0:
+                    confidence[k, r, c] *= weights[i]
+                    i += 1

@@ -1,0 +1,127 @@
+"""Photographs of a scene beside what the map predicts for them, window by window."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.physics.horizon.scene import Overview, horizon_in_scene
+from stages.physics.images.source_images import Source, open_source
+from stages.physics.images.table import ASTRONOMICAL_UNIT, Frame
+from stages.physics.light.sun_disc import SUN_RADIUS
+from stages.physics.maps.grid import Grid
+from stages.physics.terrain.shading import Light, shade_block
+from stages.physics.terrain.sun import Sun
+from stages.physics.terrain.surface import Surface
+
+Floats32 = NDArray[np.float32]
+Box = tuple[int, int, int, int]  # row, col, height, width
+
+OPEN_IMAGES = 64  # files that stay open between windows
+SHADOW_MARGIN_PX = 2  # a shadow's edge lies so well where the DEM and the registration say
+TURN = 30e3  # m over which the Sun's azimuth turns by 1 deg on the Moon
+
+
+@dataclass(frozen=True)
+class Look:
+    """One photograph on a window. measured : (h, w) as in the file, NaN where it says nothing; predicted : (h, w) I/F;
+    cos_incidence : (h, w)"""
+
+    measured: Floats32
+    predicted: Floats32
+    cos_incidence: Floats32
+
+
+class SceneHorizon:
+    """The terrain horizon towards one Sun for any window, from an overview of the scene that all Suns share."""
+
+    def __init__(self, elevation: Any, overview: Overview, grid: Grid, sun: Sun) -> None:
+        self._elevation, self._overview, self._grid, self._sun = elevation, overview, grid, sun
+        self._piece = 1 << min(10, max(6, int(math.log2(max(1.0, TURN / grid.gsd)))))
+
+    def window(self, row: int, col: int, height: int, width: int) -> Floats32:
+        """(height, width), rad"""
+        grid, edge = self._grid, self._piece
+        result = np.empty((height, width), np.float32)
+        for r in range(row, row + height, edge):
+            for c in range(col, col + width, edge):
+                h, w = min(edge, row + height - r), min(edge, col + width - c)
+                azimuth, elevation = self._sun.over(grid, r + (h - 1) / 2, c + (w - 1) / 2)
+                result[r - row : r - row + h, c - col : c - col + w] = horizon_in_scene(
+                    self._elevation, self._overview, r, c, h, w, grid.gsd, azimuth,
+                    sun_elevation=elevation, body_radius=grid.radius,
+                )  # fmt: skip
+        return result
+
+
+class References(contextlib.AbstractContextManager):
+    """The images of a scene. boxes : (row, col, height, width) of what each shows; use as a context manager."""
+
+    def __init__(
+        self,
+        surface: Surface,
+        elevation: Any,
+        overview: Overview,
+        heights: tuple[float, float],
+        frames: Sequence[Frame],
+        boxes: Sequence[Box],
+    ) -> None:
+        self.surface, self.elevation, self.overview, self.heights = surface, elevation, overview, heights
+        self.frames, self.boxes = frames, boxes
+        self._open: OrderedDict[int, tuple[Source, contextlib.ExitStack]] = OrderedDict()
+
+    def __exit__(self, *error: object) -> None:
+        while self._open:
+            self._open.popitem()[1][1].close()
+
+    def overlapping(self, box: Box) -> list[int]:
+        """Images that may show something of a window."""
+        return [k for k, other in enumerate(self.boxes) if overlap(box, other)]
+
+    def look(self, k: int, box: Box) -> Look | None:
+        """Image ``k`` on a window, None where it shows nothing that counts."""
+        row, col, height, width = box
+        pixels = self._source(k).read(row, col, height, width)
+        if not pixels.valid.any():
+            return None
+        frame, surface = self.frames[k], self.surface
+        position = frame.sun_position()
+        sun = Sun(position, SUN_RADIUS * ASTRONOMICAL_UNIT / float(np.linalg.norm(position)))
+        camera = frame.camera_position(surface.grid.radius)
+        if pixels.ortho is not None:
+            camera = pixels.ortho.camera_position
+        horizon: Any = SceneHorizon(self.elevation, self.overview, surface.grid, sun)
+        block = shade_block(surface, Light(sun, horizon, camera), row, col, height, width)
+        lit = (block["shadow"] == 0).astype(np.uint8)
+        side = 2 * SHADOW_MARGIN_PX + 1
+        far = cv2.erode(lit, np.ones((side, side), np.uint8), borderValue=1).astype(bool)
+        usable = far & pixels.valid & np.isfinite(pixels.values) & (block["image"] > 0)
+        if not usable.any():
+            return None
+        cosine = np.cos(np.radians(block["incidence_deg"]))
+        return Look(np.where(usable, pixels.values, np.nan).astype(np.float32), block["image"], cosine)
+
+    def _source(self, k: int) -> Source:
+        if k in self._open:
+            self._open.move_to_end(k)
+            return self._open[k][0]
+        while len(self._open) >= OPEN_IMAGES:
+            self._open.popitem(last=False)[1][1].close()
+        with contextlib.ExitStack() as stack:
+            opened = open_source(self.frames[k], self.surface.grid, self.elevation, self.heights)
+            source = stack.enter_context(opened)
+            self._open[k] = source, stack.pop_all()
+        return source
+
+
+def overlap(a: Box, b: Box) -> bool:
+    """Whether two boxes share a pixel."""
+    return a[0] < b[0] + b[2] and b[0] < a[0] + a[2] and a[1] < b[1] + b[3] and b[1] < a[1] + a[3]

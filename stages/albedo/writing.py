@@ -1,0 +1,72 @@
+"""The map with albedo: what it had before, and what the photographs add."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas import SVBRDF, ArtefactWriter
+from schemas.reading import read_strings
+from stages.albedo.calibrate import Calibration
+from stages.albedo.pyramid import LEVELS
+from stages.albedo.references import Box
+from stages.physics.images.table import Frame
+
+ROWS = 256  # rows that are copied at a time
+
+# Root attributes that every artefact makes for itself.
+_OWN = (
+    "Conventions", "title", "lunargr_schema", "schema_version", "lunargr_version", "history", "config", "inputs", "seed",
+    "command", "folder", "provenance", "parts", "shard_rows",
+)  # fmt: skip
+
+
+def kept_attributes(source: h5py.File) -> dict[str, Any]:
+    """What the new map says of itself as the old one did."""
+    return {key: value for key, value in source.attrs.items() if key not in _OWN}
+
+
+def copy_map(source: h5py.File, writer: ArtefactWriter, rows: tuple[int, int]) -> None:
+    """Every variable of a map but its rows outside of ``rows``."""
+    if "crs" in source:
+        source.copy("crs", writer.file, "crs")
+    for variable in SVBRDF.variables:
+        if variable.name not in source:
+            continue
+        if variable.dims[-2:] != ("y", "x"):
+            named = variable.dtype == "string"
+            writer.write(variable.name, read_strings(source, variable.name) if named else source[variable.name][...])
+            continue
+        target = writer.dataset(variable.name)
+        for row in range(rows[0], rows[1], ROWS):
+            part = (..., slice(row, min(rows[1], row + ROWS)), slice(None))
+            target[part] = source[variable.name][part]
+
+
+class Maps:
+    """Takes blocks of albedo, its standard deviation and the number of images."""
+
+    def __init__(self, writer: ArtefactWriter, frames: Sequence[Frame], calibration: Calibration) -> None:
+        self._maps = [writer.dataset(name) for name in ("albedo", "albedo_std", "albedo_images")]
+        self._writer, self._frames, self._calibration = writer, frames, calibration
+
+    def put(self, block: Box, *values: NDArray) -> None:
+        row, col, height, width = block
+        for target, part in zip(self._maps, values, strict=True):
+            target[row : row + height, col : col + width] = part
+
+    def close(self) -> None:
+        """Write what is known of the images."""
+        writer, frames, found = self._writer, self._frames, self._calibration
+        writer.write("albedo_image_id", [f.image_id for f in frames])
+        writer.write("albedo_gain", found.gain)
+        writer.write("albedo_offset", found.offset)
+        writer.write("albedo_subsolar_longitude_deg", np.array([f.subsolar_longitude_deg for f in frames]))
+        writer.write("albedo_subsolar_latitude_deg", np.array([f.subsolar_latitude_deg for f in frames]))
+        writer.write("albedo_band_px", 2.0 ** np.arange(LEVELS + 1))
+        writer.write("albedo_band_std", np.sqrt(found.spread.shared))
+        writer.write("albedo_image_std", np.sqrt(found.spread.own))

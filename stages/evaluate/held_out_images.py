@@ -1,0 +1,333 @@
+"""Seen ground under an unseen image: how well maps with albedo predict photographs that had no part in their albedo.
+
+Another claim than that of unseen ground (``stages.evaluate.run``), and kept apart from it: here other photographs of the
+same pixels made the albedo. How far the scored Sun stands from the nearest one used is part of the answer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from schemas import EVALUATION, SVBRDF, ArtefactError, ArtefactWriter, check_output, open_artefact, write_json
+from schemas.files.companions import companions_of
+from schemas.reading import read_strings
+from stages.common.intervals import ERROR, choose_units, gain_interval, ratio_interval
+from stages.evaluate.metrics import ssim
+from stages.pairs.reader import PairReader
+from stages.physics.formation.chain import form
+from stages.physics.formation.radiometry import crop_range, match_crops
+from stages.physics.maps.grid import unit_vectors
+from stages.physics.photometry import get_model
+
+Floats = NDArray[np.float64]
+Progress = Callable[[int, int, str], None]
+
+CLAIM = "seen ground, unseen images"
+ROWS = ("terrain", "albedo", "terrain_gain_offset", "albedo_gain_offset")
+SAME_GROUND = 0.01  # of the pairs' gsd: heights of the same pixel in map and pairs differ by rounding only
+FIT_PAIRS = 64  # pairs of one image that its gain and offset are fitted on, where it is in DN
+
+
+@dataclass(frozen=True)
+class Config:
+    """split : whose pairs are scored"""
+
+    split: str = "test"
+    seed: int = 0
+
+
+@dataclass
+class Map:
+    """An open map with albedo. used : images that made it; suns : (n, 3) body-fixed unit vectors of theirs"""
+
+    path: Path
+    file: h5py.File
+    used: list[str]
+    suns: Floats
+
+    def crop(self, row: int, col: int, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor, NDArray, NDArray]:
+        """(coefficients (1, C, h, w), albedo (1, h, w), its standard deviation, elevation), NaN where unknown."""
+        top, left = row - size[0] // 2, col - size[1] // 2
+        part = np.s_[top : top + size[0], left : left + size[1]]
+        file = self.file
+        coefficients = torch.from_numpy(file["coefficients"][:, *part])[None]
+        albedo = torch.from_numpy(file["albedo"][part])[None]
+        return coefficients, albedo, file["albedo_std"][part], file["elevation"][part]
+
+
+def run(
+    pairs: Path,
+    maps: Sequence[Path],
+    output: Path,
+    config: Config,
+    json_file: Path | None = None,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Score every pair of the split whose image had no part in one of the maps; returns what the JSON holds.
+
+    maps : of `lunargr albedo`, such as those of all folds; a pair is scored on the first that its image did not make.
+    Raises LunargrError.
+    """
+    reports = [output.with_suffix(".json"), *([json_file] if json_file else [])]
+    for path in (output, *reports):
+        check_output(path, [pairs, *maps], overwrite)
+    with PairReader(pairs) as reader, contextlib.ExitStack() as stack:
+        opened = [_open(path, reader, stack) for path in maps]
+        chosen = _choose(reader, opened, config.split)
+        sizes = {"model": len(ROWS), "pair": len(chosen), "y": reader.size[0], "x": reader.size[1]}
+        inputs = [pairs, *maps]
+        settings = {"split": config.split, "seed": config.seed, "held_out_images": True}
+        with ArtefactWriter(
+            output, EVALUATION, sizes, config=settings, inputs=inputs, seed=config.seed, overwrite=overwrite
+        ) as writer:
+            scores = _score(reader, opened, chosen, writer, progress)
+            result = _conclude(reader, opened, chosen, scores, config)
+            result |= {"pairs_file": pairs.name, "maps": [path.name for path in maps]}
+            writer.write("model_name", ROWS)
+            writer.write("pair_index", np.array([k for k, _ in chosen]))
+            writer.write("tile", reader.tile[[k for k, _ in chosen]])
+            writer.write("valid_pixels", scores["pixels"])
+            writer.write("mse", scores["squares"] / np.maximum(scores["pixels"], 1))
+            writer.write("ssim", scores["ssim"])
+            writer.file.attrs["split"] = config.split
+            writer.file.attrs["metrics"] = json.dumps(result)
+            with companions_of(output):
+                for report in reports:
+                    write_json(report, result)
+    return result
+
+
+def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> Map:
+    """A map with albedo on the ground of the pairs. Raises ArtefactError."""
+    file = stack.enter_context(open_artefact(path, SVBRDF))
+    if "albedo" not in file:
+        raise ArtefactError(
+            f"{path}:/albedo: expected a map with albedo, found none; run 'lunargr albedo' with --fold."
+        )
+    suns = unit_vectors(file["albedo_subsolar_longitude_deg"][...], file["albedo_subsolar_latitude_deg"][...])
+    found = Map(path, file, read_strings(file, "albedo_image_id"), suns)
+    for name in ("row", "col"):
+        if name not in reader.file:
+            raise ArtefactError(
+                f"{reader.path}:/{name}: expected where on the map a pair lies, found nothing; project again."
+            )
+    row, col = int(reader.file["row"][0]), int(reader.file["col"][0])
+    height = found.crop(row, col, reader.size)[3]
+    mine = reader.file["elevation"][0]
+    same = height.shape == mine.shape and not np.nanmax(np.abs(height - mine), initial=0.0) > SAME_GROUND * reader.gsd
+    if not same or abs(float(file.attrs["gsd_m"]) - reader.gsd) > 1e-6 * reader.gsd:
+        raise ArtefactError(
+            f"{path}: expected a map of the scene of {reader.path}, found other ground at its first pair."
+        )
+    return found
+
+
+def _choose(reader: PairReader, maps: Sequence[Map], split: str) -> list[tuple[int, int]]:
+    """(pair, map) of what may be scored. Raises ArtefactError where every image made the albedo."""
+    chosen = []
+    for k in reader.indices(split):
+        name = reader.image_ids[reader.frame[k]]
+        for number, one in enumerate(maps):
+            if name not in one.used:
+                chosen.append((int(k), number))
+                break
+    if not chosen:
+        raise ArtefactError(
+            f"{maps[0].path}: expected pairs of split '{split}' whose image did not make the albedo, found none; "
+            "run 'lunargr albedo' with --fold or --leave-out."
+        )
+    return chosen
+
+
+def _score(
+    reader: PairReader, maps: Sequence[Map], chosen: Sequence[tuple[int, int]], writer: ArtefactWriter, progress: Any
+) -> dict[str, NDArray]:
+    """Sums of squares (rows, pairs), pixels, ssim, pixels within the 68 and 95 % intervals, nearest Suns (rad)."""
+    count = len(chosen)
+    found: dict[str, NDArray] = {
+        "squares": np.zeros((len(ROWS), count)),
+        "ssim": np.full((len(ROWS), count), np.nan),
+        "pixels": np.zeros(count, np.int32),
+        "within": np.zeros((2, count)),
+        "sun": np.zeros(count),
+    }
+    measured_out, rendered_out = writer.dataset("measured"), writer.dataset("rendered")
+    scales: dict[tuple[int, int], list[tuple[float, float]]] = {}
+    for n, (k, number) in enumerate(chosen):
+        if progress:
+            progress(n, count, "held-out crops")
+        one = maps[number]
+        if reader.units == "dn" and (int(reader.frame[k]), number) not in scales:
+            scales[int(reader.frame[k]), number] = _image_scales(reader, one, int(reader.frame[k]))
+        pictures, std = _pictures(reader, one, k)
+        measured, valid = reader.image([k]).double(), reader.valid([k])
+        valid &= torch.isfinite(pictures[1]) & torch.isfinite(pictures[0])
+        if reader.units == "dn":
+            gains = scales[int(reader.frame[k]), number]
+            pictures = [p * gain + offset for p, (gain, offset) in zip(pictures, gains, strict=True)]
+        pictures += [match_crops(torch.nan_to_num(p), measured, valid, "gain_offset") for p in pictures]
+        mask = valid[0].numpy()
+        found["pixels"][n], found["sun"][n] = mask.sum(), _nearest_sun(reader, one, k)
+        measured_out[n] = np.where(mask, measured[0].numpy(), np.nan)
+        spread = float(crop_range(measured, valid)[0])
+        for row, picture in enumerate(pictures):
+            values = picture[0].numpy()
+            rendered_out[row, n] = np.where(mask, values, np.nan)
+            found["squares"][row, n] = ((values - measured[0].numpy())[mask] ** 2).sum()
+            found["ssim"][row, n] = ssim(measured[0].numpy(), np.nan_to_num(values), mask, data_range=spread)
+        if reader.units == "iof":
+            away = np.abs(pictures[1][0].numpy() - measured[0].numpy())[mask] / np.maximum(std[mask], 1e-12)
+            found["within"][:, n] = (away <= 1.0).sum(), (away <= 1.96).sum()
+    return found
+
+
+def _pictures(reader: PairReader, one: Map, k: int) -> tuple[list[torch.Tensor], NDArray]:
+    """I/F of the map without and with albedo, (1, h, w), and the standard deviation of what an image shows of the latter."""
+    row, col = int(reader.file["row"][k]), int(reader.file["col"][k])
+    coefficients, albedo, std, _ = one.crop(row, col, reader.size)
+    with torch.no_grad():
+        terrain = form(reader.observation([k]), get_model(str(one.file.attrs["model"])), coefficients).double()
+    # an unseen image has an error of its own, as those have that were seen
+    own = np.median((one.file["albedo_image_std"][...] ** 2).sum(axis=1))
+    with_albedo = terrain * albedo
+    shown = np.sqrt(std**2 / albedo[0].numpy() ** 2 + own) * np.abs(with_albedo[0].numpy())
+    return [terrain, with_albedo], shown
+
+
+def _image_scales(reader: PairReader, one: Map, frame: int) -> list[tuple[float, float]]:
+    """Gain and offset of an image in DN for both renderings, by least squares on its train pairs (all pairs if none)."""
+    mine = np.flatnonzero(reader.frame == frame)
+    train = np.intersect1d(mine, reader.indices("train"))
+    fitted = train if len(train) else mine
+    fitted = fitted[:: max(1, len(fitted) // FIT_PAIRS)]
+    columns: list[list[Floats]] = [[], [], []]
+    for k in fitted:
+        pictures, _ = _pictures(reader, one, int(k))
+        valid = reader.valid([k]) & torch.isfinite(pictures[0]) & torch.isfinite(pictures[1])
+        for column, picture in zip(columns, [*pictures, reader.image([k]).double()], strict=True):
+            column.append(picture[valid].numpy())
+    terrain, albedo, measured = (np.concatenate(c) for c in columns)
+    scales = []
+    for rendered in (terrain, albedo):
+        design = np.stack([rendered, np.ones_like(rendered)], axis=1)
+        gain, offset = np.linalg.lstsq(design, measured, rcond=None)[0]
+        scales.append((float(gain), float(offset)))
+    return scales
+
+
+def _nearest_sun(reader: PairReader, one: Map, k: int) -> float:
+    """Angle between a pair's Sun and the nearest of those whose images made the albedo, rad."""
+    file = reader.file
+    east, north, up = (float(v) for v in file["sun_direction_enu"][k])
+    turn = math.radians(float(file["convergence_deg"][k])) if "convergence_deg" in file else 0.0
+    azimuth = math.atan2(east, north) - turn
+    level = math.hypot(east, north)
+    lon, lat = float(file["longitude_deg"][k]), float(file["latitude_deg"][k])
+    zenith = unit_vectors(lon, lat)
+    to_east = unit_vectors(lon + 90.0, 0.0)
+    to_north = np.cross(zenith, to_east)
+    sun = up * zenith + level * (math.sin(azimuth) * to_east + math.cos(azimuth) * to_north)
+    return float(np.arccos(np.clip(one.suns @ sun, -1.0, 1.0)).min())
+
+
+def _conclude(
+    reader: PairReader,
+    maps: Sequence[Map],
+    chosen: Sequence[tuple[int, int]],
+    scores: dict[str, NDArray],
+    config: Config,
+) -> dict[str, Any]:
+    """What the JSON holds."""
+    pixels = scores["pixels"].astype(float)
+    if not pixels.any():
+        raise ArtefactError(f"split '{config.split}': expected valid pixels under unseen images, found none.")
+    numbers = np.array([k for k, _ in chosen])
+    unit, unit_name = choose_units(reader.tile[numbers], reader.site[numbers])
+    models = {}
+    for k, name in enumerate(ROWS):
+        mse = ratio_interval(scores["squares"][k], pixels, unit, ERROR)
+        models[name] = {"mse": mse.value, "mse_low": _known(mse.low), "mse_high": _known(mse.high)}
+        models[name]["ssim"] = _known(float(np.nanmean(scores["ssim"][k])))
+    gains = {}
+    for ours, other in ((1, 0), (3, 2)):
+        gain = gain_interval(scores["squares"][ours], scores["squares"][other], unit)
+        gains[ROWS[ours]] = {
+            ROWS[other]: {
+                "gain_percent": gain.value,
+                "gain_percent_low": _known(gain.low),
+                "gain_percent_high": _known(gain.high),
+            }
+        }
+    within = scores["within"].sum(axis=1) / pixels.sum()
+    suns = np.degrees(scores["sun"])
+    images = []
+    for frame in np.unique(reader.frame[numbers]):
+        mine = reader.frame[numbers] == frame
+        total = max(1.0, float(pixels[mine].sum()))
+        row = {"image_id": reader.image_ids[frame], "crops": int(mine.sum())}
+        row |= {"nearest_used_sun_deg": float(suns[mine].mean())}
+        row |= {f"mse_{name}": float(scores["squares"][k, mine].sum() / total) for k, name in enumerate(ROWS)}
+        images.append(row)
+    return {
+        "claim": CLAIM,
+        "split": config.split,
+        "models": models,
+        "gains": gains,
+        "images": images,
+        "pairs": len(chosen),
+        "tiles": len(np.unique(reader.tile[numbers])),
+        "interval_unit": unit_name,
+        "valid_pixels": int(pixels.sum()),
+        "image_units": reader.units,
+        "nearest_used_sun_deg": {"least": float(suns.min()), "mean": float(suns.mean()), "most": float(suns.max())},
+        "coverage_percent": None
+        if reader.units == "dn"
+        else {"68": 100 * float(within[0]), "95": 100 * float(within[1])},
+        "used_images": [one.used for one in maps],
+    }
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Columns and cells of the table of rows."""
+    cells = []
+    for name, row in result["models"].items():
+        bounds = "-" if row["mse_low"] is None else f"{row['mse_low']:.3e} .. {row['mse_high']:.3e}"
+        gain = next(iter(result["gains"].get(name, {}).values()), None)
+        text = "-"
+        if gain is not None:
+            text = f"{gain['gain_percent']:+.1f} %"
+            if gain["gain_percent_low"] is not None:
+                text += f" ({gain['gain_percent_low']:+.1f} .. {gain['gain_percent_high']:+.1f})"
+        cells.append([name, f"{row['mse']:.3e}", bounds, "-" if row["ssim"] is None else f"{row['ssim']:.3f}", text])
+    return ["map", "MSE", "95 % interval", "SSIM", "lower MSE than without albedo by"], cells
+
+
+def image_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Columns and cells of the table of images."""
+    cells = [
+        [
+            row["image_id"],
+            str(row["crops"]),
+            f"{row['nearest_used_sun_deg']:.1f}",
+            f"{row['mse_terrain']:.3e}",
+            f"{row['mse_albedo']:.3e}",
+        ]
+        for row in result["images"]
+    ]
+    return ["unseen image", "crops", "nearest Sun used, deg", "MSE terrain", "MSE with albedo"], cells

@@ -1,0 +1,32 @@
+"""A model whose I/F is multiplied by an albedo map, as one parameter more: what reads a map need not know of it.
+
+It is in no registry: networks are not trained on it, `lunargr albedo` makes such maps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from stages.physics.formation.geometry import Angles
+from stages.physics.photometry.base import Parameter, ReflectanceModel
+
+FACTOR = Parameter("albedo_factor", "1", 0.0, 100.0, 1.0, "I/F relative to that of the other parameters")
+
+
+class AlbedoFactor(ReflectanceModel):
+    """``model`` with FACTOR as its last parameter."""
+
+    def __init__(self, model: ReflectanceModel) -> None:
+        self.model = model
+        for key in ("name", "title", "reference", "reciprocal", "finite"):
+            setattr(self, key, getattr(model, key))
+        self.formula = f"{FACTOR.name} ({model.formula})"  # type: ignore[misc]
+        self.parameters = (*model.parameters, FACTOR)  # type: ignore[misc]
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        return self.model.radiance_factor(parameters, angles) * parameters[FACTOR.name]
+
+    def lit(self, coefficients: Tensor, angles: Angles, light: Tensor) -> Tensor:
+        return self.model.lit(coefficients[:, :-1], angles, light) * coefficients[:, -1]

@@ -1,0 +1,252 @@
+"""albedo: what photographs share comes into the map, what one of them shows alone does not; the error bars hold."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import rasterio
+from albedo_scene import NOISE, SIZE, SUNS, photograph, photographs, plant, texture
+from evaluation_scene import run_command
+
+from schemas import ArtefactError, ConfigError, InputError
+from stages import albedo, merge
+
+running = sys.modules["stages.albedo.run"]  # the package's ``run`` is the function
+QUIET = albedo.Config(geotiff=False)
+
+
+def read(path, *names):
+    with h5py.File(path) as file:
+        return [file[name][...] for name in names]
+
+
+def made(planted, config=QUIET, name="albedo.h5"):
+    """(albedo, std, images) of a planted scene."""
+    out = planted.folder / name
+    albedo.run(planted.map, planted.scene, out, config, overwrite=True)
+    return read(out, "albedo", "albedo_std", "albedo_images")
+
+
+@pytest.fixture(scope="module")
+def planted(tmp_path_factory):
+    """Six photographs of textured ground with a ray that no terrain shows; one corner that none of them sees."""
+    rng = np.random.default_rng(5)
+    log_albedo = texture(rng)
+    log_albedo[60:64, :] += 0.4
+    images = photographs(rng, np.exp(log_albedo))
+    for image in images:
+        image[:, :100] = np.where(np.arange(SIZE)[:, None] > 150, np.nan, image[:, :100])
+    return plant(tmp_path_factory.mktemp("planted"), np.exp(log_albedo), images)
+
+
+@pytest.fixture(scope="module")
+def found(planted):
+    return made(planted)
+
+
+def rms(values) -> float:
+    return float(np.sqrt(np.nanmean(np.square(values))))
+
+
+def test_a_known_albedo_comes_back_within_its_error_bars(planted, found):
+    factor, std, images = found
+    seen = images == len(SUNS)
+    away = np.log(factor / planted.albedo)[seen]
+    assert rms(away - away.mean()) < 0.2 * np.log(planted.albedo)[seen].std()
+    z = (factor - planted.albedo)[seen] / std[seen]
+    assert 0.58 < np.mean(np.abs(z) < 1) < 0.95
+    assert np.mean(np.abs(z) < 1.96) > 0.90
+
+
+def test_a_ray_that_terrain_does_not_show_is_in_the_map(found):
+    ray, beside = (np.log(found[0][rows, 120:]).mean() for rows in (slice(61, 63), slice(70, 90)))
+    assert 0.35 < ray - beside < 0.45
+
+
+def test_where_no_photograph_looks_the_map_stays_and_the_error_bar_says_so(planted, found):
+    factor, std, images = found
+    far = np.s_[-16:, :16]
+    assert (images[far] == 0).all()
+    np.testing.assert_allclose(factor[far], 1, atol=0.03)
+    spread = rms(np.log(planted.albedo))
+    assert 0.5 * spread < std[far].mean() < 2 * spread
+    assert std[images == len(SUNS)].mean() < 0.3 * std[far].mean()
+
+
+def test_a_shadow_or_a_cosmic_ray_in_one_image_leaves_no_mark(rng, tmp_path):
+    truth = np.exp(texture(rng))
+    images = photographs(rng, truth)
+    clean, _, _ = made(plant(tmp_path / "clean", truth, images))
+    images[2][100:130, 90:150] *= 0.1
+    images[4][rng.integers(0, SIZE, 60), rng.integers(0, SIZE, 60)] = 1.0
+    marked, _, _ = made(plant(tmp_path / "marked", truth, images))
+    assert rms(np.log(marked / clean)[100:130, 90:150]) < 0.02
+    assert rms(np.log(marked / truth)) < 1.5 * rms(np.log(clean / truth)) + 0.002
+    assert np.nanmax(np.abs(np.log(marked / clean))) < 0.1
+
+
+def test_shifted_images_count_less(rng, tmp_path):
+    truth = np.exp(texture(rng))
+    images = photographs(rng, truth)
+    images[1] = np.roll(images[1], 2, axis=1)
+    shifted = plant(tmp_path, truth, images)
+    factor, _, _ = made(shifted)
+    without, _, _ = made(shifted, replace(QUIET, leave_out=("IMG1",)), "without.h5")
+    plain = np.mean(
+        [np.log(image / photograph(np.ones_like(truth), sun)) for image, sun in zip(images, SUNS, strict=True)], 0
+    )
+    inner = np.s_[8:-8, 8:-8]
+    error, best, mean = (rms(log[inner] - np.log(truth)[inner]) for log in (np.log(factor), np.log(without), plain))
+    assert error < 2 * best
+    assert error < 0.4 * mean
+
+
+def test_where_photographs_do_not_agree_the_map_stays(rng, tmp_path):
+    """Each image with a texture of its own, in DN: a mean of ratios would put a sixth of each into the map."""
+    ground = np.ones((SIZE, SIZE))
+    images = [900.0 * photograph(ground, sun) * np.exp(texture(rng)) + 40.0 for sun in SUNS]
+    factor, _, _ = made(plant(tmp_path, ground, images, units="dn"))
+    assert rms(np.log(factor)) < 0.25 * rms(texture(rng)) / np.sqrt(len(SUNS))
+
+
+def test_gain_and_offset_of_images_in_dn_do_not_matter(rng, tmp_path):
+    truth = np.exp(texture(rng))
+    images = photographs(rng, truth)
+    scaled = [(300.0 + 200.0 * k) * image + 5.0 * k for k, image in enumerate(images)]
+    factor, _, _ = made(plant(tmp_path, truth, scaled, units="dn"))
+    away = np.log(factor / truth)
+    assert rms(away - away.mean()) < 0.35 * np.log(truth).std()
+
+
+def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
+    from lunargr_cli.fanout.stages import run_albedo
+
+    # blocks so small that the map has four rows of them
+    monkeypatch.setattr(running, "BLOCK_PX", 64)
+    config = replace(QUIET, geotiff=True)
+    names = ("albedo", "albedo_std", "albedo_images", "coefficients", "elevation", "albedo_gain", "albedo_image_std")
+    whole = tmp_path / "whole.h5"
+    albedo.run(planted.map, planted.scene, whole, config)
+    parts = [tmp_path / f"part{k}.h5" for k in range(3)]
+    for k, part in enumerate(parts):
+        albedo.run(planted.map, planted.scene, part, replace(config, shard=(k, 3)))
+    merge.run(parts, tmp_path / "merged.h5")
+    # an interrupted run: its calibration and first part are there, the rest is made by the next
+    resumed = tmp_path / "resumed.h5"
+    with monkeypatch.context() as broken:
+        broken.setattr("stages.merge.run", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run_albedo(planted.map, planted.scene, resumed, config, None, 3, scheduler=None, overwrite=False)
+    left = sorted((tmp_path / "resumed.h5.parts").rglob("map-*.h5"))
+    left[1].unlink()
+    run_albedo(planted.map, planted.scene, resumed, config, None, 3, scheduler=None, overwrite=False)
+    for other in ("merged", "resumed"):
+        for name, a, b in zip(names, read(whole, *names), read(tmp_path / f"{other}.h5", *names), strict=True):
+            assert a.tobytes() == b.tobytes(), (other, name)
+        with rasterio.open(whole.with_suffix(".tif")) as a, rasterio.open(tmp_path / f"{other}.tif") as b:
+            assert a.descriptions == b.descriptions == ("a", "b", "c", "albedo", "albedo_std")
+            assert a.read().tobytes() == b.read().tobytes()
+
+
+def interrupt(*arguments, **options):
+    raise KeyboardInterrupt
+
+
+def test_blocks_leave_no_seams(planted, found, monkeypatch):
+    monkeypatch.setattr(running, "BLOCK_PX", 64)
+    blocks = made(planted, name="blocks.h5")[0]
+    assert np.nanmax(np.abs(np.log(blocks / found[0]))) < 0.1 * np.nanmedian(found[1])
+
+
+def test_rendering_multiplies_by_the_albedo(planted, found):
+    from stages.physics.bodies.spheres import find_body
+    from stages.physics.terrain.shading import Light, shade_block
+    from stages.physics.terrain.sun import sun_from_angles
+    from stages.physics.terrain.surface import open_surface
+
+    images = []
+    for path in (planted.map, planted.folder / "albedo.h5"):
+        with open_surface(path, None, {}, find_body("moon")) as surface:
+            light = Light(sun_from_angles(90.0, 40.0, surface.grid), None, None)
+            images.append(shade_block(surface, light, 20, 30, 100, 120)["image"])
+    np.testing.assert_allclose(images[1], images[0] * found[0][20:120, 30:150], rtol=1e-5)
+
+
+def test_held_out_images_are_never_those_that_made_the_albedo(planted, tmp_path):
+    import json
+
+    from stages import project, sample
+
+    crops, pairs = tmp_path / "crops.h5", tmp_path / "pairs.h5"
+    sample.run(planted.scene, crops, sample.Config(count=120, tile_m=640, seed=1))
+    project.run(crops, pairs, project.Config())
+    folds = [tmp_path / f"fold{k}.h5" for k in range(2)]
+    for k, path in enumerate(folds):
+        albedo.run(planted.map, planted.scene, path, replace(QUIET, fold=(k, 2)))
+    out = tmp_path / "evaluation.h5"
+    code, _ = run_command("evaluate", pairs, *folds, "--held-out-images", "-o", out)
+    assert code == 0
+    result = json.loads(out.with_suffix(".json").read_text())
+    assert result["claim"] == "seen ground, unseen images"
+    assert result["models"]["albedo"]["mse"] < 0.1 * result["models"]["terrain"]["mse"]
+    assert result["models"]["albedo"]["mse"] < 6 * NOISE**2
+    assert result["nearest_used_sun_deg"]["least"] > 1.0
+    one, used = tmp_path / "one.h5", [f"IMG{k}" for k in (1, 3, 5)]
+    code, _ = run_command("evaluate", pairs, folds[0], "--held-out-images", "-o", one)
+    assert code == 0
+    scored = json.loads(one.with_suffix(".json").read_text())["images"]
+    assert {row["image_id"] for row in scored} == {f"IMG{k}" for k in (0, 2, 4)}
+    assert read(folds[0], "albedo_image_id")[0].astype(str).tolist() == used
+    everything = planted.folder / "albedo.h5"
+    albedo.run(planted.map, planted.scene, everything, QUIET, overwrite=True)
+    code, said = run_command("evaluate", pairs, everything, "--held-out-images", "-o", tmp_path / "no.h5")
+    assert code == 3 and "--fold" in said and not (tmp_path / "no.h5").exists()
+
+
+def test_bad_input_is_refused_in_one_line(planted, found, tmp_path):
+    out = tmp_path / "out.h5"
+
+    def refused(error, words, svbrdf=planted.map, scene=planted.scene, output=out, config=QUIET):
+        with pytest.raises(error, match=words) as caught:
+            albedo.run(svbrdf, scene, output, config, overwrite=True)
+        assert "\n" not in str(caught.value)
+        assert not out.exists()
+
+    def changed(source, name, change):
+        copy = tmp_path / f"{name}.h5"
+        copy.write_bytes(source.read_bytes())
+        with h5py.File(copy, "r+") as file:
+            change(file)
+        return copy
+
+    refused(ArtefactError, "already", svbrdf=planted.folder / "albedo.h5")
+    refused(ConfigError, "replace the input", output=planted.map)
+    refused(ConfigError, "replace the input", output=planted.scene)
+    refused(ConfigError, "found 'IMG9'", config=replace(QUIET, leave_out=("IMG9",)))
+    refused(ConfigError, "at least one image", config=replace(QUIET, leave_out=tuple(f"IMG{k}" for k in range(6))))
+    other_body = changed(planted.map, "body", lambda f: f.attrs.modify("body_radius_m", 3389500.0))
+    refused(ArtefactError, "a body of 1.7374e", svbrdf=other_body)
+    moved = changed(planted.map, "moved", lambda f: f["crs"].attrs.modify("GeoTransform", "100 20 0 2560 0 -20"))
+    refused(ArtefactError, "the grid of", svbrdf=moved)
+    mixed = changed(planted.scene, "mixed", lambda f: f["units"].write_direct(np.array([0, 0, 1, 1, 0, 0], np.uint8)))
+    relative(mixed, planted.scene)
+    refused(InputError, "both 'iof' and 'dn'", scene=mixed)
+    in_dn = changed(planted.map, "dn", lambda f: f.attrs.create("image_units", "dn"))
+    refused(InputError, "found I/F", svbrdf=in_dn)
+    nowhere = changed(planted.scene, "nowhere", lambda f: f["frame_window"].write_direct(np.zeros((6, 4), np.int32)))
+    refused(InputError, "overlap the map", scene=nowhere)
+    unknown = changed(
+        planted.map, "unknown", lambda f: f["coefficients"].write_direct(np.full((3, SIZE, SIZE), np.nan, "f4"))
+    )
+    refused(InputError, "overlap the map", svbrdf=unknown)
+
+
+def relative(copy, source):
+    """Images named relative to a scene elsewhere."""
+    with h5py.File(copy, "r+") as file:
+        for k, name in enumerate(file["path"].asstr()[...]):
+            file["path"][k] = str(source.parent / name)
