@@ -11,7 +11,7 @@ LUNARGR := $(BIN)/lunargr
 STAMP := $(VENV)/.installed
 SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 
-.PHONY: help install demo test test-slow endurance lint bench campaign docs reproduce-apollo15 reproduce-models clean
+.PHONY: help install demo test test-slow endurance lint bench campaign docs vendor-js reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -50,6 +50,14 @@ campaign: $(STAMP) ## what diagnose names on fresh hidden scenes (hours); SEED=N
 docs: $(STAMP) ## write the generated parts of docs/ again
 	$(BIN)/python examples/photometry_page.py
 	$(BIN)/python examples/file_list.py
+
+VENDOR := stages/view/assets/vendor
+
+vendor-js: ## bundle three.js for the page of `lunargr view` again (needs npm; versions in its package.json)
+	npm install --silent --no-package-lock --prefix $(VENDOR)
+	npm run --silent --prefix $(VENDOR) bundle
+	cp $(VENDOR)/node_modules/three/LICENSE $(VENDOR)/LICENSE.three.txt
+	rm -rf $(VENDOR)/node_modules
 
 # --- the embedded scene --------------------------------------------------------------------------------------------
 
