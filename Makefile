@@ -49,7 +49,6 @@ campaign: $(STAMP) ## what diagnose names on fresh hidden scenes (hours); SEED=N
 
 docs: $(STAMP) ## write the generated parts of docs/ again
 	$(BIN)/python examples/photometry_page.py
-	$(BIN)/python examples/file_list.py
 
 VENDOR := stages/view/assets/vendor
 

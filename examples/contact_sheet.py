@@ -22,8 +22,8 @@ import torch
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from stages.physics.bodies import find_body
-from stages.physics.formation import Observation, form
+from stages.physics.bodies.spheres import find_body
+from stages.physics.formation.chain import Observation, form
 from stages.physics.horizon import horizon
 from stages.physics.photometry import get_model, model_names
 
@@ -62,7 +62,7 @@ def read_terrain(path: Path, size: int) -> tuple[np.ndarray, float]:
     """The middle of a DEM on a metric grid: elevation and metres per pixel."""
     import rasterio
 
-    from stages.physics.rasters import read_window
+    from stages.physics.maps.rasters import read_window
 
     with rasterio.open(path) as data:
         size = min(size, data.height, data.width)

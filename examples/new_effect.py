@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 
 from stages.effects import Effect, get_effect, register
-from stages.physics.formation import Observation, State, form
+from stages.physics.formation.chain import Observation, State, form
 from stages.physics.photometry import Parameter, get_model
 
 

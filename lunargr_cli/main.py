@@ -19,9 +19,9 @@ import typer
 
 from lunargr_cli import INTERRUPTED, commands, quiet_interruptions, signals, stop
 from lunargr_cli.console import say_error
+from schemas.command_line import said
 from schemas.errors import EXIT_CODE, LunargrError
-from schemas.locks import claim
-from schemas.said import said
+from schemas.files.locks import claim
 
 # Threads that wait for each other by spinning slow a busy machine down many times over. Read when torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

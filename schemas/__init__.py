@@ -21,8 +21,8 @@ from schemas.truth import TRUTH
 # Where those are who need h5py: `lunargr --help` must answer at once.
 _LATER = {
     "ArtefactWriter": "writing",
-    "atomic_path": "outputs",
-    "check_output": "outputs",
+    "atomic_path": "files.outputs",
+    "check_output": "files.outputs",
     "open_artefact": "reading",
     "read_config": "reading",
     "read_kind": "reading",
@@ -30,7 +30,7 @@ _LATER = {
 }
 
 if TYPE_CHECKING:
-    from schemas.outputs import atomic_path, check_output
+    from schemas.files.outputs import atomic_path, check_output
     from schemas.reading import open_artefact, read_config, read_kind, read_strings
     from schemas.writing import ArtefactWriter
 

@@ -20,8 +20,8 @@ from typing import Any
 import h5py
 import numpy as np
 
+from schemas.command_line import said
 from schemas.declaration import Schema
-from schemas.said import said
 
 CONVENTIONS = "CF-1.11"
 SIDECAR = "record.json"  # beside files that cannot carry a record themselves: rasters and tables

@@ -12,7 +12,7 @@ import numpy as np
 
 from schemas.declaration import SCHEMAS, STRING, Schema, Variable
 from schemas.errors import ArtefactError
-from schemas.hdf5 import silence_hdf5
+from schemas.files.hdf5 import silence_hdf5
 
 
 def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5py.File:

@@ -15,8 +15,8 @@ import numpy as np
 
 from schemas.declaration import STRING, Schema, Variable
 from schemas.errors import ConfigError
-from schemas.hdf5 import UNKNOWN, lost, silence_hdf5
-from schemas.outputs import atomic_path, check_output, is_full_disk, terminate_as_exception
+from schemas.files.hdf5 import UNKNOWN, lost, silence_hdf5
+from schemas.files.outputs import atomic_path, check_output, is_full_disk, terminate_as_exception
 from schemas.provenance import describe_run
 
 _STANDARD_NAMES = {"x": "projection_x_coordinate", "y": "projection_y_coordinate"}

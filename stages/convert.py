@@ -17,8 +17,8 @@ from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
 from schemas import ConfigError, InputError, atomic_path, check_output
+from stages.physics.maps.rasters import open_raster, read_window
 from stages.physics.photometry.conventions import Convention, convert_maps, get_convention, model_difference
-from stages.physics.rasters import open_raster, read_window
 
 BLOCK_VALUES = 1 << 23  # values of all bands held at a time, in float64: 64 MB
 Progress = Callable[[int, int, str], None]

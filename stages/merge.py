@@ -22,11 +22,11 @@ from schemas import (
     read_kind,
     read_strings,
 )
-from schemas.companions import companions_of
+from schemas.files.companions import companions_of
 from schemas.provenance import whole_command
-from stages.physics.frames import relative_path
-from stages.physics.geotiff import write_geotiff
-from stages.physics.grid import read_grid
+from stages.physics.images.table import relative_path
+from stages.physics.maps.geotiff import write_geotiff
+from stages.physics.maps.grid import read_grid
 
 Progress = Callable[[int, int, str], None]
 

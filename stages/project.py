@@ -27,14 +27,14 @@ from schemas import (
 )
 from schemas.provenance import sha256
 from schemas.reading import unpack
-from stages.physics import rasters
-from stages.physics.frames import Frame, load_frames
-from stages.physics.grid import Grid, LocalFrames, read_grid
-from stages.physics.orthorectify import Ortho
-from stages.physics.register_frame import choose_regions, register_frame
-from stages.physics.registration import Field, Shift
-from stages.physics.scene_horizon import Overview, horizon_in_scene, make_overview
-from stages.physics.sources import Source, open_source
+from stages.physics.horizon.scene import Overview, horizon_in_scene, make_overview
+from stages.physics.images.orthorectify import Ortho
+from stages.physics.images.register_frame import choose_regions, register_frame
+from stages.physics.images.registration import Field, Shift
+from stages.physics.images.source_images import Source, open_source
+from stages.physics.images.table import Frame, load_frames
+from stages.physics.maps import rasters
+from stages.physics.maps.grid import Grid, LocalFrames, read_grid
 
 Progress = Callable[[int, int, str], None]
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from schemas import CROPS, SCENE, SPLITS, ArtefactWriter, ConfigError, GeometryError, open_artefact
 from schemas.provenance import sha256
-from stages.physics.frames import Frame, load_frames, relative_path, write_frames
-from stages.physics.grid import Grid, read_grid
-from stages.physics.positions import blocks, valid_positions
+from stages.physics.images.table import Frame, load_frames, relative_path, write_frames
+from stages.physics.maps.grid import Grid, read_grid
+from stages.physics.maps.positions import blocks, valid_positions
 
 Progress = Callable[[int, int, str], None]
 

@@ -24,16 +24,17 @@ from torch import Tensor
 
 from schemas import CHECKPOINT, ArtefactWriter, ConfigError, InputError, check_output
 from schemas.provenance import sha256
-from stages.network import symmetries
-from stages.network.dataset import Batch, PairReader
+from stages.common.memory import keep_freed_memory
 from stages.network.losses import Radiometry, masked_mse, squared_error
 from stages.network.predictor import Predictor, choose_device, write_state
 from stages.network.processes import join_group, mean_over_ranks, same_everywhere, sum_gradients, sum_over_ranks
 from stages.network.resume import History, restore, save, snapshot
-from stages.network.runtime import choose_precision, keep_freed_memory
+from stages.network.runtime import choose_precision
 from stages.network.unet import DROPOUT, WIDTHS, UNet
 from stages.network.uniform import elevation_scale, fit_start
-from stages.physics.formation import Extension, form
+from stages.pairs import symmetries
+from stages.pairs.reader import Batch, PairReader
+from stages.physics.formation.chain import Extension, form
 from stages.physics.photometry import get_model
 
 CHECK_EVERY = 16  # batches: looking at the loss makes a GPU wait

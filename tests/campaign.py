@@ -119,7 +119,7 @@ def strength(planted: Path, twin: Path, snr: float, model: str) -> tuple[float, 
 
     from stages.diagnose.data import group_pairs, load_site
     from stages.diagnose.nominal import fit, lit_mask, load_nominal
-    from stages.network.dataset import PairReader
+    from stages.pairs.reader import PairReader
 
     residuals, errors = [], []
     for path in (planted, twin):

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import torch
 
-from stages.physics.formation import Observation
+from stages.physics.formation.chain import Observation
 from stages.physics.photometry import get_model
 
 GSD, RADIUS = 5.0, 1e9  # a body so large that crops are flat

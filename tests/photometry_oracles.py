@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from stages.physics import geometry
+from stages.physics.formation import geometry
 from stages.physics.photometry import evaluate
 from stages.physics.photometry.conventions import convert_maps, get_convention
 

@@ -14,7 +14,7 @@ from small_scene import LAT, LON, RADIUS, local_xy
 
 from stages import ingest, project, sample
 from stages.physics.cameras.pinhole import Pinhole
-from stages.physics.grid import unit_vectors
+from stages.physics.maps.grid import unit_vectors
 
 ALTITUDE = 120e3
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from rasterio.transform import Affine
 
-from stages.physics.grid import Grid, local_metric_crs, unit_vectors
+from stages.physics.maps.grid import Grid, local_metric_crs, unit_vectors
 
 RADIUS = 1737400.0
 

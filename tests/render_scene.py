@@ -12,7 +12,7 @@ from small_scene import write_raster
 
 from lunargr_cli import main as cli
 from schemas import SVBRDF, ArtefactWriter
-from stages.physics.grid import Grid
+from stages.physics.maps.grid import Grid
 
 LON, LAT = -42.0, 17.0
 SUN = ("--sun-azimuth", "100", "--sun-elevation", "35")

@@ -13,14 +13,14 @@ from small_scene import LAT, LON, RADIUS
 
 from schemas.errors import GeometryError, LunargrError
 from stages import ingest
-from stages.physics.bodies import find_body
+from stages.physics.bodies.ephemeris import subsolar_point, utc_to_et
+from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras import open_camera
 from stages.physics.cameras.pinhole import Pinhole
-from stages.physics.ephemeris import subsolar_point, utc_to_et
-from stages.physics.frame_geometry import complete_row
-from stages.physics.frames import read_frames
-from stages.physics.grid import unit_vectors
-from stages.physics.labels import label_time, product_time
+from stages.physics.images.frame_geometry import complete_row
+from stages.physics.images.labels import label_time, product_time
+from stages.physics.images.table import read_frames
+from stages.physics.maps.grid import unit_vectors
 
 
 @pytest.fixture(scope="module")

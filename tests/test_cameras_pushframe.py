@@ -13,9 +13,9 @@ import small_scene
 from raw_frames import photograph, residual, run_all, write_image
 
 from schemas.errors import GeometryError, InputError
+from stages.physics.bodies.ephemeris import AU
 from stages.physics.cameras import camera_from_document, camera_kinds
-from stages.physics.ephemeris import AU
-from stages.physics.grid import unit_vectors
+from stages.physics.maps.grid import unit_vectors
 
 STEP = 0.1  # s between framelets
 FOCAL_PX = 500.0

@@ -327,7 +327,7 @@ def _fitted(scene, folder):
     """A site with nothing hidden, and the nominal model of it."""
     from stages.diagnose.data import group_pairs, load_site
     from stages.diagnose.nominal import fit, load_nominal
-    from stages.network.dataset import PairReader
+    from stages.pairs.reader import PairReader
 
     with PairReader(_pairs(scene, folder, {})) as reader:
         site = load_site(reader, group_pairs(reader, np.arange(reader.count), 16)[0])

@@ -11,7 +11,7 @@ import torch
 from schemas import RegistryError
 from stages.effects import Survey, effect_names, get_effect
 from stages.effects.filters import gaussian
-from stages.physics.formation import Observation, displace, form
+from stages.physics.formation.chain import Observation, displace, form
 from stages.physics.photometry import get_model
 
 CATALOGUE = [

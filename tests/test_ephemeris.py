@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from schemas.errors import ConfigError, GeometryError, InputError
-from stages.physics import ephemeris
-from stages.physics.bodies import find_body
+from stages.physics.bodies import ephemeris
+from stages.physics.bodies.ephemeris import et_to_utc, parse_utc, subsolar_point, utc_to_et
+from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras import open_camera
-from stages.physics.ephemeris import et_to_utc, parse_utc, subsolar_point, utc_to_et
 
 
 def degrees_apart(a, b):

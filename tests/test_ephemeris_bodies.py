@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from schemas.errors import InputError
-from stages.physics.bodies import RADII, find_body
+from stages.physics.bodies.ephemeris import AU, KERNELS_VARIABLE, SATELLITES, body_rotation, et_to_utc, subsolar_point
+from stages.physics.bodies.orientations import ORIENTATIONS
+from stages.physics.bodies.small_bodies import ELEMENTS, Elements, small_body_state
+from stages.physics.bodies.spheres import RADII, find_body
 from stages.physics.cameras.document import quaternion_matrix
-from stages.physics.ephemeris import AU, KERNELS_VARIABLE, SATELLITES, body_rotation, et_to_utc, subsolar_point
-from stages.physics.orientations import ORIENTATIONS
-from stages.physics.small_bodies import ELEMENTS, Elements, small_body_state
 
 # Ephemeris time, body rotation (J2000 to body-fixed, w x y z) and the Sun (J2000, km) that SPICE gave in ALE's test ISDs
 # (github.com/DOI-USGS/ale, tests/pytests/data/isds: dawnfc, cassiniiss, galileossi, newhorizons, osirisrex, msi, hayabusa2).

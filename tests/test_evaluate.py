@@ -219,7 +219,7 @@ def test_shared_illumination_gives_what_the_formation_chain_gives(scene):
     import dataclasses
 
     from stages.evaluate.renderers import shade
-    from stages.physics.formation import form, illuminate
+    from stages.physics.formation.chain import form, illuminate
 
     observation = scene.observation(np.arange(6))
     horizon = torch.linspace(0.0, 1.2, 32).expand(6, 32, 32)

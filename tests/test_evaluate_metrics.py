@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from stages.evaluate.bootstrap import TileBootstrap
 from stages.evaluate.metrics import psnr, squared_error, ssim
-from stages.physics.radiometry import full_scale, match_crops
+from stages.physics.formation.radiometry import full_scale, match_crops
 
 
 def test_squared_error_counts_valid_pixels_only():

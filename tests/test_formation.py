@@ -7,11 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from stages.physics import facets
-from stages.physics.cosine_sums import cosine_sum
-from stages.physics.formation import Observation, form
-from stages.physics.penumbra import SUN_RADIUS, sun_visibility
+from stages.physics.formation.chain import Observation, facets, form
+from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
 from stages.physics.photometry import get_model, model_names
+from stages.physics.photometry.cosine_sums import cosine_sum
 
 
 def test_gradients_in_elevation_sun_and_camera():

@@ -17,9 +17,9 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from schemas.errors import InputError
-from stages.physics import rasters
-from stages.physics.grid import Grid, sphere_crs
-from stages.physics.labels import parse_pvl, read_label
+from stages.physics.images.labels import parse_pvl, read_label
+from stages.physics.maps import rasters
+from stages.physics.maps.grid import Grid, sphere_crs
 
 MOON = 1737400.0
 

@@ -11,9 +11,9 @@ import rasterio
 import small_scene
 from rasterio.transform import Affine
 
-from stages.physics import cog
-from stages.physics.geotiff import MapTiff, halve, halved
-from stages.physics.grid import Grid
+from stages.physics.maps import cog
+from stages.physics.maps.geotiff import MapTiff, halve, halved
+from stages.physics.maps.grid import Grid
 
 ATTRIBUTES = {"model": "M2", "quantity": "I/F", "gsd_m": 5.0, "body_radius_m": 1737400.0}
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import GeometryError
-from stages.physics import hulls, shadow
-from stages.physics.horizon import cast_shadow, cast_shadow_bands, horizon
+from stages.physics.horizon import cast_shadow, cast_shadow_bands, horizon, hulls, shadow
 
 GSD = 5.0
 AZIMUTHS_DEG = (0, 13, 45, 71, 90, 118, 135, 164, 180, 205, 225, 251, 270, 298, 315, 349)

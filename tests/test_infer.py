@@ -74,7 +74,7 @@ def test_no_squares_at_window_borders(small_artefacts, checkpoint, reference, tm
 def test_the_map_is_what_the_network_says_of_the_whole_terrain(small_artefacts, checkpoint, reference):
     with h5py.File(small_artefacts["scene"]) as file:
         z, valid = file["elevation"][...], file["dem_valid"][...].astype(bool)
-    from stages.network.normalisation import fill_holes
+    from stages.pairs.holes import fill_holes
 
     whole = load_predictor(checkpoint).coefficients(torch.from_numpy(fill_holes(z, valid))[None])[0].numpy()
     far = ~np.isnan(reference[0][0])

@@ -12,8 +12,8 @@ from rasterio.transform import Affine
 from schemas import ConfigError, GeometryError, InputError
 from stages import ingest
 from stages.ingest import elevation
-from stages.physics import rasters
-from stages.physics.positions import valid_positions
+from stages.physics.maps import rasters
+from stages.physics.maps.positions import valid_positions
 
 
 def test_scene_holds_the_dem_on_its_own_grid(small_files, tmp_path):

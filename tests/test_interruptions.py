@@ -19,8 +19,8 @@ from rasterio.crs import CRS
 from rasterio.transform import Affine
 
 from schemas import SVBRDF, ArtefactWriter, InputError, atomic_path
-from stages.physics.geotiff import MapTiff
-from stages.physics.grid import Grid
+from stages.physics.maps.geotiff import MapTiff
+from stages.physics.maps.grid import Grid
 
 LINE = "lunargr: interrupted; nothing half-written was kept.\n"
 

@@ -1,4 +1,4 @@
-"""Imports run one way: schemas <- physics <- network, effects <- stages <- command line; stages never import each other."""
+"""Imports run one way: schemas <- common <- physics <- pairs <- network, effects <- stages <- command line; stages never import each other."""
 
 from __future__ import annotations
 
@@ -8,7 +8,16 @@ import sys
 
 from conftest import ROOT
 
-LAYERS = ["schemas", "stages.physics", "stages.network|stages.effects", "stages", "lunargr_cli"]
+LAYERS = [
+    "schemas",
+    "stages.common",
+    "stages.physics",
+    "stages.pairs",
+    "stages.network|stages.effects",
+    "stages",
+    "lunargr_cli",
+]
+STAGES = LAYERS.index("stages")
 
 
 def _layer(module: str) -> int:
@@ -16,7 +25,7 @@ def _layer(module: str) -> int:
         for name in names.split("|"):
             if name != "stages" and (module == name or module.startswith(name + ".")):
                 return level
-    return 3 if module.split(".")[0] == "stages" else -1
+    return STAGES if module.split(".")[0] == "stages" else -1
 
 
 def _imports(path):
@@ -39,7 +48,7 @@ def test_imports_run_one_way():
                 if level < 0 or imported == "stages":
                     continue
                 upward = level > _layer(module)
-                stage_to_stage = level == _layer(module) == 3 and imported.split(".")[:2] != module.split(".")[:2]
+                stage_to_stage = level == _layer(module) == STAGES and imported.split(".")[:2] != module.split(".")[:2]
                 if upward or stage_to_stage:
                     wrong.append(f"{module} imports {imported}")
     assert not wrong, wrong

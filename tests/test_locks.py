@@ -13,13 +13,13 @@ import time
 import pytest
 
 from schemas import ConfigError, atomic_path
-from schemas.companions import companions_of
-from schemas.locks import SILENCE, claim, host, lock_path, unlocked
+from schemas.files.companions import companions_of
+from schemas.files.locks import SILENCE, claim, host, lock_path, unlocked
 
 
 def hold(path, seconds=60):
     """Another process that holds an output's lock."""
-    code = f"import time; from pathlib import Path; from schemas.locks import claim\nwith claim(Path({str(path)!r})):\n print('held', flush=True); time.sleep({seconds})"
+    code = f"import time; from pathlib import Path; from schemas.files.locks import claim\nwith claim(Path({str(path)!r})):\n print('held', flush=True); time.sleep({seconds})"
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert other.stdout.readline() == "held\n"
     return other
@@ -125,8 +125,8 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from schemas import atomic_path
-from schemas.companions import companions_of
-from schemas.locks import claim
+from schemas.files.companions import companions_of
+from schemas.files.locks import claim
 output = Path(sys.argv[1])
 with claim(output), companions_of(output):
     for name in ("map.tif", "map.png"):

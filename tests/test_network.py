@@ -10,12 +10,13 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from stages.network.losses import Radiometry, masked_mse, squared_error
-from stages.network.normalisation import FILL_REACH, fill_holes, scale_elevation
+from stages.network.normalisation import scale_elevation
 from stages.network.predictor import Predictor
 from stages.network.runtime import choose_inference_precision
-from stages.network.symmetries import COUNT, turn_field, turn_vector
 from stages.network.unet import UNet
-from stages.physics.formation import Observation, form
+from stages.pairs.holes import FILL_REACH, fill_holes
+from stages.pairs.symmetries import COUNT, turn_field, turn_vector
+from stages.physics.formation.chain import Observation, form
 from stages.physics.photometry import get_model, model_names
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from stages.diagnose.occluders import occluder_distance
-from stages.physics.formation import Observation
+from stages.physics.formation.chain import Observation
 
 SIZE, RIDGE = 96, 60
 

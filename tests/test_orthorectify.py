@@ -12,12 +12,12 @@ import pytest
 from rasterio.transform import Affine
 
 from schemas.errors import InputError
-from stages.physics.camera_image import open_camera_image
 from stages.physics.cameras import open_camera
 from stages.physics.cameras.orthographic import Orthographic
 from stages.physics.cameras.pinhole import Pinhole
-from stages.physics.grid import Grid, local_metric_crs
-from stages.physics.orthorectify import Terrain, footprint, orthorectify, reach_px
+from stages.physics.images.camera_image import open_camera_image
+from stages.physics.images.orthorectify import Terrain, footprint, orthorectify, reach_px
+from stages.physics.maps.grid import Grid, local_metric_crs
 
 MOON = 1737400.0
 

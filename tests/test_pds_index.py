@@ -9,8 +9,8 @@ from rasterio.transform import Affine
 from small_scene import write_raster
 
 from schemas.errors import InputError
-from stages.physics.frames import read_frames
-from stages.physics.labels import index_images
+from stages.physics.images.labels import index_images
+from stages.physics.images.table import read_frames
 
 COLUMNS = (
     ("FILE_SPECIFICATION_NAME", 40, "{:<38}"), ("PRODUCT_ID", 16, "{:<14}"), ("START_TIME", 26, "{:<24}"),

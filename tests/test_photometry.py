@@ -13,7 +13,7 @@ from conftest import SHARED
 from photometry_samples import directions, interior, reciprocity_error
 
 from schemas import RegistryError
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import (
     evaluate,
     get_model,

@@ -10,8 +10,8 @@ import pytest
 import torch
 from conftest import SHARED
 
-from stages.physics import geometry
-from stages.physics.geometry import Angles
+from stages.physics.formation import geometry
+from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import evaluate, get_model, masked_radiance_factor
 
 TOLERANCE = 1e-6

@@ -11,9 +11,9 @@ from rasterio.transform import Affine
 
 from schemas import ArtefactError, GeometryError, InputError
 from stages import ingest, project, sample
-from stages.network.dataset import PairReader
-from stages.physics.formation import form
-from stages.physics.grid import Grid
+from stages.pairs.reader import PairReader
+from stages.physics.formation.chain import form
+from stages.physics.maps.grid import Grid
 from stages.physics.photometry import get_model
 
 

@@ -10,10 +10,10 @@ from rasterio.transform import Affine
 from relief import RADIUS, body_point, hills, metric_grid
 
 from schemas.errors import GeometryError
-from stages.physics.chart import TOLERANCE, chart_position, fit_chart
-from stages.physics.grid import Grid, sphere_crs, unit_vectors
-from stages.physics.hits import hit_angles, hit_points, sample_maps, surface_normals
-from stages.physics.raycast import BELOW, HIT, MISS, build_height_field, cast
+from stages.physics.maps.grid import Grid, sphere_crs, unit_vectors
+from stages.render.chart import TOLERANCE, chart_position, fit_chart
+from stages.render.ray_points import hit_angles, hit_points, sample_maps, surface_normals
+from stages.render.raycast import BELOW, HIT, MISS, build_height_field, cast
 
 
 def square_grid(size: int, gsd: float, lon: float = 12.0, lat: float = -34.0) -> Grid:

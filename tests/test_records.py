@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from schemas import PAIRS, ArtefactError, ArtefactWriter
-from schemas.hdf5 import UNKNOWN
+from schemas.files.hdf5 import UNKNOWN
 from schemas.reading import unpack
-from stages.network.dataset import PairReader
-from stages.network.records import Mapping, Records
+from stages.pairs.reader import PairReader
+from stages.pairs.records import Mapping, Records
 
 N, SIZE = 150, 128
 FIELDS = ("elevation", "image", "valid", "sun_horizon_deg")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import GeometryError
-from stages.physics.registration import Shift, estimate_shift, fit_field
+from stages.physics.images.registration import Shift, estimate_shift, fit_field
 
 FINE = 4  # the scene is made this much finer than its images, so that a shift of 1/4 px needs no interpolation
 SIZE = 128

@@ -15,11 +15,11 @@ from render_scene import LAT, LON, SUN, lunargr_render, make_grid, write_dem, wr
 
 from schemas import DIAGNOSIS, ArtefactWriter
 from stages import render
-from stages.physics import light
-from stages.physics.grid import Grid, unit_vectors
+from stages.physics.maps.grid import Grid, unit_vectors
 from stages.physics.photometry import evaluate
-from stages.physics.pictures import read_exr
+from stages.physics.terrain import sun_visibility as light
 from stages.render import maps
+from stages.render.pictures import read_exr
 
 
 def test_a_level_map_has_the_angles_of_the_sphere(tmp_path):

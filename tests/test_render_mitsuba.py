@@ -9,15 +9,15 @@ import pytest
 from rasterio.transform import Affine
 from relief import body_point, hills
 
-from stages.physics.grid import Grid, local_metric_crs, unit_vectors
-from stages.physics.light import SunHorizon
-from stages.physics.mapview import Light
-from stages.physics.penumbra import SUN_RADIUS
-from stages.physics.perspective import make_scene, render_view
+from stages.physics.light.sun_disc import SUN_RADIUS
+from stages.physics.maps.grid import Grid, local_metric_crs, unit_vectors
 from stages.physics.photometry import get_model
-from stages.physics.sun import Sun, sun_from_angles
-from stages.physics.surface import Surface
-from stages.physics.view import look_at, pinhole_view
+from stages.physics.terrain.shading import Light
+from stages.physics.terrain.sun import Sun, sun_from_angles
+from stages.physics.terrain.sun_visibility import SunHorizon
+from stages.physics.terrain.surface import Surface
+from stages.render.perspective import make_scene, render_view
+from stages.render.viewpoint import look_at, pinhole_view
 
 mi = pytest.importorskip("mitsuba", reason="the test extra brings mitsuba")
 

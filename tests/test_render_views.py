@@ -13,13 +13,13 @@ from render_scene import LAT, LON, SUN, lunargr_render, write_dem
 from scipy.spatial.transform import Rotation
 
 from stages import render
-from stages.physics.bodies import Body
+from stages.physics.bodies.spheres import Body
 from stages.physics.cameras import camera_from_document, read_document
-from stages.physics.grid import read_grid, unit_vectors
-from stages.physics.hits import hit_points
-from stages.physics.pictures import read_exr
-from stages.physics.raycast import HIT, build_height_field, cast
-from stages.physics.surface import open_surface
+from stages.physics.maps.grid import read_grid, unit_vectors
+from stages.physics.terrain.surface import open_surface
+from stages.render.pictures import read_exr
+from stages.render.ray_points import hit_points
+from stages.render.raycast import HIT, build_height_field, cast
 
 
 def test_a_camera_over_the_map_sees_what_the_map_says(hilly_map, tmp_path):

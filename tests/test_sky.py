@@ -10,13 +10,13 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from schemas.errors import GeometryError
-from stages.physics.earthshine import earth_direction_enu, earth_irradiance
-from stages.physics.formation import Observation, form
+from stages.physics.formation.chain import Observation, form
 from stages.physics.horizon import horizon
-from stages.physics.penumbra import SUN_RADIUS, sun_visibility
+from stages.physics.light.earth import earth_direction_enu, earth_irradiance
+from stages.physics.light.sky import TerrainLight, sky_view, terrain_light
+from stages.physics.light.smooth_horizon import differentiable_horizon
+from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
 from stages.physics.photometry import get_model
-from stages.physics.sky import TerrainLight, sky_view, terrain_light
-from stages.physics.smooth_horizon import differentiable_horizon
 
 GSD = 5.0
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from stages.infer.parallel import in_order, side_by_side
 from stages.infer.terrain import TerrainReader, valid_part
-from stages.infer.working import in_order, side_by_side
-from stages.network.mapping import Mapper
-from stages.network.normalisation import fill_holes
+from stages.network.cpu.mapper import Mapper
 from stages.network.predictor import Predictor
 from stages.network.unet import WIDTHS, UNet
+from stages.pairs.holes import fill_holes
 from stages.physics.photometry import get_model
 
 SMALL = (4, 4, 6, 6, 8)

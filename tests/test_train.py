@@ -16,11 +16,11 @@ import small_scene
 
 from schemas import PAIRS, ArtefactError, ArtefactWriter, ConfigError, InputError, RegistryError
 from stages import ingest, project, sample, train
-from stages.network.dataset import PairReader
 from stages.network.predictor import load_predictor
 from stages.network.unet import DROPOUT
 from stages.network.uniform import fit_radiometry, fit_uniform
-from stages.physics.formation import form
+from stages.pairs.reader import PairReader
+from stages.physics.formation.chain import form
 from stages.physics.photometry import get_model
 
 SMALL = {"widths": (4, 8), "dropout": (0.0, 0.1), "batch": 16, "device": "cpu", "precision": "fp32", "lr": 2e-3}

@@ -61,7 +61,7 @@ def command(
 
     from lunargr_cli.console import Console
     from schemas import ConfigError, check_output
-    from schemas.locks import scratch_path
+    from schemas.files.locks import scratch_path
     from stages import infer
 
     if precision not in ("auto", "fp32", "bf16"):

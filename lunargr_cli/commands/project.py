@@ -119,7 +119,7 @@ def _write_regions(path: Path, registered: Iterable[Registered]) -> None:
     """One row per region: where it is on the scene's grid, and what it said."""
     import csv
 
-    from schemas.outputs import atomic_path
+    from schemas.files.outputs import atomic_path
 
     with atomic_path(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         out = csv.writer(file)

@@ -38,7 +38,7 @@ class Here:
     """One after the other, in this process."""
 
     def work(self, tasks: Sequence[Task]) -> Iterator[Path]:
-        from schemas.locks import unlocked
+        from schemas.files.locks import unlocked
 
         for task in tasks:
             with unlocked():
@@ -156,7 +156,7 @@ class _Dask:
 
 def _work(task: Task, common: tuple[str, dict[Any, str], tuple[str, str] | None]) -> LunargrError | None:
     """On a worker. A LunargrError is an answer: no other worker would find anything else."""
-    from schemas.locks import unlocked
+    from schemas.files.locks import unlocked
     from schemas.provenance import known_digests, run_by
 
     expected, digests, command = common

@@ -16,8 +16,8 @@ from typing import Any
 
 from lunargr_cli.fanout.engines import Engine, Here, Task, open_dask
 from schemas.errors import ConfigError, InputError
-from schemas.locks import claim
-from schemas.outputs import check_output
+from schemas.files.locks import claim
+from schemas.files.outputs import check_output
 from schemas.provenance import sha256
 
 Progress = Callable[[int, int, str], None]

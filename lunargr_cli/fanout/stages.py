@@ -12,8 +12,8 @@ from typing import Any
 
 from lunargr_cli.fanout.job import open_job
 from schemas import ConfigError, atomic_path
-from schemas.companions import companions_of
-from schemas.outputs import check_output
+from schemas.files.companions import companions_of
+from schemas.files.outputs import check_output
 
 # What a part holds where --parts does not say: some minutes of work on real data.
 BANDS_OF_DEM, BANDS_OF_MAP, PAIRS, SAMPLES = 8, 8, 512, 4

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 
 from schemas import ArtefactError, ConfigError, atomic_path, check_output
-from schemas.companions import companions_of
+from schemas.files.companions import companions_of
 from stages.diagnose.answer import Answer, HeldOut, cause_json, held_out, parameters, write_diagnosis
 from stages.diagnose.chain import Chain
 from stages.diagnose.data import group_pairs, load_site, survey
@@ -42,7 +42,7 @@ from stages.diagnose.selection import enough, search
 from stages.diagnose.state import Search
 from stages.diagnose.unexplained import Structure, blind_effects, measure
 from stages.effects import Effect, effect_names
-from stages.network.dataset import PairReader
+from stages.pairs.reader import PairReader
 
 HARM = 10.0  # percent by which unseen pairs may be predicted worse (the same texture in all images of few sites can do that)
 MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model says nothing about the images

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from stages.diagnose.data import Site
 from stages.effects import Effect
-from stages.physics import formation, geometry
-from stages.physics.formation import State
+from stages.physics.formation import chain as formation
+from stages.physics.formation.chain import State, geometry
 from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
 
 STEP = 0.02  # of a slope, as tangent

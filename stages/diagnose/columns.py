@@ -11,7 +11,7 @@ from torch import Tensor
 
 from stages.diagnose.chain import Chain
 from stages.effects import Effect, Survey, Trial, get_effect
-from stages.physics.formation import State
+from stages.physics.formation.chain import State
 
 # What every data set has a little of, always fitted along, with the size that is ordinary (multiples of the column):
 # without a bound on it a strange amount of one imitates other effects.

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from stages.diagnose.occluders import occluder_distance
 from stages.effects import Survey, fields
-from stages.network.dataset import PairReader
-from stages.physics.formation import Observation
+from stages.pairs.reader import PairReader
+from stages.physics.formation.chain import Observation
 
 MARGIN = math.radians(1.2)  # from the horizon: closer, a DEM error decides whether a pixel is lit
 GRAZING = math.cos(math.radians(84))  # a slope error of a degree changes brightness by 15 % there

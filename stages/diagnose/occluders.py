@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from stages.physics.formation import Observation
+from stages.physics.formation.chain import Observation
 
 STEP, UNTIL = 0.5, 12  # px: fine steps near by; further away than so many steps they grow with the distance
 BEYOND = math.radians(0.25)  # by so much the known horizon must exceed the crop's own to be terrain outside the crop

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from stages.diagnose.chain import Chain
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import ReflectanceModel
 
 SAMPLES = 8_000

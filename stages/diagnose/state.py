@@ -16,7 +16,7 @@ from stages.diagnose.images import FEWEST, ImageEvidence
 from stages.diagnose.nominal import ROUNDS, Nominal, fit, lit_mask
 from stages.diagnose.parallel import per_site
 from stages.effects import Effect, Survey, effect_names, get_effect
-from stages.physics import formation
+from stages.physics.formation import chain as formation
 
 # With gains free the level of an image says nothing of the phase function, nor the contrast of slopes of their height.
 LEVEL_AGAINST_CONTRAST = {"dem_scale"}

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from stages.effects.base import Effect, register
 from stages.effects.fields import cosine_field
-from stages.physics.formation import State
+from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
 ORDERS = tuple((m, n) for m in range(4) for n in range(4) if 0 < m + n <= 4)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from schemas.errors import ConfigError, RegistryError
-from stages.physics.formation import SLOTS, State
+from stages.physics.formation.chain import SLOTS, State
 from stages.physics.photometry import Parameter
 
 Values = dict[str, Any]  # coordinate -> float (scene), or tensor (frames,) or (sites,)

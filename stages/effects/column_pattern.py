@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from stages.effects.base import Effect, register
-from stages.physics.formation import State
+from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
 ORDERS = tuple(range(1, 9))

@@ -7,8 +7,8 @@ from typing import ClassVar
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
-from stages.physics.formation import State
-from stages.physics.geometry import crop_axes
+from stages.physics.formation.chain import State
+from stages.physics.formation.geometry import crop_axes
 from stages.physics.photometry import Parameter
 
 SIDES = ("any", "north", "east", "south", "west")

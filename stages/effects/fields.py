@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from stages.effects.filters import gaussian, laplacian
-from stages.physics import geometry
+from stages.physics.formation import geometry
 
 CURVATURE_SIGMA2 = 4.0  # px^2: curvature of the raw DEM is mostly its noise
 

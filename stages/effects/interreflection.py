@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from stages.effects.base import Effect, register
-from stages.physics import geometry
-from stages.physics.formation import State
+from stages.physics.formation.chain import State, geometry
 from stages.physics.photometry import Parameter
 
 CELLS = 64  # the crop is cut into at most this many cells a side: exchange of light is a smooth field

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from stages.effects.base import Effect, Survey, Trial, register
-from stages.physics.formation import State
+from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 from stages.physics.photometry.roughness import rough_surface
 

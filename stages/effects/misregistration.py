@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from stages.effects.base import Effect, register
-from stages.physics.formation import State
+from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
-from stages.physics.formation import State
+from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
 

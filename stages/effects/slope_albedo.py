@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from stages.effects import fields
 from stages.effects.base import Effect, register
-from stages.physics.formation import State
+from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
 

@@ -23,8 +23,8 @@ from stages.evaluate.renderers import (
     read_batch,
     unit_images,
 )
-from stages.physics.formation import Extension
-from stages.physics.radiometry import crop_range, full_scale
+from stages.physics.formation.chain import Extension
+from stages.physics.formation.radiometry import crop_range, full_scale
 
 SAMPLE_PIXELS = 100_000  # for models that are not linear in their parameters
 TITLES = {

@@ -11,14 +11,14 @@ import h5py
 import numpy as np
 
 from schemas import atomic_path
-from schemas.hdf5 import silence_hdf5
+from schemas.files.hdf5 import silence_hdf5
 from stages.effects import load_extension
 from stages.evaluate.core import Row, Scores, choose_fit_pairs, dn_scale, fit_renderers, layout, make_renderers, score
 from stages.evaluate.perceptual import Perceptual
 from stages.evaluate.renderers import Constant, Predictor
-from stages.network.dataset import PairReader
 from stages.network.predictor import choose_device, load_predictor
-from stages.physics.formation import Extension
+from stages.pairs.reader import PairReader
+from stages.physics.formation.chain import Extension
 
 TABLES = ("squared_error", "ssim", "ssim_range_1", "lpips")
 COUNTS = ("pixels", "data_range")

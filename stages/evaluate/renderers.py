@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from schemas.errors import ArtefactError
-from stages.physics.formation import Extension, Observation, State, expose, form, illuminate
+from stages.physics.formation.chain import Extension, Observation, State, expose, form, illuminate
+from stages.physics.formation.radiometry import match_crops
 from stages.physics.photometry import ReflectanceModel, get_model, masked_radiance_factor
-from stages.physics.radiometry import match_crops
 
 
 class Reader(Protocol):
-    """What evaluate needs of a pairs file (``stages.network.dataset.PairReader``)."""
+    """What evaluate needs of a pairs file (``stages.pairs.reader.PairReader``)."""
 
     split: np.ndarray
     tile: np.ndarray

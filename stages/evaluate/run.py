@@ -23,7 +23,7 @@ from schemas import (
     open_artefact,
     read_config,
 )
-from schemas.companions import companions_of
+from schemas.files.companions import companions_of
 from stages.effects import load_extension
 from stages.evaluate.bootstrap import TileBootstrap
 from stages.evaluate.core import TITLES, Row, Scores, choose_fit_pairs, dn_scale, fit_renderers, layout, score
@@ -31,10 +31,10 @@ from stages.evaluate.parts import join_scores, read_fit, write_fit, write_scores
 from stages.evaluate.perceptual import Perceptual
 from stages.evaluate.renderers import Predictor, Reader
 from stages.evaluate.table import gain_table, metric_table
-from stages.network.dataset import PairReader
 from stages.network.predictor import Predictor as Network
 from stages.network.predictor import choose_device, load_predictor
-from stages.physics.formation import Extension
+from stages.pairs.reader import PairReader
+from stages.physics.formation.chain import Extension
 
 RENDERINGS_LIMIT = 512 * 2**20  # bytes of rendered crops that are kept without being asked for
 MANY_TILES = 10  # fewer make percentile intervals too narrow

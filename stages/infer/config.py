@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from stages.physics.grid import Grid
+from stages.physics.maps.grid import Grid
 
 
 @dataclass(frozen=True)

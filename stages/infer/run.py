@@ -28,20 +28,20 @@ from schemas import (
     open_artefact,
     read_strings,
 )
-from schemas.companions import companions_of
-from schemas.hdf5 import silence_hdf5
+from schemas.files.companions import companions_of
+from schemas.files.hdf5 import silence_hdf5
+from stages.common.memory import keep_freed_memory, return_freed_memory
 from stages.infer.config import Config, Summary
+from stages.infer.parallel import in_order, side_by_side
 from stages.infer.terrain import TerrainReader, valid_part
 from stages.infer.windows import Box, axis_windows, own_rows, swaths_of, window_and_stride, windows_of
-from stages.infer.working import in_order, side_by_side
 from stages.infer.writing import Blend, Outputs
-from stages.network.mapping import Mapper
-from stages.network.normalisation import fill_holes
+from stages.network.cpu.mapper import Mapper
 from stages.network.predictor import choose_device, load_predictor
-from stages.network.runtime import choose_inference_precision, keep_freed_memory
-from stages.physics.geotiff import EVEN, MapTiff
-from stages.physics.grid import read_grid
-from stages.physics.memory import return_freed_memory
+from stages.network.runtime import choose_inference_precision
+from stages.pairs.holes import fill_holes
+from stages.physics.maps.geotiff import EVEN, MapTiff
+from stages.physics.maps.grid import read_grid
 
 Progress = Callable[[int, int, str], None]
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.network.normalisation import FILL_REACH, fill_holes
-from stages.physics.geotiff import EVEN
+from stages.pairs.holes import FILL_REACH, fill_holes
+from stages.physics.maps.geotiff import EVEN
 
 READ = 1024  # rows read at once: what filling holes needs around them is read again with the next
 

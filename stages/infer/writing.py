@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from schemas import ArtefactWriter
 from stages.infer.windows import CHUNK, WIDEST, Box, blend_weights
-from stages.physics.geotiff import MapTiff
+from stages.physics.maps.geotiff import MapTiff
 
 
 class Outputs:

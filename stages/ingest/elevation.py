@@ -19,8 +19,8 @@ from schemas import (
 )
 from stages.ingest.config import Config, Progress
 from stages.ingest.plan import Plan
-from stages.physics import rasters
-from stages.physics.grid import Grid
+from stages.physics.maps import rasters
+from stages.physics.maps.grid import Grid
 
 STRIP_PX = 4096  # a raster whose blocks are wider is one in strips
 STRIPS = 96 << 20  # bytes of strips that stay in GDAL's cache

@@ -17,8 +17,8 @@ from schemas import (
     GeometryError,
     InputError,
 )
-from stages.physics import rasters
-from stages.physics.grid import Grid, local_metric_crs
+from stages.physics.maps import rasters
+from stages.physics.maps.grid import Grid, local_metric_crs
 
 # A map whose pixels are within this of square and of the working GSD counts as metric: no resampling, only means.
 METRIC_TOLERANCE = 0.01

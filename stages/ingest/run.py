@@ -25,15 +25,15 @@ from schemas import (
     open_artefact,
     read_config,
 )
-from schemas.hdf5 import silence_hdf5
+from schemas.files.hdf5 import silence_hdf5
 from stages.ingest.config import Config, Progress
 from stages.ingest.elevation import take_elevation, write_elevation
 from stages.ingest.plan import plan_grid
 from stages.ingest.validity import check_frames, with_digests, write_validity
-from stages.physics import rasters
-from stages.physics.bodies import Body, find_body
-from stages.physics.frames import Frame, load_frames, read_frames, write_frames
-from stages.physics.grid import Grid, check_body, read_grid, require_crs
+from stages.physics.bodies.spheres import Body, find_body
+from stages.physics.images.table import Frame, load_frames, read_frames, write_frames
+from stages.physics.maps import rasters
+from stages.physics.maps.grid import Grid, check_body, read_grid, require_crs
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ from schemas import (
 from schemas.provenance import sha256
 from stages.ingest.config import Config, Progress
 from stages.ingest.plan import ANY_RELIEF
-from stages.physics.frames import Frame
-from stages.physics.grid import Grid
-from stages.physics.positions import blocks, valid_positions
-from stages.physics.sources import open_source
+from stages.physics.images.source_images import open_source
+from stages.physics.images.table import Frame
+from stages.physics.maps.grid import Grid
+from stages.physics.maps.positions import blocks, valid_positions
 
 
 def check_frames(frames: Sequence[Frame], grid: Grid, skip_outside: bool) -> tuple[list[Frame], list[str]]:

@@ -10,9 +10,9 @@ from typing import Any
 
 from schemas import ConfigError, atomic_path, check_output
 from stages.match.base import Matches, Models, get_matcher
+from stages.match.comparisons import comparisons
 from stages.match.consistency import summarise
 from stages.match.pictures import inside, match_figure, stretch_limits, to_grey
-from stages.match.sources import comparisons
 
 FIGURES = 4  # comparisons that are drawn
 

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from schemas.errors import ArtefactError
-from schemas.hdf5 import silence_hdf5
-from schemas.outputs import atomic_path
+from schemas.files.hdf5 import silence_hdf5
+from schemas.files.outputs import atomic_path
 from stages.network.losses import Radiometry
 from stages.network.predictor import Predictor, read_state, write_state
 

@@ -1,35 +1,18 @@
-"""Making the machine run fast: freed memory that stays mapped, and bf16 only where a probe finds it faster."""
+"""Which precision a machine runs fastest in: bf16 only where a probe finds it faster."""
 
 from __future__ import annotations
 
-import ctypes
-import sys
 import time
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stages.network.mapping import Mapper
+from stages.network.cpu.mapper import Mapper
 from stages.network.predictor import Predictor
 
 CLOSE = 0.02  # of a coefficient's spread: what bf16 may cost in inference
 WORTH_IT = 1.25  # bf16 loses digits: it must be faster by this much
-
-
-def keep_freed_memory() -> None:
-    """Let glibc keep freed blocks instead of returning them: page faults cost fp32 training up to three times its time."""
-    if not sys.platform.startswith("linux"):
-        return
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError):
-        return  # another C library, which has no such knob
-    m_trim_threshold, m_top_pad, m_mmap_threshold, m_arena_max = -1, -2, -3, -8
-    mallopt(m_arena_max, 1)  # other threads' own arenas map large blocks anew each time
-    mallopt(m_mmap_threshold, 1 << 30)
-    mallopt(m_trim_threshold, (1 << 31) - 1)
-    mallopt(m_top_pad, 1 << 26)
 
 
 def choose_precision(predictor: Predictor, size: tuple[int, int], device: torch.device) -> str:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from stages.network.fused import join, norm_act, pool, quarter_weights
+from stages.network.cpu.fused_layers import join, norm_act, pool, quarter_weights
 from stages.network.layers import SLOPE, BatchNorm, Dropout, draw_keys
 
 WIDTHS = (16, 32, 64, 128, 256)

@@ -9,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.network.dataset import Batch, PairReader
 from stages.network.losses import Radiometry
-from stages.physics.formation import form
+from stages.pairs.reader import Batch, PairReader
+from stages.physics.formation.chain import form
 from stages.physics.photometry import ReflectanceModel, get_model
 
 REFERENCE = "lunar_lambert"  # the published surface against which unknown gains and offsets are first fitted

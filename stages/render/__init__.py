@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from schemas.companions import companions_of
-from schemas.outputs import check_output
-from stages.physics.bodies import find_body
+from schemas.files.companions import companions_of
+from schemas.files.outputs import check_output
+from stages.physics.bodies.spheres import find_body
 from stages.render.config import Config, Summary, check, inputs, output_files
 from stages.render.maps import render_map
 from stages.render.setting import find_camera, make_light, open_source

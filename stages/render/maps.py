@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from schemas.errors import GeometryError
-from stages.physics.mapview import BACKPLANES, Light, shade_block
-from stages.physics.pictures import Preview, write_exr, write_geotiff, write_png
-from stages.physics.surface import Surface
+from stages.physics.terrain.shading import BACKPLANES, Light, shade_block
+from stages.physics.terrain.surface import Surface
 from stages.render.config import Config, Summary, Tally
+from stages.render.pictures import Preview, write_exr, write_geotiff, write_png
 from stages.render.setting import metadata
 
 Progress = Callable[[int, int, str], None]

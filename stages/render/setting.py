@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import ConfigError
-from stages.physics.bodies import Body
+from stages.physics.bodies.spheres import Body
 from stages.physics.cameras import Camera, open_camera
-from stages.physics.frames import ASTRONOMICAL_UNIT
-from stages.physics.light import SunHorizon
-from stages.physics.mapview import Light
-from stages.physics.penumbra import SUN_RADIUS
-from stages.physics.sun import Sun, check_sun_is_up, find_sun
-from stages.physics.surface import Surface, open_surface, open_terrain
-from stages.physics.view import look_at, pinhole_view, place, rotation_from_quaternion
+from stages.physics.images.table import ASTRONOMICAL_UNIT
+from stages.physics.light.sun_disc import SUN_RADIUS
+from stages.physics.terrain.shading import Light
+from stages.physics.terrain.sun import Sun, check_sun_is_up, find_sun
+from stages.physics.terrain.sun_visibility import SunHorizon
+from stages.physics.terrain.surface import Surface, open_surface, open_terrain
 from stages.render.config import SUN, Config
+from stages.render.viewpoint import look_at, pinhole_view, place, rotation_from_quaternion
 
 
 @contextlib.contextmanager

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
-from schemas.outputs import check_output
-from stages.physics.bodies import find_body
+from schemas.files.outputs import check_output
+from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras.base import Camera
-from stages.physics.grid import Grid
-from stages.physics.mapview import BACKPLANES, Light
-from stages.physics.perspective import apply_sensor, make_scene, render_view
-from stages.physics.pictures import Preview, write_exr, write_png
-from stages.physics.surface import Surface
-from stages.physics.trajectory import ViewRow, read_trajectory
+from stages.physics.maps.grid import Grid
+from stages.physics.terrain.shading import BACKPLANES, Light
+from stages.physics.terrain.surface import Surface
 from stages.render.config import SUN, Config, Summary, Tally, check, inputs, output_files, skipped
+from stages.render.perspective import apply_sensor, make_scene, render_view
+from stages.render.pictures import Preview, write_exr, write_png
 from stages.render.setting import camera_place, find_camera, make_light, metadata, open_source
+from stages.render.trajectory import ViewRow, read_trajectory
 
 Floats32 = NDArray[np.float32]
 Progress = Callable[[int, int, str], None]

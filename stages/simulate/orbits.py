@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.physics.ephemeris import SubsolarPoint, subsolar_point
+from stages.physics.bodies.ephemeris import SubsolarPoint, subsolar_point
 from stages.simulate.recipe import Config
 
 RADIUS = 1737400.0  # m

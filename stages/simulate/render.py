@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stages.physics import formation
-from stages.physics.grid import Grid
+from stages.physics.formation import chain as formation
 from stages.physics.horizon import horizon
-from stages.physics.penumbra import SUN_RADIUS, sun_visibility
+from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
+from stages.physics.maps.grid import Grid
 from stages.physics.photometry import masked_radiance_factor
 from stages.simulate.hidden import Hidden, find
 from stages.simulate.orbits import Pass

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 
-from stages.physics.grid import Grid
+from stages.physics.maps.grid import Grid
 from stages.simulate.hidden import Hidden, find
 from stages.simulate.orbits import Pass, Strip
 from stages.simulate.recipe import Config

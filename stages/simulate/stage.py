@@ -15,8 +15,8 @@ from rasterio.windows import Window
 
 from schemas import atomic_path, check_output
 from schemas.provenance import SIDECAR, sidecar
-from stages.physics.frames import ASTRONOMICAL_UNIT
-from stages.physics.grid import Grid, local_metric_crs, unit_vectors
+from stages.physics.images.table import ASTRONOMICAL_UNIT
+from stages.physics.maps.grid import Grid, local_metric_crs, unit_vectors
 from stages.simulate import sensor
 from stages.simulate.hidden import Hidden, find
 from stages.simulate.orbits import RADIUS, Pass, plan_passes

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 
 from schemas import TRUTH, ArtefactWriter, atomic_path
-from stages.physics.geometry import Angles
-from stages.physics.grid import Grid
+from stages.physics.formation.geometry import Angles
+from stages.physics.maps.grid import Grid
 from stages.simulate.hidden import CHOICES, Hidden, find
 from stages.simulate.orbits import Pass, direction, sub_point
 from stages.simulate.recipe import Config

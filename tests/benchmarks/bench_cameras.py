@@ -18,8 +18,8 @@ from rasterio.transform import Affine
 
 from stages.physics.cameras import open_camera
 from stages.physics.cameras.linescan import LineScan, _into
-from stages.physics.grid import Grid, local_metric_crs
-from stages.physics.orthorectify import Terrain, orthorectify
+from stages.physics.images.orthorectify import Terrain, orthorectify
+from stages.physics.maps.grid import Grid, local_metric_crs
 
 SHARED = Path(os.environ.get("LUNARGR_SHARED", Path(__file__).resolve().parents[3] / "shared"))
 POINTS = 1_000_000

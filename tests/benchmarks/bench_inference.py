@@ -26,10 +26,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from schemas import CHECKPOINT, ArtefactWriter
+from stages.common.memory import keep_freed_memory
 from stages.infer.terrain import TerrainReader
-from stages.network.mapping import Mapper
+from stages.network.cpu.mapper import Mapper
 from stages.network.predictor import Predictor, write_state
-from stages.network.runtime import keep_freed_memory
 from stages.network.unet import DROPOUT, WIDTHS, UNet
 from stages.physics.photometry import get_model
 

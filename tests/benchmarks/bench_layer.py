@@ -18,11 +18,12 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from stages.common.memory import keep_freed_memory
 from stages.network.losses import squared_error
 from stages.network.predictor import Predictor
-from stages.network.runtime import choose_precision, keep_freed_memory
+from stages.network.runtime import choose_precision
 from stages.network.unet import UNet
-from stages.physics.formation import Observation, form
+from stages.physics.formation.chain import Observation, form
 from stages.physics.photometry import get_model
 
 BATCH, SIZE, GSD, ROUNDS = 64, 128, 5.0, 9

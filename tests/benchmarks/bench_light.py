@@ -108,7 +108,7 @@ def large(size: int, azimuth_deg: float, folder: Path) -> None:
     import h5py
     import torch
 
-    from stages.physics import geometry
+    from stages.physics.formation import geometry
     from stages.physics.horizon import cast_shadow_bands
     from stages.physics.photometry import get_model, masked_radiance_factor
 

@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import torch
 
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import get_model, masked_radiance_factor, model_names
 
 BATCH, SIZE, REPEATS = 64, 128, 9

@@ -23,14 +23,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from relief import body_point, hills
 
-from stages.physics.grid import Grid, local_metric_crs
-from stages.physics.light import SunHorizon
-from stages.physics.mapview import Light, shade_block
-from stages.physics.perspective import make_scene, render_view
+from stages.physics.maps.grid import Grid, local_metric_crs
 from stages.physics.photometry import get_model
-from stages.physics.sun import sun_from_angles
-from stages.physics.surface import Surface
-from stages.physics.view import look_at, pinhole_view
+from stages.physics.terrain.shading import Light, shade_block
+from stages.physics.terrain.sun import sun_from_angles
+from stages.physics.terrain.sun_visibility import SunHorizon
+from stages.physics.terrain.surface import Surface
+from stages.render.perspective import make_scene, render_view
+from stages.render.viewpoint import look_at, pinhole_view
 
 RADIUS, GSD, ALBEDO, FOV = 1737400.0, 5.0, 0.3, 20.0
 

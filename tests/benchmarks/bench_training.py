@@ -21,12 +21,12 @@ from torch.nn import functional
 
 from schemas import PAIRS, ArtefactWriter
 from stages import train
-from stages.network.dataset import PairReader
+from stages.common.memory import keep_freed_memory
 from stages.network.losses import squared_error
 from stages.network.predictor import Predictor
-from stages.network.runtime import keep_freed_memory
 from stages.network.unet import DROPOUT, WIDTHS, UNet
-from stages.physics.formation import form
+from stages.pairs.reader import PairReader
+from stages.physics.formation.chain import form
 from stages.physics.horizon import horizon as trace
 from stages.physics.photometry import get_model
 

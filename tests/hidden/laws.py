@@ -77,7 +77,7 @@ def roughness(mu0, mu, cosg, theta_deg):
     """Hapke's (1984) roughness relative to a smooth Lommel-Seeliger surface; the published formula of the program."""
     import torch
 
-    from stages.physics.geometry import Angles
+    from stages.physics.formation.geometry import Angles
     from stages.physics.photometry.roughness import rough_surface
 
     angles = Angles(torch.as_tensor(mu0), torch.as_tensor(mu), torch.as_tensor(cosg + 0 * mu0))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import GeometryError, InputError
-from stages.physics.bodies import find_body
+from stages.physics.bodies.spheres import find_body
 
 Floats = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-6

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import InputError
-from stages.physics.grid import CSM_CENTRE, ISIS_CENTRE
-from stages.physics.labels import Block, isis_table, read_label
+from stages.physics.images.labels import Block, isis_table, read_label
+from stages.physics.maps.grid import CSM_CENTRE, ISIS_CENTRE
 
 ISIS_SHIFT = ISIS_CENTRE - CSM_CENTRE
 

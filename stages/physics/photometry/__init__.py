@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from schemas.errors import RegistryError
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import (
     Parameter,
     ReflectanceModel,

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from schemas.errors import RegistryError
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, register
 from stages.physics.photometry.hapke import OPTIONAL, Hapke, HapkeBase
 

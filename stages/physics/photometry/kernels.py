@@ -21,7 +21,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, horizon_cosine, register
 from stages.physics.photometry.roughness import GLSL_ROUGH_SURFACE, rough_surface
 

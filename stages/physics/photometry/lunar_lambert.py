@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, register
 
 # McEwen (1996): L(g) = 1 + A g + B g^2 + C g^3 with g in degrees; negative beyond 105 deg.

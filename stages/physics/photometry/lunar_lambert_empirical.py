@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, register
 from stages.physics.photometry.lunar_lambert import GLSL_MIXTURE, MCEWEN, lunar_share, mixture
 

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import leaky_relu
 
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
 
 SLOPE = 0.01  # of the LeakyReLU that keeps coefficients nearly positive, as in the authors' code
@@ -67,7 +67,7 @@ class IncidencePhasePolynomial(CosinePolynomial):
 
     def lit(self, coefficients: Tensor, angles: Angles, light: Tensor) -> Tensor:
         # numba takes a quarter of a second to load, which `lunargr models` has no use for
-        from stages.physics.cosine_sums import cosine_sum, fits
+        from stages.physics.photometry.cosine_sums import cosine_sum, fits
 
         geometry = angles.cos_incidence, angles.cos_phase, light
         if not fits(coefficients, *geometry):

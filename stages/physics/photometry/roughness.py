@@ -21,7 +21,7 @@ import math
 import torch
 from torch import Tensor
 
-from stages.physics.geometry import Angles
+from stages.physics.formation.geometry import Angles
 
 GLSL_ROUGH_SURFACE = """
 vec2 facets(float cot_angle, float cot_theta) {

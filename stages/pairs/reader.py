@@ -1,0 +1,221 @@
+"""Reading pairs.h5 for networks: batches of observations, images and masks."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import zlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from schemas.artefacts import PAIRS, SPLITS
+from schemas.errors import ArtefactError
+from schemas.reading import open_artefact, read_strings, unpack
+from stages.common.memory import keep_freed_memory
+from stages.pairs.holes import fill_holes
+from stages.pairs.records import Mapping, Records
+from stages.pairs.symmetries import turn_field, turn_vector
+from stages.physics.formation.chain import Observation
+
+
+@dataclass
+class Batch:
+    """What one step works on: ``image`` and ``valid`` are (B, H, W), float32 and bool."""
+
+    observation: Observation
+    image: Tensor
+    valid: Tensor
+
+    def to(self, device: torch.device) -> Batch:
+        o = self.observation
+        for name in (
+            "elevation",
+            "sun_direction",
+            "camera_position",
+            "sun_horizon",
+            "sky_view",
+            "detector_sample",
+            "detector_line",
+            "frame",
+        ):
+            value = getattr(o, name)
+            setattr(o, name, None if value is None else value.to(device, non_blocking=True))
+        return Batch(o, self.image.to(device, non_blocking=True), self.valid.to(device, non_blocking=True))
+
+
+FIELDS = ("elevation", "image", "valid", "sun_horizon_deg", "sky_view")
+DETECTOR = ("detector_sample", "detector_line")
+
+
+class PairReader:
+    """Random access to pairs.h5, whoever wrote it and however it is laid out.
+
+    split, tile, frame, site : (n,) arrays; image_ids : one per frame; units : 'iof' or 'dn'; gsd, body_radius : m
+    threads : that read and decode one batch; detector : whether observations say where on the sensor a pixel was seen
+    """
+
+    def __init__(self, path: Path, threads: int = 1, detector: bool = True) -> None:
+        self.path = Path(path)
+        self.file: h5py.File = open_artefact(self.path, PAIRS)
+        f = self.file
+        self._stack = contextlib.ExitStack()
+        self._stack.callback(f.close)
+        mapping = Mapping(self.path)
+        self._stack.callback(mapping.close)
+        keep_freed_memory()  # page faults of new arrays would cost as much as reading
+        self._threads = max(1, threads)
+        self._pool = self._stack.enter_context(ThreadPoolExecutor(self._threads)) if threads > 1 else None
+        names = FIELDS + (DETECTOR if detector else ())
+        self._records = {name: Records(f[name], mapping) for name in names if name in f}
+        self.size: tuple[int, int] = f["elevation"].shape[1:]
+        self.count: int = f["elevation"].shape[0]
+        if not self.count:
+            raise ArtefactError(f"{path}: expected pairs, found none; sample more crops.")
+        self.gsd = float(f.attrs["gsd_m"])
+        self.body_radius = float(f.attrs["body_radius_m"])
+        unit = f["image"].attrs.get("units", "1")
+        self.units = "dn" if (unit.decode() if isinstance(unit, bytes) else str(unit)) == "dn" else "iof"
+        self.split = f["split"][...].astype(np.int64)
+        self.frame = f["image_index"][...].astype(np.int64)
+        self.site = f["site"][...].astype(np.int64)
+        self.tile = f["tile"][...].astype(np.int64) if "tile" in f else self.site
+        self._sun, self._camera = (
+            unpack(f[n], f[n][...]).astype(np.float32) for n in ("sun_direction_enu", "camera_position_enu")
+        )
+        self.image_ids = read_strings(f, "image_id")
+        if self.frame.min() < 0 or self.frame.max() >= len(self.image_ids):
+            raise ArtefactError(
+                f"{path}:/image_index: expected indices below {len(self.image_ids)} (frames), found {self.frame.max()}."
+            )
+
+    def close(self) -> None:
+        self._stack.close()
+
+    def __enter__(self) -> PairReader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def indices(self, part: str) -> NDArray[np.int64]:
+        """Pairs of 'train', 'validation' or 'test'."""
+        return np.flatnonzero(self.split == dict(SPLITS)[part])
+
+    def _read(self, names: Sequence[str], indices: Sequence[int] | NDArray) -> dict[str, NDArray]:
+        """Variables of some pairs, (B, H, W): float32 with NaN where unknown, or flags; shared out over the threads."""
+        wanted = np.asarray(indices, dtype=np.int64)
+        parts = np.array_split(np.arange(len(wanted)), min(self._threads, max(1, len(wanted) // 4)))
+        out, jobs = {}, []
+        for name in (n for n in names if n in self._records):
+            records = self._records[name]
+            records.prepare(len(wanted))
+            out[name] = records.empty(len(wanted))
+            jobs += [(records, out[name][p[0] : p[-1] + 1], wanted[p]) for p in parts if len(p)]
+        try:
+            if self._pool is None:
+                for records, target, which in jobs:
+                    records.read_into(target, which)
+            else:
+                for done in [self._pool.submit(r.read_into, target, which) for r, target, which in jobs]:
+                    done.result()
+        except (OSError, zlib.error) as error:
+            raise ArtefactError(
+                f"{self.path}: cannot be read to the end ({error}); the file is damaged or truncated, write it again."
+            ) from None
+        return out
+
+    def elevation(self, indices: Sequence[int] | NDArray) -> Tensor:
+        """(B, H, W) float32 m; holes are filled from their surroundings."""
+        return torch.from_numpy(_without_holes(self._read(["elevation"], indices)["elevation"]))
+
+    def observation(self, indices: Sequence[int] | NDArray) -> Observation:
+        """Everything about these pairs but their images."""
+        names = [n for n in self._records if n not in ("image", "valid")]
+        return self._observation(self._read(names, indices), indices)
+
+    def _observation(self, found: dict[str, NDArray], indices: Sequence[int] | NDArray) -> Observation:
+        def optional(name: str) -> Tensor | None:
+            return torch.from_numpy(found[name]) if name in found else None
+
+        horizon = found.get("sun_horizon_deg")
+        if horizon is not None:
+            _replace_unknown(horizon, -90.0)
+            horizon *= np.float32(math.pi / 180)
+        rows = np.asarray(indices)
+        return Observation(
+            elevation=torch.from_numpy(_without_holes(found["elevation"])),
+            sun_direction=torch.from_numpy(self._sun[rows]),
+            camera_position=torch.from_numpy(self._camera[rows]),
+            gsd=self.gsd,
+            body_radius=self.body_radius,
+            sun_horizon=optional("sun_horizon_deg"),
+            sky_view=optional("sky_view"),
+            detector_sample=optional("detector_sample"),
+            detector_line=optional("detector_line"),
+            frame=torch.from_numpy(self.frame[rows]),
+        )
+
+    def image(self, indices: Sequence[int] | NDArray) -> Tensor:
+        """(B, H, W) float32; 0 where invalid."""
+        return torch.from_numpy(_replace_unknown(self._read(["image"], indices)["image"], 0.0))
+
+    def valid(self, indices: Sequence[int] | NDArray) -> Tensor:
+        """(B, H, W) bool: DEM and image both valid and finite."""
+        return torch.from_numpy(_validity(self._read(["valid", "image", "elevation"], indices)))
+
+    def batch(self, indices: Sequence[int] | NDArray, symmetries: NDArray | None = None) -> Batch:
+        """A batch, each pair under its own symmetry of the square where given."""
+        found = self._read(list(self._records), indices)
+        valid = torch.from_numpy(_validity(found))
+        image = torch.from_numpy(_replace_unknown(found["image"], 0.0))
+        batch = Batch(self._observation(found, indices), image, valid)
+        if symmetries is not None:
+            _turn(batch, symmetries)
+        return batch
+
+
+def _all_known(values: NDArray) -> bool:
+    return bool(np.isfinite(values.sum()))
+
+
+def _replace_unknown(values: NDArray, by: float) -> NDArray:
+    """In place."""
+    if not _all_known(values):
+        np.nan_to_num(values, copy=False, nan=by, posinf=by, neginf=by)
+    return values
+
+
+def _validity(found: dict[str, NDArray]) -> NDArray[np.bool_]:
+    flag = found["valid"] > 0.5
+    for name in ("image", "elevation"):
+        if not _all_known(found[name]):
+            flag &= np.isfinite(found[name])
+    return flag
+
+
+def _without_holes(elevation: NDArray[np.float32]) -> NDArray[np.float32]:
+    if not _all_known(elevation):
+        finite = np.isfinite(elevation)
+        for k in np.flatnonzero(~finite.all(axis=(1, 2))):
+            elevation[k] = fill_holes(elevation[k], finite[k])
+    return elevation
+
+
+def _turn(batch: Batch, symmetries: NDArray) -> None:
+    o = batch.observation
+    fields = [batch.image, batch.valid, o.elevation]
+    fields += [f for f in (o.sun_horizon, o.sky_view, o.detector_sample, o.detector_line) if f is not None]
+    for k, symmetry in enumerate(symmetries):
+        if symmetry:
+            for field in fields:
+                field[k] = turn_field(field[k].clone(), int(symmetry))
+            o.sun_direction[k] = turn_vector(o.sun_direction[k].clone(), int(symmetry))
+            o.camera_position[k] = turn_vector(o.camera_position[k].clone(), int(symmetry))

@@ -1,0 +1,1 @@
+"""Bodies: their spheres, where they are and how they are turned."""

@@ -1,0 +1,180 @@
+"""How an image comes to be: the ordered chain geometry -> illumination -> reflectance -> radiance -> sensor.
+
+Every step is differentiable in the coefficients and, where the chain is smooth, in elevation, Sun and camera.
+Extensions (``stages/effects``) act at the slot that they name; the order of the slots fixes their composition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from stages.physics.formation import facets, geometry
+from stages.physics.formation.geometry import Angles
+from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
+from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
+
+SLOTS = ("geometry", "illumination", "reflectance", "radiance", "sensor")
+
+
+@dataclass
+class Observation:
+    """What is known about a batch of crops before any reflectance is chosen.
+
+    elevation : (B, H, W) float32, m
+    sun_direction : (B, 3), unit, ENU along the crop's axes
+    camera_position : (B, 3), m from the crop's centre
+    sun_horizon : (B, H, W), rad, or None where nothing casts shadows
+    sky_view : (B, H, W), 1, or None
+    detector_sample, detector_line : (B, H, W), px, or None
+    frame : (B,) int64, index of the source image, or None
+    site : (B,) int64, number of the ground site, or None
+    """
+
+    elevation: Tensor
+    sun_direction: Tensor
+    camera_position: Tensor
+    gsd: float
+    body_radius: float
+    sun_horizon: Tensor | None = None
+    sky_view: Tensor | None = None
+    detector_sample: Tensor | None = None
+    detector_line: Tensor | None = None
+    frame: Tensor | None = None
+    site: Tensor | None = None
+
+
+@dataclass
+class State:
+    """What the chain has made so far; an extension changes what its slot may change.
+
+    geometry      sees and may change: elevation, sun_horizon, camera_position, displacement (where the map projection
+                  looked: columns to the east, rows to the south, px, broadcastable to the image)
+    illumination  sees also slopes, view; may change: sun_direction, sun_horizon, sun_radius, further_light (functions
+                  of the state, run once the directly lit radiance is known; each adds to it)
+    reflectance   sees also angles, sun_visibility; may change: reflectance (I/F of a lit facet)
+    radiance      may change: radiance (I/F that reaches the camera)
+    sensor        may change: image; sees measured, (B, H, W) with NaN where invalid, where a measurement is being explained:
+                  what repeats the light repeats what came in, shadows in their true places
+    """
+
+    observation: Observation
+    elevation: Tensor
+    sun_direction: Tensor
+    camera_position: Tensor
+    sun_horizon: Tensor | None
+    sun_radius: float | Tensor = SUN_RADIUS
+    displacement: tuple[Tensor, Tensor] | None = None
+    further_light: list[Callable[[State], None]] = field(default_factory=list)
+    slopes: tuple[Tensor, Tensor] = field(default=None)  # type: ignore[assignment]
+    view: tuple[Tensor, Tensor, Tensor] = field(default=None)  # type: ignore[assignment]
+    angles: Angles = field(default=None)  # type: ignore[assignment]
+    sun_visibility: Tensor | None = None
+    reflectance: Tensor = field(default=None)  # type: ignore[assignment]
+    radiance: Tensor = field(default=None)  # type: ignore[assignment]
+    image: Tensor = field(default=None)  # type: ignore[assignment]
+    measured: Tensor | None = None
+
+
+class Extension(Protocol):
+    """A physical effect that extends the chain (``stages/effects``)."""
+
+    @property
+    def slot(self) -> str: ...
+
+    def apply(self, state: State) -> None: ...
+
+
+def form(
+    observation: Observation,
+    model: ReflectanceModel,
+    coefficients: Tensor,
+    extensions: Sequence[Extension] = (),
+) -> Tensor:
+    """The image, in I/F, of a batch of crops.
+
+    coefficients : (B, C, H, W) or anything that broadcasts to it, in the order of ``model.parameters``
+    returns (B, H, W)
+    """
+    if not extensions:
+        o = observation
+        known = facets.look(o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius)
+        if known is not None:
+            return model.lit(coefficients, *known)
+    state = illuminate(observation, extensions)
+    parameters = model.unpack(coefficients, dim=1)
+    state.reflectance = masked_radiance_factor(model, parameters, state.angles)
+    return expose(state, extensions)
+
+
+def illuminate(observation: Observation, extensions: Sequence[Extension] = (), known: State | None = None) -> State:
+    """The first half of the chain, which no coefficient enters: slopes, angles and the visible share of the Sun.
+
+    known : a state of the same observation; what the extensions leave as it is there is taken over, not computed again
+    """
+    state = State(
+        observation,
+        observation.elevation,
+        observation.sun_direction,
+        observation.camera_position,
+        observation.sun_horizon,
+    )
+    _apply(state, extensions, "geometry")
+    gsd, radius = observation.gsd, observation.body_radius
+    ground = known
+    if known is not None and state.elevation is known.elevation and state.camera_position is known.camera_position:
+        state.slopes, state.view = known.slopes, known.view
+    else:
+        ground = None
+        state.slopes = geometry.curvature_slopes(*geometry.slopes(state.elevation, gsd), gsd, radius)
+        state.view = geometry.view_vectors(state.elevation, state.camera_position, gsd)
+    _apply(state, extensions, "illumination")
+    if ground is not None and state.sun_direction is ground.sun_direction:
+        state.angles = ground.angles
+    else:
+        state.angles = geometry.photometric_angles(*state.slopes, state.sun_direction, state.view)
+    if state.sun_horizon is not None:
+        sun_elevation = torch.asin(state.sun_direction[:, 2].clamp(-1, 1)).to(state.elevation.dtype)
+        state.sun_visibility = sun_visibility(sun_elevation[:, None, None], state.sun_horizon, state.sun_radius)
+    return state
+
+
+def expose(state: State, extensions: Sequence[Extension] = ()) -> Tensor:
+    """The second half of the chain: from the I/F of lit facets to the image."""
+    _apply(state, extensions, "reflectance")
+    lit = state.sun_visibility
+    state.radiance = state.reflectance if lit is None else state.reflectance * lit
+    for add_light in state.further_light:
+        add_light(state)
+    _apply(state, extensions, "radiance")
+    state.image = state.radiance if state.displacement is None else displace(state.radiance, *state.displacement)
+    _apply(state, extensions, "sensor")
+    return state.image
+
+
+def displace(image: Tensor, east: Tensor, south: Tensor) -> Tensor:
+    """The image as seen ``east`` columns and ``south`` rows further on, bicubic, edges repeated.
+
+    Bilinear sampling would blur by up to a quarter of a squared pixel.
+
+    image : (B, H, W); east, south : px, broadcastable to it
+    """
+    height, width = image.shape[-2:]
+    columns = torch.arange(width, dtype=image.dtype, device=image.device) + east
+    rows = torch.arange(height, dtype=image.dtype, device=image.device)[:, None] + south
+    x, y = torch.broadcast_tensors(columns, rows)
+    grid = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], dim=-1).expand(len(image), -1, -1, -1)
+    sampled = torch.nn.functional.grid_sample(
+        image[:, None], grid, mode="bicubic", padding_mode="border", align_corners=False
+    )
+    return sampled[:, 0]
+
+
+def _apply(state: State, extensions: Sequence[Extension], slot: str) -> None:
+    for extension in extensions:
+        if extension.slot == slot:
+            extension.apply(state)

@@ -1,0 +1,1 @@
+"""Source images: their table, labels and places on the ground."""

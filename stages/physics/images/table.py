@@ -1,0 +1,173 @@
+"""The image table: one frame per source image, with its Sun and its camera. `images.csv`, or JSON with the same keys."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.reading import read_strings
+from schemas.writing import ArtefactWriter
+from stages.physics.bodies.spheres import Body, find_body
+from stages.physics.images.frame_geometry import complete_row
+from stages.physics.images.labels import index_images
+from stages.physics.maps.grid import unit_vectors
+
+ASTRONOMICAL_UNIT = 149597870700.0  # m, IAU 2012
+
+_NUMBERS = {
+    "subsolar_longitude_deg": (-360.0, 360.0),
+    "subsolar_latitude_deg": (-90.0, 90.0),
+    "solar_distance_au": (0.05, 100.0),
+    "spacecraft_longitude_deg": (-360.0, 360.0),
+    "spacecraft_latitude_deg": (-90.0, 90.0),
+    "spacecraft_altitude_m": (1.0, 1e10),
+}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One source image. ``units`` is 'iof' or 'dn'; ``camera`` is None for map-projected images; digests once it was read."""
+
+    image_id: str
+    path: Path
+    units: str
+    camera: Path | None
+    start_time: str
+    subsolar_longitude_deg: float
+    subsolar_latitude_deg: float
+    solar_distance_au: float
+    spacecraft_longitude_deg: float
+    spacecraft_latitude_deg: float
+    spacecraft_altitude_m: float
+    sha256: str = ""
+    camera_sha256: str = ""
+
+    def sun_position(self) -> np.ndarray:
+        """(3,) body-fixed, m."""
+        direction = unit_vectors(self.subsolar_longitude_deg, self.subsolar_latitude_deg)
+        return direction * self.solar_distance_au * ASTRONOMICAL_UNIT
+
+    def camera_position(self, radius: float) -> np.ndarray:
+        """(3,) body-fixed, m."""
+        direction = unit_vectors(self.spacecraft_longitude_deg, self.spacecraft_latitude_deg)
+        return direction * (radius + self.spacecraft_altitude_m)
+
+
+def read_frames(table: Path, body: Body | None = None) -> list[Frame]:
+    """Read and check an image table, or a PDS3 index (CUMINDEX.TAB) in its place.
+
+    What the table leaves empty is taken from the camera model, the image's label or its time: see frame_geometry.
+    Raises InputError naming the row and column.
+    """
+    if not table.exists():
+        raise InputError(f"{table}: no such file; expected the image table (images.csv or JSON).")
+    try:
+        if table.suffix.lower() in (".tab", ".lbl"):
+            return _frames(table, index_images(table), body)
+        text = table.read_text(encoding="utf-8-sig")
+        rows = json.loads(text) if table.suffix.lower() == ".json" else list(csv.DictReader(text.splitlines()))
+    except (UnicodeDecodeError, json.JSONDecodeError, csv.Error) as error:
+        raise InputError(f"{table}: expected a CSV or JSON table, found something else ({error}).") from None
+    if isinstance(rows, Mapping):
+        rows = rows.get("images", [])
+    if not rows:
+        raise InputError(f"{table}: expected at least one image, found none.")
+    return _frames(table, rows, body)
+
+
+def _frames(table: Path, rows: Sequence[Mapping[str, Any]], body: Body | None) -> list[Frame]:
+    body = body or find_body("moon")
+    frames = [_frame(table, number, row, body) for number, row in enumerate(rows, start=1)]
+    seen: set[str] = set()
+    for frame in frames:
+        if frame.image_id in seen:
+            raise InputError(f"{table}: expected each image_id once, found '{frame.image_id}' twice.")
+        seen.add(frame.image_id)
+    return frames
+
+
+def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Frame:
+    where = f"{table}: image {number}"
+    text = {k: ("" if v is None else str(v).strip()) for k, v in row.items() if k is not None}
+    for key in ("image_id", "path"):
+        if not text.get(key):
+            raise InputError(f"{where}: expected a value in column '{key}', found none.")
+    units = text.get("units", "").lower()
+    if units not in ("iof", "dn"):
+        raise InputError(f"{where} ({text['image_id']}): expected units 'iof' or 'dn', found '{units or 'nothing'}'.")
+    camera = text.get("camera", "")
+    text = complete_row(
+        text,
+        table.parent / text["path"],
+        table.parent / camera if camera else None,
+        body,
+        f"{where} ({text['image_id']})",
+    )
+    numbers: dict[str, Any] = {}
+    for key, (low, high) in _NUMBERS.items():
+        try:
+            value = float(text.get(key, ""))
+        except ValueError:
+            raise InputError(
+                f"{where} ({text['image_id']}): expected a number in column '{key}', found '{text.get(key, '') or 'nothing'}'."
+            ) from None
+        if not (math.isfinite(value) and low <= value <= high):
+            raise InputError(f"{where} ({text['image_id']}): expected '{key}' in {low:g}..{high:g}, found {value:g}.")
+        numbers[key] = value
+    return Frame(
+        image_id=text["image_id"],
+        path=(table.parent / text["path"]),
+        units=units,
+        camera=table.parent / camera if camera else None,
+        start_time=text.get("start_time", ""),
+        **numbers,
+    )
+
+
+def write_frames(writer: ArtefactWriter, frames: Sequence[Frame]) -> None:
+    """Write the frame table of a scene or crops artefact; paths become relative to it."""
+    folder = writer.path.resolve().parent
+    writer.write("image_id", [f.image_id for f in frames])
+    writer.write("path", [relative_path(f.path, folder) for f in frames])
+    writer.write("camera", [relative_path(f.camera, folder) if f.camera else "" for f in frames])
+    writer.write("start_time", [f.start_time for f in frames])
+    if all(f.sha256 for f in frames):
+        writer.write("sha256", [f.sha256 for f in frames])
+        writer.write("camera_sha256", [f.camera_sha256 for f in frames])
+    writer.write("units", np.array([0 if f.units == "iof" else 1 for f in frames], np.uint8))
+    for key in _NUMBERS:
+        writer.write(key, np.array([getattr(f, key) for f in frames]))
+
+
+def load_frames(file: h5py.File, path: Path) -> list[Frame]:
+    """The frame table of a scene or crops artefact at ``path``."""
+    folder = path.resolve().parent
+    names, paths, cameras, times = (read_strings(file, k) for k in ("image_id", "path", "camera", "start_time"))
+    columns: dict[str, Any] = {key: file[key][...].tolist() for key in _NUMBERS}
+    columns |= {k: read_strings(file, k) for k in ("sha256", "camera_sha256") if k in file}
+    return [
+        Frame(
+            image_id=names[k],
+            path=folder / paths[k],
+            units="dn" if file["units"][k] else "iof",
+            camera=folder / cameras[k] if cameras[k] else None,
+            start_time=times[k],
+            **{key: column[k] for key, column in columns.items()},
+        )
+        for k in range(len(names))
+    ]
+
+
+def relative_path(path: Path, folder: Path) -> str:
+    """``path`` as seen from ``folder``: artefacts name their sources so that a folder can move as a whole."""
+    return os.path.relpath(path.resolve(), folder)

@@ -1,0 +1,1 @@
+"""Light: the Sun's disc, the sky, the terrain around, the Earth."""

@@ -1,0 +1,1 @@
+"""Map grids, and the rasters on them."""

@@ -1,0 +1,249 @@
+"""Map grids: where a pixel is on the body, which way its axes point, and how large it truly is.
+
+The one place for pixel conventions. Ours counts pixel *centres* from 0: row r, column c is the centre of the pixel in
+array[r, c]. GDAL counts corners from 0 (our centre 0 is its 0.5), CSM centres from 0.5, ISIS centres from 1.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import h5py
+import numpy as np
+import rasterio.warp
+from numpy.typing import ArrayLike, NDArray
+from rasterio.crs import CRS
+from rasterio.errors import CRSError
+from rasterio.transform import Affine
+
+from schemas.errors import ArtefactError, GeometryError, InputError
+from stages.physics.bodies.spheres import Body
+
+GDAL_CENTRE = 0.5  # GDAL's coordinate of the centre of the first pixel
+CSM_CENTRE = 0.5
+ISIS_CENTRE = 1.0
+_ELLIPSOID = re.compile(r"(?:SPHEROID|ELLIPSOID)\[\"[^\"]*\",\s*([0-9.eE+]+),\s*([0-9.eE+]+)")
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A north-up map grid on a body.
+
+    transform : GDAL-style affine, corner convention; ``height`` x ``width`` pixels; ``radius`` of the sphere in metres
+    """
+
+    crs_wkt: str
+    transform: Affine
+    height: int
+    width: int
+    radius: float
+
+    @cached_property
+    def crs(self) -> CRS:
+        return _parsed(self.crs_wkt)
+
+    @property
+    def squash(self) -> float:
+        """:func:`latitude_squash` of its CRS."""
+        return _squash(self.crs_wkt)
+
+    @cached_property
+    def _geographic(self) -> CRS:
+        """Longitude and latitude of the kind that ``crs`` itself counts in."""
+        if self.squash == 1.0:
+            return sphere_crs(self.radius)
+        return CRS.from_proj4(f"+proj=longlat {ellipsoid_of(self.crs)} +no_defs")
+
+    @property
+    def gsd(self) -> float:
+        """Nominal ground sample distance, m (the grid's own unit must be the metre)."""
+        return float(self.transform.a)
+
+    def xy(self, row: ArrayLike, col: ArrayLike) -> tuple[Floats, Floats]:
+        """Map coordinates of (row, col) in our centre convention."""
+        row, col = np.asarray(row, float), np.asarray(col, float)
+        t = self.transform
+        u, v = col + GDAL_CENTRE, row + GDAL_CENTRE
+        return t.a * u + t.b * v + t.c, t.d * u + t.e * v + t.f
+
+    def rowcol(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
+        """(row, col), fractional, of map coordinates."""
+        inverse = ~self.transform
+        x, y = np.asarray(x, float), np.asarray(y, float)
+        col = inverse.a * x + inverse.b * y + inverse.c - GDAL_CENTRE
+        row = inverse.d * x + inverse.e * y + inverse.f - GDAL_CENTRE
+        return row, col
+
+    def lonlat(self, row: ArrayLike, col: ArrayLike) -> tuple[Floats, Floats]:
+        """East longitude and planetocentric latitude, degrees."""
+        return self.map_lonlat(*self.xy(row, col))
+
+    def map_lonlat(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
+        """East longitude and planetocentric latitude, degrees, of map coordinates."""
+        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        lon, lat = rasterio.warp.transform(self.crs, self._geographic, x.ravel(), y.ravel())
+        lat = _scaled_tangent(np.asarray(lat), self.squash)
+        return np.reshape(lon, x.shape), np.reshape(lat, x.shape)
+
+    def rowcol_of_lonlat(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
+        """(row, col), fractional, of places given in degrees."""
+        return self.rowcol(*self.map_xy(longitude_deg, latitude_deg))
+
+    def map_xy(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
+        """Map coordinates of places given in degrees."""
+        lon, lat = np.broadcast_arrays(np.asarray(longitude_deg, float), np.asarray(latitude_deg, float))
+        lat_own = _scaled_tangent(lat.ravel(), 1 / self.squash)
+        x, y = rasterio.warp.transform(self._geographic, self.crs, lon.ravel(), lat_own)
+        return np.reshape(x, lon.shape), np.reshape(y, lon.shape)
+
+    def window(self, row: int, col: int, height: int, width: int) -> Grid:
+        """The grid of array[row : row + height, col : col + width]."""
+        moved = self.transform @ Affine.translation(col, row)
+        return Grid(self.crs_wkt, moved, height, width, self.radius)
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """left, bottom, right, top of the outer pixel edges."""
+        x0, y0 = self.transform @ (0, 0)
+        x1, y1 = self.transform @ (self.width, self.height)
+        return min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1)
+
+    def local_frames(self, row: ArrayLike, col: ArrayLike) -> LocalFrames:
+        """Axes along the grid at each place, and the true size of a pixel there.
+
+        The Sun's and the camera's directions must follow the crop's own rows and columns, which turn against true
+        north by the meridian convergence (a full circle around the pole of a polar stereographic map).
+        """
+        row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
+        n = row.size
+        half = 0.5
+        rows = np.concatenate([row.ravel() + d for d in (0, -half, half, 0, 0)])
+        cols = np.concatenate([col.ravel() + d for d in (0, 0, 0, -half, half)])
+        points = unit_vectors(*self.lonlat(rows, cols)).reshape(5, n, 3)
+        up = points[0]
+        towards_north = (points[1] - points[2]) * self.radius
+        towards_east = (points[4] - points[3]) * self.radius
+        pixel = np.stack([np.linalg.norm(towards_north, axis=1), np.linalg.norm(towards_east, axis=1)], axis=1)
+        north = towards_north - (towards_north * up).sum(1, keepdims=True) * up
+        north /= np.linalg.norm(north, axis=1, keepdims=True)
+        east = np.cross(north, up)
+        pole = np.array([0.0, 0.0, 1.0])
+        true_east = np.cross(pole, up)
+        true_north = np.cross(up, true_east)
+        convergence = np.degrees(np.arctan2((true_north * east).sum(1), (true_north * north).sum(1)))
+        return LocalFrames(np.stack([east, north, up], axis=1), pixel, convergence)
+
+
+@dataclass(frozen=True)
+class LocalFrames:
+    """Local frames at n places.
+
+    axes : (n, 3, 3), rows are grid-east, grid-north and up in body-fixed coordinates
+    pixel_size : (n, 2), true metres along a column step (rows) and a row step (columns)
+    convergence_deg : (n,), azimuth of true north clockwise from grid north
+    """
+
+    axes: Floats
+    pixel_size: Floats
+    convergence_deg: Floats
+
+    @property
+    def up(self) -> Floats:
+        return self.axes[:, 2]
+
+
+def unit_vectors(longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> Floats:
+    """Body-fixed unit vectors (..., 3) of places in degrees."""
+    lon, lat = np.radians(np.asarray(longitude_deg, float)), np.radians(np.asarray(latitude_deg, float))
+    return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat) + 0 * lon], axis=-1)
+
+
+@lru_cache(maxsize=256)
+def _parsed(wkt: str) -> CRS:
+    return CRS.from_wkt(wkt)
+
+
+@lru_cache(maxsize=256)
+def sphere_crs(radius: float) -> CRS:
+    """Longitude and latitude on the reference sphere."""
+    return CRS.from_proj4(f"+proj=longlat +R={radius!r} +no_defs")
+
+
+def local_metric_crs(longitude_deg: float, latitude_deg: float, radius: float) -> CRS:
+    """Oblique stereographic about a place: shapes are true (conformal), scale grows by (d / 2R)^2."""
+    return CRS.from_proj4(
+        f"+proj=stere +lat_0={latitude_deg:.6f} +lon_0={longitude_deg:.6f} +k=1 +x_0=0 +y_0=0 +R={radius!r} +units=m +no_defs"
+    )
+
+
+def crs_radius(crs: CRS) -> float | None:
+    """Equatorial radius of a CRS's ellipsoid in metres, None where it names none."""
+    match = re.search(r"(?:SPHEROID|ELLIPSOID)\[\"[^\"]*\",\s*([0-9.eE+]+)", crs.to_wkt())
+    return float(match.group(1)) if match else None
+
+
+def latitude_squash(crs: CRS) -> float:
+    """tan(planetocentric) / tan(planetographic latitude), (b/a)^2: 1 for spheres and where the CRS says 'ocentric'.
+
+    PROJ leaves latitudes as they are between an ellipsoid and a sphere, which on Mars is 20 km in the middle latitudes.
+    """
+    return _squash(crs.to_wkt())
+
+
+@lru_cache(maxsize=256)
+def _squash(wkt: str) -> float:
+    match = _ELLIPSOID.search(wkt)
+    inverse = float(match.group(2)) if match else 0.0
+    return 1.0 if inverse == 0 or "ocentric" in wkt.lower() else (1 - 1 / inverse) ** 2
+
+
+def ellipsoid_of(crs: CRS) -> str:
+    """A CRS's ellipsoid as PROJ parameters."""
+    match = _ELLIPSOID.search(crs.to_wkt())
+    if match is None:
+        return ""
+    return f"+a={match.group(1)} +rf={match.group(2)}" if float(match.group(2)) else f"+R={match.group(1)}"
+
+
+def _scaled_tangent(latitude_deg: Floats, factor: float) -> Floats:
+    if factor == 1.0:
+        return latitude_deg
+    latitude = np.radians(latitude_deg)
+    return np.degrees(np.arctan2(factor * np.sin(latitude), np.cos(latitude)))
+
+
+def check_body(where: str, crs: CRS, body: Body) -> None:
+    """Refuse a CRS of another body. Raises GeometryError."""
+    found = crs_radius(crs)
+    if found is not None and abs(found - body.radius) > 0.005 * body.radius:
+        raise GeometryError(
+            f"{where}: expected a CRS on a sphere of {body.radius:g} m ({body.name}), found radius {found:g} m; name the body with --body."
+        )
+
+
+def read_grid(file: h5py.File, path: object) -> Grid:
+    """The grid of an artefact with a ``crs`` variable."""
+    if "crs" not in file or "GeoTransform" not in file["crs"].attrs:
+        raise ArtefactError(f"{path}:/crs: expected a georeference, found none; write it again.")
+    attributes = file["crs"].attrs
+    c, a, b, f, d, e = (float(v) for v in str(attributes["GeoTransform"]).split())
+    height, width = file["elevation"].shape[-2:]
+    return Grid(str(attributes["crs_wkt"]), Affine(a, b, c, d, e, f), height, width, float(file.attrs["body_radius_m"]))
+
+
+def require_crs(where: str, crs: CRS | None, transform: Affine) -> CRS:
+    """The CRS of a raster that must be georeferenced. Raises InputError."""
+    if crs is None or transform == Affine.identity():
+        raise InputError(
+            f"{where}: expected a georeferenced raster, found no CRS; assign one (gdal_edit.py -a_srs) or, for a raw image, give its camera."
+        )
+    try:
+        crs.to_wkt()
+    except CRSError as error:
+        raise InputError(
+            f"{where}: its CRS cannot be understood ({error}); assign one with gdal_edit.py -a_srs."
+        ) from None
+    return crs

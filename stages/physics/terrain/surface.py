@@ -1,0 +1,178 @@
+"""What is rendered: a terrain on a metric grid and its reflectance, read window by window."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from rasterio.windows import Window
+
+from schemas.artefacts import SCENE, SVBRDF
+from schemas.errors import ArtefactError, ConfigError, InputError, RegistryError
+from schemas.reading import open_artefact, read_kind, read_strings
+from stages.physics.bodies.spheres import Body
+from stages.physics.maps.grid import Grid, check_body, read_grid, require_crs
+from stages.physics.maps.rasters import open_raster, pixel_size_at, read_window
+from stages.physics.photometry import ReflectanceModel, get_model
+
+Floats32 = NDArray[np.float32]
+_HDF5_SUFFIXES = (".h5", ".hdf5", ".nc")
+DEFAULT_MODEL = "lambert"
+_UNEVEN = 0.01  # a raw DEM's pixels may differ in true width and height by this share
+
+
+class Elevation:
+    """Windows of a DEM by slicing, NaN where unknown, so that a raster and an HDF5 variable look alike."""
+
+    def __init__(self, source: object, radius_offset: float = 0.0) -> None:
+        self._source, self._offset = source, radius_offset
+        if isinstance(source, h5py.Dataset):
+            self.shape: tuple[int, int] = source.shape
+        else:
+            self.shape = (source.height, source.width)  # type: ignore[attr-defined]
+        self.dtype = np.dtype(np.float32)
+        self.ndim = 2
+
+    def __getitem__(self, key: tuple[slice, slice]) -> Floats32:
+        (r0, r1, rs), (c0, c1, cs) = (s.indices(n) for s, n in zip(key, self.shape, strict=True))
+        if isinstance(self._source, h5py.Dataset):
+            return np.asarray(self._source[r0:r1, c0:c1], np.float32)[::rs, ::cs]
+        block = read_window(self._source, Window(c0, r0, c1 - c0, r1 - r0))  # type: ignore[arg-type]
+        return (block - self._offset).astype(np.float32)[::rs, ::cs]
+
+
+@dataclass
+class Surface:
+    """Terrain and reflectance on one grid.
+
+    elevation : windows (h, w), m; coefficients : (C, H, W) dataset or None where ``uniform`` (C,) holds everywhere
+    """
+
+    path: Path
+    grid: Grid
+    elevation: Elevation
+    model: ReflectanceModel
+    coefficients: h5py.Dataset | None
+    uniform: NDArray[np.float32]
+
+    def read_coefficients(self, row: int, col: int, height: int, width: int) -> Floats32:
+        """(C, h, w), or (C, 1, 1) where they are the same everywhere."""
+        if self.coefficients is None:
+            return self.uniform[:, None, None]
+        return self.coefficients[:, row : row + height, col : col + width]
+
+    def height_range(self) -> tuple[float, float]:
+        """Lowest and highest elevation, m, by one pass over the DEM. Raises InputError where there is none."""
+        low, high = np.inf, -np.inf
+        rows = max(1, (1 << 23) // self.grid.width)
+        for row in range(0, self.grid.height, rows):
+            block = self.elevation[row : row + rows, 0 : self.grid.width]
+            known = block[np.isfinite(block)]
+            if known.size:
+                low, high = min(low, float(known.min())), max(high, float(known.max()))
+        if not np.isfinite(low):
+            raise InputError(f"{self.path}: expected elevations, found only nodata.")
+        return low, high
+
+
+@contextlib.contextmanager
+def open_surface(path: Path, model: str | None, parameters: Mapping[str, float], body: Body) -> Iterator[Surface]:
+    """Open svbrdf.h5 (its own model), or a DEM or scene.h5 with one model and one set of parameters everywhere.
+
+    Raises LunargrError.
+    """
+    with contextlib.ExitStack() as stack:
+        if path.suffix.lower() in _HDF5_SUFFIXES:
+            kind = read_kind(path).name
+            if kind not in ("svbrdf", "scene"):
+                raise ArtefactError(
+                    f"{path}: expected an 'svbrdf' (from 'lunargr infer') or a 'scene' (from 'lunargr ingest'), found a '{kind}'."
+                )
+            file = stack.enter_context(open_artefact(path, SVBRDF if kind == "svbrdf" else SCENE))
+            grid, elevation = read_grid(file, path), Elevation(file["elevation"])
+            if kind == "svbrdf":
+                if model is not None:
+                    raise ConfigError(
+                        f"--model: {path.name} holds its own reflectance ({file.attrs['model']}); to render its terrain with another model give --dem {path.name}."
+                    )
+                reflectance = get_model(str(file.attrs["model"]))
+                _check_names(path, reflectance, read_strings(file, "coefficient_name"))
+                empty = np.empty(0, np.float32)
+                yield Surface(path, grid, elevation, reflectance, file["coefficients"], empty)
+                return
+        else:
+            dataset = stack.enter_context(open_raster(path, "a DEM, scene.h5 or svbrdf.h5"))
+            grid = _metric_grid(path, dataset, body)
+            sample = read_window(dataset, _middle(dataset))
+            finite = sample[np.isfinite(sample)]
+            # LOLA cubes keep radii, not heights
+            offset = body.radius if finite.size and abs(float(np.median(finite))) > 0.5 * body.radius else 0.0
+            elevation = Elevation(dataset, offset)
+        reflectance = get_model(model or DEFAULT_MODEL)
+        yield Surface(path, grid, elevation, reflectance, None, _uniform(reflectance, parameters))
+
+
+@contextlib.contextmanager
+def open_terrain(path: Path, model: str | None, parameters: Mapping[str, float], body: Body) -> Iterator[Surface]:
+    """Like :func:`open_surface`, but only the terrain of svbrdf.h5 is used."""
+    if path.suffix.lower() in _HDF5_SUFFIXES and read_kind(path).name == "svbrdf":
+        reflectance = get_model(model or DEFAULT_MODEL)
+        with open_artefact(path, SVBRDF) as file:
+            grid = read_grid(file, path)
+            uniform = _uniform(reflectance, parameters)
+            yield Surface(path, grid, Elevation(file["elevation"]), reflectance, None, uniform)
+        return
+    with open_surface(path, model, parameters, body) as surface:
+        yield surface
+
+
+def _check_names(path: Path, model: ReflectanceModel, found: list[str]) -> None:
+    expected = [p.name for p in model.parameters]
+    if found != expected:
+        raise ArtefactError(
+            f"{path}:/coefficient_name: expected {', '.join(expected)} (model {model.name}), found {', '.join(found)}; write it again with 'lunargr infer'."
+        )
+
+
+def _uniform(model: ReflectanceModel, parameters: Mapping[str, float]) -> NDArray[np.float32]:
+    """(C,) in the model's order; what is not given takes its default. Raises RegistryError or ConfigError."""
+    names = [p.name for p in model.parameters]
+    for name, value in parameters.items():
+        if name not in names:
+            raise RegistryError.unknown(f"parameter of {model.name}", name, names)
+        bounds = next(p for p in model.parameters if p.name == name)
+        if not bounds.lower <= value <= bounds.upper:
+            raise ConfigError(
+                f"--parameters: expected {name} of {model.name} in {bounds.lower:g}..{bounds.upper:g}, found {value:g}."
+            )
+    return np.array([parameters.get(p.name, p.default) for p in model.parameters], np.float32)
+
+
+def _middle(dataset) -> Window:
+    size = min(512, dataset.height, dataset.width)
+    return Window((dataset.width - size) // 2, (dataset.height - size) // 2, size, size)
+
+
+def _metric_grid(path: Path, dataset, body: Body) -> Grid:
+    """The grid of a raw DEM that can be rendered as it stands: north up, square metres."""
+    crs = require_crs(str(path), dataset.crs, dataset.transform)
+    check_body(str(path), crs, body)
+    t = dataset.transform
+    advice = "bring it to a metric grid with 'lunargr ingest' and render its scene.h5."
+    if crs.is_geographic or abs(crs.linear_units_factor[1] - 1.0) > 1e-9:
+        raise InputError(f"{path}: expected a DEM on a grid of metres, found degrees or other units; {advice}")
+    if t.b != 0 or t.d != 0 or t.a <= 0 or t.e >= 0 or abs(t.a + t.e) > _UNEVEN * t.a:
+        raise InputError(
+            f"{path}: expected a north-up DEM with square pixels, found the transform {tuple(t)[:6]}; {advice}"
+        )
+    east, north = pixel_size_at(dataset, body.radius, dataset.height / 2, dataset.width / 2)
+    if abs(east - north) > _UNEVEN * max(east, north):
+        raise InputError(
+            f"{path}: expected pixels as wide as high on the ground, found {east:.4g} x {north:.4g} m (its projection stretches them here); {advice}"
+        )
+    return Grid(crs.to_wkt(), t, dataset.height, dataset.width, body.radius)

@@ -1,0 +1,325 @@
+"""Views of a terrain through a camera: rays, light and reflectance of every pixel, band by band of image lines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rasterio.transform import Affine
+
+from schemas.errors import GeometryError
+from stages.physics.cameras.base import Camera
+from stages.physics.cameras.pinhole import Pinhole
+from stages.physics.formation.chain import Observation, State
+from stages.physics.formation.geometry import Angles
+from stages.physics.maps.grid import CSM_CENTRE, Grid
+from stages.physics.photometry import masked_radiance_factor
+from stages.physics.terrain.shading import BACKPLANES, Light, form_window
+from stages.physics.terrain.sun_visibility import visible_share
+from stages.physics.terrain.surface import Surface
+from stages.render.ray_points import HitAngles, hit_angles, hit_points, sample_maps
+from stages.render.raycast import HIT, MISS, HeightField, Hits, build_height_field, cast
+from stages.render.viewpoint import pixel_footprint
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+
+MOST_SAMPLES = 8  # rays per pixel and axis; beyond, the terrain itself is averaged first
+RAYS_AT_ONCE = 1 << 19
+LATTICE = 33  # rays per axis of the first look
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The part of a surface that a camera sees, at the resolution that its pixels need.
+
+    grid : of that part; row, col : its first pixel on the surface's grid; factor : px of the surface per px here
+    maps : (C, h, w) coefficients or (C, 1, 1); horizon : (h, w), rad, or None
+    lit : (h, w) I/F where extensions have shaded the ground beforehand, or None
+    """
+
+    grid: Grid
+    field: HeightField
+    maps: Floats32
+    horizon: Floats32 | None
+    lit: Floats32 | None
+    samples: int
+    distance: float
+
+
+def look(
+    surface: Surface, camera: Camera, relief: tuple[float, float], samples: int | None
+) -> tuple[tuple[int, int, int, int], int, int, float]:
+    """Which window of the map a camera can see, samples per pixel and axis, coarsening factor, distance to the ground.
+
+    relief : lowest and highest elevation, m. Raises GeometryError where the view misses the map or starts under it.
+    """
+    grid = surface.grid
+    line = np.linspace(0, camera.lines, LATTICE)
+    sample = np.linspace(0, camera.samples, LATTICE)
+    lines, columns = (v.ravel() for v in np.meshgrid(line, sample, indexing="ij"))
+    origins, directions = camera.rays(lines, columns)
+    _check_above_ground(surface, origins, relief)
+    near, far = shell_crossing(origins, directions, grid.radius + relief[0] - 1.0, grid.radius + relief[1] + 1.0)
+    steps = np.linspace(0.0, 1.0, 9)
+    distances = (near[:, None] + (far - near)[:, None] * steps).ravel()
+    points = (origins[:, None, :] + 0.0).repeat(9, axis=1).reshape(-1, 3) + distances[:, None] * directions.repeat(
+        9, axis=0
+    )
+    known = np.isfinite(distances)
+    if not known.any():
+        raise GeometryError("the camera does not see the body; check its place, --look-at (or --quaternion) and --fov.")
+    points, distances = points[known], distances[known]
+    lon = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    lat = np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
+    row, col = grid.rowcol_of_lonlat(lon, lat)
+    inside = np.isfinite(row) & np.isfinite(col)
+    row, col, distances = row[inside], col[inside], distances[inside]
+    # beyond the map by more than its own size is no place that a neighbouring ray leads back from
+    row, col = np.clip(row, -grid.height, 2 * grid.height), np.clip(col, -grid.width, 2 * grid.width)
+    pad_row = 4 + (np.ptp(row) if row.size else 0) * 1.5 / (LATTICE - 1)
+    pad_col = 4 + (np.ptp(col) if col.size else 0) * 1.5 / (LATTICE - 1)
+    top, bottom = max(0, int(row.min() - pad_row)), min(grid.height, int(row.max() + pad_row) + 2)
+    left, right = max(0, int(col.min() - pad_col)), min(grid.width, int(col.max() + pad_col) + 2)
+    if bottom - top < 2 or right - left < 2:
+        raise GeometryError(_misses(surface))
+    on_map = (row > -0.5) & (row < grid.height) & (col > -0.5) & (col < grid.width)
+    distance = float(np.median(distances[on_map] if on_map.any() else distances))
+    footprint = pixel_footprint(camera, distance) / grid.gsd
+    wanted = samples or min(MOST_SAMPLES, max(2, math.ceil(footprint)))
+    factor = max(1, int(footprint / wanted))
+    return (top, left, bottom - top, right - left), wanted, factor, distance
+
+
+def shell_crossing(origins: Floats, directions: Floats, inner: float, outer: float) -> tuple[Floats, Floats]:
+    """Distances along rays at which they enter and leave the shell between two spheres; NaN where they miss it."""
+    along = (origins * directions).sum(-1)
+    closest2 = (origins * origins).sum(-1) - along**2
+    with np.errstate(invalid="ignore"):
+        half_outer = np.sqrt(outer**2 - closest2)
+        half_inner = np.sqrt(inner**2 - closest2)
+    near = np.maximum(-along - half_outer, 0.0)
+    far = -along + half_outer
+    enters = -along - half_inner
+    far = np.where(enters > 0, enters, far)
+    missed = ~(far > near)
+    return np.where(missed, np.nan, near), np.where(missed, np.nan, far)
+
+
+def _misses(surface: Surface) -> str:
+    grid = surface.grid
+    lon, lat = grid.lonlat((grid.height - 1) / 2, (grid.width - 1) / 2)
+    return (
+        f"the view misses {surface.path.name}, whose middle is at longitude {float(lon):.4f}, latitude {float(lat):.4f} deg; "
+        "check the camera's place, --look-at (or --quaternion) and --fov."
+    )
+
+
+def _check_above_ground(surface: Surface, origins: Floats, relief: tuple[float, float]) -> None:
+    """Refuse a camera inside the ground. Raises GeometryError."""
+    grid = surface.grid
+    for origin in (origins[0], origins[-1]):
+        altitude = float(np.linalg.norm(origin)) - grid.radius
+        if altitude > relief[1]:
+            continue
+        lon = math.degrees(math.atan2(origin[1], origin[0]))
+        lat = math.degrees(math.asin(origin[2] / np.linalg.norm(origin)))
+        row, col = (float(v) for v in grid.rowcol_of_lonlat(lon, lat))
+        ground = relief[0]
+        if 0 <= row <= grid.height - 1 and 0 <= col <= grid.width - 1:
+            r, c = min(int(row), grid.height - 2), min(int(col), grid.width - 2)
+            corner = surface.elevation[r : r + 2, c : c + 2]
+            if np.isfinite(corner).all():
+                u, v = col - c, row - r
+                ground = float(np.array([1 - v, v]) @ corner @ np.array([1 - u, u]))
+        if altitude <= ground:
+            raise GeometryError(
+                f"the camera is under the ground: it stands {altitude:.1f} m above the sphere, the ground there at {ground:.1f} m; raise the altitude in --position."
+            )
+
+
+def make_scene(
+    surface: Surface, camera: Camera, light: Light, relief: tuple[float, float], samples: int | None
+) -> Scene:
+    """Read and prepare what a camera sees. Raises GeometryError."""
+    (row, col, height, width), samples, factor, distance = look(surface, camera, relief, samples)
+    grid = surface.grid.window(row, col, height, width)
+    elevation = surface.elevation[row : row + height, col : col + width]
+    horizon = None if light.horizon is None else light.horizon.window(row, col, height, width)
+    lit = None
+    if light.extensions:
+        # the sensor comes last: its effects act on the camera's image, not on the ground
+        ground = replace(light, extensions=[e for e in light.extensions if e.slot != "sensor"])
+        lit = form_window(surface, ground, row, col, height, width)
+        maps = np.zeros((0, 1, 1), np.float32)
+    else:
+        maps = surface.read_coefficients(row, col, height, width)
+    if factor > 1:
+        elevation = coarsen(elevation, factor)
+        horizon = None if horizon is None else coarsen(horizon, factor)
+        lit = None if lit is None else coarsen(lit, factor)
+        if maps.shape[1] > 1:
+            maps = np.stack([coarsen(m, factor) for m in maps])
+        coarse = grid.transform @ Affine.scale(factor)
+        grid = Grid(grid.crs_wkt, coarse, elevation.shape[0], elevation.shape[1], grid.radius)
+    return Scene(grid, build_height_field(elevation, grid), maps, horizon, lit, samples, distance)
+
+
+def coarsen(values: Floats32, factor: int) -> Floats32:
+    """Means of whole factor x factor blocks, over what is known (NaN where nothing is)."""
+    height, width = (n // factor for n in values.shape)
+    blocks = values[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    known = np.isfinite(blocks)
+    count = known.sum(axis=(1, 3))
+    total = np.where(known, blocks, 0).sum(axis=(1, 3), dtype=np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return (total / count).astype(np.float32)
+
+
+def render_view(surface: Surface, camera: Camera, light: Light, scene: Scene) -> Iterator[dict[str, Floats32]]:
+    """Bands of image lines from the top down: ``image`` (I/F, mean over each pixel) and backplanes at pixel centres.
+
+    NaN where the map is unknown; space is 0. Backplanes are NaN where there is no ground.
+    """
+    lines_at_once = max(1, RAYS_AT_ONCE // (camera.samples * scene.samples**2))
+    for first in range(0, camera.lines, lines_at_once):
+        count = min(lines_at_once, camera.lines - first)
+        centre = _trace(camera, scene, first, count, 1)
+        band = _backplanes(surface, light, scene, centre)
+        fine = centre if scene.samples == 1 else _trace(camera, scene, first, count, scene.samples)
+        band["image"] = _mean(_radiance(surface, light, scene, fine), count, camera.samples, scene.samples)
+        yield {k: v.reshape(count, camera.samples) for k, v in band.items()}
+
+
+@dataclass(frozen=True)
+class _Rays:
+    origins: Floats
+    directions: Floats
+    hits: Hits
+
+
+def _trace(camera: Camera, scene: Scene, first: int, count: int, samples: int) -> _Rays:
+    """Rays of ``count`` lines, ``samples`` x ``samples`` evenly spread over each pixel, in order of image position."""
+    offset = (np.arange(samples) + 0.5) / samples + (CSM_CENTRE - 0.5)
+    lines = (first + np.arange(count)[:, None] + offset).ravel()
+    columns = (np.arange(camera.samples)[:, None] + offset).ravel()
+    line, sample = np.meshgrid(lines, columns, indexing="ij")
+    origins, directions = _rays(camera, line.ravel(), sample.ravel())
+    return _Rays(origins, directions, cast(scene.field, origins, directions))
+
+
+def _rays(camera: Camera, line: Floats, sample: Floats) -> tuple[Floats, Floats]:
+    """Like ``camera.rays``, with one origin where all rays leave one point."""
+    if isinstance(camera, Pinhole):  # by far the most common, and drawing rays should not take longer than casting them
+        directions = np.empty((len(line), 3))
+        _pinhole_rays(camera.focal_px, camera.principal_point_px, camera.rotation, line, sample, directions)
+        return camera.centre[None], directions
+    return camera.rays(line, sample)
+
+
+@numba.njit(cache=True, parallel=True)
+def _pinhole_rays(focal, point, rotation, line, sample, directions):
+    for n in numba.prange(len(line)):
+        x, y = (sample[n] - point[0]) / focal[0], (line[n] - point[1]) / focal[1]
+        inverse = 1.0 / math.sqrt(x * x + y * y + 1.0)
+        for k in range(3):
+            directions[n, k] = (rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2]) * inverse
+
+
+def _light_at(light: Light, scene: Scene, rays: _Rays) -> tuple[HitAngles, Floats32]:
+    """Angles and visible share of the Sun at the hits, (N,)."""
+    angles = hit_angles(scene.field, rays.origins, rays.directions, rays.hits, light.sun.position)
+    if scene.horizon is None:
+        return angles, np.ones(len(rays.directions), np.float32)
+    horizon = sample_maps(scene.horizon[None], rays.hits)[0]
+    return angles, visible_share(angles.sun_elevation, horizon, light.sun.radius)
+
+
+def _radiance(surface: Surface, light: Light, scene: Scene, rays: _Rays) -> Floats32:
+    """(N,) I/F along rays: NaN where unknown, 0 in space."""
+    if scene.lit is not None:
+        image = sample_maps(scene.lit[None], rays.hits)[0]
+    else:
+        found, visible = _light_at(light, scene, rays)
+        cosines = (torch.from_numpy(found.cos_incidence), torch.from_numpy(found.cos_emission))
+        phase = torch.from_numpy(found.phase)
+        angles = Angles(*cosines, phase.cos(), phase_given=phase)
+        if scene.maps.shape[1] > 1:
+            coefficients = sample_maps(scene.maps, rays.hits)
+        else:
+            coefficients = np.ascontiguousarray(scene.maps[:, :, 0])
+        parameters = surface.model.unpack(torch.from_numpy(coefficients), dim=0)
+        image = masked_radiance_factor(surface.model, parameters, angles).numpy() * visible
+        image[(rays.hits.status != HIT) | ~np.isfinite(coefficients).all(axis=0)] = np.nan
+    image[_in_space(scene, rays)] = 0.0
+    return image
+
+
+def _in_space(scene: Scene, rays: _Rays) -> NDArray[np.bool_]:
+    """Rays that pass above everything there could be on the way."""
+    missed = rays.hits.status == MISS
+    if not missed.any():
+        return missed
+    single = len(rays.origins) == 1
+    origins = rays.origins if single else rays.origins[missed]
+    along = (origins * rays.directions[missed]).sum(-1)
+    closest2 = (origins * origins).sum(-1) - along**2
+    missed[missed] = (closest2 > (scene.grid.radius + scene.field.lowest) ** 2) | (along > 0)
+    return missed
+
+
+def _mean(values: Floats32, lines: int, width: int, samples: int) -> Floats32:
+    """Pixel means over the known samples; NaN where fewer than half are known."""
+    if samples == 1:
+        return values
+    cells = values.reshape(lines, samples, width, samples)
+    known = np.isfinite(cells)
+    if known.all():
+        return cells.mean(axis=(1, 3), dtype=np.float32)
+    count = known.sum(axis=(1, 3))
+    total = np.where(known, cells, 0).sum(axis=(1, 3))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(2 * count >= samples**2, total / count, np.nan).astype(np.float32)
+
+
+def _backplanes(surface: Surface, light: Light, scene: Scene, rays: _Rays) -> dict[str, Floats32]:
+    angles, visible = _light_at(light, scene, rays)
+    points = hit_points(rays.hits, rays.origins, rays.directions)
+    shadow = np.where(angles.cos_incidence > 0, 1 - visible, np.float32(1))
+    shadow[np.isnan(angles.cos_incidence)] = np.nan
+    planes = (
+        np.degrees(np.arccos(np.clip(angles.cos_incidence, -1, 1))),
+        np.degrees(np.arccos(np.clip(angles.cos_emission, -1, 1))),
+        np.degrees(angles.phase),
+        shadow,
+        rays.hits.depth,
+        np.degrees(np.arctan2(points[:, 1], points[:, 0])),
+        np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))),
+    )
+    return {name: plane.astype(np.float32) for name, plane in zip(BACKPLANES, planes, strict=True)}
+
+
+def apply_sensor(image: Floats32, light: Light, grid: Grid) -> Floats32:
+    """The sensor's own effects of an extended model, on the whole image of a camera (H, W)."""
+    sensor = [e for e in light.extensions if e.slot == "sensor"]
+    if not sensor:
+        return image
+    known = np.isfinite(image)
+    tensor = torch.from_numpy(np.nan_to_num(image))[None]
+    line, sample = (torch.from_numpy(v.astype(np.float32))[None] for v in np.indices(image.shape))
+    zero = torch.zeros_like(tensor)
+    observation = Observation(
+        zero, torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3), grid.gsd, grid.radius,
+        detector_sample=sample, detector_line=line, frame=torch.full((1,), -1),
+    )  # fmt: skip
+    state = State(observation, zero, observation.sun_direction, observation.camera_position, None)
+    state.image = tensor
+    with torch.no_grad():
+        for effect in sensor:
+            effect.apply(state)
+    return np.where(known, state.image[0].numpy(), np.nan).astype(np.float32)

@@ -1,0 +1,228 @@
+"""Writing rendered images: EXR with named channels, cloud-optimised GeoTIFF, and PNG previews that look right.
+
+Writers take bands of rows from the top down, so that an image of any size passes through little memory, and leave
+nothing behind where they are interrupted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import rasterio
+import rasterio.shutil
+from numpy.typing import NDArray
+from rasterio.errors import RasterioError
+from rasterio.windows import Window
+
+from schemas.errors import InputError
+from schemas.files.locks import partial_path
+from schemas.files.outputs import atomic_path
+from stages.physics.maps.grid import Grid
+
+Floats32 = NDArray[np.float32]
+DISPLAY_GAMMA = 2.2
+
+
+def _failed(path: Path, message: str) -> OSError | InputError:
+    """OpenImageIO reports a full disk like any other failure: an OSError lets atomic_path tell them apart."""
+    with contextlib.suppress(OSError):
+        stat = os.statvfs(path.parent)
+        if stat.f_bavail * stat.f_frsize < 1 << 20:
+            return OSError(28, "No space left on device")
+    return InputError(f"{path}: cannot be written ({' '.join(message.split())}); choose another --output.")
+
+
+class ExrWriter:
+    """Rows of a float32 EXR as they come; channels by name."""
+
+    def __init__(self, path: Path, output: Any, channels: Sequence[str]) -> None:
+        self._path, self._output, self.channels = path, output, list(channels)
+        self._row = 0
+
+    def write(self, band: Mapping[str, Floats32]) -> None:
+        """Append rows: name -> (rows, W)."""
+        block = np.ascontiguousarray(np.stack([band[c] for c in self.channels], axis=-1), np.float32)
+        rows = block.shape[0]
+        if not self._output.write_scanlines(self._row, self._row + rows, 0, block):
+            raise _failed(self._path, self._output.geterror())
+        self._row += rows
+
+
+@contextlib.contextmanager
+def write_exr(
+    path: Path, height: int, width: int, channels: Sequence[str], metadata: Mapping[str, Any] | None = None
+) -> Iterator[ExrWriter]:
+    """An EXR file (scan lines, ZIP, float32) to append rows to. Raises InputError where it cannot be written."""
+    with atomic_path(path) as partial:
+        spec = oiio.ImageSpec(width, height, len(channels), oiio.FLOAT)
+        spec.channelnames = tuple(channels)
+        spec.attribute("compression", "zip")
+        spec.attribute("Software", "lunargr")
+        for key, value in (metadata or {}).items():
+            spec.attribute(f"lunargr:{key}", value if isinstance(value, (int, float)) else str(value))
+        output = oiio.ImageOutput.create(str(partial))
+        if output is None or not output.open(str(partial), spec):
+            raise _failed(path, output.geterror() if output else oiio.geterror())
+        try:
+            yield ExrWriter(path, output, channels)
+        except BaseException:
+            output.close()
+            raise
+        if not output.close():
+            raise _failed(path, output.geterror())
+
+
+def read_exr(path: Path) -> dict[str, Floats32]:
+    """Channels of an EXR by name, each (H, W) float32. Raises InputError."""
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        raise InputError(f"{path}: expected an EXR image, found something else ({' '.join(oiio.geterror().split())}).")
+    try:
+        names = source.spec().channelnames
+        pixels = source.read_image(oiio.FLOAT)
+    finally:
+        source.close()
+    if pixels is None:
+        raise InputError(f"{path}: expected a whole EXR image, found a truncated one; write it again.")
+    return {name: np.ascontiguousarray(pixels[..., k]) for k, name in enumerate(names)}
+
+
+class GeoTiffWriter:
+    """Rows of a GeoTIFF as they come."""
+
+    def __init__(self, path: Path, target: rasterio.io.DatasetWriter) -> None:
+        self._path, self._target = path, target
+        self._row = 0
+
+    def write(self, bands: NDArray) -> None:
+        """Append rows: (bands, rows, W), NaN where there is nothing."""
+        rows, width = bands.shape[1:]
+        try:
+            self._target.write(bands, window=Window(0, self._row, width, rows))
+        except RasterioError as error:
+            raise _failed(self._path, str(error.__cause__ or error)) from None
+        self._row += rows
+
+
+@contextlib.contextmanager
+def _scratch(path: Path) -> Iterator[Path]:
+    """A file of strips beside the output, only a way to the cloud-optimised one, which GDAL must make in one go."""
+    scratch = path.with_name(f"{partial_path(path).stem}.strips.tif")
+    try:
+        yield scratch
+    finally:
+        with contextlib.suppress(OSError):
+            scratch.unlink()
+
+
+@contextlib.contextmanager
+def write_geotiff(
+    path: Path, grid: Grid, bands: Sequence[str], tags: Mapping[str, Any] | None = None, units: Sequence[str] = ()
+) -> Iterator[GeoTiffWriter]:
+    """A cloud-optimised float32 GeoTIFF on ``grid``, to the pixel; NaN is nodata, bands and tags carry their names."""
+    with atomic_path(path) as partial, _scratch(path) as plain:
+        profile = {
+            "driver": "GTiff",
+            "height": grid.height,
+            "width": grid.width,
+            "count": len(bands),
+            "dtype": "float32",
+            "crs": grid.crs,
+            "transform": grid.transform,
+            "nodata": float("nan"),
+            "BIGTIFF": "IF_SAFER",
+            "INTERLEAVE": "BAND",
+        }
+        with rasterio.open(plain, "w", **profile) as target:
+            for k, name in enumerate(bands, start=1):
+                target.set_band_description(k, name)
+                if units:
+                    target.set_band_unit(k, units[k - 1])
+            target.update_tags(**{k.upper(): str(v) for k, v in (tags or {}).items()})
+            yield GeoTiffWriter(path, target)
+        try:
+            rasterio.shutil.copy(
+                str(plain), str(partial), driver="COG", COMPRESS="DEFLATE", LEVEL="1", PREDICTOR="YES",
+                BIGTIFF="IF_SAFER", OVERVIEW_RESAMPLING="AVERAGE", NUM_THREADS="ALL_CPUS",
+            )  # fmt: skip
+        except RasterioError as error:
+            raise _failed(path, str(error.__cause__ or error)) from None
+
+
+class Preview:
+    """A picture of at most ``limit`` pixels a side, gathered from rows as they come (means of whole pixels)."""
+
+    def __init__(self, height: int, width: int, limit: int = 3072) -> None:
+        self.factor = max(1, -(-max(height, width) // limit))
+        self._shape = (-(-height // self.factor), -(-width // self.factor))
+        self._sum = np.zeros(self._shape, np.float32)
+        self._count = np.zeros(self._shape, np.int32)
+        self._row = 0
+
+    def add(self, rows: Floats32) -> None:
+        """Append rows (rows, W), NaN where there is nothing."""
+        known = np.isfinite(rows)
+        values = np.where(known, rows, 0.0)
+        target = (self._row + np.arange(rows.shape[0])) // self.factor
+        starts = np.arange(0, rows.shape[1], self.factor)
+        np.add.at(self._sum, target, np.add.reduceat(values, starts, axis=1))
+        np.add.at(self._count, target, np.add.reduceat(known.astype(np.int32), starts, axis=1))
+        self._row += rows.shape[0]
+
+    def image(self) -> Floats32:
+        """(h, w) float32, NaN where nothing was seen."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(self._sum / self._count.astype(np.float32), np.float32)
+
+
+def stretch(
+    image: Floats32, limits: tuple[float, float] | None = None
+) -> tuple[NDArray[np.uint8], tuple[float, float]]:
+    """A linear image as 8-bit grey for the eye, and the limits (black, white) that were used.
+
+    White is the 99.5th percentile, black a little under the 0.2th (0 where there are shadows), with display gamma.
+    """
+    if limits is None:
+        every = max(1, image.size // 2_000_000)
+        known = image.ravel()[::every]
+        known = known[np.isfinite(known)]
+        if known.size == 0:
+            limits = (0.0, 1.0)
+        else:
+            low, high = (float(v) for v in np.percentile(known, (0.2, 99.5)))
+            low = min(0.9 * low, low)
+            limits = (low, max(1.05 * high - 0.05 * low, low + 1e-6))
+    low, high = limits
+    grey = np.empty(image.shape, np.uint8)
+    for row in range(0, len(image), 256):  # a preview may have millions of pixels, and each needs several floats
+        scaled = np.clip((np.nan_to_num(image[row : row + 256], nan=low) - low) / (high - low), 0.0, 1.0)
+        grey[row : row + 256] = np.round(255.0 * scaled ** (1.0 / DISPLAY_GAMMA))
+    return grey, limits
+
+
+def write_png(path: Path, image: Floats32, limits: tuple[float, float] | None = None) -> tuple[float, float]:
+    """A stretched 8-bit preview, transparent (and black beneath) where ``image`` is NaN; returns the limits used."""
+    grey, limits = stretch(image, limits)
+    alpha = np.isfinite(image).astype(np.uint8)
+    pixels = np.stack([grey * alpha, alpha * np.uint8(255)], axis=-1)
+    height, width = image.shape
+    with atomic_path(path) as partial:
+        spec = oiio.ImageSpec(width, height, 2, oiio.UINT8)
+        spec.channelnames = ("Y", "A")
+        spec.alpha_channel = 1
+        spec.attribute("oiio:UnassociatedAlpha", 1)
+        output = oiio.ImageOutput.create(str(partial))
+        if (
+            output is None
+            or not output.open(str(partial), spec)
+            or not output.write_image(np.ascontiguousarray(pixels))
+        ):
+            raise _failed(path, output.geterror() if output else oiio.geterror())
+        output.close()
+    return limits
