@@ -47,12 +47,12 @@ def pack_map(values: NDArray, known: NDArray[np.bool_], step: float) -> Packed:
 
 
 def spread_step(values: NDArray, known: NDArray[np.bool_]) -> float:
-    """A step finer than an eye or a photometrist sees: 1/2048 of the range between the 1st and 99th percentiles."""
+    """A step finer than an eye or a photometrist sees: 1/1024 of the range between the 1st and 99th percentiles."""
     sample = values[known]
     if sample.size == 0:
         return 1.0
     low, high = np.percentile(sample[:: max(1, sample.size // 500_000)], (1, 99))
-    return float(high - low) / 2048 or max(abs(float(high)), 1e-6) * 1e-4
+    return float(high - low) / 1024 or max(abs(float(high)), 1e-6) * 1e-4
 
 
 def fill_along_rows(values: NDArray, known: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -161,19 +161,21 @@ class App {
   drawNow() {
     this.dirty = false;
     const { relighter, terrain } = this, layer = relighter.layers[state.layer], span = this.span(layer);
-    relighter.setLight(this.light());
-    relighter.show(state.layer, span);
-    if (state.auto) {
-      const found = relighter.contrast(state.layer);
-      const shown = state.layer >= QUANTITIES.length || layer.name === "elevation" || layer.name === "sunlight";
-      state.limits = shown ? found : found.map((v) => span[0] + v * (span[1] - span[0]));
+    const light = this.light(), key = JSON.stringify([light, state.layer]);
+    if (key !== this.drawn) {  // else only the map's place on the screen has changed
+      relighter.setLight(light);
+      relighter.show(state.layer, span);
+      this.found = relighter.contrast(state.layer, span);
     }
+    this.drawn = key;
+    if (state.auto) state.limits = this.found;
     terrain.draw(span, layer.colours, state.limits);
     this.panel.contrast(state.limits, layer.colours);
     this.panel.scaleBar(terrain.unitsPerPixel());
-    const key = `${state.photograph} ${state.shadows}`;
-    if (key !== this.compared) this.photographs.refresh(state.photograph);
-    this.compared = key;
+    this.panel.needle(state.view === "space" ? terrain.controls.space.getAzimuthalAngle() : 0);
+    const compared = `${state.photograph} ${state.shadows}`;
+    if (compared !== this.compared) this.photographs.refresh(state.photograph);
+    this.compared = compared;
     if (this.pointer) this.readPointer();
   }
 
@@ -214,7 +216,11 @@ class App {
       this.pointer = place(event);
       this.readSoon();
     });
-    canvas.addEventListener("pointerleave", () => (this.pointer = null));
+    canvas.addEventListener("pointerleave", (event) => {
+      if (event.pointerType !== "mouse") return;  // a tap's values stay
+      this.pointer = null;
+      this.panel.values([]);
+    });
   }
 
   readSoon() {
@@ -228,7 +234,7 @@ class App {
 
   readPointer() {
     const found = this.terrain.pick(this.pointer.x, this.pointer.y);
-    if (found) this.panel.values(pixelRows(this.head, this.page, this.relighter, found.row, found.col));
+    this.panel.values(found ? pixelRows(this.head, this.page, this.relighter, found.row, found.col) : []);
   }
 
   /** For tests and for the curious: the page's own numbers */
@@ -244,6 +250,7 @@ class App {
       pixels: ({ azimuth, elevation, shadows = true, camera = null }) => {
         this.relighter.setLight({ sun: sunVector(this.head, azimuth, elevation), shadows, camera: camera && new THREE.Vector3(...camera) });
         const image = this.relighter.image();
+        this.drawn = null;
         this.ask();
         return image;
       },

@@ -18,7 +18,6 @@ class Panel {
     for (const id of ["black", "white"]) {
       byId(id).onchange = () => act.change({ auto: false, limits: [Number(byId("black").value), Number(byId("white").value)] });
     }
-    byId("needle").setAttribute("transform", `rotate(${head.convergence_deg})`);
     const means = head.factor > 1 ? `, each the mean of ${head.factor} × ${head.factor} of the file's` : "";
     byId("about").textContent = `${head.width} × ${head.height} pixels of ${short(head.gsd)} m${means}. Radiance factor I/F, with cos(incidence) in it; negative values are shown as 0. Made by ${document.querySelector("meta[name=generator]").content}.`;
     window.addEventListener("keydown", (event) => this.key(event));
@@ -90,8 +89,13 @@ class Panel {
     byId("layer-title").textContent = layerName(this.head, layer, state.layer);
     byId("layer-unit").textContent = layer.unit === "1" ? "" : layer.unit;
     byId("layer-text").textContent = layer.map ? layer.title : "";
-    byId("view-text").textContent = state.photograph !== null ? "Light that goes to the photograph's camera." : state.view === "map" ? "Light that goes straight up from every pixel." : "Light that goes to this camera. Drag to turn, scroll to come near.";
+    byId("view-text").textContent = state.photograph !== null ? "Light that goes to the photograph's camera." : state.view === "map" ? "Light that goes straight up from every pixel." : "Light that goes to this camera. Drag to turn it, scroll to come near.";
     document.body.classList.toggle("in-space", state.view === "space");
+  }
+
+  /** turned: how far the camera has gone round the map, rad */
+  needle(turned) {
+    byId("needle").setAttribute("transform", `rotate(${this.head.convergence_deg + (turned * 180) / Math.PI})`);
   }
 
   contrast(limits, colours) {
@@ -156,7 +160,7 @@ function pixelRows(head, page, relighter, row, col) {
     ...place,
     ["Height", `${page.elevation[k].toFixed(1)} m`],
     ["I/F", image < 0 ? "unknown" : image.toFixed(5)],
-    ["Incidence, emission, phase", [incidence, emission, phase].map(degrees).join(", ")],
+    ["i, e, g", [incidence, emission, phase].map(degrees).join(", ")],
     ["Slope", degrees(slope)],
     ["Sunlight", `${(100 * sunlight).toFixed(0)} %`],
     ...page.fields.map((f) => [f.name.replaceAll("_", " "), Number.isFinite(f.values[k]) ? Number(f.values[k].toPrecision(4)).toString() : "unknown"]),

@@ -130,8 +130,8 @@ class Relighter {
     return out;
   }
 
-  /** Values that black and white stand for, from a few thousand pixels of the map */
-  contrast(what) {
+  /** Values that black and white stand for, from a few thousand pixels of the map; span: as it was shown with */
+  contrast(what, span) {
     const layer = this.layers[what];
     if (what >= QUANTITIES.length) return spread(layer.values, 0.005);
     if (layer.name === "elevation") return spread(this.page.elevation, 0);
@@ -140,7 +140,7 @@ class Relighter {
     this.passes.run("sample", { layer: this.shown.texture }, into);
     const four = new Float32Array(4 * size * size), found = [];
     this.renderer.readRenderTargetPixels(into, 0, 0, size, size, four);
-    for (let k = 0; k < size * size; k++) if (four[4 * k + 1] > 0.5) found.push(four[4 * k]);
+    for (let k = 0; k < size * size; k++) if (four[4 * k + 1] > 0.5) found.push(span[0] + four[4 * k] * (span[1] - span[0]));
     found.sort((a, b) => a - b);
     if (!found.length) return [0, 1];
     const low = found[Math.floor(0.002 * found.length)], high = found[Math.floor(0.995 * (found.length - 1))];

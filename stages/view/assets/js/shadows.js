@@ -1,8 +1,8 @@
 // Cast shadows with the Sun's disc, on the map's own pixels.
 //
 // Parallel lines of sight cover the map, one per pixel across. Along each, the highest ray that grazes the terrain is
-// found by doubling: after n passes it knows the next 2^n rows. Two rays per line, of the Sun's lower and upper edge,
-// give the horizon within the disc.
+// found by doubling: after n passes it knows the next 2^n rows. Four rays per line, from the Sun's lower edge to
+// its upper one, give the horizon within the disc.
 
 const SUN_RADIUS = (0.2666 * Math.PI) / 180;
 
@@ -21,7 +21,7 @@ class Shadows {
     const shear = major === 0 ? 0 : Math.max(-1, Math.min(1, minor / Math.abs(major)));
     const spacing = head.gsd * Math.hypot(1, shear), elevation = Math.asin(Math.min(1, sun.z));
     const edge = (angle) => spacing * Math.tan(Math.min(angle, 1.5533));  // 89 degrees: nothing casts shadows there
-    const drop = new THREE.Vector2(edge(elevation - SUN_RADIUS), edge(elevation + SUN_RADIUS));
+    const drop = new THREE.Vector4(...[-1, -1 / 3, 1 / 3, 1].map((k) => edge(elevation + k * SUN_RADIUS)));
     const first = shear > 0 ? Math.ceil(shear * (count - 1)) : 0;
     const lines = across + Math.ceil(Math.abs(shear) * (count - 1)) + 2;
     const uniforms = { by_rows: byRows, backwards: major < 0, count, first, shear, spacing, radius: head.radius, drop };
@@ -42,7 +42,7 @@ class Shadows {
     if (!a || a.width < lines || a.height < rows) {
       this.lines.forEach((old) => old.dispose());
       const width = Math.max(lines, a ? a.width : 0), height = Math.max(rows, a ? a.height : 0);
-      this.lines = [0, 1].map(() => target(width, height, THREE.RGFormat, THREE.FloatType));
+      this.lines = [0, 1].map(() => target(width, height, THREE.RGBAFormat, THREE.FloatType));
     }
     return this.lines;
   }

@@ -59,7 +59,7 @@ class Terrain {
     } else {
       const floor = this.middleHeight * this.scale;
       controls.target.set(0, 0, floor);
-      camera.position.set(0.9, -3.3, floor + 2.4);
+      camera.position.set(0.55, -2.9, floor + 1.9);
     }
     camera.updateProjectionMatrix();
     controls.update();

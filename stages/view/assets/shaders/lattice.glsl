@@ -7,7 +7,7 @@ uniform int first;
 uniform float shear;       // columns from row to row, -1..1
 uniform float spacing;     // m from row to row along a ray
 uniform float radius;      // of the body, m
-uniform vec2 drop;         // m that a ray falls from row to row, of the Sun's lower and upper edge
+uniform vec4 drop;         // m that a ray falls from row to row, of four heights on the Sun's disc, lower edge to upper
 
 ivec2 place_of(int i, int column) {
   int row = backwards ? count - 1 - i : i;

@@ -5,15 +5,15 @@ out vec4 result;
 
 void main() {
   ivec2 here = ivec2(gl_FragCoord.xy);  // line, row
-  vec2 top;
+  vec4 top;
   if (reach == 0) {
     float column = float(here.x - first) + shear * float(here.y), share;
     float crossed = between_rows(here.y, column, share);
-    top = vec2(on_row(here.y, column));
+    top = vec4(on_row(here.y, column));
     if (is_known(crossed)) top = max(top, crossed - share * drop);
   } else {
-    top = texelFetch(rays, here, 0).rg;
-    if (here.y + reach < count) top = max(top, texelFetch(rays, here + ivec2(0, reach), 0).rg - float(reach) * drop);
+    top = texelFetch(rays, here, 0);
+    if (here.y + reach < count) top = max(top, texelFetch(rays, here + ivec2(0, reach), 0) - float(reach) * drop);
   }
-  result = vec4(max(top, NOTHING), 0.0, 1.0);
+  result = max(top, NOTHING);
 }

@@ -10,12 +10,15 @@ float disc_share(float t) {  // of a limb-darkened disc above a line t radii abo
   return mix(uniform_disc, darkened, 0.5);
 }
 
-vec2 ray_between(float line, int i) {
-  if (i >= count) return vec2(NOTHING);
+// where the horizon cuts the disc, in radii above its centre, between two of its heights
+float crossing(float lower, float above, float below) { return lower + 2.0 / 3.0 * above / max(above - below, 1e-20); }
+
+vec4 ray_between(float line, int i) {
+  if (i >= count) return vec4(NOTHING);
   int whole = int(floor(line));
-  vec2 a = texelFetch(rays, ivec2(whole, i), 0).rg, b = texelFetch(rays, ivec2(whole + 1, i), 0).rg;
+  vec4 a = texelFetch(rays, ivec2(whole, i), 0), b = texelFetch(rays, ivec2(whole + 1, i), 0);
   float share = line - floor(line);
-  return vec2(blend(a.x, b.x, share), blend(a.y, b.y, share));
+  return vec4(blend(a.x, b.x, share), blend(a.y, b.y, share), blend(a.z, b.z, share), blend(a.w, b.w, share));
 }
 
 void main() {
@@ -24,7 +27,7 @@ void main() {
   int i = by_rows ? here.y : here.x, column = by_rows ? here.x : here.y;
   if (backwards) i = count - 1 - i;
   own = sunk(own, float(i));
-  vec2 top = vec2(NOTHING);
+  vec4 top = vec4(NOTHING);
   for (int d = 0; d < NEAR; d++) {
     float at = float(column) + shear * float(d), share;
     float crossed = between_rows(i + d, at, share);
@@ -34,10 +37,15 @@ void main() {
       if (is_known(ground)) top = max(top, ground - float(d) * drop);
     }
   }
-  vec2 far = ray_between(float(column + first) - shear * float(i), i + NEAR);
+  vec4 far = ray_between(float(column + first) - shear * float(i), i + NEAR);
   top = max(top, far - float(NEAR) * drop);
-  vec2 over = top - own;  // m by which the horizon stands over the Sun's lower and upper edge
+  vec4 over = top - own;  // m by which the horizon stands over four heights on the disc
   float share = 1.0;
-  if (is_known(own) && over.x > 0.0) share = over.y >= 0.0 ? 0.0 : disc_share(2.0 * over.x / (over.x - over.y) - 1.0);
+  if (is_known(own) && over.x > 0.0) {
+    if (over.w >= 0.0) share = 0.0;
+    else if (over.y <= 0.0) share = disc_share(crossing(-1.0, over.x, over.y));
+    else if (over.z <= 0.0) share = disc_share(crossing(-1.0 / 3.0, over.y, over.z));
+    else share = disc_share(crossing(1.0 / 3.0, over.z, over.w));
+  }
   result = vec4(share, 0.0, 0.0, 1.0);
 }

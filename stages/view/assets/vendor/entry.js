@@ -6,6 +6,6 @@ export {
   BufferAttribute, BufferGeometry, Camera, ClampToEdgeWrapping, DataArrayTexture, DataTexture, DataUtils, FloatType,
   GLSL3, HalfFloatType, LinearFilter, LinearMipmapLinearFilter, Mesh, NearestFilter, OrthographicCamera,
   PerspectiveCamera, PlaneGeometry, RGBAFormat, RGFormat, RawShaderMaterial, RedFormat, Scene, UnsignedByteType,
-  Vector2, Vector3, WebGLRenderTarget, WebGLRenderer,
+  Vector2, Vector3, Vector4, WebGLRenderTarget, WebGLRenderer,
 } from "three";
 export { OrbitControls } from "three/addons/controls/OrbitControls.js";
