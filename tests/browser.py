@@ -27,6 +27,7 @@ FLAGS = (
     "--hide-scrollbars", "--no-first-run", "--disable-extensions", "--disable-background-networking",
     "--disable-dev-shm-usage", "--mute-audio",
 )  # fmt: skip
+WINDOW = "--window-size=900,600"
 POLICY = re.compile(r'<meta http-equiv="Content-Security-Policy"[^>]*>')
 
 # Float32Arrays travel as base64, which JSON alone would turn into objects.
@@ -40,7 +41,7 @@ SENDER = """
       return {float32: btoa(text)};
     })});
   try {
-    for (let k = 0; k < 1200 && WAIT && !window.lunargr; k++) await new Promise((done) => setTimeout(done, 100));
+    for (let k = 0; k < 1200 && !window.lunargr; k++) await new Promise((done) => setTimeout(done, 100));
     await send({result: await (async () => { SCRIPT })()});
   } catch (error) { await send({error: String(error) + " " + (error.stack || "")}); }
 })();</script>
@@ -80,15 +81,17 @@ def _server() -> Iterator[tuple[int, queue.Queue[bytes]]]:
         thread.join()
 
 
-def run_in_page(page: Path, script: str, *, wait: bool = True, timeout: float = 120, size: str = "900,600") -> Any:
+def run_in_page(page: Path, script: str, *, timeout: float = 180, flags: tuple[str, ...] = ()) -> Any:
     """What the body of an async function returns inside the page, once the page's ``window.lunargr`` is there."""
     program = chromium()
     with _server() as (port, answers), tempfile.TemporaryDirectory() as profile:
-        sender = SENDER.replace("PORT", str(port)).replace("WAIT", str(wait).lower()).replace("SCRIPT", script)
+        sender = SENDER.replace("PORT", str(port)).replace("SCRIPT", script)
         copy = Path(profile) / "page.html"
         # the page itself may not speak to anyone: the copy that is tested must
         copy.write_text(POLICY.sub("", page.read_text()).replace("</body>", sender + "</body>"))
-        command = [program, *FLAGS, f"--window-size={size}", f"--user-data-dir={profile}/profile", "--remote-debugging-port=0", copy.as_uri()]
+        profile_flag = f"--user-data-dir={profile}/profile"
+        # without a port for debugging, a headless Chromium ends as soon as the page has loaded
+        command = [program, *FLAGS, *flags, WINDOW, profile_flag, "--remote-debugging-port=0", copy.as_uri()]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
             answer = json.loads(answers.get(timeout=timeout), object_hook=_arrays)
@@ -109,13 +112,9 @@ def _arrays(value: dict[str, Any]) -> Any:
     return value
 
 
-def screenshot(page: Path, target: Path, *, size: str = "1280,800", fragment: str = "", more: tuple[str, ...] = ()) -> Path:
-    """A PNG of the page as a person sees it."""
+def read_dom(page: Path, flags: tuple[str, ...] = ("--dump-dom",)) -> str:
+    """The page's document after its scripts have run, with nothing in it changed."""
     program = chromium()
     with tempfile.TemporaryDirectory() as profile:
-        command = [
-            program, *FLAGS, *more, f"--window-size={size}", f"--user-data-dir={profile}", "--timeout=60000",
-            "--virtual-time-budget=30000", f"--screenshot={target}", page.resolve().as_uri() + fragment,
-        ]  # fmt: skip
-        subprocess.run(command, check=True, capture_output=True, timeout=180)
-    return target
+        command = [program, *FLAGS, *flags, WINDOW, f"--user-data-dir={profile}", "--virtual-time-budget=30000", page.resolve().as_uri()]
+        return subprocess.run(command, check=True, capture_output=True, text=True, timeout=180).stdout

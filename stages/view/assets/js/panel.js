@@ -145,7 +145,7 @@ function setValue(id, value) {
   if (document.activeElement !== byId(id) || byId(id).type === "range") byId(id).value = Math.round(value * 100) / 100;
 }
 
-const short = (value) => Number(value.toPrecision(4)).toString();
+const short = (value) => (value !== 0 && Math.abs(value) < 1e-3 ? value.toExponential(2) : Number(value.toPrecision(4)).toString());
 
 /** Rows for the read-out of a pixel */
 function pixelRows(head, page, relighter, row, col) {
@@ -163,6 +163,6 @@ function pixelRows(head, page, relighter, row, col) {
     ["i, e, g", [incidence, emission, phase].map(degrees).join(", ")],
     ["Slope", degrees(slope)],
     ["Sunlight", `${(100 * sunlight).toFixed(0)} %`],
-    ...page.fields.map((f) => [f.name.replaceAll("_", " "), Number.isFinite(f.values[k]) ? Number(f.values[k].toPrecision(4)).toString() : "unknown"]),
+    ...page.fields.map((f) => [f.name.replaceAll("_", " "), Number.isFinite(f.values[k]) ? short(f.values[k]) : "unknown"]),
   ];
 }

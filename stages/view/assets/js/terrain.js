@@ -59,7 +59,7 @@ class Terrain {
     } else {
       const floor = this.middleHeight * this.scale;
       controls.target.set(0, 0, floor);
-      camera.position.set(0.55, -2.9, floor + 1.9);
+      camera.position.set(0.5, -3.1, floor + 2.1);
     }
     camera.updateProjectionMatrix();
     controls.update();
