@@ -59,8 +59,8 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
   float multiple = multiple_scattering(rough.x / k, w) * multiple_scattering(rough.y / k, w) - 1.0;
   float x = tangent / max(p[6], 1e-9);
   float mean = x < 1e-2 ? 1.0 - x / 2.0 * (1.0 - x / 3.0) : (1.0 - exp(-x)) / x;
-  float coherent = 1.0 + p[5] * (1.0 + mean) / (2.0 * (1.0 + x) * (1.0 + x));
-  return (single + multiple) * rough.x * rough.y / (rough.x + rough.y) * rough.z * k * w / 4.0 * coherent;
+  float backscatter = 1.0 + p[5] * (1.0 + mean) / (2.0 * (1.0 + x) * (1.0 + x));
+  return (single + multiple) * rough.x * rough.y / (rough.x + rough.y) * rough.z * k * w / 4.0 * backscatter;
 }
 """
 GLSL_HENYEY_GREENSTEIN = """

@@ -15,6 +15,9 @@ function makeRenderer() {
   const renderer = new THREE.WebGLRenderer({ canvas, context, antialias: true, alpha: true });
   renderer.outputColorSpace = "srgb-linear";  // the page's shaders write display values
   renderer.setClearColor(0x000000, 0);
+  renderer.debug.onShaderError = (gl, program, vertex, fragment) => {
+    throw new Error(`the graphics driver refuses a shader: ${gl.getShaderInfoLog(fragment) || gl.getProgramInfoLog(program)}`);
+  };
   return renderer;
 }
 
