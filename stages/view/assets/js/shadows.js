@@ -1,10 +1,12 @@
 // Cast shadows with the Sun's disc, on the map's own pixels.
 //
 // Parallel lines of sight cover the map, one per pixel across. Along each, the highest ray that grazes the terrain is
-// found by doubling: after n passes it knows the next 2^n rows. Four rays per line, from the Sun's lower edge to
+// found by doubling: after n passes it knows the next 8 x 2^n rows. Four rays per line, from the Sun's lower edge to
 // its upper one, give the horizon within the disc.
 
 const SUN_RADIUS = (0.2666 * Math.PI) / 180;
+
+const GRAIN = 8;  // as in lattice.glsl
 
 class Shadows {
   constructor(renderer, passes, head, relief) {
@@ -25,11 +27,11 @@ class Shadows {
     const first = shear > 0 ? Math.ceil(shear * (count - 1)) : 0;
     const lines = across + Math.ceil(Math.abs(shear) * (count - 1)) + 2;
     const uniforms = { by_rows: byRows, backwards: major < 0, count, first, shear, spacing, radius: head.radius, drop };
-    let [from, to] = this.targets(lines, count);
+    let [from, to] = this.targets(lines, Math.ceil(count / GRAIN));
     this.passes.run("spread", { ...uniforms, reach: 0, rays: null }, to);
     const sink = (count * spacing) ** 2 / (8 * head.radius);
     const needed = drop.x > 0 ? Math.min(count, Math.ceil((this.relief + sink) / drop.x) + 1) : count;
-    for (let reach = 1; reach < needed; reach *= 2) {
+    for (let reach = 1; reach * GRAIN < needed; reach *= 2) {
       [from, to] = [to, from];
       this.passes.run("spread", { ...uniforms, reach, rays: from.texture }, to);
     }

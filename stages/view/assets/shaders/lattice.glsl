@@ -1,5 +1,6 @@
 // Lines of sight towards the Sun over the map. Line k crosses row i of the sweep at the column k - first + shear i; rows
 // count towards the Sun. Heights are those above the plane of the map's middle, so that the Sun's rays are straight.
+const int GRAIN = 8;       // rows that one row of the lattice stands for: exact, as pixels look at the rows before it themselves
 uniform bool by_rows;      // the sweep's rows are rows of the map, else its columns
 uniform bool backwards;    // they count down
 uniform int count;         // rows of the sweep

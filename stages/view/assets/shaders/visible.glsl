@@ -1,6 +1,6 @@
 // The Sun's visible share at every pixel: the terrain horizon against the Sun's limb-darkened disc.
 uniform sampler2D rays;
-const int NEAR = 8;  // rows looked at along the pixel's own ray
+const int NEAR = 6;  // rows at least that are looked at along the pixel's own ray
 out vec4 result;
 
 float disc_share(float t) {  // of a limb-darkened disc above a line t radii above its centre (u = 0.6)
@@ -14,7 +14,7 @@ float disc_share(float t) {  // of a limb-darkened disc above a line t radii abo
 float crossing(float lower, float above, float below) { return lower + 2.0 / 3.0 * above / max(above - below, 1e-20); }
 
 vec4 ray_between(float line, int i) {
-  if (i >= count) return vec4(NOTHING);
+  if (i * GRAIN >= count) return vec4(NOTHING);
   int whole = int(floor(line));
   vec4 a = texelFetch(rays, ivec2(whole, i), 0), b = texelFetch(rays, ivec2(whole + 1, i), 0);
   float share = line - floor(line);
@@ -28,7 +28,8 @@ void main() {
   if (backwards) i = count - 1 - i;
   own = sunk(own, float(i));
   vec4 top = vec4(NOTHING);
-  for (int d = 0; d < NEAR; d++) {
+  int next = (i + NEAR + GRAIN - 1) / GRAIN, rows = next * GRAIN - i;  // row of the lattice to go on from
+  for (int d = 0; d < rows; d++) {
     float at = float(column) + shear * float(d), share;
     float crossed = between_rows(i + d, at, share);
     if (is_known(crossed)) top = max(top, crossed - (float(d) + share) * drop);
@@ -37,8 +38,8 @@ void main() {
       if (is_known(ground)) top = max(top, ground - float(d) * drop);
     }
   }
-  vec4 far = ray_between(float(column + first) - shear * float(i), i + NEAR);
-  top = max(top, far - float(NEAR) * drop);
+  vec4 far = ray_between(float(column + first) - shear * float(i), next);
+  top = max(top, far - float(rows) * drop);
   vec4 over = top - own;  // m by which the horizon stands over four heights on the disc
   float share = 1.0;
   if (is_known(own) && over.x > 0.0) {
