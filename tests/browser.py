@@ -116,5 +116,13 @@ def read_dom(page: Path, flags: tuple[str, ...] = ("--dump-dom",)) -> str:
     """The page's document after its scripts have run, with nothing in it changed."""
     program = chromium()
     with tempfile.TemporaryDirectory() as profile:
-        command = [program, *FLAGS, *flags, WINDOW, f"--user-data-dir={profile}", "--virtual-time-budget=30000", page.resolve().as_uri()]
+        command = [
+            program,
+            *FLAGS,
+            *flags,
+            WINDOW,
+            f"--user-data-dir={profile}",
+            "--virtual-time-budget=30000",
+            page.resolve().as_uri(),
+        ]
         return subprocess.run(command, check=True, capture_output=True, text=True, timeout=180).stdout

@@ -24,7 +24,9 @@ from stages.view.photographs import read_photographs
 
 def unpack(packed: Packed) -> np.ndarray:
     """What the page's script does, in numpy."""
-    planes = np.frombuffer(zlib.decompress(packed.data), np.uint8).reshape(packed.planes, *packed.shape).astype(np.int64)
+    planes = (
+        np.frombuffer(zlib.decompress(packed.data), np.uint8).reshape(packed.planes, *packed.shape).astype(np.int64)
+    )
     folded = sum(plane << (8 * k) for k, plane in enumerate(planes))
     codes = np.where(folded & 1, -((folded + 1) >> 1), folded >> 1)
     if packed.order == 2:
@@ -88,7 +90,9 @@ def test_photographs_lie_on_the_ground_that_they_show(small_artefacts, tmp_path)
         names = [name.decode() for name in file["image_id"][...]]
         for photograph in found:
             height, width = photograph.image.shape
-            ground = content.elevation[photograph.row : photograph.row + height, photograph.col : photograph.col + width]
+            ground = content.elevation[
+                photograph.row : photograph.row + height, photograph.col : photograph.col + width
+            ]
             same = [k for k in range(len(file["row"])) if np.allclose(file["elevation"][k], ground, atol=0.02)]
             assert same, "no crop has this ground"
             pair = next(k for k in same if names[file["image_index"][k]] == photograph.title)

@@ -113,7 +113,9 @@ def test_photographs_match_the_page_under_their_own_sun(small_artefacts, tmp_pat
     from test_view import map_of
 
     page = tmp_path / "v.html"
-    view.run(map_of(small_artefacts["scene"], tmp_path), page, view.Config(photographs=2), pairs=small_artefacts["pairs"])
+    view.run(
+        map_of(small_artefacts["scene"], tmp_path), page, view.Config(photographs=2), pairs=small_artefacts["pairs"]
+    )
     text = run_in_page(page, "lunargr.photograph(1); return document.getElementById('photograph-text').textContent")
     assert float(re.search(r"correlation (-?[\d.]+)", text).group(1)) > 0.8, text
 
@@ -192,7 +194,12 @@ def test_every_models_formula_in_glsl_is_its_formula_here(tmp_path):
     for name in model_names():
         model = get_model(name)
         assert model.glsl is not None
-        given = np.stack([p.default + rng.uniform(0, 0.4, n) * (p.upper - p.default) * (rng.random(n) < 0.5) for p in model.parameters])
+        given = np.stack(
+            [
+                p.default + rng.uniform(0, 0.4, n) * (p.upper - p.default) * (rng.random(n) < 0.5)
+                for p in model.parameters
+            ]
+        )
         named = dict(zip((p.name for p in model.parameters), given, strict=True))
         expected.append(evaluate(name, named, incidence, emission, phase))
         numbers = json.dumps([float(f"{v:.9g}") for v in given.ravel()])

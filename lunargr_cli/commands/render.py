@@ -95,6 +95,10 @@ def command(
     trajectory: Annotated[
         Path | None, typer.Option(metavar="CSV", help="One view per row; see docs/render.md. --output names a folder.")
     ] = None,
+    export: Annotated[
+        str | None,
+        typer.Option("--export", metavar="colmap|nerfstudio", help="With --trajectory: also its views as a data set."),
+    ] = None,
     extend: Annotated[
         Path | None, typer.Option(metavar="FILE", help="diagnosis.h5: add the effects that 'lunargr diagnose' found.")
     ] = None,
@@ -154,6 +158,7 @@ def command(
         extension=str(extend) if extend else None,
         body=body or "moon",
         backplanes_in_tif=backplanes,
+        export=export,
     )
     console = Console(quiet)
     if trajectory is not None:

@@ -17,9 +17,7 @@ def model_card(
     """Markdown. losses : train_loss and validation_loss by epoch; best : the epoch whose weights these are, from 0"""
     model, stride = predictor.model, predictor.net.stride
     rows = "\n".join(f"| {k} | `{p.name}` | {p.unit} | {p.description} |" for k, p in enumerate(model.parameters))
-    inputs = ", ".join(
-        f"`{i['name']}` (SHA-256 `{i['sha256'][:16]}...`)" for i in json.loads(told.get("inputs", "[]"))
-    )
+    inputs = ", ".join(f"`{i['name']}` (SHA-256 `{i['sha256'][:16]}...`)" for i in json.loads(told.get("inputs", "[]")))
     found = float(losses["validation_loss"][best]) if 0 <= best < len(losses["validation_loss"]) else float("nan")
     error = f"{found:.4g}" if np.isfinite(found) else "not recorded"
     return f"""# {name}

@@ -17,14 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import ConfigError, InputError
+from schemas.errors import InputError
 from schemas.files.outputs import atomic_path
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
 from stages.render.pictures import DISPLAY_GAMMA, read_exr
 
 Floats = NDArray[np.float64]
-FORMATS = ("colmap", "nerfstudio")
 POINTS_PER_SIDE = 24  # of each view, on which the sparse points are picked
 SAME_PLACE = 2e-3  # of the distance: a point that another view sees this near is the same
 GL_AXES = np.diag([1.0, -1.0, -1.0])  # nerfstudio's cameras look along -z, with y up
@@ -58,9 +57,7 @@ def make_world(grid: Grid) -> World:
 
 
 def export_views(views: Sequence[View], grid: Grid, folder: Path, kind: str) -> list[Path]:
-    """Write the data set of ``views`` into ``folder``/colmap or ``folder``/nerfstudio. Raises ConfigError, InputError."""
-    if kind not in FORMATS:
-        raise ConfigError(f"--export: expected one of {', '.join(FORMATS)}; found '{kind}'.")
+    """Write the data set of ``views`` into ``folder``/colmap or ``folder``/nerfstudio. Raises InputError."""
     missing = [view.exr.name for view in views if not view.exr.exists()]
     if missing:
         raise InputError(
@@ -143,7 +140,9 @@ def _write_nerfstudio(views: Sequence[View], world: World, target: Path) -> list
         )
     path = target / "transforms.json"
     with atomic_path(path) as partial:
-        partial.write_text(json.dumps({"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}, indent=1))
+        partial.write_text(
+            json.dumps({"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}, indent=1)
+        )
     return [*written, path]
 
 

@@ -47,9 +47,7 @@ def make_page(
     )
 
 
-def describe(
-    content: Content, frames: Frames, photographs: Sequence[Photograph], blob: Blob
-) -> dict[str, Any]:
+def describe(content: Content, frames: Frames, photographs: Sequence[Photograph], blob: Blob) -> dict[str, Any]:
     """What the page's script must know; its maps go into ``blob``."""
     grid = content.grid
     known = np.isfinite(content.elevation)
