@@ -71,7 +71,7 @@ def test_content_has_every_map_of_the_file(hilly_map):
 
 
 def test_a_large_map_is_shown_as_means_at_the_same_place(hilly_map):
-    path, grid, elevation, coefficients = hilly_map
+    path, grid, elevation, _ = hilly_map
     content = read_content(path, 70)
     assert content.factor == 3 and content.elevation.shape == (53, 66)
     np.testing.assert_allclose(content.elevation[10, 20], elevation[30:33, 60:63].mean(), rtol=1e-6)

@@ -86,7 +86,7 @@ def to_onnx(predictor: Predictor, opset: int, told: dict[str, str]) -> bytes:
         torch.onnx.export(
             _Exported(predictor.to(memory_format=torch.contiguous_format).eval()),  # type: ignore[call-overload]
             (torch.zeros(1, 4 * stride, 4 * stride),),
-            buffer,
+            buffer,  # type: ignore[arg-type]
             input_names=[INPUT],
             output_names=[OUTPUT],
             dynamic_axes={INPUT: axes, OUTPUT: {0: "batch", 2: "height", 3: "width"}},

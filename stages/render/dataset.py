@@ -79,6 +79,13 @@ def z_depth(camera: Pinhole, distance: NDArray) -> Floats:
     return distance / np.sqrt(1 + x * x + y * y)
 
 
+def ray_directions(camera: Pinhole) -> Floats:
+    """(lines, samples, 3) unit vectors of the pixels' rays in the camera: right, down, forward."""
+    x, y = _ray_slopes(camera)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
 def _ray_slopes(camera: Pinhole) -> tuple[Floats, Floats]:
     sample, line = np.meshgrid(np.arange(camera.samples) + 0.5, np.arange(camera.lines) + 0.5)
     x = (sample - camera.principal_point_px[0]) / camera.focal_px[0]
@@ -211,11 +218,12 @@ def _grid_points(camera: Pinhole, depth: NDArray[np.float32], world: World) -> t
     line, sample = (v.ravel() for v in np.mgrid[step // 2 : camera.lines : step, step // 2 : camera.samples : step])
     known = np.isfinite(depth[line, sample])
     line, sample = line[known], sample[known]
-    x, y = (v[line, sample] for v in _ray_slopes(camera))
-    rays = np.stack([x, y, np.ones_like(x)], axis=1)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     rotation, place = world.pose(camera)
-    return place + depth[line, sample, None] * (rays @ rotation.T), sample + 0.5, line + 0.5
+    return (
+        place + depth[line, sample, None] * (ray_directions(camera)[line, sample] @ rotation.T),
+        sample + 0.5,
+        line + 0.5,
+    )
 
 
 def project(camera: Pinhole, world: World, points: Floats) -> tuple[NDArray[np.bool_], Floats, Floats, Floats]:

@@ -128,6 +128,6 @@ def block_mean(values: Floats32, factor: int) -> Floats32:
     blocks = values[: height * factor, : width * factor].reshape(height, factor, width, factor)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a block without any known pixel
-        mean = np.nanmean(blocks, axis=(1, 3), dtype=np.float64)
+        mean = np.asarray(np.nanmean(blocks, axis=(1, 3), dtype=np.float64))
     mean[np.isfinite(blocks).mean(axis=(1, 3)) < 0.5] = np.nan
-    return mean.astype(np.float32)
+    return np.asarray(mean, np.float32)

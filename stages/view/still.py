@@ -25,7 +25,9 @@ def still_jpeg(content: Content, sun_azimuth_deg: float, sun_elevation_deg: floa
     elevation = block_mean(content.elevation, factor)
     coefficients = np.stack([block_mean(layer.values, factor) for layer in content.coefficients])
     grid = content.grid
-    small = Grid(grid.crs_wkt, grid.transform @ grid.transform.scale(factor), *elevation.shape, grid.radius)
+    small = Grid(
+        grid.crs_wkt, grid.transform @ grid.transform.scale(factor), elevation.shape[0], elevation.shape[1], grid.radius
+    )
     sun = sun_from_angles(sun_azimuth_deg, sun_elevation_deg, small)
     relief = float(np.nanmax(elevation) - np.nanmin(elevation))
     # arrays slice as the file's variables do
