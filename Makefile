@@ -64,8 +64,11 @@ D := demo
 # fp32: which precision is faster is timed, and the README's figures must not hang on how busy a machine was
 DEMO_TRAIN := --epochs 6 --batch 32 --lr 1e-3 --schedule cosine --precision fp32
 
-demo: $(D)/report.html ## run every stage on the embedded scene and name a report to open
-	@echo; echo "Open $(abspath $(D)/report.html)"
+demo: $(D)/report.html $(D)/view.html ## run every stage on the embedded scene and name a report to open
+	@echo; echo "Open $(abspath $(D)/report.html)"; echo "and  $(abspath $(D)/view.html)"
+
+$(D)/view.html: $(D)/svbrdf.h5 $(D)/pairs.h5
+	$(LUNARGR) view $< --pairs $(D)/pairs.h5 -o $@ --title "lunargr demo: the embedded scene" --overwrite
 
 $(D)/scene/images.csv: | $(STAMP)
 	$(LUNARGR) simulate -o $(D)/scene --hidden sun_azimuth:error_deg=5 --overwrite

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 
 import cv2
 import numpy as np
 import pytest
+from conftest import ROOT
+from PIL import Image, ImageSequence
 from render_scene import LAT, LON, SUN, lunargr_render
 
 from stages.physics.maps.grid import read_grid, unit_vectors
@@ -109,6 +114,24 @@ def test_a_rotation_comes_back_from_its_quaternion(rng):
             ]
         )
         np.testing.assert_allclose(back, rotation, atol=1e-12)
+
+
+@pytest.mark.parametrize("suffix", ["webp", "mp4"])
+def test_a_trajectory_becomes_a_film(hilly_map, tmp_path, monkeypatch, capsys, suffix):
+    render_views(hilly_map[0], tmp_path, monkeypatch, capsys, "colmap")
+    film = tmp_path / f"film.{suffix}"
+    command = [sys.executable, ROOT / "examples" / "film.py", tmp_path / "views", film, "--rate", "3"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert done.returncode == 0, done.stderr
+    if suffix == "webp":
+        with Image.open(film) as opened:
+            assert opened.n_frames == 3 and opened.size == (60, 40)
+            frames = [np.asarray(frame.convert("L"), float) for frame in ImageSequence.Iterator(opened)]
+    else:
+        reader = cv2.VideoCapture(str(film))
+        frames = [reader.read()[1][..., 0].astype(float) for _ in range(3)]
+        assert reader.read()[0] is False
+    assert np.abs(frames[0] - frames[1]).mean() > 1 and frames[0].std() > 5
 
 
 def test_what_makes_no_data_set_is_one_line(hilly_map, tmp_path, monkeypatch, capsys):
