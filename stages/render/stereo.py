@@ -173,7 +173,7 @@ def _render_pair(
             position, look_at(position, target, roll), config.fov_deg, config.size_px, surface.grid.radius
         )
         sun = {"sun_azimuth_deg": rng.uniform(0, 360), "sun_elevation_deg": rng.uniform(*stereo.sun_elevation_deg)}
-        own = replace(config, **sun)
+        own = replace(config, sun_azimuth_deg=sun["sun_azimuth_deg"], sun_elevation_deg=sun["sun_elevation_deg"])
         files = output_files(folder / f"{name}_{side}.exr", "pinhole")
         light = make_light(surface, own, body, relief)
         render_camera(surface, camera, light, relief, files, own, f"{name}_{side}", None)
@@ -183,7 +183,7 @@ def _render_pair(
     depths = exrs[0]["depth"], exrs[1]["depth"]
     matches = correspondences(cameras[0], cameras[1], depths, world)
     path = folder / f"{name}_matches.exr"
-    with write_exr(path, *depths[0].shape, list(matches)) as writer:
+    with write_exr(path, depths[0].shape[0], depths[0].shape[1], list(matches)) as writer:
         writer.write(matches)
     lit = np.mean(matches["visible"][np.isfinite(depths[0])]) if np.isfinite(depths[0]).any() else 0.0
     return {
