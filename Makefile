@@ -11,7 +11,7 @@ LUNARGR := $(BIN)/lunargr
 STAMP := $(VENV)/.installed
 SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 
-.PHONY: help install demo test test-slow fuzz endurance lint bench campaign docs reproduce-apollo15 reproduce-models clean
+.PHONY: help install demo test test-slow fuzz endurance lint bench campaign docs vendor-js reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -58,6 +58,14 @@ docs: $(STAMP) ## write the generated parts of docs/ again, and build the site i
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "Open $(abspath build/site/index.html)"
 
+VENDOR := stages/view/assets/vendor
+
+vendor-js: ## bundle three.js for the page of `lunargr view` again (needs npm; versions in its package.json)
+	npm install --silent --no-package-lock --prefix $(VENDOR)
+	npm run --silent --prefix $(VENDOR) bundle
+	cp $(VENDOR)/node_modules/three/LICENSE $(VENDOR)/LICENSE.three.txt
+	rm -rf $(VENDOR)/node_modules
+
 # --- the embedded scene --------------------------------------------------------------------------------------------
 
 D := demo
@@ -66,8 +74,11 @@ DEMO_SPLIT := --split 65/10/25
 # fp32: which precision is faster is timed, and the README's figures must not hang on how busy a machine was
 DEMO_TRAIN := --epochs 6 --batch 32 --lr 1e-3 --schedule cosine --precision fp32
 
-demo: $(D)/report.html ## run every stage on the embedded scene and name a report to open
-	@echo; echo "Open $(abspath $(D)/report.html)"
+demo: $(D)/report.html $(D)/view.html ## run every stage on the embedded scene and name a report to open
+	@echo; echo "Open $(abspath $(D)/report.html)"; echo "and  $(abspath $(D)/view.html)"
+
+$(D)/view.html: $(D)/svbrdf.h5 $(D)/pairs.h5
+	$(LUNARGR) view $< --pairs $(D)/pairs.h5 -o $@ --title "lunargr demo: the embedded scene" --overwrite
 
 $(D)/scene/images.csv: | $(STAMP)
 	$(LUNARGR) simulate -o $(D)/scene --hidden sun_azimuth:error_deg=5 --overwrite

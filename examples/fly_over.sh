@@ -1,6 +1,7 @@
 #!/bin/sh
 # Render a trajectory over a reflectance map; run it again to go on where it was stopped.
 #   sh examples/fly_over.sh [svbrdf.h5] [trajectory.csv] [folder]
+# Afterwards: python examples/film.py views/ film.webp   (or film.mp4)
 # As a Slurm array each task takes its share of the views: sbatch --array=1-8 examples/fly_over.sh svbrdf.h5
 set -eu
 map=${1:-svbrdf.h5}

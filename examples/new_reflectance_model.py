@@ -27,6 +27,12 @@ class AshikhminShirley(ReflectanceModel):
     linear = True  # in its parameters: a global fit is one least-squares solve
     finite = True  # no division, no root: any cosines will do
     parameters = (Parameter("albedo", "1", 0.0, 1.0, 0.12, "diffuse albedo"),)
+    # the same for the page of `lunargr view`, which refuses a model without it
+    glsl = """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
+  return 28.0 / 23.0 * p[0] * mu0 * (1.0 - pow(1.0 - mu0 / 2.0, 5.0)) * (1.0 - pow(1.0 - mu / 2.0, 5.0));
+}
+"""
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         """I/F = pi r, so with cos(incidence) in it; parameters broadcast with the angles."""

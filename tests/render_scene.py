@@ -13,6 +13,7 @@ from small_scene import write_raster
 from lunargr_cli import main as cli
 from schemas import SVBRDF, ArtefactWriter
 from stages.physics.maps.grid import Grid
+from stages.physics.photometry import get_model
 
 LON, LAT = -42.0, 17.0
 SUN = ("--sun-azimuth", "100", "--sun-elevation", "35")
@@ -23,7 +24,7 @@ def make_grid(height: int, width: int, gsd: float) -> Grid:
 
 
 def write_svbrdf(path, grid: Grid, elevation: np.ndarray, coefficients: np.ndarray, model: str = "M2"):
-    names = {"M2": ["a", "b", "c"], "lambert": ["albedo"]}[model]
+    names = [p.name for p in get_model(model).parameters]
     attributes = {"gsd_m": grid.gsd, "body_radius_m": RADIUS, "model": model, "quantity": "I/F"}
     sizes = {"coefficient": len(names), "y": grid.height, "x": grid.width}
     with ArtefactWriter(path, SVBRDF, sizes, attributes=attributes) as writer:
@@ -60,8 +61,13 @@ def write_hilly_map(rng, path):
 
 def lunargr_render(monkeypatch, capsys, *arguments) -> tuple[int, str]:
     """Exit code and standard error of `lunargr render`, as the shell would see them."""
+    return run_lunargr(monkeypatch, capsys, "render", *arguments)
+
+
+def run_lunargr(monkeypatch, capsys, *arguments) -> tuple[int, str]:
+    """The same of any command."""
     monkeypatch.setattr(os, "_exit", sys.exit)  # the command line leaves Python at once after an error
-    monkeypatch.setattr(sys, "argv", ["lunargr", "render", *map(str, arguments)])
+    monkeypatch.setattr(sys, "argv", ["lunargr", *map(str, arguments)])
     with pytest.raises(SystemExit) as stop:
         cli.main()
     return int(stop.value.code or 0), capsys.readouterr().err

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lunargr_cli.options import BodyOption, Json, Overwrite, Quiet, Resume, Shard, parse_shard
+from lunargr_cli.options import BodyOption, Json, Overwrite, Quiet, Resume, Seed, Shard, parse_shard
 from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
 
@@ -97,6 +97,23 @@ def command(
     trajectory: Annotated[
         Path | None, typer.Option(metavar="CSV", help="One view per row; see docs/render.md. --output names a folder.")
     ] = None,
+    export: Annotated[
+        str | None,
+        typer.Option("--export", metavar="colmap|nerfstudio", help="With --trajectory: also its views as a data set."),
+    ] = None,
+    stereo: Annotated[
+        int | None,
+        typer.Option(
+            "--stereo", metavar="N", help="N stereo pairs with every correspondence into the folder --output."
+        ),
+    ] = None,
+    altitude: Annotated[
+        float | None, typer.Option(metavar="M", help="With --stereo: of both cameras above the ground they look at.")
+    ] = None,
+    convergence: Annotated[
+        str, typer.Option(metavar="LOW,HIGH", help="With --stereo: degrees between both lines of sight.")
+    ] = "4,30",
+    seed: Seed = 0,
     extend: Annotated[
         Path | None, typer.Option(metavar="FILE", help="diagnosis.h5: add the effects that 'lunargr diagnose' found.")
     ] = None,
@@ -156,8 +173,19 @@ def command(
         extension=str(extend) if extend else None,
         body=body,
         backplanes_in_tif=backplanes,
+        export=export,
     )
     console = Console(quiet)
+    if stereo is not None:
+        if trajectory is not None or camera or position or shard or resume:
+            raise ConfigError(
+                "--stereo: expected without a camera, --trajectory, --shard and --resume; it draws its own."
+            )
+        low, high = _numbers(convergence, "--convergence", (2,)) or (4.0, 30.0)
+        drawn = render.StereoConfig(stereo, altitude, (low, high), seed=seed)
+        manifest = render.run_stereo(path, output, config, drawn, overwrite=overwrite, progress=console.progress)
+        console.say(f"{manifest}: {stereo} stereo pairs")
+        return
     if trajectory is not None:
         results = render.run_trajectory(
             path,

@@ -11,6 +11,7 @@ from stages.physics.bodies.spheres import find_body
 from stages.render.config import Config, Summary, check, inputs, output_files
 from stages.render.maps import render_map
 from stages.render.setting import find_camera, make_light, open_source
+from stages.render.stereo import StereoConfig, run_stereo
 from stages.render.views import render_camera, run_trajectory
 
 Progress = Callable[[int, int, str], None]
@@ -40,4 +41,4 @@ def run(
         return render_camera(surface, camera, light, relief, files, config, output.stem, progress)
 
 
-__all__ = ["Config", "Summary", "run", "run_trajectory"]
+__all__ = ["Config", "StereoConfig", "Summary", "run", "run_stereo", "run_trajectory"]

@@ -15,6 +15,7 @@ from schemas.errors import ConfigError
 Floats32 = NDArray[np.float32]
 
 VIEWS = ("ortho", "pinhole")
+EXPORTS = ("colmap", "nerfstudio")
 SUN = (
     "sun_azimuth_deg",
     "sun_elevation_deg",
@@ -37,6 +38,7 @@ class Config:
     camera : path of a camera model (JSON), instead of position, attitude, fov and size
     samples : rays per pixel and axis (None: as many as the pixel's footprint asks for)
     model, parameters : a reflectance that is the same everywhere, where the source holds none
+    export : with a trajectory: also a data set of its views, colmap or nerfstudio
     terrain_only : of svbrdf.h5 use the terrain, with ``model``
     """
 
@@ -62,6 +64,7 @@ class Config:
     extension: str | None = None
     body: str | None = None
     backplanes_in_tif: bool = False
+    export: str | None = None
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,10 @@ def check(config: Config, trajectory: bool = False) -> None:
         raise ConfigError(
             f"--size: expected a view of at most {LARGEST_VIEW:,} pixels, found {config.size_px[0]} x {config.size_px[1]}."
         )
+    if config.export is not None and not trajectory:
+        raise ConfigError("--export: expected together with --trajectory; a single view makes no data set.")
+    if config.export not in (None, *EXPORTS):
+        raise ConfigError(f"--export: expected one of {', '.join(EXPORTS)}; found '{config.export}'.")
     if config.view == "ortho" or config.camera or trajectory:
         return
     if config.position is None:

@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,12 @@ from schemas.errors import ConfigError, GeometryError
 from schemas.files.outputs import Target, check_outputs
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras.base import Camera
+from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
 from stages.physics.terrain.shading import BACKPLANES, Light
 from stages.physics.terrain.surface import Surface
 from stages.render.config import SUN, Config, Summary, Tally, check, inputs, output_files, skipped
+from stages.render.dataset import View, export_views
 from stages.render.perspective import apply_sensor, make_scene, render_view
 from stages.render.pictures import Preview, write_exr, write_png
 from stages.render.setting import camera_place, find_camera, make_light, metadata, open_source
@@ -47,6 +50,12 @@ def run_trajectory(
         raise ConfigError("--trajectory: expected no --camera; each row places its own pinhole camera.")
     config = replace(config, view="pinhole")
     check(config, trajectory=True)
+    if config.export is not None and shard[1] > 1:
+        raise ConfigError(
+            "--export: expected without --shard; render the shards, then export with --resume and no --shard."
+        )
+    if config.export is not None and suffix != ".exr":
+        raise ConfigError("--export: expected EXR files, which hold the depths; drop --png-only.")
     body = find_body("moon" if config.body is None else config.body)
     views = read_trajectory(table)[shard[0] :: shard[1]]
     outputs = {view.view_id: output_files(folder / f"{view.view_id}{suffix}", "pinhole") for view in views}
@@ -75,6 +84,10 @@ def run_trajectory(
                 )
             except GeometryError as error:
                 raise GeometryError(f"{table.name}, {view.view_id}: {error}") from None
+        if config.export is not None:
+            cameras = [cast(Pinhole, find_camera(surface, _with_row(config, view))) for view in views]
+            found = [View(v.view_id, c, outputs[v.view_id][0]) for v, c in zip(views, cameras, strict=True)]
+            export_views(found, surface.grid, folder, config.export)
     if progress:
         progress(len(views), len(views), "views")
     return results

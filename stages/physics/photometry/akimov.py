@@ -33,6 +33,16 @@ class Akimov(ReflectanceModel):
         Parameter("albedo", "1", 0.0, 1.0, 0.07, "equigonal albedo: I/F at the mirror point of the phase angle"),
         Parameter("eta", "1", 0.0, 1.0, 1.0, "latitude exponent: 1 = theory, about 0.5 lunar highlands, 0.3 maria"),
     )
+    glsl = """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
+  float g = clamp(phase_angle(cos_g), 1e-3, PI - 1e-3);
+  float sin_g = sin(g), across = mu0 - mu * cos(g), along = mu * sin_g, share = g / (PI - g);
+  float d = clamp(atan(along, across), 1e-6, PI - 1e-4);
+  float longitude = cos(share * d) + sin(share * d) / tan(d);
+  float cos2_latitude = clamp((across * across + along * along) / (sin_g * sin_g), 1e-12, 1.0);
+  return p[0] * cos(0.5 * g) * max(longitude, 0.0) * exp(0.5 * p[1] * share * log(cos2_latitude));
+}
+"""
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         mu0, mu = angles.cos_incidence, angles.cos_emission

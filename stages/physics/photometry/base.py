@@ -42,6 +42,10 @@ class ReflectanceModel(ABC):
     linear: ClassVar[bool] = False
     # The formula and its gradients are finite for any cosines in [-1, 1]: no need to keep them from 0 first.
     finite: ClassVar[bool] = False
+    # The same formula in GLSL ES 3.00 for the page of `lunargr view`; None: it has no page. It defines
+    #     float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g)
+    # with p in the order of ``parameters`` and both cosines above 0, and may use PI and phase_angle(cos_g).
+    glsl: ClassVar[str | None] = None
 
     @abstractmethod
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:

@@ -35,7 +35,7 @@ from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
-from stages.physics.photometry.roughness import rough_surface
+from stages.physics.photometry.roughness import GLSL_ROUGH_SURFACE, rough_surface
 
 # Defaults: Sato et al. (2014), 643 nm, mean over the Moon (set "sato2014_643nm" of `published.py`).
 OPTIONAL = (
@@ -46,6 +46,44 @@ OPTIONAL = (
     Parameter("theta", "rad", 0.0, math.radians(60), math.radians(23.6566), "mean slope of macroscopic roughness"),
     Parameter("phi", "1", 0.0, 0.7, 0.0, "filling factor; 0 = no porosity correction (K = 1)"),
 )
+
+# Parameters by position: w, b, c, then OPTIONAL
+GLSL_BODY = """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
+  float w = p[0], tangent = tan(min(0.5 * phase_angle(cos_g), 0.5 * PI - 1e-3));
+  vec3 rough = rough_surface(mu0, mu, cos_g, p[7]);
+  float surge = p[4] / max(p[4] + tangent, 1e-12);
+  float y = 1.209 * pow(clamp(p[8], 1e-20, 0.75), 2.0 / 3.0);
+  float k = y < 1e-3 ? 1.0 + y * (0.5 + y / 3.0) : -log(1.0 - y) / y;
+  float single = phase_function(p[1], p[2], cos_g) * (1.0 + p[3] * surge);
+  float multiple = multiple_scattering(rough.x / k, w) * multiple_scattering(rough.y / k, w) - 1.0;
+  float x = tangent / max(p[6], 1e-9);
+  float mean = x < 1e-2 ? 1.0 - x / 2.0 * (1.0 - x / 3.0) : (1.0 - exp(-x)) / x;
+  float backscatter = 1.0 + p[5] * (1.0 + mean) / (2.0 * (1.0 + x) * (1.0 + x));
+  return (single + multiple) * rough.x * rough.y / (rough.x + rough.y) * rough.z * k * w / 4.0 * backscatter;
+}
+"""
+GLSL_HENYEY_GREENSTEIN = """
+float phase_function(float b, float c, float cos_g) {
+  float backward = pow(max(1.0 - 2.0 * b * cos_g + b * b, 1e-12), -1.5);
+  float forward = pow(max(1.0 + 2.0 * b * cos_g + b * b, 1e-12), -1.5);
+  return (1.0 - b * b) * 0.5 * ((1.0 + c) * backward + (1.0 - c) * forward);
+}
+"""
+GLSL_H = {
+    "1981": """
+float multiple_scattering(float x, float w) {
+  return (1.0 + 2.0 * x) / (1.0 + 2.0 * x * sqrt(max(1.0 - w, 1e-12)));
+}
+""",
+    "2002": """
+float multiple_scattering(float x, float w) {
+  float gamma = sqrt(max(1.0 - w, 1e-12)), r0 = (1.0 - gamma) / (1.0 + gamma);
+  x = max(x, 1e-12);
+  return 1.0 / (1.0 - w * x * (r0 + (0.5 - r0 * x) * log(1.0 + 1.0 / x)));
+}
+""",
+}
 
 
 def henyey_greenstein(cos_phase: Tensor, b: Tensor, c: Tensor) -> Tensor:
@@ -99,6 +137,11 @@ class HapkeBase(ReflectanceModel):
     )
     reciprocal = True
     h_function: ClassVar[str] = "2002"
+    glsl_phase_function: ClassVar[str]
+
+    def __init_subclass__(cls) -> None:
+        if hasattr(cls, "glsl_phase_function"):
+            cls.glsl = GLSL_ROUGH_SURFACE + GLSL_H[cls.h_function] + cls.glsl_phase_function + GLSL_BODY
 
     @abstractmethod
     def phase_function(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
@@ -133,6 +176,7 @@ class HapkeHenyeyGreenstein(HapkeBase):
         Parameter("c", "1", -1.0, 1.0, 0.40267, "backward minus forward share of the lobes (Hapke 2012, Sato 2014)"),
         *OPTIONAL,
     )
+    glsl_phase_function = GLSL_HENYEY_GREENSTEIN
 
     def phase_function(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         return henyey_greenstein(angles.cos_phase, parameters["b"], parameters["c"])

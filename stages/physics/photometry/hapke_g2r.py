@@ -34,6 +34,21 @@ class HapkeG2R(ReflectanceModel):
         Parameter("gamma", "1", 0.0, 1.0, 0.9, "sqrt(1 - w), w the single-scattering albedo"),
         Parameter("B0", "1", 0.0, 2.0, 1.0, "amplitude of the opposition surge"),
     )
+    glsl = """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
+  float g = phase_angle(cos_g), gamma = p[1], surge = 0.0;
+  float particle = (sin(g) + (PI - g) * cos_g) / PI + 0.1 * (1.0 - cos_g) * (1.0 - cos_g);
+  if (cos_g > 0.0) {
+    float t = clamp(sin(g) / (max(p[0], 1e-6) * cos_g), 1e-3, 1e3), fall = exp(-1.0 / t);
+    // 1 - exp(-1/t) loses its digits where 1/t is small
+    float rise = t > 30.0 ? (1.0 - 0.5 / t * (1.0 - 1.0 / (3.0 * t))) / t : 1.0 - fall;
+    surge = 1.0 - 0.5 * t * (3.0 - fall) * rise;
+  }
+  float multiple = (1.0 + 2.0 * mu0) / (1.0 + 2.0 * mu0 * gamma) * (1.0 + 2.0 * mu) / (1.0 + 2.0 * mu * gamma) - 1.0;
+  float single = (1.0 + p[2] * surge) * particle * 0.8 * PI;
+  return (1.0 - gamma * gamma) / 4.0 * mu0 / (mu0 + mu) * (single + multiple);
+}
+"""
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         mu0, mu, cos_phase, phase = angles.cos_incidence, angles.cos_emission, angles.cos_phase, angles.phase

@@ -32,6 +32,9 @@ class HapkeLegendreBase(HapkeBase):
         Parameter("c", "1", -1.0, 1.0, 0.39, "second Legendre coefficient of the phase function"),
         *(_lunar(p) for p in OPTIONAL),
     )
+    glsl_phase_function = """
+float phase_function(float b, float c, float cos_g) { return 1.0 + b * cos_g + c * (1.5 * cos_g * cos_g - 0.5); }
+"""
 
     def phase_function(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         cos_phase = angles.cos_phase

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, horizon_cosine, register
-from stages.physics.photometry.roughness import rough_surface
+from stages.physics.photometry.roughness import GLSL_ROUGH_SURFACE, rough_surface
 
 ROUGH = math.radians(20)
 KERNELS = (
@@ -54,6 +54,22 @@ class Kernels(ReflectanceModel):
     finite = True
     parameters = tuple(
         Parameter(name, "1", -1.0, 2.0, default, f"coefficient of {of}") for name, of, default in KERNELS
+    )
+    glsl = (
+        GLSL_ROUGH_SURFACE
+        + f"""
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {{
+  float g = phase_angle(cos_g), tangent = tan(min(0.5 * g, 0.5 * PI - 1e-3));
+  float narrow = 0.03 / (0.03 + tangent), wide = 0.06 / (0.06 + tangent), seeliger = 2.0 * mu0 / (mu0 + mu);
+  vec3 s = rough_surface(mu0, mu, cos_g, {ROUGH!r});
+  float rough = 2.0 * s.x * s.y / (s.x + s.y) * s.z;
+  return p[0] * mu0 + p[1] * mu0 * narrow / (mu + 0.3)
+    + seeliger * (p[2] + p[3] * cos_g + p[4] * wide)
+    + rough * (p[5] + p[6] * cos_g + p[7] * cos_g * cos_g / (mu0 + 0.15)
+      + p[8] * cos_g * cos_g * cos_g / (mu + 0.3) + p[9] * wide)
+    + p[10] * g * mu + p[11] * cos_g + p[12];
+}}
+"""
     )
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:

@@ -25,6 +25,7 @@ class Lambert(ReflectanceModel):
     linear = True
     finite = True
     parameters = (ALBEDO,)
+    glsl = "float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) { return p[0] * mu0; }"
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         return parameters["albedo"] * angles.cos_incidence

@@ -24,6 +24,11 @@ class LommelSeeliger(ReflectanceModel):
     reciprocal = True
     linear = True
     parameters = (ALBEDO,)
+    glsl = """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
+  return p[0] * 2.0 * mu0 / (mu0 + mu);
+}
+"""
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         mu0 = angles.cos_incidence

@@ -42,6 +42,11 @@ class LrocEmpirical2014(ReflectanceModel):
         ),
         1.0,
     )
+    glsl = """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
+  return exp(p[0] + p[1] * degrees(phase_angle(cos_g)) + p[2] * mu + p[3] * mu0);
+}
+"""
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         a0, a1, a2, a3 = (parameters[p.name] for p in self.parameters)
@@ -69,6 +74,13 @@ class LrocEmpirical2019(ReflectanceModel):
         ),
         1.0,
     )
+    glsl = """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
+  float g = degrees(phase_angle(cos_g));
+  float exponent = p[0] + g * (p[2] + p[1] * g) + p[3] * sqrt(g) + p[4] * mu + mu0 * (p[5] + p[6] * mu0);
+  return mu0 / (mu0 + mu) * exp(exponent);
+}
+"""
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         b0, b1, b2, b3, b4, b5, b6 = (parameters[p.name] for p in self.parameters)

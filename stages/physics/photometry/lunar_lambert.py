@@ -19,6 +19,14 @@ from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, 
 # McEwen (1996): L(g) = 1 + A g + B g^2 + C g^3 with g in degrees; negative beyond 105 deg.
 MCEWEN = (1.0, -0.019, 2.42e-4, -1.46e-6)
 
+GLSL_MIXTURE = """
+float lunar_share(float g, vec4 c) {
+  float d = degrees(g);
+  return c.x + d * (c.y + d * (c.z + d * c.w));
+}
+float mixture(float share, float mu0, float mu) { return mu0 * (1.0 + share * (2.0 / (mu0 + mu) - 1.0)); }
+"""
+
 
 def lunar_share(phase: Tensor, coefficients: tuple = MCEWEN) -> Tensor:
     """L(g) = O + A g + B g^2 + C g^3, the weight of the Lommel-Seeliger term.
@@ -48,6 +56,15 @@ class LunarLambert(ReflectanceModel):
     reciprocal = True
     linear = True
     parameters = (ALBEDO,)
+    glsl = (
+        GLSL_MIXTURE
+        + f"""
+const vec4 MCEWEN = vec4({", ".join(map(repr, MCEWEN))});
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {{
+  return p[0] * max(mixture(lunar_share(phase_angle(cos_g), MCEWEN), mu0, mu), 0.0);
+}}
+"""
+    )
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         # The cubic makes I/F negative at large phase: 0 there, as in ISIS.
@@ -62,6 +79,12 @@ class LunarLambertFixed(ReflectanceModel):
     reference = "McEwen, A. S. (1991), Icarus 92, 298"
     reciprocal = True
     parameters = (ALBEDO, Parameter("L", "1", 0.0, 1.0, 0.5, "share of the Lommel-Seeliger term"))
+    glsl = (
+        GLSL_MIXTURE
+        + """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) { return p[0] * mixture(p[1], mu0, mu); }
+"""
+    )
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         return parameters["albedo"] * mixture(parameters["L"], angles)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, register
-from stages.physics.photometry.lunar_lambert import MCEWEN, lunar_share, mixture
+from stages.physics.photometry.lunar_lambert import GLSL_MIXTURE, MCEWEN, lunar_share, mixture
 
 
 @register
@@ -33,6 +33,16 @@ class LunarLambertEmpirical(ReflectanceModel):
         Parameter("C", "1/degree^3", -1e-5, 1e-5, MCEWEN[3], "cubic term of L"),
         Parameter("C1", "1/rad", 0.0, 10.0, 0.0, "decay of the phase factor"),
         Parameter("C2", "1", 0.0, 10.0, 0.0, "constant of the phase factor"),
+    )
+    glsl = (
+        GLSL_MIXTURE
+        + """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
+  float g = phase_angle(cos_g);
+  float share = lunar_share(g, vec4(p[1], p[2], p[3], p[4]));
+  return p[0] * mixture(share, mu0, mu) * (exp(-p[5] * g) + p[6]);
+}
+"""
     )
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:

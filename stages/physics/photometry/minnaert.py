@@ -23,6 +23,11 @@ class Minnaert(ReflectanceModel):
     reference = "Minnaert, M. (1941), Astrophys. J. 93, 403"
     reciprocal = True
     parameters = (ALBEDO, Parameter("k", "1", 0.0, 2.0, 0.6, "exponent; for k < 1 the law breaks down at the limb"))
+    glsl = """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
+  return p[0] * mu0 * exp(log(mu0 * mu) * (p[1] - 1.0));
+}
+"""
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         mu0, mu = angles.cos_incidence, angles.cos_emission

@@ -52,6 +52,12 @@ class IncidencePhasePolynomial(CosinePolynomial):
     reciprocal = False
     powers: ClassVar[tuple[tuple[int, int], ...]]
 
+    def __init_subclass__(cls) -> None:
+        terms = [" * ".join([f"p[{k}]"] + m * ["mu0"] + n * ["cos_g"]) for k, (m, n) in enumerate(cls.powers)]
+        cls.glsl = (
+            f"float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {{ return {' + '.join(terms)}; }}"
+        )
+
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         terms = []
         for parameter, (p, q) in zip(self.parameters, self.powers, strict=True):

@@ -23,6 +23,31 @@ from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
 
+GLSL_ROUGH_SURFACE = """
+vec2 facets(float cot_angle, float cot_theta) {
+  float ratio = min(cot_angle * cot_theta, 60.0);
+  return vec2(exp(-2.0 / PI * ratio), exp(-ratio * ratio / PI));
+}
+// mu_x, mu_y, S / mue
+vec3 rough_surface(float mu0, float mu, float cos_g, float theta) {
+  float tan_theta = tan(theta), cot_theta = 1.0 / max(tan_theta, 1e-4);
+  float chi = inversesqrt(1.0 + PI * tan_theta * tan_theta);
+  float cos_x = max(mu0, mu), cos_y = min(mu0, mu);
+  float sin_x = sqrt(max(1.0 - cos_x * cos_x, 1e-10)), sin_y = sqrt(max(1.0 - cos_y * cos_y, 1e-10));
+  float half_cosine = (cos_g - mu0 * mu) / (2.0 * sin_x * sin_y);
+  float sin2 = clamp(0.5 - half_cosine, 1e-10, 1.0), cos2 = clamp(0.5 + half_cosine, 1e-10, 1.0);
+  float tan_half = sqrt(sin2 / cos2), psi_over_pi = atan(tan_half) * 2.0 / PI, f = exp(-2.0 * tan_half);
+  vec2 e_x = facets(cos_x / sin_x, cot_theta), e_y = facets(cos_y / sin_y, cot_theta);
+  float tilt_x = sin_x * tan_theta, tilt_y = sin_y * tan_theta, hidden = sin2 * e_x.y;
+  float between = max(2.0 - e_y.x - psi_over_pi * e_x.x, 1e-6);
+  float mu_x = max(cos_x + tilt_x * ((cos2 - sin2) * e_y.y + hidden) / between, 1e-12);
+  float mu_y = max(cos_y + tilt_y * (e_y.y - hidden) / between, 1e-12);
+  float eta_x = cos_x + tilt_x * e_x.y / (2.0 - e_x.x), eta_y = cos_y + tilt_y * e_y.y / (2.0 - e_y.x);
+  float visible = eta_x * (1.0 - f) + f * cos_x;
+  return vec3(chi * mu_x, chi * mu_y, mu0 / (chi * eta_y * visible));
+}
+"""
+
 
 def rough_surface(angles: Angles, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Effective cosines of the smaller and of the larger of incidence and emission, and S / mue.

@@ -60,6 +60,15 @@ class M6(CosinePolynomial):
         coefficient("c", "cos(phi_h)", 0.005),
         coefficient("d", "cos(phi_d)", 0.005),
     )
+    glsl = """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
+  float cos_half = sqrt(max(0.5 + 0.5 * cos_g, 1.2e-7)), cosine = cos_g - mu0 * mu;
+  float volume = max((1.0 - mu0 * mu0) * (1.0 - mu * mu) - cosine * cosine, 0.0) + 1.2e-7;
+  float h = 1.0 - mu0 * mu0 + cosine, d = cos_half * (mu - mu0);
+  float theta_h = min(0.5 * (mu0 + mu) / cos_half, 1.0);
+  return p[0] * theta_h + p[1] * cos_half + p[2] * h * inversesqrt(h * h + volume) + p[3] * d * inversesqrt(d * d + volume);
+}
+"""
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         theta_h, theta_d, phi_h, phi_d = half_difference_cosines(angles)

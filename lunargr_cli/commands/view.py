@@ -1,0 +1,49 @@
+"""`lunargr view`: one HTML page that relights a reflectance map in a browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lunargr_cli.options import Output, Overwrite, Quiet
+
+NAME, ORDER = "view", 61
+
+
+def command(
+    source: Annotated[Path, typer.Argument(metavar="SVBRDF.h5", help="Reflectance map from 'lunargr infer'.")],
+    output: Output = Path("view.html"),
+    pairs: Annotated[
+        Path | None, typer.Option("--pairs", metavar="PAIRS.h5", help="Show measured photographs beside the map.")
+    ] = None,
+    photographs: Annotated[int, typer.Option(metavar="N", help="With --pairs: how many of its crops.")] = 12,
+    max_px: Annotated[
+        int, typer.Option("--max-px", metavar="PX", help="Larger maps are shown as means over blocks of pixels.")
+    ] = 2048,
+    sun_azimuth: Annotated[
+        float, typer.Option(metavar="DEG", help="The first picture's Sun, clockwise from north ...")
+    ] = 270.0,
+    sun_elevation: Annotated[float, typer.Option(metavar="DEG", help="... and above the horizon.")] = 25.0,
+    title: Annotated[str | None, typer.Option("--title", help="Title of the page (default: the map's name).")] = None,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+) -> None:
+    """Make a page that relights a map: move the Sun and the camera, see every coefficient, read values. No network.
+
+    \b
+    lunargr view svbrdf.h5 -o view.html
+    lunargr view svbrdf.h5 --pairs pairs.h5 -o view.html
+    """
+    from lunargr_cli.console import Console
+    from stages import view
+
+    console = Console(quiet)
+    config = view.Config(max_px, photographs, sun_azimuth, sun_elevation, title)
+    made = view.run(source, output, config, pairs=pairs, overwrite=overwrite, progress=console.progress)
+    smaller = f", means of {made.factor} x {made.factor} px" if made.factor > 1 else ""
+    console.say(
+        f"{output}: {made.height} x {made.width} px{smaller}, {made.model}, {made.layers} maps, "
+        f"{made.photographs} photographs, {made.size / 1e6:.1f} MB; open it in a browser"
+    )

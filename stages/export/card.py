@@ -1,0 +1,54 @@
+"""The page beside an exported network: what it takes and gives, what it was trained on, where it must not be trusted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stages.network.predictor import Predictor
+
+
+def model_card(
+    name: str, checkpoint: str, predictor: Predictor, told: Mapping[str, str], losses: Mapping[str, NDArray], best: int
+) -> str:
+    """Markdown. losses : train_loss and validation_loss by epoch; best : the epoch whose weights these are, from 0"""
+    model, stride = predictor.model, predictor.net.stride
+    rows = "\n".join(f"| {k} | `{p.name}` | {p.unit} | {p.description} |" for k, p in enumerate(model.parameters))
+    inputs = ", ".join(f"`{i['name']}` (SHA-256 `{i['sha256'][:16]}...`)" for i in json.loads(told.get("inputs", "[]")))
+    found = float(losses["validation_loss"][best]) if 0 <= best < len(losses["validation_loss"]) else float("nan")
+    error = f"{found:.4g}" if np.isfinite(found) else "not recorded"
+    return f"""# {name}
+
+A network that maps terrain to the coefficients of the reflectance model **{model.name}** ({model.title}):
+
+    I/F = {model.formula}
+
+I/F is the radiance factor pi r, including cos(incidence). Source of the formula: {model.reference}.
+
+| | name | shape | unit |
+|---|---|---|---|
+| input | `elevation` | (batch, height, width) float32 | m; any datum, rows run south, {predictor.gsd:g} m per pixel |
+| output | `coefficients` | (batch, {len(model.parameters)}, height, width) float32 | as below |
+
+Height and width are multiples of {stride}. An output pixel sees {predictor.net.reach} pixels around it: of maps in windows keep
+those pixels as context, on windows that begin at multiples of {stride}. Holes must be filled before.
+
+| channel | coefficient | unit | |
+|---|---|---|---|
+{rows}
+
+## Where it comes from
+
+- Exported from `{checkpoint}`, epoch {best + 1} of {len(losses["train_loss"])}; mean squared error on validation pixels {error} (I/F squared).
+- Trained on {inputs or "inputs that were not recorded"} with lunargr {told.get("lunargr_version", "?")}: `{told.get("history", "").strip().splitlines()[-1] if told.get("history", "").strip() else "?"}`
+- Images in {"I/F" if predictor.image_units == "iof" else "DN, with a gain and an offset per image"}.
+
+## Limits
+
+- Trained at {predictor.gsd:g} m per pixel; at other scales terrain looks different, and nothing is known about the result.
+- It knows only the ground, the Sun's directions and the cameras of its training images.
+- It gives no uncertainty.
+"""

@@ -1,0 +1,116 @@
+"""From checkpoint.h5 to model.onnx: elevations in, coefficients out, for maps of any size."""
+
+from __future__ import annotations
+
+import io
+import json
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from schemas import CHECKPOINT, ConfigError, atomic_path, check_output, open_artefact
+from schemas.files.companions import companions_of
+from stages.export.card import model_card
+from stages.network.normalisation import scale_elevation
+from stages.network.predictor import Predictor, load_predictor
+
+OPSET = 17
+INPUT, OUTPUT = "elevation", "coefficients"
+
+
+@dataclass(frozen=True)
+class Config:
+    """opset : of ONNX"""
+
+    opset: int = OPSET
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What was written, for the line at the end."""
+
+    model: str
+    coefficients: tuple[str, ...]
+    stride: int
+    size: int
+    card: Path
+
+
+class _Exported(torch.nn.Module):
+    """(B, H, W) m -> (B, C, H, W), as :class:`Predictor` in evaluation mode; H and W are multiples of the stride."""
+
+    def __init__(self, predictor: Predictor) -> None:
+        super().__init__()
+        self.predictor = predictor
+
+    def forward(self, elevation: Tensor) -> Tensor:
+        p = self.predictor
+        raw = p.net.plain(scale_elevation(elevation, p.elevation_scale), elevation.new_empty(0, dtype=torch.int64))
+        return p.model.constrain(raw * p.output_scale + p.start[None, :, None, None], dim=1)
+
+
+def run(checkpoint: Path, output: Path, config: Config, *, overwrite: bool = False) -> Summary:
+    """Write ``output`` (.onnx) and its card beside it (.md). Raises LunargrError."""
+    if output.suffix.lower() != ".onnx":
+        raise ConfigError(f"{output}: expected a name that ends in .onnx; choose another --output.")
+    if not 13 <= config.opset <= 20:
+        raise ConfigError(f"--opset: expected 13..20, found {config.opset}.")
+    card = output.with_suffix(".md")
+    for path in (output, card):
+        check_output(path, [checkpoint], overwrite)
+    predictor = load_predictor(checkpoint)
+    with open_artefact(checkpoint, CHECKPOINT) as file:
+        told = {k: str(file.attrs[k]) for k in ("history", "lunargr_version", "config", "inputs") if k in file.attrs}
+        losses = {k: file[k][...] for k in ("train_loss", "validation_loss")}
+        best = int(file.attrs["best_epoch"])
+    data = to_onnx(predictor, config.opset, told)
+    names = tuple(p.name for p in predictor.model.parameters)
+    with companions_of(output), atomic_path(output) as partial, atomic_path(card) as text:
+        partial.write_bytes(data)
+        text.write_text(model_card(output.name, checkpoint.name, predictor, told, losses, best), encoding="utf-8")
+    return Summary(predictor.model.name, names, predictor.net.stride, len(data), card)
+
+
+def to_onnx(predictor: Predictor, opset: int, told: dict[str, str]) -> bytes:
+    """The network as an ONNX file; what must be known to use it stands in its metadata. Raises ConfigError."""
+    onnx = _library()
+    stride = predictor.net.stride
+    axes = {0: "batch", 1: "height", 2: "width"}
+    buffer = io.BytesIO()
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter's remarks on its own age
+        torch.onnx.export(
+            _Exported(predictor.to(memory_format=torch.contiguous_format).eval()),  # type: ignore[call-overload]
+            (torch.zeros(1, 4 * stride, 4 * stride),),
+            buffer,  # type: ignore[arg-type]
+            input_names=[INPUT],
+            output_names=[OUTPUT],
+            dynamic_axes={INPUT: axes, OUTPUT: {0: "batch", 2: "height", 3: "width"}},
+            opset_version=opset,
+            dynamo=False,
+        )
+    model = onnx.load_from_string(buffer.getvalue())
+    facts = {
+        "reflectance_model": predictor.model.name,
+        "formula": f"I/F = {predictor.model.formula}",
+        "coefficients": json.dumps([p.name for p in predictor.model.parameters]),
+        "gsd_m": f"{predictor.gsd:g}",
+        "height_and_width_are_multiples_of": str(stride),
+        "context_px": str(predictor.net.reach),
+        **{f"checkpoint_{name}": text for name, text in told.items()},
+    }
+    onnx.helper.set_model_props(model, facts)
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+def _library() -> Any:
+    try:
+        import onnx
+    except ImportError:
+        raise ConfigError("export: expected the package 'onnx', found none; pip install 'lunargr[onnx]'.") from None
+    return onnx

@@ -1,0 +1,257 @@
+"""A rendered trajectory as a data set for other programs: COLMAP's text model, nerfstudio's transforms.json.
+
+The world's axes are east, north and up at the middle of the map, in metres from the reference sphere there: positions
+in body-fixed metres would leave single-precision programs a tenth of a metre. world.json says how to go back.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.errors import InputError
+from schemas.files.outputs import atomic_path
+from stages.physics.cameras.pinhole import Pinhole
+from stages.physics.maps.grid import Grid
+from stages.render.pictures import DISPLAY_GAMMA, read_exr
+
+Floats = NDArray[np.float64]
+POINTS_PER_SIDE = 24  # of each view, on which the sparse points are picked
+SAME_PLACE = 2e-3  # of the distance: a point that another view sees this near is the same
+GL_AXES = np.diag([1.0, -1.0, -1.0])  # nerfstudio's cameras look along -z, with y up
+
+
+@dataclass(frozen=True)
+class View:
+    """One rendered view. depth in its EXR is the distance along each pixel's ray, m."""
+
+    view_id: str
+    camera: Pinhole
+    exr: Path
+
+
+@dataclass(frozen=True)
+class World:
+    """origin : (3,), body-fixed, m; axes : (3, 3), rows east, north, up in body-fixed coordinates"""
+
+    origin: Floats
+    axes: Floats
+
+    def pose(self, camera: Pinhole) -> tuple[Floats, Floats]:
+        """(3, 3) camera (right, down, forward) -> world, and (3,) place, m."""
+        return self.axes @ camera.rotation, self.axes @ (camera.centre - self.origin)
+
+
+def make_world(grid: Grid) -> World:
+    """Over the middle of a map."""
+    axes = grid.local_frames((grid.height - 1) / 2, (grid.width - 1) / 2).axes[0]
+    return World(axes[2] * grid.radius, axes)
+
+
+def export_views(views: Sequence[View], grid: Grid, folder: Path, kind: str) -> list[Path]:
+    """Write the data set of ``views`` into ``folder``/colmap or ``folder``/nerfstudio. Raises InputError."""
+    missing = [view.exr.name for view in views if not view.exr.exists()]
+    if missing:
+        raise InputError(
+            f"{folder}: expected every view's EXR, found {missing[0]} missing (of {len(missing)}); render all views first, without --png-only."
+        )
+    target, world = folder / kind, make_world(grid)
+    (target / "images").mkdir(parents=True, exist_ok=True)
+    written = [_write_world(target / "world.json", world, grid)]
+    limit = _white(views)
+    for view in views:
+        written.append(_write_image(target / "images" / f"{view.view_id}.png", read_exr(view.exr)["image"], limit))
+    write = _write_colmap if kind == "colmap" else _write_nerfstudio
+    return [*written, *write(views, world, target)]
+
+
+def z_depth(camera: Pinhole, distance: NDArray) -> Floats:
+    """Distances along rays -> distances along the optical axis, (lines, samples), NaN where nothing was seen."""
+    x, y = _ray_slopes(camera)
+    return distance / np.sqrt(1 + x * x + y * y)
+
+
+def ray_directions(camera: Pinhole) -> Floats:
+    """(lines, samples, 3) unit vectors of the pixels' rays in the camera: right, down, forward."""
+    x, y = _ray_slopes(camera)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
+def _ray_slopes(camera: Pinhole) -> tuple[Floats, Floats]:
+    sample, line = np.meshgrid(np.arange(camera.samples) + 0.5, np.arange(camera.lines) + 0.5)
+    x = (sample - camera.principal_point_px[0]) / camera.focal_px[0]
+    y = (line - camera.principal_point_px[1]) / camera.focal_px[1]
+    return x, y
+
+
+def _white(views: Sequence[View]) -> float:
+    """One white for all views, so that the same ground is as bright in each."""
+    sample = [image[np.isfinite(image)][::97] for image in (read_exr(v.exr)["image"] for v in views)]
+    values = np.concatenate(sample)
+    return max(float(np.percentile(values, 99.5)), 1e-6) if values.size else 1.0
+
+
+def _write_image(path: Path, image: NDArray[np.float32], white: float) -> Path:
+    grey = np.rint(255 * np.clip(np.nan_to_num(image) / white, 0, 1) ** (1 / DISPLAY_GAMMA)).astype(np.uint8)
+    data = cv2.imencode(".png", cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB))[1].tobytes()
+    with atomic_path(path) as partial:
+        partial.write_bytes(data)
+    return path
+
+
+def _write_world(path: Path, world: World, grid: Grid) -> Path:
+    row, col = (grid.height - 1) / 2, (grid.width - 1) / 2
+    lon, lat = (float(v) for v in grid.lonlat(row, col))
+    told = {
+        "origin_mcmf": world.origin.tolist(),
+        "axes_mcmf": dict(zip(("east", "north", "up"), world.axes.tolist(), strict=True)),
+        "origin": {"longitude_deg": lon, "latitude_deg": lat, "height": 0.0},
+        "body_radius": grid.radius,
+        "unit": "m",
+    }
+    with atomic_path(path) as partial:
+        partial.write_text(json.dumps(told, indent=1))
+    return path
+
+
+def _write_nerfstudio(views: Sequence[View], world: World, target: Path) -> list[Path]:
+    """transforms.json with depth maps as float32 arrays in mm, which nerfstudio's default scale makes metres."""
+    (target / "depths").mkdir(exist_ok=True)
+    frames: list[dict[str, Any]] = []
+    written = []
+    for view in views:
+        rotation, place = world.pose(view.camera)
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = rotation @ GL_AXES, place
+        depth = np.nan_to_num(z_depth(view.camera, read_exr(view.exr)["depth"]) * 1000).astype(np.float32)
+        path = target / "depths" / f"{view.view_id}.npy"
+        with atomic_path(path) as partial, partial.open("wb") as file:
+            np.save(file, depth, allow_pickle=False)
+        written.append(path)
+        frames.append(
+            {
+                "file_path": f"images/{view.view_id}.png",
+                "depth_file_path": f"depths/{view.view_id}.npy",
+                "transform_matrix": matrix.tolist(),
+                **_intrinsics(view.camera),
+            }
+        )
+    path = target / "transforms.json"
+    with atomic_path(path) as partial:
+        partial.write_text(
+            json.dumps({"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}, indent=1)
+        )
+    return [*written, path]
+
+
+def _intrinsics(camera: Pinhole) -> dict[str, float]:
+    return {
+        "fl_x": camera.focal_px[0],
+        "fl_y": camera.focal_px[1],
+        "cx": camera.principal_point_px[0],
+        "cy": camera.principal_point_px[1],
+        "w": camera.samples,
+        "h": camera.lines,
+    }
+
+
+def _write_colmap(views: Sequence[View], world: World, target: Path) -> list[Path]:
+    """sparse/0 with cameras.txt, images.txt and points3D.txt: true ground points with all views that see them."""
+    folder = target / "sparse" / "0"
+    folder.mkdir(parents=True, exist_ok=True)
+    points = list(_tracks(views, world))
+    seen: list[list[tuple[float, float, int]]] = [[] for _ in views]
+    lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
+    for number, (place, track) in enumerate(points, start=1):
+        entries = []
+        for k, sample, line in track:
+            entries.append(f"{k + 1} {len(seen[k])}")
+            seen[k].append((sample, line, number))
+        lines.append(f"{number} {place[0]:.4f} {place[1]:.4f} {place[2]:.4f} 128 128 128 0 {' '.join(entries)}")
+    cameras, images = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"], ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"]
+    for k, view in enumerate(views):
+        c = view.camera
+        numbers = (*c.focal_px, *c.principal_point_px)
+        cameras.append(f"{k + 1} PINHOLE {c.samples} {c.lines} {' '.join(f'{v:.9g}' for v in numbers)}")
+        rotation, place = world.pose(c)
+        pose = (*quaternion(rotation.T), *(-rotation.T @ place))
+        images.append(f"{k + 1} {' '.join(f'{v:.12g}' for v in pose)} {k + 1} {view.view_id}.png")
+        images.append(" ".join(f"{x:.4f} {y:.4f} {point}" for x, y, point in seen[k]))
+    written = []
+    for name, text in (("cameras", cameras), ("images", images), ("points3D", lines)):
+        path = folder / f"{name}.txt"
+        with atomic_path(path) as partial:
+            partial.write_text("\n".join(text) + "\n")
+        written.append(path)
+    return written
+
+
+def _tracks(views: Sequence[View], world: World) -> Iterator[tuple[Floats, list[tuple[int, float, float]]]]:
+    """Ground points of every view, (3,) in the world, with (view, sample, line) of all views that see them."""
+    depths = [read_exr(view.exr)["depth"] for view in views]
+    for k, view in enumerate(views):
+        points, sample, line = _grid_points(view.camera, depths[k], world)
+        tracks = [[(k, s, ln)] for s, ln in zip(sample, line, strict=True)]
+        for other, view_there in enumerate(views):
+            if other == k:
+                continue
+            there, x, y, distance = project(view_there.camera, world, points)
+            found = depths[other][y[there].astype(int), x[there].astype(int)]
+            same = np.abs(found - distance[there]) < SAME_PLACE * distance[there]
+            for n in np.flatnonzero(there)[same]:
+                tracks[n].append((other, float(x[n]), float(y[n])))
+        yield from zip(points, tracks, strict=True)
+
+
+def _grid_points(camera: Pinhole, depth: NDArray[np.float32], world: World) -> tuple[Floats, Floats, Floats]:
+    """(n, 3) ground points of a coarse grid of pixels, in the world, and their samples and lines."""
+    step = max(1, math.ceil(max(camera.lines, camera.samples) / POINTS_PER_SIDE))
+    line, sample = (v.ravel() for v in np.mgrid[step // 2 : camera.lines : step, step // 2 : camera.samples : step])
+    known = np.isfinite(depth[line, sample])
+    line, sample = line[known], sample[known]
+    rotation, place = world.pose(camera)
+    return (
+        place + depth[line, sample, None] * (ray_directions(camera)[line, sample] @ rotation.T),
+        sample + 0.5,
+        line + 0.5,
+    )
+
+
+def project(camera: Pinhole, world: World, points: Floats) -> tuple[NDArray[np.bool_], Floats, Floats, Floats]:
+    """Whether each of (n, 3) world points falls on the image, its sample and line, and its distance, m."""
+    rotation, place = world.pose(camera)
+    local = (points - place) @ rotation
+    ahead = local[:, 2] > 0
+    z = np.where(ahead, local[:, 2], 1.0)
+    x = camera.focal_px[0] * local[:, 0] / z + camera.principal_point_px[0]
+    y = camera.focal_px[1] * local[:, 1] / z + camera.principal_point_px[1]
+    inside = ahead & (x >= 0) & (y >= 0) & (x < camera.samples) & (y < camera.lines)
+    return inside, x, y, np.linalg.norm(local, axis=1)
+
+
+def quaternion(rotation: Floats) -> tuple[float, float, float, float]:
+    """(3, 3) rotation -> w, x, y, z with w >= 0, by the largest of its four forms (Shepperd 1978)."""
+    trace = float(np.trace(rotation))
+    squares = np.array([trace, *np.diag(rotation)])
+    k = int(np.argmax(squares))
+    r = rotation
+    if k == 0:
+        q = np.array([1 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    else:
+        i, j, m = k - 1, k % 3, (k + 1) % 3
+        q = np.empty(4)
+        q[0] = r[m, j] - r[j, m]
+        q[1 + i] = 1 + 2 * r[i, i] - trace
+        q[1 + j] = r[j, i] + r[i, j]
+        q[1 + m] = r[m, i] + r[i, m]
+    q /= np.linalg.norm(q) * (-1 if q[0] < 0 else 1)
+    return float(q[0]), float(q[1]), float(q[2]), float(q[3])

@@ -1,0 +1,236 @@
+"""Stereo pairs with truth for learned matching: two cameras and two Suns over the same ground, and every correspondence.
+
+The ground is cut into square tiles, each wholly in one split; a pair looks at the middle of its tile's inner part, so
+that no ground seen in training is seen in the test.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.errors import ConfigError, GeometryError
+from schemas.files.outputs import atomic_path, check_output
+from stages.physics.bodies.spheres import Body, find_body
+from stages.physics.cameras.pinhole import Pinhole
+from stages.physics.terrain.surface import Surface
+from stages.render.config import SUN, Config, check, output_files
+from stages.render.dataset import World, make_world, project, ray_directions
+from stages.render.pictures import read_exr, write_exr
+from stages.render.setting import make_light, open_source
+from stages.render.viewpoint import look_at, pinhole_view
+from stages.render.views import render_camera
+
+Floats = NDArray[np.float64]
+Progress = Callable[[int, int, str], None]
+
+SPLITS = (("train", 0.8), ("validation", 0.1), ("test", 0.1))
+TILE_FOOTPRINTS = 2.0  # edge of a tile in footprints seen from straight above
+ROOM = 1.5  # the part of a tile that a view may cover, in footprints: oblique views reach further
+SAME_PLACE = 1e-3  # of the distance: a farther surface there hides the point
+TRIES = 200
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """How pairs are drawn; ranges are uniform.
+
+    altitude : m above the ground (None: an eighth of the map's shorter side in a picture)
+    convergence_deg : between both lines of sight at the ground; off_nadir_deg : of their mean; roll_deg : to either side
+    sun_elevation_deg : of both Suns, each with any azimuth
+    """
+
+    count: int
+    altitude: float | None = None
+    convergence_deg: tuple[float, float] = (4.0, 30.0)
+    off_nadir_deg: float = 8.0
+    roll_deg: float = 20.0
+    sun_elevation_deg: tuple[float, float] = (12.0, 65.0)
+    seed: int = 0
+
+
+def run_stereo(
+    source: Path,
+    folder: Path,
+    config: Config,
+    stereo: StereoConfig,
+    *,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Render ``stereo.count`` pairs of ``source`` into ``folder``; the path of the manifest. Raises LunargrError.
+
+    config : what is rendered, size and field of view; its Sun and camera are drawn here
+    """
+    _check(config, stereo)
+    manifest = folder / "manifest.json"
+    check_output(manifest, [source], overwrite)
+    body = find_body("moon" if config.body is None else config.body)
+    own = replace(config, view="pinhole", position=(0.0, 0.0, 0.0))
+    check(own)
+    rng = np.random.default_rng(stereo.seed)
+    pairs: list[dict[str, Any]] = []
+    with open_source(source, config, body) as surface:
+        relief, world = surface.height_range(), make_world(surface.grid)
+        places = _Places(surface, config, stereo, rng)
+        for number in range(stereo.count):
+            if progress:
+                progress(number, stereo.count, "pairs")
+            pairs.append(_render_pair(f"pair_{number:05d}", surface, places, own, body, relief, world, folder))
+    told = {
+        "source": source.name,
+        "pixel_centre": 0.5,
+        "unit": "m",
+        "gsd": places.footprint / config.size_px[0],
+        "tile": places.tile,
+        "seed": stereo.seed,
+        "pairs": pairs,
+    }
+    with atomic_path(manifest) as partial:
+        partial.write_text(json.dumps(told, indent=1))
+    if progress:
+        progress(stereo.count, stereo.count, "pairs")
+    return manifest
+
+
+def _check(config: Config, stereo: StereoConfig) -> None:
+    if stereo.count < 1:
+        raise ConfigError(f"--stereo: expected at least 1 pair, found {stereo.count}.")
+    low, high = stereo.convergence_deg
+    if not 0 < low <= high <= 90:
+        raise ConfigError(f"--convergence: expected LOW,HIGH degrees in 0..90, found {low:g},{high:g}.")
+    if stereo.altitude is not None and not stereo.altitude > 0:
+        raise ConfigError(f"--altitude: expected metres above 0, found {stereo.altitude:g}.")
+    if any(getattr(config, name) is not None for name in SUN):
+        raise ConfigError("--stereo: expected no Sun; each picture gets one of its own.")
+
+
+class _Places:
+    """Where pairs may look: tiles of ground with their splits, in order of a shuffle."""
+
+    def __init__(self, surface: Surface, config: Config, stereo: StereoConfig, rng: np.random.Generator) -> None:
+        grid = surface.grid
+        self.surface, self.stereo, self.rng = surface, stereo, rng
+        width = 2 * math.tan(math.radians(config.fov_deg) / 2)
+        shorter = min(grid.height, grid.width) * grid.gsd
+        self.altitude = stereo.altitude if stereo.altitude is not None else shorter / 8 / width
+        self.footprint = self.altitude * width * max(1.0, config.size_px[1] / config.size_px[0])
+        self.tile = TILE_FOOTPRINTS * self.footprint
+        rows, cols = (int(n * grid.gsd / self.tile) for n in (grid.height, grid.width))
+        if rows * cols < len(SPLITS):
+            raise ConfigError(
+                f"--stereo: expected ground for {len(SPLITS)} tiles of {self.tile:.4g} m, one per split, found {rows} x {cols}; lower --altitude or --fov."
+            )
+        self.corners = [(r, c) for r in range(rows) for c in range(cols)]
+        self.splits = _split_tiles(len(self.corners), rng)
+        self.drawn = 0
+
+    def next(self) -> tuple[str, int, Floats]:
+        """Split, number of the tile and a place on the ground, (3,) body-fixed, m. Raises GeometryError."""
+        grid, px = self.surface.grid, self.tile / self.surface.grid.gsd
+        for _ in range(TRIES):
+            tile = self.drawn % len(self.corners)
+            self.drawn += 1
+            slack = (1 - ROOM / TILE_FOOTPRINTS) / 2
+            down, across = 0.5 + self.rng.uniform(-slack, slack, 2)
+            row, col = (self.corners[tile][0] + down) * px, (self.corners[tile][1] + across) * px
+            r, c = min(int(row), grid.height - 1), min(int(col), grid.width - 1)
+            height = float(self.surface.elevation[r : r + 1, c : c + 1][0, 0])
+            if math.isfinite(height):
+                return self.splits[tile], tile, grid.local_frames(r, c).up[0] * (grid.radius + height)
+        raise GeometryError(f"{self.surface.path}: expected known ground in its tiles, found none in {TRIES} tries.")
+
+
+def _split_tiles(count: int, rng: np.random.Generator) -> list[str]:
+    """A split per tile: shares as in SPLITS, at least one tile of each."""
+    numbers = [max(1, round(share * count)) for _, share in SPLITS[1:]]
+    names = [name for (name, _), n in zip(SPLITS[1:], numbers, strict=True) for _ in range(n)]
+    names = ["train"] * (count - len(names)) + names
+    return [names[k] for k in rng.permutation(count)]
+
+
+def _render_pair(
+    name: str, surface: Surface, places: _Places, config: Config, body: Body, relief: tuple[float, float], world: World,
+    folder: Path,
+) -> dict[str, Any]:  # fmt: skip
+    """Both pictures, the correspondences, and the pair's entry in the manifest."""
+    split, tile, target = places.next()
+    stereo, rng = places.stereo, places.rng
+    convergence = rng.uniform(*stereo.convergence_deg)
+    sights = _lines_of_sight(target, convergence, stereo.off_nadir_deg, rng)
+    views, exrs, cameras = [], [], []
+    for side, sight in zip(("left", "right"), sights, strict=True):
+        position = target + sight * places.altitude
+        roll = rng.uniform(-stereo.roll_deg, stereo.roll_deg)
+        camera = pinhole_view(
+            position, look_at(position, target, roll), config.fov_deg, config.size_px, surface.grid.radius
+        )
+        sun = {"sun_azimuth_deg": rng.uniform(0, 360), "sun_elevation_deg": rng.uniform(*stereo.sun_elevation_deg)}
+        own = replace(config, sun_azimuth_deg=sun["sun_azimuth_deg"], sun_elevation_deg=sun["sun_elevation_deg"])
+        files = output_files(folder / f"{name}_{side}.exr", "pinhole")
+        light = make_light(surface, own, body, relief)
+        render_camera(surface, camera, light, relief, files, own, f"{name}_{side}", None)
+        views.append({"image": files[0].name, "preview": files[1].name, "camera": camera.to_document(), **sun})
+        exrs.append(read_exr(files[0]))
+        cameras.append(camera)
+    depths = exrs[0]["depth"], exrs[1]["depth"]
+    matches = correspondences(cameras[0], cameras[1], depths, world)
+    path = folder / f"{name}_matches.exr"
+    with write_exr(path, depths[0].shape[0], depths[0].shape[1], list(matches)) as writer:
+        writer.write(matches)
+    lit = np.mean(matches["visible"][np.isfinite(depths[0])]) if np.isfinite(depths[0]).any() else 0.0
+    return {
+        "pair_id": name,
+        "split": split,
+        "tile": tile,
+        "baseline": float(np.linalg.norm(cameras[0].centre - cameras[1].centre)),
+        "convergence_deg": convergence,
+        "overlap": float(lit),
+        "left": views[0],
+        "right": views[1],
+        "matches": path.name,
+    }
+
+
+def _lines_of_sight(
+    target: Floats, convergence_deg: float, off_nadir_deg: float, rng: np.random.Generator
+) -> list[Floats]:
+    """Two unit vectors from the ground to the cameras, ``convergence_deg`` apart about a mean near the zenith."""
+    up = target / np.linalg.norm(target)
+    across = np.cross(up, rng.normal(size=3))
+    across /= np.linalg.norm(across)
+    along = np.cross(up, across)
+    tilt = math.radians(rng.uniform(0, off_nadir_deg))  # of the plane of both, so that the angle between them stays
+    mean = math.cos(tilt) * up + math.sin(tilt) * along
+    half = math.radians(convergence_deg) / 2
+    return [math.cos(half) * mean + side * math.sin(half) * across for side in (-1.0, 1.0)]
+
+
+def correspondences(
+    left: Pinhole, right: Pinhole, depths: tuple[NDArray[np.float32], NDArray[np.float32]], world: World
+) -> dict[str, NDArray[np.float32]]:
+    """Where the right camera sees the ground of each left pixel: ``sample``, ``line`` (first pixel's centre at 0.5) and
+    ``visible`` (1 = inside its picture and not hidden); each (lines, samples) float32, NaN where the left sees no ground.
+
+    depths : left and right, along the rays, m
+    """
+    rotation, place = world.pose(left)
+    points = place + depths[0].ravel()[:, None].astype(float) * (ray_directions(left).reshape(-1, 3) @ rotation.T)
+    known = np.isfinite(points).all(axis=1)
+    points[~known] = 0.0
+    inside, sample, line, distance = project(right, world, points)
+    visible = np.zeros(len(points))
+    inside &= known
+    found = depths[1][line[inside].astype(int), sample[inside].astype(int)]
+    # the right camera may see farther, past an edge within the pixel, but nothing nearer
+    visible[inside] = found > distance[inside] * (1 - SAME_PLACE)
+    shape = depths[0].shape
+    named = {"sample": sample, "line": line, "visible": visible}
+    return {k: np.where(known, v, np.nan).reshape(shape).astype(np.float32) for k, v in named.items()}

@@ -1,0 +1,301 @@
+// The page's state, what changes it, and the one loop that draws it.
+
+const state = { azimuth: 0, elevation: 0, shadows: true, layer: 0, view: "map", auto: true, limits: [0, 1], photograph: null };
+
+/** The Sun's direction in the axes of the map's middle */
+function sunVector(head, azimuth, elevation) {
+  const a = ((azimuth + head.convergence_deg) * Math.PI) / 180, e = (elevation * Math.PI) / 180;
+  return new THREE.Vector3(Math.sin(a) * Math.cos(e), Math.cos(a) * Math.cos(e), Math.sin(e));
+}
+
+function makeRenderer() {
+  const canvas = byId("canvas"), context = canvas.getContext("webgl2", { antialias: true, alpha: true, premultipliedAlpha: true });
+  if (!context) return null;
+  if (!context.getExtension("EXT_color_buffer_float")) return null;
+  const renderer = new THREE.WebGLRenderer({ canvas, context, antialias: true, alpha: true });
+  renderer.outputColorSpace = "srgb-linear";  // the page's shaders write display values
+  renderer.setClearColor(0x000000, 0);
+  renderer.debug.onShaderError = (gl, program, vertex, fragment) => {
+    throw new Error(`the graphics driver refuses a shader: ${gl.getShaderInfoLog(fragment) || gl.getProgramInfoLog(program)}`);
+  };
+  return renderer;
+}
+
+async function main() {
+  const head = JSON.parse(byId("head").textContent), renderer = makeRenderer();
+  if (!renderer || typeof DecompressionStream === "undefined") {
+    window.lunargr = { able: false };
+    return;
+  }
+  document.body.classList.add("able");
+  await new Promise((resolve) => setTimeout(resolve, 20));  // let the message show
+  const page = await unpackPage(head), relighter = new Relighter(renderer, head, page);
+  Object.assign(state, head.start, readHash(relighter.layers));
+  const terrain = new Terrain(renderer, head, page, relighter), app = new App(head, page, relighter, terrain);
+  document.body.classList.add("ready");
+  app.resize();
+  app.drawNow();
+  window.lunargr = { able: true, state, head, ...app.hooks() };
+  document.documentElement.dataset.lunargr = "ready";
+}
+
+class App {
+  constructor(head, page, relighter, terrain) {
+    Object.assign(this, { head, page, relighter, terrain, state, dirty: false, playing: false });
+    this.canvas = terrain.renderer.domElement;
+    this.panel = new Panel(head, relighter.layers, this);
+    this.photographs = new Photographs(head, page, relighter, this);
+    for (const controls of Object.values(terrain.controls)) controls.addEventListener("change", () => this.ask());
+    window.addEventListener("resize", () => this.resize());
+    window.addEventListener("hashchange", () => this.change(readHash(relighter.layers), false));
+    this.wirePointer();
+    this.change({}, false);
+  }
+
+  /** Change parts of the state and draw. */
+  change(parts, say = true) {
+    if ("layer" in parts && parts.layer !== state.layer) state.auto = true;
+    Object.assign(state, parts);
+    this.terrain.setView(state.view);
+    this.panel.refresh(state);
+    this.ask();
+    if (say) this.sayInAddress();
+  }
+
+  sun(azimuth, elevation) {
+    const parts = { photograph: null };
+    if (azimuth !== null && Number.isFinite(azimuth)) parts.azimuth = ((azimuth % 360) + 360) % 360;
+    if (elevation !== null && Number.isFinite(elevation)) parts.elevation = Math.min(90, Math.max(0.1, elevation));
+    this.letGo();
+    this.change(parts);
+  }
+
+  photograph(k) {
+    this.stop();
+    if (k === null) return this.letGo(), this.change({ photograph: null });
+    const p = this.page.photographs[k];
+    this.terrain.setOutline(p);
+    this.terrain.frame(p.row, p.col, p.height, p.width);
+    this.change({ photograph: k, azimuth: p.azimuth, elevation: p.elevation, view: "map", layer: 0 });
+  }
+
+  /** The photograph's Sun or camera no longer hold */
+  letGo() {
+    if (state.photograph === null) return;
+    state.photograph = null;
+    this.terrain.setOutline(null);
+    this.photographs.refresh(null);
+  }
+
+  reset() {
+    this.terrain.reset();
+    this.ask();
+  }
+
+  play() {
+    if (this.playing) return this.stop();
+    this.playing = true;
+    byId("play").setAttribute("aria-pressed", "true");
+    byId("play").textContent = "❚❚ Stop";
+    let before = performance.now();
+    const turn = (now) => {
+      if (!this.playing) return;
+      this.sun(state.azimuth + (now - before) * 0.03, null);
+      before = now;
+      requestAnimationFrame(turn);
+    };
+    requestAnimationFrame(turn);
+  }
+
+  stop() {
+    this.playing = false;
+    byId("play").setAttribute("aria-pressed", "false");
+    byId("play").textContent = "▶ Let it turn";
+  }
+
+  save() {
+    this.drawNow();
+    this.canvas.toBlob((blob) => {
+      const link = document.createElement("a"), layer = this.relighter.layers[state.layer].name;
+      link.href = URL.createObjectURL(blob);
+      link.download = `${this.head.title}_${layer}_sun_${state.azimuth.toFixed(1)}_${state.elevation.toFixed(1)}.png`;
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+    });
+  }
+
+  async copyLink(button) {
+    this.sayInAddress();
+    const before = button.textContent;
+    try {
+      await navigator.clipboard.writeText(location.href);
+      button.textContent = "Copied";
+    } catch {
+      button.textContent = "See the address bar";
+    }
+    setTimeout(() => (button.textContent = before), 1500);
+  }
+
+  sayInAddress() {
+    clearTimeout(this.saying);
+    this.saying = setTimeout(() => {
+      const { azimuth, elevation, layer, view, shadows } = state, name = this.relighter.layers[layer].name;
+      const text = new URLSearchParams({ azimuth: azimuth.toFixed(2), elevation: elevation.toFixed(2), layer: name, view, shadows: shadows ? 1 : 0 });
+      try {
+        history.replaceState(null, "", `#${text}`);
+      } catch {
+        // some browsers do not let a page from a file change its address
+      }
+    }, 200);
+  }
+
+  ask() {
+    if (this.dirty) return;
+    this.dirty = true;
+    requestAnimationFrame(() => this.drawNow());
+  }
+
+  /** The light as the state says; where the light goes to follows the view */
+  light() {
+    const camera = state.photograph !== null ? this.photographs.camera(state.photograph) : state.view === "space" ? this.terrain.cameraPlace() : null;
+    return { sun: sunVector(this.head, state.azimuth, state.elevation), shadows: state.shadows, camera };
+  }
+
+  drawNow() {
+    this.dirty = false;
+    const { relighter, terrain } = this, layer = relighter.layers[state.layer], span = this.span(layer);
+    const light = this.light(), key = JSON.stringify([light, state.layer]);
+    if (key !== this.drawn) {  // else only the map's place on the screen has changed
+      relighter.setLight(light);
+      relighter.show(state.layer, span);
+      this.found = relighter.contrast(state.layer, span);
+    }
+    this.drawn = key;
+    if (state.auto) state.limits = this.found;
+    terrain.draw(span, layer.colours, state.limits);
+    this.panel.contrast(state.limits, layer.colours);
+    this.panel.scaleBar(terrain.unitsPerPixel());
+    this.panel.needle(state.view === "space" ? terrain.controls.space.getAzimuthalAngle() : 0);
+    const compared = `${state.photograph} ${state.shadows}`;
+    if (compared !== this.compared) this.photographs.refresh(state.photograph);
+    this.compared = compared;
+    if (this.pointer) this.readPointer();
+  }
+
+  /** Values that half floats keep best as 0 and 1 */
+  span(layer) {
+    if (layer.name === "elevation" && !layer.map) return spread(this.page.elevation, 0);
+    if (layer.map) return spread(layer.values, 0.005);
+    return [0, layer.unit === "deg" ? 90 : 1];
+  }
+
+  resize() {
+    const { clientWidth: width, clientHeight: height } = byId("stage");
+    this.terrain.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    this.terrain.renderer.setSize(width, height, false);
+    this.terrain.resize(width, height);
+    this.ask();
+  }
+
+  wirePointer() {
+    const canvas = this.canvas, place = (event) => {
+      const box = canvas.getBoundingClientRect();
+      return { x: event.clientX - box.left, y: event.clientY - box.top };
+    };
+    let grabbed = null;
+    canvas.addEventListener("pointerdown", (event) => {
+      if (!event.shiftKey) return;
+      grabbed = { ...place(event), azimuth: state.azimuth, elevation: state.elevation };
+      canvas.setPointerCapture(event.pointerId);
+      event.stopImmediatePropagation();
+    }, { capture: true });
+    canvas.addEventListener("pointermove", (event) => {
+      this.pointer = place(event);
+      if (grabbed && event.buttons) this.sun(grabbed.azimuth + (this.pointer.x - grabbed.x) * 0.4, grabbed.elevation - (this.pointer.y - grabbed.y) * 0.2);
+      else if (!event.buttons) this.readSoon();
+    });
+    canvas.addEventListener("pointerup", (event) => {
+      grabbed = null;
+      this.pointer = place(event);
+      this.readSoon();
+    });
+    canvas.addEventListener("pointerleave", (event) => {
+      if (event.pointerType !== "mouse") return;  // a tap's values stay
+      this.pointer = null;
+      this.panel.values([]);
+    });
+  }
+
+  readSoon() {
+    if (this.reading) return;
+    this.reading = true;
+    requestAnimationFrame(() => {
+      this.reading = false;
+      if (this.pointer) this.readPointer();
+    });
+  }
+
+  readPointer() {
+    const found = this.terrain.pick(this.pointer.x, this.pointer.y);
+    this.panel.values(found ? pixelRows(this.head, this.page, this.relighter, found.row, found.col) : []);
+  }
+
+  /** For tests and for the curious: the page's own numbers */
+  hooks() {
+    const set = (parts) => {
+      if ("layer" in parts && typeof parts.layer === "string") parts = { ...parts, layer: this.relighter.layers.findIndex((l) => l.name === parts.layer) };
+      this.change(parts);
+      this.drawNow();
+    };
+    return {
+      set,
+      /** I/F of the whole map under a Sun; camera: [m, m, m] in the axes of the map's middle, or from straight above */
+      pixels: ({ azimuth, elevation, shadows = true, camera = null }) => {
+        this.relighter.setLight({ sun: sunVector(this.head, azimuth, elevation), shadows, camera: camera && new THREE.Vector3(...camera) });
+        const image = this.relighter.image();
+        this.drawn = null;
+        this.ask();
+        return image;
+      },
+      photograph: (k) => (this.photograph(k), this.drawNow()),
+      pick: (x, y) => this.terrain.pick(x, y),
+      values: (row, col) => pixelRows(this.head, this.page, this.relighter, row, col),
+      /** Frames per second over some frames, the Sun (or else the camera) turning, each frame waited for */
+      rate: (frames, turning = "sun") => {
+        const start = performance.now(), context = this.terrain.renderer.getContext(), one = new Uint8Array(4);
+        for (let k = 0; k < frames; k++) {
+          if (turning === "sun") state.azimuth = (state.azimuth + 2) % 360;
+          else this.terrain.cameras.space.position.x += 0.01;
+          this.drawNow();
+          context.readPixels(0, 0, 1, 1, context.RGBA, context.UNSIGNED_BYTE, one);
+        }
+        return (1000 * frames) / (performance.now() - start);
+      },
+    };
+  }
+}
+
+/** #azimuth=..&elevation=..&layer=..&view=map|space&shadows=0|1 */
+function readHash(layers) {
+  const given = new URLSearchParams(location.hash.slice(1)), parts = {};
+  const number = (name, low, high) => {
+    const value = Number(given.get(name));
+    if (given.has(name) && Number.isFinite(value) && value >= low && value <= high) parts[name] = value;
+  };
+  number("azimuth", -360, 360);
+  number("elevation", 0.1, 90);
+  if (given.has("layer")) {
+    const k = layers.findIndex((layer) => layer.name === given.get("layer"));
+    if (k >= 0) parts.layer = k;
+  }
+  if (["map", "space"].includes(given.get("view"))) parts.view = given.get("view");
+  if (given.has("shadows")) parts.shadows = given.get("shadows") !== "0";
+  return parts;
+}
+
+main().catch((error) => {
+  document.body.classList.remove("able", "ready");
+  byId("why").textContent = `This page could not relight the map here (${error.message}). Below is one still picture of it.`;
+  window.lunargr = { able: false, error: String(error) };
+  throw error;
+});

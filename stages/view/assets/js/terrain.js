@@ -1,0 +1,218 @@
+// The map in space: a flat sheet seen from above, or the terrain as it stands, with the camera that looks at it.
+
+const MESH_PX = 512;  // vertices along the longer side
+
+class Terrain {
+  constructor(renderer, head, page, relighter) {
+    Object.assign(this, { renderer, head, page, relighter });
+    this.scale = 2 / (Math.max(head.height, head.width) * head.gsd);  // scene units per m
+    this.material = new THREE.RawShaderMaterial({
+      glslVersion: THREE.GLSL3,
+      vertexShader: head.shaders.draw_vertex,
+      fragmentShader: head.shaders.draw,
+      uniforms: {
+        layer: { value: relighter.shown.texture },
+        colours: { value: colourTable(head.colours) },
+        colour_row: { value: -1 },
+        limits: { value: new THREE.Vector2(0, 1) },
+        outline: { value: [0, 0, 0, 0] },
+        outline_colour: { value: new THREE.Vector3(1, 0.72, 0.2) },
+        picking: { value: false },
+      },
+      side: 2,
+      transparent: true,
+      premultipliedAlpha: true,
+    });
+    this.scenes = { map: scene(this.flat(), this.material), space: scene(this.relief(), this.material) };
+    this.cameras = { map: new THREE.OrthographicCamera(-1, 1, 1, -1, -100, 100), space: new THREE.PerspectiveCamera(30, 1, 0.005, 50) };
+    this.controls = {};
+    const element = renderer.domElement;
+    for (const view of ["map", "space"]) {
+      this.cameras[view].up.set(0, view === "map" ? 1 : 0, view === "map" ? 0 : 1);
+      const controls = (this.controls[view] = new THREE.OrbitControls(this.cameras[view], element));
+      Object.assign(controls, { enableDamping: false, enabled: false, zoomToCursor: true });
+    }
+    this.controls.map.enableRotate = false;
+    this.controls.map.mouseButtons = { LEFT: 2, MIDDLE: 1, RIGHT: 2 };
+    this.controls.map.touches = { ONE: 1, TWO: 2 };
+    this.controls.space.maxPolarAngle = Math.PI / 2 - 0.02;
+    this.controls.space.maxDistance = 12;
+    this.controls.map.minZoom = 0.5;
+    this.controls.map.maxZoom = Math.max(head.height, head.width) / 8;
+    this.pixel = target(1, 1, THREE.RGBAFormat, THREE.FloatType, { depthBuffer: true });
+    this.reset("map");
+    this.reset("space");
+    this.setView("map");
+  }
+
+  setView(view) {
+    this.view = view;
+    for (const [name, controls] of Object.entries(this.controls)) controls.enabled = name === view;
+  }
+
+  reset(view = this.view) {
+    const camera = this.cameras[view], controls = this.controls[view];
+    if (view === "map") {
+      camera.position.set(0, 0, 10);
+      camera.zoom = 1;
+      controls.target.set(0, 0, 0);
+    } else {
+      const floor = this.middleHeight * this.scale;
+      controls.target.set(0, 0, floor);
+      camera.position.set(0.5, -3.1, floor + 2.1);
+    }
+    camera.updateProjectionMatrix();
+    controls.update();
+  }
+
+  /** Look at a window of the map from above. */
+  frame(row, col, height, width) {
+    const { head } = this, side = Math.max(head.height, head.width), camera = this.cameras.map;
+    const x = ((col + width / 2 - head.width / 2) * 2) / side, y = ((head.height / 2 - row - height / 2) * 2) / side;
+    camera.position.set(x, y, 10);
+    camera.zoom = (0.3 * side) / Math.max(height, width);
+    camera.updateProjectionMatrix();
+    this.controls.map.target.set(x, y, 0);
+    this.controls.map.update();
+  }
+
+  resize(width, height) {
+    const { map, space } = this.cameras, aspect = width / height;
+    const reach = 1.04 * Math.max(this.head.width / Math.max(this.head.width, this.head.height) / aspect, this.head.height / Math.max(this.head.width, this.head.height));
+    Object.assign(map, { left: -reach * aspect, right: reach * aspect, top: reach, bottom: -reach });
+    space.aspect = aspect;
+    space.fov = aspect < 1 ? 30 / Math.max(aspect, 0.5) : 30;
+    map.updateProjectionMatrix();
+    space.updateProjectionMatrix();
+  }
+
+  /** Where the camera of the view in space stands, m, in the axes of the map's middle */
+  cameraPlace() {
+    return this.cameras.space.position.clone().divideScalar(this.scale);
+  }
+
+  /** Scene units on the map per pixel of the screen */
+  unitsPerPixel() {
+    const camera = this.cameras.map;
+    return (camera.right - camera.left) / camera.zoom / this.renderer.domElement.clientWidth;
+  }
+
+  draw(span, colours, limits) {
+    const { uniforms } = this.material, names = Object.keys(this.head.colours);
+    uniforms.colour_row.value = colours ? (names.indexOf(colours) + 0.5) / names.length : -1;
+    uniforms.limits.value.set((limits[0] - span[0]) / (span[1] - span[0]), (limits[1] - span[0]) / (span[1] - span[0]));
+    uniforms.picking.value = false;
+    this.renderer.render(this.scenes[this.view], this.cameras[this.view]);
+  }
+
+  setOutline(photograph) {
+    const { width, height } = this.head, p = photograph;
+    const box = p ? [p.col / width, p.row / height, (p.col + p.width) / width, (p.row + p.height) / height] : [0, 0, 0, 0];
+    this.material.uniforms.outline.value = box;
+  }
+
+  /** {row, col} under a place of the canvas (CSS pixels), or null */
+  pick(x, y) {
+    const canvas = this.renderer.domElement, camera = this.cameras[this.view];
+    camera.setViewOffset(canvas.clientWidth, canvas.clientHeight, x, y, 1, 1);
+    this.material.uniforms.picking.value = true;
+    this.renderer.setRenderTarget(this.pixel);
+    this.renderer.render(this.scenes[this.view], camera);
+    this.renderer.setRenderTarget(null);
+    camera.clearViewOffset();
+    this.material.uniforms.picking.value = false;
+    const found = new Float32Array(4);
+    this.renderer.readRenderTargetPixels(this.pixel, 0, 0, 1, 1, found);
+    if (found[2] < 0.5) return null;
+    const row = Math.floor(found[1] * this.head.height), col = Math.floor(found[0] * this.head.width);
+    const inside = row >= 0 && col >= 0 && row < this.head.height && col < this.head.width;
+    return inside ? { row, col } : null;
+  }
+
+  flat() {
+    const { width, height } = this.head, side = Math.max(width, height);
+    const geometry = new THREE.PlaneGeometry((2 * width) / side, (2 * height) / side), uv = geometry.getAttribute("uv");
+    for (let k = 0; k < uv.count; k++) uv.setY(k, 1 - uv.getY(k));
+    return geometry;
+  }
+
+  /** The terrain as a mesh in the axes of the map's middle, body curvature included; holes stay open. */
+  relief() {
+    const { head, page, relighter } = this, { width, height, radius, nodes, axes } = head;
+    const step = Math.max(1, Math.ceil(Math.max(width, height) / MESH_PX));
+    const columns = lattice(width, step), rows = lattice(height, step), count = columns.length * rows.length;
+    const positions = new Float32Array(3 * count), uvs = new Float32Array(2 * count), known = new Uint8Array(count);
+    this.middleHeight = relighter.base;
+    for (let j = 0, k = 0; j < rows.length; j++) {
+      for (let i = 0; i < columns.length; i++, k++) {
+        const z = meanAround(page.elevation, width, height, rows[j], columns[i], step);
+        known[k] = Number.isFinite(z) ? 1 : 0;
+        const up = upAt(axes, nodes, rows[j] / (height - 1), columns[i] / (width - 1)), r = radius + (known[k] ? z : relighter.base);
+        positions[3 * k] = r * up[0] * this.scale;
+        positions[3 * k + 1] = r * up[1] * this.scale;
+        positions[3 * k + 2] = (r * up[2] - radius) * this.scale;
+        uvs[2 * k] = (columns[i] + 0.5) / width;
+        uvs[2 * k + 1] = (rows[j] + 0.5) / height;
+      }
+    }
+    const faces = [];
+    for (let j = 0; j + 1 < rows.length; j++) {
+      for (let i = 0; i + 1 < columns.length; i++) {
+        const a = j * columns.length + i, b = a + 1, c = a + columns.length, d = c + 1;
+        if (known[a] && known[b] && known[c] && known[d]) faces.push(a, c, b, b, c, d);
+      }
+    }
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+    geometry.setAttribute("uv", new THREE.BufferAttribute(uvs, 2));
+    geometry.setIndex(new THREE.BufferAttribute(Uint32Array.from(faces), 1));
+    return geometry;
+  }
+}
+
+function scene(geometry, material) {
+  const made = new THREE.Scene(), mesh = new THREE.Mesh(geometry, material);
+  mesh.frustumCulled = false;
+  made.add(mesh);
+  return made;
+}
+
+function lattice(length, step) {
+  const places = [];
+  for (let k = 0; k < length - 1; k += step) places.push(k);
+  return [...places, length - 1];
+}
+
+function meanAround(values, width, height, row, col, step) {
+  const reach = step >> 1;
+  let sum = 0, count = 0;
+  for (let r = Math.max(0, row - reach); r <= Math.min(height - 1, row + reach); r++) {
+    for (let c = Math.max(0, col - reach); c <= Math.min(width - 1, col + reach); c++) {
+      const v = values[r * width + c];
+      if (v === v) {
+        sum += v;
+        count++;
+      }
+    }
+  }
+  return count ? sum / count : NaN;
+}
+
+/** Unit vector up at shares of the map's height and width, interpolated between nodes */
+function upAt(axes, nodes, down, across) {
+  const v = down * (nodes - 1), u = across * (nodes - 1), j = Math.min(nodes - 2, Math.floor(v)), i = Math.min(nodes - 2, Math.floor(u));
+  const at = (row, col, k) => axes[9 * (row * nodes + col) + 6 + k], f = u - i, g = v - j;
+  const up = [0, 1, 2].map((k) => (1 - g) * ((1 - f) * at(j, i, k) + f * at(j, i + 1, k)) + g * ((1 - f) * at(j + 1, i, k) + f * at(j + 1, i + 1, k)));
+  const length = Math.hypot(...up);
+  return up.map((c) => c / length);
+}
+
+function colourTable(colours) {
+  const tables = Object.values(colours).map((text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)));
+  const data = new Uint8Array(256 * 4 * tables.length);
+  tables.forEach((table, row) => {
+    for (let k = 0; k < 256; k++) data.set([table[3 * k], table[3 * k + 1], table[3 * k + 2], 255], 4 * (256 * row + k));
+  });
+  const made = texture(data, 256, tables.length, THREE.RGBAFormat, THREE.UnsignedByteType);
+  return Object.assign(made, { magFilter: THREE.LinearFilter, minFilter: THREE.LinearFilter });
+}

@@ -1,0 +1,124 @@
+"""One HTML file from packed maps: template, style, shaders and scripts in one, nothing from outside."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from importlib.metadata import version
+from importlib.resources import files
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from stages.view.frames import NODES, Frames
+from stages.view.layers import Content
+from stages.view.packing import Blob, pack_map, spread_step
+from stages.view.photographs import Photograph
+
+HEIGHT_STEP = 1e-3  # of a pixel: slopes are then kept to 2e-4
+SCRIPTS = ("decode.js", "shadows.js", "relight.js", "terrain.js", "panel.js", "photographs.js", "main.js")
+SHADERS = ("common", "lattice", "spread", "visible", "shade", "draw_vertex", "draw")
+COLOURS = ("viridis", "magma", "cividis")
+
+
+def make_page(
+    content: Content, frames: Frames, photographs: Sequence[Photograph], still: bytes, start: dict[str, Any], title: str
+) -> str:
+    """The whole page. start : what it shows first (azimuth, elevation in degrees)"""
+    blob = Blob()
+    head = describe(content, frames, photographs, blob)
+    head |= {"start": start, "title": title}
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    template = environment.from_string(_asset("page.html.j2"))
+    return template.render(
+        title=title,
+        model=content.model,
+        version=version("lunargr"),
+        start=start,
+        style=_asset("page.css"),
+        library=_asset("vendor/three.min.js"),
+        licence=_asset("vendor/LICENSE.three.txt"),
+        script="\n".join(_asset(f"js/{name}") for name in SCRIPTS),
+        head=_json_for_html({**head, "shaders": _shaders(content)}),
+        blob=blob.text(),
+        still=base64.b64encode(still).decode("ascii"),
+    )
+
+
+def describe(content: Content, frames: Frames, photographs: Sequence[Photograph], blob: Blob) -> dict[str, Any]:
+    """What the page's script must know; its maps go into ``blob``."""
+    grid = content.grid
+    known = np.isfinite(content.elevation)
+    mapped = known.copy()
+    for layer in content.coefficients:
+        mapped &= np.isfinite(layer.values)
+    fields = []
+    for layer in [*content.coefficients, *content.others]:
+        good = np.isfinite(layer.values)
+        packed = pack_map(layer.values, good, spread_step(layer.values, good))
+        entry: dict[str, Any] = {"name": layer.name, "title": layer.title, "unit": layer.unit}
+        entry["map"] = blob.add_map(packed)
+        # most maps are known where the coefficients are
+        if not np.array_equal(good, mapped):
+            entry["known"] = blob.add_map(pack_map(good, np.ones_like(good), 1.0))
+        fields.append(entry)
+    everywhere = np.ones_like(known)
+    return {
+        "height": grid.height,
+        "width": grid.width,
+        "gsd": grid.gsd,
+        "radius": grid.radius,
+        "factor": content.factor,
+        "model": {"name": content.model.name, "title": content.model.title, "formula": content.model.formula},
+        "count": len(content.coefficients),
+        "elevation": blob.add_map(pack_map(content.elevation, known, HEIGHT_STEP * grid.gsd)),
+        "elevation_known": blob.add_map(pack_map(known, everywhere, 1.0)),
+        "mapped": blob.add_map(pack_map(mapped, everywhere, 1.0)),
+        "fields": fields,
+        "nodes": NODES,
+        "axes": [round(float(v), 9) for v in frames.axes.ravel()],
+        "pixel_size": [float(v) for v in frames.pixel_size.ravel()],
+        "middle": frames.middle.tolist(),
+        "convergence_deg": frames.convergence_deg,
+        "colours": {name: _colours(name) for name in COLOURS},
+        "photographs": [_photograph(p, blob) for p in photographs],
+    }
+
+
+def _photograph(photograph: Photograph, blob: Blob) -> dict[str, Any]:
+    good = np.isfinite(photograph.image)
+    return {
+        "title": photograph.title,
+        "unit": photograph.unit,
+        "row": photograph.row,
+        "col": photograph.col,
+        "azimuth": photograph.sun_azimuth_deg,
+        "elevation": photograph.sun_elevation_deg,
+        "camera": photograph.camera.tolist(),
+        "map": blob.add_map(pack_map(photograph.image, good, spread_step(photograph.image, good))),
+        "known": blob.add_map(pack_map(good, np.ones_like(good), 1.0)),
+    }
+
+
+def _colours(name: str) -> str:
+    """256 RGB colours of a colour map as base64."""
+    import matplotlib
+
+    table = matplotlib.colormaps[name](np.arange(256), bytes=True)[:, :3]
+    return base64.b64encode(table.tobytes()).decode("ascii")
+
+
+def _shaders(content: Content) -> dict[str, str]:
+    sources = {name: _asset(f"shaders/{name}.glsl") for name in SHADERS}
+    return {**sources, "model": content.model.glsl or ""}
+
+
+def _asset(name: str) -> str:
+    return files("stages.view").joinpath("assets", *name.split("/")).read_text(encoding="utf-8")
+
+
+def _json_for_html(value: Any) -> str:
+    """JSON that may stand inside a script element, whatever its strings hold."""
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
