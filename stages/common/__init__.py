@@ -1,1 +1,1 @@
-"""What every part of the package uses: threads, memory."""
+"""What every part of the package uses: threads, memory, intervals."""
