@@ -8,30 +8,25 @@ in one tile, so that tiles share no ground either and their errors are independe
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
-from geographiclib.geodesic import Geodesic
 from numpy.typing import NDArray
 
 from schemas import CROPS, SCENE, SPLITS, ArtefactWriter, ConfigError, GeometryError, check_output, open_artefact
 from schemas.provenance import sha256
 from stages.physics.images.table import Frame, load_frames, relative_path, write_frames
 from stages.physics.maps.grid import Grid, read_grid
-from stages.physics.maps.positions import blocks, valid_positions
+from stages.physics.maps.ground_tiles import PositionMasks, Tiles, bounds_deg, split_tiles, tile_edge
+from stages.physics.maps.positions import blocks
 
 Progress = Callable[[int, int, str], None]
 
-TEST_TILES = 20  # where --tile-m is left to us and the scene is large enough: intervals over fewer are wide
-WITH_ROOM = 0.8  # of the tiles, in which a crop fits: images end, elevations have holes
-SMALLEST_TILE, LARGEST_TILE = 1.125, 4  # of the scene's crops
 LARGEST = 1e9  # m of a tile, crops per km2
 MOST_CROPS = 2**31 - 1  # what an index of a pair can count
 
@@ -63,43 +58,6 @@ class Part:
     shared_km2: float
 
 
-@dataclass(frozen=True)
-class Tiles:
-    """Square ground tiles from the scene grid's first pixel on: ``edge`` in pixels; ``part`` (rows, cols) int8, -1 where unused."""
-
-    edge: int
-    part: NDArray[np.int8]
-
-    def identity(self, ground_deg: tuple[float, float, float, float]) -> dict[str, Any]:
-        """What says that two samples split the same ground alike, kept in ``config`` and so in all that is made from it.
-
-        ground_deg : west, east, south, north
-        """
-        digest = hashlib.sha256(json.dumps([self.edge, self.part.shape, ground_deg]).encode() + self.part.tobytes())
-        return {"split_id": digest.hexdigest()[:16], "split_ground_deg": ground_deg}
-
-    def allowed(self, row: NDArray, col: NDArray, crop: int) -> NDArray[np.int8]:
-        """Part of the split of crops centred at row (n, 1) and col (m,), -1 where a crop must not be.
-
-        A footprint that touches two parts, or two tiles where it is not for training.
-        """
-        half = crop // 2
-        r0, r1 = (row - half) // self.edge, (row + half - 1) // self.edge
-        c0, c1 = (col - half) // self.edge, (col + half - 1) // self.edge
-        rows, cols = self.part.shape
-        # Centres near the scene's edge have no whole footprint and are not valid positions anyway.
-        r0, r1, c0, c1 = (
-            np.clip(r0, 0, rows - 1),
-            np.clip(r1, 0, rows - 1),
-            np.clip(c0, 0, cols - 1),
-            np.clip(c1, 0, cols - 1),
-        )
-        corner = self.part[r0, c0]
-        same = (corner == self.part[r0, c1]) & (corner == self.part[r1, c0]) & (corner == self.part[r1, c1])
-        one_tile = (r0 == r1) & (c0 == c1)
-        return np.where(same & (one_tile | (corner == 0)), corner, -1).astype(np.int8)
-
-
 def run(
     scene: Path, output: Path, config: Config, overwrite: bool = False, progress: Progress | None = None
 ) -> list[Part]:
@@ -127,8 +85,8 @@ def run(
         if not frames:
             raise ConfigError(f"{scene}: expected images, found none; run 'lunargr ingest' with --images.")
         positions = PositionMasks(file, grid, crop, config.block)
-        edge = _tile_edge(grid, positions, config)
-        tiles = _split_tiles(positions, grid, edge, config, progress)
+        edge = tile_edge(grid, positions, config.split, config.tile_m)
+        tiles = split_tiles(positions, grid, edge, config.split, config.seed, progress)
         chosen = _choose(positions, tiles, frames, grid, config, np.random.default_rng(config.seed), progress)
         if not len(chosen):
             raise GeometryError(
@@ -145,121 +103,6 @@ def read_audit(crops: Path) -> list[Part]:
     """The audit of the split, of all shards, as it stands in the file."""
     with open_artefact(crops, CROPS) as file:
         return [Part(**part) for part in json.loads(file.attrs["split_audit"])]
-
-
-class PositionMasks:
-    """Valid positions of a scene, block by block, for any crop size."""
-
-    def __init__(self, file: h5py.File, grid: Grid, crop: int, block: int) -> None:
-        self.file, self.grid, self.crop = file, grid, crop
-        self.scene_crop = int(file.attrs["crop_px"])
-        self.stored = self.scene_crop == crop
-        self.windows = file["frame_window"][...]
-        self.blocks = list(blocks(grid.height, grid.width, block))
-
-    def frames_of(self, block: tuple[int, int, int, int]) -> list[int]:
-        """Frames whose valid pixels meet a block."""
-        row, col, h, w = block
-        r, c, fh, fw = self.windows.T
-        meets = (fh > 0) & (r < row + h) & (r + fh > row) & (c < col + w) & (c + fw > col)
-        return [int(k) for k in np.flatnonzero(meets)]
-
-    def mask(self, frame: int, block: tuple[int, int, int, int]) -> NDArray[np.bool_]:
-        row, col, h, w = block
-        if self.stored:
-            return self.file["valid_position"][frame, row : row + h, col : col + w].astype(bool)
-        # Two-dimensional view of one frame, sliced lazily.
-        return valid_positions(_Layer(self.file["valid"], frame), self.grid.height, self.grid.width, block, self.crop)
-
-
-class _Layer:
-    """One frame of a (frame, y, x) dataset that slices like a two-dimensional one."""
-
-    def __init__(self, data: h5py.Dataset, index: int) -> None:
-        self.data, self.index = data, index
-
-    def __getitem__(self, key: tuple[slice, slice]) -> NDArray:
-        return self.data[(self.index, *key)]
-
-
-def _tile_edge(grid: Grid, positions: PositionMasks, config: Config) -> int:
-    """Edge of a ground tile in pixels; metres are measured along the body with a geodesic at the scene's centre.
-
-    Without --tile-m it follows from the scene and the shares alone, not from the crops that are asked for.
-    """
-    crop = positions.crop
-    if config.tile_m is not None:
-        row, col = grid.height / 2, grid.width / 2
-        lon, lat = grid.lonlat([row, row], [col - 50, col + 50])
-        metres = Geodesic(grid.radius, 0).Inverse(lat[0], lon[0], lat[1], lon[1])["s12"] / 100
-        edge = min(round(config.tile_m / metres), 4 * max(grid.height, grid.width))
-        if edge < crop:
-            raise ConfigError(f"--tile-m: expected at least one crop ({crop * metres:g} m), found {config.tile_m:g} m.")
-        return edge
-    edge = _scene_edge(positions, config.split)
-    if edge < crop:
-        raise ConfigError(
-            f"--crop: expected at most {edge} px, the ground tiles of this scene's split, found {crop}; "
-            "name larger tiles with --tile-m here and wherever else this scene is sampled."
-        )
-    return edge
-
-
-def _scene_edge(positions: PositionMasks, shares: tuple[float, float, float]) -> int:
-    """As large as leaves TEST_TILES for testing, between SMALLEST_TILE and LARGEST_TILE; slivers at the edge avoided."""
-    crop, used = positions.scene_crop, positions.windows[positions.windows[:, 2] > 0]
-    if not len(used):
-        return LARGEST_TILE * crop
-    height = int((used[:, 0] + used[:, 2]).max() - used[:, 0].min())
-    width = int((used[:, 1] + used[:, 3]).max() - used[:, 1].min())
-    tiles = TEST_TILES / min(s for s in shares if s > 0) / WITH_ROOM
-    edge = min(max(math.sqrt(height * width / tiles), SMALLEST_TILE * crop), LARGEST_TILE * crop)
-    longest = max(height, width)
-    return math.ceil(longest / max(1, math.floor(longest / edge)))
-
-
-def _split_tiles(positions: PositionMasks, grid: Grid, edge: int, config: Config, progress: Progress | None) -> Tiles:
-    """Give every tile with valid ground to a part, in the order of a hash, so that the parts' ground is near their shares.
-
-    Tiles in which no crop of the scene's own size fits train only: they would not be tested on.
-    """
-    shape = (math.ceil(grid.height / edge), math.ceil(grid.width / edge))
-    ground, room = np.zeros(shape), np.zeros(shape, bool)
-    before, behind = positions.scene_crop // 2, positions.scene_crop - positions.scene_crop // 2 - 1
-    for number, block in enumerate(positions.blocks):
-        if progress:
-            progress(number, len(positions.blocks), "tiles")
-        row, col, h, w = block
-        part_of_scene = np.s_[row : row + h, col : col + w]
-        covered, centres = np.zeros((h, w), bool), np.zeros((h, w), bool)
-        for frame in positions.frames_of(block):
-            covered |= positions.file["valid"][frame, *part_of_scene].astype(bool)
-            centres |= positions.file["valid_position"][frame, *part_of_scene].astype(bool)
-        r, c = np.nonzero(covered)
-        np.add.at(ground, ((r + row) // edge, (c + col) // edge), 1)
-        r, c = (v + first for v, first in zip(np.nonzero(centres), (row, col), strict=True))
-        inside = ((r - before) // edge == (r + behind) // edge) & ((c - before) // edge == (c + behind) // edge)
-        room[r[inside] // edge, c[inside] // edge] = True
-    if progress:
-        progress(len(positions.blocks), len(positions.blocks), "tiles")
-    if not room.any():  # tiles are smaller than the scene's crops: smaller ones will be asked for
-        room = ground > 0
-    part = np.where(ground > 0, 0 if config.split[0] > 0 else -1, -1).astype(np.int8)
-    shares = np.array(config.split)
-    total, filled = (ground * room).sum(), np.zeros(3)
-    for row, col in sorted(np.argwhere(room).tolist(), key=lambda at: _lot(config.seed, *at)):
-        deficit = shares * total - filled
-        deficit[shares <= 0] = -np.inf
-        # The emptiest part relative to its share: small parts get their first tile early.
-        k = int(np.argmax(deficit / np.maximum(shares * total, 1)))
-        part[row, col] = k
-        filled[k] += ground[row, col]
-    return Tiles(edge, part)
-
-
-def _lot(seed: int, row: int, col: int) -> bytes:
-    """A tile's place in the draw: of its index and the seed, whatever is sampled and by which version of numpy."""
-    return hashlib.sha256(f"{seed} {row} {col}".encode()).digest()
 
 
 CHOSEN = np.dtype([("frame", "i4"), ("row", "i4"), ("col", "i4"), ("site", "i4"), ("tile", "i4"), ("split", "u1")])
@@ -405,16 +248,6 @@ def audit(chosen: NDArray, tiles: Tiles, grid: Grid, crop: int) -> list[Part]:
     ]
 
 
-def _bounds_deg(grid: Grid) -> tuple[float, float, float, float]:
-    """West, east, south, north of the scene, degrees to 1e-5."""
-    rows, cols = np.linspace(0, grid.height, 9), np.linspace(0, grid.width, 9)
-    lon, lat = grid.lonlat(*(v.ravel() for v in np.meshgrid(rows, cols, indexing="ij")))
-    middle = grid.lonlat([grid.height / 2], [grid.width / 2])[0][0]
-    lon = middle + (np.asarray(lon) - middle + 180) % 360 - 180
-    west, east, south, north = (round(float(v), 5) for v in (lon.min(), lon.max(), np.min(lat), np.max(lat)))
-    return west, east, south, north
-
-
 def _write(
     scene: Path,
     output: Path,
@@ -442,7 +275,7 @@ def _write(
         "pairs_in_all_shards": np.int64(len(chosen)),
         "split_audit": json.dumps([asdict(p) for p in audited]),
     }
-    stored = asdict(config) | {"crop": crop} | tiles.identity(_bounds_deg(grid))
+    stored = asdict(config) | {"crop": crop} | tiles.identity(bounds_deg(grid))
     half = crop // 2
     with ArtefactWriter(
         output,
