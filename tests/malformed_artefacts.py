@@ -40,20 +40,23 @@ READERS: dict[str, list[list[str]]] = {
             "out.h5",
         ],
         ["evaluate", "pairs.h5", "checkpoint.h5", "--device", "cpu", "-o", "out.h5"],
-        ["match", "pairs.h5", "checkpoint.h5", "--device", "cpu", "--json", "out.json"],
+        ["match", "pairs.h5", "checkpoint.h5", "--count", "1", "--device", "cpu", "--json", "out.json"],
         ["diagnose", "pairs.h5", "-o", "out.h5"],
         ["report", "pairs.h5", "-o", "out.html"],
     ],
     "checkpoint": [
         ["infer", "scene.h5", "checkpoint.h5", "--device", "cpu", "-o", "out.h5"],
         ["evaluate", "pairs.h5", "checkpoint.h5", "--device", "cpu", "-o", "out.h5"],
-        ["match", "pairs.h5", "checkpoint.h5", "--device", "cpu", "--json", "out.json"],
+        ["match", "pairs.h5", "checkpoint.h5", "--count", "1", "--device", "cpu", "--json", "out.json"],
     ],
     "svbrdf": [
         ["render", "svbrdf.h5", "--sun-azimuth", "90", "--sun-elevation", "30", "-o", "out.exr"],
         ["report", "svbrdf.h5", "-o", "out.html"],
     ],
-    "evaluation": [["match", "evaluation.h5", "--json", "out.json"], ["report", "evaluation.h5", "-o", "out.html"]],
+    "evaluation": [
+        ["match", "evaluation.h5", "--count", "1", "--json", "out.json"],
+        ["report", "evaluation.h5", "-o", "out.html"],
+    ],
     "diagnosis": [
         [
             "render",

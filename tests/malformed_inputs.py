@@ -275,6 +275,8 @@ def raster_cases() -> Iterator[Case]:
         "of pixels without size": {"transform": Affine(0, 0, 0, 0, 0, 0)}, "of NaN pixels": {"transform": Affine(np.nan, 0, 0, 0, np.nan, 0)},
         "of huge heights": {"values": lambda a: a * 1e30}, "of kilometres": {"values": lambda a: a * 1e-3}, "of millimetres": {"values": lambda a: a * 1e3},
         "of radii in kilometres": {"values": lambda a: a * 1e-3 + 1737.4}, "scaled by NaN": {"scale": float("nan")}, "scaled by 0": {"scale": 0.0},
+        "at longitude +720 deg": {
+            "crs": CRS.from_proj4(f"+proj=longlat +R={small_scene.RADIUS} +no_defs"), "transform": Affine(step, 0, 740, 0, -step, 10)},
         "beyond the pole": {"crs": CRS.from_proj4(f"+proj=longlat +R={small_scene.RADIUS} +no_defs"), "transform": Affine(step, 0, 20, 0, -step, 95)},
     }  # fmt: skip
     for name, change in changes.items():

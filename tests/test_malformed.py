@@ -46,6 +46,7 @@ SAMPLE = [
     "crops: /image_index above",
     "crops: /subsolar_latitude_deg NaN",
     "DEM: HDF5 garbage",
+    "DEM at longitude +720 deg",
     "train --seed '-1'",
     "sample --tile-m 'nan'",
     "sample --tile-m 'inf'",

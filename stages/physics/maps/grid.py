@@ -270,6 +270,11 @@ def require_crs(where: str, crs: CRS | None, transform: Affine) -> CRS:
         raise InputError(
             f"{where}: expected pixels of a finite size, found the transform {tuple(transform)[:6]}; set it with gdal_edit.py -a_ullr."
         )
+    if crs.is_geographic and not -360.0 <= transform.c <= 540.0:
+        raise InputError(
+            f"{where}: expected longitudes of -360 .. 540 deg, found a raster that begins at {transform.c:g}; take off whole "
+            "turns (gdal_edit.py -a_ullr)."
+        )
     try:
         crs.to_wkt()
     except CRSError as error:
