@@ -90,6 +90,13 @@ def read_state(group: h5py.Group) -> dict[str, Tensor]:
     return {name: torch.from_numpy(np.array(data[...])) for name, data in group.items()}
 
 
+def first_misfit(error: BaseException) -> str:
+    """What PyTorch says of the first weight that does not fit; its own first line only names a class."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+    text = lines[1] if len(lines) > 1 else lines[0]
+    return text if len(text) <= 160 else f"{text[:157]}..."
+
+
 def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | None = None) -> Predictor:
     """Load checkpoint.h5. ``model``: the model that the caller expects. Raises ArtefactError."""
     with open_artefact(Path(path), CHECKPOINT) as file:
@@ -122,7 +129,8 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
             predictor.load_state_dict(read_state(file["weights"]))
         except RuntimeError as error:
             raise ArtefactError(
-                f"{path}:/weights: they do not fit the network ({str(error).splitlines()[0]}); train again."
+                f"{path}:/weights: expected those of the network that 'config' describes, found others ({first_misfit(error)}); "
+                "train again, or bring back the file as 'lunargr train' wrote it."
             ) from None
         ids = read_strings(file, "image_id")
         predictor.gain = dict(zip(ids, map(float, file["gain"][...]), strict=True))
