@@ -94,6 +94,13 @@ def read_state(group: h5py.Group) -> dict[str, Tensor]:
     return {name: torch.from_numpy(np.array(data[...])) for name, data in group.items()}
 
 
+def first_misfit(error: BaseException) -> str:
+    """What PyTorch says of the first weight that does not fit; its own first line only names a class."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+    text = lines[1] if len(lines) > 1 else lines[0]
+    return text if len(text) <= 160 else f"{text[:157]}..."
+
+
 def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | None = None) -> Predictor:
     """Load checkpoint.h5. ``model``: the model that the caller expects. Raises ArtefactError."""
     with open_artefact(Path(path), CHECKPOINT) as file:

@@ -15,7 +15,7 @@ from schemas.errors import ArtefactError
 from schemas.files.hdf5 import silence_hdf5
 from schemas.files.outputs import atomic_path
 from stages.network.losses import Radiometry
-from stages.network.predictor import Predictor, read_state, write_state
+from stages.network.predictor import Predictor, first_misfit, read_state, write_state
 
 
 @dataclass
@@ -98,5 +98,5 @@ def restore(
             return str(file.attrs["precision"])
     except (OSError, KeyError, RuntimeError) as error:
         raise ArtefactError(
-            f"{sidecar}: cannot be resumed from ({str(error).splitlines()[0]}); remove it and train again."
+            f"{sidecar}: cannot be resumed from ({first_misfit(error)}); remove it and train again."
         ) from None
