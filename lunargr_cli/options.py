@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import typer
 
 from schemas.errors import ConfigError
+
+Number = TypeVar("Number", int, float)
 
 Output = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output.")]
@@ -57,6 +59,19 @@ def parse_shard(text: str | None) -> tuple[int, int]:
     if first.isdigit() and last.isdigit() and 1 <= int(first) <= int(last):
         return int(first) - 1, int(last)
     raise ConfigError(f"--shard: expected I/N with 1 <= I <= N, found '{text}'.")
+
+
+def read_numbers(option: str, text: str, kind: type[Number]) -> tuple[Number, ...]:
+    """'16-32-64' -> (16, 32, 64). Raises ConfigError."""
+    try:
+        return tuple(kind(part) for part in text.split("-"))
+    except ValueError:
+        raise ConfigError(f"{option}: expected numbers like 8-16-32, found '{text}'.") from None
+
+
+def read_names(text: str | None) -> tuple[str, ...]:
+    """'w, b' -> ('w', 'b'); None -> ()"""
+    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
 
 
 def in_parts(scheduler: str | None, resume: bool, parts: int | None, shard: str | None) -> bool:

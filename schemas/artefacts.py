@@ -298,7 +298,12 @@ CHECKPOINT = declare(
         ),
         attributes=(
             Attribute("model", "reflectance model whose coefficients the network predicts"),
-            Attribute("coefficients", "JSON list of coefficient names, in channel order"),
+            Attribute("coefficients", "JSON list of the model's coefficient names"),
+            Attribute(
+                "maps", "JSON list of the coefficients that the network predicts place by place, in channel order"
+            ),
+            Attribute("globals", "JSON: the other coefficients, the same everywhere, by name"),
+            Attribute("positive", "1 = coefficients are kept nearly positive by LeakyReLU, 0 = within their bounds"),
             Attribute("elevation_scale_m", "std of the crop-centred training elevations, m"),
             Attribute("gsd_m", "ground sample distance the network was trained at, m"),
             Attribute("body_radius_m", "radius of the reference sphere, m"),

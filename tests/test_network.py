@@ -11,6 +11,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from stages.network.losses import Radiometry, masked_mse, squared_error
 from stages.network.normalisation import FILL_REACH, fill_holes, scale_elevation
+from stages.network.maps import CoefficientMaps
 from stages.network.predictor import Predictor
 from stages.network.runtime import choose_inference_precision
 from stages.network.symmetries import COUNT, turn_field, turn_vector
@@ -112,7 +113,7 @@ def test_bf16_is_refused_where_it_would_drown_the_coefficients(contrast, expecte
     with torch.no_grad():
         net.head.weight *= contrast
         net.head.bias += 1
-    predictor = Predictor(get_model("M1"), net, 1.0, torch.zeros(1), 1.0)
+    predictor = Predictor(net, CoefficientMaps(get_model("lambert"), (), torch.tensor([0.5]), 1.0), 1.0)
     sample = (torch.randn(64, 64).cumsum(0).cumsum(1) * 0.1).numpy()
     assert choose_inference_precision(predictor, sample, torch.device("cpu")) == expected
 

@@ -17,15 +17,15 @@ def command(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for checkpoints, evaluations and the table.")],
     models: Annotated[
         str, typer.Option("--models", help="Reflectance models, separated by commas.")
-    ] = "M1,M2,M3,M4,M5,M6",
+    ] = "M1,M2,M3,M4,M5,M6,kernels,hapke",
     seeds: Annotated[int, typer.Option("--seeds", help="Training runs of every model, from seeds 0, 1, ...")] = 3,
     epochs: Annotated[int, typer.Option("--epochs", help="Passes over the training pairs.")] = 20,
-    batch: Annotated[int, typer.Option("--batch", help="Pairs per training step.")] = 64,
-    lr: Annotated[float, typer.Option("--lr", help="Adam's learning rate.")] = 1e-4,
+    batch: Annotated[int, typer.Option("--batch", help="Pairs per training step.")] = 32,
+    lr: Annotated[float, typer.Option("--lr", help="Adam's learning rate.")] = 3e-3,
     schedule: Annotated[
-        str, typer.Option("--schedule", help="Learning rate over the epochs: constant or cosine.")
-    ] = "constant",
-    widths: Annotated[str, typer.Option("--widths", help="Channels of each stage of the U-Net.")] = "16-32-64-128-256",
+        str, typer.Option("--schedule", help="Learning rate over the steps: constant or cosine.")
+    ] = "cosine",
+    widths: Annotated[str, typer.Option("--widths", help="Channels of each stage of the U-Net.")] = "8-16-32",
     split: Annotated[
         str, typer.Option("--split", help="Where models are compared: validation (as in the paper) or test.")
     ] = "validation",
@@ -40,6 +40,7 @@ def command(
     With --resume, runs that the folder already holds are kept and an interrupted one goes on where it stopped.
     """
     from lunargr_cli.console import Console
+    from lunargr_cli.options import read_numbers
     from schemas import ConfigError
     from stages import compare, evaluate, train
     from stages.physics.photometry import get_model
@@ -56,10 +57,7 @@ def command(
     for report in (table, *([json_file] if json_file else [])):
         if report.exists() and not (overwrite or resume):
             raise ConfigError(f"{report}: exists already; add --overwrite or --resume, or choose another --output.")
-    try:
-        channels = tuple(int(w) for w in widths.split("-"))
-    except ValueError:
-        raise ConfigError(f"--widths: expected numbers like 16-32-64-128-256, found '{widths}'.") from None
+    channels = read_numbers("--widths", widths, int)
     settings: dict[str, Any] = {"epochs": epochs, "batch": batch, "lr": lr, "schedule": schedule, "widths": channels}
     files: list[tuple[Path, Path]] = []
     for seed in range(seeds):
@@ -100,5 +98,4 @@ def _same(checkpoint: Path, config: Any, pairs: Path) -> bool:
     with open_artefact(checkpoint, CHECKPOINT) as file:
         found, inputs = read_config(file), json.loads(str(file.attrs["inputs"]))
     wanted = json.loads(json.dumps(asdict(config)))
-    keys = ("model", "seed", "epochs", "batch", "lr", "schedule", "widths")
-    return all(found.get(k) == wanted[k] for k in keys) and inputs[0]["sha256"] == sha256(pairs)
+    return all(found.get(k) == wanted[k] for k in wanted if k != "device") and inputs[0]["sha256"] == sha256(pairs)

@@ -28,7 +28,7 @@ class Mapper:
         self.predictor, self.device, self.precision = predictor.eval(), device, precision
         self.in_strips = device.type == "cpu"
         self.together = 1
-        self._start = predictor.start.detach().cpu().float().numpy()
+        self._start = predictor.maps.start.detach().cpu().float().numpy()
         if self.in_strips:
             dtype = torch.bfloat16 if precision == "bf16" else torch.float32
             self.together = min(threads, MEMORY // (64 * dtype.itemsize))
@@ -65,9 +65,9 @@ class Mapper:
     @torch.inference_mode()
     def _finish(self, raw: Tensor, first: int, width: int) -> NDArray[np.float32]:
         out = np.empty((raw.shape[1], raw.shape[2], width), np.float32)
-        scale = np.float32(self.predictor.output_scale)
+        scale = np.float32(self.predictor.maps.output_scale)
         row_kernels.finish(pixels_of(raw)[0], first, first + width, scale, self._start, out)
-        return self.predictor.model.constrain(torch.from_numpy(out), dim=0).numpy()
+        return self.predictor.maps.stack(torch.from_numpy(out), dim=0).numpy()
 
     @torch.no_grad()
     def _window(self, terrain: Terrain, shape: tuple[int, int], part: tuple[int, int, int, int]) -> Tensor:

@@ -14,28 +14,21 @@ from torch import Tensor
 from schemas.artefacts import CHECKPOINT
 from schemas.errors import ArtefactError, ConfigError
 from schemas.reading import open_artefact, read_config, read_strings
+from stages.network.maps import CoefficientMaps
 from stages.network.normalisation import scale_elevation
 from stages.network.unet import UNet
-from stages.physics.photometry import ReflectanceModel, get_model
+from stages.physics.photometry import get_model
 
 
 class Predictor(torch.nn.Module):
-    """Elevation -> coefficients of a reflectance model.
+    """Elevation -> coefficients of a reflectance model."""
 
-    The network's raw output is scaled by ``output_scale`` and shifted by ``start`` (the raw global coefficients), so
-    that training begins at the best uniform surface and moves in steps of its own size.
-    """
-
-    def __init__(
-        self, model: ReflectanceModel, net: UNet, elevation_scale: float, start: Tensor, output_scale: float
-    ) -> None:
+    def __init__(self, net: UNet, maps: CoefficientMaps, elevation_scale: float) -> None:
         super().__init__()
-        self.model = model
+        self.model = maps.model
         self.net = net
+        self.maps = maps
         self.elevation_scale = elevation_scale
-        self.output_scale = output_scale
-        self.start: Tensor
-        self.register_buffer("start", start.clone())
         self.gain: dict[str, float] = {}
         self.offset: dict[str, float] = {}
         self.image_units = "iof"
@@ -43,11 +36,14 @@ class Predictor(torch.nn.Module):
 
     def forward(self, elevation: Tensor, keys: Tensor | None = None) -> Tensor:
         """(B, H, W) m -> (B, C, H, W) coefficients; ``keys`` as in :class:`UNet`."""
+        return self.maps.stack(self.shifted(elevation, keys), dim=1)
+
+    def shifted(self, elevation: Tensor, keys: Tensor | None = None) -> Tensor:
+        """(B, H, W) m -> (B, M, H, W), the maps before their bounds: see :class:`CoefficientMaps`."""
         x = scale_elevation(elevation, self.elevation_scale)
         if elevation.device.type == "cpu":
             x = x.to(memory_format=torch.channels_last)
-        raw = self.net(x, keys).float() * self.output_scale + self.start[None, :, None, None]
-        return self.model.constrain(raw, dim=1)
+        return self.maps.shifted(self.net(x, keys))
 
     def _whole_strides(self, elevation: Tensor) -> Tensor:
         stride = self.net.stride
@@ -103,20 +99,21 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
                 f"{path}:/weights: expected the network's weights, found none; write it again with 'lunargr train'."
             )
         reflectance = get_model(name)
-        found = json.loads(str(file.attrs["coefficients"]))
-        expected = [p.name for p in reflectance.parameters]
-        if found != expected:
+        names = [p.name for p in reflectance.parameters]
+        found, maps = (json.loads(str(file.attrs[key])) for key in ("coefficients", "maps"))
+        if found != names or not maps or not set(maps) <= set(names):
             raise ArtefactError(
-                f"{path}: expected coefficients {', '.join(expected)} of '{name}', found {', '.join(found)}; train again."
+                f"{path}: expected coefficients {', '.join(names)} of '{name}', some of them in maps, found {', '.join(found)} "
+                f"and maps of {', '.join(maps) or 'none'}; train again."
             )
         config = read_config(file)
-        net = UNet(len(expected), config["widths"], config["dropout"])
+        net = UNet(len(maps), config["widths"], config["dropout"])
+        start = torch.tensor([p.default for p in reflectance.parameters])
+        output_scale, positive = float(file.attrs["output_scale"]), bool(file.attrs["positive"])
         predictor = Predictor(
-            reflectance,
             net,
+            CoefficientMaps(reflectance, maps, start, output_scale, positive),
             float(file.attrs["elevation_scale_m"]),
-            torch.zeros(len(expected)),
-            float(file.attrs["output_scale"]),
         )
         try:
             predictor.load_state_dict(read_state(file["weights"]))

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from stages.network.fused import join, norm_act, pool, quarter_weights
 from stages.network.layers import SLOPE, BatchNorm, Dropout, draw_keys
+from stages.network.pieces import convolution
 
 WIDTHS = (16, 32, 64, 128, 256)
 DROPOUT = (0.1, 0.1, 0.2, 0.2, 0.3)
@@ -32,7 +33,7 @@ class HeightConv(nn.Conv2d):
         # bfloat16 keeps three digits of a height, which would leave little of a slope: float32, whatever the rest is in.
         with torch.autocast(x.device.type, enabled=False):
             weight = self.weight - self.weight.mean(dim=(2, 3), keepdim=True)
-            return functional.conv2d(functional.pad(x.float(), (1, 1, 1, 1), mode="replicate"), weight)
+            return convolution(functional.pad(x.float(), (1, 1, 1, 1), mode="replicate"), weight)
 
     def forward(self, x: Tensor) -> Tensor:
         assert self.bias is not None
@@ -71,9 +72,9 @@ class Block(nn.Sequential):
         assert isinstance(entry, nn.Conv2d) and isinstance(first, BatchNorm) and isinstance(drop, Dropout)
         assert isinstance(second, nn.Conv2d) and isinstance(last, BatchNorm) and entry.bias is not None
         assert second.bias is not None
-        y = entry.differences(x) if isinstance(entry, HeightConv) else functional.conv2d(x, entry.weight)
+        y = entry.differences(x) if isinstance(entry, HeightConv) else convolution(x, entry.weight)
         y = norm_act(y, entry.bias, first, 1, drop, keys)
-        y = functional.conv2d(y, second.weight)
+        y = convolution(y, second.weight)
         return norm_act(y, second.bias, last, pad)
 
 
@@ -149,6 +150,6 @@ class UNet(nn.Module):
         x = bottom.fused(x, keys, 1)
         for rise, block in zip(self.rise, self.up, strict=True):
             assert isinstance(rise, nn.Conv2d) and rise.bias is not None and isinstance(block, Block)
-            quarters = functional.conv2d(x, quarter_weights(rise.weight), rise.bias.repeat(4))
+            quarters = convolution(x, quarter_weights(rise.weight), rise.bias.repeat(4))
             x = block.fused(join(quarters, kept.pop()), keys, 0 if block is self.up[-1] else 1)
-        return self.head(x)
+        return convolution(x, self.head.weight, self.head.bias)

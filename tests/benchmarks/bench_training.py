@@ -23,6 +23,7 @@ from schemas import PAIRS, ArtefactWriter
 from stages import train
 from stages.network.dataset import PairReader
 from stages.network.losses import squared_error
+from stages.network.maps import CoefficientMaps
 from stages.network.predictor import Predictor
 from stages.network.runtime import keep_freed_memory
 from stages.network.unet import DROPOUT, WIDTHS, UNet
@@ -120,7 +121,7 @@ def peer_step(bf16: bool) -> Callable[[], None]:
 def our_steps(reader: PairReader, bf16: bool) -> dict[str, Callable[[], None]]:
     """The network alone with its optimiser, as the peer's; the rendering layer alone; and the step that `train` takes."""
     model = get_model("M2")
-    predictor = Predictor(model, UNet(3), 10.0, torch.tensor([0.06, 0.02, 0.01]), 0.03).train()
+    predictor = Predictor(UNet(3), CoefficientMaps(model, (), torch.tensor([0.06, 0.02, 0.01]), 0.03), 10.0).train()
     predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.Adam(predictor.parameters(), 1e-4, fused=True)
     batch = reader.batch(np.arange(BATCH))

@@ -57,6 +57,7 @@ class LunarLambert(ReflectanceModel):
 @register
 class LunarLambertFixed(ReflectanceModel):
     name = "lunar_lambert_fixed"
+    default_maps = ("albedo",)
     title = "Lunar-Lambert, L given"
     formula = "A [2 L cos(i) / (cos(i) + cos(e)) + (1 - L) cos(i)]"
     reference = "McEwen, A. S. (1991), Icarus 92, 298"
