@@ -393,7 +393,7 @@ def _write_checkpoint(
         "model": predictor.model.name,
         "coefficients": json.dumps(maps.names),
         "maps": json.dumps(maps.maps),
-        "globals": json.dumps({name: float(value) for name, value in maps.everywhere().items()}),
+        "globals": json.dumps({name: value.item() for name, value in maps.everywhere().items()}),
         "positive": np.int32(maps.positive),
         "elevation_scale_m": predictor.elevation_scale,
         "output_scale": maps.output_scale,

@@ -10,8 +10,8 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from stages.network.losses import Radiometry, masked_mse, squared_error
-from stages.network.normalisation import FILL_REACH, fill_holes, scale_elevation
 from stages.network.maps import CoefficientMaps
+from stages.network.normalisation import FILL_REACH, fill_holes, scale_elevation
 from stages.network.predictor import Predictor
 from stages.network.runtime import choose_inference_precision
 from stages.network.symmetries import COUNT, turn_field, turn_vector
