@@ -304,6 +304,10 @@ CHECKPOINT = declare(
             ),
             Attribute("globals", "JSON: the other coefficients, the same everywhere, by name"),
             Attribute("positive", "1 = coefficients are kept nearly positive by LeakyReLU, 0 = within their bounds"),
+            Attribute("deviations", "1 = the network also gives the logarithm of each map's standard deviation"),
+            Attribute(
+                "image_noise", "standard deviation of images, I/F, that errors of the maps do not explain; or NaN"
+            ),
             Attribute("elevation_scale_m", "std of the crop-centred training elevations, m"),
             Attribute("gsd_m", "ground sample distance the network was trained at, m"),
             Attribute("body_radius_m", "radius of the reference sphere, m"),
@@ -321,11 +325,24 @@ SVBRDF = declare(
         title="Georeferenced maps of reflectance coefficients",
         dims={
             "coefficient": "coefficients of the reflectance model",
+            "map": "coefficients that vary by place",
             "y": "grid rows, north to south",
             "x": "grid columns, west to east",
         },
         variables=_GRID
         + (
+            Variable(
+                "coefficients_std",
+                ("map", "y", "x"),
+                "f4",
+                "1",
+                "standard deviations of single pixels' coefficients, by name in map_name; the other coefficients are the "
+                "same everywhere",
+                chunks=(1, 256, 256),
+                georeferenced=True,
+                required=False,
+            ),
+            Variable("map_name", ("map",), STRING, "", "names of the coefficients that vary by place", required=False),
             Variable(
                 "coefficients",
                 ("coefficient", "y", "x"),

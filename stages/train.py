@@ -33,6 +33,7 @@ from stages.network.predictor import Predictor, choose_device, write_state
 from stages.network.processes import join_group, mean_over_ranks, sum_gradients, sum_over_ranks
 from stages.network.resume import History, restore, save, snapshot
 from stages.network.runtime import choose_precision, keep_freed_memory
+from stages.network.spread import fit_deviations
 from stages.network.unet import UNet
 from stages.network.uniform import elevation_scale, fit_start
 from stages.physics.formation import Extension, form
@@ -177,7 +178,11 @@ def run(
                     f"{' *' if history.best_epoch == epoch else '  '} {speed:6.1f} pairs/s  {left / 60:5.1f} min left"
                 )
         if rank == 0:
-            _write_checkpoint(output, config, training, best, history, overwrite)
+            _take(training, best)
+            fit_deviations(
+                training.predictor, training.radiometry, reader, train, validation, extensions=training.extensions
+            )
+            _write_checkpoint(output, config, training, history, overwrite)
             sidecar.unlink(missing_ok=True)
     if ranks > 1:
         dist.barrier()
@@ -196,8 +201,8 @@ def _set_up(
     # Linear: about the coefficients' own size, whatever their bounds are. Else: a third of a unit of the sigmoid.
     span = [1.0 if config.positive else p.upper - p.lower for p in model.parameters]
     output_scale = float((start.abs() / torch.tensor(span)).mean()) * 4 if model.linear else 0.3
-    maps = CoefficientMaps(model, config.maps, start, output_scale, config.positive)
-    net = UNet(len(maps.maps), config.widths, config.dropout)
+    maps = CoefficientMaps(model, config.maps, start, output_scale, config.positive, deviations=True)
+    net = UNet(maps.channels, config.widths, config.dropout)
     predictor = Predictor(net, maps, elevation_scale(reader, train))
     predictor.gsd, predictor.image_units = reader.gsd, reader.units
     predictor.to(device)
@@ -379,13 +384,15 @@ def _arrive(batch: Batch, device: torch.device) -> Batch:
     return batch if device.type == "cpu" else batch.to(device)
 
 
-def _write_checkpoint(
-    output: Path, config: Config, training: Training, best: dict[str, Tensor], history: History, overwrite: bool
-) -> None:
-    """The best epoch's weights and all that is needed to use them."""
+def _take(training: Training, state: dict[str, Tensor]) -> None:
+    """Go back to a snapshot."""
+    for name, module in (("predictor", training.predictor), ("radiometry", training.radiometry)):
+        module.load_state_dict({k.split("/", 1)[1]: v for k, v in state.items() if k.startswith(f"{name}/")})
+
+
+def _write_checkpoint(output: Path, config: Config, training: Training, history: History, overwrite: bool) -> None:
+    """The weights and all that is needed to use them."""
     reader, predictor, radiometry = training.reader, training.predictor, training.radiometry
-    for name, module in (("predictor", predictor), ("radiometry", radiometry)):
-        module.load_state_dict({k.split("/", 1)[1]: v for k, v in best.items() if k.startswith(f"{name}/")})
     trained = set(reader.frame[reader.indices("train")].tolist())
     known = np.array([k in trained or reader.units == "iof" for k in range(len(reader.image_ids))])
     maps = predictor.maps
@@ -395,6 +402,8 @@ def _write_checkpoint(
         "maps": json.dumps(maps.maps),
         "globals": json.dumps({name: value.item() for name, value in maps.everywhere().items()}),
         "positive": np.int32(maps.positive),
+        "deviations": np.int32(maps.channels > len(maps.maps)),
+        "image_noise": predictor.image_noise,
         "elevation_scale_m": predictor.elevation_scale,
         "output_scale": maps.output_scale,
         "gsd_m": reader.gsd,

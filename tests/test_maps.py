@@ -7,19 +7,23 @@ import json
 import h5py
 import numpy as np
 import pytest
+import rasterio
 import torch
 from evaluation_scene import run_command
 from torch.nn import functional
 
-from schemas import ConfigError, RegistryError
+from schemas import ConfigError, RegistryError, read_strings
 from stages import infer, train
 from stages.network.losses import crop_errors, squared_error
 from stages.network.maps import CoefficientMaps
+from stages.network.normalisation import fill_holes
 from stages.network.pieces import PIECE, convolution, sum_over_crops
+from stages.network.pixels import Pixels, fit_pixels
 from stages.network.predictor import load_predictor
-from stages.network.uniform import Pixels, fit_pixels
+from stages.network.spread import _likelihood
 from stages.physics.geometry import Angles
 from stages.physics.photometry import get_model, masked_radiance_factor, model_names
+from stages.physics.photometry.deviation import radiance_deviation
 from stages.physics.threads import one_thread_each, share_out
 
 SMALL = {"widths": (4, 8), "epochs": 2, "batch": 16, "lr": 5e-3, "device": "cpu", "precision": "fp32"}
@@ -56,7 +60,7 @@ def test_default_maps_are_parameters(name):
 
 def test_unknown_maps_list_the_choices(small_artefacts, tmp_path):
     out = tmp_path / "c.h5"
-    with pytest.raises(RegistryError, match="unknown parameter of hapke 'x'; choose one of: .*theta"):
+    with pytest.raises(RegistryError, match=r"unknown parameter of hapke 'x'; choose one of: .*theta"):
         train.run(small_artefacts["pairs"], out, train.Config(model="hapke", maps=("w", "x")))
     code, message = run_command("train", small_artefacts["pairs"], "--maps", "w,x", "-o", out)
     assert code == 3 and "\n" not in message and "choose one of" in message
@@ -206,3 +210,50 @@ def test_an_older_checkpoint_is_refused(trained, tmp_path):
         del file.attrs["maps"]
     with pytest.raises(ArtefactError, match="maps"):
         load_predictor(old)
+
+
+def test_deviations_come_back_from_residuals(rng):
+    """Errors of two maps, one of them larger where a feature is, and of the image: each finds its own size."""
+    n = 20_000
+    features = torch.from_numpy(rng.normal(size=(n, 2)))
+    effects = torch.from_numpy(rng.uniform(0, 1, (n, 2)) * [1.0, 0.3])
+    sigma = torch.stack([0.1 * torch.exp(0.5 * features[:, 0]), torch.full((n,), 0.2)], dim=1)
+    errors = torch.from_numpy(rng.normal(size=(n, 2))) * sigma * effects
+    residual = errors.sum(dim=1) + 0.02 * torch.from_numpy(rng.normal(size=n))
+    weights, constants, noise = _likelihood(residual, effects, features)
+    assert constants.exp().tolist() == pytest.approx([0.1, 0.2], rel=0.1)
+    assert weights[0, 0].item() == pytest.approx(0.5, abs=0.08) and weights.abs().sum() < 0.8
+    assert noise.exp().item() == pytest.approx(0.02, rel=0.1)
+
+
+def test_the_image_deviation_is_that_of_drawn_parameters(rng):
+    model = get_model("hapke")
+    angles = Angles(*(torch.tensor(v, dtype=torch.float64) for v in ([0.7, 0.4], [0.95, 0.9], [0.8, 0.5])))
+    values = {p.name: torch.tensor(p.default, dtype=torch.float64) for p in model.parameters}
+    deviations = {"w": torch.tensor(0.02).double(), "b": torch.tensor(0.01).double()}
+    drawn = {k: values[k] + s * torch.from_numpy(rng.normal(size=(40_000, 1))) for k, s in deviations.items()}
+    images = masked_radiance_factor(model, {**values, **drawn}, angles)
+    found = radiance_deviation(model, values, deviations, angles)
+    np.testing.assert_allclose(found.numpy(), images.std(dim=0).numpy(), rtol=0.03)
+
+
+def test_the_map_carries_its_deviations(small_artefacts, trained, tmp_path):
+    """In strips and from a whole window alike, positive, by name; the GeoTIFF has them as bands."""
+    infer.run(small_artefacts["scene"], trained, tmp_path / "map.h5", infer.Config(device="cpu"))
+    predictor = load_predictor(trained)
+    assert predictor.image_noise > 0
+    with h5py.File(small_artefacts["scene"]) as file:
+        elevation, known = file["elevation"][...], file["dem_valid"][...].astype(bool)
+    coefficients, deviations = predictor.coefficients_and_deviations(
+        torch.from_numpy(fill_holes(elevation, known))[None]
+    )
+    with h5py.File(tmp_path / "map.h5") as file:
+        assert read_strings(file, "map_name") == list(deviations) == ["albedo"]
+        found = file["coefficients_std"][0]
+        np.testing.assert_allclose(file["coefficients"][0][known], coefficients[0, 0].numpy()[known], rtol=1e-4)
+        assert file.attrs["image_noise"] == predictor.image_noise
+    assert np.isnan(found[~known]).all() and (found[known] > 0).all()
+    np.testing.assert_allclose(found[known], deviations["albedo"][0].numpy()[known], rtol=1e-3)
+    with rasterio.open(tmp_path / "map.tif") as tiff:
+        assert tiff.descriptions == ("albedo", "k", "albedo_std")
+        np.testing.assert_array_equal(tiff.read(3), found)

@@ -33,6 +33,7 @@ class Predictor(torch.nn.Module):
         self.offset: dict[str, float] = {}
         self.image_units = "iof"
         self.gsd = float("nan")
+        self.image_noise = float("nan")  # of the images, I/F: what errors of the maps do not explain
 
     def forward(self, elevation: Tensor, keys: Tensor | None = None) -> Tensor:
         """(B, H, W) m -> (B, C, H, W) coefficients; ``keys`` as in :class:`UNet`."""
@@ -54,10 +55,24 @@ class Predictor(torch.nn.Module):
     @torch.no_grad()
     def coefficients(self, elevation: Tensor) -> Tensor:
         """(B, H, W) m -> (B, C, H, W), in evaluation mode. H and W need not be multiples of the network's stride."""
+        return self.maps.stack(self._evaluated(elevation), dim=1)
+
+    @torch.no_grad()
+    def coefficients_and_deviations(self, elevation: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """(B, H, W) m -> coefficients (B, C, H, W), and the standard deviations (B, H, W) of those that are maps, by name.
+
+        ``photometry.deviation.radiance_deviation`` makes the image's of them; ``image_noise`` comes on top.
+        """
+        shifted = self._evaluated(elevation)
+        deviations = self.maps.deviations(shifted, dim=1)
+        return self.maps.stack(shifted, dim=1), dict(zip(self.maps.maps, deviations.unbind(1), strict=True))
+
+    def _evaluated(self, elevation: Tensor) -> Tensor:
+        """(B, H, W) m -> :meth:`shifted` in evaluation mode."""
         was = self.training
         self.eval()
         height, width = elevation.shape[-2:]
-        out = self(self._whole_strides(elevation))[..., :height, :width]
+        out = self.shifted(self._whole_strides(elevation))[..., :height, :width]
         self.train(was)
         return out
 
@@ -107,14 +122,12 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
                 f"and maps of {', '.join(maps) or 'none'}; train again."
             )
         config = read_config(file)
-        net = UNet(len(maps), config["widths"], config["dropout"])
         start = torch.tensor([p.default for p in reflectance.parameters])
-        output_scale, positive = float(file.attrs["output_scale"]), bool(file.attrs["positive"])
-        predictor = Predictor(
-            net,
-            CoefficientMaps(reflectance, maps, start, output_scale, positive),
-            float(file.attrs["elevation_scale_m"]),
-        )
+        output_scale = float(file.attrs["output_scale"])
+        positive, deviations = (bool(file.attrs[key]) for key in ("positive", "deviations"))
+        mapped = CoefficientMaps(reflectance, maps, start, output_scale, positive, deviations)
+        net = UNet(mapped.channels, config["widths"], config["dropout"])
+        predictor = Predictor(net, mapped, float(file.attrs["elevation_scale_m"]))
         try:
             predictor.load_state_dict(read_state(file["weights"]))
         except RuntimeError as error:
@@ -126,6 +139,7 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
         predictor.offset = dict(zip(ids, map(float, file["offset"][...]), strict=True))
         predictor.image_units = str(file.attrs["image_units"])
         predictor.gsd = float(file.attrs["gsd_m"])
+        predictor.image_noise = float(file.attrs["image_noise"])
     predictor.to(device)
     if torch.device(device).type == "cpu":
         predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

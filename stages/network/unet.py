@@ -118,15 +118,23 @@ class UNet(nn.Module):
 
     def forward(self, x: Tensor, keys: Tensor | None = None) -> Tensor:
         """``keys`` (B,) int64: what each crop's dropout hangs on; drawn where None."""
+        return self.read_out(self.features(x, keys))
+
+    def read_out(self, features: Tensor) -> Tensor:
+        """(B, F, H, W) -> (B, C, H, W), the last layer."""
+        return convolution(features, self.head.weight, self.head.bias)
+
+    def features(self, x: Tensor, keys: Tensor | None = None) -> Tensor:
+        """What the last layer sees, (B, F, H, W) with F the first of the widths."""
         if keys is None:
             keys = draw_keys(len(x), x.device) if self.training else x.new_empty(0, dtype=torch.int64)
         # The fused form has no gradient in evaluation mode.
         if x.device.type == "cpu" and (self.training or not torch.is_grad_enabled()):
             return self._fused(x, keys)
-        return self.plain(x, keys)
+        return self.plain_features(x, keys)
 
-    def plain(self, x: Tensor, keys: Tensor) -> Tensor:
-        """The network as one writes it down."""
+    def plain_features(self, x: Tensor, keys: Tensor) -> Tensor:
+        """The same as one writes a network down."""
         kept = []
         for block in self.down[:-1]:
             x = block(x, keys)
@@ -136,10 +144,10 @@ class UNet(nn.Module):
         for rise, block in zip(self.rise, self.up, strict=True):
             x = rise(functional.interpolate(x, scale_factor=2.0, mode="nearest"))
             x = block(torch.cat([x, kept.pop()], dim=1), keys)
-        return self.head(x)
+        return x
 
     def _fused(self, x: Tensor, keys: Tensor) -> Tensor:
-        """The same to rounding: see ``fused``."""
+        """The same to rounding, in fewer passes: see ``fused``."""
         kept = []
         for block in self.down[:-1]:
             assert isinstance(block, Block)
@@ -152,4 +160,4 @@ class UNet(nn.Module):
             assert isinstance(rise, nn.Conv2d) and rise.bias is not None and isinstance(block, Block)
             quarters = convolution(x, quarter_weights(rise.weight), rise.bias.repeat(4))
             x = block.fused(join(quarters, kept.pop()), keys, 0 if block is self.up[-1] else 1)
-        return convolution(x, self.head.weight, self.head.bias)
+        return x

@@ -33,7 +33,7 @@ EVEN = 1 << DIRECT  # px
 
 
 class MapTiff:
-    """A GeoTIFF that is written as its map is made: one band per coefficient, named; nodata NaN. Use as a context manager.
+    """A GeoTIFF that is written as its map is made: one band per coefficient and deviation, named; nodata NaN. Use as a context manager.
 
     Overviews are means of what is known. Every level grows in a file of its own beside ``path``;
     """
@@ -41,7 +41,10 @@ class MapTiff:
     def __init__(self, path: Path, grid: Grid, names: Sequence[str], attributes: Mapping[str, Any]) -> None:
         self.path, self.grid, self.names = path, grid, list(names)
         self.tags = {key: str(attributes[key]) for key in TAGS}
-        self.tags |= {"coefficients": json.dumps(self.names), "software": "lunargr"}
+        self.tags |= {
+            "coefficients": json.dumps([n for n in self.names if not n.endswith("_std")]),
+            "software": "lunargr",
+        }
         # Halved until it fits into a block.
         overviews = max(0, math.ceil(math.log2(max(grid.height, grid.width) / BLOCK)))
         self.shapes = [(-(-grid.height >> k), -(-grid.width >> k)) for k in range(overviews + 1)]
@@ -80,10 +83,11 @@ class MapTiff:
             with _told():
                 level.write(values, window=Window(col, row, values.shape[2], values.shape[1]))
 
-    def put_all(self, coefficients: h5py.Dataset) -> None:
-        """coefficients : (C, H, W)"""
+    def put_all(self, *fields: h5py.Dataset) -> None:
+        """fields : (C, H, W) each, band after band"""
         for piece in _pieces(*self.shapes[0]):
-            self.put(piece.row_off, piece.col_off, coefficients[(slice(None), *piece.toslices())])
+            part = (slice(None), *piece.toslices())
+            self.put(piece.row_off, piece.col_off, np.concatenate([field[part] for field in fields]))
 
     def _create(self, level: int) -> rasterio.io.DatasetWriter:
         height, width = self.shapes[level]
@@ -118,8 +122,15 @@ def _told() -> Iterator[None]:
 
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
     """The map that an open artefact holds, as a cloud-optimised GeoTIFF."""
-    with MapTiff(path, grid, read_strings(file, "coefficient_name"), file.attrs) as tiff:
-        tiff.put_all(file["coefficients"])
+    fields = [file[name] for name in ("coefficients", "coefficients_std") if name in file]
+    maps = read_strings(file, "map_name") if len(fields) > 1 else []
+    with MapTiff(path, grid, band_names(read_strings(file, "coefficient_name"), maps), file.attrs) as tiff:
+        tiff.put_all(*fields)
+
+
+def band_names(coefficients: Sequence[str], maps: Sequence[str]) -> list[str]:
+    """The coefficients, and after them the standard deviations of those that vary by place."""
+    return [*coefficients, *(f"{name}_std" for name in maps)]
 
 
 def _pieces(height: int, width: int) -> Iterator[Window]:

@@ -208,7 +208,7 @@ def main() -> None:
             print(f"{name:28s} {BATCH / seconds:9.1f} samples/s, {peer / seconds:5.2f} of the best peer")
         step = min(best["our step, fp32"], best["our step, bf16"])
         print(f"the rendering layer is {100 * best['rendering layer, bf16'] / step:.1f} % of our step")
-        config = train.Config(epochs=2, batch=BATCH, device="cpu")
+        config = train.Config(model="M2", epochs=2, batch=BATCH, device="cpu")
         found = train.run(ours, Path(folder) / "checkpoint.h5", config)
         print(f"`lunargr train`, whole epochs {found.pairs_per_second:9.1f} pairs/s in {found.precision}")
 
