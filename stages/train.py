@@ -6,13 +6,11 @@ batch; the first one writes.
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -24,7 +22,6 @@ from torch import Tensor
 
 from schemas import CHECKPOINT, ArtefactWriter, ConfigError, InputError, check_output
 from schemas.provenance import sha256
-from stages.network import symmetries
 from stages.network.dataset import Batch, PairReader
 from stages.network.losses import Radiometry, crop_errors
 from stages.network.maps import CoefficientMaps
@@ -34,6 +31,7 @@ from stages.network.processes import join_group, mean_over_ranks, sum_gradients,
 from stages.network.resume import History, restore, save, snapshot
 from stages.network.runtime import choose_precision, keep_freed_memory
 from stages.network.spread import fit_deviations
+from stages.network.steps import learning_rate, order_steps, prefetch
 from stages.network.unet import UNet
 from stages.network.uniform import elevation_scale, fit_start
 from stages.physics.formation import Extension, form
@@ -41,7 +39,6 @@ from stages.physics.photometry import get_model
 from stages.physics.threads import one_thread_each
 
 CHECK_EVERY = 16  # batches: looking at the loss makes a GPU wait
-WARM_UP = 20  # steps over which a cosine schedule rises
 
 Say = Callable[[str], None]
 Progress = Callable[[int, int, str], None]
@@ -225,10 +222,12 @@ def learn_epoch(
     torch.manual_seed(hash((config.seed, epoch)) % 2**31)
     training.predictor.train()
     sums = torch.zeros(2, dtype=torch.float64, device=device)  # squared errors and pixels of this process
-    steps, keys = _steps(train, config, rng, rank, ranks)
-    for number, batch in enumerate(_prefetch(training.reader, steps, device)):
+    steps, keys = order_steps(train, config.batch, config.augment, rng, rank, ranks)
+    for number, batch in enumerate(prefetch(training.reader, steps, device)):
         for group in training.optimizer.param_groups:
-            group["lr"] = _learning_rate(config, epoch * len(steps) + number, config.epochs * len(steps))
+            group["lr"] = learning_rate(
+                config.lr, config.schedule, epoch * len(steps) + number, config.epochs * len(steps)
+            )
         objective, error = _errors(training, batch, config.brightness, keys[number].to(device))
         pixels = batch.valid.sum().double()
         sums += torch.stack([error.detach().double(), pixels])
@@ -281,7 +280,7 @@ def evaluate_loss(training: Training, indices: NDArray[np.int64], batch_size: in
     total, pixels = 0.0, 0.0
     mine = indices[training.rank :: training.ranks]
     steps = [(mine[k : k + batch_size], None) for k in range(0, len(mine), batch_size)]
-    for batch in _prefetch(training.reader, steps, training.device):
+    for batch in prefetch(training.reader, steps, training.device):
         _, error = _errors(training, batch, brightness=1.0)
         total, pixels = total + float(error), pixels + float(batch.valid.sum())
     return mean_over_ranks(total, pixels, training.ranks, training.device)
@@ -339,49 +338,6 @@ def _load_extensions(path: str | None) -> list[Extension]:
     from stages.effects import load_extension
 
     return list(load_extension(Path(path)))
-
-
-def _learning_rate(config: Config, step: int, steps: int) -> float:
-    if config.schedule == "constant":
-        return config.lr
-    return config.lr * min(1, (step + 1) / WARM_UP) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps)))
-
-
-def _steps(
-    train: NDArray[np.int64], config: Config, rng: np.random.Generator, rank: int, ranks: int
-) -> tuple[list[tuple[NDArray, NDArray | None]], list[Tensor]]:
-    """The batches of one epoch for this process: (pair indices, symmetries), and the crops' keys for dropout.
-
-    Every process gets as many batches; what a crop meets does not depend on the process that works on it.
-    """
-    order = rng.permutation(train)
-    turns = rng.integers(0, symmetries.COUNT, len(order)) if config.augment else None
-    count = math.ceil(len(order) / config.batch)
-    bounds = [len(order) * k // count for k in range(count + 1)]  # equal batches: BatchNorm dislikes a rest of one
-    drawn = torch.from_numpy(rng.integers(0, 2**62, len(order)))
-    steps, keys = [], []
-    for first, last in itertools.pairwise(bounds):
-        mine = np.arange(first, last)[rank::ranks] if last - first >= ranks else np.arange(first, last)
-        steps.append((order[mine], None if turns is None else turns[mine]))
-        keys.append(drawn[mine])
-    return steps, keys
-
-
-def _prefetch(reader: PairReader, steps: Sequence[tuple[NDArray, NDArray | None]], device: torch.device):
-    """Batches in order, the next one read while the current one is worked on."""
-    with ThreadPoolExecutor(1) as pool:
-        waiting = None
-        for indices, turns in steps:
-            following = pool.submit(reader.batch, indices, turns)
-            if waiting is not None:
-                yield _arrive(waiting.result(), device)
-            waiting = following
-        if waiting is not None:
-            yield _arrive(waiting.result(), device)
-
-
-def _arrive(batch: Batch, device: torch.device) -> Batch:
-    return batch if device.type == "cpu" else batch.to(device)
 
 
 def _take(training: Training, state: dict[str, Tensor]) -> None:

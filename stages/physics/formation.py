@@ -7,8 +7,8 @@ Extensions (``stages/effects``) act at the slot that they name; the order of the
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Protocol
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -51,8 +51,9 @@ class Observation:
         """Crops ``first`` .. ``last`` of the batch."""
         if first == 0 and last == len(self.elevation):
             return self
-        kept = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Observation(**{k: v[first:last] if isinstance(v, Tensor) else v for k, v in kept.items()})
+        named = {f.name: getattr(self, f.name) for f in fields(self)}
+        cut: dict[str, Any] = {k: v[first:last] for k, v in named.items() if isinstance(v, Tensor)}
+        return replace(self, **cut)
 
 
 @dataclass
