@@ -55,7 +55,7 @@ class Config:
     schedule : 'constant' or 'cosine'
     """
 
-    model: str = "hapke"
+    model: str = "kernels"
     maps: tuple[str, ...] = ()
     positive: bool = False
     epochs: int = 20

@@ -107,7 +107,7 @@ def _stop_after_one(learn):
     return learn_or_stop
 
 
-@pytest.mark.parametrize("model", ["hapke", "M2"])
+@pytest.mark.parametrize("model", ["hapke", "kernels", "M2"])
 def test_the_same_checkpoint_on_any_number_of_threads(model, small_artefacts, tmp_path, threads):
     found = []
     for count in (1, 2, 3):
