@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
 from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
+
+Number = TypeVar("Number", int, float)
 
 MOST = 2**31 - 1  # what counts pairs, pixels or crops
 MOST_WORKERS = 4096  # of one machine
@@ -94,6 +96,19 @@ def parse_shard(text: str | None) -> tuple[int, int]:
     if all(part.isdecimal() and len(part) < 9 for part in (first, last)) and 1 <= int(first) <= int(last) <= MOST_PARTS:
         return int(first) - 1, int(last)
     raise ConfigError(f"--shard: expected I/N with 1 <= I <= N <= {MOST_PARTS}, found '{text}'.")
+
+
+def read_numbers(option: str, text: str, kind: type[Number]) -> tuple[Number, ...]:
+    """'16-32-64' -> (16, 32, 64). Raises ConfigError."""
+    try:
+        return tuple(kind(part) for part in text.split("-"))
+    except ValueError:
+        raise ConfigError(f"{option}: expected numbers like 8-16-32, found '{text}'.") from None
+
+
+def read_names(text: str | None) -> tuple[str, ...]:
+    """'w, b' -> ('w', 'b'); None -> ()"""
+    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
 
 
 def in_parts(scheduler: str | None, resume: bool, parts: int | None, shard: str | None) -> bool:

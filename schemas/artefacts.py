@@ -374,9 +374,19 @@ CHECKPOINT = declare(
             Attribute("model", "reflectance model whose coefficients the network predicts"),
             Attribute("coefficients", "JSON list of coefficient names, in channel order", kind="json list"),
             Attribute(
+                "maps",
+                "JSON list of the coefficients that the network predicts place by place, in channel order",
+                kind="json list",
+            ),
+            Attribute("globals", "JSON: the other coefficients, the same everywhere, by name", kind="json"),
+            Attribute("positive", "1 = coefficients are kept nearly positive by LeakyReLU, 0 = within their bounds"),
+            Attribute("deviations", "1 = the network also gives the logarithm of each map's standard deviation"),
+            Attribute(
+                "image_noise", "standard deviation of images, I/F, that errors of the maps do not explain; or NaN"
+            ),
+            Attribute(
                 "elevation_scale_m", "std of the crop-centred training elevations, m", True, "number", 1e-6, LARGEST_GSD
             ),
-            Attribute("output_scale", "factor of the network's raw output", True, "number", 0.0, LARGEST_GSD),
             *_PLACE,
             Attribute("image_units", "units of the training images", choices=("iof", "dn")),
             Attribute("best_epoch", "epoch whose weights are in /weights", True, "integer", 0, LARGEST_COUNT),
@@ -421,6 +431,7 @@ SVBRDF = declare(
         title="Georeferenced maps of reflectance coefficients",
         dims={
             "coefficient": "coefficients of the reflectance model",
+            "map": "coefficients that vary by place",
             "y": "grid rows, north to south",
             "x": "grid columns, west to east",
             "frame": "images that the albedo was made of",
@@ -428,6 +439,18 @@ SVBRDF = declare(
         },
         variables=_GRID
         + (
+            Variable(
+                "coefficients_std",
+                ("map", "y", "x"),
+                "f4",
+                "1",
+                "standard deviations of single pixels' coefficients, by name in map_name; the other coefficients are the "
+                "same everywhere",
+                chunks=(1, 256, 256),
+                georeferenced=True,
+                required=False,
+            ),
+            Variable("map_name", ("map",), STRING, "", "names of the coefficients that vary by place", required=False),
             Variable(
                 "coefficients",
                 ("coefficient", "y", "x"),

@@ -6,13 +6,11 @@ batch; the first one writes.
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -26,15 +24,19 @@ from schemas import CHECKPOINT, ArtefactWriter, ConfigError, InputError
 from schemas.files.outputs import Target, check_apart, check_outputs
 from schemas.provenance import sha256
 from stages.common.memory import keep_freed_memory
-from stages.network.losses import Radiometry, masked_mse, squared_error
+from stages.common.threads import one_thread_each
+from stages.network.losses import Radiometry, crop_errors
+from stages.network.maps import CoefficientMaps
+from stages.network.pieces import sum_over_crops
 from stages.network.predictor import Predictor, choose_device, write_state
-from stages.network.processes import join_group, mean_over_ranks, same_everywhere, sum_gradients, sum_over_ranks
+from stages.network.processes import join_group, mean_over_ranks, sum_gradients, sum_over_ranks
 from stages.network.resume import History, restore, save, snapshot
 from stages.network.runtime import choose_precision
+from stages.network.spread import fit_deviations
+from stages.network.steps import learning_rate, order_steps, prefetch
 from stages.network.stored import DEEPEST, WIDEST
-from stages.network.unet import DROPOUT, WIDTHS, UNet
+from stages.network.unet import UNet
 from stages.network.uniform import elevation_scale, fit_start
-from stages.pairs import symmetries
 from stages.pairs.reader import Batch, PairReader
 from stages.physics.formation.chain import Extension, form
 from stages.physics.photometry import get_model
@@ -47,20 +49,50 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Config:
-    """Defaults are the paper's: Adam, 1e-4, batches of 64, 20 epochs. ``schedule``: 'constant' or 'cosine'."""
+    """Defaults are what does best on validation ground; the paper's are named in the command's help.
 
-    model: str = "M2"
+    maps : coefficients predicted place by place, the others are fitted globally; empty: the model's own choice
+    positive : keep coefficients nearly positive, as Lunar-G2R does; models linear in their coefficients only
+    brightness : weight of each crop's overall brightness in the loss, 0..1; 1: plain squared errors. Whole crops are
+        bright or dark for reasons that terrain does not show: counted in full, the network learns ground by heart
+    schedule : 'constant' or 'cosine'
+    """
+
+    model: str = "kernels"
+    maps: tuple[str, ...] = ()
+    positive: bool = False
     epochs: int = 20
-    batch: int = 64
-    lr: float = 1e-4
-    schedule: str = "constant"
-    widths: tuple[int, ...] = WIDTHS
-    dropout: tuple[float, ...] = DROPOUT
+    batch: int = 32
+    lr: float = 3e-3
+    schedule: str = "cosine"
+    widths: tuple[int, ...] = (8, 16, 32)
+    dropout: tuple[float, ...] = (0.0,)
+    brightness: float = 0.1
     augment: bool = True
     seed: int = 0
     device: str = "auto"
     precision: str = "auto"
     extend: str | None = None
+
+
+@dataclass
+class Training:
+    """What every step works with and changes. rank, ranks : this process among those that share every batch."""
+
+    reader: PairReader
+    predictor: Predictor
+    radiometry: Radiometry
+    optimizer: torch.optim.Optimizer
+    extensions: list[Extension]
+    device: torch.device
+    precision: str
+    start: dict[str, float]
+    rank: int = 0
+    ranks: int = 1
+
+    @property
+    def learned(self) -> list[Tensor]:
+        return [p for group in self.optimizer.param_groups for p in group["params"]]
 
 
 @dataclass(frozen=True)
@@ -97,117 +129,52 @@ def run(
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
     keep_freed_memory()
     extensions = _load_extensions(config.extend, pairs, say)
-    if (
-        extensions and config.augment
-    ):  # an effect may belong to a direction on the ground, which turning crops would lose
+    if extensions and config.augment:
+        # an effect may belong to a direction on the ground, which turning crops would lose
         say("crops are not turned or mirrored: the extended model may hold effects bound to an azimuth")
         config = replace(config, augment=False)
-    with PairReader(pairs, detector=bool(extensions)) as reader:
-        train, validation = reader.indices("train"), reader.indices("validation")
-        if not len(train):
-            raise InputError(
-                f"{pairs}:/split: expected training pairs (split = 0), found none; sample more crops or other tiles."
-            )
-        if not len(validation):
-            say(f"no validation pairs in {pairs}: the epoch with the least training loss is kept")
-        elif not any(reader.valid(validation[k : k + 1]).any() for k in range(len(validation))):
-            raise InputError(f"{pairs}: no validation pair has a valid pixel; sample more crops or other tiles.")
-        if not any(reader.valid(train[k : k + 1]).any() for k in range(len(train))):
-            raise InputError(f"{pairs}: no training pair has a valid pixel; sample more crops or other tiles.")
-        stride = 2 ** (len(config.widths) - 1)
-        if any(s % stride for s in reader.size):
-            raise ConfigError(
-                f"{pairs}: expected crops of a multiple of {stride} px for {len(config.widths)} widths, found {reader.size[0]} x {reader.size[1]}."
-            )
-
-        torch.manual_seed(config.seed)
-        model = get_model(config.model)
-        start, radiometry = fit_start(reader, train, model)
-        raw_start = model.unconstrain(start[None], dim=1)[0]
-        output_scale = float(start.abs().mean()) if model.linear else 0.3
-        scale = elevation_scale(reader, train)
-        predictor = Predictor(model, UNet(len(start), config.widths, config.dropout), scale, raw_start, output_scale)
-        predictor.gsd, predictor.image_units = reader.gsd, reader.units
-        predictor.to(device)
-        predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        radiometry.to(device)
-        parameters = [p for p in (*predictor.parameters(), *radiometry.parameters()) if p.requires_grad]
-        optimizer = torch.optim.Adam(parameters, lr=config.lr, fused=True)
-        history = History()
-        best: dict[str, Tensor] = {}
-
+    with one_thread_each(), PairReader(pairs, detector=bool(extensions)) as reader:
+        _check_pairs(pairs, reader, config, say)
+        training = _set_up(reader, config, extensions, device, rank, ranks)
+        history, best = History(), dict[str, Tensor]()
         # A constant rate may go on for longer; what a cosine did in its first epochs hangs on how many there are.
         epochs = config.epochs if config.schedule == "cosine" else None
         identity = json.dumps(
             asdict(config) | {"device": None, "epochs": epochs, "pairs": sha256(pairs), "ranks": ranks}, sort_keys=True
         )
-        precision = config.precision
         if resume and sidecar.exists():
-            precision = restore(sidecar, identity, predictor, radiometry, optimizer, history, best, device)
-            say(f"resumed after epoch {len(history.train_loss)}/{config.epochs}")
-        elif precision == "auto":
-            precision = choose_precision(predictor, reader.size, device) if rank == 0 else "fp32"
-            precision = same_everywhere(precision, ranks)
-        if rank == 0:
-            say(
-                f"model {model.name}, {sum(p.numel() for p in predictor.net.parameters()):,} weights, {len(train)} training and "
-                f"{len(validation)} validation pairs, {device}, {precision}"
-                + (f", {ranks} processes" if ranks > 1 else "")
+            training.precision = restore(
+                sidecar,
+                identity,
+                training.predictor,
+                training.radiometry,
+                training.optimizer,
+                history,
+                best,
+                device,
             )
-
+            say(f"resumed after epoch {len(history.train_loss)}/{config.epochs}")
+        if rank == 0:
+            say(_introduction(training))
         speed = math.nan
+        train, validation = reader.indices("train"), reader.indices("validation")
         for epoch in range(len(history.train_loss), config.epochs):
             began = time.monotonic()
-            # All randomness of an epoch hangs on (seed, epoch): a resumed run draws what an uninterrupted one would.
-            rng = np.random.default_rng([config.seed, epoch])
-            torch.manual_seed(hash((config.seed, epoch)) % 2**31)
-            for group in optimizer.param_groups:
-                group["lr"] = _learning_rate(config, epoch)
-            predictor.train()
-            sums = torch.zeros(2, dtype=torch.float64, device=device)  # squared errors and pixels of this process
-            steps, keys = _steps(train, config, rng, rank, ranks)
-            for number, batch in enumerate(_prefetch(reader, steps, device)):
-                measured = batch.image / radiometry.scale
-                with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
-                    coefficients = predictor(batch.observation.elevation, keys[number].to(device))
-                rendered = form(batch.observation, model, coefficients.float(), extensions)
-                error = squared_error(radiometry(rendered, batch.observation.frame), measured, batch.valid)
-                pixels = batch.valid.sum().double()
-                sums += torch.stack([error.detach().double(), pixels])
-                if number % CHECK_EVERY == 0 and not torch.isfinite(sums[0]):
-                    break
-                # The mean over the valid pixels of the whole batch; this process has its share of the sum.
-                loss = error / sum_over_ranks(pixels, ranks).clamp(min=1).float()
-                optimizer.zero_grad(set_to_none=True)
-                loss.backward()
-                if ranks > 1:
-                    sum_gradients(parameters)
-                optimizer.step()
-                if progress and rank == 0:
-                    progress(number + 1, len(steps), f"epoch {epoch + 1}/{config.epochs}")
-            error_sum, pixel_sum = sums.tolist()
-            if not math.isfinite(error_sum):
-                raise InputError(
-                    f"{pairs}: the loss is not finite in epoch {epoch + 1}; lower --lr or check the images' units."
-                )
+            train_loss = learn_epoch(training, train, config, epoch, progress)
             training_seconds = time.monotonic() - began
-            train_loss = mean_over_ranks(error_sum, pixel_sum, ranks, device)
-            validation_loss = evaluate_loss(
-                reader, validation, predictor, radiometry, extensions, config.batch, device, rank, ranks
-            )
+            validation_loss = evaluate_loss(training, validation, config.batch)
             history.train_loss.append(train_loss)
             history.validation_loss.append(validation_loss)
             history.epoch_seconds.append(time.monotonic() - began)
-            criterion = validation_loss if math.isfinite(validation_loss) else train_loss
-            earlier = [
-                v if math.isfinite(v) else t
-                for v, t in zip(history.validation_loss[:-1], history.train_loss[:-1], strict=True)
+            criteria = [
+                v if math.isfinite(v) else t for v, t in zip(history.validation_loss, history.train_loss, strict=True)
             ]
-            if criterion <= min(earlier, default=math.inf):
+            if criteria[-1] <= min(criteria):
                 history.best_epoch = epoch
-                best = snapshot(predictor, radiometry)
+                best = snapshot(training.predictor, training.radiometry)
             if rank == 0:
-                save(sidecar, identity, predictor, radiometry, optimizer, history, best, precision)
+                predictor, radiometry, optimizer = training.predictor, training.radiometry, training.optimizer
+                save(sidecar, identity, predictor, radiometry, optimizer, history, best, training.precision)
                 speed = len(train) / training_seconds
                 left = (config.epochs - epoch - 1) * history.epoch_seconds[-1]
                 say(
@@ -215,40 +182,115 @@ def run(
                     f"{' *' if history.best_epoch == epoch else '  '} {speed:6.1f} pairs/s  {left / 60:5.1f} min left"
                 )
         if rank == 0:
-            _write_checkpoint(
-                pairs, output, config, predictor, best, history, reader, precision, start, scale, overwrite
+            _take(training, best)
+            fit_deviations(
+                training.predictor, training.radiometry, reader, train, validation, extensions=training.extensions
             )
+            _write_checkpoint(output, config, training, history, overwrite)
             sidecar.unlink(missing_ok=True)
     if ranks > 1:
         dist.barrier()
         dist.destroy_process_group()
-    names = [p.name for p in model.parameters]
-    return Summary(history, speed, precision, dict(zip(names, start.tolist(), strict=True)))
+    return Summary(history, speed, training.precision, training.start)
+
+
+def _set_up(
+    reader: PairReader, config: Config, extensions: list[Extension], device: torch.device, rank: int, ranks: int
+) -> Training:
+    """The network at the best uniform surface of the training pairs, and all that goes with it."""
+    torch.manual_seed(config.seed)
+    model = get_model(config.model)
+    train = reader.indices("train")
+    start, radiometry = fit_start(reader, train, model, config.positive)
+    # Linear: about the coefficients' own size, whatever their bounds are. Else: a third of a unit of the sigmoid.
+    span = [1.0 if config.positive else p.upper - p.lower for p in model.parameters]
+    output_scale = float((start.abs() / torch.tensor(span)).mean()) * 4 if model.linear else 0.3
+    maps = CoefficientMaps(model, config.maps, start, output_scale, config.positive, deviations=True)
+    net = UNet(maps.channels, config.widths, config.dropout)
+    predictor = Predictor(net, maps, elevation_scale(reader, train))
+    predictor.gsd, predictor.image_units = reader.gsd, reader.units
+    predictor.to(device)
+    predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    radiometry.to(device)
+    learned = [p for p in (*predictor.parameters(), *radiometry.parameters()) if p.requires_grad]
+    optimizer = torch.optim.Adam(learned, lr=config.lr, fused=True)
+    precision = choose_precision(device) if config.precision == "auto" else config.precision
+    named = dict(zip((p.name for p in model.parameters), start.tolist(), strict=True))
+    return Training(reader, predictor, radiometry, optimizer, extensions, device, precision, named, rank, ranks)
+
+
+def learn_epoch(
+    training: Training, train: NDArray[np.int64], config: Config, epoch: int, progress: Progress | None = None
+) -> float:
+    """One pass over the training pairs; the mean squared error on the way. Raises InputError where it is not finite."""
+    rank, ranks, device = training.rank, training.ranks, training.device
+    # All randomness of an epoch hangs on (seed, epoch): a resumed run draws what an uninterrupted one would.
+    rng = np.random.default_rng([config.seed, epoch])
+    torch.manual_seed(hash((config.seed, epoch)) % 2**31)
+    training.predictor.train()
+    sums = torch.zeros(2, dtype=torch.float64, device=device)  # squared errors and pixels of this process
+    steps, keys = order_steps(train, config.batch, config.augment, rng, rank, ranks)
+    for number, batch in enumerate(prefetch(training.reader, steps, device)):
+        for group in training.optimizer.param_groups:
+            group["lr"] = learning_rate(
+                config.lr, config.schedule, epoch * len(steps) + number, config.epochs * len(steps)
+            )
+        objective, error = _errors(training, batch, config.brightness, keys[number].to(device))
+        pixels = batch.valid.sum().double()
+        sums += torch.stack([error.detach().double(), pixels])
+        if number % CHECK_EVERY == 0 and not torch.isfinite(sums[0]):
+            break
+        # The mean over the valid pixels of the whole batch; this process has its share of the sum.
+        loss = objective / sum_over_ranks(pixels, ranks).clamp(min=1).float()
+        training.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        if ranks > 1:
+            sum_gradients(training.learned)
+        training.optimizer.step()
+        if progress and rank == 0:
+            progress(number + 1, len(steps), f"epoch {epoch + 1}/{config.epochs}")
+    error_sum, pixel_sum = sums.tolist()
+    if not math.isfinite(error_sum):
+        raise InputError(
+            f"{training.reader.path}: the loss is not finite in epoch {epoch + 1}; lower --lr or check the images' units."
+        )
+    return mean_over_ranks(error_sum, pixel_sum, ranks, device)
+
+
+def _errors(training: Training, batch: Batch, brightness: float, keys: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Sums over a batch: what is to be minimised, and the squared errors."""
+    predictor, radiometry = training.predictor, training.radiometry
+    maps = predictor.maps
+    with torch.autocast(
+        training.device.type, torch.bfloat16, enabled=training.precision == "bf16" and keys is not None
+    ):
+        shifted = predictor.shifted(batch.observation.elevation, keys)
+    crops = len(shifted)
+    rest = [value.expand(crops, 1, 1) for value in maps.everywhere().values()]
+    frame = batch.observation.frame
+    assert frame is not None
+
+    def objective(first: int, last: int, shifted: Tensor, gain: Tensor, offset: Tensor, *rest: Tensor):
+        coefficients = maps.combine(shifted, rest)
+        rendered = form(batch.observation.part(first, last), maps.model, coefficients, training.extensions)
+        measured = batch.image[first:last] / radiometry.scale
+        predicted = rendered if radiometry.calibrated else gain * rendered + offset
+        return crop_errors(predicted, measured, batch.valid[first:last], brightness)
+
+    return sum_over_crops(objective, shifted, *radiometry.of_crops(frame), *rest)
 
 
 @torch.no_grad()
-def evaluate_loss(
-    reader: PairReader,
-    indices: NDArray[np.int64],
-    predictor: Predictor,
-    radiometry: Radiometry,
-    extensions: Sequence[Extension],
-    batch_size: int,
-    device: torch.device,
-    rank: int = 0,
-    ranks: int = 1,
-) -> float:
+def evaluate_loss(training: Training, indices: NDArray[np.int64], batch_size: int) -> float:
     """Mean squared error over the valid pixels of some pairs, in evaluation mode; NaN where there are none."""
-    predictor.eval()
+    training.predictor.eval()
     total, pixels = 0.0, 0.0
-    mine = indices[rank::ranks]
+    mine = indices[training.rank :: training.ranks]
     steps = [(mine[k : k + batch_size], None) for k in range(0, len(mine), batch_size)]
-    for batch in _prefetch(reader, steps, device):
-        rendered = form(batch.observation, predictor.model, predictor(batch.observation.elevation), extensions)
-        count = float(batch.valid.sum())
-        loss = masked_mse(radiometry(rendered, batch.observation.frame), batch.image / radiometry.scale, batch.valid)
-        total, pixels = total + loss.item() * count, pixels + count
-    return mean_over_ranks(total, pixels, ranks, device)
+    for batch in prefetch(training.reader, steps, training.device):
+        _, error = _errors(training, batch, brightness=1.0)
+        total, pixels = total + float(error), pixels + float(batch.valid.sum())
+    return mean_over_ranks(total, pixels, training.ranks, training.device)
 
 
 def check(config: Config) -> None:
@@ -265,8 +307,46 @@ def check(config: Config) -> None:
         raise ConfigError(
             f"--widths: expected 2 .. {DEEPEST} stages of 1 .. {WIDEST} channels, found {'-'.join(map(str, config.widths))}."
         )
-    get_model(config.model)
+    if not 0 <= config.brightness <= 1:
+        raise ConfigError(f"--brightness: expected a number from 0 to 1, found {config.brightness}.")
+    if not config.dropout or not all(0 <= share < 1 for share in config.dropout):
+        raise ConfigError(f"--dropout: expected shares from 0 to below 1, found {config.dropout}.")
+    model = get_model(config.model)
+    model.choose_maps(config.maps)
+    if config.positive and not model.linear:
+        raise ConfigError(f"--positive: expected a model that is linear in its coefficients, found '{model.name}'.")
     choose_device(config.device)
+
+
+def _check_pairs(pairs: Path, reader: PairReader, config: Config, say: Say) -> None:
+    train, validation = reader.indices("train"), reader.indices("validation")
+    if not len(train):
+        raise InputError(
+            f"{pairs}:/split: expected training pairs (split = 0), found none; sample more crops or other tiles."
+        )
+    if not len(validation):
+        say(f"no validation pairs in {pairs}: the epoch with the least training loss is kept")
+    for what, part in (("training", train), ("validation", validation)):
+        if len(part) and not any(reader.valid(part[k : k + 1]).any() for k in range(len(part))):
+            raise InputError(f"{pairs}: no {what} pair has a valid pixel; sample more crops or other tiles.")
+    stride = 2 ** (len(config.widths) - 1)
+    if any(s % stride for s in reader.size):
+        raise ConfigError(
+            f"{pairs}: expected crops of a multiple of {stride} px for {len(config.widths)} widths, found {reader.size[0]} x {reader.size[1]}."
+        )
+
+
+def _introduction(training: Training) -> str:
+    predictor, reader = training.predictor, training.reader
+    maps = predictor.maps
+    where = f"maps of {', '.join(maps.maps)}" + (f", global {', '.join(maps.rest)}" if maps.rest else "")
+    weights = sum(p.numel() for p in predictor.net.parameters())
+    train, validation = (len(reader.indices(part)) for part in ("train", "validation"))
+    processes = f", {training.ranks} processes" if training.ranks > 1 else ""
+    return (
+        f"model {predictor.model.name}: {where}; {weights:,} weights, {train} training and {validation} validation pairs, "
+        f"{training.device}, {training.precision}{processes}"
+    )
 
 
 def _load_extensions(path: str | None, pairs: Path, say: Say) -> list[Extension]:
@@ -280,80 +360,34 @@ def _load_extensions(path: str | None, pairs: Path, say: Say) -> list[Extension]
     return list(load_extension(Path(path)))
 
 
-def _learning_rate(config: Config, epoch: int) -> float:
-    if config.schedule == "constant":
-        return config.lr
-    return config.lr * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * epoch / config.epochs)))
+def _take(training: Training, state: dict[str, Tensor]) -> None:
+    """Go back to a snapshot."""
+    for name, module in (("predictor", training.predictor), ("radiometry", training.radiometry)):
+        module.load_state_dict({k.split("/", 1)[1]: v for k, v in state.items() if k.startswith(f"{name}/")})
 
 
-def _steps(
-    train: NDArray[np.int64], config: Config, rng: np.random.Generator, rank: int, ranks: int
-) -> tuple[list[tuple[NDArray, NDArray | None]], list[Tensor]]:
-    """The batches of one epoch for this process: (pair indices, symmetries), and the crops' keys for dropout.
-
-    Every process gets as many batches; what a crop meets does not depend on the process that works on it.
-    """
-    order = rng.permutation(train)
-    turns = rng.integers(0, symmetries.COUNT, len(order)) if config.augment else None
-    count = math.ceil(len(order) / config.batch)
-    bounds = [len(order) * k // count for k in range(count + 1)]  # equal batches: BatchNorm dislikes a rest of one
-    drawn = torch.from_numpy(rng.integers(0, 2**62, len(order)))
-    steps, keys = [], []
-    for first, last in itertools.pairwise(bounds):
-        mine = np.arange(first, last)[rank::ranks] if last - first >= ranks else np.arange(first, last)
-        steps.append((order[mine], None if turns is None else turns[mine]))
-        keys.append(drawn[mine])
-    return steps, keys
-
-
-def _prefetch(reader: PairReader, steps: Sequence[tuple[NDArray, NDArray | None]], device: torch.device):
-    """Batches in order, the next one read while the current one is worked on."""
-    with ThreadPoolExecutor(1) as pool:
-        waiting = None
-        for indices, turns in steps:
-            following = pool.submit(reader.batch, indices, turns)
-            if waiting is not None:
-                yield _arrive(waiting.result(), device)
-            waiting = following
-        if waiting is not None:
-            yield _arrive(waiting.result(), device)
-
-
-def _arrive(batch: Batch, device: torch.device) -> Batch:
-    return batch if device.type == "cpu" else batch.to(device)
-
-
-def _write_checkpoint(
-    pairs: Path,
-    output: Path,
-    config: Config,
-    predictor: Predictor,
-    best: dict[str, Tensor],
-    history: History,
-    reader: PairReader,
-    precision: str,
-    start: Tensor,
-    scale: float,
-    overwrite: bool,
-) -> None:
-    radiometry = Radiometry(
-        torch.ones(len(reader.image_ids)), torch.zeros(len(reader.image_ids)), reader.units == "iof"
-    )
-    radiometry.load_state_dict({k.split("/", 1)[1]: v.cpu() for k, v in best.items() if k.startswith("radiometry/")})
+def _write_checkpoint(output: Path, config: Config, training: Training, history: History, overwrite: bool) -> None:
+    """The weights and all that is needed to use them."""
+    reader, predictor, radiometry = training.reader, training.predictor, training.radiometry
     trained = set(reader.frame[reader.indices("train")].tolist())
     known = np.array([k in trained or reader.units == "iof" for k in range(len(reader.image_ids))])
-    names = [p.name for p in predictor.model.parameters]
+    maps = predictor.maps
     attributes = {
         "model": predictor.model.name,
-        "coefficients": json.dumps(names),
-        "elevation_scale_m": scale,
-        "output_scale": predictor.output_scale,
+        "coefficients": json.dumps(maps.names),
+        "maps": json.dumps(maps.maps),
+        "globals": json.dumps({name: value.item() for name, value in maps.everywhere().items()}),
+        "positive": np.int32(maps.positive),
+        "deviations": np.int32(maps.channels > len(maps.maps)),
+        "image_noise": predictor.image_noise,
+        "elevation_scale_m": predictor.elevation_scale,
+        "output_scale": maps.output_scale,
         "gsd_m": reader.gsd,
         "body_radius_m": reader.body_radius,
         "image_units": reader.units,
         "best_epoch": np.int32(history.best_epoch),
-        "start": json.dumps(dict(zip(names, start.tolist(), strict=True))),
-        "precision": precision,
+        "start": json.dumps(training.start),
+        "precision": training.precision,
     }
     sizes = {"epoch": len(history.train_loss), "frame": len(reader.image_ids)}
     with ArtefactWriter(
@@ -361,7 +395,7 @@ def _write_checkpoint(
         CHECKPOINT,
         sizes,
         config=asdict(config),
-        inputs=[pairs],
+        inputs=[reader.path],
         seed=config.seed,
         attributes=attributes,
         overwrite=overwrite,
@@ -370,7 +404,6 @@ def _write_checkpoint(
             writer.write(key, np.array(getattr(history, key)))
         writer.write("image_id", reader.image_ids)
         # An image without training pairs has no gain of its own: NaN says so.
-        writer.write("gain", np.where(known, radiometry.gain().detach().numpy(), np.nan))
-        writer.write("offset", np.where(known, radiometry.offset().detach().numpy(), np.nan))
-        state = {k.split("/", 1)[1]: v for k, v in best.items() if k.startswith("predictor/")}
-        write_state(writer.file.create_group("weights", track_order=True), state)
+        for key in ("gain", "offset"):
+            writer.write(key, np.where(known, getattr(radiometry, key)().detach().cpu().numpy(), np.nan))
+        write_state(writer.file.create_group("weights", track_order=True), predictor.state_dict())

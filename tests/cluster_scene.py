@@ -46,9 +46,7 @@ def write_inputs(folder: Path) -> dict[str, Path]:
     ingest.run(files.dem, files.images, paths["scene"], ingest.Config(gsd=20, crop=32))
     sample.run(paths["scene"], paths["crops"], sample.Config(count=90, tile_m=1280, seed=3))
     project.run(paths["crops"], paths["pairs"], project.Config())
-    config = train.Config(
-        epochs=1, batch=32, widths=(4, 4, 8), dropout=(0.0,) * 3, device="cpu", precision="fp32", lr=1e-2
-    )
+    config = train.Config(model="M2", epochs=1, batch=32, widths=(4, 4, 8), device="cpu", precision="fp32", lr=1e-2)
     train.run(paths["pairs"], paths["checkpoint"], config)
     return paths
 

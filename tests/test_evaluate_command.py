@@ -26,7 +26,9 @@ def trained(tmp_path_factory):
     write_pairs(folder / "pairs.h5", scene)
     scene.images = np.float32([600, 900, 800, 700])[scene.frame][:, None, None] * scene.images + 12
     write_pairs(folder / "pairs_dn.h5", scene, "dn")
-    config = train.Config(epochs=3, batch=8, widths=WIDTHS, dropout=(0.0,) * 3, device="cpu", precision="fp32")
+    config = train.Config(
+        model="M2", epochs=3, batch=8, widths=WIDTHS, dropout=(0.0,) * 3, device="cpu", precision="fp32"
+    )
     for suffix in ("", "_dn"):
         train.run(folder / f"pairs{suffix}.h5", folder / f"checkpoint{suffix}.h5", config)
     return folder
@@ -123,7 +125,9 @@ def test_extend_scores_the_extended_model_in_further_rows(tmp_path):
     bias = 0.02
     scene = make_scene(np.random.default_rng(6), pairs=24)
     write_pairs(tmp_path / "clean.h5", scene)
-    config = train.Config(epochs=2, batch=8, widths=(4, 8), dropout=(0.0, 0.0), device="cpu", precision="fp32")
+    config = train.Config(
+        model="M2", epochs=2, batch=8, widths=(4, 8), dropout=(0.0, 0.0), device="cpu", precision="fp32"
+    )
     train.run(tmp_path / "clean.h5", tmp_path / "checkpoint.h5", config)
     scene.images += np.float32(bias)
     write_pairs(tmp_path / "biased.h5", scene)

@@ -151,7 +151,9 @@ def trained(tmp_path_factory):
     """Pairs, a checkpoint trained for a moment and an evaluation that kept its renderings."""
     folder = tmp_path_factory.mktemp("match")
     write_pairs(folder / "pairs.h5", make_scene(np.random.default_rng(3), pairs=24))
-    config = train.Config(epochs=2, batch=8, widths=(4, 8), dropout=(0.0, 0.0), device="cpu", precision="fp32")
+    config = train.Config(
+        model="M2", epochs=2, batch=8, widths=(4, 8), dropout=(0.0, 0.0), device="cpu", precision="fp32"
+    )
     train.run(folder / "pairs.h5", folder / "checkpoint.h5", config)
     settings = evaluate.Config(device="cpu")
     evaluate.run(folder / "pairs.h5", folder / "checkpoint.h5", folder / "evaluation.h5", settings)

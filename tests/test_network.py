@@ -10,6 +10,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from stages.network.losses import Radiometry, masked_mse, squared_error
+from stages.network.maps import CoefficientMaps
 from stages.network.normalisation import scale_elevation
 from stages.network.predictor import Predictor
 from stages.network.runtime import choose_inference_precision
@@ -25,7 +26,7 @@ def test_the_network_has_the_papers_size():
     net = UNet(3)
     assert sum(p.numel() for p in net.parameters()) == pytest.approx(2.16e6, rel=5e-3)
     with FlopCounterMode(display=False) as counter:
-        net.plain(torch.zeros(1, 1, 128, 128), torch.zeros(1, dtype=torch.int64))
+        net.plain_features(torch.zeros(1, 1, 128, 128), torch.zeros(1, dtype=torch.int64))
     assert counter.get_total_flops() == pytest.approx(2.05e9, rel=0.02)
 
 
@@ -40,7 +41,7 @@ def test_the_fused_network_is_the_plain_one(widths):
             torch.nn.init.normal_(module.bias, 0, 0.2)
     plain = copy.deepcopy(net)
     x, keys, weight = torch.randn(3, 1, 48, 48), torch.arange(3) * 77, torch.randn(3, 3, 48, 48)
-    fused_out, plain_out = net(x, keys), plain.plain(x, keys)
+    fused_out, plain_out = net(x, keys), plain.read_out(plain.plain_features(x, keys))
     torch.testing.assert_close(fused_out, plain_out, rtol=1e-4, atol=1e-4)
     (fused_out * weight).sum().backward()
     (plain_out * weight).sum().backward()
@@ -54,7 +55,9 @@ def test_the_fused_network_is_the_plain_one(widths):
     for p, q in zip(net.buffers(), plain.buffers(), strict=True):
         torch.testing.assert_close(p, q, rtol=1e-5, atol=1e-6)
     with torch.no_grad():
-        torch.testing.assert_close(net.eval()(x), plain.eval().plain(x, keys), rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(
+            net.eval()(x), plain.eval().read_out(plain.plain_features(x, keys)), rtol=1e-4, atol=1e-4
+        )
 
 
 def test_the_fused_network_keeps_its_form_in_bf16():
@@ -113,7 +116,7 @@ def test_bf16_is_refused_where_it_would_drown_the_coefficients(contrast, expecte
     with torch.no_grad():
         net.head.weight *= contrast
         net.head.bias += 1
-    predictor = Predictor(get_model("M1"), net, 1.0, torch.zeros(1), 1.0)
+    predictor = Predictor(net, CoefficientMaps(get_model("lambert"), (), torch.tensor([0.5]), 1.0), 1.0)
     sample = (torch.randn(64, 64).cumsum(0).cumsum(1) * 0.1).numpy()
     assert choose_inference_precision(predictor, sample, torch.device("cpu")) == expected
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 
+import h5py
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -203,3 +204,19 @@ def test_black_is_0_in_a_preview_whatever_the_image_holds():
     image = np.array([[-0.005, 0.0, 0.05, 0.1]] * 50, np.float32)
     grey, limits = stretch(image)
     assert limits[0] == 0.0 and (grey[:, :2] == 0).all() and (grey[:, 2:] > 100).all()
+
+
+def test_deviations_of_the_map_reach_the_image(tmp_path):
+    """Lambert: what an albedo is unsure of times cos(i), where the Sun shines, and the images' own noise on top."""
+    grid = make_grid(96, 96, 5.0)
+    shape = (grid.height, grid.width)
+    path = write_svbrdf(tmp_path / "m.h5", grid, np.zeros(shape), np.full((1, *shape), 0.1), model="lambert")
+    sigma = np.broadcast_to(np.linspace(0.001, 0.01, grid.width, dtype=np.float32), shape)
+    with h5py.File(path, "r+") as file:
+        file.create_dataset("coefficients_std", data=sigma[None])
+        file.create_dataset("map_name", data=["albedo"])
+        file.attrs["image_noise"] = 0.002
+    render.run(path, tmp_path / "o.exr", render.Config(sun_azimuth_deg=100.0, sun_elevation_deg=35.0))
+    exr = read_exr(tmp_path / "o.exr")
+    cosine = np.cos(np.radians(exr["incidence_deg"]))
+    np.testing.assert_allclose(exr["image_std"], np.hypot(sigma * cosine, 0.002), rtol=1e-3)

@@ -84,7 +84,9 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     rng = np.random.default_rng(4)
     write_pairs(folder / "pairs.h5", make_scene(rng, pairs=24))
-    config = train.Config(epochs=2, batch=8, widths=(4, 8), dropout=(0.0, 0.0), device="cpu", precision="fp32")
+    config = train.Config(
+        model="M2", epochs=2, batch=8, widths=(4, 8), dropout=(0.0, 0.0), device="cpu", precision="fp32"
+    )
     train.run(folder / "pairs.h5", folder / "checkpoint.h5", config)
     files = (folder / "pairs.h5", folder / "checkpoint.h5")
     evaluate.run(*files, folder / "evaluation.h5", evaluate.Config(device="cpu"))

@@ -9,6 +9,7 @@ import torch
 from stages.infer.parallel import in_order, side_by_side
 from stages.infer.terrain import TerrainReader, valid_part
 from stages.network.cpu.mapper import Mapper
+from stages.network.maps import CoefficientMaps
 from stages.network.predictor import Predictor
 from stages.network.unet import WIDTHS, UNet
 from stages.pairs.holes import fill_holes
@@ -27,7 +28,7 @@ def shaken(widths=SMALL, outputs=3):
             torch.nn.init.uniform_(module.running_var, 0.5, 1.5)
             torch.nn.init.normal_(module.bias, 0, 0.3)
     torch.nn.init.normal_(net.head.weight, 0, 0.3)
-    return Predictor(get_model("M2"), net, 2.0, torch.tensor([0.1, 0.2, 0.3]), 0.5).eval()
+    return Predictor(net, CoefficientMaps(get_model("M2"), (), torch.tensor([0.1, 0.2, 0.3]), 0.5), 2.0).eval()
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,16 @@ from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form
 from stages.physics.photometry import get_model
 
-SMALL = {"widths": (4, 8), "dropout": (0.0, 0.1), "batch": 16, "device": "cpu", "precision": "fp32", "lr": 2e-3}
+SMALL = {
+    "model": "M2",
+    "brightness": 1.0,
+    "widths": (4, 8),
+    "dropout": (0.0, 0.1),
+    "batch": 16,
+    "device": "cpu",
+    "precision": "fp32",
+    "lr": 2e-3,
+}
 
 
 def config(**change):
@@ -113,7 +122,7 @@ def test_killed_and_resumed_is_uninterrupted(small_artefacts, trained, tmp_path)
     out = tmp_path / "checkpoint.h5"
     command = [
         sys.executable, "-m", "lunargr_cli.main", "train", str(small_artefacts["pairs"]), "-o", str(out), "--epochs", "4", "--batch", "16",
-        "--widths", "4-8", "--lr", "2e-3", "--device", "cpu", "--precision", "fp32", "--resume",
+        "--widths", "4-8", "--lr", "2e-3", "--device", "cpu", "--precision", "fp32", "--dropout", "0-0.1", "--resume",
     ]  # fmt: skip
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     child = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
@@ -188,7 +197,7 @@ def test_two_processes_learn_like_one(small_artefacts, trained, tmp_path):
     command = [
         sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "lunargr_cli.main", "train",
         str(small_artefacts["pairs"]), "-o", str(out), "--epochs", "4", "--batch", "16", "--widths", "4-8", "--lr", "2e-3", "--device", "cpu",
-        "--precision", "fp32",
+        "--precision", "fp32", "--model", "M2", "--brightness", "1", "--dropout", "0.1-0.1-0.2-0.2-0.3",
     ]  # fmt: skip
     train.run(small_artefacts["pairs"], tmp_path / "one.h5", config(epochs=4, dropout=DROPOUT))
     subprocess.run(command, check=True, capture_output=True, timeout=240)

@@ -64,6 +64,7 @@ def _print_model(model) -> None:  # type: ignore[no-untyped-def]
     write_out(
         f"reciprocal: {'yes' if model.reciprocal else 'no'}; linear in its parameters: {'yes' if model.linear else 'no'}"
     )
+    write_out(f"maps that 'lunargr train' predicts by default: {', '.join(model.choose_maps())}")
     console = Console()
     rows = [
         (p.name, p.unit, f"{p.lower:.6g}", f"{p.upper:.6g}", f"{p.default:.6g}", p.description)

@@ -16,19 +16,41 @@ def command(
     pairs: Annotated[Path, typer.Argument(help="pairs.h5 from 'lunargr project'.")],
     model: Annotated[
         str, typer.Option("--model", help="Reflectance model to predict; 'lunargr models' lists them.")
-    ] = "M2",
+    ] = "kernels",
+    maps: Annotated[
+        str | None,
+        typer.Option(
+            "--maps",
+            metavar="NAME,...",
+            help="Coefficients to predict place by place; the others are fitted globally. Default: the model's own choice.",
+        ),
+    ] = None,
+    positive: Annotated[
+        bool, typer.Option("--positive", help="Keep coefficients nearly positive (LeakyReLU), as Lunar-G2R does.")
+    ] = False,
     epochs: Annotated[int, typer.Option("--epochs", min=1, max=100_000, help="Passes over the training pairs.")] = 20,
-    batch: Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Pairs per step, over all processes.")] = 64,
-    lr: Annotated[float, typer.Option("--lr", help="Adam's learning rate.")] = 1e-4,
+    batch: Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Pairs per step, over all processes.")] = 32,
+    lr: Annotated[float, typer.Option("--lr", help="Adam's learning rate.")] = 3e-3,
     schedule: Annotated[
-        str, typer.Option("--schedule", help="Learning rate over the epochs: constant or cosine.")
-    ] = "constant",
-    widths: Annotated[str, typer.Option("--widths", help="Channels of each stage of the U-Net.")] = "16-32-64-128-256",
+        str, typer.Option("--schedule", help="Learning rate over the steps: constant or cosine.")
+    ] = "cosine",
+    widths: Annotated[
+        str, typer.Option("--widths", help="Channels of each stage of the U-Net; Lunar-G2R: 16-32-64-128-256.")
+    ] = "8-16-32",
+    dropout: Annotated[
+        str, typer.Option("--dropout", help="Dropout of each stage, or one for all; Lunar-G2R: 0.1-0.1-0.2-0.2-0.3.")
+    ] = "0",
+    brightness: Annotated[
+        float,
+        typer.Option(
+            "--brightness", help="Weight of each crop's overall brightness in the loss, 0 to 1; 1: squared errors."
+        ),
+    ] = 0.1,
     augment: Annotated[
         bool, typer.Option("--augment/--no-augment", help="Turn and mirror crops, Sun and camera along.")
     ] = True,
     precision: Annotated[
-        str, typer.Option("--precision", help="fp32, bf16, or auto: bf16 where a probe finds it faster.")
+        str, typer.Option("--precision", help="fp32, bf16, or auto: bf16 where the processor is made for it.")
     ] = "auto",
     extend: Annotated[
         Path | None, typer.Option("--extend", metavar="FILE", help="diagnosis.h5: train through the extended model.")
@@ -42,21 +64,21 @@ def command(
 ) -> None:
     """Learn reflectance from terrain through the differentiable renderer. Several processes: run under torchrun."""
     from lunargr_cli.console import Console
-    from schemas import ConfigError
+    from lunargr_cli.options import read_names, read_numbers
     from stages import train
 
-    try:
-        channels = tuple(int(w) for w in widths.split("-"))
-    except ValueError:
-        raise ConfigError(f"--widths: expected numbers like 16-32-64-128-256, found '{widths}'.") from None
     console = Console(quiet)
     config = train.Config(
         model=model,
+        maps=read_names(maps),
+        positive=positive,
         epochs=epochs,
         batch=batch,
         lr=lr,
         schedule=schedule,
-        widths=channels,
+        widths=read_numbers("--widths", widths, int),
+        dropout=read_numbers("--dropout", dropout, float),
+        brightness=brightness,
         augment=augment,
         seed=seed,
         device=device,

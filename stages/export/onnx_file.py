@@ -50,7 +50,7 @@ class _Exported(torch.nn.Module):
     def forward(self, elevation: Tensor) -> Tensor:
         p = self.predictor
         raw = p.net.plain(scale_elevation(elevation, p.elevation_scale), elevation.new_empty(0, dtype=torch.int64))
-        return p.model.constrain(raw * p.output_scale + p.start[None, :, None, None], dim=1)
+        return p.maps.stack(p.maps.shifted(raw), dim=1)
 
 
 def run(checkpoint: Path, output: Path, config: Config, *, overwrite: bool = False) -> Summary:

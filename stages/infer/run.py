@@ -40,7 +40,7 @@ from stages.network.cpu.mapper import Mapper
 from stages.network.predictor import choose_device, load_predictor
 from stages.network.runtime import choose_inference_precision
 from stages.pairs.holes import fill_holes
-from stages.physics.maps.geotiff import EVEN, MapTiff
+from stages.physics.maps.geotiff import EVEN, MapTiff, band_names
 from stages.physics.maps.grid import check_same_body, read_grid
 
 Progress = Callable[[int, int, str], None]
@@ -75,7 +75,8 @@ def run(
         if precision == "auto":
             precision = choose_inference_precision(predictor, _sample_of(file), device)
         names = [p.name for p in predictor.model.parameters]
-        sizes = {"coefficient": len(names), "y": grid.height, "x": grid.width}
+        maps = list(predictor.maps.maps) if predictor.maps.channels > len(predictor.maps.maps) else []
+        sizes = {"coefficient": len(names), "map": len(maps), "y": grid.height, "x": grid.width}
         attributes = {
             "gsd_m": grid.gsd,
             "body_radius_m": grid.radius,
@@ -83,6 +84,7 @@ def run(
             "quantity": QUANTITY,
             "image_units": predictor.image_units,
             "precision": precision,
+            "image_noise": predictor.image_noise,
         }
         with contextlib.ExitStack() as stack:
             writer = stack.enter_context(
@@ -100,13 +102,16 @@ def run(
             writer.write("x", file["x"][...])
             writer.write("y", file["y"][...])
             writer.write("coefficient_name", names)
-            mapper = Mapper(predictor, device, precision, torch.get_num_threads())
+            if maps:
+                writer.write("map_name", maps)
+                writer.dataset("coefficients_std")
+            mapper = Mapper(predictor, device, precision, torch.get_num_threads(), deviations=bool(maps))
             picture = None
             # a shard holds some rows only; the GeoTIFF is made of the merged whole
             if config.geotiff and config.shard[1] == 1:
                 stack.enter_context(companions_of(output))
                 partial = stack.enter_context(atomic_path(tiff))
-                picture = stack.enter_context(MapTiff(partial, grid, names, attributes))
+                picture = stack.enter_context(MapTiff(partial, grid, band_names(names, maps), attributes))
             windows = _predict(file, writer, picture, mapper, config, progress)
             share, ranges = _statistics(writer.file, names)
     return Summary(grid, predictor.model.name, share, windows, ranges)
@@ -197,7 +202,7 @@ def _predict(
     while outputs.copy_elevation():
         pass
     if picture and not at_once:
-        picture.put_all(outputs.coefficients)
+        picture.put_all(*(f for f in (outputs.coefficients, outputs.deviations) if f is not None))
     if progress:
         progress(rows, rows, "rows of windows")
     return len(boxes)

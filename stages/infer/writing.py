@@ -14,15 +14,18 @@ from stages.physics.maps.geotiff import MapTiff
 
 
 class Outputs:
-    """The three fields of a map in its artefact, and the DEM that they are made of. own : (first, last) row
+    """The fields of a map in its artefact, and the DEM that they are made of. own : (first, last) row
 
-    tiff : gets the coefficients too, where strips begin and end as it needs them to
+    tiff : gets coefficients and deviations too, where strips begin and end as it needs them to
     """
 
     def __init__(
         self, writer: ArtefactWriter, elevation: Any, dem_valid: Any, own: tuple[int, int], tiff: MapTiff | None = None
     ) -> None:
         self.coefficients, self.valid = writer.dataset("coefficients"), writer.dataset("valid")
+        self.deviations = writer.dataset("coefficients_std") if "coefficients_std" in writer.file else None
+        self.count = len(self.coefficients)
+        self.channels = self.count + (0 if self.deviations is None else len(self.deviations))
         self.copied = writer.dataset("elevation")
         self.elevation, self.dem_valid, self.tiff = elevation, dem_valid, tiff
         columns = range(0, self.copied.shape[1], WIDEST)
@@ -38,14 +41,16 @@ class Outputs:
         return False
 
     def put(self, row: int, col: int, values: NDArray[np.float32], known: NDArray[np.bool_] | None = None) -> None:
-        """values : (C, n, w), which are changed; ``known`` : (n, w), where there is something to write besides a valid DEM"""
+        """values : (channels, n, w), coefficients and deviations, which are changed; ``known`` : (n, w), where there is something to write besides a valid DEM"""
         part = np.s_[row : row + values.shape[1], col : col + values.shape[2]]
         mask = self.dem_valid[part].astype(bool)
         if known is not None:
             mask &= known
         if not mask.all():
             values[:, ~mask] = np.nan
-        self.coefficients[(slice(None), *part)] = values
+        self.coefficients[(slice(None), *part)] = values[: self.count]
+        if self.deviations is not None:
+            self.deviations[(slice(None), *part)] = values[self.count :]
         self.valid[part] = mask
         if self.tiff:
             self.tiff.put(row, col, values)
@@ -56,8 +61,8 @@ class Blend:
 
     def __init__(self, outputs: Outputs, overlap: int, own: tuple[int, int]) -> None:
         self.outputs, self.overlap, self.own = outputs, overlap, own
-        channels, self.height, self.width = outputs.coefficients.shape
-        self.total = np.zeros((channels, 0, self.width), np.float32)
+        _, self.height, self.width = outputs.coefficients.shape
+        self.total = np.zeros((outputs.channels, 0, self.width), np.float32)
         self.weight = np.zeros((0, self.width), np.float32)
         self.top = own[0]
 

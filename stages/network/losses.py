@@ -33,6 +33,22 @@ def masked_mse(predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
     return squared_error(predicted, measured, valid) / valid.sum().clamp(min=1)
 
 
+def crop_errors(predicted: Tensor, measured: Tensor, valid: Tensor, brightness: float) -> tuple[Tensor, Tensor]:
+    """Sums over crops (B, H, W): of squared errors less the part that each crop's own gain would explain, and of all.
+
+    ``brightness`` of that part is kept, so that the overall level stays known. Albedo that terrain does not show changes
+    whole crops together: this is what generalised least squares makes of errors with a common factor per crop.
+    """
+    if brightness == 1:
+        error = squared_error(predicted, measured, valid)
+        return error, error.detach()
+    seen = predicted * valid
+    residual = seen - measured * valid
+    error = residual.square().sum(dim=(1, 2))
+    along = (residual * seen).sum(dim=(1, 2)).square() / seen.square().sum(dim=(1, 2)).clamp(min=1e-12)
+    return (error - (1 - brightness) * along).sum(), error.detach().sum()
+
+
 class Radiometry(nn.Module):
     """measured = gain x I/F + offset, per image; the identity for calibrated images.
 
@@ -54,9 +70,14 @@ class Radiometry(nn.Module):
     def offset(self) -> Tensor:
         return self.scale * self.shift
 
+    def of_crops(self, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """Gain and offset over ``scale``, (B, 1, 1) each, of crops from frames (B,)."""
+        gain = (self.log_gain - self.log_gain.mean()).exp()
+        return gain[frame, None, None], self.shift[frame, None, None]
+
     def forward(self, radiance_factor: Tensor, frame: Tensor) -> Tensor:
         """I/F (B, H, W) of frames (B,) -> measured units over ``scale``: residuals then read like I/F."""
         if self.calibrated:
             return radiance_factor
-        gain = (self.log_gain - self.log_gain.mean()).exp()
-        return gain[frame, None, None] * radiance_factor + self.shift[frame, None, None]
+        gain, offset = self.of_crops(frame)
+        return gain * radiance_factor + offset

@@ -15,41 +15,38 @@ from torch import Tensor
 from schemas.artefacts import CHECKPOINT
 from schemas.errors import ArtefactError, ConfigError, RegistryError
 from schemas.reading import open_artefact, read_config, read_strings
+from stages.network.maps import CoefficientMaps
 from stages.network.normalisation import scale_elevation
 from stages.network.stored import check_finite, check_weights, read_layout
 from stages.network.unet import UNet
-from stages.physics.photometry import ReflectanceModel, get_model
+from stages.physics.photometry import get_model
 
 
 class Predictor(torch.nn.Module):
-    """Elevation -> coefficients of a reflectance model.
+    """Elevation -> coefficients of a reflectance model."""
 
-    The network's raw output is scaled by ``output_scale`` and shifted by ``start`` (the raw global coefficients), so
-    that training begins at the best uniform surface and moves in steps of its own size.
-    """
-
-    def __init__(
-        self, model: ReflectanceModel, net: UNet, elevation_scale: float, start: Tensor, output_scale: float
-    ) -> None:
+    def __init__(self, net: UNet, maps: CoefficientMaps, elevation_scale: float) -> None:
         super().__init__()
-        self.model = model
+        self.model = maps.model
         self.net = net
+        self.maps = maps
         self.elevation_scale = elevation_scale
-        self.output_scale = output_scale
-        self.start: Tensor
-        self.register_buffer("start", start.clone())
         self.gain: dict[str, float] = {}
         self.offset: dict[str, float] = {}
         self.image_units = "iof"
         self.gsd = float("nan")
+        self.image_noise = float("nan")  # of the images, I/F: what errors of the maps do not explain
 
     def forward(self, elevation: Tensor, keys: Tensor | None = None) -> Tensor:
         """(B, H, W) m -> (B, C, H, W) coefficients; ``keys`` as in :class:`UNet`."""
+        return self.maps.stack(self.shifted(elevation, keys), dim=1)
+
+    def shifted(self, elevation: Tensor, keys: Tensor | None = None) -> Tensor:
+        """(B, H, W) m -> (B, M, H, W), the maps before their bounds: see :class:`CoefficientMaps`."""
         x = scale_elevation(elevation, self.elevation_scale)
         if elevation.device.type == "cpu":
             x = x.to(memory_format=torch.channels_last)
-        raw = self.net(x, keys).float() * self.output_scale + self.start[None, :, None, None]
-        return self.model.constrain(raw, dim=1)
+        return self.maps.shifted(self.net(x, keys))
 
     def _whole_strides(self, elevation: Tensor) -> Tensor:
         stride = self.net.stride
@@ -60,10 +57,24 @@ class Predictor(torch.nn.Module):
     @torch.no_grad()
     def coefficients(self, elevation: Tensor) -> Tensor:
         """(B, H, W) m -> (B, C, H, W), in evaluation mode. H and W need not be multiples of the network's stride."""
+        return self.maps.stack(self._evaluated(elevation), dim=1)
+
+    @torch.no_grad()
+    def coefficients_and_deviations(self, elevation: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """(B, H, W) m -> coefficients (B, C, H, W), and the standard deviations (B, H, W) of those that are maps, by name.
+
+        ``photometry.deviation.radiance_deviation`` makes the image's of them; ``image_noise`` comes on top.
+        """
+        shifted = self._evaluated(elevation)
+        deviations = self.maps.deviations(shifted, dim=1)
+        return self.maps.stack(shifted, dim=1), dict(zip(self.maps.maps, deviations.unbind(1), strict=True))
+
+    def _evaluated(self, elevation: Tensor) -> Tensor:
+        """(B, H, W) m -> :meth:`shifted` in evaluation mode."""
         was = self.training
         self.eval()
         height, width = elevation.shape[-2:]
-        out = self(self._whole_strides(elevation))[..., :height, :width]
+        out = self.shifted(self._whole_strides(elevation))[..., :height, :width]
         self.train(was)
         return out
 
@@ -113,22 +124,21 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
             reflectance = get_model(name)
         except RegistryError as error:
             raise ArtefactError(f"{path}: root attribute 'model': {error}") from None
-        found = json.loads(str(file.attrs["coefficients"]))
-        expected = [p.name for p in reflectance.parameters]
-        if found != expected:
+        names = [p.name for p in reflectance.parameters]
+        found, maps = (json.loads(str(file.attrs[key])) for key in ("coefficients", "maps"))
+        if found != names or not maps or not set(map(str, maps)) <= set(names):
             raise ArtefactError(
-                f"{path}: expected coefficients {', '.join(expected)} of '{name}', found {', '.join(map(str, found))}; train again."
+                f"{path}: expected coefficients {', '.join(names)} of '{name}', some of them in maps, "
+                f"found {', '.join(map(str, found))} and maps of {', '.join(map(str, maps)) or 'none'}; train again."
             )
         widths, dropout = read_layout(path, read_config(file), name)
-        check_weights(path, file.get("weights"), len(expected), widths, dropout)
-        net = UNet(len(expected), widths, dropout)
-        predictor = Predictor(
-            reflectance,
-            net,
-            float(file.attrs["elevation_scale_m"]),
-            torch.zeros(len(expected)),
-            float(file.attrs["output_scale"]),
-        )
+        start = torch.tensor([p.default for p in reflectance.parameters])
+        output_scale = float(file.attrs["output_scale"])
+        positive, deviations = (bool(file.attrs[key]) for key in ("positive", "deviations"))
+        mapped = CoefficientMaps(reflectance, maps, start, output_scale, positive, deviations)
+        check_weights(path, file.get("weights"), mapped.channels, widths, dropout)
+        net = UNet(mapped.channels, widths, dropout)
+        predictor = Predictor(net, mapped, float(file.attrs["elevation_scale_m"]))
         try:
             state = read_state(file["weights"])
         except OSError as error:
@@ -142,6 +152,7 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
         predictor.offset = dict(zip(ids, map(float, file["offset"][...]), strict=True))
         predictor.image_units = str(file.attrs["image_units"])
         predictor.gsd = float(file.attrs["gsd_m"])
+        predictor.image_noise = float(file.attrs["image_noise"])
     predictor.to(device)
     if torch.device(device).type == "cpu":
         predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

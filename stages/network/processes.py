@@ -42,11 +42,3 @@ def mean_over_ranks(total: float, weight: float, ranks: int, device: torch.devic
     if ranks > 1:
         dist.all_reduce(sums)
     return float(sums[0] / sums[1]) if sums[1] > 0 else math.nan
-
-
-def same_everywhere(precision: str, ranks: int) -> str:
-    if ranks == 1:
-        return precision
-    box = [precision]
-    dist.broadcast_object_list(box, src=0)
-    return box[0]

@@ -1,8 +1,6 @@
-"""Which precision a machine runs fastest in: bf16 only where a probe finds it faster."""
+"""Which precision a machine runs fastest in: bf16 only where the processor is made for it, or a probe finds it faster."""
 
 from __future__ import annotations
-
-import time
 
 import numpy as np
 import torch
@@ -12,13 +10,16 @@ from stages.network.cpu.mapper import Mapper
 from stages.network.predictor import Predictor
 
 CLOSE = 0.02  # of a coefficient's spread: what bf16 may cost in inference
-WORTH_IT = 1.25  # bf16 loses digits: it must be faster by this much
 
 
-def choose_precision(predictor: Predictor, size: tuple[int, int], device: torch.device) -> str:
-    """'bf16' where two training steps with it are clearly faster on this device, else 'fp32'; leaves no trace."""
-    seconds = {name: _time_step(predictor, size, device, name == "bf16") for name in ("fp32", "bf16")}
-    return "bf16" if seconds["fp32"] > WORTH_IT * seconds["bf16"] else "fp32"
+def choose_precision(device: torch.device) -> str:
+    """'bf16' for training where the processor multiplies matrices of it, else 'fp32'.
+
+    Nothing is timed: the same machine must choose alike, however busy it is.
+    """
+    if device.type == "cuda":
+        return "bf16" if torch.cuda.is_bf16_supported() else "fp32"
+    return "bf16" if bool(getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)()) else "fp32"
 
 
 def choose_inference_precision(predictor: Predictor, sample: NDArray[np.float32], device: torch.device) -> str:
@@ -51,21 +52,3 @@ def _coefficients(predictor: Predictor, device: torch.device, precision: str, sa
 
     found = Mapper(predictor, device, precision).strips(terrain, sample.shape, (0, 0, *sample.shape))
     return np.concatenate([values for _, values in found], axis=1)
-
-
-def _time_step(predictor: Predictor, size: tuple[int, int], device: torch.device, bf16: bool) -> float:
-    import copy
-
-    with torch.random.fork_rng():
-        probe = copy.deepcopy(predictor).train()
-        elevation = torch.randn(16, *size, device=device)
-        best = float("inf")
-        for _ in range(3):
-            began = time.perf_counter()
-            with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
-                out = probe(elevation)
-            out.float().square().mean().backward()
-            if device.type == "cuda":
-                torch.cuda.synchronize(device)
-            best = min(best, time.perf_counter() - began)
-    return best

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from stages.network.cpu.fused_layers import join, norm_act, pool, quarter_weights
 from stages.network.layers import SLOPE, BatchNorm, Dropout, draw_keys
+from stages.network.pieces import convolution
 
 WIDTHS = (16, 32, 64, 128, 256)
 DROPOUT = (0.1, 0.1, 0.2, 0.2, 0.3)
@@ -32,7 +33,7 @@ class HeightConv(nn.Conv2d):
         # bfloat16 keeps three digits of a height, which would leave little of a slope: float32, whatever the rest is in.
         with torch.autocast(x.device.type, enabled=False):
             weight = self.weight - self.weight.mean(dim=(2, 3), keepdim=True)
-            return functional.conv2d(functional.pad(x.float(), (1, 1, 1, 1), mode="replicate"), weight)
+            return convolution(functional.pad(x.float(), (1, 1, 1, 1), mode="replicate"), weight)
 
     def forward(self, x: Tensor) -> Tensor:
         assert self.bias is not None
@@ -71,9 +72,9 @@ class Block(nn.Sequential):
         assert isinstance(entry, nn.Conv2d) and isinstance(first, BatchNorm) and isinstance(drop, Dropout)
         assert isinstance(second, nn.Conv2d) and isinstance(last, BatchNorm) and entry.bias is not None
         assert second.bias is not None
-        y = entry.differences(x) if isinstance(entry, HeightConv) else functional.conv2d(x, entry.weight)
+        y = entry.differences(x) if isinstance(entry, HeightConv) else convolution(x, entry.weight)
         y = norm_act(y, entry.bias, first, 1, drop, keys)
-        y = functional.conv2d(y, second.weight)
+        y = convolution(y, second.weight)
         return norm_act(y, second.bias, last, pad)
 
 
@@ -117,15 +118,23 @@ class UNet(nn.Module):
 
     def forward(self, x: Tensor, keys: Tensor | None = None) -> Tensor:
         """``keys`` (B,) int64: what each crop's dropout hangs on; drawn where None."""
+        return self.read_out(self.features(x, keys))
+
+    def read_out(self, features: Tensor) -> Tensor:
+        """(B, F, H, W) -> (B, C, H, W), the last layer."""
+        return convolution(features, self.head.weight, self.head.bias)
+
+    def features(self, x: Tensor, keys: Tensor | None = None) -> Tensor:
+        """What the last layer sees, (B, F, H, W) with F the first of the widths."""
         if keys is None:
             keys = draw_keys(len(x), x.device) if self.training else x.new_empty(0, dtype=torch.int64)
         # The fused form has no gradient in evaluation mode.
         if x.device.type == "cpu" and (self.training or not torch.is_grad_enabled()):
             return self._fused(x, keys)
-        return self.plain(x, keys)
+        return self.plain_features(x, keys)
 
-    def plain(self, x: Tensor, keys: Tensor) -> Tensor:
-        """The network as one writes it down."""
+    def plain_features(self, x: Tensor, keys: Tensor) -> Tensor:
+        """The same as one writes a network down."""
         kept = []
         for block in self.down[:-1]:
             x = block(x, keys)
@@ -135,10 +144,10 @@ class UNet(nn.Module):
         for rise, block in zip(self.rise, self.up, strict=True):
             x = rise(functional.interpolate(x, scale_factor=2.0, mode="nearest"))
             x = block(torch.cat([x, kept.pop()], dim=1), keys)
-        return self.head(x)
+        return x
 
     def _fused(self, x: Tensor, keys: Tensor) -> Tensor:
-        """The same to rounding: see ``fused``."""
+        """The same to rounding, in fewer passes: see ``fused``."""
         kept = []
         for block in self.down[:-1]:
             assert isinstance(block, Block)
@@ -149,6 +158,6 @@ class UNet(nn.Module):
         x = bottom.fused(x, keys, 1)
         for rise, block in zip(self.rise, self.up, strict=True):
             assert isinstance(rise, nn.Conv2d) and rise.bias is not None and isinstance(block, Block)
-            quarters = functional.conv2d(x, quarter_weights(rise.weight), rise.bias.repeat(4))
+            quarters = convolution(x, quarter_weights(rise.weight), rise.bias.repeat(4))
             x = block.fused(join(quarters, kept.pop()), keys, 0 if block is self.up[-1] else 1)
-        return self.head(x)
+        return x

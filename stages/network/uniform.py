@@ -2,45 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.network.losses import Radiometry
-from stages.pairs.reader import Batch, PairReader
+from stages.network.pixels import Pixels, batches_of, fit_pixels, sample_pixels
+from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form
-from stages.physics.photometry import ReflectanceModel, get_model
+from stages.physics.photometry import ReflectanceModel, get_model, masked_radiance_factor
 
 REFERENCE = "lunar_lambert"  # the published surface against which unknown gains and offsets are first fitted
-MAXIMUM_PAIRS = 512  # enough for a handful of numbers
-
-
-def _batches(reader: PairReader, indices: NDArray[np.int64], size: int = 32) -> Iterator[Batch]:
-    step = max(1, len(indices) // MAXIMUM_PAIRS)
-    chosen = indices[::step]
-    for first in range(0, len(chosen), size):
-        yield reader.batch(chosen[first : first + size])
 
 
 def _uniform(values: Tensor) -> Tensor:
     return values.view(1, -1, 1, 1)
 
 
-def fit_start(reader: PairReader, indices: NDArray[np.int64], model: ReflectanceModel) -> tuple[Tensor, Radiometry]:
+def fit_start(
+    reader: PairReader, indices: NDArray[np.int64], model: ReflectanceModel, positive: bool = False
+) -> tuple[Tensor, Radiometry]:
     """Uniform coefficients (C,) and the radiometry that go with them.
 
     Gains are first fitted against the reference surface, then in turn with the coefficients: a surface of another
     shape would give images of steep and of flat ground gains that do not belong together.
     """
     radiometry = fit_radiometry(reader, indices)
-    start = fit_uniform(reader, indices, model, radiometry)
-    if reader.units == "dn" and model.linear:
+    start = fit_uniform(reader, indices, model, radiometry, positive)
+    if reader.units == "dn":
         for _ in range(4):
             radiometry = fit_radiometry(reader, indices, model, start)
-            start = fit_uniform(reader, indices, model, radiometry)
+            start = fit_uniform(reader, indices, model, radiometry, positive)
     return start, radiometry
 
 
@@ -59,7 +52,7 @@ def fit_radiometry(
         uniform = torch.tensor([p.default for p in model.parameters])
     defaults = _uniform(uniform)
     moments = torch.zeros(frames, 5, dtype=torch.float64)  # n, sum x, sum y, sum xx, sum xy
-    for batch in _batches(reader, indices):
+    for batch in batches_of(reader, indices):
         x = form(batch.observation, model, defaults).double() * batch.valid
         y = batch.image.double() * batch.valid
         terms = torch.stack([batch.valid.double(), x, y, x * x, x * y], dim=1).sum(dim=(2, 3))
@@ -82,33 +75,41 @@ def fit_radiometry(
 
 
 def fit_uniform(
-    reader: PairReader, indices: NDArray[np.int64], model: ReflectanceModel, radiometry: Radiometry
+    reader: PairReader,
+    indices: NDArray[np.int64],
+    model: ReflectanceModel,
+    radiometry: Radiometry,
+    positive: bool = False,
 ) -> Tensor:
-    """The uniform coefficients (C,) that fit best over ``indices``; the model's defaults where it is not linear.
-
-    Linear models: normal equations over valid pixels, cast shadow included. Coefficients that come out negative are
-    dropped to a small positive value and the rest solved again, since the network keeps them nearly positive.
-    """
-    names = [p.name for p in model.parameters]
+    """The uniform coefficients (C,) that fit best over ``indices``, within the model's bounds or, if wanted, positive."""
+    pixels = sample_pixels(reader, indices, radiometry)
     if not model.linear:
-        return torch.tensor([p.default for p in model.parameters])
-    gram = torch.zeros(len(names), len(names), dtype=torch.float64)
-    right = torch.zeros(len(names), dtype=torch.float64)
-    gain, offset = radiometry.gain().detach(), radiometry.offset().detach()
-    for batch in _batches(reader, indices):
-        o = batch.observation
-        assert o.frame is not None
-        target = (batch.image - offset[o.frame, None, None]) / gain[o.frame, None, None]
-        columns = torch.stack([form(o, model, _uniform(torch.eye(len(names))[k])) for k in range(len(names))])
-        z = (columns * batch.valid).flatten(1).double()
-        gram += z @ z.T
-        right += z @ (target * batch.valid).flatten().double()
-    keep = list(range(len(names)))
-    solution = torch.zeros(len(names), dtype=torch.float64)
+        return fit_pixels(model, pixels)
+    gram, right = _normal_equations(model, pixels)
+    return _solve_positive(gram, right) if positive else _solve(gram, right).float()
+
+
+def _normal_equations(model: ReflectanceModel, pixels: Pixels) -> tuple[Tensor, Tensor]:
+    """(C, C) and (C,) float64 of a linear model."""
+    names = [p.name for p in model.parameters]
+    units = [dict(zip(names, unit, strict=True)) for unit in torch.eye(len(names), dtype=torch.float64)]
+    columns = torch.stack([masked_radiance_factor(model, unit, pixels.angles) * pixels.light for unit in units])
+    # products and sums instead of BLAS, whose sums hang on where arrays lie in memory
+    gram = torch.stack([(columns * column).sum(dim=1) for column in columns])
+    return gram, (columns * pixels.image).sum(dim=1)
+
+
+def _solve(gram: Tensor, right: Tensor) -> Tensor:
+    ridge = 1e-6 * gram.diagonal().mean() * torch.eye(len(gram), dtype=torch.float64)
+    return torch.linalg.solve(gram + ridge, right)
+
+
+def _solve_positive(gram: Tensor, right: Tensor) -> Tensor:
+    """Coefficients that come out negative are dropped to a small positive value and the rest solved again."""
+    keep = list(range(len(right)))
+    solution = torch.zeros(len(right), dtype=torch.float64)
     while keep:
-        sub = gram[keep][:, keep]
-        ridge = 1e-6 * sub.diagonal().mean() * torch.eye(len(keep), dtype=torch.float64)
-        part = torch.linalg.solve(sub + ridge, right[keep])
+        part = _solve(gram[keep][:, keep], right[keep])
         if (part > 0).all():
             solution[keep] = part
             break

@@ -19,7 +19,7 @@ Progress = Callable[[int, int, str], None]
 BAND_ROWS = 256
 BAND_PX = 1 << 20  # of a wide map fewer rows at a time: memory does not follow its width
 BAND_COLUMNS = 1024
-UNITS = {"image": "1", "shadow": "1", "depth": "m", "elevation": "m"}
+UNITS = {"image": "1", "image_std": "1", "shadow": "1", "depth": "m", "elevation": "m"}
 
 
 def render_map(
@@ -32,7 +32,8 @@ def render_map(
 ) -> Summary:
     """The whole map, streamed to its files band by band."""
     grid = surface.grid
-    channels = ["image", *BACKPLANES, "elevation"]
+    images = ["image", "image_std"] if surface.deviations is not None else ["image"]
+    channels = [*images, *BACKPLANES, "elevation"]
     bands = channels if config.backplanes_in_tif else ["image"]
     named = {path.suffix.lower(): path for path in files}
     wanted = channels if ".exr" in named else list(dict.fromkeys([*bands, "shadow", "incidence_deg"]))

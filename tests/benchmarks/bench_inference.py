@@ -29,6 +29,7 @@ from schemas import CHECKPOINT, ArtefactWriter
 from stages.common.memory import keep_freed_memory
 from stages.infer.terrain import TerrainReader
 from stages.network.cpu.mapper import Mapper
+from stages.network.maps import CoefficientMaps
 from stages.network.predictor import Predictor, write_state
 from stages.network.unet import DROPOUT, WIDTHS, UNet
 from stages.physics.photometry import get_model
@@ -80,11 +81,11 @@ def write_inputs(folder: Path) -> tuple[Path, Path]:
     with rasterio.open(dem, "w", **profile) as out:
         out.write((150 * z / z.std()).astype(np.float32), 1)
     torch.manual_seed(0)
-    predictor = Predictor(get_model("M2"), UNet(3), 10.0, torch.tensor([0.06, 0.02, 0.01]), 0.03)
+    predictor = Predictor(UNet(3), CoefficientMaps(get_model("M2"), (), torch.tensor([0.06, 0.02, 0.01]), 0.03), 10.0)
     nn.init.normal_(predictor.net.head.weight, 0, 0.1)
     attributes = {
         "model": "M2", "coefficients": '["a", "b", "c"]', "elevation_scale_m": 10.0, "output_scale": 0.03, "gsd_m": 5.0,
-        "body_radius_m": 1737400.0, "image_units": "iof", "best_epoch": np.int32(0), "start": "{}", "precision": "fp32",
+        "body_radius_m": 1737400.0, "maps": '["a", "b", "c"]', "globals": "{}", "positive": np.int32(0), "image_units": "iof", "best_epoch": np.int32(0), "start": "{}", "precision": "fp32",
     }  # fmt: skip
     config = {"widths": WIDTHS, "dropout": DROPOUT}
     with ArtefactWriter(
@@ -113,7 +114,9 @@ def bare(bf16: bool, compiled: bool) -> Callable[[], None]:
 
 def ours(bf16: bool, context: int) -> Callable[[], None]:
     """One tile of a map: at the map's edges, where nothing lies around it, or with the context that makes windows seamless."""
-    predictor = Predictor(get_model("M2"), UNet(3), 10.0, torch.tensor([0.06, 0.02, 0.01]), 0.03).eval()
+    predictor = Predictor(
+        UNet(3), CoefficientMaps(get_model("M2"), (), torch.tensor([0.06, 0.02, 0.01]), 0.03), 10.0
+    ).eval()
     mapper = Mapper(predictor, torch.device("cpu"), "bf16" if bf16 else "fp32")
     edge = TILE + 2 * context
     terrain = TerrainReader(torch.randn(edge, edge).numpy(), np.ones((edge, edge), np.uint8))

@@ -20,6 +20,7 @@ import torch
 
 from stages.common.memory import keep_freed_memory
 from stages.network.losses import squared_error
+from stages.network.maps import CoefficientMaps
 from stages.network.predictor import Predictor
 from stages.network.runtime import choose_precision
 from stages.network.unet import UNet
@@ -73,9 +74,9 @@ def main() -> None:
     observation = Observation(z, sun, camera, GSD, 1737400.0, sun_horizon=torch.full_like(z, 0.2))
     target = torch.full_like(z, 0.05)
     model = get_model("M2")
-    predictor = Predictor(model, UNet(3), 30.0, torch.tensor([0.06, 0.02, 0.01]), 0.03).train()
+    predictor = Predictor(UNet(3), CoefficientMaps(model, (), torch.tensor([0.06, 0.02, 0.01]), 0.03), 30.0).train()
     predictor.to(memory_format=torch.channels_last)
-    precision = choose_precision(predictor, (SIZE, SIZE), torch.device("cpu"))
+    precision = choose_precision(torch.device("cpu"))
     valid = torch.ones(z.shape, dtype=torch.bool)
 
     def layer_of(name: str) -> Callable[[], None]:

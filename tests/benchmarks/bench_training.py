@@ -23,6 +23,7 @@ from schemas import PAIRS, ArtefactWriter
 from stages import train
 from stages.common.memory import keep_freed_memory
 from stages.network.losses import squared_error
+from stages.network.maps import CoefficientMaps
 from stages.network.predictor import Predictor
 from stages.network.unet import DROPOUT, WIDTHS, UNet
 from stages.pairs.reader import PairReader
@@ -120,7 +121,7 @@ def peer_step(bf16: bool) -> Callable[[], None]:
 def our_steps(reader: PairReader, bf16: bool) -> dict[str, Callable[[], None]]:
     """The network alone with its optimiser, as the peer's; the rendering layer alone; and the step that `train` takes."""
     model = get_model("M2")
-    predictor = Predictor(model, UNet(3), 10.0, torch.tensor([0.06, 0.02, 0.01]), 0.03).train()
+    predictor = Predictor(UNet(3), CoefficientMaps(model, (), torch.tensor([0.06, 0.02, 0.01]), 0.03), 10.0).train()
     predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.Adam(predictor.parameters(), 1e-4, fused=True)
     batch = reader.batch(np.arange(BATCH))
@@ -207,7 +208,7 @@ def main() -> None:
             print(f"{name:28s} {BATCH / seconds:9.1f} samples/s, {peer / seconds:5.2f} of the best peer")
         step = min(best["our step, fp32"], best["our step, bf16"])
         print(f"the rendering layer is {100 * best['rendering layer, bf16'] / step:.1f} % of our step")
-        config = train.Config(epochs=2, batch=BATCH, device="cpu")
+        config = train.Config(model="M2", epochs=2, batch=BATCH, device="cpu")
         found = train.run(ours, Path(folder) / "checkpoint.h5", config)
         print(f"`lunargr train`, whole epochs {found.pairs_per_second:9.1f} pairs/s in {found.precision}")
 

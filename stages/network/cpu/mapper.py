@@ -22,13 +22,22 @@ class Mapper:
     """Coefficients of any part of a map, with all the context that the network can see.
 
     precision : fp32 or bf16; threads : how many would work with it side by side, of which ``together`` do
+    deviations : whether the standard deviations of the maps come after the coefficients
     """
 
-    def __init__(self, predictor: Predictor, device: torch.device, precision: str, threads: int = 1) -> None:
+    def __init__(
+        self,
+        predictor: Predictor,
+        device: torch.device,
+        precision: str,
+        threads: int = 1,
+        deviations: bool = False,
+    ) -> None:
+        self.deviations = deviations
         self.predictor, self.device, self.precision = predictor.eval(), device, precision
         self.in_strips = device.type == "cpu"
         self.together = 1
-        self._start = predictor.start.detach().cpu().float().numpy()
+        self._start = predictor.maps.start.detach().cpu().float().numpy()
         if self.in_strips:
             dtype = torch.bfloat16 if precision == "bf16" else torch.float32
             self.together = min(threads, MEMORY // (64 * dtype.itemsize))
@@ -40,7 +49,7 @@ class Mapper:
     def strips(
         self, terrain: Terrain, shape: tuple[int, int], part: tuple[int, int, int, int]
     ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """(row, coefficients (C, n, w)) of the part (row, col, height, width) of a map of ``shape``, from north to south.
+        """(row, coefficients and deviations (C, n, w)) of the part (row, col, height, width) of a map of ``shape``, from north to south.
 
         ``terrain(r0, r1, c0, c1)`` gives float32 heights in m, holes filled, continued beyond the map's edges.
         """
@@ -65,9 +74,17 @@ class Mapper:
     @torch.inference_mode()
     def _finish(self, raw: Tensor, first: int, width: int) -> NDArray[np.float32]:
         out = np.empty((raw.shape[1], raw.shape[2], width), np.float32)
-        scale = np.float32(self.predictor.output_scale)
+        scale = np.float32(self.predictor.maps.output_scale)
         row_kernels.finish(pixels_of(raw)[0], first, first + width, scale, self._start, out)
-        return self.predictor.model.constrain(torch.from_numpy(out), dim=0).numpy()
+        return self._complete(torch.from_numpy(out)).numpy()
+
+    def _complete(self, shifted: Tensor) -> Tensor:
+        """(channels, n, w) before their bounds -> coefficients, and deviations where wanted."""
+        maps = self.predictor.maps
+        # PyTorch's exponentials differ in the last bit where a row ends, which hangs on the window: double has bits to spare
+        exact = shifted.double()
+        found = maps.stack(exact, dim=0)
+        return (torch.cat([found, maps.deviations(exact, dim=0)]) if self.deviations else found).float()
 
     @torch.no_grad()
     def _window(self, terrain: Terrain, shape: tuple[int, int], part: tuple[int, int, int, int]) -> Tensor:
@@ -79,4 +96,5 @@ class Mapper:
         c1 = min(columns, -(-(col + width + reach) // lattice) * lattice)
         x = torch.from_numpy(terrain(r0, r1, c0, c1)).to(self.device)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.precision == "bf16"):
-            return self.predictor(x[None])[0, :, row - r0 : row - r0 + height, col - c0 : col - c0 + width]
+            shifted = self.predictor.shifted(x[None])[0, :, row - r0 : row - r0 + height, col - c0 : col - c0 + width]
+        return self._complete(shifted)

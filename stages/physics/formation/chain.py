@@ -6,9 +6,9 @@ Extensions (``stages/effects``) act at the slot that they name; the order of the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -46,6 +46,14 @@ class Observation:
     detector_line: Tensor | None = None
     frame: Tensor | None = None
     site: Tensor | None = None
+
+    def part(self, first: int, last: int) -> Observation:
+        """Crops ``first`` .. ``last`` of the batch."""
+        if first == 0 and last == len(self.elevation):
+            return self
+        named = {f.name: getattr(self, f.name) for f in fields(self)}
+        cut: dict[str, Any] = {k: v[first:last] for k, v in named.items() if isinstance(v, Tensor)}
+        return replace(self, **cut)
 
 
 @dataclass
@@ -92,12 +100,13 @@ class Extension(Protocol):
 def form(
     observation: Observation,
     model: ReflectanceModel,
-    coefficients: Tensor,
+    coefficients: Tensor | Mapping[str, Tensor],
     extensions: Sequence[Extension] = (),
 ) -> Tensor:
     """The image, in I/F, of a batch of crops.
 
-    coefficients : (B, C, H, W) or anything that broadcasts to it, in the order of ``model.parameters``
+    coefficients : (B, C, H, W) or anything that broadcasts to it, in the order of ``model.parameters``; or by name, each
+        broadcasting to (B, H, W)
     returns (B, H, W)
     """
     if not extensions:

@@ -34,7 +34,7 @@ EVEN = 1 << DIRECT  # px
 
 
 class MapTiff:
-    """A GeoTIFF that is written as its map is made: one band per coefficient, named; nodata NaN. Use as a context manager.
+    """A GeoTIFF that is written as its map is made: one band per coefficient and deviation, named; nodata NaN. Use as a context manager.
 
     Overviews are means of what is known. Every level grows in a file of its own beside ``path``;
     """
@@ -42,7 +42,10 @@ class MapTiff:
     def __init__(self, path: Path, grid: Grid, names: Sequence[str], attributes: Mapping[str, Any]) -> None:
         self.path, self.grid, self.names = path, grid, list(names)
         self.tags = {key: str(attributes[key]) for key in TAGS}
-        self.tags |= {"coefficients": json.dumps(self.names), "software": "lunargr"}
+        self.tags |= {
+            "coefficients": json.dumps([n for n in self.names if not n.endswith("_std")]),
+            "software": "lunargr",
+        }
         # Halved until it fits into a block.
         overviews = max(0, math.ceil(math.log2(max(grid.height, grid.width) / BLOCK)))
         self.shapes = [(-(-grid.height >> k), -(-grid.width >> k)) for k in range(overviews + 1)]
@@ -81,12 +84,12 @@ class MapTiff:
             with _told():
                 level.write(values, window=Window(col, row, values.shape[2], values.shape[1]))
 
-    def put_all(self, coefficients: h5py.Dataset, *further: h5py.Dataset) -> None:
-        """coefficients : (C, H, W); further : (H, W), a band each"""
+    def put_all(self, *fields: h5py.Dataset) -> None:
+        """fields : (C, H, W) or (H, W) each, band after band"""
         for piece in _pieces(*self.shapes[0]):
             part = piece.toslices()
-            bands = [coefficients[(slice(None), *part)], *(layer[part][None] for layer in further)]
-            self.put(piece.row_off, piece.col_off, np.concatenate(bands) if further else bands[0])
+            bands = [f[(slice(None), *part)] if f.ndim == 3 else f[part][None] for f in fields]
+            self.put(piece.row_off, piece.col_off, np.concatenate(bands))
 
     def _create(self, level: int) -> rasterio.io.DatasetWriter:
         height, width = self.shapes[level]
@@ -120,10 +123,18 @@ def _told() -> Iterator[None]:
 
 
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
-    """The map that an open artefact holds, as a cloud-optimised GeoTIFF; albedo and its error are bands more."""
+    """The map that an open artefact holds, as a cloud-optimised GeoTIFF; standard deviations and albedo are bands more."""
+    fields = [file[name] for name in ("coefficients", "coefficients_std") if name in file]
+    maps = read_strings(file, "map_name") if len(fields) > 1 else []
     further = [name for name in ALBEDO_BANDS if name in file]
-    with MapTiff(path, grid, [*read_strings(file, "coefficient_name"), *further], file.attrs) as tiff:
-        tiff.put_all(file["coefficients"], *(file[name] for name in further))
+    names = [*band_names(read_strings(file, "coefficient_name"), maps), *further]
+    with MapTiff(path, grid, names, file.attrs) as tiff:
+        tiff.put_all(*fields, *(file[name] for name in further))
+
+
+def band_names(coefficients: Sequence[str], maps: Sequence[str]) -> list[str]:
+    """The coefficients, and after them the standard deviations of those that vary by place."""
+    return [*coefficients, *(f"{name}_std" for name in maps)]
 
 
 def _pieces(height: int, width: int) -> Iterator[Window]:

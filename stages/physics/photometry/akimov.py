@@ -25,6 +25,7 @@ from stages.physics.photometry.base import Parameter, ReflectanceModel, register
 @register
 class Akimov(ReflectanceModel):
     name = "akimov"
+    default_maps = ("albedo",)
     title = "Akimov disk function"
     formula = "A cos(g/2) cos[pi/(pi-g) (L - g/2)] cos(B)^(eta g/(pi-g)) / cos(L)"
     reference = "Akimov, L. A. (1976), Sov. Astron. 19, 385; Shkuratov, Y. et al. (2011), Planet. Space Sci. 59, 1326"

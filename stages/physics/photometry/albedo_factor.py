@@ -28,5 +28,8 @@ class AlbedoFactor(ReflectanceModel):
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         return self.model.radiance_factor(parameters, angles) * parameters[FACTOR.name]
 
-    def lit(self, coefficients: Tensor, angles: Angles, light: Tensor) -> Tensor:
-        return self.model.lit(coefficients[:, :-1], angles, light) * coefficients[:, -1]
+    def lit(self, coefficients: Tensor | Mapping[str, Tensor], angles: Angles, light: Tensor) -> Tensor:
+        if isinstance(coefficients, Tensor):
+            return self.model.lit(coefficients[:, :-1], angles, light) * coefficients[:, -1]
+        rest = {name: value for name, value in coefficients.items() if name != FACTOR.name}
+        return self.model.lit(rest, angles, light) * coefficients[FACTOR.name]

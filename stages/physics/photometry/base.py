@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -38,6 +38,8 @@ class ReflectanceModel(ABC):
     reference: ClassVar[str]
     reciprocal: ClassVar[bool]
     parameters: ClassVar[tuple[Parameter, ...]]
+    # What a network predicts place by place unless told otherwise; the rest is fitted globally. Empty: every parameter.
+    default_maps: ClassVar[tuple[str, ...]] = ()
     # I/F is a linear function of the parameters: a global set is then one least-squares solve.
     linear: ClassVar[bool] = False
     # The formula and its gradients are finite for any cosines in [-1, 1]: no need to keep them from 0 first.
@@ -54,31 +56,52 @@ class ReflectanceModel(ABC):
         parameters : tensors that broadcast with the angles. Callers use :func:`evaluate`, which masks the rest.
         """
 
-    def constrain(self, raw: Tensor, dim: int) -> Tensor:
-        """Network outputs -> parameters within their bounds (sigmoid between lower and upper)."""
-        shape = [1] * raw.ndim
-        shape[dim] = len(self.parameters)
-        low = torch.tensor([p.lower for p in self.parameters], dtype=raw.dtype, device=raw.device).view(shape)
-        high = torch.tensor([p.upper for p in self.parameters], dtype=raw.dtype, device=raw.device).view(shape)
+    def constrain(self, raw: Tensor, dim: int, names: Sequence[str] | None = None) -> Tensor:
+        """Network outputs -> parameters within their bounds (sigmoid between lower and upper).
+
+        names : the parameters along ``dim``; all of them where None
+        """
+        low, high = self._bounds(raw, dim, names)
         return low + (high - low) * torch.sigmoid(raw)
 
-    def unconstrain(self, value: Tensor, dim: int) -> Tensor:
+    def unconstrain(self, value: Tensor, dim: int, names: Sequence[str] | None = None) -> Tensor:
         """Inverse of :meth:`constrain`, for starting a network at known coefficients."""
-        shape = [1] * value.ndim
-        shape[dim] = len(self.parameters)
-        low = torch.tensor([p.lower for p in self.parameters], dtype=value.dtype, device=value.device).view(shape)
-        high = torch.tensor([p.upper for p in self.parameters], dtype=value.dtype, device=value.device).view(shape)
+        low, high = self._bounds(value, dim, names)
         return torch.logit(((value - low) / (high - low)).clamp(1e-6, 1 - 1e-6))
 
-    def unpack(self, coefficients: Tensor, dim: int) -> dict[str, Tensor]:
-        """A stack of coefficients -> parameters by name; the order is that of ``parameters``."""
+    def _bounds(self, like: Tensor, dim: int, names: Sequence[str] | None) -> tuple[Tensor, Tensor]:
+        """Lower and upper bounds along ``dim``, on the device of ``like``."""
+        chosen = [p for p in self.parameters if names is None or p.name in names]
+        shape = [1] * like.ndim
+        shape[dim] = len(chosen)
+        bounds = ([p.lower for p in chosen], [p.upper for p in chosen])
+        low, high = (torch.tensor(b, dtype=like.dtype, device=like.device).view(shape) for b in bounds)
+        return low, high
+
+    def choose_maps(self, wanted: Sequence[str] = ()) -> tuple[str, ...]:
+        """The parameters to predict place by place, in the model's order; by default ``default_maps``, or all.
+
+        Raises RegistryError for a name that is not a parameter.
+        """
+        names = [p.name for p in self.parameters]
+        for name in wanted:
+            if name not in names:
+                raise RegistryError.unknown(f"parameter of {self.name}", name, names)
+        chosen = wanted or self.default_maps or names
+        return tuple(name for name in names if name in chosen)
+
+    def unpack(self, coefficients: Tensor | Mapping[str, Tensor], dim: int) -> dict[str, Tensor]:
+        """A stack of coefficients -> parameters by name; the order is that of ``parameters``. Named ones stay as they are."""
+        if not isinstance(coefficients, Tensor):
+            return dict(coefficients)
         # unbind and not select: its backward is one stack, where select writes a full stack of zeros per parameter
         return dict(zip((p.name for p in self.parameters), coefficients.unbind(dim), strict=True))
 
-    def lit(self, coefficients: Tensor, angles: Angles, light: Tensor) -> Tensor:
+    def lit(self, coefficients: Tensor | Mapping[str, Tensor], angles: Angles, light: Tensor) -> Tensor:
         """I/F of facets that receive the share ``light`` of the Sun, 0 where Sun or camera are behind them.
 
-        coefficients : (B, C, H, W) or what broadcasts to it, in the order of ``parameters``; light : (B, H, W), 0..1
+        coefficients : (B, C, H, W) or what broadcasts to it, in the order of ``parameters``, or by name, each broadcasting
+            to (B, H, W); light : (B, H, W), 0..1
         """
         return masked_radiance_factor(self, self.unpack(coefficients, dim=1), angles) * light
 

@@ -136,6 +136,7 @@ class HapkeBase(ReflectanceModel):
         "Hapke, B. (2012), Theory of Reflectance and Emittance Spectroscopy, 2nd ed.; roughness: (1984), Icarus 59, 41"
     )
     reciprocal = True
+    default_maps = ("w", "b")
     h_function: ClassVar[str] = "2002"
     glsl_phase_function: ClassVar[str]
 

@@ -23,6 +23,7 @@ from stages.physics.photometry.base import Parameter, ReflectanceModel, register
 @register
 class HapkeG2R(ReflectanceModel):
     name = "hapke_g2r"
+    default_maps = ("gamma",)
     title = "Hapke of the Lunar-G2R reference implementation"
     formula = "(1 - gamma^2)/4 cos(i)/(cos(i) + cos(e)) [(1 + B) p + H(cos i) H(cos e) - 1]"
     reference = (

@@ -74,6 +74,7 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {{
 @register
 class LunarLambertFixed(ReflectanceModel):
     name = "lunar_lambert_fixed"
+    default_maps = ("albedo",)
     title = "Lunar-Lambert, L given"
     formula = "A [2 L cos(i) / (cos(i) + cos(e)) + (1 - L) cos(i)]"
     reference = "McEwen, A. S. (1991), Icarus 92, 298"

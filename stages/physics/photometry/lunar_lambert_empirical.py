@@ -21,6 +21,7 @@ from stages.physics.photometry.lunar_lambert import GLSL_MIXTURE, MCEWEN, lunar_
 @register
 class LunarLambertEmpirical(ReflectanceModel):
     name = "lunar_lambert_empirical"
+    default_maps = ("albedo",)
     title = "Lunar-Lambert, empirical polynomial of ASP"
     formula = "A [2 L cos(i)/(cos(i) + cos(e)) + (1 - L) cos(i)] (exp(-C1 g) + C2), L = O + A g + B g^2 + C g^3"
     reference = "Alexandrov, O. and Beyer, R. A. (2018), Earth Space Sci. 5, 652; Lohse, V. et al. (2006)"

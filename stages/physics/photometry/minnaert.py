@@ -18,6 +18,7 @@ from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, 
 @register
 class Minnaert(ReflectanceModel):
     name = "minnaert"
+    default_maps = ("albedo",)
     title = "Minnaert"
     formula = "A cos(i)^k cos(e)^(k-1)"
     reference = "Minnaert, M. (1941), Astrophys. J. 93, 403"

@@ -17,32 +17,20 @@ import operator
 from collections.abc import Mapping
 from typing import ClassVar
 
-import torch
 from torch import Tensor
-from torch.nn.functional import leaky_relu
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
 
-SLOPE = 0.01  # of the LeakyReLU that keeps coefficients nearly positive, as in the authors' code
-
 
 class CosinePolynomial(ReflectanceModel):
-    """Coefficients are nearly positive: LeakyReLU(0.01) of the network's output."""
-
     reference = "Grethen et al., Lunar-G2R, table 1"
     linear = True
     finite = True
 
-    def constrain(self, raw: Tensor, dim: int) -> Tensor:
-        return leaky_relu(raw, SLOPE)
-
-    def unconstrain(self, value: Tensor, dim: int) -> Tensor:
-        return torch.where(value >= 0, value, value / SLOPE)
-
 
 def coefficient(name: str, of: str, default: float) -> Parameter:
-    """A coefficient of a cosine: dimensionless, bounded only for display."""
+    """A coefficient of a cosine: dimensionless, with bounds far beyond what the Moon needs."""
     return Parameter(name, "1", -1.0, 2.0, default, f"coefficient of {of}")
 
 
@@ -65,12 +53,12 @@ class IncidencePhasePolynomial(CosinePolynomial):
             terms.append(functools.reduce(operator.mul, factors))
         return functools.reduce(operator.add, terms)
 
-    def lit(self, coefficients: Tensor, angles: Angles, light: Tensor) -> Tensor:
+    def lit(self, coefficients: Tensor | Mapping[str, Tensor], angles: Angles, light: Tensor) -> Tensor:
         # numba takes a quarter of a second to load, which `lunargr models` has no use for
         from stages.physics.photometry.cosine_sums import cosine_sum, fits
 
         geometry = angles.cos_incidence, angles.cos_phase, light
-        if not fits(coefficients, *geometry):
+        if not (isinstance(coefficients, Tensor) and fits(coefficients, *geometry)):
             return super().lit(coefficients, angles, light)
         return cosine_sum(coefficients, *geometry, self.powers)
 

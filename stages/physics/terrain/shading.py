@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from stages.physics.formation.chain import Extension, Observation, State, form
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import masked_radiance_factor
-from stages.physics.terrain.ground import block_geometry
+from stages.physics.photometry.deviation import radiance_deviation
+from stages.physics.terrain.ground import BlockGeometry, block_geometry
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.sun_visibility import SunHorizon, visible_share
 from stages.physics.terrain.surface import Surface
@@ -62,6 +63,7 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
     """``image`` (I/F) and the backplanes of a window, each (height, width), NaN where the map is unknown.
 
     ``clipped`` is 1 where the model gave I/F below 0, which is drawn as 0.
+    ``image_std`` is among them where the map has deviations: of a photograph of the same view, pixel by pixel.
     """
     elevation = read_padded(surface, row, col, height, width, 1)
     geometry = block_geometry(surface.grid, row, col, elevation, light.sun.position, light.camera_position)
@@ -82,11 +84,13 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
         unknown = np.isnan(geometry.cos_incidence) | ~np.isfinite(coefficients.numpy()).all(axis=0)
         image[unknown] = np.nan
         clipped[unknown] = 0
+    deviation = _image_deviation(surface, geometry, visible, row, col) if surface.deviations is not None else {}
     shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
     shadow[np.isnan(geometry.cos_incidence)] = np.nan
     return {
         "image": image,
         "clipped": clipped,
+        **deviation,
         "incidence_deg": _degrees(geometry.cos_incidence),
         "emission_deg": _degrees(geometry.cos_emission),
         "phase_deg": _degrees(geometry.cos_phase),
@@ -96,6 +100,20 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
         "latitude_deg": geometry.latitude_deg,
         "elevation": elevation[1:-1, 1:-1],
     }
+
+
+def _image_deviation(
+    surface: Surface, geometry: BlockGeometry, visible: Floats32, row: int, col: int
+) -> dict[str, Floats32]:
+    """``image_std``, (h, w) I/F: errors of the coefficients, through the model, and the images' own."""
+    height, width = visible.shape
+    known = torch.from_numpy(np.ascontiguousarray(surface.read_coefficients(row, col, height, width)))
+    values = surface.model.unpack(known, dim=0)
+    deviations = {k: torch.from_numpy(v) for k, v in surface.read_deviations(row, col, height, width).items()}
+    angles = Angles(*(torch.from_numpy(v) for v in (geometry.cos_incidence, geometry.cos_emission, geometry.cos_phase)))
+    found = radiance_deviation(surface.model, values, deviations, angles).numpy() * visible
+    found[np.isnan(geometry.cos_incidence) | ~np.isfinite(known.numpy()).all(axis=0)] = np.nan
+    return {"image_std": np.hypot(found, np.float32(surface.image_noise))}
 
 
 def read_padded(surface: Surface, row: int, col: int, height: int, width: int, margin: int) -> Floats32:

@@ -52,6 +52,8 @@ class Surface:
 
     elevation : windows (h, w), m; coefficients : (C, H, W) dataset or None where ``uniform`` (C,) holds everywhere
     albedo : (H, W) dataset of the factor that is the last parameter of ``model``, None where the map has none
+    deviations : (M, H, W) dataset, standard deviations of the coefficients ``mapped``, or None where unknown
+    image_noise : I/F, what else sets photographs apart from renderings
     """
 
     path: Path
@@ -61,6 +63,16 @@ class Surface:
     coefficients: h5py.Dataset | None
     uniform: NDArray[np.float32]
     albedo: h5py.Dataset | None = None
+    deviations: h5py.Dataset | None = None
+    mapped: tuple[str, ...] = ()
+    image_noise: float = 0.0
+
+    def read_deviations(self, row: int, col: int, height: int, width: int) -> dict[str, Floats32]:
+        """(h, w) standard deviations by name; none where they are unknown."""
+        if self.deviations is None:
+            return {}
+        planes = self.deviations[:, row : row + height, col : col + width]
+        return dict(zip(self.mapped, planes, strict=True))
 
     def read_coefficients(self, row: int, col: int, height: int, width: int) -> Floats32:
         """(C, h, w), or (C, 1, 1) where they are the same everywhere."""
@@ -111,7 +123,12 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
                 if albedo is not None:
                     reflectance = AlbedoFactor(reflectance)
                 empty = np.empty(0, np.float32)
-                yield Surface(path, grid, elevation, reflectance, file["coefficients"], empty, albedo)
+                surface = Surface(path, grid, elevation, reflectance, file["coefficients"], empty, albedo)
+                if "coefficients_std" in file:
+                    surface.deviations = file["coefficients_std"]
+                    surface.mapped = tuple(read_strings(file, "map_name"))
+                    surface.image_noise = float(np.nan_to_num(file.attrs.get("image_noise", 0.0)))
+                yield surface
                 return
         else:
             dataset = stack.enter_context(open_raster(path, "a DEM, scene.h5 or svbrdf.h5"))

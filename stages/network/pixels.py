@@ -1,0 +1,113 @@
+"""Single pixels of many images, and the one set of parameters of a reflectance model that fits them best."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stages.network.losses import Radiometry
+from stages.pairs.reader import Batch, PairReader
+from stages.physics.formation import facets
+from stages.physics.formation.geometry import Angles
+from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
+
+MAXIMUM_PAIRS = 512  # enough for a handful of numbers
+MAXIMUM_PIXELS = 30_000
+
+
+def batches_of(reader: PairReader, indices: NDArray[np.int64], size: int = 32) -> Iterator[Batch]:
+    """At most about MAXIMUM_PAIRS of some pairs."""
+    step = max(1, len(indices) // MAXIMUM_PAIRS)
+    chosen = indices[::step]
+    for first in range(0, len(chosen), size):
+        yield reader.batch(chosen[first : first + size])
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Valid pixels of many images, (N,) float64 each: cosines, the share of the Sun that lights them, and I/F.
+
+    more : (N, ...) float64, whatever else was asked for
+    """
+
+    angles: Angles
+    light: Tensor
+    image: Tensor
+    more: tuple[Tensor, ...] = ()
+
+
+def sample_pixels(
+    reader: PairReader,
+    indices: NDArray[np.int64],
+    radiometry: Radiometry,
+    more: Callable[[Batch], Sequence[Tensor]] = lambda batch: (),
+) -> Pixels:
+    """Valid pixels on a regular lattice over every crop, about MAXIMUM_PIXELS, with images in I/F by their radiometry.
+
+    more : further fields of a batch, (B, ..., H, W) each
+    """
+    crops = min(len(indices), MAXIMUM_PAIRS)
+    step = max(1, math.ceil(math.sqrt(crops * reader.size[0] * reader.size[1] / MAXIMUM_PIXELS)))
+    part = np.s_[..., step // 2 :: step, step // 2 :: step]
+    gain, offset = (value().detach().cpu() for value in (radiometry.gain, radiometry.offset))
+    found: list[list[Tensor]] = []
+    for batch in batches_of(reader, indices):
+        o = batch.observation
+        seen = facets.look(o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius)
+        assert seen is not None and o.frame is not None  # on the CPU, without gradients
+        angles, light = seen
+        image = (batch.image - offset[o.frame, None, None]) / gain[o.frame, None, None]
+        fields = (angles.cos_incidence, angles.cos_emission, angles.cos_phase, light, image, *more(batch))
+        valid = batch.valid[part]
+        found.append([field[part].movedim((-2, -1), (1, 2))[valid].double() for field in fields])
+    mu0, mu, phase, light, image, *rest = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return Pixels(Angles(mu0, mu, phase), light, image, tuple(rest))
+
+
+def fit_pixels(model: ReflectanceModel, pixels: Pixels, rounds: int = 40) -> Tensor:
+    """One set of parameters (C,) within the model's bounds, by Levenberg-Marquardt from its defaults.
+
+    What the pixels do not tell stays at its default: leaving it costs a millionth of the images' power per unit of the
+    unbounded parameter. That also keeps the fit from wandering along valleys, in which rounding would choose the place.
+    """
+    names = [p.name for p in model.parameters]
+
+    def render(raw: Tensor) -> Tensor:
+        values = dict(zip(names, model.constrain(raw, 0), strict=True))
+        return masked_radiance_factor(model, values, pixels.angles) * pixels.light
+
+    home = model.unconstrain(torch.tensor([p.default for p in model.parameters], dtype=torch.float64), 0).clamp(-8, 8)
+    tie = 1e-6 * pixels.image.square().sum()
+    raw, damping = home, 1e-3
+    error = pixels.image - render(raw)
+    loss = error.square().sum()
+    for _ in range(rounds):
+        columns = _slopes(render, raw)
+        normal = torch.stack([(columns * c).sum(dim=1) for c in columns]) + tie * torch.eye(len(raw))
+        slope = (columns * error).sum(dim=1) - tie * (raw - home)
+        gained = 0.0
+        for _ in range(8):
+            step = torch.linalg.solve(normal + damping * torch.diag(normal.diagonal()), slope)
+            moved = (raw + step).clamp(-12, 12)
+            error_there = pixels.image - render(moved)
+            loss_there = error_there.square().sum() + tie * (moved - home).square().sum()
+            if loss_there < loss:
+                gained = float((loss - loss_there) / loss)
+                raw, error, loss, damping = moved, error_there, loss_there, damping / 5
+                break
+            damping *= 5
+        if gained < 1e-7:
+            break
+    return model.constrain(raw, 0).float()
+
+
+def _slopes(render: Callable[[Tensor], Tensor], raw: Tensor, step: float = 1e-5) -> Tensor:
+    """(C, N) by central differences: in double precision exact to about 1e-9."""
+    shifts = step * torch.eye(len(raw), dtype=raw.dtype)
+    return torch.stack([(render(raw + shift) - render(raw - shift)) / (2 * step) for shift in shifts])
