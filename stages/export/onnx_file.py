@@ -15,8 +15,10 @@ from torch import Tensor
 from schemas import CHECKPOINT, ConfigError, atomic_path, check_output, open_artefact
 from schemas.files.companions import companions_of
 from stages.export.card import model_card
+from stages.network.maps import CoefficientMaps
 from stages.network.normalisation import scale_elevation
 from stages.network.predictor import Predictor, load_predictor
+from stages.network.unet import UNet
 
 OPSET = 17
 INPUT, OUTPUT = "elevation", "coefficients"
@@ -45,12 +47,14 @@ class _Exported(torch.nn.Module):
 
     def __init__(self, predictor: Predictor) -> None:
         super().__init__()
-        self.predictor = predictor
+        self.net: UNet = predictor.net
+        self.maps: CoefficientMaps = predictor.maps
+        self.elevation_scale = predictor.elevation_scale
 
     def forward(self, elevation: Tensor) -> Tensor:
-        p = self.predictor
-        raw = p.net.plain(scale_elevation(elevation, p.elevation_scale), elevation.new_empty(0, dtype=torch.int64))
-        return p.maps.stack(p.maps.shifted(raw), dim=1)
+        keys = elevation.new_empty(0, dtype=torch.int64)
+        raw = self.net.plain(scale_elevation(elevation, self.elevation_scale), keys)
+        return self.maps.stack(self.maps.shifted(raw), dim=1)
 
 
 def run(checkpoint: Path, output: Path, config: Config, *, overwrite: bool = False) -> Summary:
