@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -152,7 +153,7 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
         predictor.offset = dict(zip(ids, map(float, file["offset"][...]), strict=True))
         predictor.image_units = str(file.attrs["image_units"])
         predictor.gsd = float(file.attrs["gsd_m"])
-        predictor.image_noise = float(file.attrs["image_noise"])
+        predictor.image_noise = float(file.attrs.get("image_noise", math.nan))
     predictor.to(device)
     if torch.device(device).type == "cpu":
         predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
