@@ -139,7 +139,7 @@ $(A)/pairs.h5: $(A)/crops.h5
 	$(LUNARGR) project $< --register field -o $@ --overwrite
 
 $(A)/checkpoint.h5: $(A)/pairs.h5
-	$(LUNARGR) train $< --epochs 6 --precision fp32 -o $@ --overwrite --resume
+	$(LUNARGR) train $< --model kernels --epochs 6 --precision fp32 -o $@ --overwrite --resume
 
 $(A)/svbrdf.h5: $(A)/scene.h5 $(A)/checkpoint.h5
 	$(LUNARGR) infer $^ -o $@ --overwrite

@@ -59,7 +59,7 @@ class Config:
     schedule : 'constant' or 'cosine'
     """
 
-    model: str = "kernels"
+    model: str = "hapke"
     maps: tuple[str, ...] = ()
     positive: bool = False
     epochs: int = 20
