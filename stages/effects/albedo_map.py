@@ -19,6 +19,7 @@ class AlbedoMap(Effect):
     channel = "albedo"
     linear = True
     scope = "site"
+    table = ("site_albedo", "term")
     title = "broad albedo pattern (rays, mare borders)"
     mechanism = (
         "Crater rays, swirls and mare borders change albedo over tens of pixels without a trace in the terrain: a low-order cosine "

@@ -19,6 +19,7 @@ class LineJitter(Effect):
     name = "line_jitter"
     slot = "geometry"
     scope = "image"
+    table = ("line_jitter_px", "mode")
     displaces = True
     relative = True
     title = "lines shifted against each other"
