@@ -83,7 +83,9 @@ PLANTS: dict[str, dict[str, Any]] = {
         "effect": "nonlinearity",
     },
     "columns of 3 %": {
-        "do": lambda f: _images(f, lambda x, _: x * (1 + 0.03 * np.sqrt(2) * np.cos(np.pi * 3 * (np.arange(x.shape[1]) + 0.5) / x.shape[1]))),
+        "do": lambda f: _images(
+            f, lambda x, _: x * (1 + 0.03 * np.sqrt(2) * np.cos(np.pi * 3 * (np.arange(x.shape[1]) + 0.5) / x.shape[1]))
+        ),
         "effect": "column_pattern",
     },
     "echo of 10 % at 6 px": {
@@ -128,7 +130,14 @@ def resample(source: Path, target: Path, seed: int) -> Path:
                 by_pair = data.shape and data.shape[0] == len(site)
                 made = out.create_dataset(name, data=data[...][keep] if by_pair else data[...], dtype=data.dtype)
                 for key, value in data.attrs.items():
-                    if key not in ("DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates"):
+                    if key not in (
+                        "DIMENSION_LIST",
+                        "REFERENCE_LIST",
+                        "CLASS",
+                        "NAME",
+                        "_Netcdf4Dimid",
+                        "_Netcdf4Coordinates",
+                    ):
                         made.attrs[key] = value
     return target
 
@@ -166,8 +175,19 @@ def semi_real(
     rng = np.random.default_rng(seed)
     fine, gsd = 4, 20.0
     side = size * fine
-    frames = [(rng.uniform(0, 360), rng.uniform(25, 60), rng.uniform(0, 360), rng.uniform(0, 25)) for _ in range(images)]
-    keys = ("image", "elevation", "sun_horizon_deg", "sun_direction_enu", "camera_position_enu", "image_index", "site", "split")
+    frames = [
+        (rng.uniform(0, 360), rng.uniform(25, 60), rng.uniform(0, 360), rng.uniform(0, 25)) for _ in range(images)
+    ]
+    keys = (
+        "image",
+        "elevation",
+        "sun_horizon_deg",
+        "sun_direction_enu",
+        "camera_position_enu",
+        "image_index",
+        "site",
+        "split",
+    )
     rows: dict[str, list[Any]] = {k: [] for k in keys}
     amount, width = truth.get("noise", rng.uniform(0.002, 0.02)), rng.uniform(4, 16)
     for place in range(sites + 1):
@@ -237,7 +257,12 @@ def judge(path: Path, name: str | None) -> dict[str, Any]:
 
     started = time.process_time()
     said = diagnose.run(path).answer.to_json()
-    return {"planted": name, "effect": PLANTS[name]["effect"] if name else None, "cpu_s": time.process_time() - started, "said": said}
+    return {
+        "planted": name,
+        "effect": PLANTS[name]["effect"] if name else None,
+        "cpu_s": time.process_time() - started,
+        "said": said,
+    }
 
 
 def _values(cause: dict[str, Any]) -> str:
@@ -290,7 +315,10 @@ def main() -> None:
             for name in PLANTS:
                 cases.append(judge(plant(source, Path(folder) / "planted.h5", name), name) | {"source": source.name})
             for k in range(a.resamples):
-                cases.append(judge(resample(source, Path(folder) / "again.h5", 1000 * a.seed + k), None) | {"source": source.name})
+                cases.append(
+                    judge(resample(source, Path(folder) / "again.h5", 1000 * a.seed + k), None)
+                    | {"source": source.name}
+                )
             a.output.parent.mkdir(parents=True, exist_ok=True)
             a.output.with_suffix(".json").write_text(json.dumps(cases, indent=1))
             a.output.with_suffix(".md").write_text(report(cases))

@@ -37,8 +37,9 @@ import torch
 from schemas import ArtefactError, ConfigError, atomic_path, check_output
 from schemas.companions import companions_of
 from stages.diagnose.likelihood.left import budget, peak
+from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import better_form, relative_misfit
-from stages.diagnose.model.nominal import fit, load_nominal
+from stages.diagnose.model.nominal import fit, lit_mask, load_nominal
 from stages.diagnose.model.sites import Site, group_pairs, load_site, survey
 from stages.diagnose.registration.explain import explain
 from stages.diagnose.result.answer import Answer
@@ -131,7 +132,9 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         say(f"{config.model} has the wrong form: {answer.form} is fitted in its place")
         fit(nominal, sites, [], units, [s.read for s in sites])
     data = survey(sites, frames, units)
-    state = State(nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, say=say, progress=progress)
+    state = State(
+        nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, say=say, progress=progress
+    )
     state.reference = copy.copy(nominal)
     before = _residual(state)
     if not before > 0:
@@ -198,6 +201,10 @@ def _residual(state: State) -> float:
     total, count = 0.0, 0.0
     for k, chain in enumerate(state.chains()):
         residual = (chain.site.image - chain.predict())[None]
+        if (
+            state.free_gains
+        ):  # relative to the image as it was read: a gain that is fitted too low would blow residuals up
+            residual = residual * _as_read(chain)
         for patch in make_patches(k, chain, pieces, state.free_gains):
             z, mean = patch.transform(residual, grid)
             total += float((z.real.square() + z.imag.square()).sum())
@@ -206,6 +213,15 @@ def _residual(state: State) -> float:
                 total += float((mean.square() * area).sum())
             count += float(area.sum())
     return total / count if count else math.nan
+
+
+def _as_read(chain: Chain) -> torch.Tensor:
+    """(n, 1, 1) by which a residual over the prediction's mean gets one over the read image's mean."""
+    site = chain.site
+    lit = lit_mask(chain).float()
+    count = lit.sum((-2, -1)).clamp(min=1)
+    ratio = (chain.predict() * lit).sum((-2, -1)) / count * site.gain.abs()
+    return (ratio / ((site.read * lit).sum((-2, -1)) / count).clamp(min=1e-9))[:, None, None]
 
 
 def split(reader: PairReader) -> tuple[np.ndarray, np.ndarray]:

@@ -5,11 +5,19 @@ from __future__ import annotations
 import math
 
 # --- which pixels say anything ---
-LIT_MARGIN = math.radians(1.2)  # rad above the horizon: closer, an ordinary error of the DEM decides whether a pixel is lit
-GRAZING = math.cos(math.radians(84.0))  # cosine of incidence: a slope error of a degree changes brightness by 15 % there
+LIT_MARGIN = math.radians(
+    1.2
+)  # rad above the horizon: closer, an ordinary error of the DEM decides whether a pixel is lit
+GRAZING = math.cos(
+    math.radians(84.0)
+)  # cosine of incidence: a slope error of a degree changes brightness by 15 % there
 DARKEST = 0.3  # of an image's mean: noise of darker pixels is not divided by less than this
-TAPER = 0.12  # of a crop's side, at either end: a window this wide keeps borders out of the spectrum and 80 % of the area
-CLEAR = math.radians(15.0)  # rad of the Sun above facet and horizon: lower, a slope error of a degree is 7 % of brightness and more
+TAPER = (
+    0.12  # of a crop's side, at either end: a window this wide keeps borders out of the spectrum and 80 % of the area
+)
+CLEAR = math.radians(
+    15.0
+)  # rad of the Sun above facet and horizon: lower, a slope error of a degree is 7 % of brightness and more
 RUGGED = 1.35  # ... and on rugged ground so many times its rms slope, since facets that seem to face the Sun are chosen by the DEM's errors
 FEWEST_PIXELS = 400  # of an image in a crop: fewer do not give a spectrum
 
@@ -29,7 +37,7 @@ SHAMS = 99  # sham residuals: p values go down to 1 %
 DISCOVERY = 0.05  # false discovery rate
 SURE = 4.0  # standard errors: an effect found at this size is never called invisible
 CORRELATED = 16.0  # px^2 per independent sample of a residual: what is left of albedo and relief is some 4 px wide
-CHANCE = 6.0  # times the median of its annulus: a single wave of one frame that the spectrum of ground and noise does not have
+CHANCE = 25.0  # times the median of its annulus: a single wave of one frame that the spectrum of ground and noise does not have
 GROSS = 0.1  # residual over mean brightness, from which the form of the nominal model is questioned ...
 HALVED = 0.5  # ... and another form taken if it leaves so little of the residual
 MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model says nothing about the images

@@ -44,7 +44,8 @@ class Survey:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Survey:
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+        return cls(**values)
 
 
 @dataclass(frozen=True)

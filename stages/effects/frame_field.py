@@ -42,7 +42,7 @@ class FrameField(Effect):
         height, width = state.image.shape[-2:]
         y = (torch.arange(height, dtype=state.image.dtype) + 0.5) / height
         x = (torch.arange(width, dtype=state.image.dtype) + 0.5) / width
-        factor = 1.0
+        factor = torch.ones_like(state.image)
         for m, n in TERMS:
             wave = torch.cos(math.pi * m * y)[:, None] * torch.cos(math.pi * n * x)
             factor = factor + self.value(f"f{m}{n}", state) * wave

@@ -60,9 +60,7 @@ class Covariance:
         return (self.mean_albedo + self.mean_relief * (g @ g.T) + own) * self.mean_size.get(patch.number, 1.0)
 
 
-def estimate(
-    patches: Sequence[Patch], rows: Sequence[tuple[Tensor, Tensor]], grid: Grid, frames: int
-) -> Covariance:
+def estimate(patches: Sequence[Patch], rows: Sequence[tuple[Tensor, Tensor]], grid: Grid, frames: int) -> Covariance:
     """From the residual's coefficients (n, K) and means (n,) of every patch."""
     products, counts = [], []
     for patch, (z, _) in zip(patches, rows, strict=True):
@@ -74,7 +72,11 @@ def estimate(
         weight = grid.root.double() ** 2 * grid.height * grid.width  # 1 or 2 real waves
         sums.index_add_(0, grid.bins, torch.einsum("ikc,jkc->kij", parts, parts))
         products.append(sums.unflatten(0, (grid.annuli, SECTORS)))
-        counts.append(torch.zeros(grid.annuli * SECTORS, dtype=torch.float64).index_add_(0, grid.bins, weight).unflatten(0, (grid.annuli, SECTORS)))
+        counts.append(
+            torch.zeros(grid.annuli * SECTORS, dtype=torch.float64)
+            .index_add_(0, grid.bins, weight)
+            .unflatten(0, (grid.annuli, SECTORS))
+        )
     share = [float(p.weight.square().mean()) for p in patches]
     total = torch.zeros(grid.annuli, dtype=torch.float64)
     number = torch.zeros(grid.annuli, dtype=torch.float64)
@@ -117,7 +119,9 @@ def estimate(
         common = o.sum(1, keepdim=True) / oc.sum(1, keepdim=True).clamp(min=1e-9)
         own = ((o + BORROWED * common) / (oc + BORROWED)).clamp(min=1e-3 * level[:, None])
         sizes = _unit_mean(fits)
-        model = Covariance((a / n_ar.clamp(min=1e-9)).clamp(min=0), (r / n_ar.clamp(min=1e-9)).clamp(min=0), own, 0.0, 0.0, 0.0)
+        model = Covariance(
+            (a / n_ar.clamp(min=1e-9)).clamp(min=0), (r / n_ar.clamp(min=1e-9)).clamp(min=0), own, 0.0, 0.0, 0.0
+        )
     _means(model, patches, [m.double() for _, m in rows])
     model.size, model.radius = sizes, grid.radius.tolist()
     return model
@@ -186,7 +190,9 @@ def texture(site: Site, chain: Chain, model: Covariance) -> Tensor:
 
 def _bend(chain: Chain, mask: Tensor) -> Tensor:
     image = chain.predict()
-    parts = [(t / image.clamp(min=1e-6) * mask).square().sum() / mask.sum().clamp(min=1) for t in chain.slope_tangents()]
+    parts = [
+        (t / image.clamp(min=1e-6) * mask).square().sum() / mask.sum().clamp(min=1) for t in chain.slope_tangents()
+    ]
     return torch.stack(parts).mean()
 
 

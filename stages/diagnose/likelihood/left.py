@@ -17,7 +17,9 @@ def budget(rows: list[Rows], model: Covariance, grid: Grid, before: float, after
     """Shares of the variance ``before`` anything was named; ``after`` is what is left. Sum 1."""
     waves = torch.bincount(grid.annulus, weights=grid.root.double() ** 2, minlength=grid.annuli)
     bend = torch.stack([(r.patch.slopes.double() @ grid.direction.double().T).square().mean() for r in rows]).mean()
-    common = float(((model.albedo + model.relief * bend) * waves).sum()) + (0.0 if rows[0].patch.free else model.mean_albedo)
+    common = float(((model.albedo + model.relief * bend) * waves).sum()) + (
+        0.0 if rows[0].patch.free else model.mean_albedo
+    )
     every = model.own.mean(1)
     floor = float(every.min())
     noise = floor * float(waves.sum())

@@ -60,9 +60,7 @@ def _factor(model: Covariance, patch: Patch, grid: Grid) -> Tensor:
     return torch.linalg.inv(lower).to(torch.complex64)
 
 
-def products(
-    rows: Rows, model: Covariance, grid: Grid, frames: int, shams: tuple[Tensor, Tensor] | None
-) -> Products:
+def products(rows: Rows, model: Covariance, grid: Grid, frames: int, shams: tuple[Tensor, Tensor] | None) -> Products:
     """shams : (R, n, K) and (R, n), whitened sham residuals."""
     patch = rows.patch
     n = len(patch.frames)
@@ -100,9 +98,7 @@ def products(
             own += torch.einsum("ai,ij,bj->aibj", rows.own_mean.double(), inverse, rows.own_mean.double())
     top = torch.cat([dense, cross.flatten(1)], 1)
     low = torch.cat([cross.flatten(1).T, own.reshape(k * n, k * n)], 1)
-    place = np.concatenate(
-        [np.arange(m), (m + np.arange(k)[:, None] * frames + patch.frames.numpy()[None]).flatten()]
-    )
+    place = np.concatenate([np.arange(m), (m + np.arange(k)[:, None] * frames + patch.frames.numpy()[None]).flatten()])
     sham, squares = np.zeros((len(place), 0)), np.zeros(0)
     if shams is not None:
         z, mean = shams

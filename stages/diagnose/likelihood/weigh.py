@@ -94,13 +94,18 @@ class Whole:
         Their scatter is estimated along the main directions in which they change the images (expectation-maximisation), and
         the amounts of each unit are integrated out.
         """
-        places = 1 + np.array([k for k, n in enumerate(self.plan.shared) if n.startswith("coefficient") and "albedo" not in n], dtype=np.int64)
+        places = 1 + np.array(
+            [k for k, n in enumerate(self.plan.shared) if n.startswith("coefficient") and "albedo" not in n],
+            dtype=np.int64,
+        )
         if not len(places):
             return
-        total = sum(u.gram[np.ix_(places, places)] for u in self.units)
+        total = np.sum([u.gram[np.ix_(places, places)] for u in self.units], 0)
         scale = 1 / np.sqrt(np.maximum(total.diagonal(), 1e-30))
-        power, axes = np.linalg.eigh(total * np.outer(scale, scale))
-        main = (scale[:, None] * axes[:, -DRIFTING:]) * math.sqrt(len(self.units))  # a unit's column has about unit information
+        _, axes = np.linalg.eigh(total * np.outer(scale, scale))
+        main = (scale[:, None] * axes[:, -DRIFTING:]) * math.sqrt(
+            len(self.units)
+        )  # a unit's column has about unit information
         reduced = [main.T @ u.gram[places] for u in self.units]
         spread = np.full(main.shape[1], 1.0)
         squares = [main.T @ u.gram[np.ix_(places, places)] @ main for u in self.units]
@@ -109,7 +114,9 @@ class Whole:
             posterior = [np.linalg.inv(g + np.diag(spread**-2)) for g in squares]
             weight = [np.eye(len(spread)) - g @ c for g, c in zip(squares, posterior, strict=True)]
             top = sum(w @ g for w, g in zip(weight, squares, strict=True))
-            mean = np.linalg.solve(top + 1e-9 * np.eye(len(top)), sum(w @ s for w, s in zip(weight, score, strict=True)))
+            mean = np.linalg.solve(
+                top + 1e-9 * np.eye(len(top)), sum(w @ s for w, s in zip(weight, score, strict=True))
+            )
             own = np.array([c @ (s - g @ mean) for c, g, s in zip(posterior, squares, score, strict=True)])
             variance = own**2 + np.array([c.diagonal() for c in posterior])
             spread = np.sqrt(np.maximum(variance.mean(0), 1e-8))
@@ -175,7 +182,9 @@ class Whole:
         for p in self.scattered:
             self.precision[int(p)] = max(spread, 1e-4) ** -2
 
-    def reduce(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array, Array, Array]:
+    def reduce(
+        self, places: NDArray[np.int64], exclude: Sequence[int] = ()
+    ) -> tuple[Array, Array, Array, NDArray[np.int64]]:
         """(information (J, J), score (J,), sham scores (J, R), nuisance) once the nuisance is fitted along."""
         n = self.nuisance([*places, *exclude])
         a = self.gram[np.ix_(n, n)] + np.diag(self.weight(n))
@@ -207,7 +216,9 @@ class Whole:
         inflation = max(1.0, float(null.mean()) / len(places)) if len(null) else 1.0
         error = np.sqrt(np.maximum(inverse.diagonal(), 0))
         surprises = _surprise(np.concatenate([[ratio], null]) / inflation, len(places))
-        found = Found(guise.effect, guise, amount, error, float(surprises[0]), alone=math.sqrt(max(ratio / inflation, 0.0)))
+        found = Found(
+            guise.effect, guise, amount, error, float(surprises[0]), alone=math.sqrt(max(ratio / inflation, 0.0))
+        )
         if len(self.scattered):
             beside, spread = self._beside_gains(places, self.exclude(guise))
             if beside / inflation > ratio / inflation:
@@ -238,10 +249,7 @@ class Whole:
         def ratio(squares: Array) -> tuple[Array, Array]:
             """Twice the log likelihood at the best level, and which it is; squares (J, R)."""
             every = np.stack(
-                [
-                    (squares / (power[:, None] + v**-2)).sum(0) - np.log1p(v * v * power).sum()
-                    for v in LEVELS
-                ]
+                [(squares / (power[:, None] + v**-2)).sum(0) - np.log1p(v * v * power).sum() for v in LEVELS]
             )
             return np.maximum(every.max(0), 0.0), every.argmax(0)
 
@@ -255,7 +263,9 @@ class Whole:
         found.alone = math.sqrt(float(best[0]))
         return found, null / 2 / math.log(10)
 
-    def held_out(self, places: NDArray[np.int64], exclude: Sequence[int] = (), spread: float = 0.0, scored: Whole | None = None) -> Array:
+    def held_out(
+        self, places: NDArray[np.int64], exclude: Sequence[int] = (), spread: float = 0.0, scored: Whole | None = None
+    ) -> Array:
         """(labels,) nats that the columns gain on ground that they and the nuisance were not fitted to.
 
         scored : products by which the gain is counted, these where None
@@ -307,7 +317,11 @@ def weigh_all(whole: Whole) -> tuple[dict[str, Found], Array]:
     best: dict[str, Found] = {}
     null: dict[str, Array] = {}
     for guise in whole.plan.guises:
-        if get_effect(guise.effect).never_named or not len(whole.places(guise)) or not whole.seen[whole.places(guise)].all():
+        if (
+            get_effect(guise.effect).never_named
+            or not len(whole.places(guise))
+            or not whole.seen[whole.places(guise)].all()
+        ):
             continue
         found, shams = whole.weigh(guise)
         e = guise.effect

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from schemas.errors import ArtefactError, RegistryError
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.sites import Site
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sampled import sampled_fit
+from stages.diagnose.model.sites import Site
 from stages.diagnose.settings import GRAZING, LIT_MARGIN
 from stages.effects import Effect
 from stages.physics.photometry import ReflectanceModel, get_model

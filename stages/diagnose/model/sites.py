@@ -91,8 +91,8 @@ def survey(sites: list[Site], frames: int, units: str) -> Survey:
     lit = bright[bright > 0.3 * bright.mean()] if len(bright) else torch.tensor([0.05])
     top = torch.quantile(bright, torch.tensor([0.9, 0.97, 0.99, 0.998])) if len(bright) else lit.repeat(4)
     terrain = [s.observation.elevation[:1] for s in sites]
-    columns = [s.observation.detector_sample for s in sites]
-    known = all(c is not None for c in columns)
+    columns = [c for s in sites if (c := s.observation.detector_sample) is not None]
+    known = len(columns) == len(sites)
     ends = (
         (min(float(c.nan_to_num(1e9).min()) for c in columns), max(float(c.nan_to_num(-1e9).max()) for c in columns))
         if known
@@ -104,7 +104,7 @@ def survey(sites: list[Site], frames: int, units: str) -> Survey:
         crop_px=int(min(first.elevation.shape[-2:])),
         gsd=first.gsd,
         brightness=float(lit.mean()),
-        brightness_quantiles=tuple(float(q) for q in top),
+        brightness_quantiles=(float(top[0]), float(top[1]), float(top[2]), float(top[3])),
         slope=_moments([fields.slope(z, first.gsd) for z in terrain]),
         elevation=_moments(terrain),
         curvature=_moments([fields.curvature(z, first.gsd) for z in terrain]),

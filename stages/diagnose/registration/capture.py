@@ -40,7 +40,9 @@ def correlation(image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, mos
     return torch.where(enough, top / below.clamp(min=1e-30).sqrt(), 0.0)
 
 
-def capture(image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, most: int, sigma: float) -> tuple[Tensor, Tensor]:
+def capture(
+    image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, most: int, sigma: float
+) -> tuple[Tensor, Tensor]:
     """Shift (n, 2) east and south, px, that brings each image over its rendering, and the correlation there, (n,)."""
     valid, lit = valid.float(), lit.float()
     map_ = correlation(fine(image, valid, sigma), valid, fine(rendered, lit, sigma), lit, most)

@@ -114,7 +114,10 @@ def captured(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect]) ->
 def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], frames: int, level: float) -> Registration:
     """Capture, fit every form, score each on held-out sites, and align the sites by the best; sites' ``displacement`` is set."""
     shifts = captured(sites, nominal, base)
-    known = [tuple(d[:, k, None, None].expand_as(s.image) for k in (0, 1)) for d, s in zip(shifts, sites, strict=True)]
+    known = [
+        (d[:, 0, None, None].expand_as(s.image), d[:, 1, None, None].expand_as(s.image))
+        for d, s in zip(shifts, sites, strict=True)
+    ]
     frame = _frame(sites)
     pieces = cuts(min(sites[0].image.shape[-2:]), len(sites))
     spread = max(float(torch.cat(shifts).square().mean().sqrt()), 0.3)
@@ -141,10 +144,15 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     pixels = sum(float(s.read_valid.sum()) for s in sites)
     by_name = {f.name: q for f, q in zip(FORMS, squares, strict=True)}
     rms = {k: math.sqrt(float(q.sum()) / max(pixels, 1.0)) for k, q in by_name.items()}
-    shifts = [torch.linalg.inv(m.gram[:, [0, len(TERMS)]][:, :, [0, len(TERMS)]] / CORRELATED + 1e-9 * torch.eye(2)) for m in matched]
+    shifts = [
+        torch.linalg.inv(m.gram[:, [0, len(TERMS)]][:, :, [0, len(TERMS)]] / CORRELATED + 1e-9 * torch.eye(2))
+        for m in matched
+    ]
     every = torch.cat([s.diagonal(dim1=1, dim2=2).sum(1) for s in shifts])
     shift_error = math.sqrt(float(every.median()) * frames / max(len(every), 1))
-    return Registration(form, coefficients, share, error, gains, leaning, known, frame, level, by_name, rms, shift_error)
+    return Registration(
+        form, coefficients, share, error, gains, leaning, known, frame, level, by_name, rms, shift_error
+    )
 
 
 def _frame(sites: Sequence[Site]) -> Frame:
@@ -179,10 +187,12 @@ def _own_shifts(matched: Sequence[Matched], fields, pieces: int) -> list[tuple[T
     fields = fields[::pieces]
     for k, (east, south) in enumerate(fields):
         own_parts = matched[k * pieces : (k + 1) * pieces]
-        gram = sum(m.gram for m in own_parts)[:, place[:, None], place] / CORRELATED
+        gram = torch.stack([m.gram for m in own_parts]).sum(0)[:, place[:, None], place] / CORRELATED
         # what the residual still asks for once the form is taken out
         at = torch.stack([east, south], 1).double().mean((-2, -1))
-        asks = sum(m.score for m in own_parts)[:, place] / CORRELATED - torch.einsum("nab,nb->na", gram, at)
+        asks = torch.stack([m.score for m in own_parts]).sum(0)[:, place] / CORRELATED - torch.einsum(
+            "nab,nb->na", gram, at
+        )
         parts.append((gram, asks))
     spread = 0.3
     for _ in range(6):

@@ -112,7 +112,7 @@ def match(
         1,
     ).flatten(2)
     out = []
-    for part in _parts(*image.shape[-2:], pieces):
+    for part in _parts(image.shape[-2], image.shape[-1], pieces):
         weighted = columns * (weight * part).flatten(1)[:, None]
         gram = (weighted @ columns.transpose(1, 2)).double()
         score = torch.einsum("npx,nx->np", weighted, target.flatten(1)).double()

@@ -113,7 +113,9 @@ class Answer:
         if not self.form:
             return self._finding()
         asked = self.config.get("model", "the model")
-        return f"The reflectance does not have the form of {asked}: {self.form} was fitted in its place. {self._finding()}"
+        return (
+            f"The reflectance does not have the form of {asked}: {self.form} was fitted in its place. {self._finding()}"
+        )
 
     def _finding(self) -> str:
         if self.note:

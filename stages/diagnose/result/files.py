@@ -35,8 +35,8 @@ def write_diagnosis(
                 sizes["site"] = len(data)
         else:
             entry["values"] = {k: float(v) + effect.in_simulation.get(k, 0.0) for k, v in effect.values.items()}
-        for variable, (data, dimension) in effect.curves().items():
-            tables[variable], sizes[dimension] = data, len(data)
+        for variable, (curve, dimension) in effect.curves().items():
+            tables[variable], sizes[dimension] = curve, len(curve)
         entries.append(entry)
     attributes = {"report": json.dumps(answer.to_json()), "extension": json.dumps(entries)}
     with ArtefactWriter(

@@ -14,6 +14,7 @@ from stages.diagnose.registration.explain import Registration
 from stages.diagnose.registration.forms import FORMS
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.state import State
+from stages.diagnose.settings import SURE
 from stages.effects import Survey, effect_names, get_effect
 from stages.effects.filters import gaussian
 
@@ -67,7 +68,7 @@ def _named(effect, parameters, percent: tuple[float, float, float], squares: tup
 
 
 def _leaning(state: State, r: Registration, name: str) -> Named | None:
-    if not r.form.leaning or not r.leaning.low > 0:
+    if not r.form.leaning or not r.leaning.low > 0 or abs(r.share) < SURE * r.share_error:
         return None
     effect = get_effect(name)({"share": r.share}, state.data)
     size = abs(r.share) * state.data.lean_px
@@ -76,7 +77,9 @@ def _leaning(state: State, r: Registration, name: str) -> Named | None:
         "rms_px": (size, r.share_error * state.data.lean_px, "px"),
     }
     plain = next(f for f in FORMS if f.terms == r.form.terms and not f.leaning)
-    return _named(effect, parameters, (r.leaning.percent, r.leaning.low, r.leaning.high), (r.rms[plain.name], r.rms[r.form.name]))
+    return _named(
+        effect, parameters, (r.leaning.percent, r.leaning.low, r.leaning.high), (r.rms[plain.name], r.rms[r.form.name])
+    )
 
 
 def _shifts(state: State, r: Registration, name: str) -> Named | None:
@@ -97,7 +100,12 @@ def _shifts(state: State, r: Registration, name: str) -> Named | None:
     size = cls.size(effect.values)
     if size < max(cls.tolerance.values()):
         return None
-    return _named(effect, {"rms_px": (size, r.shift_error, "px")}, (gain.percent, gain.low, gain.high), (r.rms[first.name], r.rms[form.name]))
+    return _named(
+        effect,
+        {"rms_px": (size, r.shift_error, "px")},
+        (gain.percent, gain.low, gain.high),
+        (r.rms[first.name], r.rms[form.name]),
+    )
 
 
 def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State], Named] | None:
@@ -111,7 +119,9 @@ def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State],
         level, error, gain = found
         for site in sites:
             near: Tensor = gaussian(torch.where(site.read_valid, site.read, 0.0), 1.0)
-            site.read_valid = site.read_valid & (site.read < cls.keep_below * level) & (near < cls.keep_below**3 * level)
+            site.read_valid = (
+                site.read_valid & (site.read < cls.keep_below * level) & (near < cls.keep_below**3 * level)
+            )
             site.valid = site.read_valid
 
         def make(data: Survey, state: State, cls=cls, level=level, error=error, gain=gain) -> Named:

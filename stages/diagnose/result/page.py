@@ -91,12 +91,17 @@ def _residuals(state: State, image_ids: Sequence[str]) -> str:
     first, last = _models(state, site)
     for row, k in zip(axes, np.linspace(0, site.count - 1, 3).round().astype(int), strict=True):
         mask = lit_mask(last)[k].numpy()
-        aligned, read = site.image[k].numpy(), ((site.read - site.offset[:, None, None]) / site.gain[:, None, None])[k].numpy()
+        aligned, read = (
+            site.image[k].numpy(),
+            ((site.read - site.offset[:, None, None]) / site.gain[:, None, None])[k].numpy(),
+        )
         simulated, bare = last.predict()[k].numpy(), first.predict()[k].numpy()
         level = float(np.mean(aligned[mask])) if mask.any() else 1.0
 
         def residual(image, model, mask=mask, level=level):
-            scale = float((image[mask] * model[mask]).sum() / max((model[mask] ** 2).sum(), 1e-20)) if mask.any() else 1.0
+            scale = (
+                float((image[mask] * model[mask]).sum() / max((model[mask] ** 2).sum(), 1e-20)) if mask.any() else 1.0
+            )
             return np.where(mask, 100 * (image - scale * model) / level, np.nan)
 
         before, after = residual(read, bare), residual(aligned, simulated)
@@ -143,8 +148,8 @@ def _binned(state: State) -> str:
         count = np.bincount(place, minlength=max(len(edges) - 1, 1))
         middle = np.bincount(place, x, minlength=len(count)) / np.maximum(count, 1)
         for label, r in zip(("before", "after"), left, strict=True):
-            mean = np.bincount(place, np.concatenate(r), minlength=len(count)) / np.maximum(count, 1)
-            axis.plot(middle[count > 0], 100 * mean[count > 0], ".-", label=label)
+            level = np.bincount(place, np.concatenate(r), minlength=len(count)) / np.maximum(count, 1)
+            axis.plot(middle[count > 0], 100 * level[count > 0], ".-", label=label)
         axis.axhline(0, color="0.6", lw=0.8)
         axis.set_xlabel(name)
     axes[0][0].set_ylabel("mean residual, %")

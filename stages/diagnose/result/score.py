@@ -47,7 +47,9 @@ def score(state: State, sites: Sequence[Site], answer: Answer) -> HeldOut:
     return HeldOut(pairs, len(sites), before.sum() / total, after.sum() / total, low, high)
 
 
-def _squares(site: Site, model: Nominal, effects: Sequence[Effect], image: torch.Tensor, mask: torch.Tensor, free: bool) -> float:
+def _squares(
+    site: Site, model: Nominal, effects: Sequence[Effect], image: torch.Tensor, mask: torch.Tensor, free: bool
+) -> float:
     site.image = image
     predicted = model.chain(site, effects).predict()
     if free:
@@ -81,7 +83,9 @@ def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
                 continue
             if guise.per_frame:
                 information, _, _, _ = whole.reduce(whole.places(guise))
-                error = min(error, float(1 / np.sqrt(max(np.median(information.diagonal()), 1e-12))) / math.sqrt(state.frames))
+                error = min(
+                    error, float(1 / np.sqrt(max(np.median(information.diagonal()), 1e-12))) / math.sqrt(state.frames)
+                )
                 continue
             information, _, _, _ = whole.reduce(whole.places(guise), whole.exclude(guise))
             for k, column in enumerate(guise.trial.columns):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.model.chain import Chain
-from stages.effects import Effect, Survey, Trial, get_effect
+from stages.effects import Survey, Trial, get_effect
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,9 @@ class Plan:
     prior: dict[int, float] = field(default_factory=dict)
     frame_prior: dict[int, float] = field(default_factory=dict)
     ordinary: dict[str, list[int]] = field(default_factory=dict)  # effect -> its columns among the nuisance
-    form: list[int] = field(default_factory=list)  # another form of the reflectance, beside effects that could stand for it
+    form: list[int] = field(
+        default_factory=list
+    )  # another form of the reflectance, beside effects that could stand for it
     guises: list[Guise] = field(default_factory=list)
     steps: list[tuple[int, str, float]] = field(default_factory=list)  # base effect, coordinate, step: tangents
 
@@ -94,7 +96,13 @@ def shared_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
     """
     tangents = chain.surface_tangents()
     bright = chain.site.texture - chain.site.texture.mean()
-    out = [chain.site.image - chain.predict(), *tangents, *(t * bright for t in tangents), *chain.form_tangents(), chain.unresolved_slopes()]
+    out = [
+        chain.site.image - chain.predict(),
+        *tangents,
+        *(t * bright for t in tangents),
+        *chain.form_tangents(),
+        chain.unresolved_slopes(),
+    ]
     for place, coordinate, step in plan.steps:
         effect = chain.base[place]
         moved = type(effect)({**effect.values, coordinate: float(effect.values[coordinate]) + step}, data)
@@ -121,7 +129,9 @@ def frame_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
             ((name, size),) = column.items()
             if guise.effect in base:
                 effect = chain.base[base[guise.effect]]
-                moved = chain.replace(base[guise.effect], cls({**effect.values, name: effect.values[name] + size}, data))
+                moved = chain.replace(
+                    base[guise.effect], cls({**effect.values, name: effect.values[name] + size}, data)
+                )
             else:
                 moved = chain.render(cls({name: torch.full((frames,), size)}, data))
             out.append((moved - chain.textured) * lit)

@@ -48,7 +48,7 @@ def make_grid(height: int, width: int) -> Grid:
     if width % 2 == 0:
         twice[:, -1] = 1.0
     radius = torch.hypot(kx, ky) * math.sqrt(height * width)  # waves per patch
-    keep = torch.nonzero((radius.flatten() > 0.5))[:, 0]
+    keep = torch.nonzero(radius.flatten() > 0.5)[:, 0]
     r = radius.flatten()[keep]
     edges = [1.5, 2.5, 4.0]
     while edges[-1] < float(r.max()):
@@ -100,7 +100,13 @@ class Patch:
         x = x - mean[..., None, None]
         if self.free:
             bright = self.level
-            x = x - ((x * bright * w).sum((-2, -1)) / (bright * bright * w).sum((-2, -1)).clamp(min=1e-9))[..., None, None] * bright
+            x = (
+                x
+                - ((x * bright * w).sum((-2, -1)) / (bright * bright * w).sum((-2, -1)).clamp(min=1e-9))[
+                    ..., None, None
+                ]
+                * bright
+            )
         z = torch.fft.rfft2(x * w).flatten(-2)[..., grid.keep] * grid.root
         return z, mean
 
@@ -145,7 +151,7 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
     """The pieces of one site that show enough pixels."""
     use = judged(chain)
     image = chain.predict()
-    count, height, width = image.shape
+    _, height, width = image.shape
     lit = lit_mask(chain)
     level = (image * lit).sum((-2, -1)) / lit.sum((-2, -1)).clamp(min=1)
     scale = torch.maximum(image, DARKEST * level[:, None, None]).clamp(min=1e-6)
@@ -169,7 +175,21 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
             bright = 1 / s
             bright = bright - ((bright * weight).sum((-2, -1)) / total)[:, None, None]
             frames = torch.from_numpy(chain.site.frames)[images]
-            out.append(Patch((number * pieces + i) * pieces + j, number, images, rows, columns, weight, s, slopes, bright, frames, free))
+            out.append(
+                Patch(
+                    (number * pieces + i) * pieces + j,
+                    number,
+                    images,
+                    rows,
+                    columns,
+                    weight,
+                    s,
+                    slopes,
+                    bright,
+                    frames,
+                    free,
+                )
+            )
     return out
 
 

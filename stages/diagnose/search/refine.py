@@ -8,7 +8,7 @@ import torch
 from stages.diagnose.search.state import Cause, State, View
 from stages.effects import Survey, get_effect
 
-STEPS = 4
+STEPS = 6
 SETTLED = 0.1
 
 
@@ -70,12 +70,14 @@ def _step(state: State, view: View, last: bool) -> float:
         for p in places:
             whole.precision[int(p)] = 1e-10 * whole.gram[p, p]
         alone = {c.effect.name: 0 for c in state.causes}
-        for (_, (place, name, _)), amount, error in zip([s for s, ok in zip(scene, seen, strict=True) if ok], amounts, errors, strict=True):
+        for (_, (place, name, _)), amount, error in zip(
+            [s for s, ok in zip(scene, seen, strict=True) if ok], amounts, errors, strict=True
+        ):
             cause = state.causes[place]
             cls = type(cause.effect)
             low, high = cls.bounds(name)
             now = float(cause.effect.values[name])
-            limit = 0.5 * max(abs(now - cls.null()[name]), 5 * cls.step(name, state.data))
+            limit = max(abs(now - cls.null()[name]), 10 * cls.step(name, state.data))
             moved = min(max(now + float(np.clip(amount, -limit, limit)), low), high)
             largest = max(largest, abs(moved - now) / max(error, 1e-12))
             effect = cls({**cause.effect.values, name: moved}, state.data)

@@ -15,7 +15,6 @@ from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
 from stages.diagnose.search.refine import as_effect, refine
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import DISCOVERY, SURE
-from stages.effects import get_effect
 
 TRIED = 8
 TRIES = 3
@@ -58,7 +57,10 @@ def search(state: State, most: int) -> Outcome:
         for f in tried:
             low, high = f.gain_interval()
             if f not in sure:
-                out.rejected[f.effect] = (f.gain, f"on ground that it was not fitted to it gains {f.gain:.0f} nats ({low:.0f} .. {high:.0f}), which may be nothing")
+                out.rejected[f.effect] = (
+                    f.gain,
+                    f"on ground that it was not fitted to it gains {f.gain:.0f} nats ({low:.0f} .. {high:.0f}), which may be nothing",
+                )
         if len(state.causes) >= most:
             break
         taken = False
@@ -134,9 +136,11 @@ def doubt(state: State, cause: Cause) -> str:
     values = {k: float(v) for k, v in cause.effect.values.items()}
     if not cls.plausible(values, state.data):
         return ODD
-    for name, error in cause.errors.items():
+    for name in cause.errors:
         low, high = cls.bounds(name)
-        if (abs(values[name] - low) < 1e-9 or abs(values[name] - high) < 1e-9) and cls.null()[name] not in (values[name],):
+        if (abs(values[name] - low) < 1e-9 or abs(values[name] - high) < 1e-9) and cls.null()[name] not in (
+            values[name],
+        ):
             return f"{ODD}: {name} ends at its bound of {values[name]:.3g}"
     sizes = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in cause.errors.items() if n not in cls.shaped]
     if math.sqrt(sum(s * s for s in sizes)) < SURE:
@@ -178,6 +182,8 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
     whole = Whole(added, plan, state.frames)
     for k in [k for k, n in enumerate(look.plan.shared) if n.startswith(cause.effect.name + ".")]:
         whole.precision.pop(1 + k, None)
+    first = look.whole.first
+    whole.precision |= {k + 1: v for k, v in look.whole.precision.items() if k >= first}  # one shared column more
     cause.rms_before, cause.rms_after = _rms(np.sum(plain, 0), look)
     if type(cause.effect).scope == "image" or len(cause.found.guise.columns) > 1:
         return cause.found.gains, float(whole.gram[0, 0])
