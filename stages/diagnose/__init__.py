@@ -48,7 +48,7 @@ from stages.diagnose.result.named import by_histogram, by_registration, by_searc
 from stages.diagnose.result.score import blind_effects, score
 from stages.diagnose.search.select import Outcome, search
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import MISFIT
+from stages.diagnose.settings import LINE, MISFIT
 from stages.effects import effect_names
 from stages.network.dataset import PairReader
 
@@ -166,7 +166,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     answer.budget = budget(view.rows, view.model, view.grid, before, after)
     line, share = peak(view.rows, view.model, view.grid, frames)
     answer.blind = blind_effects(state, outcome, {c.effect.name for c in answer.causes})
-    structure = line > 3
+    structure = line > LINE
     answer.unexplained_fraction = share if structure else 0.0
     if answer.causes:
         answer.verdict = "named"

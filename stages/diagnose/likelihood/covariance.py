@@ -19,10 +19,7 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import lit_mask
 from stages.diagnose.model.sites import Site
 from stages.diagnose.rows.patches import Grid, Patch
-from stages.diagnose.settings import DARKEST, ROUNDS, SECTORS
-
-BORROWED = 20.0
-ADDED = 50.0
+from stages.diagnose.settings import ADDED, BORROWED, DARKEST, ROUNDS, SECTORS
 
 
 @dataclass

@@ -10,7 +10,7 @@ from scipy.stats import gamma
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.products import Rows, whitened_residual
 from stages.diagnose.rows.patches import Grid
-from stages.diagnose.settings import CHANCE
+from stages.diagnose.settings import PEAK
 
 
 def budget(rows: list[Rows], model: Covariance, grid: Grid, before: float, after: float) -> dict[str, float]:
@@ -58,8 +58,8 @@ def peak(rows: list[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[
         middle = float(gamma.median(shape))
         chance = -float(gamma.logsf(top * middle, shape)) / math.log(10) - math.log10(len(ratio) * len(power))
         # neighbours share a wave through the window: what stands out by a little is no line
-        if top > CHANCE and chance > best:
-            best, largest = chance, float((p[fine] * (ratio > CHANCE)).sum() / p.sum())
+        if top > PEAK and chance > best:
+            best, largest = chance, float((p[fine] * (ratio > PEAK)).sum() / p.sum())
     return best, largest
 
 

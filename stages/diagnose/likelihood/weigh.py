@@ -15,12 +15,10 @@ from scipy.special import gammaincc, gammaln
 from stages.diagnose.likelihood.jackknife import FRACTION, jackknife_error, student
 from stages.diagnose.likelihood.products import Products
 from stages.diagnose.rows.columns import Guise, Plan
+from stages.diagnose.settings import DRIFTING, FOLDS, LEVELS
 from stages.effects import get_effect
 
 Array = NDArray[np.float64]
-FOLDS = 8
-DRIFTING = 4
-LEVELS = (0.03, 0.1, 0.3, 1.0, 3.0)
 
 
 @dataclass

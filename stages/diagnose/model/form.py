@@ -24,6 +24,8 @@ def relative_misfit(nominal: Nominal, sites: Sequence[Site], varied: bool = Fals
         if varied:
             level = light.sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
             light = (light - level[:, None, None]) * mask
+            size = site.gain[:, None, None].abs().double()  # as read: a gain fitted too low would blow both up
+            left, light = left * size, light * size
         return float(left.square().sum()), float(light.square().sum() if whole else light.sum()), float(mask.sum())
 
     left, light, count = (sum(x) for x in zip(*per_site(of, sites), strict=True))

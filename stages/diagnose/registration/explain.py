@@ -29,11 +29,9 @@ from stages.diagnose.registration.forms import (
     solve,
 )
 from stages.diagnose.rows.patches import cuts
-from stages.diagnose.settings import BROAD, CAPTURE, CORRELATED, SURE
+from stages.diagnose.settings import BROAD, CAPTURE, CORRELATED, FOLDS, SURE
 from stages.effects import Effect
 from stages.effects.relief_displacement import lean
-
-FOLDS = 8
 
 
 @dataclass

@@ -6,10 +6,8 @@ import numpy as np
 import torch
 
 from stages.diagnose.search.state import Cause, State, View
+from stages.diagnose.settings import SETTLED, STEPS
 from stages.effects import Survey, get_effect
-
-STEPS = 6
-SETTLED = 0.1
 
 
 def as_effect(found, data: Survey, frames: int, whole):

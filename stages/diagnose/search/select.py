@@ -14,13 +14,9 @@ from stages.diagnose.likelihood.products import products
 from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
 from stages.diagnose.search.refine import as_effect, refine
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.settings import DISCOVERY, SURE
+from stages.diagnose.settings import DISCOVERY, NOTABLE, SIMPLER, SURE, TRIED, TRIES
 
-TRIED = 8
-TRIES = 3
-NOTABLE = 0.01
 ODD = "nothing real has the values that fit best"
-SIMPLER = 0.8
 
 
 @dataclass
