@@ -32,7 +32,7 @@ def _images(file: h5py.File, change: Callable[[np.ndarray, int], np.ndarray]) ->
     data = file["image"][...].astype(float)
     frames = file["image_index"][...]
     for k in range(len(data)):
-        good = np.isfinite(data[k])
+        good = np.isfinite(data[k]) & (file["valid"][k] > 0)
         whole = np.where(good, data[k], np.nanmedian(data[k]) if good.any() else 0.0)
         data[k] = np.where(good, change(whole, int(frames[k])), data[k])
     file["image"][...] = data
@@ -41,6 +41,10 @@ def _images(file: h5py.File, change: Callable[[np.ndarray, int], np.ndarray]) ->
 def moved(file: h5py.File, frame: int, east: float, south: float) -> None:
     """One frame shows ground further east and south by so many pixels."""
     _images(file, lambda x, f: shift(x, (-south, -east), order=3, mode="nearest") if f == frame else x)
+    valid = file["valid"][...]
+    for k in np.flatnonzero(file["image_index"][...] == frame):
+        valid[k] = shift(valid[k].astype(float), (-south, -east), order=1, mode="constant") > 0.99
+    file["valid"][...] = valid
 
 
 def turned_sun(file: h5py.File, azimuth_deg: float, elevation_deg: float = 0.0) -> None:
