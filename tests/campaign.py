@@ -116,9 +116,9 @@ def strength(planted: Path, twin: Path, snr: float, model: str) -> tuple[float, 
     the test split.
     """
     import torch
-
     from stages.diagnose.data import group_pairs, load_site
     from stages.diagnose.nominal import fit, lit_mask, load_nominal
+
     from stages.pairs.reader import PairReader
 
     residuals, errors = [], []
