@@ -65,9 +65,9 @@ def refused(result, folder, before):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["ingest", "absent.tif"], "absent.tif: no such file"),
-        (["sample", "text.h5"], "another kind of file"),
-        (["project", "scene.h5"], "expected a 'crops'"),
+        (["ingest", "absent.tif", "-o", "x.h5"], "absent.tif: no such file"),
+        (["sample", "text.h5", "-o", "x.h5"], "another kind of file"),
+        (["project", "scene.h5", "-o", "x.h5"], "expected a 'crops'"),
         (["train", "crops.h5"], "expected a 'pairs'"),
         (["train", "pairs.h5", "--model", "M77"], "choose one of"),
         (["infer", "scene.h5", "pairs.h5"], "expected a 'checkpoint'"),
