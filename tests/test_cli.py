@@ -79,7 +79,7 @@ def refused(result, folder, before):
         (["merge", "crops.h5", "pairs.h5", "-o", "x.h5"], "expected a 'crops'"),
         (["inspect", "text.h5"], "another kind of file"),
         (["schema", "nothing"], "choose one of"),
-        (["ingest", "../nowhere/dem.tif", "--body", "pluto2"], "expected a radius"),
+        (["ingest", "../nowhere/dem.tif", "--body", "pluto2", "-o", "x.h5"], "expected a radius"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_3(small_artefacts, tmp_path, arguments, words):
