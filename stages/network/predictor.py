@@ -110,6 +110,7 @@ def first_misfit(error: BaseException) -> str:
     """What PyTorch says of the first weight that does not fit; its own first line only names a class."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
     text = lines[1] if len(lines) > 1 else lines[0]
+    text = text.replace(" in state_dict", "")
     return text if len(text) <= 160 else f"{text[:157]}..."
 
 
