@@ -75,9 +75,9 @@ TRUTH = declare(
             Variable("crater_age", ("crater",), "f4", "1", "0 = fresh, 1 = worn out: share of its size's lifetime"),
         ),
         attributes=(
-            Attribute("gsd_m", "ground sample distance of the working grid, m"),
-            Attribute("dem_gsd_m", "ground sample distance of the truth and of the DEM, m"),
-            Attribute("body_radius_m", "radius of the reference sphere, m"),
+            Attribute("gsd_m", "ground sample distance of the working grid, m", True, "number", 0.0),
+            Attribute("dem_gsd_m", "ground sample distance of the truth and of the DEM, m", True, "number", 0.0),
+            Attribute("body_radius_m", "radius of the reference sphere, m", True, "number", 0.0),
             Attribute("model", "the truth's reflectance model"),
             Attribute("parameters", "its constant parameters as JSON", kind="json"),
             Attribute("hidden", "JSON list of the planted effects with their parameters", kind="json list"),

@@ -259,7 +259,7 @@ def test_recipe_goes_round(tmp_path):
     [
         ({"size": 3}, ConfigError, "unknown key 'size'"),
         ({"size_px": "big"}, ConfigError, "'size_px': expected"),
-        ({"size_px": 8}, ConfigError, "at least 64"),
+        ({"size_px": 8}, ConfigError, "expected 64 .."),
         ({"gsd": 5.0, "dem_gsd": 2.0}, ConfigError, "whole multiple"),
         ({"incidence_deg": [40, 20]}, ConfigError, "low <= high"),
         ({"latitude_deg": 60, "incidence_deg": [20, 40]}, ConfigError, "never below"),

@@ -10,6 +10,7 @@ import h5py
 import torch
 
 from schemas.errors import ArtefactError
+from stages.network.maps import CoefficientMaps
 from stages.network.unet import UNet
 
 WIDEST, DEEPEST = 65536, 12  # channels of a stage, stages: beyond any network, and short of any machine's memory
@@ -34,11 +35,14 @@ def read_layout(path: Path, config: dict[str, Any], model: str) -> tuple[tuple[i
     return tuple(widths), tuple(dropout)
 
 
-def check_weights(path: Path, group: Any, outputs: int, widths: tuple[int, ...], dropout: tuple[float, ...]) -> None:
+def check_weights(
+    path: Path, group: Any, maps: CoefficientMaps, widths: tuple[int, ...], dropout: tuple[float, ...]
+) -> None:
     """Names, shapes and kinds of the stored arrays against the network's. Raises ArtefactError."""
     with torch.device("meta"):
-        net = UNet(outputs, widths, dropout)
-    expected = {f"net.{name}": tuple(value.shape) for name, value in net.state_dict().items()} | {"start": (outputs,)}
+        net = UNet(maps.channels, widths, dropout)
+    states = {"net": net.state_dict(), "maps": maps.state_dict()}
+    expected = {f"{part}.{name}": tuple(value.shape) for part, state in states.items() for name, value in state.items()}
     if not isinstance(group, h5py.Group):
         raise ArtefactError(
             f"{path}:/weights: expected the network's weights, found none; write it again with 'lunargr train'."
