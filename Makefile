@@ -11,7 +11,7 @@ LUNARGR := $(BIN)/lunargr
 STAMP := $(VENV)/.installed
 SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 
-.PHONY: help install demo demo-paper figures test test-slow fuzz endurance lint bench campaign docs vendor-js reproduce-apollo15 reproduce-models clean
+.PHONY: help install demo demo-paper figures test test-slow fuzz endurance lint bench campaign campaign-real docs vendor-js reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -49,6 +49,10 @@ bench: $(STAMP) ## speed and memory, each beside a named peer in the same run
 
 campaign: $(STAMP) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
 	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign
+
+# Pairs of real photographs; REGISTERED=pairs.h5 adds a registered set.
+campaign-real: $(STAMP) results/apollo15/diagnosis.h5 ## plant effects into real photographs and see what diagnose names (needs the reference data)
+	$(BIN)/python tests/planted.py --raw $(A)/stack.h5 $(if $(REGISTERED),--registered $(REGISTERED)) --seed $(or $(SEED),5) --output results/planted
 
 docs: $(STAMP) ## write the generated parts of docs/ again, and build the site in build/site
 	$(BIN)/python examples/cli_page.py
@@ -165,7 +169,7 @@ $(A)/pairs.h5: $(A)/crops.h5
 	$(LUNARGR) project $< --register field -o $@ --overwrite
 
 $(A)/checkpoint.h5: $(A)/pairs.h5
-	$(LUNARGR) train $< --epochs 6 --precision fp32 -o $@ --overwrite --resume
+	$(LUNARGR) train $< --model kernels --epochs 6 --precision fp32 -o $@ --overwrite --resume
 
 $(A)/svbrdf.h5: $(A)/scene.h5 $(A)/checkpoint.h5
 	$(LUNARGR) infer $^ -o $@ --overwrite

@@ -74,7 +74,6 @@ def guarded(command: Callable[..., None], *arguments: Any, **options: Any) -> It
     for path in (*files.read, *(path for _, path, _ in files.written)):
         _check_name(path)
     replace = bool(bound.arguments.get("overwrite") or bound.arguments.get("resume"))  # what is resumed, stages say
-    replace |= not all(os.path.exists(path) for path in files.read)  # a wrong input is said first
     with protect(files.read):
         targets = [Target(path, option) for option, path, _ in files.written]
         check_apart(targets)

@@ -353,6 +353,14 @@ PAIRS = declare(
     )
 )
 
+_IMAGE_NOISE = Attribute(
+    "image_noise",
+    "standard deviation of images, I/F, that errors of the maps do not explain; absent where it is not known",
+    False,
+    "number",
+    0.0,
+)
+
 CHECKPOINT = declare(
     Schema(
         name="checkpoint",
@@ -379,15 +387,28 @@ CHECKPOINT = declare(
                 kind="json list",
             ),
             Attribute("globals", "JSON: the other coefficients, the same everywhere, by name", kind="json"),
-            Attribute("positive", "1 = coefficients are kept nearly positive by LeakyReLU, 0 = within their bounds"),
-            Attribute("deviations", "1 = the network also gives the logarithm of each map's standard deviation"),
             Attribute(
-                "image_noise", "standard deviation of images, I/F, that errors of the maps do not explain; or NaN"
+                "positive",
+                "1 = coefficients are kept nearly positive by LeakyReLU, 0 = within their bounds",
+                True,
+                "integer",
+                0,
+                1,
             ),
+            Attribute(
+                "deviations",
+                "1 = the network also gives the logarithm of each map's standard deviation",
+                True,
+                "integer",
+                0,
+                1,
+            ),
+            _IMAGE_NOISE,
             Attribute(
                 "elevation_scale_m", "std of the crop-centred training elevations, m", True, "number", 1e-6, LARGEST_GSD
             ),
             *_PLACE,
+            Attribute("output_scale", "factor of the network's raw output", True, "number", 0.0, LARGEST_GSD),
             Attribute("image_units", "units of the training images", choices=("iof", "dn")),
             Attribute("best_epoch", "epoch whose weights are in /weights", True, "integer", 0, LARGEST_COUNT),
         ),
@@ -487,6 +508,7 @@ SVBRDF = declare(
         + (
             Attribute("model", "reflectance model"),
             Attribute("quantity", "what the model gives: I/F"),
+            _IMAGE_NOISE,
             Attribute("image_units", "units of the images that the map was trained on: 'iof' or 'dn'", required=False),
         ),
     )
@@ -550,6 +572,7 @@ DIAGNOSIS = declare(
             "frame": "source images",
             "axis": "east, south",
             "mode": "cosines of line jitter",
+            "field_term": "cosines of a frame's response over a crop",
             "column": "detector samples, evenly spaced from the first to the last",
             "site": "sites of the pairs, by their number there",
             "term": "cosines of an albedo pattern, down and across a crop, in the order of the effect's coordinates",
@@ -570,6 +593,14 @@ DIAGNOSIS = declare(
                 "f4",
                 "px",
                 "line_jitter: amplitudes of cosines 1..3 over the lines, east, then south",
+                required=False,
+            ),
+            Variable(
+                "frame_field",
+                ("frame", "field_term"),
+                "f4",
+                "1",
+                "frame_field: amplitudes of low cosines over a crop, relative to the response",
                 required=False,
             ),
             Variable("image_gain", ("frame",), "f4", "1", "image_gain: relative gain of the image", required=False),

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -58,7 +59,7 @@ class Config:
     schedule : 'constant' or 'cosine'
     """
 
-    model: str = "kernels"
+    model: str = "hapke"
     maps: tuple[str, ...] = ()
     positive: bool = False
     epochs: int = 20
@@ -372,14 +373,13 @@ def _write_checkpoint(output: Path, config: Config, training: Training, history:
     trained = set(reader.frame[reader.indices("train")].tolist())
     known = np.array([k in trained or reader.units == "iof" for k in range(len(reader.image_ids))])
     maps = predictor.maps
-    attributes = {
+    attributes: dict[str, Any] = {
         "model": predictor.model.name,
         "coefficients": json.dumps(maps.names),
         "maps": json.dumps(maps.maps),
         "globals": json.dumps({name: value.item() for name, value in maps.everywhere().items()}),
         "positive": np.int32(maps.positive),
         "deviations": np.int32(maps.channels > len(maps.maps)),
-        "image_noise": predictor.image_noise,
         "elevation_scale_m": predictor.elevation_scale,
         "output_scale": maps.output_scale,
         "gsd_m": reader.gsd,
@@ -389,6 +389,8 @@ def _write_checkpoint(output: Path, config: Config, training: Training, history:
         "start": json.dumps(training.start),
         "precision": training.precision,
     }
+    if math.isfinite(predictor.image_noise):
+        attributes["image_noise"] = predictor.image_noise
     sizes = {"epoch": len(history.train_loss), "frame": len(reader.image_ids)}
     with ArtefactWriter(
         output,

@@ -28,6 +28,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from hidden.drawn import drawn
 from hidden.laws import LAWS
 from hidden.scene import Layout, Scene, Truth, write_pairs
+from hidden.size import strength
 from hidden.worlds import WORLDS
 
 # effect -> parameters at full strength; weaker plants multiply the first one
@@ -87,14 +88,14 @@ def diagnose(path: Path) -> dict:
 def case(scene: Scene, effect: dict, seed: int, folder: Path, law: str = "linear", kind: str = "usual") -> dict:
     rng = np.random.default_rng((seed, 99))
     world = random_world(rng) | {"law": law} | WORLDS[kind][1]
-    path = write_pairs(folder / "pairs.h5", scene.make(Truth(effect=effect, **world), seed), scene.layout)
+    data = scene.make(Truth(effect=effect, **world), seed)
+    path = write_pairs(folder / "pairs.h5", data, scene.layout)
     started = time.perf_counter()
     found = diagnose(path)
     seconds = time.perf_counter() - started
     fid, possible = 0.0, None
     if effect:
-        twin = write_pairs(folder / "twin.h5", scene.make(Truth(**world), seed), scene.layout)
-        fid, possible = strength(path, twin, world["snr"], "M2" if law == "linear" else "hapke")
+        fid, possible = strength(data, scene.make(Truth(**world), seed), scene.layout.gsd)
     return {
         "seed": seed,
         "scene": scene.layout.seed,
@@ -107,43 +108,6 @@ def case(scene: Scene, effect: dict, seed: int, folder: Path, law: str = "linear
         "seconds": seconds,
         "answer": found,
     }
-
-
-def strength(planted: Path, twin: Path, snr: float, model: str) -> tuple[float, float]:
-    """What the effect leaves once nominal model and static texture are out, over the noise; and the gain of undoing it.
-
-    The twin is the same world, noise included, with nothing hidden. The gain is in percent of the mean squared error on
-    the test split.
-    """
-    import torch
-
-    from stages.diagnose.data import group_pairs, load_site
-    from stages.diagnose.nominal import fit, lit_mask, load_nominal
-    from stages.pairs.reader import PairReader
-
-    residuals, errors = [], []
-    for path in (planted, twin):
-        with PairReader(path) as reader, torch.no_grad():
-            train, test = np.flatnonzero(reader.split != 2), np.flatnonzero(reader.split == 2)
-            sites = [load_site(reader, g) for g in group_pairs(reader, train, 99)]
-            nominal = load_nominal(None, model, reader.units)
-            fit(nominal, sites, [], reader.units, [s.image for s in sites], start=True)
-            chains = [nominal.chain(s, []) for s in sites]
-            residuals.append([(c.site.image - c.predict(), lit_mask(c), c.predict()) for c in chains])
-            unseen = [nominal.chain(load_site(reader, g), []) for g in group_pairs(reader, test, 99)]
-            squares = [((c.site.image - c.predict())[lit_mask(c)]).double().square() for c in unseen]
-            errors.append(float(torch.cat(squares).mean()))
-    total, count = 0.0, 0
-    for (first, lit, level), (second, also, _) in zip(*residuals, strict=True):
-        mean = (level * lit).sum((-2, -1), keepdim=True) / lit.sum((-2, -1), keepdim=True).clamp(min=1)
-        noise = mean / snr * (0.8 * level / mean + 0.2).clamp(min=0.05).sqrt()
-        use = (lit & also) / noise
-        difference, texture = (first - second) * use, level * use
-        share = (difference * texture).sum(0) / texture.square().sum(0).clamp(min=1e-12)
-        difference = difference - share * texture
-        total += float(difference.double().square().sum())
-        count += int((use > 0).sum())
-    return float(np.sqrt(total / max(count, 1))), 100 * (1 - errors[1] / errors[0])
 
 
 def summarise(cases: list[dict]) -> str:
@@ -214,14 +178,14 @@ def summarise(cases: list[dict]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for effect in PLANTS:
-        for strength in sorted({_strength(c) for c in single if effect in c["planted"]}):
-            mine = [c for c in single if effect in c["planted"] and _strength(c) == strength]
+        for size in sorted({_strength(c) for c in single if effect in c["planted"]}):
+            mine = [c for c in single if effect in c["planted"] and _strength(c) == size]
             hit = [c for c in mine if _first(c) == effect]
             blind = sum(effect in c["answer"]["blind"] for c in mine)
             verdicts = ", ".join(f"{k} {v}" for k, v in Counter(c["answer"]["verdict"] for c in mine).items())
             fid = " ".join(f"{c['fid']:.2f}" for c in mine)
             lines.append(
-                f"| `{effect}` | {strength:.3g} | {fid} | {len(hit)} of {len(mine)} | {blind} | {verdicts} | {_ratio(effect, hit)} |"
+                f"| `{effect}` | {size:.3g} | {fid} | {len(hit)} of {len(mine)} | {blind} | {verdicts} | {_ratio(effect, hit)} |"
             )
     return "\n".join([*lines, *_by_world(cases)]) + "\n"
 
@@ -401,7 +365,11 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=None, help="effects; none for nulls alone")
     parser.add_argument("--draw", type=int, default=0, help="effects per scene, drawn from these; 0 for all")
     parser.add_argument(
-        "--laws", nargs="+", choices=tuple(LAWS), default=["linear"], help="of reflectance, one drawn per case"
+        "--laws",
+        nargs="+",
+        choices=tuple(LAWS),
+        default=[law for law in LAWS if law != "linear"],
+        help="of reflectance, one drawn per case; by default all but `linear`, which is a form of the program's",
     )
     parser.add_argument(
         "--worlds", nargs="+", choices=tuple(WORLDS), default=["usual"], help="one for each scene, in turn"
@@ -438,7 +406,7 @@ def _line(done: dict) -> str:
     answer = done["answer"]
     named = [(c["effect"], {k: p["value"] for k, p in c["parameters"].items()}) for c in answer["causes"]]
     return (
-        f"{done['world']:15s} {done['law']:13s} {','.join(done['planted']) or 'nothing':24s} -> {answer['verdict']:20s} {named} closest {answer['closest']} "
+        f"{done['world']:15s} {done['law']:13s} {','.join(done['planted']) or 'nothing':24s} -> {answer['verdict']:20s} {named} "
         f"blind {answer['blind']} fid {done['fid']:.3f} {done['seconds']:.1f} s"
     )
 

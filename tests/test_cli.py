@@ -66,9 +66,9 @@ def refused(result, folder, before):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["ingest", "absent.tif"], "absent.tif: no such file"),
-        (["sample", "text.h5"], "another kind of file"),
-        (["project", "scene.h5"], "expected a 'crops'"),
+        (["ingest", "absent.tif", "-o", "x.h5"], "absent.tif: no such file"),
+        (["sample", "text.h5", "-o", "x.h5"], "another kind of file"),
+        (["project", "scene.h5", "-o", "x.h5"], "expected a 'crops'"),
         (["train", "crops.h5"], "expected a 'pairs'"),
         (["train", "pairs.h5", "--model", "M77"], "choose one of"),
         (["infer", "scene.h5", "pairs.h5"], "expected a 'checkpoint'"),
@@ -80,7 +80,7 @@ def refused(result, folder, before):
         (["merge", "crops.h5", "pairs.h5", "-o", "x.h5"], "expected a 'crops'"),
         (["inspect", "text.h5"], "another kind of file"),
         (["schema", "nothing"], "choose one of"),
-        (["ingest", "../nowhere/dem.tif", "--body", "pluto2"], "expected a radius"),
+        (["ingest", "../nowhere/dem.tif", "--body", "pluto2", "-o", "x.h5"], "expected a radius"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_3(small_artefacts, tmp_path, arguments, words):

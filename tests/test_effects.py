@@ -41,6 +41,8 @@ CATALOGUE = [
     "column_pattern",
     "echo",
     "saturation",
+    "relief_displacement",
+    "frame_field",
 ]
 
 

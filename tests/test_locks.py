@@ -97,11 +97,11 @@ def test_parts_of_a_run_whose_driver_holds_the_lock_are_not_locked(tmp_path):
     assert (tmp_path / "x.h5").read_text() == "part"
 
 
-def _take(path, out):
+def _take(path, out, everyone_answered):
     try:
         with claim(path):
             out.put("got it")
-            time.sleep(1.0)
+            everyone_answered.wait(20)
     except ConfigError:
         out.put("refused")
 
@@ -111,11 +111,12 @@ def test_one_of_many_takes_over_a_stale_lock(tmp_path):
     dead.wait()
     write_lock(tmp_path / "x.h5", pid=dead.pid)
     context = multiprocessing.get_context("fork")
-    out = context.Queue()
-    many = [context.Process(target=_take, args=(tmp_path / "x.h5", out)) for _ in range(6)]
+    out, everyone_answered = context.Queue(), context.Event()
+    many = [context.Process(target=_take, args=(tmp_path / "x.h5", out, everyone_answered)) for _ in range(6)]
     for process in many:
         process.start()
     answers = sorted(out.get(timeout=20) for _ in many)
+    everyone_answered.set()
     for process in many:
         process.join()
     assert answers == ["got it"] + ["refused"] * 5

@@ -132,7 +132,9 @@ def test_impossible_requests_are_refused(small_artefacts, tmp_path):
         ({"tile_m": 100.0}, ConfigError, "at least one crop"),
         ({"crop": 40}, ConfigError, "multiple of 16"),
         ({"count": 5, "density": 1.0}, ConfigError, "one of the two"),
-        ({"count": 0}, ConfigError, "positive"),
+        ({"count": 0}, ConfigError, "--count: expected 1"),
+        ({"crop": 0}, ConfigError, "multiple of 16"),
+        ({"tile_m": float("nan")}, ConfigError, "--tile-m"),
         ({"crop": 320, "tile_m": 6400.0}, GeometryError, "no crop"),
     ]:
         with pytest.raises(kind, match=words):

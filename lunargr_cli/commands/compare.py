@@ -58,8 +58,6 @@ def command(
     from stages.physics.photometry import get_model
 
     console = Console(quiet)
-    if seeds < 1:
-        raise ConfigError(f"--seeds: expected at least 1, found {seeds}.")
     names = list(dict.fromkeys(get_model(name.strip()).name for name in models.split(",") if name.strip()))
     if len(names) < 2:
         raise ConfigError(f"--models: expected at least two models, found '{models}'.")

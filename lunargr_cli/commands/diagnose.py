@@ -59,7 +59,7 @@ def command(
     if pairs is None:
         raise ConfigError("diagnose: expected a file of pairs, found none; give pairs.h5, or --list.")
     from stages import diagnose
-    from stages.diagnose.answer import describe
+    from stages.diagnose.result.answer import describe
 
     chosen = tuple(name.strip() for name in free.split(",") if name.strip())
     config = diagnose.Config(model, chosen, most_causes, most_pairs=most_pairs, seed=seed)
@@ -76,21 +76,26 @@ def command(
         (
             c["effect"],
             describe(c["parameters"]),
-            f"{c['p_family_wise']:.1e}",
-            f"{c['gain_nats']:.0f} +- {c['gain_error']:.0f}",
-            f"{c['size_over_noise']:.3f}",
+            _percent(c["held_out_gain_percent"], c["held_out_low"], c["held_out_high"]),
             ", ".join(g for g in c["group"] if g != c["effect"]) or "-",
         )
         for c in answer["causes"]
     ]
     if rows:
-        console.table(
-            "causes", ("effect", "parameters", "p (family)", "gain, nats", "size / noise", "equally good"), rows
-        )
+        console.table("causes", ("effect", "parameters", "gain on held-out ground", "equally good"), rows)
+    if answer["budget"] and not quiet:
+        shares = ", ".join(f"{name.replace('_', ' ')} {100 * share:.0f} %" for name, share in answer["budget"].items())
+        write_out(f"Variance of the residual: {shares}.")
+    for r in answer["rejected"] if not quiet else ():
+        write_out(f"Not named: {r['effect']}, since {r['why']}.")
     if not quiet:
         write_out(f"{answer['verdict']}: {answer['sentence']}")
         if answer["blind"] and answer["verdict"] != "cannot_tell":
             write_out(f"These data could not show: {', '.join(answer['blind'])}.")
+
+
+def _percent(value: float | None, low: float | None, high: float | None) -> str:
+    return "-" if value is None or low is None or high is None else f"{value:.2g} % ({low:.2g} .. {high:.2g})"
 
 
 def _list(console) -> None:

@@ -16,7 +16,7 @@ def command(
     pairs: Annotated[Path, typer.Argument(help="pairs.h5 from 'lunargr project'.")],
     model: Annotated[
         str, typer.Option("--model", help="Reflectance model to predict; 'lunargr models' lists them.")
-    ] = "kernels",
+    ] = "hapke",
     maps: Annotated[
         str | None,
         typer.Option(

@@ -1,24 +1,31 @@
 """`lunargr diagnose`: what the simulation gets wrong, why, and what fixing it is worth.
 
-data         measured pairs by site                      chain        the forward model, rendered with small changes
-nominal      the model that is judged                    sampled      ... its start, from few pixels
-form         ... or one of another form                  judged       pixels clear of relief that the DEM lacks
-projection   texture and DEM error taken out, per pixel  columns      what effects add to images
-preparing    a site's weights, texture and slopes        statistics   products per cluster of pixels
-evidence     held-out gain and significance, scene-wide  images       effects with values per image
-relief       a DEM's scale and smoothing                 pattern      a broad albedo pattern
-plateau      highlights that are cut off                 looking      one look at all of that
-naming       what deserves a name after it               refining     the values that fit best
-contest      nearly equal candidates, each tried         gains        ... or what acts by image
-selection    name, refine, look again                    state        what is known so far
-parallel     sites side by side                          numbers      tails of distributions
-unexplained  what is left, what is not seen              answer       verdict, JSON, diagnosis.h5
-report       HTML
+One likelihood, in five steps, each a folder:
+
+model         The nominal simulation of every site, rendered again with small changes.
+registration  Where the images lie. Shifts of up to 8 px are captured by correlation with the rendering, then explained: by nothing, a
+              constant, an affine map or a smooth field per frame, with or without relief displacement. The simplest form that no other
+              beats on held-out sites wins.
+rows          Residuals relative to brightness, and what a little of everything would add to them, in windows on pieces of ground, as
+              Fourier coefficients. Deep shadow counts, shadow edges do not.
+likelihood    The covariance of the residuals, estimated from them by wavelength: albedo and relief that all images of a place share,
+              what each image has of its own, noise. One image of a place is enough, several tell the parts apart. Under it, generalised least squares
+              for every effect, along with the nominal coefficients (which may drift from place to place, by as much as they are seen
+              to), gains and shifts per frame, and ordinary amounts of other effects. Sham residuals, those of other ground
+              mirrored and shuffled, say how large the largest of all statistics is when nothing is there.
+search        The effect that gains most on held-out ground, if shams hardly do as well, is rendered at its values and everything is fitted
+              again. It is named if it is real (its own file says what is plausible and what is ordinary) and if its held-out gain is
+              above zero for sure. Then the next.
+result        What is named, how much of the residual is what, what was refused and why, what these data could not have shown.
+
+Whatever is special about one effect stands in its own file under ``stages/effects``; every number set by hand stands in ``settings.py``.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,23 +36,21 @@ import torch
 from schemas import ArtefactError, ConfigError, write_json
 from schemas.files.companions import companions_of
 from schemas.files.outputs import Target, check_outputs
-from stages.diagnose.answer import Answer, HeldOut, cause_json, held_out, parameters, write_diagnosis
-from stages.diagnose.chain import Chain
-from stages.diagnose.data import group_pairs, load_site, survey
-from stages.diagnose.form import first_form, richer_form
-from stages.diagnose.judged import LEAST, clear_and_lit
-from stages.diagnose.looking import Round
-from stages.diagnose.nominal import Nominal, fit, lit_mask, load_nominal
-from stages.diagnose.plateau import CLEAR_OF, KEEP_BELOW, plateau, saturated
-from stages.diagnose.refining import refine
-from stages.diagnose.selection import enough, search
-from stages.diagnose.state import Search
-from stages.diagnose.unexplained import Structure, blind_effects, measure
-from stages.effects import Effect, effect_names
+from stages.diagnose.likelihood.left import budget, peak
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.form import better_form, relative_misfit
+from stages.diagnose.model.nominal import fit, lit_mask, load_nominal
+from stages.diagnose.model.sites import Site, group_pairs, load_site, survey
+from stages.diagnose.registration.explain import explain
+from stages.diagnose.result.answer import Answer
+from stages.diagnose.result.files import write_diagnosis
+from stages.diagnose.result.named import by_histogram, by_registration, by_search
+from stages.diagnose.result.score import blind_effects, score
+from stages.diagnose.search.select import Outcome, search
+from stages.diagnose.search.state import State
+from stages.diagnose.settings import LINE, MISFIT
+from stages.effects import effect_names
 from stages.pairs.reader import PairReader
-
-HARM = 10.0  # percent by which unseen pairs may be predicted worse (the same texture in all images of few sites can do that)
-MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model says nothing about the images
 
 
 @dataclass(frozen=True)
@@ -57,16 +62,15 @@ class Config:
     most_causes: int = 4
     most_images: int = 16
     most_pairs: int = 384
-    most_sites: int = 64
+    most_sites: int = 128
     seed: int = 0
 
 
 @dataclass
 class Result:
     answer: Answer
-    search: Search | None
-    round: Round | None
-    structure: Structure | None
+    state: State | None
+    outcome: Outcome | None
 
 
 @torch.no_grad()
@@ -94,9 +98,9 @@ def run(
         if json_file is not None:
             write_json(json_file, result.answer.to_json())
         if report is not None:
-            from stages.diagnose.report import write_report
+            from stages.diagnose.result.page import write_page
 
-            write_report(report, result)
+            write_page(report, result.answer, result.state, image_ids)
     if output is not None:  # last: where it is, the others are
         write_diagnosis(output, result.answer, image_ids, inputs, overwrite)
     return result
@@ -110,97 +114,115 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
             "found none; write the pairs again with 'lunargr project'."
         )
     nominal = load_nominal(checkpoint, config.model, reader.units, config.free)
-    train, test = _split(reader)
-    groups = group_pairs(reader, train, config.most_images)
-    sites, used = [], 0
-    for members in groups:
-        if used and (used + len(members) > config.most_pairs or len(sites) >= config.most_sites):
-            break
-        sites.append(load_site(reader, members))
-        used += len(members)
+    train, test = split(reader)
+    sites = _load(reader, train, config)
     answer = Answer("cannot_tell", config={**dataclasses.asdict(config), "checkpoint": str(checkpoint or "")})
-    answer.pairs, answer.sites = used, len(sites)
+    answer.pairs, answer.sites = sum(s.count for s in sites), len(sites)
     answer.images = len({int(f) for s in sites for f in s.frames})
-    few = enough(sites) if sites else "no pairs to learn from"
-    if few:
-        answer.note, answer.blind = few, effect_names()
-        return Result(answer, None, None, None)
-    cut = None if reader.units == "dn" else plateau(sites)
-    for site in sites if cut is not None else []:
-        site.valid &= site.image < KEEP_BELOW * cut
-    measured, valid = [s.image for s in sites], [s.valid for s in sites]
-
-    def begin(nominal: Nominal) -> Search:
-        """The search at its start, with this nominal model."""
-        for site, image, mask in zip(sites, measured, valid, strict=True):
-            site.as_read(image, mask)
-        fit(nominal, sites, [], reader.units, measured, start=True)
-        if cut is not None:  # leaving out by the measured value alone would keep the dark half of the noise
-            for site in sites:
-                site.valid = site.valid & (nominal.chain(site, []).textured < CLEAR_OF * cut)
-            fit(nominal, sites, [], reader.units, measured)
-        data, clear = survey(sites, len(reader.image_ids)), [s.valid for s in sites]
-        has = frozenset({"sun_horizon"})
-        state = Search(
-            nominal, sites, data, len(reader.image_ids), reader.units, has, progress, measured=measured, valid=clear,
-            replaced=bool(answer.form),
-        )  # fmt: skip
-        if cut is not None:
-            state.causes.append(saturated(cut, data, sites))
-        return state
-
-    state = begin(nominal)
-    if not config.free and (form := first_form(state)):
-        say(f"{nominal.model.name} has the wrong form: {form} is fitted in its place")
-        answer.form, nominal = form, load_nominal(None, form, reader.units)
-        state = begin(nominal)
-    clear, lit = (sum(of) for of in zip(*state.each(clear_and_lit), strict=True))
-    share = clear / max(lit, 1.0)
-    if share < LEAST:
-        answer.blind = effect_names()
-        answer.note = (
-            f"the Sun is too low over this ground: {100 * share:.0f} % of the lit pixels lie in images that see most of their lit ground "
-            f"clear of its own slopes, {100 * LEAST:.0f} % are needed; add images with a higher Sun"
-        )
-        return Result(answer, state, None, None)
-    misfit = _misfit(state)
+    if not sites:
+        answer.note, answer.blind = "too few pixels of the pairs show lit ground", effect_names()
+        return Result(answer, None, None)
+    frames, units = len(reader.image_ids), reader.units
+    cut = by_histogram(sites, units)
+    fit(nominal, sites, [], units, [s.read for s in sites], start=True)
+    if not config.free and (other := better_form(nominal, sites, units)):
+        answer.form, nominal = other.model.name, other
+        say(f"{config.model} has the wrong form: {answer.form} is fitted in its place")
+        fit(nominal, sites, [], units, [s.read for s in sites])
+    data = survey(sites, frames, units)
+    state = State(
+        nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, say=say, progress=progress
+    )
+    state.reference = copy.copy(nominal)
+    before = _residual(state)
+    if not before > 0:
+        answer.note, answer.blind = "too few pixels of the pairs show fully lit ground", effect_names()
+        return Result(answer, state, None)
+    progress(1, 5, "registration")
+    state.registration = explain(sites, nominal, [], frames, data.elevation[0])
+    if state.registration.form.name != "none":
+        for site, known in zip(sites, state.registration.known, strict=True):
+            site.displacement = known
+    state.fit()
+    misfit = relative_misfit(nominal, sites, varied=units == "dn", whole=True) * (0.5 if units == "dn" else 1.0)
     if not misfit < MISFIT:
         answer.verdict, answer.unexplained_fraction = "unexplained", 1.0
         answer.note = (
-            f"the nominal model does not fit at all: its residual has {100 * misfit:.0f} % of the images' own variation about "
-            "zero; check units, Sun direction and registration before any cause is sought"
+            f"the nominal model does not fit at all: its residual has {100 * misfit:.0f} % of the images' own signal; "
+            "check units, Sun direction and registration before any cause is sought"
         )
-        return Result(answer, state, None, None)
-    seen = search(state, config.most_causes, say)
-    structure = measure(seen.works)
-    while form := state.form or richer_form(state, seen, _unexplained(state, structure) > 0.5):
-        say(f"{nominal.model.name} has the wrong form: {form} alone explains more")
-        answer.form, nominal = form, load_nominal(None, form, reader.units)
-        state = begin(nominal)
-        seen = search(state, config.most_causes, say)
-        structure = measure(seen.works)
-    state.restore()
-    _decide(answer, state, seen, structure)
-    hidden = [load_site(reader, g) for g in group_pairs(reader, test, config.most_images)[:64]]
-    tiles = [reader.tile[s.pairs] for s in hidden]
-    effects = [c.effect for c in answer.causes]
-    # shifts that are ordinary, and no cause, are taken out under both models
-    shifts = [] if state.aligned is None or any(e.name == state.aligned.name for e in effects) else [state.aligned]
-    for site in hidden if cut is not None else []:
-        site.valid &= site.image < KEEP_BELOW * cut
-
-    def score(causes: list[Effect]) -> HeldOut:
-        models = (state.reference, nominal if causes else state.reference)
-        return held_out(hidden, tiles, models, (shifts, [*causes, *shifts]), state.dn, config.seed)
-
-    answer.held_out = score(effects)
-    while answer.causes and answer.held_out.high < -HARM:  # what predicts unseen ground worse explains nothing
-        _withdraw_last(answer, state)
-        answer.held_out = score([c.effect for c in answer.causes])
-    return Result(answer, state, seen, structure)
+        return Result(answer, state, None)
+    progress(2, 5, "search")
+    outcome = search(state, config.most_causes)
+    answer.causes = by_registration(state) + by_search(state) + ([cut(data, state)] if cut else [])
+    answer.rejected = outcome.rejected
+    if state.registration is not None:
+        answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}
+    view = outcome.view
+    assert view is not None
+    after = _residual(state)
+    answer.budget = budget(view.rows, view.model, view.grid, before, after)
+    line, share = peak(view.rows, view.model, view.grid, frames)
+    answer.blind = blind_effects(state, outcome, {c.effect.name for c in answer.causes})
+    structure = line > LINE
+    answer.unexplained_fraction = share if structure else 0.0
+    if answer.causes:
+        answer.verdict = "named"
+    elif structure or outcome.sure:
+        answer.verdict = "unexplained"
+        answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)
+    else:
+        answer.verdict = "cannot_tell" if answer.blind else "nothing_significant"
+    hidden = _load(reader, test, dataclasses.replace(config, most_sites=64))
+    answer.held_out = score(state, hidden, answer)
+    return Result(answer, state, outcome)
 
 
-def _split(reader: PairReader) -> tuple[np.ndarray, np.ndarray]:
+def _load(reader: PairReader, pairs: np.ndarray, config: Config) -> list[Site]:
+    sites: list[Site] = []
+    used = 0
+    for members in group_pairs(reader, pairs, config.most_images):
+        if used and (used + len(members) > config.most_pairs or len(sites) >= config.most_sites):
+            break
+        site = load_site(reader, members)
+        if site is not None:
+            sites.append(site)
+            used += site.count
+    return sites
+
+
+def _residual(state: State) -> float:
+    """Mean square of the relative residual in the windows."""
+    from stages.diagnose.rows.patches import make_patches
+
+    grid, pieces = state.grid()
+    total, count = 0.0, 0.0
+    for k, chain in enumerate(state.chains()):
+        residual = (chain.site.image - chain.predict())[None]
+        if (
+            state.free_gains
+        ):  # relative to the image as it was read: a gain that is fitted too low would blow residuals up
+            residual = residual * _as_read(chain)
+        for patch in make_patches(k, chain, pieces, state.free_gains):
+            z, mean = patch.transform(residual, grid)
+            total += float((z.real.square() + z.imag.square()).sum())
+            area = patch.weight.square().sum((-2, -1))
+            if not patch.free:
+                total += float((mean.square() * area).sum())
+            count += float(area.sum())
+    return total / count if count else math.nan
+
+
+def _as_read(chain: Chain) -> torch.Tensor:
+    """(n, 1, 1) by which a residual over the prediction's mean gets one over the read image's mean."""
+    site = chain.site
+    lit = lit_mask(chain).float()
+    count = lit.sum((-2, -1)).clamp(min=1)
+    ratio = (chain.predict() * lit).sum((-2, -1)) / count * site.gain.abs()
+    return (ratio / ((site.read * lit).sum((-2, -1)) / count).clamp(min=1e-9))[:, None, None]
+
+
+def split(reader: PairReader) -> tuple[np.ndarray, np.ndarray]:
     """Pairs to learn from and pairs to score: the test split, or the last of at least three sites."""
     test = np.flatnonzero(reader.split == 2)
     train = np.flatnonzero(reader.split != 2)
@@ -214,65 +236,4 @@ def _split(reader: PairReader) -> tuple[np.ndarray, np.ndarray]:
     return everything, everything[:0]
 
 
-def _misfit(state: Search) -> float:
-    """rms residual over rms signal on fully lit pixels."""
-
-    def of(chain: Chain) -> tuple[float, float]:
-        mask, image = lit_mask(chain), chain.site.image
-        level = torch.zeros(len(image))
-        if state.dn:  # the free offset takes the mean: only variation counts
-            level = (image * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
-        varied = (image - level[:, None, None]) * mask
-        left = (image - chain.predict()) * mask
-        return float(varied.double().square().sum()), float(left.double().square().sum())
-
-    signal, residual = (sum(x) for x in zip(*state.each(of), strict=True))
-    ratio = (residual / signal) ** 0.5 if signal > 0 else float("inf")
-    return ratio * (0.5 if state.dn else 1.0)  # film and texture: half of the variation may stay and say something
-
-
-def _decide(answer: Answer, state: Search, seen: Round, structure: Structure) -> None:
-    """The verdict from what was named, what is left and what could not be seen."""
-    answer.blind = blind_effects(state, seen)
-    answer.unexplained_fraction = _unexplained(state, structure)
-    if answer.unexplained_fraction > 0.5:
-        answer.verdict = "unexplained"
-        ranked = sorted(seen.best.values(), key=lambda e: -e.gain)
-        answer.closest = [c.effect.name for c in state.causes] or [e.effect for e in ranked[:1]]
-    elif state.causes:
-        answer.verdict = "named"
-        answer.causes = list(state.causes)
-    elif answer.blind:
-        answer.verdict = "cannot_tell"
-    else:
-        answer.verdict = "nothing_significant"
-
-
-def _unexplained(state: Search, structure: Structure) -> float:
-    """Share of what the nominal model misses that no named cause explains; 0 where nothing more than noise is left."""
-    explained = sum(c.fid**2 for c in state.causes)
-    left = structure.largest**2 if structure.present else 0.0
-    if structure.present and structure.largest**2 < 1e-3:
-        left = 1e-3 * structure.peak
-    return left / (left + explained) if left > 0 else 0.0
-
-
-def _withdraw_last(answer: Answer, state: Search) -> None:
-    """Take the cause named last out of the model and of the answer; what it stood for is unexplained."""
-    names = [c.effect.name for c in answer.causes]
-    explained = sum(c.fid**2 for c in state.causes)
-    unexplained = explained * answer.unexplained_fraction / max(1 - answer.unexplained_fraction, 1e-9)
-    unexplained += state.causes.pop().fid ** 2
-    explained = sum(c.fid**2 for c in state.causes)
-    if state.causes:
-        refine(state)
-    else:
-        state.fit()
-    state.restore()
-    answer.causes = list(state.causes)
-    answer.unexplained_fraction = unexplained / (unexplained + explained)
-    if explained < unexplained:
-        answer.verdict, answer.closest, answer.causes = "unexplained", names, []
-
-
-__all__ = ["Answer", "Config", "Result", "cause_json", "diagnose", "parameters", "run"]
+__all__ = ["Answer", "Config", "Result", "diagnose", "run"]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import torch
+
 from stages.effects.base import Effect, register
 from stages.effects.fields import cosine_field
 from stages.physics.formation.chain import State
@@ -19,6 +21,7 @@ class AlbedoMap(Effect):
     channel = "albedo"
     linear = True
     scope = "site"
+    table = ("site_albedo", "term")
     title = "broad albedo pattern (rays, mare borders)"
     mechanism = (
         "Crater rays, swirls and mare borders change albedo over tens of pixels without a trace in the terrain: a low-order cosine "
@@ -34,7 +37,7 @@ class AlbedoMap(Effect):
 
     def apply(self, state: State) -> None:
         height, width = state.elevation.shape[-2:]
-        factor = 1.0
+        factor = torch.ones(height, width)
         for m, n in ORDERS:
             factor = factor + self.value(f"c{m}{n}", state) * cosine_field((m, n), height, width)
         state.reflectance = state.reflectance * factor

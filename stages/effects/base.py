@@ -33,6 +33,8 @@ class Survey:
     curvature: tuple[float, float] = (0.0, 1.0)  # of the Laplacian after a 2 px blur, 1/m
     relief: float = 100.0  # largest range of heights in a crop, m
     columns: tuple[float, float] = (0.0, 127.0)  # first and last detector sample
+    lean_px: float = 0.0  # rms of h tan(emission), heights from their mean
+    units: str = "iof"
     has_detector: bool = False
     frames: int = 1
     sites: int = 1
@@ -42,7 +44,8 @@ class Survey:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Survey:
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+        return cls(**values)
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,14 @@ class Effect(ABC):
     relative     whether its values per image are known against the other images only: what all share is the ground's
     in_simulation  what a coordinate gets added in the extended model: `diagnose` judges with slopes of fourth order,
                  while the simulation's smooth the ground by about a quarter of a squared pixel themselves
+    shaped       coordinates that guises step through and that stay free once the effect is named
+    always       an effect with values per image that all images have a little of: its ordinary size, in multiples of ``strong``
+    scatters     ... whose ordinary size is estimated from the data
+    never_named  judged by a step of its own: registration, or a histogram
+    leans        ... and displaces relief by its height, not images as a whole
+    keep_below   what is brighter than this times a level that was read off says nothing more
+    beside_form  another form of the reflectance, which looks like it, is fitted along (each kernel within 2 % of the brightness)
+    table        where values per image (or site) stand in diagnosis.h5, and the name of their second dimension
     linear       whether the image is linear in the coordinates: the first estimate needs no second one
     """
 
@@ -91,6 +102,14 @@ class Effect(ABC):
     relative: ClassVar[bool] = False
     linear: ClassVar[bool] = False
     in_simulation: ClassVar[Mapping[str, float]] = {}
+    shaped: ClassVar[tuple[str, ...]] = ()
+    always: ClassVar[float] = 0.0
+    scatters: ClassVar[bool] = False
+    never_named: ClassVar[bool] = False
+    leans: ClassVar[bool] = False
+    beside_form: ClassVar[bool] = False
+    keep_below: ClassVar[float] = 1.0
+    table: ClassVar[tuple[str, str | None] | None] = None
 
     def __init__(self, values: Mapping[str, Any] | None = None, survey: Survey | None = None) -> None:
         self.values: Values = {**self.null(), **(values or {})}
@@ -120,14 +139,53 @@ class Effect(ABC):
         return True
 
     @classmethod
+    def step(cls, name: str, survey: Survey) -> float:
+        """A small change of a coordinate, for finite differences: a tenth of a realistic one."""
+        for trial in cls.trials(survey):
+            for column in trial.columns:
+                if name in column:
+                    return 0.1 * abs(column[name] - cls.null()[name]) or 1e-3
+        parameter = next(p for p in cls.fitted() if p.name == name)
+        return max(0.05 * abs(parameter.default), 1e-3 * (parameter.upper - parameter.lower))
+
+    @classmethod
+    def ordinary(cls, trial: Trial) -> float:
+        """How much of the trial every real data set has, in multiples of its columns; 0: none that is known."""
+        sizes = [
+            cls.tolerance[name] / abs(value - cls.null()[name])
+            for column in trial.columns
+            for name, value in column.items()
+            if name in cls.tolerance and value != cls.null()[name]
+        ]
+        return max(sizes, default=0.0)
+
+    @classmethod
+    def read_off(cls, bright: Tensor) -> tuple[float, float, float] | None:
+        """(value, error, nats) of an effect that shows in the histogram of all pixels itself, or None."""
+        return None
+
+    @classmethod
     def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
         """Whether anything real has these values; a fit that ends elsewhere stands for something else."""
         return True
 
     @classmethod
+    def size(cls, values: Mapping[str, Any]) -> float:
+        """One number for all values: of many, the root of the mean over frames of their sum of squares."""
+        table = torch.stack([torch.as_tensor(v, dtype=torch.float64) for v in values.values()])
+        if table.ndim == 1:
+            return float(table.square().sum().sqrt())
+        seen = table.abs().sum(0) > 0
+        return float(table[:, seen].square().sum(0).mean().sqrt()) if bool(seen.any()) else 0.0
+
+    @classmethod
     def report(cls, values: Mapping[str, float], errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
         """Reported parameter -> (value, standard error), from the fitted coordinates (of scene scope)."""
         return {p.name: (values[p.name], errors.get(p.name, 0.0)) for p in cls.parameters}
+
+    def curves(self) -> dict[str, tuple[Tensor, str]]:
+        """Variable of diagnosis.h5 -> a curve that shows the effect, and its dimension."""
+        return {}
 
     @classmethod
     def bounds(cls, name: str) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -36,7 +37,18 @@ class ColumnPattern(Effect):
     def response(self, count: int) -> Tensor:
         """Response at ``count`` samples from the first to the last column, (count,)."""
         u = (torch.arange(count) + 0.5) / count
-        return 1 + sum(float(self.values[f"c{k}"]) * (math.sqrt(2) * torch.cos(math.pi * k * u)) for k in ORDERS)
+        return torch.ones(count) + sum(
+            float(self.values[f"c{k}"]) * (math.sqrt(2) * torch.cos(math.pi * k * u)) for k in ORDERS
+        )
+
+    def curves(self) -> dict[str, tuple[Tensor, str]]:
+        return {"column_response": (self.response(256), "column")}
+
+    @classmethod
+    def report(cls, values: Mapping[str, float], errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+        size = math.sqrt(sum(v * v for v in values.values()))
+        error = math.sqrt(sum((v * errors.get(k, 0.0)) ** 2 for k, v in values.items())) / max(size, 1e-12)
+        return {"rms": (size, error)}
 
     def columns(self, state: State) -> Tensor:
         sample = state.observation.detector_sample
@@ -47,7 +59,7 @@ class ColumnPattern(Effect):
     def apply(self, state: State) -> None:
         first, last = self.survey.columns
         u = ((self.columns(state) - first + 0.5) / max(last - first + 1, 1)).clamp(0, 1)
-        factor = 1.0
+        factor = torch.ones_like(state.image)
         for k in ORDERS:
             factor = factor + self.value(f"c{k}", state) * (math.sqrt(2) * torch.cos(math.pi * k * u))
         state.image = state.image * factor

@@ -57,6 +57,11 @@ class Earthshine(Effect):
             "azimuth_deg": (math.degrees(math.atan2(vector[0], vector[1])) % 360, turn * safe / max(level, 1e-12)),
         }
 
+    @classmethod
+    def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
+        """A source above the horizon."""
+        return values["up"] > 0
+
     def apply(self, state: State) -> None:
         state.further_light.append(self._shine)
 

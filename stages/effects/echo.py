@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -46,6 +47,11 @@ class Echo(Effect):
             for lag in lags
             for sign in (1, -1)
         ]
+
+    @classmethod
+    def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
+        """Nearer, an echo is not told from blur and soft shadows."""
+        return abs(values["lag_px"]) >= CLEAR_LAG
 
     def apply(self, state: State) -> None:
         observation = state.observation

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from stages.effects.base import Effect, register
+from stages.effects.base import Effect, Survey, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
@@ -14,6 +14,10 @@ class ImageGain(Effect):
     name = "image_gain"
     slot = "radiance"
     scope = "image"
+    table = ("image_gain", None)
+    always = 0.5
+    scatters = True
+    beside_form = True
     title = "calibration scale of single images"
     mechanism = (
         "Exposure, temperature and decay of the detector leave every image with its own scale error. Images in dn have a free "
@@ -25,6 +29,10 @@ class ImageGain(Effect):
     parameters = (Parameter("rms", "1", 0.0, 1.0, 0.0, "rms of the gains about their mean"),)
     coordinates = (Parameter("gain", "1", -0.9, 4.0, 0.0, "relative gain of an image"),)
     strong: ClassVar = {"gain": 0.02}
+
+    @classmethod
+    def visible(cls, survey: Survey, has: frozenset[str]) -> bool:
+        return survey.units == "iof"
 
     def apply(self, state: State) -> None:
         state.radiance = state.radiance * (1 + self.value("gain", state))

@@ -19,6 +19,7 @@ class LineJitter(Effect):
     name = "line_jitter"
     slot = "geometry"
     scope = "image"
+    table = ("line_jitter_px", "mode")
     displaces = True
     relative = True
     title = "lines shifted against each other"
@@ -41,7 +42,8 @@ class LineJitter(Effect):
     def apply(self, state: State) -> None:
         height = state.elevation.shape[-2]
         u = (torch.arange(height, dtype=state.elevation.dtype) + 0.5) / height
-        east, south = state.displacement or (0.0, 0.0)
+        none = torch.zeros(())
+        east, south = state.displacement or (none, none)
         for k in ORDERS:
             wave = math.sqrt(2) * torch.cos(math.pi * k * u)[:, None]
             east = east + self.value(f"east{k}_px", state) * wave

@@ -14,6 +14,10 @@ class Misregistration(Effect):
     name = "misregistration"
     slot = "geometry"
     scope = "image"
+    table = ("image_shift_px", "axis")
+    always = 0.2
+    scatters = True
+    never_named = True
     displaces = True
     title = "image shifted against the DEM"
     mechanism = (

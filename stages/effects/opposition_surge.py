@@ -28,6 +28,7 @@ class OppositionSurge(Effect):
         Parameter("h", "1", 0.005, 0.5, 0.06, "angular width, as tan(g/2)"),
     )
     strong: ClassVar = {"B0": 1.0}
+    shaped = ("h",)
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -5,16 +5,22 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
+
+PILE = 150  # pixels
+STANDS_OUT = 3.0  # times the bins (2 %) below
 
 
 @register
 class Saturation(Effect):
     name = "saturation"
     slot = "sensor"
+    never_named = True
+    keep_below = 0.97
     title = "saturation"
     mechanism = (
         "The full well or the converter's last step cuts the signal off: nothing brighter than a level is recorded."
@@ -28,6 +34,28 @@ class Saturation(Effect):
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
         return [Trial(({"iof": q},)) for q in survey.brightness_quantiles]
+
+    @classmethod
+    def read_off(cls, bright: Tensor) -> tuple[float, float, float] | None:
+        """Level, its error and the gain in nats, where pixels pile up at one level that none exceeds; bright : (N,) valid pixels."""
+        if len(bright) < 1000:
+            return None
+        top = float(bright.kthvalue(max(1, int(0.9995 * len(bright)))).values)
+        if top <= 0:
+            return None
+        edges = top * 1.02 ** torch.arange(-16.0, 4.0)
+        counts = torch.histogram(bright, edges)[0]
+        best = int(counts[6:].argmax()) + 6
+        before = counts[max(best - 5, 0) : best - 1].mean()
+        above = float(counts[best + 2 :].sum())
+        # resampling rings a little over the level, noise added later blurs it: the pile is three bins wide
+        pile = float(counts[best - 1 : best + 2].sum())
+        if pile < PILE or counts[best] < STANDS_OUT * before or above > 0.05 * pile:
+            return None
+        inside = (bright > edges[best]) & (bright < edges[best + 1])
+        level = float(bright[inside].median())
+        # an unbent histogram would hold a quarter of the pile in its last bin
+        return level, 0.005 * level, 1.386 * int((bright >= cls.keep_below * level).sum())
 
     def apply(self, state: State) -> None:
         state.image = torch.minimum(state.image, self.value("iof", state))

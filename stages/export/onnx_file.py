@@ -53,8 +53,8 @@ class _Exported(torch.nn.Module):
 
     def forward(self, elevation: Tensor) -> Tensor:
         keys = elevation.new_empty(0, dtype=torch.int64)
-        raw = self.net.plain(scale_elevation(elevation, self.elevation_scale), keys)
-        return self.maps.stack(self.maps.shifted(raw), dim=1)
+        features = self.net.plain_features(scale_elevation(elevation, self.elevation_scale), keys)
+        return self.maps.stack(self.maps.shifted(self.net.read_out(features)), dim=1)
 
 
 def run(checkpoint: Path, output: Path, config: Config, *, overwrite: bool = False) -> Summary:

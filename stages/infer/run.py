@@ -84,8 +84,7 @@ def run(
             "quantity": QUANTITY,
             "image_units": predictor.image_units,
             "precision": precision,
-            "image_noise": predictor.image_noise,
-        }
+        } | ({"image_noise": predictor.image_noise} if math.isfinite(predictor.image_noise) else {})
         with contextlib.ExitStack() as stack:
             writer = stack.enter_context(
                 ArtefactWriter(

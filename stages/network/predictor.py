@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -109,6 +110,7 @@ def first_misfit(error: BaseException) -> str:
     """What PyTorch says of the first weight that does not fit; its own first line only names a class."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
     text = lines[1] if len(lines) > 1 else lines[0]
+    text = text.replace(" in state_dict", "")
     return text if len(text) <= 160 else f"{text[:157]}..."
 
 
@@ -152,7 +154,7 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
         predictor.offset = dict(zip(ids, map(float, file["offset"][...]), strict=True))
         predictor.image_units = str(file.attrs["image_units"])
         predictor.gsd = float(file.attrs["gsd_m"])
-        predictor.image_noise = float(file.attrs["image_noise"])
+        predictor.image_noise = float(file.attrs.get("image_noise", math.nan))
     predictor.to(device)
     if torch.device(device).type == "cpu":
         predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -1,5 +1,5 @@
-"""Hidden data for `lunargr diagnose`: a second renderer (Mitsuba) and a physical sensor, apart from the forward model.
+"""Hidden data for `lunargr diagnose`: a second renderer (Mitsuba) and a physical sensor, apart from the program.
 
-Nothing here imports the forward model, the effects or the program's horizon. The one formula taken over is Hapke's
-roughness, from ``stages.physics.photometry.roughness``, because ``theta_bar_deg`` is defined by it.
+Nothing here imports the program: not its forward model, effects, horizon or formulas. Laws and departures from them are
+written from the papers, in other functional forms than the catalogue's where it has one.
 """

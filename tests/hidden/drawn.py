@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hidden.departures import equivalents
 from hidden.scene import Scene, Truth
 
 
@@ -31,4 +32,5 @@ def drawn(scene: Scene, truth: Truth, seed: int) -> dict[str, float]:
         first, last = (f(pose.first[1] for pose, _ in frames) for f in (min, max))
         columns = frames[0][1].response(np.arange(first - half, last + half))
         out["column_pattern"] = float(columns.std() / np.mean(seen))
-    return out
+    samples = [s for site in range(scene.layout.sites) for s in scene.lit_samples(site, truth)]
+    return out | equivalents(truth.effect, samples)

@@ -74,15 +74,39 @@ def _phase(cosg):
 
 
 def roughness(mu0, mu, cosg, theta_deg):
-    """Hapke's (1984) roughness relative to a smooth Lommel-Seeliger surface; the published formula of the program."""
-    import torch
+    """Hapke's (1984, Icarus 59, 41) roughness relative to a smooth Lommel-Seeliger surface, from the paper's equations."""
+    tangent = np.tan(np.radians(theta_deg))
+    chi = 1 / np.sqrt(1 + np.pi * tangent**2)
+    mu0, mu, cosg = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (mu0, mu, cosg)))
+    sin_i, sin_e = (np.sqrt(np.clip(1 - x * x, 1e-12, None)) for x in (mu0, mu))
+    psi = np.arccos(np.clip((cosg - mu0 * mu) / (sin_i * sin_e), -1, 1))
+    between = np.exp(-2 * np.tan(np.minimum(psi, np.pi - 1e-6) / 2))
+    cot_i, cot_e = mu0 / sin_i, mu / sin_e
+    first = {k: np.exp(-2 / np.pi * c / tangent) for k, c in (("i", cot_i), ("e", cot_e))}
+    second = {k: np.exp(-(c**2) / np.pi / tangent**2) for k, c in (("i", cot_i), ("e", cot_e))}
+    share = psi / np.pi
+    half = np.sin(psi / 2) ** 2
 
-    from stages.physics.formation.geometry import Angles
-    from stages.physics.photometry.roughness import rough_surface
+    def eta(cosine, sine, key):
+        return chi * (cosine + sine * tangent * second[key] / (2 - first[key]))
 
-    angles = Angles(torch.as_tensor(mu0), torch.as_tensor(mu), torch.as_tensor(cosg + 0 * mu0))
-    x, y, shadow = (t.numpy() for t in rough_surface(angles, torch.tensor(np.radians(theta_deg))))
-    return shadow * x * y / (x + y) * (mu0 + mu) / mu0
+    def effective(sun_lower: bool):
+        """Effective cosines where the Sun stands lower than the camera (i >= e), and the other way round."""
+        a, b = ("i", "e") if sun_lower else ("e", "i")
+        below = 2 - first[a] - share * first[b]
+        grazing = (second[a] - half * second[b]) / below
+        other = (np.cos(psi) * second[a] + half * second[b]) / below
+        sine_a, sine_b = (sin_i, sin_e) if sun_lower else (sin_e, sin_i)
+        low = chi * ((mu0 if sun_lower else mu) + sine_a * tangent * grazing)
+        high = chi * ((mu if sun_lower else mu0) + sine_b * tangent * other)
+        return (low, high) if sun_lower else (high, low)
+
+    lower = mu0 <= mu
+    sun, view = (np.where(lower, a, b) for a, b in zip(effective(True), effective(False), strict=True))
+    eta_i, eta_e = eta(mu0, sin_i, "i"), eta(mu, sin_e, "e")
+    blocked = np.where(lower, mu / eta_e, mu0 / eta_i)  # of the smaller angle
+    shadow = view / eta_e * mu0 / eta_i * chi / (1 - between + between * chi * blocked)
+    return shadow * sun / (sun + view) * (mu0 + mu) / mu0
 
 
 LAWS = {

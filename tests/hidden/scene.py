@@ -14,6 +14,7 @@ import numba
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
+from hidden.departures import FORMS, factor
 from hidden.laws import LAWS, roughness
 from hidden.layers import SUN_RADIUS_DEG, Ground
 from hidden.sensor import Detector, Pose, shoot
@@ -40,6 +41,8 @@ class Layout:
     emissions: tuple[float, float] = (0.0, 35.0)
     opposition: int = 2  # images with phase below 10 deg
     border: int = 8
+    per_site: int = 0  # images of a site, in turn; 0 for all of them
+    rotation_deg: float = 4.0  # of detectors against the map, at most
     relief: str = ""  # a DEM under LUNARGR_SHARED's data/, whose shape the ground takes
 
 
@@ -56,7 +59,11 @@ class Truth:
     dem_smoothing: float = 0.3  # sigma, px
     seam: float = 0.15  # step along a line, m
     misregistration: float = 0.3  # px, rms length
+    dem_samples: bool = False  # heights at the pixels' centres, not means over their areas
     snr: float = 70.0
+    veil: float = 0.0  # broad correlated noise of each image, rms, relative to its mean
+    veil_px: float = 12.0  # sigma of its correlation
+    drift: float = 0.0  # rms by which reflectance, and its phase curve, vary smoothly over a site
     law: str = "linear"  # of reflectance
     units: str = "iof"
 
@@ -142,7 +149,8 @@ class Scene:
         n = lay.size + 2 * lay.margin
         corner = self.heights[site]
         centres = (corner[:-1, :-1] + corner[1:, :-1] + corner[:-1, 1:] + corner[1:, 1:]) / 4
-        dem = centres.reshape(n, lay.sub, n, lay.sub).mean((1, 3))
+        dem = centres.reshape(n, lay.sub, n, lay.sub)
+        dem = dem[:, lay.sub // 2, :, lay.sub // 2] if truth.dem_samples else dem.mean((1, 3))
         variance = truth.dem_smoothing**2 + truth.effect.get("dem_smoothing", {}).get("sigma2_px2", 0.0)
         dem = gaussian_filter(dem, np.sqrt(variance), mode="nearest")
         dem = dem / (1 + truth.effect.get("dem_scale", {}).get("relative", 0.0))
@@ -160,6 +168,8 @@ class Scene:
         rng = np.random.default_rng((lay.seed, site, 77))
         count = (lay.size + 2 * lay.border) * lay.sub
         albedo = 1 + truth.texture * self._texture(rng, count, truth)
+        if truth.drift:
+            albedo = albedo * (1 + truth.drift * red_noise(rng, count, 4.0, count / 4))
         names = [n for n in ("slope_albedo", "elevation_albedo", "curvature_albedo") if n in effect]
         if names:
             fields = [self._terrain_fields(s) for s in range(lay.sites)]
@@ -215,6 +225,10 @@ class Scene:
         mu0 = np.maximum(mu0, 1e-4)
         albedo = self._albedo(site, truth)
         surface = self._extended(LAWS[truth.law](mu0, mu, cosg, albedo), mu0, mu, cosg, sun, effect)
+        if truth.drift:  # ages differ over a site, and with them the phase curve
+            waves = np.random.default_rng((self.layout.seed, site, 78))
+            bend = red_noise(waves, len(mu0), 4.0, len(mu0) / 4)
+            surface = surface * np.exp(-0.5 * truth.drift * bend * (np.arccos(cosg) - 0.8))
         total = surface * share * lit
         if "interreflection" in effect:
             normal = float(LAWS[truth.law](np.ones(1), np.ones(1), 1.0, np.ones(1))[0])
@@ -229,20 +243,11 @@ class Scene:
 
     @staticmethod
     def _extended(base, mu0, mu, cosg, sun, effect):
-        phase = np.arccos(cosg)
-        if "opposition_surge" in effect:
-            e = effect["opposition_surge"]
-            base = base * (1 + e["B0"] / (1 + np.tan(phase / 2) / e["h"]))
-        if "phase_slope" in effect:
-            base = base * np.exp(-effect["phase_slope"]["per_radian"] * phase)
-        if "limb_darkening" in effect:
-            share = effect["limb_darkening"]["share"]
-            base = base * ((1 - share) + share * 2 / (mu0 + mu))
+        for name in FORMS:
+            if name in effect:
+                base = base * factor(name, effect[name], mu0, mu, cosg, sun)
         if "macroscopic_roughness" in effect:
             base = base * roughness(mu0, mu, cosg, effect["macroscopic_roughness"]["theta_bar_deg"])
-        if "azimuthal_anisotropy" in effect:
-            e = effect["azimuthal_anisotropy"]
-            base = base * (1 + (e["east"] * sun[0] + e["north"] * sun[1]) / np.hypot(sun[0], sun[1]))
         return base
 
     def make(self, truth: Truth, seed: int, *, split: bool = True) -> dict[str, Any]:
@@ -269,7 +274,7 @@ class Scene:
         }
         frames = [self._frame(rng, truth) for _ in range(lay.images)]
         for site in range(lay.sites):
-            for image in range(lay.images):
+            for image in self.images_of(site):
                 pose, camera = frames[image]
                 pose = replace(pose, error=tuple(np.array(pose.error)))
                 fine = self.radiance(site, image, truth)
@@ -285,7 +290,7 @@ class Scene:
                 out["camera_position_enu"].append(self.views[image] * DISTANCE * lay.size * lay.gsd)
                 out["image_index"].append(image)
                 out["site"].append(site)
-                out["split"].append(2 if split and site == lay.sites - 1 else 0)
+                out["split"].append(2 if split and site >= lay.sites - max(1, lay.sites // 6) else 0)
         data = {k: np.array(v) for k, v in out.items()}
         data["valid"] = np.ones(data["image"].shape, np.uint8)
         if truth.units == "dn":
@@ -293,6 +298,25 @@ class Scene:
             shift = rng.uniform(-5, 20, lay.images)[data["image_index"]]
             data["image"] = data["image"] * scale[:, None, None] + shift[:, None, None]
         return data
+
+    def images_of(self, site: int) -> list[int]:
+        lay = self.layout
+        count = lay.per_site or lay.images
+        return sorted((site * count + k) % lay.images for k in range(count))
+
+    def lit_samples(self, site: int, truth: Truth, step: int = 7) -> list[tuple]:
+        """Per image of a site (mu0, mu, cosg, sun, I/F) of every ``step``-th lit point each way."""
+        out = []
+        for image in self.images_of(site):
+            mu0, share = self.layer("direct", site, image)
+            mu = np.maximum(self.layer("view", site, image), 1e-3)
+            cosg = float(np.clip(self.suns[image] @ self.views[image], -1, 1))
+            use = np.zeros(mu0.shape, bool)
+            use[::step, ::step] = True
+            use &= (mu0 > 0.05) & (share > 0.99)
+            base = LAWS[truth.law](mu0[use], mu[use], cosg, 1.0)
+            out.append((mu0[use].astype(float), mu[use].astype(float), cosg, self.suns[image], base))
+        return out
 
     def _given_sun(self, image: int, effect: dict) -> np.ndarray:
         """The metadata's Sun: truth minus the planted error."""
@@ -309,12 +333,12 @@ class Scene:
         gain, wave = rng.normal(), rng.normal(size=(2, 3))
         size = np.hypot(size, effect.get("misregistration", {}).get("rms_px", 0.0) / np.sqrt(2))
         pose = Pose(
-            rotation_deg=float(rng.uniform(-4, 4)),
+            rotation_deg=float(rng.uniform(-1, 1)) * self.layout.rotation_deg,
             offset=tuple(rng.uniform(-0.5, 0.5, 2)),
             error=tuple(shift * size),
             first=(float(rng.uniform(0, 5000)), 2500.0 + float(np.clip(extra[0], -2, 2)) * self.layout.size / 2),
         )
-        camera = Detector(snr=truth.snr)
+        camera = Detector(snr=truth.snr, veil=truth.veil, veil_px=truth.veil_px)
         if "image_gain" in effect:
             camera.gain = 1 + effect["image_gain"]["rms"] * gain
         camera.bias = effect.get("dark_bias", {}).get("iof", 0.0)

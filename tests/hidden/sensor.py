@@ -13,9 +13,13 @@ from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 class Detector:
     """Faults of one camera; the defaults have none but noise. Everything acts on detector pixels, in I/F or DN."""
 
-    snr: float = 70.0  # at the mean brightness; shot noise plus a fifth of it read noise
+    snr: float = 70.0  # at the mean brightness, from photons, read-out and quantisation together
+    read: float = 18.0  # electrons rms
+    uneven: float = 0.002  # rms by which single pixels differ in response: fixed on the detector
     full_scale: float = 0.4  # I/F of the last DN step
     bits: int = 12
+    veil: float = 0.0  # rms of broad correlated noise (stray light, compression, scanning), relative to the mean
+    veil_px: float = 12.0  # sigma of its correlation
     gain: float = 1.0
     bias: float = 0.0
     gamma: float = 0.0  # response I^(1 + gamma), scaled to keep the mean
@@ -89,8 +93,15 @@ def expose(rng, seen: np.ndarray, pose: Pose, camera: Detector) -> np.ndarray:
         signal = signal * camera.response(samples)[None]
     mean = 0.05
     signal = np.clip(signal, 0, None)
-    noise = signal.mean() / camera.snr * np.sqrt(0.8 * signal / max(signal.mean(), 1e-9) + 0.2)
-    electrons = signal + rng.normal(size=signal.shape) * noise
+    if camera.veil > 0:
+        broad = gaussian_filter(rng.normal(size=signal.shape), camera.veil_px, mode="nearest")
+        signal = np.clip(signal + signal.mean() * camera.veil * broad / broad.std(), 0, None)
+    # electrons at the mean brightness: n of them scatter by sqrt(n + read^2)
+    n = camera.snr * (camera.snr + np.sqrt(camera.snr**2 + 4 * camera.read**2)) / 2
+    per_electron = max(float(signal.mean()), 1e-9) / n
+    pixels = np.random.default_rng(20).normal(size=signal.shape)  # the detector's own, the same in every image
+    counted = rng.poisson(signal / per_electron * np.clip(1 + camera.uneven * pixels, 0.9, 1.1))
+    electrons = (counted + rng.normal(size=signal.shape) * camera.read) * per_electron
     if camera.gamma:
         electrons = mean * np.sign(electrons) * (np.abs(electrons) / mean) ** (1 + camera.gamma)
     if camera.quadratic:
@@ -99,5 +110,7 @@ def expose(rng, seen: np.ndarray, pose: Pose, camera: Detector) -> np.ndarray:
         amplitude, period = camera.banding
         electrons = electrons * (1 + amplitude * np.sin(2 * np.pi * lines / period))[:, None]
     electrons = np.minimum(electrons, camera.level) + camera.bias
-    step = camera.full_scale / 2**camera.bits
-    return np.round(electrons / step) * step
+    # companded to the bits of the link, as most flight cameras do: steps grow with the root of the signal
+    steps = 2**camera.bits / 4
+    root = np.round(np.sqrt(np.clip(electrons / camera.full_scale, 0, None)) * steps) / steps
+    return root**2 * camera.full_scale

@@ -16,6 +16,21 @@ WORLDS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "broad_noise": ({}, {"dem_noise_px": 4.0}),
     "patches": ({}, {"texture_kind": "patches"}),
     "units": ({}, {"texture_kind": "units"}),
+    # what real photographs have and the first campaigns had not, each alone
+    "veil_fine": ({}, {"veil": 0.005, "veil_px": 4.0}),
+    "veil": ({}, {"veil": 0.005, "veil_px": 12.0}),
+    "veil_strong": ({}, {"veil": 0.02, "veil_px": 12.0}),
+    "veil_broad": ({}, {"veil": 0.01, "veil_px": 40.0}),
+    "drift": ({}, {"drift": 0.04}),
+    "quiet": ({}, {"snr": 150.0}),
+    "noisy": ({}, {"snr": 30.0}),
+    "aligned": ({"rotation_deg": 0.0}, {}),
+    "turned": ({"rotation_deg": 60.0, "border": 40, "margin": 56}, {}),
+    "dem_samples": ({}, {"dem_samples": True, "dem_smoothing": 0.0}),
+    "one_image": ({"sites": 36, "images": 12, "per_site": 1}, {}),
+    "two_images": ({"sites": 18, "images": 12, "per_site": 2}, {}),
+    "four_images": ({"sites": 10, "images": 12, "per_site": 4}, {}),
+    "photograph": ({}, {"veil": 0.006, "veil_px": 12.0, "drift": 0.03, "snr": 60.0}),
 }
 
 __all__ = ["WORLDS"]

@@ -1,0 +1,196 @@
+"""Covariance of the residuals, estimated from them: what the images of a place share, what each has of its own, by wavelength.
+
+For every annulus of spatial frequency  z = 1 a + i (g . k) h + e:  albedo a that all images of the place see alike, relief h that
+the DEM has not, which each sees by its own shading g, and what is each image's own, noise included. Variances by
+expectation-maximisation (Dempster et al. 1977; factor analysis with known loadings).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.nominal import lit_mask
+from stages.diagnose.model.sites import Site
+from stages.diagnose.rows.patches import Grid, Patch
+from stages.diagnose.settings import ADDED, BORROWED, DARKEST, ROUNDS, SECTORS
+
+
+@dataclass
+class Covariance:
+    """Variances of a wave, relative to brightness squared. albedo, relief : (A,); own : (A, frames); mean_* : of a patch's means"""
+
+    albedo: Tensor
+    relief: Tensor
+    own: Tensor
+    mean_albedo: float
+    mean_relief: float
+    mean_own: float
+    size: dict[int, float] = field(default_factory=dict)  # of a patch (by its number), times the above
+    mean_size: dict[int, float] = field(default_factory=dict)
+    radius: list[float] = field(default_factory=list)  # (A,) cycles/px
+
+    @classmethod
+    def white(cls, annuli: int, frames: int) -> Covariance:
+        """Every pixel for itself."""
+        none = torch.zeros(annuli, dtype=torch.float64)
+        return cls(none, none, torch.ones(annuli, frames, dtype=torch.float64), 0.0, 0.0, 1.0)
+
+    def matrices(self, patch: Patch, grid: Grid) -> Tensor:
+        """(A * SECTORS, n, n) of the waves of one patch."""
+        u = patch.slopes.double() @ grid.direction.double().T  # (n, sectors)
+        shape = u.T[:, :, None] * u.T[:, None]  # (sectors, n, n)
+        out = self.albedo[:, None, None, None] + self.relief[:, None, None, None] * shape
+        own = self.own[:, patch.frames]
+        out = out + torch.diag_embed(own)[:, None]
+        return out.flatten(0, 1) * self.size.get(patch.number, 1.0)
+
+    def mean_matrix(self, patch: Patch) -> Tensor:
+        g = patch.slopes.double()
+        own = torch.eye(len(g), dtype=torch.float64) * self.mean_own
+        return (self.mean_albedo + self.mean_relief * (g @ g.T) + own) * self.mean_size.get(patch.number, 1.0)
+
+
+def estimate(patches: Sequence[Patch], rows: Sequence[tuple[Tensor, Tensor]], grid: Grid, frames: int) -> Covariance:
+    """From the residual's coefficients (n, K) and means (n,) of every patch."""
+    products, counts = [], []
+    for patch, (z, _) in zip(patches, rows, strict=True):
+        size = patch.weight.square().mean((-2, -1)).sqrt().clamp(min=1e-6)
+        scaled = z / size[:, None]
+        parts = torch.stack([scaled.real, scaled.imag], -1).double()  # (n, K, 2)
+        n = len(z)
+        sums = torch.zeros(grid.annuli * SECTORS, n, n, dtype=torch.float64)
+        weight = grid.root.double() ** 2 * grid.height * grid.width  # 1 or 2 real waves
+        sums.index_add_(0, grid.bins, torch.einsum("ikc,jkc->kij", parts, parts))
+        products.append(sums.unflatten(0, (grid.annuli, SECTORS)))
+        counts.append(
+            torch.zeros(grid.annuli * SECTORS, dtype=torch.float64)
+            .index_add_(0, grid.bins, weight)
+            .unflatten(0, (grid.annuli, SECTORS))
+        )
+    share = [float(p.weight.square().mean()) for p in patches]
+    total = torch.zeros(grid.annuli, dtype=torch.float64)
+    number = torch.zeros(grid.annuli, dtype=torch.float64)
+    for s, c in zip(products, counts, strict=True):
+        total += s.diagonal(dim1=-2, dim2=-1).sum((1, 2))
+        number += c.sum(1) * s.shape[-1]
+    level = total / number.clamp(min=1e-9)
+    albedo, relief = 0.4 * level, 0.2 * level
+    own = 0.4 * level[:, None].expand(-1, frames).clone()
+    bends = torch.stack([(p.slopes.double() @ grid.direction.double().T).square().mean() for p in patches]).mean()
+    relief = relief / bends.clamp(min=1e-9)
+    model = Covariance(albedo, relief, own, 0.0, 0.0, 0.0)
+    sizes = {p.number: 1.0 for p in patches}
+    for _ in range(ROUNDS):
+        fits = {}
+        a, r = torch.zeros_like(albedo), torch.zeros_like(relief)
+        o, oc = torch.zeros_like(own), torch.zeros_like(own)
+        n_ar = torch.zeros_like(albedo)
+        for patch, s, c, part in zip(patches, products, counts, share, strict=True):
+            sigma = model.matrices(patch, grid).unflatten(0, (grid.annuli, SECTORS))
+            inverse = torch.linalg.inv(sigma)
+            degrees = float(c.sum()) * len(patch.frames) * part
+            fits[patch.number] = (float((inverse * s).sum()) * part + ADDED) / (degrees + ADDED)
+            s = s / sizes[patch.number]
+            u = (patch.slopes.double() @ grid.direction.double().T).T  # (sectors, n)
+            load = torch.stack([torch.ones_like(u), u], -1)  # (sectors, n, 2)
+            size = torch.stack([model.albedo, model.relief], -1)  # (A, 2)
+            gain = size[:, None, :, None] * (load.transpose(1, 2)[None] @ inverse)  # (A, S, 2, n)
+            count = c[..., None, None]
+            second = gain @ s @ gain.transpose(-1, -2) + count * (
+                torch.diag_embed(size)[:, None] - gain @ load[None] * size[:, None, None, :]
+            )
+            left = s - 2 * (load[None] @ gain @ s) + load[None] @ second @ load.transpose(1, 2)[None]
+            a += second[..., 0, 0].sum(1) * part
+            r += second[..., 1, 1].sum(1) * part
+            n_ar += c.sum(1) * part
+            diagonal = left.diagonal(dim1=-2, dim2=-1).sum(1) * part  # (A, n)
+            o.index_add_(1, patch.frames, diagonal)
+            oc.index_add_(1, patch.frames, (c.sum(1) * part)[:, None].expand(-1, len(patch.frames)).contiguous())
+        common = o.sum(1, keepdim=True) / oc.sum(1, keepdim=True).clamp(min=1e-9)
+        own = ((o + BORROWED * common) / (oc + BORROWED)).clamp(min=1e-3 * level[:, None])
+        sizes = _unit_mean(fits)
+        model = Covariance(
+            (a / n_ar.clamp(min=1e-9)).clamp(min=0), (r / n_ar.clamp(min=1e-9)).clamp(min=0), own, 0.0, 0.0, 0.0
+        )
+    _means(model, patches, [m.double() for _, m in rows])
+    model.size, model.radius = sizes, grid.radius.tolist()
+    return model
+
+
+def _unit_mean(sizes: dict[int, float]) -> dict[int, float]:
+    """Sizes over their geometric mean."""
+    middle = math.exp(sum(math.log(v) for v in sizes.values()) / len(sizes))
+    return {k: v / middle for k, v in sizes.items()}
+
+
+def _means(model: Covariance, patches: Sequence[Patch], means: Sequence[Tensor]) -> None:
+    """Variances of the patches' mean brightness, likewise."""
+    everything = torch.cat(list(means))
+    level = max(float(everything.square().mean()), 1e-12)
+    albedo, relief, own = 0.5 * level, 0.1 * level, 0.4 * level
+    sizes = {p.number: 1.0 for p in patches}
+    for _ in range(ROUNDS):
+        fits: dict[int, float] = {}
+        sums = [0.0, 0.0, 0.0]
+        numbers = [0, 0, 0]
+        for patch, m in zip(patches, means, strict=True):
+            load = torch.cat([torch.ones(len(m), 1, dtype=torch.float64), patch.slopes.double()], 1)
+            size = torch.tensor([albedo, relief, relief], dtype=torch.float64)
+            sigma = (load * size) @ load.T + own * torch.eye(len(m), dtype=torch.float64)
+            inverse = torch.linalg.inv(sigma)
+            fits[patch.number] = (float(m @ inverse @ m) + 5.0) / (len(m) + 5.0)
+            m = m / math.sqrt(sizes[patch.number])
+            gain = (size[:, None] * load.T) @ inverse
+            mean = gain @ m
+            second = torch.outer(mean, mean) + torch.diag(size) - gain @ load * size
+            rest = m - load @ mean
+            sums[0] += float(second[0, 0])
+            sums[1] += float(second[1, 1] + second[2, 2])
+            sums[2] += float(rest @ rest + ((load @ (torch.diag(size) - gain @ load * size)) * load).sum())
+            numbers[0] += 1
+            numbers[1] += 2
+            numbers[2] += len(m)
+        sizes = _unit_mean(fits)
+        albedo, relief, own = (max(s / max(k, 1), 1e-4 * level) for s, k in zip(sums, numbers, strict=True))
+    model.mean_albedo, model.mean_relief, model.mean_own = albedo, relief, own
+    model.mean_size = sizes
+
+
+def texture(site: Site, chain: Chain, model: Covariance) -> Tensor:
+    """(H, W) relative albedo of the ground: what all its images share, as far as the covariance lets it be known (Wiener 1949)."""
+    mask = lit_mask(chain).float()
+    level = (chain.predict() * mask).sum((-2, -1), keepdim=True) / mask.sum((-2, -1), keepdim=True).clamp(min=1)
+    scale = torch.maximum(chain.predict(), DARKEST * level).clamp(min=1e-6)
+    relative = (site.image - chain.predict()) / scale
+    own = model.own[:, torch.from_numpy(site.frames)].mean(0).float()
+    weight = mask / own[:, None, None]
+    total = weight.sum(0)
+    mean = (relative * weight).sum(0) / total.clamp(min=1e-9)
+    known = total > 0.2 * total.max()
+    level = mean[known].mean() if bool(known.any()) else torch.zeros(())
+    varied = torch.where(known, mean - level, 0.0)
+    height, width = varied.shape
+    radius = torch.hypot(torch.fft.fftfreq(height)[:, None], torch.fft.rfftfreq(width))
+    beside = (model.relief * float(_bend(chain, mask))) / len(mask) + model.own.mean(1) / len(mask)
+    share = (model.albedo / (model.albedo + beside)).numpy()
+    keep = np.interp(radius.numpy(), model.radius, share)
+    smooth = torch.fft.irfft2(torch.fft.rfft2(varied) * torch.from_numpy(keep).float(), s=(height, width))
+    return (1 + level + smooth).clamp(min=0.2, max=5.0)
+
+
+def _bend(chain: Chain, mask: Tensor) -> Tensor:
+    image = chain.predict()
+    parts = [
+        (t / image.clamp(min=1e-6) * mask).square().sum() / mask.sum().clamp(min=1) for t in chain.slope_tangents()
+    ]
+    return torch.stack(parts).mean()
+
+
+__all__ = ["Covariance", "estimate", "texture"]

@@ -1,0 +1,66 @@
+"""What is left: how its variance is shared out, and whether a single wave stands out of it that no covariance of ground or noise has."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from scipy.stats import gamma
+
+from stages.diagnose.likelihood.covariance import Covariance
+from stages.diagnose.likelihood.products import Rows, whitened_residual
+from stages.diagnose.rows.patches import Grid
+from stages.diagnose.settings import PEAK
+
+
+def budget(rows: list[Rows], model: Covariance, grid: Grid, before: float, after: float) -> dict[str, float]:
+    """Shares of the variance ``before`` anything was named; ``after`` is what is left. Sum 1."""
+    waves = torch.bincount(grid.annulus, weights=grid.root.double() ** 2, minlength=grid.annuli)
+    bend = torch.stack([(r.patch.slopes.double() @ grid.direction.double().T).square().mean() for r in rows]).mean()
+    common = float(((model.albedo + model.relief * bend) * waves).sum()) + (
+        0.0 if rows[0].patch.free else model.mean_albedo
+    )
+    every = model.own.mean(1)
+    floor = float(every.min())
+    noise = floor * float(waves.sum())
+    own = float(((every - floor) * waves).sum()) + (0.0 if rows[0].patch.free else model.mean_own)
+    named = min(max(1 - after / before, 0.0), 1.0) if before > 0 else 0.0
+    total = max(common + own + noise, 1e-30)
+    return {
+        "named": named,
+        "common_to_images": (1 - named) * common / total,
+        "own_to_image": (1 - named) * own / total,
+        "noise": (1 - named) * noise / total,
+    }
+
+
+def peak(rows: list[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[float, float]:
+    """-log10 of the chance of the strongest single wave of any frame among all of them, and its share of the residual's variance."""
+    power = torch.zeros(frames, len(grid.keep), dtype=torch.float64)
+    count = torch.zeros(frames, dtype=torch.float64)
+    for row in rows:
+        z, _ = whitened_residual(row, model, grid)
+        size = (row.patch.weight.square().mean((-2, -1)) * model.size.get(row.patch.number, 1.0)).clamp(min=1e-6)
+        share = (z.real.square() + z.imag.square()).double() / size[:, None]
+        power.index_add_(0, row.patch.frames, share)
+        count.index_add_(0, row.patch.frames, torch.ones(len(row.patch.frames), dtype=torch.float64))
+    seen = count > 0
+    power, count = power[seen], count[seen]
+    best, largest = 0.0, 0.0
+    fine = grid.annulus >= 2  # broad waves are ground and film
+    for p, n in zip(power, count, strict=True):
+        level = torch.zeros(grid.annuli, dtype=torch.float64)
+        for a in range(grid.annuli):
+            level[a] = p[grid.annulus == a].median()
+        ratio = (p / level[grid.annulus].clamp(min=1e-30))[fine]
+        top = float(ratio.max())
+        shape = max(float(n), 1.0)
+        middle = float(gamma.median(shape))
+        chance = -float(gamma.logsf(top * middle, shape)) / math.log(10) - math.log10(len(ratio) * len(power))
+        # neighbours share a wave through the window: what stands out by a little is no line
+        if top > PEAK and chance > best:
+            best, largest = chance, float((p[fine] * (ratio > PEAK)).sum() / p.sum())
+    return best, largest
+
+
+__all__ = ["budget", "peak"]

@@ -1,0 +1,371 @@
+"""Evidence for every candidate from the products: likelihood ratios, calibrated on sham residuals, and gains on held-out ground."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.special import gammaincc, gammaln
+
+from stages.diagnose.likelihood.jackknife import FRACTION, jackknife_error, student
+from stages.diagnose.likelihood.products import Products
+from stages.diagnose.rows.columns import Guise, Plan
+from stages.diagnose.settings import DRIFTING, FOLDS, LEVELS
+from stages.effects import get_effect
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Found:
+    """An effect in its best guise. amount, error : in multiples of the guise's columns (per frame: of ``strong``)
+
+    surprise : -log10 of the chance of so much likelihood, calibrated on shams; p : family-wise
+    gains : (units,) nats on held-out ground; spread : standard deviation over the frames, of an effect per frame
+    """
+
+    effect: str
+    guise: Guise
+    amount: Array
+    error: Array
+    surprise: float
+    p: float = 1.0
+    gains: Array = field(default_factory=lambda: np.zeros(0))
+    spread: float = 0.0
+    beside: float = 0.0  # scatter of the gains per frame beside it, where that is less than without
+    alone: float = 0.0  # standard errors by which the largest amount differs from nothing
+
+    @property
+    def gain(self) -> float:
+        return float(self.gains.sum())
+
+    def gain_interval(self) -> tuple[float, float]:
+        """95 % interval of the held-out gain, nats, by the scatter over pieces of ground."""
+        return interval(self.gains)
+
+
+def interval(gains: Array) -> tuple[float, float]:
+    units = len(gains)
+    if units < 3:
+        return -math.inf, math.inf
+    half = student.ppf(0.5 + FRACTION / 2, units - 1) * math.sqrt(units) * float(gains.std(ddof=1))
+    return float(gains.sum()) - half, float(gains.sum()) + half
+
+
+class Whole:
+    """All units' products put together, with the nuisance among the columns."""
+
+    def __init__(self, units: Sequence[Products], plan: Plan, frames: int) -> None:
+        self.units, self.plan, self.frames = list(units), plan, frames
+        self.first = 1 + len(plan.shared)
+        self._let_coefficients_drift()
+        self.size = self.first + len(plan.per_frame) * frames
+        self.gram = np.zeros((self.size, self.size))
+        shams = units[0].sham.shape[1]
+        self.sham, self.sham_squares = np.zeros((self.size, shams)), np.zeros(shams)
+        for u in self.units:
+            self.gram[np.ix_(u.place, u.place)] += u.gram
+            self.sham[u.place] += u.sham
+            self.sham_squares += u.sham_squares
+        self.seen = self.gram.diagonal() > 1e-12 * max(self.gram.diagonal().max(), 1e-30)
+        self.scattered = np.zeros(0, np.int64)  # places of the gains per frame
+        self.precision = self._precision()
+        self.labels = self._labels()
+        self.folds = [np.flatnonzero(np.array([u % FOLDS for u in self.labels]) == k) for k in range(FOLDS)]
+        self.folds = [f for f in self.folds if len(f)]
+
+    def _labels(self) -> list[int]:
+        """Which units are left out together: sites, where there are enough of them."""
+        sites = sorted({u.site for u in self.units})
+        if len(sites) >= 4:
+            return [sites.index(u.site) for u in self.units]
+        return list(range(len(self.units)))
+
+    def _let_coefficients_drift(self) -> None:
+        """Take out of every unit what the nominal coefficients may be there beside the rest: reflectance varies over the ground.
+
+        Their scatter is estimated along the main directions in which they change the images (expectation-maximisation), and
+        the amounts of each unit are integrated out.
+        """
+        places = 1 + np.array(
+            [k for k, n in enumerate(self.plan.shared) if n.startswith("coefficient") and "albedo" not in n],
+            dtype=np.int64,
+        )
+        if not len(places):
+            return
+        total = np.sum([u.gram[np.ix_(places, places)] for u in self.units], 0)
+        scale = 1 / np.sqrt(np.maximum(total.diagonal(), 1e-30))
+        _, axes = np.linalg.eigh(total * np.outer(scale, scale))
+        main = (scale[:, None] * axes[:, -DRIFTING:]) * math.sqrt(
+            len(self.units)
+        )  # a unit's column has about unit information
+        reduced = [main.T @ u.gram[places] for u in self.units]
+        spread = np.full(main.shape[1], 1.0)
+        squares = [main.T @ u.gram[np.ix_(places, places)] @ main for u in self.units]
+        score = np.array([main.T @ u.gram[places, 0] for u in self.units])
+        for _ in range(10):
+            posterior = [np.linalg.inv(g + np.diag(spread**-2)) for g in squares]
+            weight = [np.eye(len(spread)) - g @ c for g, c in zip(squares, posterior, strict=True)]
+            top = sum(w @ g for w, g in zip(weight, squares, strict=True))
+            mean = np.linalg.solve(
+                top + 1e-9 * np.eye(len(top)), sum(w @ s for w, s in zip(weight, score, strict=True))
+            )
+            own = np.array([c @ (s - g @ mean) for c, g, s in zip(posterior, squares, score, strict=True)])
+            variance = own**2 + np.array([c.diagonal() for c in posterior])
+            spread = np.sqrt(np.maximum(variance.mean(0), 1e-8))
+        out = []
+        for u, g, r in zip(self.units, squares, reduced, strict=True):
+            inner = np.linalg.inv(g + np.diag(spread**-2))
+            sham = main.T @ u.sham[places]
+            out.append(dataclasses.replace(u, gram=u.gram - r.T @ inner @ r, sham=u.sham - r.T @ inner @ sham))
+        self.units = out
+
+    def frame_places(self, columns: Sequence[int]) -> NDArray[np.int64]:
+        """Places of columns per frame in the whole, frame by frame within a column."""
+        places = [self.first + a * self.frames + np.arange(self.frames) for a in columns]
+        out = np.concatenate(places) if places else np.zeros(0, np.int64)
+        return out[self.seen[out]]
+
+    def places(self, guise: Guise) -> NDArray[np.int64]:
+        if guise.per_frame:
+            return self.frame_places(guise.columns)
+        return np.array([1 + k for k in guise.columns])
+
+    def _precision(self) -> dict[int, float]:
+        """Place of every nuisance column -> inverse prior variance."""
+        out: dict[int, float] = {}
+        for k, sd in self.plan.prior.items():
+            if self.seen[1 + k]:
+                out[1 + k] = 1e-10 * self.gram[1 + k, 1 + k] + (0.0 if math.isinf(sd) else sd**-2)
+        for k, sd in self.plan.frame_prior.items():
+            for place in self.frame_places([k]):
+                out[int(place)] = sd**-2
+        return out
+
+    def nuisance(self, without: Sequence[int] = ()) -> NDArray[np.int64]:
+        """Places of the nuisance; ``without`` some, and with the places in it that are negative."""
+        gone = {int(w) for w in without if w >= 0}
+        more = {-int(w) for w in without if w < 0}
+        return np.array([k for k in sorted({*self.precision, *more}) if k not in gone], dtype=np.int64)
+
+    def weight(self, places: NDArray[np.int64]) -> Array:
+        """Inverse prior variances."""
+        return np.array([self.precision.get(int(k), 1.0) for k in places])
+
+    def let_gains_scatter(self, name_columns: Sequence[int]) -> float:
+        """Estimate the scatter of nuisance per frame by expectation-maximisation and set its prior; returns it."""
+        places = self.frame_places(name_columns)
+        if not len(places):
+            return 0.0
+        spread = 0.3
+        for _ in range(8):
+            for p in places:
+                self.precision[int(p)] = spread**-2
+            n = self.nuisance()
+            at = np.searchsorted(n, places)
+            a = self.gram[np.ix_(n, n)] + np.diag(self.weight(n))
+            inverse = np.linalg.inv(_scaled(a)[0]) * np.outer(*(2 * [_scaled(a)[1]]))
+            mean = inverse @ self.gram[n, 0]
+            spread = math.sqrt(max(float((mean[at] ** 2 + inverse.diagonal()[at]).mean()), 1e-10))
+        for p in places:
+            self.precision[int(p)] = max(spread, 1e-4) ** -2
+        return spread
+
+    def set_scatter(self, spread: float) -> None:
+        for p in self.scattered:
+            self.precision[int(p)] = max(spread, 1e-4) ** -2
+
+    def reduce(
+        self, places: NDArray[np.int64], exclude: Sequence[int] = ()
+    ) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+        """(information (J, J), score (J,), sham scores (J, R), nuisance) once the nuisance is fitted along."""
+        n = self.nuisance([*places, *exclude])
+        a = self.gram[np.ix_(n, n)] + np.diag(self.weight(n))
+        scaled, scale = _scaled(a)
+        right = np.concatenate([self.gram[np.ix_(n, places)], self.gram[n, :1], self.sham[n]], 1)
+        solved = scale[:, None] * cho_solve(cho_factor(scaled), scale[:, None] * right)
+        j = len(places)
+        cross = self.gram[np.ix_(places, n)]
+        information = self.gram[np.ix_(places, places)] - cross @ solved[:, :j]
+        score = self.gram[places, 0] - cross @ solved[:, j]
+        shams = self.sham[places] - cross @ solved[:, j + 1 :]
+        return (information + information.T) / 2, score, shams, n
+
+    def exclude(self, guise: Guise) -> list[int]:
+        """What the nuisance does without beside this effect, and (negative) what it has more."""
+        beside = [-1 - k for k in self.plan.form] if get_effect(guise.effect).beside_form else []
+        return [1 + k for k in self.plan.ordinary.get(guise.effect, [])] + beside
+
+    def weigh(self, guise: Guise) -> tuple[Found, Array]:
+        """Evidence for one guise, and the same of every sham."""
+        places = self.places(guise)
+        information, score, shams, _ = self.reduce(places, self.exclude(guise))
+        if guise.per_frame:
+            return self._weigh_frames(guise, information, score, shams)
+        inverse = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+        amount = inverse @ score
+        ratio = float(score @ amount)
+        null = np.einsum("ar,ab,br->r", shams, inverse, shams)
+        inflation = max(1.0, float(null.mean()) / len(places)) if len(null) else 1.0
+        error = np.sqrt(np.maximum(inverse.diagonal(), 0))
+        surprises = _surprise(np.concatenate([[ratio], null]) / inflation, len(places))
+        found = Found(
+            guise.effect, guise, amount, error, float(surprises[0]), alone=math.sqrt(max(ratio / inflation, 0.0))
+        )
+        if len(self.scattered):
+            beside, spread = self._beside_gains(places, self.exclude(guise))
+            if beside / inflation > ratio / inflation:
+                found.surprise = max(found.surprise, float(_surprise(np.array([beside / inflation]), len(places))[0]))
+                found.beside = spread
+                found.alone = math.sqrt(beside / inflation)
+        return found, surprises[1:]
+
+    def _beside_gains(self, places: NDArray[np.int64], exclude: Sequence[int]) -> tuple[float, float]:
+        """Twice the log likelihood that the columns gain if the scatter of the gains is estimated with and without them, and it.
+
+        What a gain of every image can do as well, one amount for all does better.
+        """
+        gains = self.scattered
+        j = len(places)
+        information, score, _, _ = self.reduce(np.concatenate([places, gains]), exclude)
+        own = np.linalg.pinv(information[:j, :j], rcond=1e-9, hermitian=True)
+        with_ = information[j:, j:] - information[j:, :j] @ own @ information[:j, j:]
+        left = score[j:] - information[j:, :j] @ own @ score[:j]
+        best, spread = _scatter(with_, left)
+        none, _ = _scatter(information[j:, j:], score[j:])
+        return max(float(score[:j] @ own @ score[:j]) + best - none, 0.0), spread
+
+    def _weigh_frames(self, guise: Guise, information: Array, score: Array, shams: Array) -> tuple[Found, Array]:
+        power, axes = np.linalg.eigh(information)
+        power = np.maximum(power, 0.0)
+
+        def ratio(squares: Array) -> tuple[Array, Array]:
+            """Twice the log likelihood at the best level, and which it is; squares (J, R)."""
+            every = np.stack(
+                [(squares / (power[:, None] + v**-2)).sum(0) - np.log1p(v * v * power).sum() for v in LEVELS]
+            )
+            return np.maximum(every.max(0), 0.0), every.argmax(0)
+
+        best, level = ratio((axes.T @ score)[:, None] ** 2)
+        null, _ = ratio((axes.T @ shams) ** 2)
+        spread = LEVELS[int(level[0])]
+        variance = (axes / (power + spread**-2)) @ axes.T
+        amount = variance @ score
+        error = np.sqrt(np.maximum(variance.diagonal(), 0))
+        found = Found(guise.effect, guise, amount, error, float(best[0]) / 2 / math.log(10), spread=spread)
+        found.alone = math.sqrt(float(best[0]))
+        return found, null / 2 / math.log(10)
+
+    def held_out(
+        self, places: NDArray[np.int64], exclude: Sequence[int] = (), spread: float = 0.0, scored: Whole | None = None
+    ) -> Array:
+        """(labels,) nats that the columns gain on ground that they and the nuisance were not fitted to.
+
+        scored : products by which the gain is counted, these where None
+        """
+        n = self.nuisance([*places, *exclude])
+        every = np.concatenate([n, places])
+        precision = self.weight(n)
+        more = np.concatenate([precision, np.full(len(places), spread**-2 if spread else 0.0)])
+        out = np.zeros(max(self.labels) + 1)
+        judge = scored or self
+        for fold in self.folds:
+            rest = self.gram.copy()
+            for k in fold:
+                u = self.units[k]
+                rest[np.ix_(u.place, u.place)] -= u.gram
+            with_ = _solve(rest[np.ix_(every, every)] + np.diag(more), rest[every, 0])
+            without = _solve(rest[np.ix_(n, n)] + np.diag(precision), rest[n, 0])
+            b1, b0 = np.zeros(self.size), np.zeros(self.size)
+            b1[every], b0[n] = with_, without
+            for k in fold:
+                u = judge.units[k]
+                out[self.labels[k]] += 0.5 * (_left(u, b0) - _left(u, b1))
+        return out
+
+    def without_one(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> Array:
+        """(labels, J) amounts with one piece of ground left out each."""
+        n = self.nuisance([*places, *exclude])
+        every = np.concatenate([n, places])
+        more = np.diag(np.concatenate([self.weight(n), np.zeros(len(places))]))
+        out = []
+        for label in sorted(set(self.labels)):
+            rest = self.gram.copy()
+            for u, own in zip(self.units, self.labels, strict=True):
+                if own == label:
+                    rest[np.ix_(u.place, u.place)] -= u.gram
+            out.append(_solve(rest[np.ix_(every, every)] + more, rest[every, 0])[len(n) :])
+        return np.array(out)
+
+    def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array]:
+        """Amounts and their standard errors: the larger of the likelihood's and the jackknife's."""
+        information, score, _, _ = self.reduce(places, exclude)
+        inverse = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+        scatter = jackknife_error(self.without_one(places, exclude))
+        return inverse @ score, np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter)
+
+
+def weigh_all(whole: Whole) -> tuple[dict[str, Found], Array]:
+    """The best guise of every effect with its family-wise p, and the largest surprise of every sham."""
+    best: dict[str, Found] = {}
+    null: dict[str, Array] = {}
+    for guise in whole.plan.guises:
+        if (
+            get_effect(guise.effect).never_named
+            or not len(whole.places(guise))
+            or not whole.seen[whole.places(guise)].all()
+        ):
+            continue
+        found, shams = whole.weigh(guise)
+        e = guise.effect
+        null[e] = np.maximum(null[e], shams) if e in null else shams
+        if e not in best or found.surprise > best[e].surprise:
+            best[e] = found
+    if not best:
+        return {}, np.zeros(1)
+    largest = np.max(np.stack(list(null.values())), 0)
+    for found in best.values():
+        found.p = (1 + float((largest >= found.surprise).sum())) / (1 + len(largest))
+    return best, largest
+
+
+def _surprise(ratio: Array, freedom: int) -> Array:
+    """-log10 of the upper tail of chi square, by its leading term where that underflows."""
+    ratio = np.maximum(ratio, 1e-12)
+    leading = ratio / 2 - (freedom / 2 - 1) * np.log(ratio / 2) + gammaln(freedom / 2)
+    exact = -np.log(np.maximum(gammaincc(freedom / 2, ratio / 2), 1e-300))
+    return np.maximum(np.where(exact < 600, exact, leading) / math.log(10), 0.0)
+
+
+def _scatter(information: Array, score: Array) -> tuple[float, float]:
+    """Twice the log likelihood of values that scatter about nothing, at the best of their standard deviations, and it."""
+    power, axes = np.linalg.eigh((information + information.T) / 2)
+    power, squares = np.maximum(power, 0.0), (axes.T @ score) ** 2
+    every = [
+        (float((squares / (power + v**-2)).sum() - np.log1p(v * v * power).sum()), v)
+        for v in np.geomspace(1e-3, 10.0, 25)
+    ]
+    return max(every)
+
+
+def _scaled(a: Array) -> tuple[Array, Array]:
+    scale = 1 / np.sqrt(np.maximum(a.diagonal(), 1e-30))
+    return a * np.outer(scale, scale) + 1e-10 * np.eye(len(a)), scale
+
+
+def _solve(a: Array, b: Array) -> Array:
+    scaled, scale = _scaled(a)
+    return scale * cho_solve(cho_factor(scaled), scale * b)
+
+
+def _left(unit: Products, b: Array) -> float:
+    own = b[unit.place]
+    return float(unit.gram[0, 0] - 2 * own @ unit.gram[:, 0] + own @ unit.gram @ own)
+
+
+__all__ = ["Found", "Whole", "interval", "weigh_all"]

@@ -1,0 +1,1 @@
+"""Step 0: the nominal model, rendered site by site."""

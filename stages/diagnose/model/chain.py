@@ -1,0 +1,195 @@
+"""The forward model of one site, rendered again and again with small changes: what does not change is kept."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from stages.diagnose.model.sites import Site
+from stages.effects import Effect
+from stages.physics.formation import chain as formation
+from stages.physics.formation import geometry
+from stages.physics.formation.chain import State
+from stages.physics.photometry import ReflectanceModel, get_model, masked_radiance_factor
+
+STEP = 0.02  # of a slope, as tangent
+RICH = "kernels"  # the model that follows any smooth law
+SCATTER = 0.14  # 8 deg: rms slope of relief below a typical DEM's resolution
+
+
+class SharpSlopes:
+    """Slopes by fourth-order differences, as an extension of the model.
+
+    Second-order ones, which the simulation uses, take the mean over two pixels: a third of a squared pixel along the
+    slope, that images do not have. Judged with them every image looks sharper than it is, and every DEM smoother.
+    """
+
+    slot = "illumination"
+
+    def __init__(self, gsd: float, body_radius: float) -> None:
+        self.gsd, self.body_radius = gsd, body_radius
+        self.made: object = None
+
+    def apply(self, state: State) -> None:
+        if state.slopes is self.made:  # taken over from the state that they were made for
+            return
+        z = state.elevation
+        east, north = geometry.slopes(z, self.gsd)
+        far, near = z[..., 4:] - z[..., :-4], z[..., 3:-1] - z[..., 1:-3]
+        east[..., 2:-2] = (8 * near - far) / (12 * self.gsd)
+        far, near = z[..., 4:, :] - z[..., :-4, :], z[..., 3:-1, :] - z[..., 1:-3, :]
+        north[..., 2:-2, :] = (far - 8 * near) / (12 * self.gsd)
+        state.slopes = geometry.curvature_slopes(east, north, self.gsd, self.body_radius)
+        self.made = self.made or state.slopes
+
+
+class Chain:
+    """Renders a site with the effects named so far (``base``) plus one more.
+
+    coefficients : broadcastable to (n, C, H, W). moved : effects that the site's images are rid of; free : coefficients
+    that may move, None for all. Templates carry the site's albedo texture; predictions do not.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        model: ReflectanceModel,
+        coefficients: Tensor,
+        base: Sequence[Effect],
+        moved: Sequence[Effect] = (),
+        free: Tensor | None = None,
+    ) -> None:
+        self.site, self.model, self.coefficients, self.base = site, model, coefficients, list(base)
+        self.moved = list(moved)
+        self.free = free
+        self._measured = torch.where(site.valid, site.image, torch.nan)
+        self._sharp = SharpSlopes(site.observation.gsd, site.observation.body_radius)
+        self._state = self._illuminate(self.base)
+        self._state.reflectance = self._surface(self._state)
+        self.textured = self.render()
+        # of the image that they belong to: it changes once its texture is known
+        self._tangents: tuple[Tensor | None, list[Tensor]] = (None, [])
+        self._slope_tangents: tuple[Tensor | None, tuple[Tensor, Tensor]] = (None, (self.textured, self.textured))
+        self._unresolved: tuple[Tensor | None, Tensor] = (None, self.textured)
+
+    @property
+    def state(self) -> State:
+        """Angles and visibility under the base effects; not to be changed."""
+        return self._state
+
+    def _illuminate(self, effects: Sequence[Effect], known: State | None = None) -> State:
+        return formation.illuminate(self.site.observation, [self._sharp, *effects], known)
+
+    def _surface(self, state: State, coefficients: Tensor | None = None) -> Tensor:
+        c = self.coefficients if coefficients is None else coefficients
+        return masked_radiance_factor(self.model, self.model.unpack(c, dim=1), state.angles)
+
+    def _expose(self, state: State, reflectance: Tensor, effects: list[Effect], texture: bool = True) -> Tensor:
+        state = copy.copy(state)
+        state.further_light = list(state.further_light)
+        state.reflectance = reflectance * self.site.texture if texture else reflectance
+        state.measured = self._measured if texture else None
+        return formation.expose(state, effects)
+
+    def predict(self) -> Tensor:
+        """(n, H, W) I/F without the texture."""
+        return self._expose(self._state, self._state.reflectance, self.base, texture=False)
+
+    def render(self, extra: Effect | None = None) -> Tensor:
+        """(n, H, W) I/F with the texture and one more effect."""
+        if extra is None:
+            return self._expose(self._state, self._state.reflectance, self.base)
+        effects = [*self.base, extra]
+        if extra.slot in ("geometry", "illumination"):
+            state = self._illuminate(effects, self._state)
+            same = state.angles.cos_incidence is self._state.angles.cos_incidence
+            return self._expose(state, self._state.reflectance if same else self._surface(state), effects)
+        return self._expose(self._state, self._state.reflectance, effects)
+
+    def replace(self, k: int, effect: Effect) -> Tensor:
+        """As ``render`` with base effect ``k`` exchanged."""
+        effects = [effect if j == k else e for j, e in enumerate(self.base)]
+        if effect.slot in ("geometry", "illumination"):
+            state = self._illuminate(effects)
+            return self._expose(state, self._surface(state), effects)
+        return self._expose(self._state, self._state.reflectance, effects)
+
+    def surface_tangents(self, keep: bool = True) -> list[Tensor]:
+        """d image / d coefficient, one (n, H, W) per free coefficient: the nominal model's own freedom."""
+        if self._tangents[0] is self.textured:
+            return self._tangents[1]
+        columns: list[Tensor] = []
+        for k in range(self.coefficients.shape[1]):
+            if self.free is not None and not bool(self.free[k]):
+                continue
+            c = self.coefficients.clone()
+            step = 0.05 * float(c[:, k].abs().mean()) + 1e-4
+            c[:, k] += step
+            shifted = self._expose(self._state, self._surface(self._state, c), self.base)
+            columns.append((shifted - self.textured) / step)
+        if keep:
+            self._tangents = (self.textured, columns)
+        return columns
+
+    @property
+    def free_form(self) -> bool:
+        """Whether the nominal model is the sum of kernels itself."""
+        return self.model.name == RICH
+
+    def form_tangents(self) -> list[Tensor]:
+        """d image / d coefficient of a sum of kernels that stands beside the nominal model, (n, H, W) each."""
+        if self.free_form:
+            return []
+        rich = get_model(RICH)
+        zero = torch.zeros(1, len(rich.parameters), 1, 1)
+        out = []
+        for k in range(len(rich.parameters)):
+            c = zero.clone()
+            c[:, k] = 1.0
+            surface = masked_radiance_factor(rich, rich.unpack(c, dim=1), self._state.angles)
+            step = 0.02 * self._state.reflectance.mean() / surface.mean().abs().clamp(min=1e-9)
+            more = self._expose(self._state, self._state.reflectance + step * surface, self.base)
+            out.append(more - self.textured)
+        return out
+
+    def slope_tangents(self) -> tuple[Tensor, Tensor]:
+        """d image / d slope to the east and to the north: how an error of the DEM shows in every image."""
+        if self._slope_tangents[0] is self.textured:
+            return self._slope_tangents[1]
+        east, north = self._state.slopes
+        out = []
+        for de, dn in ((STEP, 0.0), (0.0, STEP)):
+            state = copy.copy(self._state)
+            state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
+            out.append((self._expose(state, self._surface(state), self.base) - self.textured) / STEP)
+        self._slope_tangents = self.textured, (out[0], out[1])
+        return out[0], out[1]
+
+    def unresolved_slopes(self) -> Tensor:
+        """What a scatter of slopes within a pixel, or of the DEM's own slopes, does to the mean: its second order."""
+        if self._unresolved[0] is self.textured:
+            return self._unresolved[1]
+        east, north = self._state.slopes
+        out = -self.textured.clone()
+        for de, dn in ((SCATTER, 0.0), (-SCATTER, 0.0), (0.0, SCATTER), (0.0, -SCATTER)):
+            state = copy.copy(self._state)
+            state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
+            out += 0.25 * self._expose(state, self._surface(state), self.base)
+        self._unresolved = self.textured, out
+        return out
+
+    def lit(self) -> Tensor:
+        """(n, H, W) bool: ground that the Sun's centre shines on."""
+        above, facing = self.height_above_horizon(), self._state.angles.cos_incidence > 0
+        return facing if above is None else facing & (above > 0)
+
+    def height_above_horizon(self) -> Tensor | None:
+        """rad, (n, H, W): the Sun's centre above the terrain horizon."""
+        state = self._state
+        if state.sun_horizon is None:
+            return None
+        sun = torch.asin(state.sun_direction[:, 2].clamp(-1, 1))
+        return sun[:, None, None] - state.sun_horizon

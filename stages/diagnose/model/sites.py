@@ -1,0 +1,123 @@
+"""Measured pairs, grouped by the ground they show, and what the effects need to know about them as a whole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stages.diagnose.settings import FEWEST_PIXELS
+from stages.effects import Survey, fields
+from stages.effects.relief_displacement import lean
+from stages.pairs.reader import PairReader
+from stages.physics.formation.chain import Observation
+
+
+@dataclass
+class Site:
+    """All images of one piece of ground, pixel for pixel.
+
+    image, valid : (n, H, W), I/F aligned with the ground (after the nominal fit also for dn images), and bool
+    read, read_valid : the same as they were read
+    pairs : (n,) indices into the file; number : the site's number in the file; place : (2,) row and column in the scene, px
+    gain, offset : (n,), measured = gain x I/F + offset; 1 and 0 for calibrated images
+    texture : (H, W), relative albedo of the ground beyond the nominal model
+    displacement : where each image looks for its pixels, (columns east, rows south), px, broadcastable to it
+    """
+
+    observation: Observation
+    image: Tensor
+    valid: Tensor
+    read: Tensor
+    read_valid: Tensor
+    pairs: NDArray[np.int64]
+    number: int
+    place: tuple[float, float]
+    gain: Tensor
+    offset: Tensor
+    texture: Tensor
+    displacement: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def count(self) -> int:
+        return len(self.pairs)
+
+    @property
+    def frames(self) -> NDArray[np.int64]:
+        assert self.observation.frame is not None
+        return self.observation.frame.numpy()
+
+
+def load_site(reader: PairReader, pairs: NDArray[np.int64]) -> Site | None:
+    """Read one site's pairs, but for images that show hardly a pixel; None if there is no other."""
+    valid = reader.valid(pairs)
+    pairs = pairs[(valid.sum((-2, -1)) >= FEWEST_PIXELS).numpy()]
+    if not len(pairs):
+        return None
+    observation = reader.observation(pairs)
+    number = int(reader.site[pairs[0]])
+    observation.site = torch.full((len(pairs),), number)
+    if observation.detector_sample is None or observation.detector_line is None:
+        observation.detector_sample = observation.detector_line = None
+    image, valid = reader.image(pairs), reader.valid(pairs)
+    if observation.sun_horizon is not None:
+        valid &= torch.isfinite(observation.sun_horizon)
+    one = torch.ones(len(pairs))
+    height, width = image.shape[-2:]
+    place = tuple(float(reader.file[name][pairs[0]]) if name in reader.file else 0.0 for name in ("row", "col"))
+    texture = torch.ones(height, width)
+    return Site(observation, image, valid, image, valid, pairs, number, (place[0], place[1]), one, one * 0, texture)
+
+
+def group_pairs(reader: PairReader, pairs: NDArray[np.int64], most: int) -> list[NDArray[np.int64]]:
+    """Pairs by site, each site cut to ``most`` images spread evenly; sites with many images first."""
+    groups = []
+    for number in np.unique(reader.site[pairs]):
+        members = pairs[reader.site[pairs] == number]
+        if len(members) > most:
+            members = members[np.linspace(0, len(members) - 1, most).round().astype(int)]
+        groups.append(members)
+    return sorted(groups, key=lambda g: -len(g))
+
+
+def survey(sites: list[Site], frames: int, units: str) -> Survey:
+    """Means and deviations of the terrain and the brightness over all sites."""
+    first = sites[0].observation
+    bright = torch.cat([s.image[s.valid].flatten()[:: max(1, s.count // 2)] for s in sites])
+    bright = bright[:: max(1, len(bright) // 200_000)]
+    lit = bright[bright > 0.3 * bright.mean()] if len(bright) else torch.tensor([0.05])
+    top = torch.quantile(bright, torch.tensor([0.9, 0.97, 0.99, 0.998])) if len(bright) else lit.repeat(4)
+    terrain = [s.observation.elevation[:1] for s in sites]
+    columns = [c for s in sites if (c := s.observation.detector_sample) is not None]
+    known = len(columns) == len(sites)
+    ends = (
+        (min(float(c.nan_to_num(1e9).min()) for c in columns), max(float(c.nan_to_num(-1e9).max()) for c in columns))
+        if known
+        else (0.0, float(first.elevation.shape[-1] - 1))
+    )
+    level = float(torch.cat([z.flatten() for z in terrain]).double().mean())
+    leaning = [torch.stack(lean(s.observation, level)).square().sum(0).mean() for s in sites]
+    return Survey(
+        crop_px=int(min(first.elevation.shape[-2:])),
+        gsd=first.gsd,
+        brightness=float(lit.mean()),
+        brightness_quantiles=(float(top[0]), float(top[1]), float(top[2]), float(top[3])),
+        slope=_moments([fields.slope(z, first.gsd) for z in terrain]),
+        elevation=_moments(terrain),
+        curvature=_moments([fields.curvature(z, first.gsd) for z in terrain]),
+        relief=max(float(z.max() - z.min()) for z in terrain),
+        columns=ends,
+        lean_px=float(torch.stack(leaning).mean().sqrt()),
+        units=units,
+        has_detector=known,
+        frames=frames,
+        sites=len(sites),
+    )
+
+
+def _moments(parts: list[Tensor]) -> tuple[float, float]:
+    values = torch.cat([p.flatten() for p in parts]).double()
+    return float(values.mean()), max(float(values.std()), 1e-9)

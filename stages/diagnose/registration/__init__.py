@@ -1,0 +1,1 @@
+"""Step 1: where the images lie beside the ground."""

@@ -1,0 +1,63 @@
+"""Shifts of several pixels, found by correlating images with their rendering under masks."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from stages.effects.filters import gaussian
+
+
+def fine(image: Tensor, mask: Tensor, sigma: float) -> Tensor:
+    """The image less its Gaussian mean over ``sigma`` px of valid pixels, 0 where invalid; (n, H, W)."""
+    share = gaussian(mask, sigma**2).clamp(min=1e-3)
+    return (image - gaussian(image * mask, sigma**2) / share) * mask
+
+
+def correlation(image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, most: int) -> Tensor:
+    """Normalised correlation at every whole shift, (n, 2 most + 1, 2 most + 1), rows then columns: image(x) with rendered(x + shift).
+
+    Masked as by Padfield (2012, IEEE Trans. Image Process. 21, 2706); 0 where under a quarter of the pixels overlap.
+    """
+    height, width = image.shape[-2:]
+    size = (height + 2 * most, width + 2 * most)
+
+    def spectrum(x: Tensor) -> Tensor:
+        return torch.fft.rfft2(x, s=size)
+
+    a, m1, b, m2 = spectrum(image * valid), spectrum(valid), spectrum(rendered * lit), spectrum(lit)
+    a2, b2 = spectrum(image**2 * valid), spectrum(rendered**2 * lit)
+
+    def cross(x: Tensor, y: Tensor) -> Tensor:
+        whole = torch.fft.irfft2(x.conj() * y, s=size)
+        return torch.roll(whole, (most, most), (-2, -1))[..., : 2 * most + 1, : 2 * most + 1]
+
+    count = cross(m1, m2).clamp(min=1e-3)
+    sum_a, sum_b = cross(a, m2), cross(m1, b)
+    top = cross(a, b) - sum_a * sum_b / count
+    below = (cross(a2, m2) - sum_a**2 / count).clamp(min=0) * (cross(m1, b2) - sum_b**2 / count).clamp(min=0)
+    enough = count > 0.25 * torch.minimum(valid.sum((-2, -1)), lit.sum((-2, -1)))[:, None, None]
+    return torch.where(enough, top / below.clamp(min=1e-30).sqrt(), 0.0)
+
+
+def capture(
+    image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, most: int, sigma: float
+) -> tuple[Tensor, Tensor]:
+    """Shift (n, 2) east and south, px, that brings each image over its rendering, and the correlation there, (n,)."""
+    valid, lit = valid.float(), lit.float()
+    map_ = correlation(fine(image, valid, sigma), valid, fine(rendered, lit, sigma), lit, most)
+    best, place = map_.flatten(1).max(1)
+    row, column = place // map_.shape[-1], place % map_.shape[-1]
+    n = torch.arange(len(map_))
+    inner_row, inner_column = row.clamp(1, 2 * most - 1), column.clamp(1, 2 * most - 1)
+
+    def vertex(low: Tensor, middle: Tensor, high: Tensor) -> Tensor:
+        bend = (low - 2 * middle + high).clamp(max=-1e-9)
+        return (0.5 * (low - high) / bend).clamp(-0.5, 0.5)
+
+    south = vertex(map_[n, inner_row - 1, column], map_[n, inner_row, column], map_[n, inner_row + 1, column])
+    east = vertex(map_[n, row, inner_column - 1], map_[n, row, inner_column], map_[n, row, inner_column + 1])
+    return torch.stack([column - most + east, row - most + south], 1), best
+
+
+__all__ = ["capture", "correlation", "fine"]

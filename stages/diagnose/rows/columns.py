@@ -1,0 +1,141 @@
+"""The columns of the linear model: what a small amount of everything would add to the images of a site."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from stages.diagnose.model.chain import Chain
+from stages.effects import Survey, Trial, get_effect
+
+
+@dataclass(frozen=True)
+class Guise:
+    """An effect in one of its guises; ``columns`` are its places among the shared columns, or among those per frame."""
+
+    effect: str
+    trial: Trial
+    columns: tuple[int, ...]
+    per_frame: bool = False
+
+
+@dataclass
+class Plan:
+    """Which columns there are, the same for every site.
+
+    shared : names of the columns with one amount for all images; per_frame : of those with one for every frame
+    prior : standard deviations of the nuisance among them, in multiples of the column (inf: free)
+    """
+
+    shared: list[str] = field(default_factory=list)
+    per_frame: list[str] = field(default_factory=list)
+    prior: dict[int, float] = field(default_factory=dict)
+    frame_prior: dict[int, float] = field(default_factory=dict)
+    ordinary: dict[str, list[int]] = field(default_factory=dict)  # effect -> its columns among the nuisance
+    form: list[int] = field(
+        default_factory=list
+    )  # another form of the reflectance, beside effects that could stand for it
+    guises: list[Guise] = field(default_factory=list)
+    steps: list[tuple[int, str, float]] = field(default_factory=list)  # base effect, coordinate, step: tangents
+
+
+def make_plan(chain: Chain, names: Sequence[str], data: Survey) -> Plan:
+    """Columns for the nominal model's freedom, the effects in the chain, ordinary imperfections, and the candidates ``names``."""
+    plan = Plan()
+
+    def shared(name: str, prior: float | None = None) -> int:
+        plan.shared.append(name)
+        if prior is not None:
+            plan.prior[len(plan.shared) - 1] = prior
+        return len(plan.shared) - 1
+
+    free = range(chain.coefficients.shape[1]) if chain.free is None else torch.nonzero(chain.free)[:, 0].tolist()
+    for k in free:
+        shared(f"coefficient {k}", float("inf"))
+    for k in free:
+        shared(f"coefficient {k} with albedo", float("inf"))
+    if not chain.free_form:
+        for k in range(len(chain.form_tangents())):
+            plan.form.append(shared(f"form {k}"))
+    shared("slopes within a pixel", 1.0)
+    for place, effect in enumerate(chain.base):
+        if effect.scope == "scene":
+            for p in effect.fitted():
+                if p.name not in effect.held:
+                    step = type(effect).step(p.name, data)
+                    plan.steps.append((place, p.name, step))
+                    shared(f"{effect.name}.{p.name}", float("inf"))
+    named = [e.name for e in chain.base if e.scope == "image"]
+    for name in [*named, *(n for n in names if n not in named)]:
+        cls = get_effect(name)
+        if cls.scope == "scene":
+            for trial in cls.trials(data):
+                places = tuple(shared(name) for _ in trial.columns)
+                plan.guises.append(Guise(name, trial, places))
+                if name not in plan.ordinary and (size := cls.ordinary(trial)) > 0:
+                    plan.ordinary[name] = list(places)
+                    plan.prior |= {k: size for k in places}
+        elif cls.scope == "image":
+            first = len(plan.per_frame)
+            plan.per_frame += [name] * len(cls.fitted())
+            places = tuple(range(first, len(plan.per_frame)))
+            trial = Trial(tuple({p.name: cls.strong[p.name]} for p in cls.fitted()))
+            plan.guises.append(Guise(name, trial, places, True))
+            if cls.always and name not in named:
+                plan.frame_prior |= {k: cls.always for k in places}
+    return plan
+
+
+def shared_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
+    """(m, n, H, W): the residual first, then the shared columns in the plan's order.
+
+    The residual is that of the bare prediction, albedo being part of its covariance; what effects add goes with the albedo.
+    """
+    tangents = chain.surface_tangents()
+    bright = chain.site.texture - chain.site.texture.mean()
+    out = [
+        chain.site.image - chain.predict(),
+        *tangents,
+        *(t * bright for t in tangents),
+        *chain.form_tangents(),
+        chain.unresolved_slopes(),
+    ]
+    for place, coordinate, step in plan.steps:
+        effect = chain.base[place]
+        moved = type(effect)({**effect.values, coordinate: float(effect.values[coordinate]) + step}, data)
+        out.append((chain.replace(place, moved) - chain.textured) / step)
+    for guise in plan.guises:
+        if not guise.per_frame:
+            cls = get_effect(guise.effect)
+            for column in guise.trial.columns:
+                out.append(chain.render(cls({**guise.trial.fixed, **column}, data)) - chain.textured)
+    return torch.stack(out)
+
+
+def frame_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
+    """(k, n, H, W): what each coordinate of the effects with values per frame adds to the frame's own image."""
+    out = []
+    frames = int(chain.site.frames.max()) + 1
+    base = {e.name: k for k, e in enumerate(chain.base)}
+    for guise in plan.guises:
+        if not guise.per_frame:
+            continue
+        cls = get_effect(guise.effect)
+        lit = chain.lit() if cls.displaces else 1.0
+        for column in guise.trial.columns:
+            ((name, size),) = column.items()
+            if guise.effect in base:
+                effect = chain.base[base[guise.effect]]
+                moved = chain.replace(
+                    base[guise.effect], cls({**effect.values, name: effect.values[name] + size}, data)
+                )
+            else:
+                moved = chain.render(cls({name: torch.full((frames,), size)}, data))
+            out.append((moved - chain.textured) * lit)
+    return torch.stack(out) if out else torch.zeros(0, *chain.textured.shape)
+
+
+__all__ = ["Guise", "Plan", "frame_columns", "make_plan", "shared_columns"]

@@ -1,0 +1,196 @@
+"""Pieces of ground, seen through a window: relative residuals and templates as Fourier coefficients."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.nominal import lit_mask
+from stages.diagnose.settings import CLEAR, DARKEST, FEWEST_PIXELS, LIT_MARGIN, PATCH, RUGGED, SECTORS, TAPER, UNITS
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Waves of a patch: which coefficients of ``rfft2`` are kept, how often each counts, and its annulus and sector.
+
+    keep : (K,) indices; root : (K,) root of how often a wave counts over the number of pixels
+    annulus, sector : (K,) numbers; direction : (SECTORS, 2) unit vectors east, north; radius : (A,) cycles/px, mean
+    """
+
+    height: int
+    width: int
+    keep: Tensor
+    root: Tensor
+    annulus: Tensor
+    sector: Tensor
+    direction: Tensor
+    radius: Tensor
+
+    @property
+    def annuli(self) -> int:
+        return len(self.radius)
+
+    @property
+    def bins(self) -> Tensor:
+        return self.annulus * SECTORS + self.sector
+
+
+def make_grid(height: int, width: int) -> Grid:
+    """Annuli grow by half an octave, the first ones by single waves."""
+    ky = torch.fft.fftfreq(height)[:, None].expand(height, width // 2 + 1)
+    kx = torch.fft.rfftfreq(width).expand_as(ky)
+    twice = torch.full_like(kx, 2.0)
+    twice[:, 0] = 1.0
+    if width % 2 == 0:
+        twice[:, -1] = 1.0
+    radius = torch.hypot(kx, ky) * math.sqrt(height * width)  # waves per patch
+    keep = torch.nonzero(radius.flatten() > 0.5)[:, 0]
+    r = radius.flatten()[keep]
+    edges = [1.5, 2.5, 4.0]
+    while edges[-1] < float(r.max()):
+        edges.append(edges[-1] * math.sqrt(2))
+    annulus = torch.bucketize(r, torch.tensor(edges[:-1]))
+    # image rows run south
+    angle = torch.atan2(-ky.flatten()[keep], kx.flatten()[keep]) % math.pi
+    sector = (angle / math.pi * SECTORS).long().clamp(max=SECTORS - 1)
+    middle = (torch.arange(SECTORS) + 0.5) * math.pi / SECTORS
+    direction = torch.stack([middle.cos(), middle.sin()], 1)
+    count = int(annulus.max()) + 1
+    mean = torch.zeros(count).index_add_(0, annulus, r) / torch.bincount(annulus, minlength=count).clamp(min=1)
+    order = torch.argsort(annulus * SECTORS + sector, stable=True)  # waves of a bin lie together
+    keep, annulus, sector, r = keep[order], annulus[order], sector[order], r[order]
+    root = (twice.flatten()[keep] / (height * width)).sqrt()
+    return Grid(height, width, keep, root, annulus, sector, direction, mean / math.sqrt(height * width))
+
+
+@dataclass
+class Patch:
+    """One piece of one site. weight : (n, h, w) window on judged pixels; scale : (n, h, w), I/F that residuals are relative to
+
+    images : (n,) which of the site's images; slopes : (n, 2) relative brightness per slope to the east and north
+    """
+
+    number: int
+    site: int
+    images: Tensor
+    rows: slice
+    columns: slice
+    weight: Tensor
+    scale: Tensor
+    slopes: Tensor
+    level: Tensor
+    frames: Tensor
+    free: bool  # gain and offset of every image
+
+    def relative(self, fields: Tensor) -> Tensor:
+        """Fields (m, N, H, W) of the site as relative ones of the patch, free of each image's mean (gain and offset), windowed."""
+        x = fields[:, self.images, self.rows, self.columns] / self.scale
+        return x
+
+    def transform(self, fields: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
+        """Fields (m, N, H, W) -> coefficients (m, n, K) complex and means (m, n)."""
+        x = self.relative(fields)
+        w = self.weight
+        total = w.sum((-2, -1)).clamp(min=1e-9)
+        mean = (x * w).sum((-2, -1)) / total
+        x = x - mean[..., None, None]
+        if self.free:
+            bright = self.level
+            x = (
+                x
+                - ((x * bright * w).sum((-2, -1)) / (bright * bright * w).sum((-2, -1)).clamp(min=1e-9))[
+                    ..., None, None
+                ]
+                * bright
+            )
+        z = torch.fft.rfft2(x * w).flatten(-2)[..., grid.keep] * grid.root
+        return z, mean
+
+
+def judged(chain: Chain) -> Tensor:
+    """(n, H, W) bool: ground with the Sun well above its own slopes and the horizon, and ground in deep shadow a pixel away from its edge.
+
+    Elsewhere relief below the DEM's resolution decides what is lit.
+    """
+    own = torch.asin(chain.state.angles.cos_incidence.clamp(-1, 1))
+    above = chain.height_above_horizon()
+    east, north = chain.state.slopes
+    rugged = math.atan(float((east.square() + north.square()).mean().sqrt()))
+    clear = own > max(CLEAR, RUGGED * rugged)
+    lit = lit_mask(chain) & clear
+    if above is None:
+        return lit
+    lit &= above > max(CLEAR, RUGGED * rugged)
+    deep = (above < -LIT_MARGIN).float()
+    deep = -torch.nn.functional.max_pool2d(-deep[:, None], 3, 1, 1)[:, 0] > 0
+    return lit | (deep & chain.site.valid)
+
+
+def window(height: int, width: int) -> Tensor:
+    """Cosine taper (Tukey) at the borders, (h, w)."""
+
+    def side(count: int) -> Tensor:
+        u = (torch.arange(count) + 0.5) / count
+        edge = torch.minimum(u, 1 - u) / TAPER
+        return torch.where(edge < 1, 0.5 - 0.5 * torch.cos(math.pi * edge), 1.0)
+
+    return side(height)[:, None] * side(width)
+
+
+def cuts(size: int, sites: int) -> int:
+    """Into how many pieces a side is cut, so that there are enough pieces of ground for a jackknife."""
+    need = math.ceil(math.sqrt(UNITS / max(sites, 1)))
+    return max(1, min(need, size // PATCH))
+
+
+def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Patch]:
+    """The pieces of one site that show enough pixels."""
+    use = judged(chain)
+    image = chain.predict()
+    _, height, width = image.shape
+    lit = lit_mask(chain)
+    level = (image * lit).sum((-2, -1)) / lit.sum((-2, -1)).clamp(min=1)
+    scale = torch.maximum(image, DARKEST * level[:, None, None]).clamp(min=1e-6)
+    east, north = chain.slope_tangents()
+    h, w = height // pieces, width // pieces
+    out = []
+    for i in range(pieces):
+        for j in range(pieces):
+            rows, columns = slice(i * h, (i + 1) * h), slice(j * w, (j + 1) * w)
+            here = use[:, rows, columns]
+            seen = (here & lit[:, rows, columns]).sum((-2, -1))
+            images = torch.nonzero((seen >= min(FEWEST_PIXELS, 0.3 * h * w)) & (level > 0))[:, 0]
+            if not len(images):
+                continue
+            weight = here[images].float() * window(h, w)
+            s = scale[images, rows, columns]
+            total = weight.sum((-2, -1)).clamp(min=1e-9)
+            slopes = torch.stack(
+                [((t[images, rows, columns] / s) * weight).sum((-2, -1)) / total for t in (east, north)], 1
+            )
+            bright = 1 / s
+            bright = bright - ((bright * weight).sum((-2, -1)) / total)[:, None, None]
+            frames = torch.from_numpy(chain.site.frames)[images]
+            out.append(
+                Patch(
+                    (number * pieces + i) * pieces + j,
+                    number,
+                    images,
+                    rows,
+                    columns,
+                    weight,
+                    s,
+                    slopes,
+                    bright,
+                    frames,
+                    free,
+                )
+            )
+    return out
+
+
+__all__ = ["Grid", "Patch", "judged", "make_grid", "make_patches"]

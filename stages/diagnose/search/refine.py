@@ -1,0 +1,118 @@
+"""The values of all named effects that fit best together: Gauss-Newton steps, rendered again each time."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from stages.diagnose.search.state import Cause, State, View
+from stages.diagnose.settings import SETTLED, STEPS
+from stages.effects import Survey, get_effect
+
+
+def as_effect(found, data: Survey, frames: int, whole):
+    """The effect at the first estimate of its values, within bounds."""
+    cls = get_effect(found.effect)
+    values = {**cls.null(), **found.guise.trial.fixed}
+    if found.guise.per_frame:
+        table = np.zeros(len(whole.plan.per_frame) * frames)
+        places = whole.places(found.guise)
+        table[places - whole.first] = found.amount
+        for k, column in zip(found.guise.columns, found.guise.trial.columns, strict=True):
+            ((name, size),) = column.items()
+            values[name] = torch.from_numpy(table[k * frames : (k + 1) * frames] * size).float()
+        return cls(values, data)
+    for amount, column in zip(found.amount, found.guise.trial.columns, strict=True):
+        for name, at in column.items():
+            low, high = cls.bounds(name)
+            null = cls.null()[name]
+            values[name] = min(max(null + float(amount) * (at - null), low), high)
+    effect = cls(values, data)
+    touched = {name for column in found.guise.trial.columns for name in column}
+    effect.held = tuple(p.name for p in cls.fitted() if p.name not in touched and p.name not in cls.shaped)
+    return effect
+
+
+def refine(state: State) -> View:
+    """Fit the nominal model and all causes' values together; sets values and errors; returns the last look."""
+    view = None
+    for step in range(STEPS):
+        state.fit()
+        along = [n for n in state.open_names() if _ordinary(n) or get_effect(n).always]
+        view = state.look(along, 0)
+        largest = _step(state, view, last=step == STEPS - 1)
+        if largest < SETTLED:
+            break
+    state.fit()
+    assert view is not None
+    return view
+
+
+def _ordinary(name: str) -> bool:
+    cls = get_effect(name)
+    return cls.scope == "scene" and bool(cls.tolerance)
+
+
+def _step(state: State, view: View, last: bool) -> float:
+    """Move all values; returns the largest move in standard errors."""
+    whole, plan = view.whole, view.plan
+    scene = [(k, step) for k, step in enumerate(plan.steps)]
+    first = next((k for k, n in enumerate(plan.shared) if "." in n), len(plan.shared))
+    largest = 0.0
+    if scene:
+        places = np.array([1 + first + k for k, _ in scene])
+        seen = whole.seen[places]
+        for p in places:
+            whole.precision.pop(int(p), None)
+        amounts, errors = whole.errors(places[seen])
+        for p in places:
+            whole.precision[int(p)] = 1e-10 * whole.gram[p, p]
+        alone = {c.effect.name: 0 for c in state.causes}
+        for (_, (place, name, _)), amount, error in zip(
+            [s for s, ok in zip(scene, seen, strict=True) if ok], amounts, errors, strict=True
+        ):
+            cause = state.causes[place]
+            cls = type(cause.effect)
+            low, high = cls.bounds(name)
+            now = float(cause.effect.values[name])
+            limit = max(abs(now - cls.null()[name]), 10 * cls.step(name, state.data))
+            moved = min(max(now + float(np.clip(amount, -limit, limit)), low), high)
+            largest = max(largest, abs(moved - now) / max(error, 1e-12))
+            effect = cls({**cause.effect.values, name: moved}, state.data)
+            effect.held = cause.effect.held
+            cause.effect = effect
+            cause.errors[name] = float(error)
+            alone[cls.name] += 1
+    for cause in state.causes:
+        if cause.found.guise.per_frame:
+            largest = max(largest, _step_frames(state, view, cause))
+    return largest
+
+
+def _step_frames(state: State, view: View, cause: Cause) -> float:
+    """Move the values per frame, drawn to nothing as far as the first estimate found."""
+    whole = view.whole
+    guise = next((g for g in view.plan.guises if g.effect == cause.effect.name), None)
+    if guise is None:
+        return 0.0
+    places = whole.places(guise)
+    cls = type(cause.effect)
+    names = [p.name for p in cls.fitted()]
+    sizes = np.array([cls.strong[n] for n in names])
+    index = places - whole.first
+    column, frame = index // whole.frames - min(guise.columns), index % whole.frames
+    table = np.stack([np.broadcast_to(np.asarray(cause.effect.values[n], float), (whole.frames,)) for n in names])
+    now = table[column, frame] / sizes[column]
+    information, score, _, _ = whole.reduce(places)
+    prior = cause.found.spread**-2
+    inverse = np.linalg.inv(information + prior * np.eye(len(places)))
+    move = inverse @ (score - prior * now)
+    out = table.copy()
+    out[column, frame] = (now + move) * sizes[column]
+    cause.effect = cls({n: torch.from_numpy(out[k].copy()).float() for k, n in enumerate(names)}, state.data)
+    variance = inverse.diagonal() * sizes[column] ** 2
+    cause.errors["rms"] = float(np.sqrt(variance.mean() / max(len(variance), 1)))
+    return float(np.sqrt((move**2).mean() / max(inverse.diagonal().mean(), 1e-12)))
+
+
+__all__ = ["as_effect", "refine"]

@@ -1,0 +1,203 @@
+"""Forward selection: the effect that gains most on held-out ground is named, if shams seldom do as well and it does not come out ordinary."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from stages.diagnose.likelihood.covariance import Covariance
+from stages.diagnose.likelihood.products import products
+from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
+from stages.diagnose.search.refine import as_effect, refine
+from stages.diagnose.search.state import Cause, State, View
+from stages.diagnose.settings import DISCOVERY, NOTABLE, SIMPLER, SURE, TRIED, TRIES
+
+ODD = "nothing real has the values that fit best"
+
+
+@dataclass
+class Outcome:
+    """The last look, every effect's evidence there, and what had strong evidence and was not named (name -> nats, why)."""
+
+    view: View | None = None
+    best: dict[str, Found] = field(default_factory=dict)
+    rejected: dict[str, tuple[float, str]] = field(default_factory=dict)
+    sure: bool = False  # whether something stands out that no plausible effect explains
+
+
+def search(state: State, most: int) -> Outcome:
+    """Name causes until no candidate is left."""
+    out = Outcome()
+    refused: set[str] = set()
+    while True:
+        state.learn_texture()
+        view = state.look(state.open_names())
+        best, _ = weigh_all(view.whole)
+        out.rejected = {k: v for k, v in out.rejected.items() if k in refused}
+        out.view, out.best = view, best
+        strong = [f for f in best.values() if f.p <= DISCOVERY and f.effect not in refused]
+        strong.sort(key=lambda f: -f.surprise)
+        for found in strong[:TRIED]:
+            whole = view.whole
+            kept = dict(whole.precision)
+            if found.beside:
+                whole.set_scatter(found.beside)
+            found.gains = whole.held_out(whole.places(found.guise), whole.exclude(found.guise), found.spread)
+            whole.precision = kept
+        tried = sorted(strong[:TRIED], key=lambda f: -f.gain)
+        sure = [f for f in tried if f.gain_interval()[0] > 0]
+        for f in tried:
+            low, high = f.gain_interval()
+            if f not in sure:
+                out.rejected[f.effect] = (
+                    f.gain,
+                    f"on ground that it was not fitted to it gains {f.gain:.0f} nats ({low:.0f} .. {high:.0f}), which may be nothing",
+                )
+        if len(state.causes) >= most:
+            break
+        taken = False
+        for _ in range(TRIES):
+            if not sure or taken:
+                break
+            chosen, group = choose(sure)
+            why = take(state, view, chosen, group)
+            taken = not why
+            if why:
+                sure = [f for f in sure if f is not chosen]
+                refused.add(chosen.effect)
+                out.rejected[chosen.effect] = (chosen.gain, why)
+                out.sure |= why.startswith(ODD) and chosen.gain > NOTABLE * float(view.whole.gram[0, 0])
+                state.say(f"{chosen.effect} is not taken: {why}")
+            else:
+                state.say(f"{chosen.effect} gains {chosen.gain:.0f} nats on held-out ground")
+        if not taken:
+            break
+    for cause in state.causes:
+        out.rejected.pop(cause.effect.name, None)
+    return out
+
+
+def choose(sure: list[Found]) -> tuple[Found, list[str]]:
+    """The best, or one with fewer values that gains nearly as much; and all that gain the same within their scatter."""
+    best = max(sure, key=lambda f: f.gain)
+    if best.guise.per_frame:
+        simple = [f for f in sure if not f.guise.per_frame and f.gain > SIMPLER * best.gain]
+        best = max(simple, key=lambda f: f.gain, default=best)
+    group = []
+    for f in sorted(sure, key=lambda f: -f.gain):
+        less = best.gains - f.gains
+        if f is best or interval(less)[0] <= 0:
+            group.append(f.effect)
+    group.sort(key=lambda n: n != best.effect)
+    return best, group
+
+
+def take(state: State, view: View, found: Found, group: list[str]) -> str:
+    """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
+    vector, causes = state.nominal.vector, list(state.causes)
+    saved = [(c, c.effect, dict(c.errors)) for c in causes]
+    cause = Cause(as_effect(found, state.data, state.frames, view.whole), found, group=group)
+    state.causes.append(cause)
+    look = refine(state)
+    why = doubt(state, cause) or next(
+        (f"beside it {c.effect.name} is no cause any more: {w}" for c in causes if (w := doubt(state, c))), ""
+    )
+    if not why:
+        gains, total = secant_gains(state, cause, look)
+        low, high = interval(gains)
+        cause.gain_percent, cause.gain_low, cause.gain_high = (200 * x / total for x in (float(gains.sum()), low, high))
+        cause.found = dataclasses.replace(cause.found, gains=gains)
+        if low <= 0:
+            why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
+    if why:
+        state.causes[:] = causes
+        for c, effect, errors in saved:
+            c.effect, c.errors = effect, errors
+        state.nominal.vector = vector
+        state.fit()
+    return why
+
+
+def doubt(state: State, cause: Cause) -> str:
+    """Why the fitted values cannot be a cause, or ''."""
+    cls = type(cause.effect)
+    if cls.scope == "image":
+        size, error = cls.size(cause.effect.values), cause.errors.get("rms", 0.0)
+        least = max(cls.tolerance.values(), default=0.0)
+        return f"it is {size:.2g}, and less than {least:.2g} is ordinary" if size - 2 * error < least else ""
+    values = {k: float(v) for k, v in cause.effect.values.items()}
+    if not cls.plausible(values, state.data):
+        return ODD
+    for name in cause.errors:
+        low, high = cls.bounds(name)
+        if (abs(values[name] - low) < 1e-9 or abs(values[name] - high) < 1e-9) and cls.null()[name] not in (
+            values[name],
+        ):
+            return f"{ODD}: {name} ends at its bound of {values[name]:.3g}"
+    sizes = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in cause.errors.items() if n not in cls.shaped]
+    if math.sqrt(sum(s * s for s in sizes)) < SURE:
+        return f"it comes out {math.sqrt(sum(s * s for s in sizes)):.1f} errors from nothing"
+    for name, least in cls.tolerance.items():
+        size = cls.size(values) if name not in values else abs(values[name] - cls.null()[name])
+        if size - 2 * cause.errors.get(name, 0.0) < least:
+            return f"{name} is {size:.2g}, and less than {least:.2g} is ordinary"
+    return ""
+
+
+def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, float]:
+    """Held-out gain (labels,) in nats of the cause as it was rendered, everything else fitted along, and the squares without it.
+
+    Effects with many values keep the gain that their columns had on held-out ground: one amount for all would not be held out.
+    """
+    others = [c.effect for c in state.causes if c is not cause]
+    added, plain = [], []
+    flat = Covariance.white(look.grid.annuli, state.frames)
+    for number, chain in enumerate(state.chains()):
+        brought = (chain.render() - state.nominal.chain(chain.site, others).render())[None]
+        for row in look.rows:
+            if row.patch.site == number:
+                z, mean = row.patch.transform(brought, look.grid)
+                shared, means = torch.cat([row.shared, z]), torch.cat([row.shared_mean, mean])
+                shared[0], means[0] = shared[0] + z[0], means[0] + mean[0]
+                more = dataclasses.replace(row, shared=shared, shared_mean=means)
+                added.append(products(more, look.model, look.grid, state.frames, None))
+                few = 1 + sum(n.startswith("coefficient") for n in look.plan.shared)
+                less = dataclasses.replace(
+                    row,
+                    shared=torch.cat([shared[:few], shared[-1:]]),
+                    shared_mean=torch.cat([means[:few], means[-1:]]),
+                    own=row.own[:0],
+                    own_mean=row.own_mean[:0],
+                )
+                plain.append(products(less, flat, look.grid, state.frames, None).gram)
+    plan = dataclasses.replace(look.plan, shared=[*look.plan.shared, "secant"])
+    whole = Whole(added, plan, state.frames)
+    for k in [k for k, n in enumerate(look.plan.shared) if n.startswith(cause.effect.name + ".")]:
+        whole.precision.pop(1 + k, None)
+    first = look.whole.first
+    whole.precision |= {k + 1: v for k, v in look.whole.precision.items() if k >= first}  # one shared column more
+    cause.rms_before, cause.rms_after = _rms(np.sum(plain, 0), look)
+    if type(cause.effect).scope == "image" or len(cause.found.guise.columns) > 1:
+        return cause.found.gains, float(whole.gram[0, 0])
+    return whole.held_out(np.array([whole.first - 1])), float(whole.gram[0, 0])
+
+
+def _rms(gram: np.ndarray, look: View) -> tuple[float, float]:
+    """rms relative residual without and with the cause, the nominal coefficients fitted to either."""
+    pixels = sum(float(r.patch.weight.square().sum()) for r in look.rows)
+    without = np.eye(len(gram))
+    with_ = without.copy()
+    with_[-1, 0] = -1.0
+    out = []
+    for change in (without, with_):
+        g = (change.T @ gram @ change)[:-1, :-1]
+        fitted = np.linalg.lstsq(g[1:, 1:], g[1:, 0], rcond=1e-9)[0]
+        out.append(math.sqrt(max(g[0, 0] - fitted @ g[1:, 0], 0.0) / max(pixels, 1.0)))
+    return out[0], out[1]
+
+
+__all__ = ["Outcome", "search"]

@@ -1,0 +1,55 @@
+"""Every number of the method that is set by hand, with its unit and its reason. There are no others."""
+
+from __future__ import annotations
+
+import math
+
+# --- which pixels say anything ---
+LIT_MARGIN = math.radians(
+    1.2
+)  # rad above the horizon: closer, an ordinary error of the DEM decides whether a pixel is lit
+GRAZING = math.cos(
+    math.radians(84.0)
+)  # cosine of incidence: a slope error of a degree changes brightness by 15 % there
+DARKEST = 0.3  # of an image's mean: noise of darker pixels is not divided by less than this
+TAPER = (
+    0.12  # of a crop's side, at either end: a window this wide keeps borders out of the spectrum and 80 % of the area
+)
+CLEAR = math.radians(
+    15.0
+)  # rad of the Sun above facet and horizon: lower, a slope error of a degree is 7 % of brightness and more
+RUGGED = 1.35  # ... and on rugged ground so many times its rms slope, since facets that seem to face the Sun are chosen by the DEM's errors
+FEWEST_PIXELS = 400  # of an image in a crop: fewer do not give a spectrum
+
+# --- registration ---
+CAPTURE = 8  # px: displacements are sought up to here; further off, neighbouring craters match as well
+BROAD = 6.0  # px, sigma: broader structure (albedo, film) is taken out before images are matched
+FIELD_ORDER = 3  # degree of the polynomial over the scene that stands for a smooth field per frame
+
+# --- covariance ---
+SECTORS = 6  # directions of waves that are told apart: relief shows by its direction to the Sun
+ROUNDS = 16  # of expectation-maximisation: further ones change a variance by less than 2 %
+
+# --- evidence ---
+UNITS = 12  # pieces of ground at least, over which a jackknife has the degrees of freedom for a 95 % interval
+PATCH = 32  # px: crops are not cut into smaller pieces than this
+SHAMS = 99  # sham residuals: p values go down to 1 %
+DISCOVERY = 0.05  # false discovery rate
+SURE = 4.0  # standard errors: an effect found at this size is never called invisible
+CORRELATED = 16.0  # px^2 per independent sample of a residual: what is left of albedo and relief is some 4 px wide
+PEAK = 6.0  # times the median of its annulus: a single wave of one frame that the spectrum of ground and noise does not have
+GROSS = 0.1  # residual over mean brightness, from which the form of the nominal model is questioned ...
+HALVED = 0.5  # ... and another form taken if it leaves so little of the residual
+MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model says nothing about the images
+LINE = 25.0  # -log10 of the chance of the strongest single wave: leakage of windows made up to 15 on development data, lines from 40
+BORROWED = 20.0  # waves' worth of the mean over frames in each frame's own variance: broad annuli have few waves
+ADDED = 50.0  # waves' worth of a size of 1 in each piece of ground's own size
+FOLDS = 8  # parts of the ground, one left out at a time
+DRIFTING = 4  # directions in which the nominal coefficients may drift from place to place
+LEVELS = (0.03, 0.1, 0.3, 1.0, 3.0)  # standard deviations of values per frame that are tried, in worthwhile sizes
+TRIED = 8  # candidates per look whose held-out gain is computed, the most surprising first
+TRIES = 3  # candidates per look that are fitted before the search ends
+SIMPLER = 0.8  # of the gain of values per frame, with which one value for all is preferred
+NOTABLE = 0.01  # of the weighted squares: an impossible fit that gains so much is structure
+STEPS = 6  # Gauss-Newton steps at most
+SETTLED = 0.1  # standard errors: a smaller move is the last

@@ -1,0 +1,52 @@
+"""The hidden data, which judge `diagnose`, share no code with it and hold what they say."""
+
+from __future__ import annotations
+
+import ast
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from hidden import departures, laws, sensor
+
+
+def test_hidden_data_import_nothing_of_the_program():
+    for path in sorted((ROOT / "tests" / "hidden").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            for name in names:
+                assert name.split(".")[0] not in ("stages", "schemas", "lunargr_cli"), f"{path.name} imports {name}"
+
+
+def test_roughness_of_a_smooth_surface_is_one():
+    mu0, mu = np.linspace(0.2, 0.9, 5), np.linspace(0.9, 0.3, 5)
+    assert laws.roughness(mu0, mu, 0.5 * (mu0 + mu), 1e-3) == pytest.approx(np.ones(5), abs=1e-9)
+
+
+def test_surge_is_half_as_high_where_hapkes_is():
+    h = 0.06
+    half = 2 * np.arctan(h)
+    assert departures.surge(np.cos(half), 0.4, h) == pytest.approx(1.2)
+
+
+@pytest.mark.parametrize("slope", [-0.1, 0.08, 0.3])
+def test_phase_curve_falls_by_as_much_as_planted(slope):
+    ends = departures.steeper(np.cos([0.3, 1.5]), slope)
+    assert np.log(ends[0] / ends[1]) / 1.2 == pytest.approx(slope)
+
+
+@pytest.mark.parametrize("snr", [30.0, 140.0])
+def test_noise_is_as_large_as_asked_for(snr):
+    camera = sensor.Detector(snr=snr, uneven=0.0)
+    image = sensor.expose(np.random.default_rng(1), np.full((200, 200), 0.05), sensor.Pose(), camera)
+    assert 0.05 / image.std() == pytest.approx(snr, rel=0.05)
+
+
+def test_veil_is_broad_and_its_own_in_every_image():
+    rng = np.random.default_rng(2)
+    camera = sensor.Detector(snr=1e4, read=0.0, uneven=0.0, bits=20, veil=0.02, veil_px=10.0)
+    first, second = (sensor.expose(rng, np.full((160, 160), 0.05), sensor.Pose(), camera) / 0.05 - 1 for _ in range(2))
+    assert first.std() == pytest.approx(0.02, rel=0.02)
+    assert np.abs(np.diff(first)).mean() < 0.15 * first.std()
+    assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.3
