@@ -138,7 +138,7 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
         output_scale = float(file.attrs["output_scale"])
         positive, deviations = (bool(file.attrs[key]) for key in ("positive", "deviations"))
         mapped = CoefficientMaps(reflectance, maps, start, output_scale, positive, deviations)
-        check_weights(path, file.get("weights"), mapped.channels, widths, dropout)
+        check_weights(path, file.get("weights"), mapped, mapped.channels, widths, dropout)
         net = UNet(mapped.channels, widths, dropout)
         predictor = Predictor(net, mapped, float(file.attrs["elevation_scale_m"]))
         try:

@@ -34,11 +34,14 @@ def read_layout(path: Path, config: dict[str, Any], model: str) -> tuple[tuple[i
     return tuple(widths), tuple(dropout)
 
 
-def check_weights(path: Path, group: Any, outputs: int, widths: tuple[int, ...], dropout: tuple[float, ...]) -> None:
-    """Names, shapes and kinds of the stored arrays against the network's. Raises ArtefactError."""
+def check_weights(
+    path: Path, group: Any, maps: torch.nn.Module, outputs: int, widths: tuple[int, ...], dropout: tuple[float, ...]
+) -> None:
+    """Names, shapes and kinds of the stored arrays against those of network and ``maps``. Raises ArtefactError."""
     with torch.device("meta"):
         net = UNet(outputs, widths, dropout)
-    expected = {f"net.{name}": tuple(value.shape) for name, value in net.state_dict().items()} | {"start": (outputs,)}
+    expected = {f"net.{name}": tuple(value.shape) for name, value in net.state_dict().items()}
+    expected |= {f"maps.{name}": tuple(value.shape) for name, value in maps.state_dict().items()}
     if not isinstance(group, h5py.Group):
         raise ArtefactError(
             f"{path}:/weights: expected the network's weights, found none; write it again with 'lunargr train'."
