@@ -64,7 +64,14 @@ def smaller(source: Path, output: Path, width: int) -> None:
 
 def main(root: Path) -> None:
     demo, images = root / "demo", root / "docs" / "images"
-    needed = ("evaluation.h5", "pairs.h5", "render.tif", "render.png", "figures/crop_median.png", "figures/match_daisy_1.png")
+    needed = (
+        "evaluation.h5",
+        "pairs.h5",
+        "render.tif",
+        "render.png",
+        "figures/crop_median.png",
+        "figures/match_daisy_1.png",
+    )
     missing = [name for name in needed if not (demo / name).is_file()]
     if missing:
         print(f"pictures stay as they are: no demo/{missing[0]}; run make demo", file=sys.stderr)

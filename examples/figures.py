@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -52,8 +53,10 @@ def with_bounds(value: float, low: float | None, high: float | None, spread: flo
     power = math.floor(math.log10(value)) if value > 0 else 0
     text = f"{value / 10**power:.2f}" + (f"e{power}" if power else "")
     text += "" if spread is None else f" +- {spread / 10**power:.2f}"
-    ends = "no interval" if low is None else f"{low / 10**power:.3g} .. " + (
-        "unbounded" if high is None else f"{high / 10**power:.3g}"
+    ends = (
+        "no interval"
+        if low is None
+        else f"{low / 10**power:.3g} .. " + ("unbounded" if high is None else f"{high / 10**power:.3g}")
     )
     return f"{text} ({ends})"
 
@@ -82,8 +85,10 @@ def evaluated(result: dict[str, Any], names: Iterable[str], more: list[list[str]
         "training runs, in brackets 95 % intervals."
     ]
     rows = sorted(rows_of(result, names), key=lambda row: list(KNOWS.values()).index(row[1]))
-    return lines + table(["model", "what it may know", "MSE", "SSIM"], [*rows, *more]) + said(
-        conclusions.evaluation(result)
+    return (
+        lines
+        + table(["model", "what it may know", "MSE", "SSIM"], [*rows, *more])
+        + said(conclusions.evaluation(result))
     )
 
 
@@ -125,7 +130,9 @@ def held_out(root: Path, folder: str, command: str) -> list[str]:
     lines += table(["map", "MSE", "SSIM"], rows) + said(conclusions.held_out_images(result))
     coverage = result.get("coverage_percent")
     if coverage:
-        lines.append(f"- Intervals that should hold 68 and 95 % of the pixels hold {coverage['68']:.1f} and {coverage['95']:.1f} %.")
+        lines.append(
+            f"- Intervals that should hold 68 and 95 % of the pixels hold {coverage['68']:.1f} and {coverage['95']:.1f} %."
+        )
     return lines
 
 
@@ -169,7 +176,16 @@ def models(root: Path) -> list[str]:
     return [*lines, f"Differences larger than their noise: {text or 'none'}."]
 
 
+def commands(_: Path) -> list[str]:
+    """What `make demo` runs, as make itself lists it, from within demo/."""
+    listed = subprocess.run(["make", "-nB", "demo"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    found = re.findall(r"^\.venv/bin/(lunargr (?:.*\\\n)*.*)$", listed, re.M)
+    lines = "\n".join(found).replace(" --overwrite", "").replace(" --resume", "").replace("demo/", "")
+    return [f"    {re.sub(r'^ +', '    ', line)}" for line in lines.splitlines()]
+
+
 BLOCKS: dict[str, Callable[[Path], list[str]]] = {
+    "demo-commands": commands,
     "demo": demo,
     "demo-rows": demo_rows,
     "demo-held-out": lambda root: held_out(root, "demo", DEMO),
@@ -203,7 +219,10 @@ def main(root: Path) -> None:
         try:
             after = rewrite(before, root)
         except (KeyError, TypeError, ValueError) as error:
-            print(f"{page.name}: a figure's file is not as its command writes it ({type(error).__name__}: {error}); run it again.", file=sys.stderr)
+            print(
+                f"{page.name}: a figure's file is not as its command writes it ({type(error).__name__}: {error}); run it again.",
+                file=sys.stderr,
+            )
             raise SystemExit(3) from None
         if after != before:
             page.write_text(after)
