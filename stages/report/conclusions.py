@@ -94,6 +94,8 @@ def diagnosis(result: dict[str, Any]) -> list[Sentence]:
     """What the simulation lacks, what naming it is worth, and what these data could not tell."""
     known = result.get("verdict", "")
     said = str(result.get("sentence") or VERDICTS.get(known, known) or "The diagnosis holds no verdict.")
+    if known == "named" and not result.get("sentence"):
+        said = f"The simulation lacks {listed([c['effect'] for c in result.get('causes', [])])}."
     data = result.get("data") or {}
     if data.get("pairs"):
         said = f"Diagnosis of {data['pairs']:,} pairs of {_count(data.get('sites', 0), 'place')}: {said}"
@@ -110,7 +112,6 @@ def diagnosis(result: dict[str, Any]) -> list[Sentence]:
 
 
 VERDICTS = {
-    "named": "The simulation lacks what is listed under Diagnosis.",
     "nothing_significant": "Nothing significant is missing from the simulation.",
     "unexplained": "Something is missing from the simulation that nothing in the catalogue explains.",
     "cannot_tell": "These data cannot tell whether something is missing from the simulation.",

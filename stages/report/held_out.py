@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from markupsafe import Markup
+
 from stages.common import page
 from stages.report.conclusions import basis, bounds, verdict
 
@@ -36,12 +38,7 @@ def held_out_images(result: dict[str, Any]) -> page.Section:
     )
     coverage = result.get("coverage_percent")
     if coverage:
-        section.add(
-            page.paragraph(
-                f"Error bars: {coverage['68']:.1f} % of the pixels lie within the intervals that should hold 68 %, "
-                f"{coverage['95']:.1f} % within those of 95 %."
-            )
-        )
+        section.add(_coverage(coverage))
     images = [
         [
             image["image_id"],
@@ -56,6 +53,16 @@ def held_out_images(result: dict[str, Any]) -> page.Section:
         header = ["unseen image", "crops", "nearest Sun used, deg", "MSE from terrain", "MSE with albedo"]
         section.add(page.table("By image", header, images))
     return section
+
+
+def _coverage(coverage: dict[str, Any]) -> Markup:
+    """How many pixels the error bars hold, in all and by incidence where that was counted."""
+    rows = [["all", _number(coverage.get("68"), ".1f"), _number(coverage.get("95"), ".1f")]]
+    for band in coverage.get("by_incidence", []):
+        name = f"{band['incidence_low_deg']:g} to {band['incidence_high_deg']:g}"
+        rows.append([name, _number(band["68"], ".1f"), _number(band["95"], ".1f")])
+    columns = ["incidence, deg", "within the 68 % interval, %", "within the 95 % interval, %"]
+    return page.table("Error bars: share of the pixels of unseen images", columns, rows)
 
 
 def _number(value: float | None, form: str) -> str:

@@ -13,7 +13,7 @@ from stages.common import page
 from stages.common.page import pictures
 from stages.physics.photometry import get_model
 
-LONGEST = 700  # px of a map on the page: many maps must stay a light page
+LONGEST = 800  # px of a map on the page: many maps must stay a light page
 
 
 def svbrdf(file: h5py.File) -> page.Section:
@@ -35,7 +35,7 @@ def svbrdf(file: h5py.File) -> page.Section:
     gsd = float(file.attrs["gsd_m"])
     section.add(
         page.paragraph(
-            f"{model.name}, {model.title}. {file.attrs['quantity']} = {model.formula}, with incidence i, emission e and phase g. "
+            f"{model.name}: {model.title}. I/F = {model.formula}, with incidence i, emission e and phase g. "
             f"{width:,} x {height:,} px at {gsd:g} m: {width * gsd / 1000:.1f} x {height * gsd / 1000:.1f} km."
         ),
         page.grid(figures),

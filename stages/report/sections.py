@@ -38,7 +38,7 @@ def scene(file: h5py.File) -> page.Section:
         page.grid(
             [
                 page.picture(
-                    pictures.data_uri(relief),
+                    pictures.photo_uri(relief),
                     "Elevation above the reference sphere, with relief shading",
                     below=page.colour_bar(low, high, "cividis", "m"),
                 ),
