@@ -56,7 +56,7 @@ def with_bounds(value: float, low: float | None, high: float | None, spread: flo
     ends = (
         "no interval"
         if low is None
-        else f"{low / 10**power:.3g} .. " + ("unbounded" if high is None else f"{high / 10**power:.3g}")
+        else f"{low / 10**power:#.3g} .. " + ("unbounded" if high is None else f"{high / 10**power:#.3g}")
     )
     return f"{text} ({ends})"
 

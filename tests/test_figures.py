@@ -59,7 +59,7 @@ def test_a_block_is_replaced_by_what_the_file_holds(tmp_path):
     assert (
         "9.99e-5" not in text and text.startswith("before\n<!-- figures:demo -->\n") and text.endswith("-->\nafter 1\n")
     )
-    assert "| learned reflectance | nothing of the scored crops | 3.10e-5 +- 0.06 (1.55 .. 6.2) | 0.800 |" in text
+    assert "| learned reflectance | nothing of the scored crops | 3.10e-5 +- 0.06 (1.55 .. 6.20) | 0.800 |" in text
     assert (
         "no difference from the strongest model without a network, 'Hapke fitted': gain +26.2 % (95 %: -3.0 .. +41.0"
         in text

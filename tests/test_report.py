@@ -225,7 +225,11 @@ def test_the_first_screen_concludes_before_anything_else(page):
 
 
 def evaluation_result(low, high):
-    gain = {"gain_percent": 12.0, "gain_percent_low": low, "gain_percent_high": high}
+    gain = {
+        "gain_percent": -12.0 if high is not None and high < 0 else 12.0,
+        "gain_percent_low": low,
+        "gain_percent_high": high,
+    }
     return {
         "gains": {"learned": {"kernels": gain}}, "strongest_baseline": {"none": "kernels"}, "titles": {"kernels": "Kernels"},
         "pairs": 1234, "tiles": 21, "training_runs": 3, "interval_unit": "tile",

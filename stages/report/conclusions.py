@@ -139,8 +139,9 @@ def _compared(ours: str, other: str, gain: dict[str, Any], on: str) -> Sentence:
         return f"{ours} shows no difference from {other}: {tail}.", ""
     if word == "unknown":
         return f"{ours} cannot be compared with {other} with any certainty: {tail}.", ""
-    way, kind = ("lower", "good") if word == "better" else ("higher", "bad")
-    return f"{ours} has a squared error {abs(value):.1f} % {way} than {other}; {tail}.", kind
+    if word == "better":
+        return f"{ours} has a squared error {value:.1f} % lower than {other} ({bounds(gain)}; {on}).", "good"
+    return f"{ours} has a squared error {-value:.1f} % higher than {other}; {tail}.", "bad"
 
 
 def _count(number: int, what: str) -> str:
