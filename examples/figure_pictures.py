@@ -25,7 +25,7 @@ def median_crop(evaluation: h5py.File) -> int:
 
 
 def relit(demo: Path, output: Path) -> None:
-    """A test photograph, the same rendered from terrain alone, and the same ground under another Sun."""
+    """A test image, the same rendered from terrain alone, and the same ground under another Sun."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -42,9 +42,9 @@ def relit(demo: Path, output: Path) -> None:
     low, high = np.nanpercentile(measured, (0.3, 99.7))
     figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.8), layout="constrained")
     shown = (
-        (measured, (low, high), "photograph (never seen in training)"),
+        (measured, (low, high), "image of ground never seen in training"),
         (rendered, (low, high), "rendered from terrain alone, same Sun"),
-        (other, (0, np.nanpercentile(other, 99.7)), "the learned map under another Sun"),
+        (other, (0, np.nanpercentile(other, 99.7)), "the learned map with albedo, Sun in the west"),
     )
     for axis, (picture, (black, white), title) in zip(axes, shown, strict=True):
         axis.imshow(picture, cmap="gray", vmin=black, vmax=white, interpolation="lanczos")
