@@ -11,7 +11,7 @@ LUNARGR := $(BIN)/lunargr
 STAMP := $(VENV)/.installed
 SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 
-.PHONY: help install demo test test-slow fuzz endurance lint bench campaign campaign-real docs vendor-js reproduce-apollo15 reproduce-models clean
+.PHONY: help install demo demo-paper figures test test-slow fuzz endurance lint bench campaign campaign-real docs vendor-js reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -77,12 +77,10 @@ D := demo
 DEMO_SPLIT := --split 65/10/25
 # fp32: the README's figures must not hang on whether a processor is made for bf16
 DEMO_TRAIN := --epochs 6 --precision fp32
+DEMO_RUNS := $(foreach seed,0 1 2,$(D)/checkpoint_$(seed).h5)
 
-demo: $(D)/report.html $(D)/view.html ## run every stage on the embedded scene and name a report to open
+demo: $(D)/report.html ## run every stage on the embedded scene and name a report to open
 	@echo; echo "Open $(abspath $(D)/report.html)"; echo "and  $(abspath $(D)/view.html)"
-
-$(D)/view.html: $(D)/svbrdf.h5 $(D)/pairs.h5
-	$(LUNARGR) view $< --pairs $(D)/pairs.h5 -o $@ --title "lunargr demo: the embedded scene" --overwrite
 
 $(D)/scene/images.csv: | $(STAMP)
 	$(LUNARGR) simulate -o $(D)/scene --hidden sun_azimuth:error_deg=5 --overwrite
@@ -96,19 +94,34 @@ $(D)/crops.h5: $(D)/scene.h5
 $(D)/pairs.h5: $(D)/crops.h5
 	$(LUNARGR) project $< -o $@ --overwrite
 
-$(D)/checkpoint.h5: $(D)/pairs.h5
-	$(LUNARGR) train $< $(DEMO_TRAIN) -o $@ --overwrite --resume
+# Training is random: three seeds, so that a gain can be told from luck.
+$(DEMO_RUNS): $(D)/checkpoint_%.h5: $(D)/pairs.h5
+	$(LUNARGR) train $< $(DEMO_TRAIN) --seed $* -o $@ --overwrite --resume
 
-$(D)/svbrdf.h5: $(D)/scene.h5 $(D)/checkpoint.h5
+$(D)/svbrdf.h5: $(D)/scene.h5 $(D)/checkpoint_0.h5
 	$(LUNARGR) infer $^ -o $@ --overwrite
 
-$(D)/render.exr: $(D)/svbrdf.h5
+# what the photographs show beyond terrain: all of them, for pictures ...
+$(D)/svbrdf_albedo.h5: $(D)/svbrdf.h5 $(D)/scene.h5
+	$(LUNARGR) albedo $^ -o $@ --overwrite
+
+# ... and without every fourth, to be judged by these
+$(D)/fold_1.h5: $(D)/svbrdf.h5 $(D)/scene.h5
+	$(LUNARGR) albedo $^ --fold 1/4 --no-geotiff -o $@ --overwrite
+
+$(D)/render.exr: $(D)/svbrdf_albedo.h5
 	$(LUNARGR) render $< --sun-azimuth 270 --sun-elevation 25 -o $@ --overwrite
 
-$(D)/evaluation.h5: $(D)/pairs.h5 $(D)/checkpoint.h5
+$(D)/view.html: $(D)/svbrdf_albedo.h5 $(D)/pairs.h5
+	$(LUNARGR) view $< --pairs $(D)/pairs.h5 -o $@ --title "lunargr demo: the embedded scene" --overwrite
+
+$(D)/evaluation.h5: $(D)/pairs.h5 $(DEMO_RUNS)
 	$(LUNARGR) evaluate $^ -o $@ --figures $(D)/figures --overwrite
 
-$(D)/match.json: $(D)/pairs.h5 $(D)/checkpoint.h5
+$(D)/held_out.h5: $(D)/pairs.h5 $(D)/fold_1.h5
+	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite
+
+$(D)/match.json: $(D)/pairs.h5 $(D)/checkpoint_0.h5
 	$(LUNARGR) match $^ --count 8 --json $@ --figures $(D)/figures --overwrite
 
 # Places that every image covers: what the images disagree on there cannot be the ground.
@@ -119,9 +132,22 @@ $(D)/stack.h5: $(D)/scene.h5
 $(D)/diagnosis.h5: $(D)/stack.h5
 	$(LUNARGR) diagnose $< --model hapke -o $@ --json $(D)/diagnosis.json --report $(D)/diagnosis.html --overwrite
 
-$(D)/report.html: $(D)/evaluation.h5 $(D)/match.json $(D)/render.exr $(D)/diagnosis.h5
-	$(LUNARGR) report $(D)/scene.h5 $(D)/crops.h5 $(D)/pairs.h5 $(D)/checkpoint.h5 $(D)/svbrdf.h5 $(D)/evaluation.h5 $(D)/match.json \
-	    $(D)/diagnosis.json $(D)/render.png -o $@ --title "lunargr demo: the embedded scene" --overwrite
+$(D)/report.html: $(D)/evaluation.h5 $(D)/held_out.h5 $(D)/match.json $(D)/render.exr $(D)/diagnosis.h5 $(D)/view.html
+	$(LUNARGR) report $(D)/scene.h5 $(D)/crops.h5 $(D)/pairs.h5 $(D)/checkpoint_0.h5 $(D)/svbrdf_albedo.h5 $(D)/evaluation.h5 \
+	    $(D)/held_out.h5 $(D)/match.json $(D)/diagnosis.json $(D)/render.png $(D)/figures/match_daisy_1.png $(D)/figures/match_sift_1.png \
+	    $(D)/view.html -o $@ --title "lunargr demo: the embedded scene" --overwrite
+
+demo-paper: $(D)/m2.h5 ## the model M2 of the Lunar-G2R paper on the demo's pairs, one run with the paper's network
+
+$(D)/checkpoint_m2.h5: $(D)/pairs.h5
+	$(LUNARGR) train $< --model M2 --positive --widths 16-32-64-128-256 --dropout 0.1-0.1-0.2-0.2-0.3 --brightness 1 \
+	    $(DEMO_TRAIN) -o $@ --overwrite --resume
+
+$(D)/m2.h5: $(D)/pairs.h5 $(D)/checkpoint_m2.h5
+	$(LUNARGR) evaluate $^ --only learned --only learned_gain_offset -o $@ --overwrite
+
+figures: ## write every figure of README.md and docs/ from what demo, reproduce-apollo15 and reproduce-models left
+	$(BIN)/python examples/figures.py
 
 # --- real photographs: Apollo 15 metric camera frames over the GLD100 elevation model ------------------------------
 

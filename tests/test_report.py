@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import base64
+import html
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 from evaluation_scene import make_scene, run_command, write_pairs
 
 from schemas import DIAGNOSIS, SCENE, SVBRDF, ArtefactWriter
 from stages import evaluate, match, report, train
+from stages.report import conclusions
+from stages.report.maps import round_length
 
 WKT = "LOCAL_CS[moon]"
 VOID = {"meta", "img", "br", "link", "hr"}
@@ -146,7 +151,7 @@ def test_the_page_needs_nothing_else(page):
 
 
 def test_every_picture_shows_something(page):
-    pictures = re.findall(r'src="data:image/png;base64,([^"]+)"', page[0])
+    pictures = re.findall(r'src="data:image/(?:png|webp);base64,([^"]+)"', page[0])
     assert len(pictures) > 3 + 8 + 3 * 17
     for content in pictures:
         image = cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_UNCHANGED)
@@ -203,6 +208,143 @@ def test_large_maps_are_thinned(tmp_path):
         file["map"] = np.add.outer(np.arange(2000.0), np.zeros(150))
         small, step = read_thinned(file["map"], longest=900)
     assert step == 3 and small.shape == (667, 50) and np.array_equal(small[:, 0], np.arange(0, 2000, 3))
+
+
+def _said(text):
+    """The sentences of the first screen: (class, text)."""
+    found = re.search(r'<ul class="conclusions">(.*?)</ul>', text, re.S)
+    return re.findall(r'<li(?: class="(\w+)")?>(.*?)</li>', html.unescape(found[1])) if found else []
+
+
+def test_the_first_screen_concludes_before_anything_else(page):
+    sentences = [text for _, text in _said(page[0])]
+    assert sentences[0].startswith("Learned from heights and") and "a, b and c of the model M2" in sentences[0]
+    assert any(s.startswith("On unseen ground") and "1 training run" in s for s in sentences)
+    assert "The simulation lacks sun elevation." in sentences[-3] and "earthshine" in sentences[-1]
+    assert page[0].index('class="conclusions"') < page[0].index("<nav>")
+
+
+def evaluation_result(low, high):
+    gain = {
+        "gain_percent": -12.0 if high is not None and high < 0 else 12.0,
+        "gain_percent_low": low,
+        "gain_percent_high": high,
+    }
+    return {
+        "gains": {"learned": {"kernels": gain}}, "strongest_baseline": {"none": "kernels"}, "titles": {"kernels": "Kernels"},
+        "pairs": 1234, "tiles": 21, "training_runs": 3, "interval_unit": "tile",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "kind", "words"),
+    [
+        (3.0, 20.0, "good", "12.0 % lower than"),
+        (-30.0, -2.0, "bad", "12.0 % higher than"),
+        (-1.0, 25.0, "", "shows no difference from"),
+        (None, None, "", "cannot be compared with"),
+    ],
+)
+def test_a_sentence_says_what_its_interval_allows(low, high, kind, words):
+    [(text, found)] = conclusions.evaluation(evaluation_result(low, high))
+    assert found == kind and words in text and "'Kernels'" in text
+    assert "1,234 pairs on 21 ground tiles, 3 training runs" in text
+
+
+HELD_OUT = {
+    "claim": "seen ground, unseen images", "image_units": "iof", "pairs": 40, "tiles": 6, "interval_unit": "tile",
+    "models": {
+        "terrain": {"mse": 3.1e-5, "mse_low": 2e-5, "mse_high": 5e-5, "ssim": 0.8},
+        "albedo": {"mse": 4.2e-6, "mse_low": 3e-6, "mse_high": None, "ssim": None},
+    },
+    "gains": {"albedo": {"terrain": {"gain_percent": 86.4, "gain_percent_low": 80.0, "gain_percent_high": 90.0}}},
+    "nearest_used_sun_deg": {"least": 1.2, "mean": 4.0, "most": 9.0},
+    "coverage_percent": {"68": 67.1, "95": 94.9,
+                         "by_incidence": [{"incidence_low_deg": 0, "incidence_high_deg": 30, "68": None, "95": 91.5}]},
+    "images": [{"image_id": "seventh", "crops": 40, "nearest_used_sun_deg": 4.0, "mse_terrain": 3.1e-5, "mse_albedo": 4.2e-6}],
+}  # fmt: skip
+
+
+def test_unseen_images_are_a_section_of_their_own(tmp_path):
+    (tmp_path / "held_out.json").write_text(json.dumps(HELD_OUT))
+    assert report.run([tmp_path / "held_out.json"], tmp_path / "page.html", report.Config()) == [
+        "Albedo, judged by unseen images"
+    ]
+    text = (tmp_path / "page.html").read_text()
+    [(kind, sentence)] = _said(text)
+    assert kind == "good" and "86.4 % lower than the map from terrain alone" in sentence
+    assert "another claim" in sentence and "1 to 9 deg" in sentence and "1 unseen image, 40 pairs" in sentence
+    assert "seventh" in text and "4.200e-06" in text and "94.9" in text and "91.5" in text
+
+
+def test_a_diagnosis_shows_its_budget_and_what_got_no_name(tmp_path):
+    more = {
+        "budget": {"named": 0.5, "common_to_images": 0.25, "own_to_image": 0.2, "noise": 0.05},
+        "rejected": [{"effect": "psf_blur", "gain_nats": 21.0, "why": "its gain may be negative."}],
+        "sentence": "The simulation lacks elevation of the Sun.", "data": {"pairs": 320, "sites": 20, "images": 16},
+    }  # fmt: skip
+    (tmp_path / "diagnosis.json").write_text(json.dumps(FOUND | more))
+    report.run([tmp_path / "diagnosis.json"], tmp_path / "page.html", report.Config())
+    text = (tmp_path / "page.html").read_text()
+    assert "320 pairs of 20 places: The simulation lacks elevation of the Sun." in _said(text)[0][1]
+    assert _said(text)[1][0] == "good" and "10.0 % lower" in _said(text)[1][1]
+    assert "own to each image" in text and "20.0" in text and "psf blur" in text and "its gain may be negative." in text
+
+
+def test_a_verdict_alone_is_enough(tmp_path):
+    (tmp_path / "diagnosis.json").write_text('{"verdict": "cannot_tell"}')
+    report.run([tmp_path / "diagnosis.json"], tmp_path / "page.html", report.Config())
+    assert _said((tmp_path / "page.html").read_text()) == [
+        ("", "These data cannot tell whether something is missing from the simulation.")
+    ]
+
+
+def test_maps_carry_formula_scale_and_north(page):
+    text = html.unescape(page[0])
+    assert "I/F = a cos(i)" in text and text.count("N \u2191") == 3
+    width = re.findall(r'class="length" style="width: ([\d.]+)%">([^<]+)<', page[0])[0]
+    assert width[1] == "100 m" and float(width[0]) == pytest.approx(100 * 100 / (140 * 5), abs=0.01)
+
+
+@pytest.mark.parametrize(("longest", "length"), [(700, 500), (1999, 1000), (2000, 2000), (0.51, 0.5), (9.9, 5)])
+def test_scale_bars_have_round_lengths(longest, length):
+    assert round_length(longest) == pytest.approx(length)
+
+
+def test_albedo_and_its_deviation_are_shown(folder, tmp_path):
+    rng = np.random.default_rng(1)
+    shutil.copy(folder / "svbrdf.h5", tmp_path / "map.h5")
+    with h5py.File(tmp_path / "map.h5", "a") as file:
+        for name, values in (("albedo", rng.normal(1, 0.1, (90, 140))), ("albedo_std", rng.uniform(0, 0.1, (90, 140)))):
+            file[name] = values.astype(np.float32)
+        file["albedo_image_id"] = np.array(["one", "two"], dtype=h5py.string_dtype())
+    report.run([tmp_path / "map.h5"], tmp_path / "page.html", report.Config())
+    text = (tmp_path / "page.html").read_text()
+    assert "Albedo from photographs" in text and "Standard deviation of the albedo" in text
+    assert "albedo from 2 photographs" in _said(text)[0][1] and text.count("N &#8593;") == 5
+
+
+def test_a_page_of_view_is_linked_given_or_beside(folder, tmp_path):
+    for name in ("sub", "out"):
+        (tmp_path / name).mkdir()
+    given = tmp_path / "sub" / "a map.html"
+    given.write_text("page")
+    report.run([folder / "match.json", given], tmp_path / "out" / "report.html", report.Config())
+    assert '<a href="../sub/a%20map.html">' in (tmp_path / "out" / "report.html").read_text()
+    (tmp_path / "out" / "view.html").write_text("page")
+    report.run([folder / "match.json"], tmp_path / "out" / "report.html", report.Config(), overwrite=True)
+    assert '<a href="view.html">' in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_heavy_pictures_are_made_light_and_say_what_they_show(folder, tmp_path):
+    picture = np.random.default_rng(0).integers(0, 255, (900, 2100, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "match_sift_1.png"), cv2.GaussianBlur(picture, (0, 0), 3))
+    report.run([tmp_path / "match_sift_1.png"], tmp_path / "page.html", report.Config())
+    text = (tmp_path / "page.html").read_text()
+    [content] = re.findall(r'src="data:image/webp;base64,([^"]+)"', text)
+    shown = cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_COLOR)
+    assert shown.shape == (600, 1400, 3) and len(text) < (tmp_path / "match_sift_1.png").stat().st_size
+    assert "Matches between a measured crop" in text
 
 
 @pytest.mark.parametrize("case", ["missing", "other json", "not a picture", "existing output", "nothing to show"])

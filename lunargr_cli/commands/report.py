@@ -17,7 +17,8 @@ def command(
         list[Path],
         typer.Argument(
             metavar="FILES",
-            help="Artefacts (.h5), JSON results of match, compare or diagnose, and pictures (.png, .jpg).",
+            help="Artefacts (.h5), JSON results of evaluate, match, compare or diagnose, pictures (.png, .jpg), "
+            "and pages of 'lunargr view' (.html) to link to.",
         ),
     ],
     output: Output = Path("report.html"),

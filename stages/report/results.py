@@ -1,4 +1,4 @@
-"""Evaluation, matching, model comparison and diagnosis: one function per result, from numbers to a section."""
+"""Evaluation, matching and model comparison: one function per result, from numbers to a section."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from stages.common import page
 from stages.common.page import pictures
+from stages.report.conclusions import basis, bounds, verdict
 
 COLOURS = {
     "learned": "#3b8ecb",
@@ -26,59 +27,8 @@ EXAMPLES = (
 )  # fmt: skip
 
 
-def headline(result: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """The cards on top of the page, from evaluate's result."""
-    models, gains = result["models"], result["gains"]
-    unit = "I/F" if result["image_units"] == "iof" else "of the DN range"
-    cards = []
-    if "learned" in models:
-        cards.append((f"{models['learned']['rmse']:.4f}", f"rms error of the learned reflectance, {unit}", ""))
-    strongest = result.get("strongest_baseline", {})
-    for ours, other, what in (
-        ("learned", strongest.get("none"), "MSE than the strongest baseline, {}, neither knowing the scored crops"),
-        ("learned_gain_offset", strongest.get("gain_offset"), "MSE than the strongest baseline, {}, like for like"),
-        ("learned", "hapke_minmax", "MSE than Hapke matched by range as in the paper"),
-    ):
-        gain = gains.get(ours, {}).get(other or "")
-        if gain and gain["gain_percent"] is not None:
-            word = verdict(gain)
-            kind = {"better": "good", "worse": "bad"}.get(word, "")
-            way = "lower" if gain["gain_percent"] >= 0 else "higher"
-            cards.append(
-                (
-                    f"{abs(gain['gain_percent']):.1f} % {way}",
-                    f"{what.format(_words(other))} ({_bounds(gain)} %; {_basis(result)})",
-                    kind,
-                )
-            )
-    return cards
-
-
-def verdict(gain: dict[str, Any]) -> str:
-    """What a paired interval says."""
-    low, high = gain["gain_percent_low"], gain["gain_percent_high"]
-    if low is None or high is None:
-        return "unknown"
-    return "better" if low > 0 else "worse" if high < 0 else "no difference"
-
-
-def _words(name: str | None) -> str:
-    return (name or "").replace("_", " ")
-
-
-def _basis(result: dict[str, Any]) -> str:
-    """What a gain rests on."""
-    ground = f"{result['tiles']} ground tiles"
-    if result.get("interval_unit") == "site":
-        ground = f"{result['sites']} sites of one ground tile"
-    runs = result.get("training_runs", 1)
-    return f"{result['pairs']:,} pairs, {ground}, {runs} training run{'s' * (runs != 1)}"
-
-
-def _bounds(gain: dict[str, Any]) -> str:
-    if gain["gain_percent_low"] is None:
-        return "no interval"
-    return f"95 %: {gain['gain_percent_low']:+.1f} .. {gain['gain_percent_high']:+.1f}"
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def _cell(value: float | None, form: str) -> str:
@@ -104,11 +54,9 @@ def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
         "model", "MSE", "95 % interval", "+- training runs", "MSE per crop", "PSNR, dB", "PSNR of crop range, dB",
         "SSIM", "LPIPS",
     ]  # fmt: skip
-    for sentence in result.get("conclusions", []):
-        section.add(page.paragraph(sentence))
     section.add(
         page.paragraph(
-            f"Split '{result['split']}': {_basis(result)}; errors in {unit}. Intervals take "
+            f"Split '{result['split']}': {basis(result)}; errors in {unit}. Intervals take "
             f"{UNITS.get(result.get('interval_unit', 'tile'))} for independent (delete-one jackknife, Student's t)"
             + (" and hold the spread of training runs." if result.get("training_runs", 1) > 1 else ".")
         ),
@@ -120,7 +68,7 @@ def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
             ours.replace("_", " "),
             other.replace("_", " "),
             _cell(gain["gain_percent"], "+.1f"),
-            _bounds(gain),
+            bounds(gain),
             verdict(gain).replace(" ", "\u00a0"),
         ]
         for ours, others in result["gains"].items()
@@ -130,7 +78,7 @@ def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
     if rows:
         section.add(
             page.table(
-                f"What the learned reflectance gains: {_basis(result)}",
+                f"What the learned reflectance gains: {basis(result)}",
                 ["model", "against", "MSE lowered by, %", "interval", "verdict"],
                 rows,
             )
@@ -276,52 +224,4 @@ def comparison(result: dict[str, Any]) -> page.Section:
     ]  # fmt: skip
     header = ["pair", "difference, %", "noise of seeds", "noise of tiles", "p (Holm)", "larger than its noise"]
     section.add(page.table("Which differences are larger than their noise", header, rows))
-    return section
-
-
-VERDICTS = {
-    "named": "The simulation lacks the causes below.",
-    "nothing_significant": "Nothing significant is missing.",
-    "unexplained": "Something is missing that nothing in the catalogue explains.",
-    "cannot_tell": "These data cannot tell.",
-}
-
-
-def diagnosis(result: dict[str, Any]) -> page.Section:
-    """What the simulation still gets wrong."""
-    section = page.Section("Diagnosis")
-    known = result.get("verdict", "")
-    section.add(page.paragraph(VERDICTS.get(known, known or "The file holds no verdict.")))
-    rows = []
-    for cause in result.get("causes", []):
-        values = "; ".join(
-            f"{name} = {_cell(v['value'], '.4g')} +- {_cell(v['error'], '.2g')} {v['unit']}".rstrip(" 1")
-            if v["unit"] == "1"
-            else f"{name} = {_cell(v['value'], '.4g')} +- {_cell(v['error'], '.2g')} {v['unit']}"
-            for name, v in cause["parameters"].items()
-        )
-        rows.append(
-            [cause["effect"].replace("_", " "), values, _cell(cause["p_family_wise"], ".2g"), _cell(cause["gain_nats"], ".1f"),
-             f"{_cell(cause['residual_rms_before'], '.3g')} to {_cell(cause['residual_rms_after'], '.3g')}",
-             ", ".join(cause["group"]).replace("_", " ") or "-"]
-        )  # fmt: skip
-    if rows:
-        header = ["cause", "parameters", "p (family-wise)", "gain, nats", "residual rms", "not to be told apart from"]
-        section.add(page.table("Causes", header, rows))
-    for cause in result.get("causes", []):
-        if len(cause["group"]) > 1 and cause.get("to_separate"):
-            section.add(
-                page.paragraph(f"To separate {cause['effect'].replace('_', ' ')}: {cause['to_separate']}", "soft")
-            )
-    held_out = result.get("held_out") or {}
-    if held_out.get("gain_percent") is not None:
-        section.add(
-            page.paragraph(
-                f"On held-out pairs the extended model lowers the MSE by {held_out['gain_percent']:.1f} % "
-                f"(95 %: {_cell(held_out['gain_percent_low'], '.1f')} .. {_cell(held_out['gain_percent_high'], '.1f')})."
-            )
-        )
-    if result.get("blind"):
-        names = ", ".join(result["blind"]).replace("_", " ")
-        section.add(page.paragraph(f"These data could not show: {names}.", "soft"))
     return section

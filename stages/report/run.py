@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from markupsafe import Markup
 
@@ -15,18 +17,32 @@ from schemas import ConfigError, InputError, atomic_path, check_output, open_art
 from schemas.files.user_files import check_file, read_json
 from stages.common import page
 from stages.common.page import pictures
-from stages.report import results, sections
+from stages.report import conclusions, maps, results, sections
+from stages.report.diagnosis import diagnosis
+from stages.report.held_out import held_out_images
 
 BUILDERS = {
     "scene": sections.scene,
     "pairs": sections.pairs,
     "checkpoint": sections.checkpoint,
-    "svbrdf": sections.svbrdf,
+    "svbrdf": maps.svbrdf,
 }
+SENTENCES = {"checkpoint": conclusions.learned, "svbrdf": conclusions.albedo}
 # The order of the page; a page says the same whatever the order of its files.
-ORDER = ("scene", "pairs", "checkpoint", "svbrdf", "evaluation", "match", "compare", "diagnosis")
+ORDER = ("scene", "pairs", "checkpoint", "svbrdf", "evaluation", "held_out", "match", "compare", "diagnosis")
+# ... and of its first screen: what was learned, what it gains, what is still wrong
+FIRST = ("checkpoint", "evaluation", "svbrdf", "held_out", "diagnosis")
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 LARGEST_PICTURE = 12 * 2**20  # bytes
+HEAVY, WIDEST = 300_000, 1400  # bytes, px: pictures above are made lighter
+# What is seen on the pictures that commands write, by the beginning of their names.
+CAPTIONS = {
+    "match_": "Matches between a measured crop (left) and the rendered ones, coloured by how far each ends from where it began",
+    "crop_": "A test crop: measured, rendered by the compared models, and measured minus rendered",
+    "errors": "Errors of the compared models with their 95 % intervals",
+    "training_curves": "Loss on training and validation pairs",
+    "render": "The map as 'lunargr render' lights it",
+}
 
 
 @dataclass
@@ -46,15 +62,16 @@ def run(
 ) -> list[str]:
     """Write the page and return the titles of its sections.
 
-    files : artefacts, JSON results of match, compare and diagnose, and PNG or JPEG pictures, in any order
+    files : artefacts, JSON results of evaluate, match, compare and diagnose, PNG or JPEG pictures, and pages of
+    `lunargr view` to link to, in any order; `view.html` beside the output is linked, too
     Raises ConfigError, ArtefactError, InputError.
     """
     if not files:
         raise ConfigError("report: expected at least one file, found none; give the artefacts of a run.")
     check_output(output, files, overwrite)
-    found: list[tuple[int, page.Section]] = []
-    cards: list[tuple[str, str, str]] = []
+    found: list[tuple[str, page.Section, list[conclusions.Sentence]]] = []
     shown: list[Path] = []
+    linked: list[Path] = []
     details: list[Markup] = []
     seen: list[Any] = []  # evaluation.h5 and the evaluation.json beside it are one result
     for number, path in enumerate(sorted(files, key=lambda p: p.suffix.lower() == ".json")):
@@ -63,18 +80,22 @@ def run(
         if path.suffix.lower() in PICTURES:
             shown.append(path)
             continue
+        if path.suffix.lower() == ".html":
+            check_file(path, "a page of 'lunargr view'")
+            linked.append(path)
+            continue
         load = _json if path.suffix.lower() == ".json" else _artefact
         try:
-            kind, section, more = load(path, details, seen)
+            part = load(path, details, seen)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise InputError(
                 f"{path}: expected a result as its stage writes it, found other content ({type(error).__name__}: {error}); "
                 "run the stage again."
             ) from None
-        if section is not None:
-            found.append((ORDER.index(kind), section))
-        cards.extend(more)
-    chapters = [section for _, section in sorted(found, key=lambda item: item[0])]
+        if part is not None:
+            found.append(part)
+    found.sort(key=lambda part: ORDER.index(part[0]))
+    chapters = [section for _, section, _ in found]
     if shown:
         chapters.append(_gallery(shown))
     if details:
@@ -83,7 +104,7 @@ def run(
         raise ConfigError("report: expected artefacts or results of lunargr, found nothing that can be shown.")
     if progress is not None:
         progress(len(files), len(files), "report")
-    head = [page.cards(cards)] if cards else []
+    head = _head(found, linked, output)
     subtitle = f"made by lunargr {version('lunargr')} from {len(files)} files"
     footer = "Every number and picture on this page is read from the files named under Provenance."
     with atomic_path(output) as partial:
@@ -91,43 +112,63 @@ def run(
     return [s.title for s in chapters]
 
 
-Part = tuple[str, page.Section | None, list[tuple[str, str, str]]]  # kind, section, headline numbers
+Part = tuple[str, page.Section, list[conclusions.Sentence]]  # kind, section, what it says on the first screen
 
 
-def _artefact(path: Path, details: list[Markup], seen: list[Any]) -> Part:
+def _head(found: Sequence[Part], linked: Sequence[Path], output: Path) -> list[Markup]:
+    """The first screen: conclusions, each once, and a way to the page that relights the map."""
+    beside = output.with_name("view.html")
+    if beside.is_file() and beside.resolve() not in [path.resolve() for path in linked]:
+        linked = [*linked, beside]
+    said = [s for kind in FIRST for part, _, sentences in found if part == kind for s in sentences]
+    head = [page.conclusions(dict.fromkeys(said))] if said else []
+    for path in linked:
+        address = quote(os.path.relpath(path, output.parent).replace(os.sep, "/"))
+        head.append(page.link(address, f"Move the Sun and the camera over this map: {path.name}"))
+    return head
+
+
+def _artefact(path: Path, details: list[Markup], seen: list[Any]) -> Part | None:
     """The section of one HDF5 artefact; its origin is appended to ``details``, its result to ``seen``."""
     schema = read_kind(path)
     with open_artefact(path, schema) as file:
         details.append(_origin(path, file))
-        if schema.name == "evaluation":
-            result = json.loads(str(file.attrs["metrics"]))
+        if schema.name in ("evaluation", "diagnosis"):
+            result = json.loads(str(file.attrs["metrics" if schema.name == "evaluation" else "report"]))
             seen.append(result)
-            return "evaluation", results.evaluation(result, file), results.headline(result)
-        if schema.name == "diagnosis":
-            result = json.loads(str(file.attrs["report"]))
-            seen.append(result)
-            return "diagnosis", results.diagnosis(result), []
+            return _result(result, file)
         if schema.name in BUILDERS:
-            return schema.name, BUILDERS[schema.name](file), []
-    return "scene", None, []
+            sentences = SENTENCES[schema.name](file) if schema.name in SENTENCES else []
+            return schema.name, BUILDERS[schema.name](file), sentences
+    return None
 
 
-def _json(path: Path, details: list[Markup], seen: list[Any]) -> Part:
-    """The section of a JSON result, told by its keys; none for one that is on the page already."""
+def _json(path: Path, details: list[Markup], seen: list[Any]) -> Part | None:
+    """The section of a JSON result; none for one that is on the page already."""
     result: Any = read_json(path, "a result in JSON")
     if result in seen:
-        return "scene", None, []
+        return None
     seen.append(result)
-    keys = set(result) if isinstance(result, dict) else set()
+    part = _result(result, None) if isinstance(result, dict) else None
+    if part is None:
+        raise InputError(f"{path}: expected a result of evaluate, match, compare or diagnose, found other JSON.")
+    return part
+
+
+def _result(result: dict[str, Any], file: Any) -> Part | None:
+    """The section of a result, told by its keys; ``file`` holds its crops where there is one."""
+    keys = set(result)
     if {"matchers", "size_px"} <= keys:
         return "match", results.matching(result), []
     if {"models", "differences"} <= keys:
         return "compare", results.comparison(result), []
-    if {"verdict", "causes"} <= keys:
-        return "diagnosis", results.diagnosis(result), []
+    if "verdict" in keys:
+        return "diagnosis", diagnosis(result), conclusions.diagnosis(result)
+    if {"models", "gains", "claim"} <= keys:
+        return "held_out", held_out_images(result), conclusions.held_out_images(result)
     if {"models", "gains"} <= keys:
-        return "evaluation", results.evaluation(result, None), results.headline(result)
-    raise InputError(f"{path}: expected a result of evaluate, match, compare or diagnose, found other JSON.")
+        return "evaluation", results.evaluation(result, file), conclusions.evaluation(result)
+    return None
 
 
 def _gallery(paths: Sequence[Path]) -> page.Section:
@@ -146,10 +187,31 @@ def _gallery(paths: Sequence[Path]) -> page.Section:
             )
         if content[:4] not in (b"\x89PNG",) and content[:2] != b"\xff\xd8":
             raise InputError(f"{path}: expected a PNG or JPEG picture, found another kind of file.")
-        source = pictures.uri_of(content, PICTURES[path.suffix.lower()])
-        figures.append(page.picture(source, path.stem.replace("_", " ")))
+        figures.append(page.picture(_light(content, path), _caption(path)))
     section.add(page.grid(figures))
     return section
+
+
+def _light(content: bytes, path: Path) -> str:
+    """A picture as data URI, large ones smaller and as WebP, so that the page stays light."""
+    import cv2
+    import numpy as np
+
+    if len(content) <= HEAVY:
+        return pictures.uri_of(content, PICTURES[path.suffix.lower()])
+    picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR_RGB)
+    if picture is None:
+        raise InputError(f"{path}: expected a PNG or JPEG picture, found a damaged one; make it again.")
+    scale = min(1.0, WIDEST / max(picture.shape[:2]))
+    size = [max(1, round(n * scale)) for n in picture.shape[1::-1]]
+    return pictures.photo_uri(cv2.resize(picture, size, interpolation=cv2.INTER_AREA) if scale < 1 else picture)
+
+
+def _caption(path: Path) -> str:
+    """What is seen, where a command of lunargr named the picture; and its name."""
+    said = next((text for start, text in CAPTIONS.items() if path.stem.startswith(start)), None)
+    name = path.stem.replace("_", " ")
+    return name if said is None else f"{said} ({name})"
 
 
 def _origin(path: Path, file: Any) -> Markup:

@@ -1,4 +1,4 @@
-"""Terrain, pairs, training and coefficient maps: one function per artefact, from the open file to a section."""
+"""Terrain, pairs and training: one function per artefact, from the open file to a section."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def scene(file: h5py.File) -> page.Section:
         page.grid(
             [
                 page.picture(
-                    pictures.data_uri(relief),
+                    pictures.photo_uri(relief),
                     "Elevation above the reference sphere, with relief shading",
                     below=page.colour_bar(low, high, "cividis", "m"),
                 ),
@@ -153,36 +153,5 @@ def checkpoint(file: h5py.File) -> page.Section:
             f"{seconds.sum() / 60:.1f} min. The kept weights have a validation error of {validation[best]:.4g}."
         ),
         page.chart(pictures.chart_svg(figure, "training"), "Training and validation loss"),
-    )
-    return section
-
-
-def svbrdf(file: h5py.File) -> page.Section:
-    """The coefficient maps."""
-    section = page.Section("Reflectance maps")
-    names = read_strings(file, "coefficient_name")
-    known = pictures.read_thinned(file["valid"])[0] > 0
-    figures = []
-    for k, name in enumerate(names):
-        values = np.where(known, pictures.read_thinned(file["coefficients"], k)[0], np.nan)
-        low, high = pictures.limits(values, 1.0)
-        spread = values[np.isfinite(values)]
-        statistics = (
-            f"mean {spread.mean():.4g}, standard deviation {spread.std():.2g}" if len(spread) else "no valid pixel"
-        )
-        figures.append(
-            page.picture(
-                pictures.data_uri(pictures.coloured(values, low, high, "magma")),
-                f"Coefficient {name}: {statistics}",
-                below=page.colour_bar(low, high, "magma", ""),
-            )
-        )
-    height, width = file["valid"].shape
-    section.add(
-        page.paragraph(
-            f"Coefficients of {file.attrs['model']} on the grid of the DEM, {width:,} x {height:,} px at "
-            f"{float(file.attrs['gsd_m']):g} m ({file.attrs['quantity']})."
-        ),
-        page.grid(figures),
     )
     return section

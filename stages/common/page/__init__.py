@@ -1,4 +1,4 @@
-"""The page that `report` and `diagnose` write: one HTML file without scripts or links to anything outside, light and dark.
+"""The page that `report` and `diagnose` write: one HTML file without scripts and with no link to the network, light and dark.
 
 ``parts.html.j2`` holds the parts, ``page.html.j2`` the whole, ``style.css`` the look. Functions here return finished,
 escaped HTML.
@@ -52,11 +52,6 @@ def conclusions(items: Iterable[tuple[str, str]]) -> Markup:
     return _part("conclusions", list(items))
 
 
-def cards(items: Iterable[tuple[str, str, str]]) -> Markup:
-    """Headline numbers: (value, what it is, '' | 'good' | 'bad')."""
-    return _part("cards", list(items))
-
-
 def table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[str]], best: int | None = None) -> Markup:
     """A table; columns whose cells all look like numbers are set right; row ``best`` stands out."""
     numeric = [all(row[k][:1] in "-+.0123456789" for row in rows) for k in range(len(columns))]
@@ -86,6 +81,16 @@ def colour_bar(low: float, high: float, colours: str, unit: str) -> Markup:
     """A gradient of a matplotlib colour map with the numbers at its ends and middle."""
     ends = [f"{pictures.number(v)} {unit}".rstrip() for v in (low, (low + high) / 2, high)]
     return _part("colour_bar", pictures.gradient(colours), ends)
+
+
+def scale_bar(percent: float, label: str) -> Markup:
+    """A line of ``percent`` of the map's width with its length, and an arrow to grid north, which is up."""
+    return _part("scale_bar", percent, label)
+
+
+def link(address: str, text: str) -> Markup:
+    """A link to a page beside this one."""
+    return _part("link", address, text)
 
 
 def grid(figures: Iterable[Markup]) -> Markup:

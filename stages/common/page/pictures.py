@@ -31,6 +31,13 @@ def data_uri(picture: np.ndarray) -> str:
     return uri_of(encoded.tobytes(), "image/png")
 
 
+def photo_uri(picture: np.ndarray, quality: int = 85) -> str:
+    """(H, W, 3 or 4) uint8, RGB(A) -> WebP data URI: for maps and photographs, a tenth of a PNG."""
+    code = cv2.COLOR_RGBA2BGRA if picture.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    _, encoded = cv2.imencode(".webp", cv2.cvtColor(picture, code), [cv2.IMWRITE_WEBP_QUALITY, quality])
+    return uri_of(encoded.tobytes(), "image/webp")
+
+
 def uri_of(content: bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 

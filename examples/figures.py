@@ -1,0 +1,236 @@
+"""Write every figure of an evaluation into README.md and docs/, from the files that commands left. Run: make figures
+
+Between `<!-- figures:NAME -->` and `<!-- end -->` stands what the function of that name makes of demo/ and results/.
+Where a file is absent the block names the command that makes it: no figure is kept from another run.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from stages.report import conclusions  # noqa: E402
+from stages.report.held_out import TITLES as MAPS  # noqa: E402
+
+BLOCK = re.compile(r"(<!-- figures:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.S)
+KNOWS = {
+    "none": "nothing of the scored crops",
+    "minmax": "each crop's range and mean",
+    "gain": "each crop's gain",
+    "gain_offset": "each crop's gain and offset",
+}
+BRIEF = ("learned", "global", "hapke_fitted", "hapke_raw", "hapke_minmax", "learned_gain_offset", "hapke_gain_offset")
+DEMO, APOLLO, PAPER = "make demo", "make reproduce-apollo15", "make reproduce-models"
+
+
+class Absent(Exception):
+    """A figure has no file to come from: (file, the command that makes it)."""
+
+
+def read(root: Path, name: str, command: str) -> dict[str, Any]:
+    try:
+        return json.loads((root / name).read_text())
+    except FileNotFoundError:
+        raise Absent(name, command) from None
+
+
+def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    columns = list(columns)
+    return ["", *(f"| {' | '.join(row)} |" for row in (columns, ["---"] * len(columns), *rows)), ""]
+
+
+def with_bounds(value: float, low: float | None, high: float | None, spread: float | None = None) -> str:
+    """'7.95e-5 +- 0.12 (5.78 .. 12.2)': bounds and spread with the exponent of the value."""
+    power = math.floor(math.log10(value)) if value > 0 else 0
+    text = f"{value / 10**power:.2f}" + (f"e{power}" if power else "")
+    text += "" if spread is None else f" +- {spread / 10**power:.2f}"
+    ends = (
+        "no interval"
+        if low is None
+        else f"{low / 10**power:#.3g} .. " + ("unbounded" if high is None else f"{high / 10**power:#.3g}")
+    )
+    return f"{text} ({ends})"
+
+
+def said(sentences: list[conclusions.Sentence]) -> list[str]:
+    return [f"- {text}" for text, _ in sentences]
+
+
+def rows_of(result: dict[str, Any], names: Iterable[str], prefix: str = "") -> list[list[str]]:
+    """Lines of an evaluation's table."""
+    lines = []
+    for name in names:
+        row = result["models"][name]
+        error = with_bounds(row["mse"], row["mse_low"], row["mse_high"], row.get("mse_run_std"))
+        ssim = "-" if row.get("ssim") is None else f"{row['ssim']:.3f}"
+        title = result.get("titles", {}).get(name, name)
+        lines.append([prefix + title, KNOWS.get(row["freedom"], row["freedom"]), error, ssim])
+    return lines
+
+
+def evaluated(result: dict[str, Any], names: Iterable[str], more: list[list[str]]) -> list[str]:
+    """A table of errors with what it rests on, and what it says."""
+    unit = "I/F squared" if result["image_units"] == "iof" else "shares of the full DN range, squared"
+    lines = [
+        f"Model {result['model']}, {conclusions.basis(result)}, none of it seen in training. MSE in {unit}; +- is the standard deviation of "
+        "training runs, in brackets 95 % intervals."
+    ]
+    rows = sorted(rows_of(result, names), key=lambda row: list(KNOWS.values()).index(row[1]))
+    return (
+        lines
+        + table(["model", "what it may know", "MSE", "SSIM"], [*rows, *more])
+        + said(conclusions.evaluation(result))
+    )
+
+
+def brief(result: dict[str, Any]) -> list[str]:
+    """The rows of a short table: the strongest baselines and the paper's among them."""
+    wanted = {*BRIEF, *result.get("strongest_baseline", {}).values()}
+    return [name for name in result["models"] if name in wanted]
+
+
+def demo(root: Path) -> list[str]:
+    result = read(root, "demo/evaluation.json", DEMO)
+    return evaluated(result, brief(result), paper_row(root))
+
+
+def paper_row(root: Path) -> list[list[str]]:
+    """The paper's model and network, where they were trained on the same pairs."""
+    try:
+        other = read(root, "demo/m2.json", "make demo-paper")
+    except Absent:
+        return []
+    runs = f"M2 with the paper's network ({conclusions.basis(other)}): "
+    return rows_of(other, [name for name in other["models"] if name.startswith("learned")], runs)
+
+
+def demo_rows(root: Path) -> list[str]:
+    result = read(root, "demo/evaluation.json", DEMO)
+    return evaluated(result, result["models"], paper_row(root))
+
+
+def held_out(root: Path, folder: str, command: str) -> list[str]:
+    """Seen ground under unseen images."""
+    result = read(root, f"{folder}/held_out.json", command)
+    rows = [
+        [MAPS.get(name, name), with_bounds(row["mse"], row["mse_low"], row["mse_high"]),
+         "-" if row.get("ssim") is None else f"{row['ssim']:.3f}"]
+        for name, row in result["models"].items()
+    ]  # fmt: skip
+    lines = [f"Claim: {result['claim']}; {conclusions.basis(result)}, {len(result['images'])} images."]
+    lines += table(["map", "MSE", "SSIM"], rows) + said(conclusions.held_out_images(result))
+    coverage = result.get("coverage_percent")
+    if coverage:
+        lines.append(
+            f"- Intervals that should hold 68 and 95 % of the pixels hold {coverage['68']:.1f} and {coverage['95']:.1f} %."
+        )
+    return lines
+
+
+def matched(root: Path, folder: str, command: str) -> list[str]:
+    """Shares of matches within 1 px."""
+    result = read(root, f"{folder}/match.json", command)
+    rows = []
+    for matcher, renderings in result["matchers"].items():
+        for name, row in renderings.items():
+            share, low, high = (row[f"within_1_px_percent{end}"] for end in ("", "_low", "_high"))
+            text = "-" if share is None else f"{share:.1f} %" + ("" if low is None else f" ({low:.1f} .. {high:.1f})")
+            rows.append([matcher, name.replace("_", " "), str(row["matches"]), text])
+    lines = [f"{result['crops']} crops on {result['tiles']} ground tiles, one training run, 95 % intervals over tiles."]
+    return lines + table(["matcher", "rendering", "matches", "within 1 px"], rows)[:-1]
+
+
+def diagnosed(root: Path, folder: str, command: str) -> list[str]:
+    return said(conclusions.diagnosis(read(root, f"{folder}/diagnosis.json", command)))
+
+
+def apollo15(root: Path) -> list[str]:
+    result = read(root, "results/apollo15/evaluation.json", APOLLO)
+    return evaluated(result, brief(result), [])
+
+
+def models(root: Path) -> list[str]:
+    """The paper's comparison of reflectance models."""
+    result = read(root, "results/models.json", PAPER)
+    rows = []
+    for name, row in result["models"].items():
+        error = with_bounds(row["mse"], row["mse_low"], row["mse_high"], row["mse_seed_std"])
+        paper = "-" if row.get("paper_mse_crop_sum") is None else f"{row['paper_mse_crop_sum']:.2f}"
+        rows.append([name, error, f"{row['mse_crop_sum']:.4f}", paper])
+    lines = [
+        f"{result['crops']} validation crops on {result['tiles']} ground tiles, {result['seeds']} training runs each; +- is the standard "
+        "deviation of runs, in brackets 95 % intervals over tiles and runs. The paper's figures are of its own pairs."
+    ]
+    lines += table(["model", "MSE", "MSE summed over a crop", "the paper's"], rows)
+    known = [p for p in result["differences"] if p["larger_than_noise"]]
+    text = "; ".join(f"{p['better']} below {p['worse']} by {p['difference_percent']:.1f} %" for p in known)
+    return [*lines, f"Differences larger than their noise: {text or 'none'}."]
+
+
+def commands(_: Path) -> list[str]:
+    """What `make demo` runs, as make itself lists it, from within demo/."""
+    listed = subprocess.run(["make", "-nB", "demo"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    found = re.findall(r"^\.venv/bin/(lunargr (?:.*\\\n)*.*)$", listed, re.M)
+    lines = "\n".join(found).replace(" --overwrite", "").replace(" --resume", "").replace("demo/", "")
+    return [f"    {re.sub(r'^ +', '    ', line)}" for line in lines.splitlines()]
+
+
+BLOCKS: dict[str, Callable[[Path], list[str]]] = {
+    "demo-commands": commands,
+    "demo": demo,
+    "demo-rows": demo_rows,
+    "demo-held-out": lambda root: held_out(root, "demo", DEMO),
+    "demo-match": lambda root: matched(root, "demo", DEMO),
+    "demo-diagnosis": lambda root: diagnosed(root, "demo", DEMO),
+    "apollo15": apollo15,
+    "apollo15-match": lambda root: matched(root, "results/apollo15", APOLLO),
+    "apollo15-diagnosis": lambda root: diagnosed(root, "results/apollo15", APOLLO),
+    "models": models,
+}
+
+
+def block(name: str, root: Path) -> str:
+    """What stands between the markers. Raises KeyError for a block that nobody writes."""
+    try:
+        lines = BLOCKS[name](root)
+    except Absent as absent:
+        file, command = absent.args
+        lines = [f"*No figures yet: `{command}` makes `{file}`, then `make figures` writes them here.*"]
+    return "\n" + "\n".join(lines).strip("\n") + "\n\n"
+
+
+def rewrite(text: str, root: Path) -> str:
+    """A page with all its blocks as the files of ``root`` have them."""
+    return BLOCK.sub(lambda found: found[1] + block(found[2], root) + found[3], text)
+
+
+def main(root: Path) -> None:
+    for page in (root / "README.md", *sorted((root / "docs").glob("*.md"))):
+        before = page.read_text()
+        try:
+            after = rewrite(before, root)
+        except (KeyError, TypeError, ValueError) as error:
+            print(
+                f"{page.name}: a figure's file is not as its command writes it ({type(error).__name__}: {error}); run it again.",
+                file=sys.stderr,
+            )
+            raise SystemExit(3) from None
+        if after != before:
+            page.write_text(after)
+            print(page)
+
+
+if __name__ == "__main__":
+    main(ROOT)
+    import runpy
+
+    runpy.run_path(str(ROOT / "examples" / "figure_pictures.py"), run_name="__main__")

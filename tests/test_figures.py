@@ -1,0 +1,123 @@
+"""Figures of an evaluation stand in marked blocks only, and come from files only."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import shutil
+
+import pytest
+from conftest import ROOT
+
+figures = runpy.run_path(str(ROOT / "examples" / "figures.py"), run_name="figures")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "evaluate.md")
+NUMBER = re.compile(r"\d\.\d+e-\d|\d(?:\.\d+)? ?%|\bp ?= ?\d")  # errors, gains and shares
+
+
+def row(mse, freedom):
+    return {
+        "mse": mse,
+        "mse_low": mse / 2,
+        "mse_high": mse * 2,
+        "mse_run_std": mse / 50,
+        "ssim": 0.8,
+        "freedom": freedom,
+    }
+
+
+def gain(value, low, high):
+    return {"gain_percent": value, "gain_percent_low": low, "gain_percent_high": high}
+
+
+EVALUATION = {
+    "models": {"learned": row(3.1e-5, "none"), "hapke_fitted": row(4.2e-5, "none"), "hapke_minmax": row(5.3e-5, "minmax")},
+    "gains": {"learned": {"hapke_fitted": gain(26.2, -3.0, 41.0), "hapke_minmax": gain(41.5, 20.0, 55.0)}},
+    "strongest_baseline": {"none": "hapke_fitted"},
+    "titles": {"learned": "learned reflectance", "hapke_fitted": "Hapke fitted", "hapke_minmax": "Hapke min-max"},
+    "pairs": 321, "tiles": 22, "training_runs": 3, "interval_unit": "tile", "image_units": "iof", "model": "hapke",
+}  # fmt: skip
+HELD_OUT = {
+    "claim": "seen ground, unseen images",
+    "models": {"terrain": row(3.3e-5, ""), "albedo": row(4.4e-6, "")},
+    "gains": {"albedo": {"terrain": gain(86.7, 80.0, 91.0)}},
+    "images": [{}, {}], "pairs": 77, "tiles": 9, "image_units": "iof",
+    "nearest_used_sun_deg": {"least": 2.0, "mean": 5.0, "most": 8.0}, "coverage_percent": {"68": 70.1, "95": 94.2},
+}  # fmt: skip
+PAGE = "before\n<!-- figures:NAME -->\nold 9.99e-5\n<!-- end -->\nafter 1\n"
+
+
+def filled(name, tmp_path, files):
+    for file, content in files.items():
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text(json.dumps(content))
+    return figures["rewrite"](PAGE.replace("NAME", name), tmp_path)
+
+
+def test_a_block_is_replaced_by_what_the_file_holds(tmp_path):
+    text = filled("demo", tmp_path, {"demo/evaluation.json": EVALUATION})
+    assert (
+        "9.99e-5" not in text and text.startswith("before\n<!-- figures:demo -->\n") and text.endswith("-->\nafter 1\n")
+    )
+    assert "| learned reflectance | nothing of the scored crops | 3.10e-5 +- 0.06 (1.55 .. 6.20) | 0.800 |" in text
+    assert (
+        "no difference from the strongest model without a network, 'Hapke fitted': gain +26.2 % (95 %: -3.0 .. +41.0"
+        in text
+    )
+    assert "squared error 41.5 % lower than the baseline of the Lunar-G2R paper" in text
+    assert "321 pairs on 22 ground tiles, 3 training runs" in text
+    assert figures["rewrite"](text, tmp_path) == text
+
+
+def test_the_papers_model_stands_in_the_table_where_it_was_trained(tmp_path):
+    other = {**EVALUATION, "model": "M2", "models": {"learned": row(8.7e-5, "none")}, "training_runs": 1}
+    text = filled("demo", tmp_path, {"demo/evaluation.json": EVALUATION, "demo/m2.json": other})
+    assert re.search(r"\| M2 .*1 training run\): learned reflectance .* 8\.70e-5", text)
+
+
+def test_unseen_images_are_a_claim_of_their_own(tmp_path):
+    text = filled("demo-held-out", tmp_path, {"demo/held_out.json": HELD_OUT})
+    assert (
+        "4.40e-6" in text
+        and "unseen images" in text
+        and "86.7 % lower" in text
+        and "77 pairs on 9 ground tiles" in text
+    )
+    assert "2 to 8 deg" in text and "70.1 and 94.2 %" in text
+
+
+@pytest.mark.parametrize("name", [n for n in figures["BLOCKS"] if n != "demo-commands"])
+def test_without_a_file_the_block_names_the_command_and_no_figure(name, tmp_path):
+    text = figures["rewrite"](PAGE.replace("NAME", name), tmp_path)
+    assert "9.99e-5" not in text and re.search(r"`make (demo|reproduce-\w+)` makes `(demo|results)/", text)
+    assert not NUMBER.search(text)
+
+
+def test_a_file_of_something_else_is_refused(tmp_path):
+    for folder in ("demo", "docs"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "README.md").write_text(PAGE.replace("NAME", "demo"))
+    (tmp_path / "demo" / "evaluation.json").write_text('{"a": 1}')
+    with pytest.raises(SystemExit) as ended:
+        figures["main"](tmp_path)
+    assert ended.value.code == 3 and "9.99e-5" in (tmp_path / "README.md").read_text()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_marker_is_whole_and_has_a_writer(page):
+    text = page.read_text()
+    names = re.findall(r"<!-- figures:(\S+) -->", text)
+    assert names and set(names) <= set(figures["BLOCKS"]) and len(figures["BLOCK"].findall(text)) == len(names)
+
+
+def test_readme_holds_no_figure_of_an_evaluation_outside_the_blocks():
+    outside = figures["BLOCK"].sub("", PAGES[0].read_text())
+    assert NUMBER.search("lowers it by 18 %") and NUMBER.search("7.95e-5")
+    assert not [line for line in outside.splitlines() if NUMBER.search(line)]
+    assert "fairest" not in outside
+
+
+def test_the_printed_commands_are_those_that_make_runs():
+    if shutil.which("make") is None:
+        pytest.skip("no make on this machine")
+    assert figures["block"]("demo-commands", ROOT) in PAGES[0].read_text()
