@@ -336,13 +336,16 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Columns and cells of the table of rows."""
     cells = []
     for name, row in result["models"].items():
-        bounds = "-" if row["mse_low"] is None else f"{row['mse_low']:.3e} .. {row['mse_high']:.3e}"
+        # few units bound the error on one side only
+        ends = ["-" if row[k] is None else f"{row[k]:.3e}" for k in ("mse_low", "mse_high")]
+        bounds = "-" if ends == ["-", "-"] else " .. ".join(ends)
         gain = next(iter(result["gains"].get(name, {}).values()), None)
         text = "-"
         if gain is not None:
             text = f"{gain['gain_percent']:+.1f} %"
-            if gain["gain_percent_low"] is not None:
-                text += f" ({gain['gain_percent_low']:+.1f} .. {gain['gain_percent_high']:+.1f})"
+            ends = ["-" if gain[k] is None else f"{gain[k]:+.1f}" for k in ("gain_percent_low", "gain_percent_high")]
+            if ends != ["-", "-"]:
+                text += f" ({' .. '.join(ends)})"
         cells.append([name, f"{row['mse']:.3e}", bounds, "-" if row["ssim"] is None else f"{row['ssim']:.3f}", text])
     return ["map", "MSE", "95 % interval", "SSIM", "lower MSE than without albedo by"], cells
 
