@@ -16,7 +16,7 @@ from small_scene import GSD, LAT, LON, RADIUS, A, B, C, local_crs, slopes, sun_e
 from stages import ingest
 from stages.physics.maps.grid import Grid
 
-SIZE = 192
+SIZE = 256
 SUNS = ((-25.0, 1.0), (-10.0, -1.0), (55.0, 1.0), (70.0, 0.5), (20.0, -30.0), (-20.0, 1.2))  # sub-solar points
 NOISE = 4e-4  # I/F
 

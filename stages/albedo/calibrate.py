@@ -30,7 +30,8 @@ Progress = Callable[[int, int, str], None]
 WINDOW_PX = 128
 WINDOWS_PER_IMAGE = 16
 LOOKS = 4096  # windows of images held at a time: 0.8 GB at most
-ROUNDS = 4
+ROUNDS = 6
+SETTLED = 0.05  # relative change of all variances below which no further round is made
 COSINES = np.linspace(0.0, 1.0, 17)  # bins of cos(incidence) over which the error may differ
 STEPS = 200  # of the fit of variances to those of differences
 FARTHEST = 3.0  # |log ratio| beyond which nothing is measured any more
@@ -88,7 +89,7 @@ class Sample:
 
 def choose_windows(shape: tuple[int, int], boxes: Sequence[Box]) -> list[Box]:
     """Windows spread over the map such that every image has WINDOWS_PER_IMAGE, as far as LOOKS allow."""
-    rows, cols = (max(1, n // WINDOW_PX) for n in shape)
+    rows, cols = (-(-n // WINDOW_PX) for n in shape)
     total = rows * cols
     step = max(1, round(total * 0.6180339887))  # the golden section leaves no large gap at any time
     while np.gcd(step, total) != 1:
@@ -141,7 +142,10 @@ def calibrate(samples: Sequence[Sample], count: int, units: str) -> Calibration:
             settle(ratio, confidence, result.spread.of(sample.images))
             for sample, (ratio, confidence) in zip(samples, stacks, strict=True)
         ]
+        before = result.spread.own_px
         result = replace(result, spread=_variances(samples, stacks, count), error=_error(samples, stacks, albedo))
+        if np.abs(np.log(np.maximum(result.spread.own_px, 1e-12) / np.maximum(before, 1e-12))).max() < SETTLED:
+            break
     stacks = [(*_stack(result, s), s.images, [look.cos_incidence for look in s.looks]) for s in samples]
     shift = np.log(result.gain) if units == "iof" else np.zeros(count)
     return replace(result, interval=_rounded(unseen_intervals(stacks, result.spread, shift, COSINES)))
