@@ -39,7 +39,7 @@ def planted(tmp_path_factory):
     log_albedo[60:64, :] += 0.4
     images = photographs(rng, np.exp(log_albedo))
     for image in images:
-        image[:, :80] = np.where(np.arange(SIZE)[:, None] > 80, np.nan, image[:, :80])
+        image[:, :100] = np.where(np.arange(SIZE)[:, None] > 80, np.nan, image[:, :100])
     return plant(tmp_path_factory.mktemp("planted"), np.exp(log_albedo), images)
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from stages.albedo.intervals import GAUSSIAN, unseen_intervals
 from stages.albedo.posterior import Spread, settle
@@ -229,7 +230,8 @@ def _variances(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Float
     doubt = np.array([_sampling_variance(windows, k, shared[k], own[k]) for k in range(levels - 1)])
     # as far as what is shared is known, the map is wrong by that; else by all that single images show beyond it
     total = shared[:-1].sum()
-    known = total**2 / (total**2 + doubt.sum()) if total > 0 else 0.0
+    sure = stdtrit(max(1, len(windows) - 1), 0.975) ** 2  # few windows say little of how they differ
+    known = total**2 / (total**2 + sure * doubt.sum()) if total > 0 else 0.0
     prior = known * shared[:-1] + (1 - known) * single[:-1]
     own = np.maximum(own, beyond).T
     parts = (_rounded(v) for v in (shared[:-1], own[:, :-1], shared[-1], own[:, -1], prior))
