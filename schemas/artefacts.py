@@ -442,6 +442,15 @@ _ALBEDO = (
     _of_images(
         "albedo_image_std", ("frame", "band"), "f8", "1", "std of each image's own error in log albedo, by band"
     ),
+    _of_images("albedo_bin_cos_incidence", ("incidence_bin",), "f8", "1", "middle of the bin"),
+    _of_images(
+        "albedo_interval_68",
+        ("incidence_bin",),
+        "f8",
+        "1",
+        "half-width of the 68 % interval of an unseen image's pixel, in hypot(albedo_std / albedo, median image's own std)",
+    ),
+    _of_images("albedo_interval_95", ("incidence_bin",), "f8", "1", "the same of the 95 % interval"),
 )
 
 SVBRDF = declare(
@@ -457,6 +466,7 @@ SVBRDF = declare(
             "x": "grid columns, west to east",
             "frame": "images that the albedo was made of",
             "band": "structure sizes, fine to coarse",
+            "incidence_bin": "bins of the cosine of incidence",
         },
         variables=_GRID
         + (

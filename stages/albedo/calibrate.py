@@ -11,13 +11,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
+from stages.albedo.intervals import GAUSSIAN, unseen_intervals
 from stages.albedo.posterior import Spread, settle
 from stages.albedo.pyramid import LEVELS, bands
 from stages.albedo.references import Box, Look, References, overlap
@@ -27,9 +29,10 @@ Floats32 = NDArray[np.float32]
 Progress = Callable[[int, int, str], None]
 
 WINDOW_PX = 128
-WINDOWS_PER_IMAGE = 48
+WINDOWS_PER_IMAGE = 16
 LOOKS = 4096  # windows of images held at a time: 0.8 GB at most
 ROUNDS = 6
+SETTLED = 0.05  # relative change of all variances below which no further round is made
 COSINES = np.linspace(0.0, 1.0, 17)  # bins of cos(incidence) over which the error may differ
 STEPS = 200  # of the fit of variances to those of differences
 FARTHEST = 3.0  # |log ratio| beyond which nothing is measured any more
@@ -38,12 +41,14 @@ FARTHEST = 3.0  # |log ratio| beyond which nothing is measured any more
 @dataclass(frozen=True)
 class Calibration:
     """gain, offset : (n,), measured = gain x I/F x albedo + offset; spread : variances of log ratios;
-    error : relative variance of an image's error at the cosines of incidence ``COSINES``"""
+    error : relative variance of an image's error at the cosines of incidence ``COSINES``; interval : (2, bins), half-widths
+    of the 68 and 95 % intervals of an unseen image, in standard deviations, by the same bins"""
 
     gain: Floats
     offset: Floats
     spread: Spread
     error: Floats
+    interval: Floats
 
     def ratio(self, k: int, look: Look) -> tuple[Floats32, Floats32]:
         """(log of measured / predicted, confidence), both 0 where the image says nothing."""
@@ -56,8 +61,13 @@ class Calibration:
         return ratio, np.where(known, confidence, 0).astype(np.float32)
 
     def write(self, path: Path) -> None:
-        values = {"gain": self.gain, "offset": self.offset, "error": self.error}
-        values |= {"shared": self.spread.shared, "own": self.spread.own, "own_px": self.spread.own_px}
+        values = {"gain": self.gain, "offset": self.offset, "error": self.error, "interval": self.interval}
+        values |= {
+            "prior": self.spread.prior,
+            "shared": self.spread.shared,
+            "own": self.spread.own,
+            "own_px": self.spread.own_px,
+        }
         text = {k: v.tolist() for k, v in values.items()} | {"shared_px": self.spread.shared_px}
         path.write_text(json.dumps(text))
 
@@ -66,8 +76,8 @@ class Calibration:
         text = json.loads(path.read_text())
         shared_px = float(text.pop("shared_px"))
         v = {k: np.array(values, float) for k, values in text.items()}
-        spread = Spread(v["shared"], v["own"], shared_px, v["own_px"])
-        return Calibration(v["gain"], v["offset"], spread, v["error"])
+        spread = Spread(v["shared"], v["own"], shared_px, v["own_px"], v["prior"])
+        return Calibration(v["gain"], v["offset"], spread, v["error"], v["interval"])
 
 
 @dataclass
@@ -80,7 +90,7 @@ class Sample:
 
 def choose_windows(shape: tuple[int, int], boxes: Sequence[Box]) -> list[Box]:
     """Windows spread over the map such that every image has WINDOWS_PER_IMAGE, as far as LOOKS allow."""
-    rows, cols = (max(1, n // WINDOW_PX) for n in shape)
+    rows, cols = (-(-n // WINDOW_PX) for n in shape)
     total = rows * cols
     step = max(1, round(total * 0.6180339887))  # the golden section leaves no large gap at any time
     while np.gcd(step, total) != 1:
@@ -120,19 +130,26 @@ def take_samples(references: References, windows: Sequence[Box], progress: Progr
 def calibrate(samples: Sequence[Sample], count: int, units: str) -> Calibration:
     """Gains, offsets and variances of ``count`` images from windows that they share; units : iof or dn"""
     own = np.full((count, LEVELS + 1), 0.01)
-    spread = Spread(np.full(LEVELS + 1, 0.01), own, 0.01, own[:, 0].copy())
-    result = Calibration(np.ones(count), np.zeros(count), spread, np.ones(len(COSINES) - 1))
+    bins = len(COSINES) - 1
+    spread = Spread(np.full(LEVELS + 1, 0.01), own, 0.01, own[:, 0].copy(), np.full(LEVELS + 1, 0.01))
+    unknown = np.tile(np.array(GAUSSIAN)[:, None], bins)
+    result = Calibration(np.ones(count), np.zeros(count), spread, np.ones(bins), unknown)
     albedo: list[Any] = [0.0] * len(samples)
     for _ in range(ROUNDS):
         gain, offset = _scales(samples, albedo, count, units)
-        result = Calibration(gain, offset, result.spread, result.error)
+        result = replace(result, gain=gain, offset=offset)
         stacks = [_stack(result, sample) for sample in samples]
         albedo = [
             settle(ratio, confidence, result.spread.of(sample.images))
             for sample, (ratio, confidence) in zip(samples, stacks, strict=True)
         ]
-        result = Calibration(gain, offset, _variances(samples, stacks, count), _error(samples, stacks, albedo))
-    return result
+        before = result.spread.own_px
+        result = replace(result, spread=_variances(samples, stacks, count), error=_error(samples, stacks, albedo))
+        if np.abs(np.log(np.maximum(result.spread.own_px, 1e-12) / np.maximum(before, 1e-12))).max() < SETTLED:
+            break
+    stacks = [(*_stack(result, s), s.images, [look.cos_incidence for look in s.looks]) for s in samples]
+    shift = np.log(result.gain) if units == "iof" else np.zeros(count)
+    return replace(result, interval=_rounded(unseen_intervals(stacks, result.spread, shift, COSINES)))
 
 
 def _stack(calibration: Calibration, sample: Sample) -> tuple[Floats32, Floats32]:
@@ -187,15 +204,18 @@ def _variances(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Float
     levels = LEVELS + 2  # the last are whole pixels
     product, weight, difference, reach = (np.zeros((levels, count, count)) for _ in range(4))
     square, sums, pixels = (np.zeros((levels, count)) for _ in range(3))
+    windows: list[tuple[list[int], Floats, Floats]] = []
     for sample, (ratio, confidence) in zip(samples, stacks, strict=True):
         split = [[*bands(r, q), (r, q)] for r, q in zip(ratio, confidence, strict=True)]
         where = np.ix_(sample.images, sample.images)
+        windows.append((sample.images, *np.zeros((2, levels, len(sample.images), len(sample.images)))))
         for level in range(levels):
             values, q = (np.stack([s[level][i].ravel() for s in split]).astype(float) for i in (0, 1))
             scaled = q * values
             products, weights, squares = scaled @ scaled.T, q @ q.T, (scaled * values) @ q.T
             product[level][where] += products
             weight[level][where] += weights
+            windows[-1][1][level], windows[-1][2][level] = products, weights
             difference[level][where] += squares + squares.T - 2 * products
             reach[level][where] += (q > 0) @ q.T
             square[level, sample.images] += (scaled * values).sum(axis=1)
@@ -204,8 +224,34 @@ def _variances(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Float
     own = np.stack([_own_variances(difference[k], reach[k]) for k in range(levels)])
     shared = np.array([_shared_variance(product[k], weight[k], own[k]) for k in range(levels)])
     beyond = (square - shared[:, None] * sums) / np.maximum(pixels, 1)
+    single = np.array(
+        [np.median(k[q > 0] / q[q > 0]) if (q > 0).any() else 0.0 for k, q in zip(square, sums, strict=True)]
+    )
+    doubt = np.array([_sampling_variance(windows, k, shared[k], own[k]) for k in range(levels - 1)])
+    # as far as what is shared is known, the map is wrong by that; else by all that single images show beyond it
+    total = shared[:-1].sum()
+    sure = stdtrit(max(1, len(windows) - 1), 0.975) ** 2  # few windows say little of how they differ
+    known = total**2 / (total**2 + sure * doubt.sum()) if total > 0 else 0.0
+    prior = known * shared[:-1] + (1 - known) * single[:-1]
     own = np.maximum(own, beyond).T
-    return Spread(_rounded(shared[:-1]), _rounded(own[:, :-1]), float(_rounded(shared[-1])), _rounded(own[:, -1]))
+    parts = (_rounded(v) for v in (shared[:-1], own[:, :-1], shared[-1], own[:, -1], prior))
+    first, of_bands, px, own_px, last = parts
+    return Spread(first, of_bands, float(px), own_px, last)
+
+
+def _sampling_variance(
+    windows: Sequence[tuple[list[int], Floats, Floats]], level: int, shared: float, own: Floats
+) -> float:
+    """Variance of :func:`_shared_variance`, from how the windows differ; infinite where there are too few."""
+    away, total = [], 0.0
+    for images, product, weight in windows:
+        trust = 1.0 / (own[images][:, None] * own[images])
+        np.fill_diagonal(trust, 0.0)
+        away.append((trust * (product[level] - shared * weight[level])).sum())
+        total += (trust * weight[level]).sum()
+    if len(away) < 2 or not total > 0:
+        return np.inf
+    return float(np.square(away).sum()) / total**2 * len(away) / (len(away) - 1)
 
 
 def _shared_variance(product: Floats, weight: Floats, own: Floats) -> float:

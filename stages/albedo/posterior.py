@@ -27,15 +27,17 @@ ITERATIONS = 8
 @dataclass(frozen=True)
 class Spread:
     """Variances of log ratios. shared : (LEVELS + 1,) of the albedo that all images show, by band; own : (n, LEVELS + 1)
-    of each image's error; shared_px, own_px : (), (n,) of whole pixels"""
+    of each image's error; shared_px, own_px : (), (n,) of whole pixels; prior : (LEVELS + 1,) of what the map may be wrong
+    by where no image says more"""
 
     shared: Floats
     own: Floats
     shared_px: float
     own_px: Floats
+    prior: Floats
 
     def of(self, images: list[int]) -> Spread:
-        return Spread(self.shared, self.own[images], self.shared_px, self.own_px[images])
+        return Spread(self.shared, self.own[images], self.shared_px, self.own_px[images], self.prior)
 
 
 def settle(ratio: Floats32, confidence: Floats32, spread: Spread) -> Floats32:
@@ -51,8 +53,13 @@ def settle(ratio: Floats32, confidence: Floats32, spread: Spread) -> Floats32:
     return location
 
 
-def estimate(ratio: Floats32, confidence: Floats32, spread: Spread) -> tuple[Floats32, Floats32]:
-    """(log albedo, its standard deviation), (H, W), from ratios whose confidence ``settle`` has seen."""
+def estimate(
+    ratio: Floats32, confidence: Floats32, spread: Spread, prior: Floats32 | None = None
+) -> tuple[Floats32, Floats32]:
+    """(log albedo, its standard deviation), (H, W), from ratios whose confidence ``settle`` has seen.
+
+    prior : (H, W) variance of what the map may be wrong by, place by place; None: that of ``spread`` everywhere
+    """
     height, width = ratio.shape[1:]
     shapes = [(height, width)]
     for _ in range(LEVELS):
@@ -64,12 +71,17 @@ def estimate(ratio: Floats32, confidence: Floats32, spread: Spread) -> tuple[Flo
             scaled = weight * np.float32(1.0 / max(spread.own[k, level], 1e-12))
             sums[level] += scaled * values
             precision[level] += scaled
+    shares = spread.prior / max(float(spread.prior.sum()), 1e-30)
+    wrong = np.full(shapes[0], np.float32(spread.prior.sum())) if prior is None else prior
     means, variances = [], []
     for level in range(LEVELS + 1):
         shared = np.float32(spread.shared[level])
-        variance = shared / (1.0 + shared * precision[level])
-        means.append(variance * sums[level])
-        variances.append(variance)
+        kept = 1.0 / (1.0 + shared * precision[level])  # the prior's weight in the mean
+        means.append(shared * kept * sums[level])
+        # what the prior is wrong by comes in with its weight, the images' errors with theirs
+        variances.append(kept * kept * (np.float32(shares[level]) * wrong + shared * shared * precision[level]))
+        if level < LEVELS:
+            wrong = reduce(wrong)
     return collapse(means), np.sqrt(np.maximum(collapse(variances), 0))
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from schemas import SCENE, SVBRDF, ArtefactError, ArtefactWriter, InputError, atomic_path, check_output, open_artefact
 from schemas.files.companions import companions_of
 from schemas.reading import read_strings
-from stages.albedo.calibrate import Calibration, calibrate, choose_windows, take_samples
+from stages.albedo.calibrate import COSINES, Calibration, calibrate, choose_windows, take_samples
 from stages.albedo.config import Config, Summary, used_frames
 from stages.albedo.posterior import estimate, settle
+from stages.albedo.prior import terrain_variance
 from stages.albedo.pyramid import HALO_PX, LEVELS
 from stages.albedo.references import Box, References
 from stages.albedo.writing import Maps, copy_map, kept_attributes
@@ -30,12 +31,12 @@ from stages.physics.horizon.scene import make_overview
 from stages.physics.images.table import Frame, load_frames
 from stages.physics.maps.geotiff import write_geotiff
 from stages.physics.maps.grid import read_grid
-from stages.physics.terrain.surface import open_surface
+from stages.physics.terrain.surface import Surface, open_surface
 
 Progress = Callable[[int, int, str], None]
 Floats32 = NDArray[np.float32]
 
-BLOCK_PX = 512
+BLOCK_PX = 768
 STACK_PX = 64 << 20  # pixels of all images of a block, with what lies around it: 1.3 GB with all that is made of them
 OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
 
@@ -47,6 +48,7 @@ class Ground:
     map: h5py.File
     references: References
     units: str
+    surface: Surface
 
 
 @contextlib.contextmanager
@@ -76,8 +78,10 @@ def open_ground(svbrdf: Path, scene: Path, config: Config) -> Iterator[Ground]:
         cells = overview.cells[np.isfinite(overview.cells)]
         heights = (float(cells.min()) if cells.size else 0.0), overview.highest
         heights = heights[0] - 0.5 * max(0.0, heights[1] - heights[0]), heights[1]
-        references = stack.enter_context(References(surface, elevation, overview, heights, chosen, boxes))
-        yield Ground(file, references, units)
+        references = stack.enter_context(
+            References(replace(surface, deviations=None), elevation, overview, heights, chosen, boxes)
+        )
+        yield Ground(file, references, units, surface)
 
 
 def run(
@@ -98,7 +102,9 @@ def run(
     with open_ground(svbrdf, scene, config) as ground:
         found = Calibration.read(calibration) if calibration else _calibrate(svbrdf, scene, ground, progress)
         sizes = {d: ground.map[d].shape[0] for d in ("coefficient", "y", "x")}
-        sizes |= {"frame": len(ground.references.frames), "band": LEVELS + 1}
+        if "map_name" in ground.map:
+            sizes["map"] = len(ground.map["map_name"])
+        sizes |= {"frame": len(ground.references.frames), "band": LEVELS + 1, "incidence_bin": len(COSINES) - 1}
         with contextlib.ExitStack() as stack:
             writer = stack.enter_context(
                 ArtefactWriter(
@@ -166,7 +172,7 @@ def work_block(ground: Ground, calibration: Calibration, block: Box) -> tuple[Fl
     count = (confidence[:, *inner] > 0).sum(axis=0).astype(np.uint16)
     spread = calibration.spread.of(images)
     settle(ratio, confidence, spread)
-    log_albedo, std = estimate(ratio, confidence, spread)
+    log_albedo, std = estimate(ratio, confidence, spread, terrain_variance(ground.surface, box))
     albedo = np.exp(log_albedo[inner])
     albedo_std = albedo * std[inner]
     unknown = ground.map["valid"][row : row + height, col : col + width] == 0

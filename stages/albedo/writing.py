@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from schemas import SVBRDF, ArtefactWriter
 from schemas.reading import read_strings
-from stages.albedo.calibrate import Calibration
+from stages.albedo.calibrate import COSINES, Calibration
 from stages.albedo.pyramid import LEVELS
 from stages.albedo.references import Box
 from stages.physics.images.table import Frame
@@ -70,3 +70,6 @@ class Maps:
         writer.write("albedo_band_px", 2.0 ** np.arange(LEVELS + 1))
         writer.write("albedo_band_std", np.sqrt(found.spread.shared))
         writer.write("albedo_image_std", np.sqrt(found.spread.own))
+        writer.write("albedo_bin_cos_incidence", 0.5 * (COSINES[1:] + COSINES[:-1]))
+        writer.write("albedo_interval_68", found.interval[0])
+        writer.write("albedo_interval_95", found.interval[1])

@@ -7,6 +7,7 @@ same pixels made the albedo. How far the scored Sun stands from the nearest one 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -23,12 +24,14 @@ from schemas import EVALUATION, SVBRDF, ArtefactError, ArtefactWriter, check_out
 from schemas.files.companions import companions_of
 from schemas.reading import read_strings
 from stages.common.intervals import ERROR, choose_units, gain_interval, ratio_interval
+from stages.evaluate.coverage import BANDS_DEG
 from stages.evaluate.metrics import ssim
 from stages.pairs.reader import PairReader
-from stages.physics.formation.chain import form
+from stages.physics.formation.chain import form, illuminate
 from stages.physics.formation.radiometry import crop_range, match_crops
 from stages.physics.maps.grid import unit_vectors
 from stages.physics.photometry import get_model
+from stages.physics.terrain.surface import AlbedoError
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -55,15 +58,16 @@ class Map:
     file: h5py.File
     used: list[str]
     suns: Floats
+    error: AlbedoError
 
-    def crop(self, row: int, col: int, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor, NDArray, NDArray]:
-        """(coefficients (1, C, h, w), albedo (1, h, w), its standard deviation, elevation), NaN where unknown."""
+    def crop(self, row: int, col: int, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor, NDArray]:
+        """(coefficients (1, C, h, w), albedo (1, h, w), elevation), NaN where unknown."""
         top, left = row - size[0] // 2, col - size[1] // 2
         part = np.s_[top : top + size[0], left : left + size[1]]
         file = self.file
         coefficients = torch.from_numpy(file["coefficients"][:, *part])[None]
         albedo = torch.from_numpy(file["albedo"][part])[None]
-        return coefficients, albedo, file["albedo_std"][part], file["elevation"][part]
+        return coefficients, albedo, file["elevation"][part]
 
 
 def run(
@@ -117,14 +121,19 @@ def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> Map:
             f"{path}:/albedo: expected a map with albedo, found none; run 'lunargr albedo' with --fold."
         )
     suns = unit_vectors(file["albedo_subsolar_longitude_deg"][...], file["albedo_subsolar_latitude_deg"][...])
-    found = Map(path, file, read_strings(file, "albedo_image_id"), suns)
+    error = AlbedoError.read(file)
+    if error is None:
+        raise ArtefactError(
+            f"{path}: expected albedo_std and albedo_image_std beside the albedo, found none; run 'lunargr albedo' again."
+        )
+    found = Map(path, file, read_strings(file, "albedo_image_id"), suns, error)
     for name in ("row", "col"):
         if name not in reader.file:
             raise ArtefactError(
                 f"{reader.path}:/{name}: expected where on the map a pair lies, found nothing; project again."
             )
     row, col = int(reader.file["row"][0]), int(reader.file["col"][0])
-    height = found.crop(row, col, reader.size)[3]
+    height = found.crop(row, col, reader.size)[2]
     mine = reader.file["elevation"][0]
     same = height.shape == mine.shape and not np.nanmax(np.abs(height - mine), initial=0.0) > SAME_GROUND * reader.gsd
     if not same or abs(float(file.attrs["gsd_m"]) - reader.gsd) > 1e-6 * reader.gsd:
@@ -154,13 +163,14 @@ def _choose(reader: PairReader, maps: Sequence[Map], split: str) -> list[tuple[i
 def _score(
     reader: PairReader, maps: Sequence[Map], chosen: Sequence[tuple[int, int]], writer: ArtefactWriter, progress: Any
 ) -> dict[str, NDArray]:
-    """Sums of squares (rows, pairs), pixels, ssim, pixels within the 68 and 95 % intervals, nearest Suns (rad)."""
+    """Sums of squares (rows, pairs), pixels, ssim, nearest Suns (rad); ``within`` (3, bands, pairs): pixels
+    by incidence, and of those the ones within the 68 and the 95 % intervals."""
     count = len(chosen)
     found: dict[str, NDArray] = {
         "squares": np.zeros((len(ROWS), count)),
         "ssim": np.full((len(ROWS), count), np.nan),
         "pixels": np.zeros(count, np.int32),
-        "within": np.zeros((2, count)),
+        "within": np.zeros((3, len(BANDS_DEG) - 1, count)),
         "sun": np.zeros(count),
     }
     measured_out, rendered_out = writer.dataset("measured"), writer.dataset("rendered")
@@ -171,7 +181,7 @@ def _score(
         one = maps[number]
         if reader.units == "dn" and (int(reader.frame[k]), number) not in scales:
             scales[int(reader.frame[k]), number] = _image_scales(reader, one, int(reader.frame[k]))
-        pictures, std = _pictures(reader, one, k)
+        pictures = _pictures(reader, one, k)
         measured, valid = reader.image([k]).double(), reader.valid([k])
         valid &= torch.isfinite(pictures[1]) & torch.isfinite(pictures[0])
         if reader.units == "dn":
@@ -188,22 +198,30 @@ def _score(
             found["squares"][row, n] = ((values - measured[0].numpy())[mask] ** 2).sum()
             found["ssim"][row, n] = ssim(measured[0].numpy(), np.nan_to_num(values), mask, data_range=spread)
         if reader.units == "iof":
-            away = np.abs(pictures[1][0].numpy() - measured[0].numpy())[mask] / np.maximum(std[mask], 1e-12)
-            found["within"][:, n] = (away <= 1.0).sum(), (away <= 1.96).sum()
+            away = np.abs(pictures[1][0].numpy() - measured[0].numpy())
+            widths, incidence = _intervals(reader, one, k, pictures[1][0].numpy())
+            bands = np.clip(np.digitize(np.degrees(incidence), BANDS_DEG) - 1, 0, len(BANDS_DEG) - 2)[mask]
+            for level, inside in enumerate([np.ones_like(mask), *(away <= w for w in widths)]):
+                found["within"][level, :, n] = np.bincount(bands, inside[mask], len(BANDS_DEG) - 1)
     return found
 
 
-def _pictures(reader: PairReader, one: Map, k: int) -> tuple[list[torch.Tensor], NDArray]:
-    """I/F of the map without and with albedo, (1, h, w), and the standard deviation of what an image shows of the latter."""
+def _pictures(reader: PairReader, one: Map, k: int) -> list[torch.Tensor]:
+    """I/F of the map without and with albedo, (1, h, w)."""
     row, col = int(reader.file["row"][k]), int(reader.file["col"][k])
-    coefficients, albedo, std, _ = one.crop(row, col, reader.size)
+    coefficients, albedo, _ = one.crop(row, col, reader.size)
     with torch.no_grad():
         terrain = form(reader.observation([k]), get_model(str(one.file.attrs["model"])), coefficients).double()
-    # an unseen image has an error of its own, as those have that were seen
-    own = np.median((one.file["albedo_image_std"][...] ** 2).sum(axis=1))
-    with_albedo = terrain * albedo
-    shown = np.sqrt(std**2 / albedo[0].numpy() ** 2 + own) * np.abs(with_albedo[0].numpy())
-    return [terrain, with_albedo], shown
+    return [terrain, terrain * albedo]
+
+
+def _intervals(reader: PairReader, one: Map, k: int, rendered: NDArray) -> tuple[list[NDArray], NDArray]:
+    """Half-widths (h, w), I/F, of the 68 and 95 % intervals of an unseen image about ``rendered``; incidence (h, w), rad."""
+    row, col = int(reader.file["row"][k]), int(reader.file["col"][k])
+    height, width = reader.size
+    cosine = illuminate(reader.observation([k])).angles.cos_incidence[0].numpy()
+    relative = one.error.relative(row - height // 2, col - width // 2, height, width, cosine)
+    return [r * np.abs(rendered) for r in relative], np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
 def _image_scales(reader: PairReader, one: Map, frame: int) -> list[tuple[float, float]]:
@@ -214,7 +232,7 @@ def _image_scales(reader: PairReader, one: Map, frame: int) -> list[tuple[float,
     fitted = fitted[:: max(1, len(fitted) // FIT_PAIRS)]
     columns: list[list[Floats]] = [[], [], []]
     for k in fitted:
-        pictures, _ = _pictures(reader, one, int(k))
+        pictures = _pictures(reader, one, int(k))
         valid = reader.valid([k]) & torch.isfinite(pictures[0]) & torch.isfinite(pictures[1])
         for column, picture in zip(columns, [*pictures, reader.image([k]).double()], strict=True):
             column.append(picture[valid].numpy())
@@ -270,7 +288,6 @@ def _conclude(
                 "gain_percent_high": _known(gain.high),
             }
         }
-    within = scores["within"].sum(axis=1) / pixels.sum()
     suns = np.degrees(scores["sun"])
     images = []
     for frame in np.unique(reader.frame[numbers]):
@@ -292,11 +309,23 @@ def _conclude(
         "valid_pixels": int(pixels.sum()),
         "image_units": reader.units,
         "nearest_used_sun_deg": {"least": float(suns.min()), "mean": float(suns.mean()), "most": float(suns.max())},
-        "coverage_percent": None
-        if reader.units == "dn"
-        else {"68": 100 * float(within[0]), "95": 100 * float(within[1])},
+        "coverage_percent": None if reader.units == "dn" else _coverage(scores["within"].sum(axis=2)),
         "used_images": [one.used for one in maps],
     }
+
+
+def _coverage(within: Floats) -> dict[str, Any]:
+    """Percent of pixels within the 68 and 95 % intervals, in all and by incidence. within : (3, bands), pixels first"""
+
+    def shares(counts: Floats) -> dict[str, Any]:
+        values = [100 * float(v / counts[0]) if counts[0] else None for v in counts[1:]]
+        return {"pixels": int(counts[0]), "68": values[0], "95": values[1]}
+
+    bands = [
+        {"incidence_low_deg": low, "incidence_high_deg": high} | shares(within[:, k])
+        for k, (low, high) in enumerate(itertools.pairwise(BANDS_DEG))
+    ]
+    return shares(within.sum(axis=1)) | {"by_incidence": bands}
 
 
 def _known(value: float) -> float | None:
@@ -307,13 +336,16 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Columns and cells of the table of rows."""
     cells = []
     for name, row in result["models"].items():
-        bounds = "-" if row["mse_low"] is None else f"{row['mse_low']:.3e} .. {row['mse_high']:.3e}"
+        # few units bound the error on one side only
+        ends = ["-" if row[k] is None else f"{row[k]:.3e}" for k in ("mse_low", "mse_high")]
+        bounds = "-" if ends == ["-", "-"] else " .. ".join(ends)
         gain = next(iter(result["gains"].get(name, {}).values()), None)
         text = "-"
         if gain is not None:
             text = f"{gain['gain_percent']:+.1f} %"
-            if gain["gain_percent_low"] is not None:
-                text += f" ({gain['gain_percent_low']:+.1f} .. {gain['gain_percent_high']:+.1f})"
+            ends = ["-" if gain[k] is None else f"{gain[k]:+.1f}" for k in ("gain_percent_low", "gain_percent_high")]
+            if ends != ["-", "-"]:
+                text += f" ({' .. '.join(ends)})"
         cells.append([name, f"{row['mse']:.3e}", bounds, "-" if row["ssim"] is None else f"{row['ssim']:.3f}", text])
     return ["map", "MSE", "95 % interval", "SSIM", "lower MSE than without albedo by"], cells
 
@@ -331,3 +363,15 @@ def image_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         for row in result["images"]
     ]
     return ["unseen image", "crops", "nearest Sun used, deg", "MSE terrain", "MSE with albedo"], cells
+
+
+def coverage_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Columns and cells of the table of coverage by incidence."""
+    found = result["coverage_percent"]
+    rows = [(f"{b['incidence_low_deg']:.0f} to {b['incidence_high_deg']:.0f} deg", b) for b in found["by_incidence"]]
+    cells = [
+        [name, str(row["pixels"]), f"{row['68']:.1f}", f"{row['95']:.1f}"]
+        for name, row in [*rows, ("all", found)]
+        if row["pixels"]
+    ]
+    return ["incidence", "pixels", "within 68 %", "within 95 %"], cells

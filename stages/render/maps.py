@@ -32,7 +32,7 @@ def render_map(
 ) -> Summary:
     """The whole map, streamed to its files band by band."""
     grid = surface.grid
-    images = ["image", "image_std"] if surface.deviations is not None else ["image"]
+    images = ["image", "image_std"] if surface.knows_errors else ["image"]
     channels = [*images, *BACKPLANES, "elevation"]
     bands = channels if config.backplanes_in_tif else ["image"]
     named = {path.suffix.lower(): path for path in files}

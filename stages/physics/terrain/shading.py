@@ -63,7 +63,7 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
     """``image`` (I/F) and the backplanes of a window, each (height, width), NaN where the map is unknown.
 
     ``clipped`` is 1 where the model gave I/F below 0, which is drawn as 0.
-    ``image_std`` is among them where the map has deviations: of a photograph of the same view, pixel by pixel.
+    ``image_std`` is among them where the map knows its errors: of a photograph of the same view, pixel by pixel.
     """
     elevation = read_padded(surface, row, col, height, width, 1)
     geometry = block_geometry(surface.grid, row, col, elevation, light.sun.position, light.camera_position)
@@ -84,7 +84,13 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
         unknown = np.isnan(geometry.cos_incidence) | ~np.isfinite(coefficients.numpy()).all(axis=0)
         image[unknown] = np.nan
         clipped[unknown] = 0
-    deviation = _image_deviation(surface, geometry, visible, row, col) if surface.deviations is not None else {}
+    deviation = {}
+    if surface.albedo_error is not None:
+        # photographs have corrected the coefficients' errors: those of the albedo stand in their place
+        inner, _ = surface.albedo_error.relative(row, col, height, width, geometry.cos_incidence)
+        deviation = {"image_std": inner * image}
+    elif surface.deviations is not None:
+        deviation = _image_deviation(surface, geometry, visible, row, col)
     shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
     shadow[np.isnan(geometry.cos_incidence)] = np.nan
     return {

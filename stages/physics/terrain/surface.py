@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +47,46 @@ class Elevation:
         return (block - self._offset).astype(np.float32)[::rs, ::cs]
 
 
+@dataclass(frozen=True)
+class AlbedoError:
+    """How far photographs lie from a map with albedo, as `lunargr albedo` found it.
+
+    albedo, std : (H, W) datasets; own : () relative standard deviation of a photograph's own error
+    cos_incidence, interval : (B, 2) half-widths of the 68 and 95 % intervals, in standard deviations, by cos(incidence) (B,)
+    """
+
+    albedo: h5py.Dataset
+    std: h5py.Dataset
+    own: float
+    cos_incidence: NDArray[np.float64]
+    interval: NDArray[np.float64]
+
+    @staticmethod
+    def read(file: h5py.File) -> AlbedoError | None:
+        """None where a map has no albedo or says nothing of its errors."""
+        if not all(name in file for name in ("albedo", "albedo_std", "albedo_image_std")):
+            return None
+        own = math.sqrt(float(np.median((file["albedo_image_std"][...] ** 2).sum(axis=1))))
+        names = ("albedo_bin_cos_incidence", "albedo_interval_68", "albedo_interval_95")
+        cosines, inner, outer = (file[n][...] for n in names) if names[0] in file else ([1.0], [1.0], [1.96])
+        return AlbedoError(
+            file["albedo"], file["albedo_std"], own, np.asarray(cosines), np.stack([inner, outer], axis=1)
+        )
+
+    def relative(
+        self, row: int, col: int, height: int, width: int, cos_incidence: NDArray
+    ) -> tuple[Floats32, Floats32]:
+        """Half-widths of the 68 and 95 % intervals of an unseen photograph's I/F over that of the map, (h, w) each.
+
+        cos_incidence : (h, w)
+        """
+        part = np.s_[row : row + height, col : col + width]
+        std = np.hypot(self.std[part] / np.maximum(self.albedo[part], 1e-6), self.own)
+        widths = (np.interp(cos_incidence, self.cos_incidence, self.interval[:, k]) for k in (0, 1))
+        inner, outer = ((w * std).astype(np.float32) for w in widths)
+        return inner, outer
+
+
 @dataclass
 class Surface:
     """Terrain and reflectance on one grid.
@@ -54,6 +95,7 @@ class Surface:
     albedo : (H, W) dataset of the factor that is the last parameter of ``model``, None where the map has none
     deviations : (M, H, W) dataset, standard deviations of the coefficients ``mapped``, or None where unknown
     image_noise : I/F, what else sets photographs apart from renderings
+    albedo_error : what is known of the albedo's errors, None where the map has none
     """
 
     path: Path
@@ -66,6 +108,12 @@ class Surface:
     deviations: h5py.Dataset | None = None
     mapped: tuple[str, ...] = ()
     image_noise: float = 0.0
+    albedo_error: AlbedoError | None = None
+
+    @property
+    def knows_errors(self) -> bool:
+        """Whether renderings have standard deviations."""
+        return self.deviations is not None or self.albedo_error is not None
 
     def read_deviations(self, row: int, col: int, height: int, width: int) -> dict[str, Floats32]:
         """(h, w) standard deviations by name; none where they are unknown."""
@@ -124,6 +172,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
                     reflectance = AlbedoFactor(reflectance)
                 empty = np.empty(0, np.float32)
                 surface = Surface(path, grid, elevation, reflectance, file["coefficients"], empty, albedo)
+                surface.albedo_error = AlbedoError.read(file)
                 if "coefficients_std" in file:
                     surface.deviations = file["coefficients_std"]
                     surface.mapped = tuple(read_strings(file, "map_name"))
