@@ -183,4 +183,5 @@ def test_pairs_of_other_programs_need_no_lunargr_attributes(tmp_path):
     with h5py.File(path, "r+") as file:
         for name in ("lunargr_schema", "schema_version", "lunargr_version"):
             del file.attrs[name]
-    open_artefact(path, PAIRS).close()
+    with open_artefact(path, PAIRS) as file:
+        assert "lunargr_schema" not in file.attrs and file["image"].shape[0] > 0
