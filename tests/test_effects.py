@@ -177,7 +177,9 @@ def test_albedo_that_follows_curvature_is_high_in_hollows_where_its_strength_is_
     for bend in (0.004, -0.004):
         z = _paraboloid(bend).float()
         overhead = torch.tensor([[0.0, 0.0, 1.0]])
-        scene = Observation(z, overhead, overhead * 1e6, 5.0, 1e9, None, frame=torch.tensor([0]), site=torch.tensor([0]))
+        scene = Observation(
+            z, overhead, overhead * 1e6, 5.0, 1e9, None, frame=torch.tensor([0]), site=torch.tensor([0])
+        )
         followed = form(scene, M2, COEFFICIENTS, [cls({"per_std": 0.1}, survey)])
         ratio = (followed / form(scene, M2, COEFFICIENTS))[:, level, level]
         expected = 1 + 0.1 * (2 * bend - 0.001) / 0.005

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from schemas import PAIRS, SCHEMAS, ArtefactError, ArtefactWriter, ConfigError, open_artefact, read_kind
+from schemas.reading import unpack
 
 
 def write_pairs(path, **change):
@@ -185,3 +186,19 @@ def test_pairs_of_other_programs_need_no_lunargr_attributes(tmp_path):
             del file.attrs[name]
     with open_artefact(path, PAIRS) as file:
         assert "lunargr_schema" not in file.attrs and file["image"].shape[0] > 0
+
+
+def test_directions_have_length_1(tmp_path):
+    path = write_pairs(tmp_path / "pairs.h5")
+    with h5py.File(path, "r+") as file:
+        file["sun_direction_enu"][0] = [0.0, 0.6, 0.9]
+    with pytest.raises(ArtefactError, match=r"sun_direction_enu: expected vectors of length 1"):
+        open_artefact(path, PAIRS)
+
+
+def test_packed_numbers_are_scaled_and_moved(tmp_path):
+    """As CF means them: value = stored x scale_factor + add_offset, fill values unknown."""
+    with h5py.File(tmp_path / "packed.h5", "w") as file:
+        data = file.create_dataset("height", data=np.array([0, 10, -32768], np.int16))
+        data.attrs["scale_factor"], data.attrs["add_offset"], data.attrs["_FillValue"] = 0.5, 100.0, np.int16(-32768)
+        np.testing.assert_array_equal(unpack(data, data[...]), [100.0, 105.0, np.nan])
