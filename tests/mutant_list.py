@@ -478,7 +478,7 @@ STAGES = (
         "schemas/files/inputs.py",
         "        names.append((state.st_dev, state.st_ino))\n",
         "",
-        ("tests/test_outputs_replace_nothing.py::test_an_output_that_is_a_hard_link_to_an_input_is_refused",),
+        ("tests/test_schemas.py::test_an_output_that_is_a_hard_link_to_an_input_is_refused",),
         "an output may be a hard link to an input",
     ),
     Mutant(

@@ -17,7 +17,6 @@ from typer.main import get_command
 from lunargr_cli import commands
 from lunargr_cli import main as cli
 from lunargr_cli.paths import Writes, files_of
-from schemas import ConfigError, check_output
 
 SUN = ["--sun-azimuth", "100", "--sun-elevation", "35"]
 # What each command reads, and the words that have it read that. Every command that writes must be here.
@@ -193,12 +192,3 @@ def test_an_output_that_nobody_marked_cannot_replace_anything(tmp_path):
     with pytest.raises(ConfigError, match="would replace"), guarded(command, **arguments):
         command(**arguments)
     assert result.read_text() == "kept"
-
-
-def test_an_output_that_is_a_hard_link_to_an_input_is_refused(tmp_path):
-    (tmp_path / "input.h5").write_bytes(b"measured")
-    (tmp_path / "other.h5").hardlink_to(tmp_path / "input.h5")
-    (tmp_path / "equal.h5").write_bytes(b"measured")
-    with pytest.raises(ConfigError, match="would replace the input"):
-        check_output(tmp_path / "other.h5", [tmp_path / "input.h5"], overwrite=True)
-    check_output(tmp_path / "equal.h5", [tmp_path / "input.h5"], overwrite=True)  # another file, if of the same bytes

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-from schemas import PAIRS, SCHEMAS, ArtefactError, ArtefactWriter, ConfigError, open_artefact, read_kind
+from schemas import PAIRS, SCHEMAS, ArtefactError, ArtefactWriter, ConfigError, check_output, open_artefact, read_kind
 from schemas.reading import unpack
 
 
@@ -202,3 +202,12 @@ def test_packed_numbers_are_scaled_and_moved(tmp_path):
         data = file.create_dataset("height", data=np.array([0, 10, -32768], np.int16))
         data.attrs["scale_factor"], data.attrs["add_offset"], data.attrs["_FillValue"] = 0.5, 100.0, np.int16(-32768)
         np.testing.assert_array_equal(unpack(data, data[...]), [100.0, 105.0, np.nan])
+
+
+def test_an_output_that_is_a_hard_link_to_an_input_is_refused(tmp_path):
+    (tmp_path / "input.h5").write_bytes(b"measured")
+    (tmp_path / "other.h5").hardlink_to(tmp_path / "input.h5")
+    (tmp_path / "equal.h5").write_bytes(b"measured")
+    with pytest.raises(ConfigError, match="would replace the input"):
+        check_output(tmp_path / "other.h5", [tmp_path / "input.h5"], overwrite=True)
+    check_output(tmp_path / "equal.h5", [tmp_path / "input.h5"], overwrite=True)  # another file, if of the same bytes
