@@ -120,14 +120,14 @@ PHYSICS = (
         "stages/physics/photometry/lambert.py",
         "* angles.cos_incidence\n",
         "* angles.cos_emission\n",
-        ("tests/test_photometry_oracles.py",),
+        ("tests/test_photometry.py::test_lambert_and_lommel_seeliger_in_closed_form",),
         "Lambert's law takes the emission angle for the incidence angle",
     ),
     Mutant(
         "stages/physics/photometry/lommel_seeliger.py",
         "        mu0 = angles.cos_incidence\n",
         "        mu0 = angles.cos_emission\n",
-        ("tests/test_photometry_oracles.py",),
+        ("tests/test_photometry.py::test_lambert_and_lommel_seeliger_in_closed_form",),
         "Lommel-Seeliger's law has mu in the place of mu0",
     ),
     Mutant(
@@ -176,7 +176,7 @@ PHYSICS = (
         "stages/physics/maps/grid.py",
         "GDAL_CENTRE = 0.5 ",
         "GDAL_CENTRE = 0.0 ",
-        ("tests/test_project.py::test_images_are_area_means_of_the_truth_to_the_pixel",),
+        ("tests/test_formats.py::test_the_first_pixel_lies_half_a_pixel_within_the_corner",),
         "pixel centres are taken for pixel corners, half a pixel off",
     ),
     Mutant(
@@ -190,7 +190,7 @@ PHYSICS = (
         "stages/physics/maps/grid.py",
         "moved = self.transform @ Affine.translation(col, row)",
         "moved = self.transform @ Affine.translation(row, col)",
-        ("tests/test_project.py::test_images_are_area_means_of_the_truth_to_the_pixel",),
+        ("tests/test_formats.py::test_the_first_pixel_lies_half_a_pixel_within_the_corner",),
         "rows and columns change places in windows of a grid",
     ),
     Mutant(
