@@ -79,6 +79,9 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         tree = Path(name) / "tree"
         shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns(".venv", ".git", "demo", "results"))
+        if not options.list and fails(sorted({test for mutant in chosen for test in mutant.tests}), tree):
+            print("the named tests fail, or take too long, without any bug: mend them first")
+            return 1
         for number, mutant in enumerate(chosen, 1):
             started = time.monotonic()
             try:
