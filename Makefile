@@ -11,7 +11,7 @@ LUNARGR := $(BIN)/lunargr
 STAMP := $(VENV)/.installed
 SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 
-.PHONY: help install demo demo-paper figures test test-slow fuzz endurance lint bench campaign campaign-real docs vendor-js reproduce-apollo15 reproduce-models clean
+.PHONY: help install demo demo-paper figures test test-slow mutants fuzz endurance lint bench campaign campaign-real docs vendor-js reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -32,6 +32,9 @@ test: $(STAMP) ## the tests that every change must pass (under 10 minutes on two
 
 test-slow: $(STAMP) ## the longer checks
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow
+
+mutants: $(STAMP) ## plant bugs one at a time and see whether the tests notice, before a release; ONLY=word for some
+	OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py --only "$(ONLY)"
 
 fuzz: $(STAMP) ## over two thousand malformed inputs through the real commands: one line each, no traceback, nothing left
 	OMP_NUM_THREADS=1 $(BIN)/python tests/malformed.py

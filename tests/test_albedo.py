@@ -14,6 +14,8 @@ from evaluation_scene import run_command
 
 from schemas import ArtefactError, ConfigError, InputError
 from stages import albedo, merge
+from stages.albedo.posterior import Spread, estimate
+from stages.albedo.pyramid import LEVELS
 
 running = sys.modules["stages.albedo.run"]  # the package's ``run`` is the function
 QUIET = albedo.Config(geotiff=False)
@@ -306,3 +308,13 @@ def relative(copy, source):
     with h5py.File(copy, "r+") as file:
         for k, name in enumerate(file["path"].asstr()[...]):
             file["path"][k] = str(source.parent / name)
+
+
+def test_noisy_images_weigh_less():
+    """Two images that differ everywhere alike: the mean by inverse variances, its deviation that of the two together."""
+    size = 64
+    ratio = np.stack([np.full((size, size), v, np.float32) for v in (0.1, -0.1)])
+    own = np.repeat([[0.01], [0.04]], LEVELS + 1, axis=1)
+    spread = Spread(np.full(LEVELS + 1, 1e6), own, 1e6, own[:, 0])
+    mean, _ = estimate(ratio, np.ones_like(ratio), spread)
+    np.testing.assert_allclose(mean, (0.1 / 0.01 - 0.1 / 0.04) / (1 / 0.01 + 1 / 0.04), rtol=1e-3)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from schemas import RegistryError
-from stages.effects import Survey, effect_names, get_effect
+from stages.effects import Survey, effect_names, fields, get_effect
 from stages.effects.filters import gaussian
 from stages.physics.formation.chain import Observation, displace, form
 from stages.physics.photometry import get_model
@@ -158,3 +158,31 @@ def test_light_from_a_slope_is_its_view_factor(slope_deg):
     assert float(light[:, :20].max()) < float(foot)
     flat = gather(torch.zeros(size, size), torch.ones(1, size, size), cell)
     assert float(flat.abs().max()) == 0.0
+
+
+def _paraboloid(bend: float, size: int = 96, gsd: float = 5.0) -> torch.Tensor:
+    """(1, size, size) m: z = bend (x^2 + y^2) / 2, a hollow where bend is above 0."""
+    x = (torch.arange(size, dtype=torch.float64) - (size - 1) / 2) * gsd
+    return (bend / 2 * (x[:, None] ** 2 + x**2))[None]
+
+
+@pytest.mark.parametrize("bend", [0.004, -0.004])
+def test_curvature_of_a_paraboloid(bend):
+    """Its Laplacian is twice its bend everywhere: above 0 in hollows, below 0 on hills; a blur changes nothing of it."""
+    found = fields.curvature(_paraboloid(bend), 5.0)[:, 36:-36, 36:-36]
+    torch.testing.assert_close(found, torch.full_like(found, 2 * bend), rtol=1e-3, atol=0)
+
+
+def test_albedo_that_follows_curvature_is_high_in_hollows_where_its_strength_is_above_0():
+    cls, level = get_effect("curvature_albedo"), slice(36, -36)
+    survey = Survey(crop_px=96, gsd=5.0, curvature=(0.001, 0.005))
+    for bend in (0.004, -0.004):
+        z = _paraboloid(bend).float()
+        overhead = torch.tensor([[0.0, 0.0, 1.0]])
+        scene = Observation(
+            z, overhead, overhead * 1e6, 5.0, 1e9, None, frame=torch.tensor([0]), site=torch.tensor([0])
+        )
+        followed = form(scene, M2, COEFFICIENTS, [cls({"per_std": 0.1}, survey)])
+        ratio = (followed / form(scene, M2, COEFFICIENTS))[:, level, level]
+        expected = 1 + 0.1 * (2 * bend - 0.001) / 0.005
+        torch.testing.assert_close(ratio, torch.full_like(ratio, expected), rtol=2e-3, atol=0)

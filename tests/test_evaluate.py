@@ -9,8 +9,10 @@ import pytest
 import torch
 from evaluation_scene import A, B, C, KnowsTheTruth, make_scene
 
+from stages.common.intervals import ERROR, LOG, ratio_interval
 from stages.evaluate import fit
 from stages.evaluate.fitting import choose_fit_pairs, sample_pixels
+from stages.evaluate.metrics import ssim
 from stages.evaluate.renderers import Constant, Renderer, read_batch, unit_images
 from stages.evaluate.run import Config, Task, evaluate_pairs
 from stages.physics.photometry import get_model
@@ -345,3 +347,32 @@ def test_training_runs_are_averaged_and_their_spread_widens_the_interval(scene):
     assert result["training_runs"] == 3 and scores.runs("learned").shape == (3, 30)
     assert any("one training run" in w for w in single[0]["warnings"])
     assert not any("training run" in w for w in result["warnings"])
+
+
+def test_tiles_are_the_witnesses_and_rows_are_paired_by_them(scene, whole):
+    """The table's intervals are those over ground tiles, not over crops; gains are ratios tile by tile."""
+    result, _, scores, _ = whole
+    tile, crop = scene.tile[scene.split == 2], np.arange(30)
+    totals, rival = scores.runs("learned"), scores.runs("global")
+    row, gain = result["models"]["learned"], result["gains"]["learned"]["global"]
+    by_tile, by_crop = (ratio_interval(totals, scores.pixels, unit, ERROR) for unit in (tile, crop))
+    assert (row["mse_low"], row["mse_high"]) == pytest.approx((by_tile.low, by_tile.high), rel=1e-9)
+    assert by_crop.low != pytest.approx(by_tile.low, rel=1e-4)
+    paired = ratio_interval(totals, rival, tile, LOG)
+    assert gain["gain_percent_low"] == pytest.approx(100 * (1 - paired.high), rel=1e-9)
+    assert gain["gain_percent_high"] == pytest.approx(100 * (1 - paired.low), rel=1e-9)
+
+
+def test_ssim_takes_the_range_of_the_measured_crop(scene, whole):
+    _, rows, scores, _ = whole
+    wanted = np.flatnonzero(scene.split == 2)
+    batch = read_batch(scene, wanted[:3], 1.0)
+    row = next(k for k, r in enumerate(rows) if r.name == "global")
+    rendered = rows[row].renderer.image(batch, None).numpy()
+    for b in range(3):
+        measured, usable = scene.images[wanted[b]], scene.mask[wanted[b]]
+        span = float(measured[usable].max() - measured[usable].min())
+        assert 0.02 < span < 0.3
+        assert scores.ssim[row, b] == pytest.approx(ssim(measured, rendered[b], usable, span), rel=1e-6)
+        assert scores.ssim_range_1[row, b] == pytest.approx(ssim(measured, rendered[b], usable, 1.0), rel=1e-6)
+        assert scores.ssim[row, b] < scores.ssim_range_1[row, b]

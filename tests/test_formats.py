@@ -19,7 +19,7 @@ from rasterio.windows import Window
 from schemas.errors import InputError
 from stages.physics.images.labels import parse_pvl, read_label
 from stages.physics.maps import rasters
-from stages.physics.maps.grid import Grid, sphere_crs
+from stages.physics.maps.grid import Grid, local_metric_crs, sphere_crs
 
 MOON = 1737400.0
 
@@ -309,3 +309,13 @@ def test_planetographic_rasters_meet_planetocentric_grids(tmp_path, kind):
     assert size == (pytest.approx(85 if kind == "longlat" else 120, rel=0.03), pytest.approx(120, rel=0.03))
     back = own.rowcol_of_lonlat(lon, ocentric)
     np.testing.assert_allclose(back, [rows, cols], atol=1e-5)
+
+
+def test_the_first_pixel_lies_half_a_pixel_within_the_corner():
+    """Rows and columns count pixel centres: on a grid of 30 m whose corner is (1000, 5000), row 2 and column 1."""
+    crs = local_metric_crs(20.0, 10.0, 1737400.0)
+    grid = Grid(crs.to_wkt(), Affine(30, 0, 1000, 0, -30, 5000), 40, 50, 1737400.0)
+    assert [float(v) for v in grid.xy(0, 0)] == pytest.approx([1015, 4985])
+    assert [float(v) for v in grid.xy(2, 1)] == pytest.approx([1045, 4925])
+    assert [float(v) for v in grid.rowcol(1045, 4925)] == pytest.approx([2, 1])
+    assert [float(v) for v in grid.window(2, 1, 4, 5).xy(0, 0)] == pytest.approx([1045, 4925])

@@ -195,3 +195,11 @@ def test_a_dem_with_nothing_at_its_edges(checkpoint, tmp_path):
     two, _ = maps(tmp_path / "s.h5", checkpoint, tmp_path / "b.h5", window=80, stride=80, offset=31)
     np.testing.assert_array_equal(valid, np.isfinite(z))
     assert np.nanmax(np.abs(one - two)) < 1e-3 * np.nanstd(one[0])
+
+
+def test_weights_of_neighbouring_windows_add_up_to_one():
+    """Both fade over what they share, so that neither ends with a step; at the map's edges none fades."""
+    first, second = infer.blend_weights(0, 40, 10, 100), infer.blend_weights(30, 70, 10, 100)
+    np.testing.assert_allclose(first[30:] + second[:10], 1, rtol=1e-6)
+    np.testing.assert_allclose(second[:10], (np.arange(10) + 0.5) / 10, rtol=1e-5)
+    np.testing.assert_array_equal(first[:30], 1)

@@ -166,3 +166,8 @@ def test_joined_variances_have_welch_s_freedom():
 def test_student_of_one_degree_is_cauchy():
     assert student_quantile(1) == pytest.approx(math.tan(0.475 * math.pi))
     assert two_sided_p(1.0, 1) == pytest.approx(0.5)
+
+
+def test_the_variance_of_a_mean_of_runs_divides_by_one_less():
+    found = run_variance([1.0, 2.0, 4.0])
+    assert found.value == pytest.approx(((4 / 3) ** 2 + (1 / 3) ** 2 + (5 / 3) ** 2) / 2 / 3) and found.freedom == 2

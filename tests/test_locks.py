@@ -77,7 +77,8 @@ def test_a_lock_of_another_machine_holds_until_it_was_silent_for_long(tmp_path):
 def test_a_number_that_another_process_has_now_is_no_owner(tmp_path):
     write_lock(tmp_path / "x.h5", pid=os.getpid(), began=1.0)
     with claim(tmp_path / "x.h5"):
-        pass
+        assert json.loads(lock_path(tmp_path / "x.h5").read_text())["began"] != 1.0
+    assert not lock_path(tmp_path / "x.h5").exists()
 
 
 def test_a_lock_that_never_got_its_name_is_stale_after_a_while(tmp_path):

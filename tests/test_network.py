@@ -16,6 +16,7 @@ from stages.network.predictor import Predictor
 from stages.network.runtime import choose_inference_precision
 from stages.network.unet import UNet
 from stages.pairs.holes import FILL_REACH, fill_holes
+from stages.pairs.reader import PairReader
 from stages.pairs.symmetries import COUNT, turn_field, turn_vector
 from stages.physics.formation.chain import Observation, form
 from stages.physics.photometry import get_model, model_names
@@ -206,3 +207,27 @@ def test_weights_that_do_not_fit_are_named(small_artefacts, tmp_path):
     with pytest.raises(ArtefactError, match=rf"{name}.*train again") as error:
         load_predictor(path)
     assert "state_dict" not in str(error.value)
+
+
+def test_turned_batches_render_as_turned_images(small_artefacts):
+    """Augmentation turns terrain, horizon, image, Sun and camera alike: what a batch renders turns with its image."""
+    turns = np.arange(COUNT)
+    model = get_model("M2")
+    coefficients = torch.tensor([0.09, 0.03, 0.01]).view(1, -1, 1, 1)
+    with PairReader(small_artefacts["pairs"]) as reader:
+        plain, turned = reader.batch(turns), reader.batch(turns, turns)
+    images = [form(batch.observation, model, coefficients) for batch in (plain, turned)]
+    for k in turns.tolist():
+        torch.testing.assert_close(turned.image[k], turn_field(plain.image[k], k), rtol=0, atol=0)
+        torch.testing.assert_close(turned.valid[k], turn_field(plain.valid[k], k), rtol=0, atol=0)
+        torch.testing.assert_close(images[1][k], turn_field(images[0][k], k), rtol=1e-4, atol=1e-6)
+
+
+def test_holes_continue_the_terrain_around_them():
+    """On a slope a small hole is filled with heights of its rim, not with 0."""
+    z = np.broadcast_to(1000 + 2.0 * np.arange(64), (64, 64)).astype(np.float32)
+    valid = np.ones(z.shape, bool)
+    valid[28:36, 30:34] = False
+    filled = fill_holes(np.where(valid, z, np.nan), valid)
+    np.testing.assert_array_equal(filled[valid], z[valid])
+    assert 1056 <= filled[~valid].min() <= filled[~valid].max() <= 1070

@@ -400,3 +400,12 @@ def test_models_stay_on_the_device_of_their_inputs(name):
     assert image.shape == (2, 3, 4)
     assert gradient.device.type == "meta"
     assert model.unconstrain(raw.detach(), 1).device.type == "meta"
+
+
+def test_lambert_and_lommel_seeliger_in_closed_form():
+    """Incidence 60 and emission 30 deg, which must not change places."""
+    incidence, emission, phase = math.radians(60), math.radians(30), math.radians(90)
+    lambert = evaluate("lambert", {"albedo": 0.2}, incidence, emission, phase)
+    assert float(lambert) == pytest.approx(0.2 * 0.5, rel=1e-9)
+    seeliger = evaluate("lommel_seeliger", {"albedo": 0.2}, incidence, emission, phase)
+    assert float(seeliger) == pytest.approx(0.2 * 2 * 0.5 / (0.5 + math.sqrt(3) / 2), rel=1e-9)

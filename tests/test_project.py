@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+
 import h5py
 import numpy as np
 import pytest
@@ -163,3 +165,31 @@ def test_the_digits_that_are_dropped_do_not_matter(small_artefacts, tmp_path):
             images.append(form(batch.observation, model, uniform) * batch.valid)
     noise = images[0][images[0] > 0].mean() / 200
     assert (images[0] - images[1]).square().mean().sqrt() < 0.1 * noise
+
+
+def test_every_crop_has_the_sun_and_the_camera_of_its_own_image(tmp_path):
+    """Three images under three Suns from three places; the horizon is looked for towards each crop's own Sun."""
+    files = small_scene.write_scene(tmp_path / "files")
+    with open(files.images, newline="") as stream:
+        table = list(csv.DictReader(stream))
+    suns = [(-25.0, 1.0), (60.0, -1.0), (0.0, 40.0)]
+    for row, (longitude, latitude), altitude in zip(table, suns, (5e7, 6e7, 7e7), strict=True):
+        row |= {"subsolar_longitude_deg": longitude, "subsolar_latitude_deg": latitude}
+        row |= {"spacecraft_altitude_m": altitude}
+    with open(files.images, "w", newline="") as stream:
+        writer = csv.DictWriter(stream, table[0].keys())
+        writer.writeheader()
+        writer.writerows(table)
+    ingest.run(files.dem, files.images, tmp_path / "scene.h5", ingest.Config(gsd=20, crop=32))
+    sample.run(tmp_path / "scene.h5", tmp_path / "crops.h5", sample.Config(count=24, tile_m=1280))
+    project.run(tmp_path / "crops.h5", tmp_path / "pairs.h5", project.Config())
+    with h5py.File(tmp_path / "pairs.h5") as file:
+        index = file["image_index"][...]
+        lon, lat, sun = (file[n][...] for n in ("longitude_deg", "latitude_deg", "sun_direction_enu"))
+        distance = np.linalg.norm(file["camera_position_enu"][...], axis=1)
+    assert set(index) == {0, 1, 2}
+    for k, subsolar in enumerate(suns):
+        mine = index == k
+        # grid north is true north to 0.1 deg here
+        np.testing.assert_allclose(sun[mine], small_scene.sun_enu(lon[mine], lat[mine], subsolar), atol=2e-3)
+        np.testing.assert_allclose(distance[mine], (5e7, 6e7, 7e7)[k], rtol=1e-3)

@@ -12,7 +12,8 @@ import h5py
 import numpy as np
 import pytest
 
-from schemas import PAIRS, SCHEMAS, ArtefactError, ArtefactWriter, ConfigError, open_artefact, read_kind
+from schemas import PAIRS, SCHEMAS, ArtefactError, ArtefactWriter, ConfigError, check_output, open_artefact, read_kind
+from schemas.reading import unpack
 
 
 def write_pairs(path, **change):
@@ -183,4 +184,30 @@ def test_pairs_of_other_programs_need_no_lunargr_attributes(tmp_path):
     with h5py.File(path, "r+") as file:
         for name in ("lunargr_schema", "schema_version", "lunargr_version"):
             del file.attrs[name]
-    open_artefact(path, PAIRS).close()
+    with open_artefact(path, PAIRS) as file:
+        assert "lunargr_schema" not in file.attrs and file["image"].shape[0] > 0
+
+
+def test_directions_have_length_1(tmp_path):
+    path = write_pairs(tmp_path / "pairs.h5")
+    with h5py.File(path, "r+") as file:
+        file["sun_direction_enu"][0] = [0.0, 0.6, 0.9]
+    with pytest.raises(ArtefactError, match=r"sun_direction_enu: expected vectors of length 1"):
+        open_artefact(path, PAIRS)
+
+
+def test_packed_numbers_are_scaled_and_moved(tmp_path):
+    """As CF means them: value = stored x scale_factor + add_offset, fill values unknown."""
+    with h5py.File(tmp_path / "packed.h5", "w") as file:
+        data = file.create_dataset("height", data=np.array([0, 10, -32768], np.int16))
+        data.attrs["scale_factor"], data.attrs["add_offset"], data.attrs["_FillValue"] = 0.5, 100.0, np.int16(-32768)
+        np.testing.assert_array_equal(unpack(data, data[...]), [100.0, 105.0, np.nan])
+
+
+def test_an_output_that_is_a_hard_link_to_an_input_is_refused(tmp_path):
+    (tmp_path / "input.h5").write_bytes(b"measured")
+    (tmp_path / "other.h5").hardlink_to(tmp_path / "input.h5")
+    (tmp_path / "equal.h5").write_bytes(b"measured")
+    with pytest.raises(ConfigError, match="would replace the input"):
+        check_output(tmp_path / "other.h5", [tmp_path / "input.h5"], overwrite=True)
+    check_output(tmp_path / "equal.h5", [tmp_path / "input.h5"], overwrite=True)  # another file, if of the same bytes

@@ -13,10 +13,12 @@ import h5py
 import numpy as np
 import pytest
 import small_scene
+import torch
 
 from schemas import PAIRS, ArtefactError, ArtefactWriter, ConfigError, InputError, RegistryError
 from stages import ingest, project, sample, train
 from stages.network.predictor import load_predictor
+from stages.network.steps import order_steps
 from stages.network.unet import DROPOUT
 from stages.network.uniform import fit_radiometry, fit_uniform
 from stages.pairs.reader import PairReader
@@ -233,3 +235,30 @@ def test_bad_requests_are_refused_and_leave_nothing(small_artefacts, tmp_path):
 def test_checkpoint_for_another_model_is_refused(trained):
     with pytest.raises(ArtefactError, match="expected a checkpoint for model 'M4'"):
         load_predictor(trained[0], model="M4")
+
+
+def test_the_losses_are_means_over_valid_pixels(small_artefacts):
+    """Of a network that does not learn, evaluated by hand; the training loss is the same mean without dropout."""
+    options = config(augment=False, dropout=(0.0,), batch=7, lr=1e-12)
+    with PairReader(small_artefacts["pairs"]) as reader:
+        training = train._set_up(reader, options, [], torch.device("cpu"), 0, 1)
+        part = reader.indices("train")[:20]
+        training.predictor.eval()
+        batch = reader.batch(part)
+        rendered = form(
+            batch.observation, training.predictor.model, training.predictor.coefficients(batch.observation.elevation)
+        )
+        expected = (rendered - batch.image)[batch.valid].double().square().mean().item()
+        assert train.evaluate_loss(training, part, 7) == pytest.approx(expected, rel=1e-4)
+        learned = train.learn_epoch(training, part, options, 0)
+        assert learned == pytest.approx(expected, rel=0.5)  # batch normalisation by the batch, not the running mean
+
+
+@pytest.mark.parametrize(("batch", "ranks"), [(7, 1), (32, 1), (8, 2)])
+def test_an_epoch_shows_every_training_pair_once(batch, ranks):
+    pairs, shown = np.arange(100, 150), []
+    for rank in range(ranks):
+        steps, keys = order_steps(pairs, batch, True, np.random.default_rng(3), rank, ranks)
+        assert [len(k) for k in keys] == [len(indices) for indices, _ in steps]
+        shown += [k for indices, _ in steps for k in indices.tolist()]
+    assert sorted(shown) == pairs.tolist() and shown != pairs.tolist()
