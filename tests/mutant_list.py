@@ -299,14 +299,14 @@ STAGES = (
         "stages/physics/maps/ground_tiles.py",
         "r0, r1 = (row - half) // self.edge, (row + half - 1) // self.edge",
         "r0, r1 = (row - half) // self.edge, (row + half - 2) // self.edge",
-        ("tests/test_sample.py",),
+        ("tests/test_sample.py::test_parts_share_no_pixel_of_ground",),
         "crops reach one row into the next tile's ground",
     ),
     Mutant(
         "stages/physics/maps/ground_tiles.py",
         'f"{seed} {row} {col}".encode()',
         'f"{row} {col}".encode()',
-        ("tests/test_sample.py",),
+        ("tests/test_sample.py::test_other_options_of_the_split_are_another_split",),
         "the split does not hang on the seed",
     ),
     Mutant(

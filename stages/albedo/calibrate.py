@@ -147,9 +147,9 @@ def calibrate(samples: Sequence[Sample], count: int, units: str) -> Calibration:
         result = replace(result, spread=_variances(samples, stacks, count), error=_error(samples, stacks, albedo))
         if np.abs(np.log(np.maximum(result.spread.own_px, 1e-12) / np.maximum(before, 1e-12))).max() < SETTLED:
             break
-    stacks = [(*_stack(result, s), s.images, [look.cos_incidence for look in s.looks]) for s in samples]
+    seen = [(*_stack(result, s), s.images, [look.cos_incidence for look in s.looks]) for s in samples]
     shift = np.log(result.gain) if units == "iof" else np.zeros(count)
-    return replace(result, interval=_rounded(unseen_intervals(stacks, result.spread, shift, COSINES)))
+    return replace(result, interval=_rounded(unseen_intervals(seen, result.spread, shift, COSINES)))
 
 
 def _stack(calibration: Calibration, sample: Sample) -> tuple[Floats32, Floats32]:
