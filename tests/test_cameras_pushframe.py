@@ -201,7 +201,7 @@ def test_summing_and_starting_pixels_move_the_image(rng):
     ("change", "error", "message"),
     [
         ({"framelet_height": 13}, InputError, "'image_lines' to be whole framelets .* = 13 lines, found 480"),
-        ({"framelet_height": 0}, InputError, "whole number of pixels above 0 in 'framelet_height'"),
+        ({"framelet_height": 0}, InputError, "whole number of pixels, 1 .. .* in 'framelet_height'"),
         ({"num_lines_overlap": 3}, InputError, "even number of lines"),
         ({"num_lines_overlap": 16}, InputError, "less than the framelet's 16"),
         ({"interframe_delay": 0.0}, InputError, "'interframe_delay' above 0 s"),

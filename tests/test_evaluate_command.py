@@ -168,7 +168,8 @@ def test_training_runs_of_one_model_are_one_learned_row(trained, tmp_path):
 
 def _descends_from(path, sample_config):
     """What an artefact says that was made from a sample with this config."""
-    record = {"schema": "crops", "config": sample_config}
+    record = {"schema": "crops", "config": sample_config, "inputs": [], "seed": 0}
+    record |= {key: "" for key in ("history", "command", "folder", "version")}
     with h5py.File(path, "a") as file:
         file.attrs["provenance"] = json.dumps({"0" * 64: record})
 

@@ -104,7 +104,7 @@ try:
         group.create_dataset("w", data=np.ones((8, 256), np.float32), chunks=(8, 256))
         gc.collect()
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-        for v in SVBRDF.variables:
+        for v in (v for v in SVBRDF.variables if v.required):
             shape = [writer.sizes[d] for d in v.dims]
             writer.write(v.name, ["a"] if v.dtype == "string" else np.zeros(shape))
         writer.file.attrs.update({a.name: 1 for a in SVBRDF.attributes})

@@ -37,6 +37,9 @@ READS = {
     "merge": (["pairs.h5", "more.h5"], ["pairs.h5", "more.h5"]),
     "inspect": (["scene.h5", "image1.tif"], ["scene.h5"]),
     "models": ([], []),
+    "albedo": (["svbrdf.h5", "scene.h5", "image1.tif"], ["svbrdf.h5", "scene.h5"]),
+    "view": (["svbrdf.h5", "pairs.h5"], ["svbrdf.h5", "--pairs", "pairs.h5"]),
+    "export": (["checkpoint.h5"], ["checkpoint.h5"]),
 }
 MODULES = [importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)]
 
