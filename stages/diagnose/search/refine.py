@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from stages.diagnose.likelihood.weigh import Whole
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import SETTLED, STEPS
 from stages.effects import Survey, get_effect
@@ -64,7 +66,7 @@ def _step(state: State, view: View, last: bool) -> float:
         seen = whole.seen[places]
         for p in places:
             whole.precision.pop(int(p), None)
-        amounts, errors = whole.errors(places[seen])
+        amounts, errors = _amounts(state, whole, places[seen], [scene[k][1][0] for k in np.flatnonzero(seen)])
         for p in places:
             whole.precision[int(p)] = 1e-10 * whole.gram[p, p]
         alone = {c.effect.name: 0 for c in state.causes}
@@ -87,6 +89,17 @@ def _step(state: State, view: View, last: bool) -> float:
         if cause.found.guise.per_frame:
             largest = max(largest, _step_frames(state, view, cause))
     return largest
+
+
+def _amounts(state: State, whole: Whole, places, owners: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Moves of all coordinates and their errors; another form of the law stands beside all that is not of the law itself."""
+    whole.widen()
+    amounts, errors = whole.errors(places)
+    law = np.array([type(state.causes[k].effect).of_law for k in owners], dtype=bool)
+    if law.any():
+        alone = whole.errors(places, list(whole.form_places()))
+        amounts, errors = (np.where(law, b, a) for a, b in zip((amounts, errors), alone, strict=True))
+    return amounts, errors
 
 
 def _step_frames(state: State, view: View, cause: Cause) -> float:

@@ -15,6 +15,7 @@ from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
 from stages.diagnose.search.refine import as_effect, refine
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import DISCOVERY, NOTABLE, SIMPLER, SURE, TRIED, TRIES
+from stages.effects import get_effect
 
 ODD = "nothing real has the values that fit best"
 
@@ -48,6 +49,7 @@ def search(state: State, most: int) -> Outcome:
                 whole.set_scatter(found.beside)
             found.gains = whole.held_out(whole.places(found.guise), whole.exclude(found.guise), found.spread)
             whole.precision = kept
+        strong = [f for f in strong if not (f in strong[:TRIED] and another_law(view.whole, f, out))]
         tried = sorted(strong[:TRIED], key=lambda f: -f.gain)
         sure = [f for f in tried if f.gain_interval()[0] > 0]
         for f in tried:
@@ -94,6 +96,18 @@ def choose(sure: list[Found]) -> tuple[Found, list[str]]:
             group.append(f.effect)
     group.sort(key=lambda n: n != best.effect)
     return best, group
+
+
+def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
+    """Whether an effect of the reflectance law stands for another form of it, which has more to add for sure, or a fair share more."""
+    if not get_effect(found.effect).of_law or not len(whole.form_places()):
+        return False
+    added = whole.law_adds(found)
+    if interval(added)[0] <= 0 and added.sum() <= (1 - SIMPLER) * found.gain:
+        return False
+    why = f"the nominal law has another form, which gains {added.sum():.0f} nats more beside it; the effect stands for a part of that"
+    out.rejected[found.effect] = (found.gain, why)
+    return True
 
 
 def take(state: State, view: View, found: Found, group: list[str]) -> str:
@@ -183,7 +197,8 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
     cause.rms_before, cause.rms_after = _rms(np.sum(plain, 0), look)
     if type(cause.effect).scope == "image" or len(cause.found.guise.columns) > 1:
         return cause.found.gains, float(whole.gram[0, 0])
-    return whole.held_out(np.array([whole.first - 1])), float(whole.gram[0, 0])
+    form = list(whole.form_places()) if type(cause.effect).of_law else []
+    return whole.held_out(np.array([whole.first - 1]), form), float(whole.gram[0, 0])
 
 
 def _rms(gram: np.ndarray, look: View) -> tuple[float, float]:
