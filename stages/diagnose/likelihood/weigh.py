@@ -325,24 +325,30 @@ class Whole:
             out.append(_solve(rest[np.ix_(every, every)] + more, rest[every, 0])[len(n) :])
         return np.array(out)
 
-    def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array]:
-        """Amounts and their standard errors: the larger of the likelihood's and the jackknife's, and what the law's form changes."""
+    def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array, Array]:
+        """Amounts, their standard errors (the larger of the likelihood's and the jackknife's), and how far they hang on what is fitted along.
+
+        The last is by how much an amount moves if all ordinary imperfections, or another form of the law alone, are taken for absent.
+        """
         information, score, _, _ = self.reduce(places, exclude)
         inverse = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
         scatter = jackknife_error(self.without_one(places, exclude))
         amount = inverse @ score
-        information, score, _, _ = self.reduce(places, [*exclude, *self.form_places()])
-        moved = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ score - amount
-        return amount, np.hypot(np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter), moved)
+        free = {1 + k for k, sd in self.plan.prior.items() if math.isinf(sd)}
+        moved = np.zeros(len(places))
+        for gone in (list(self.form_places()), [k for k in self.precision if k not in free]):
+            information, score, _, _ = self.reduce(places, [*exclude, *gone])
+            other = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ score
+            moved = np.maximum(moved, np.abs(other - amount))
+        return amount, np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter), moved
 
     def law_adds(self, found: Found) -> Array:
         """(labels,) nats that another form of the reflectance gains on held-out ground beside an effect of the law."""
         places = self.places(found.guise)
         kept = dict(self.precision)
         self.precision |= {int(p): 1e-10 * self.gram[p, p] for p in places}
-        added = self.held_out(
-            self.form_places(), [1 + k for k in self.plan.ordinary.get(found.effect, []) if 1 + k not in places], 1.0
-        )
+        ordinary = [1 + k for k in self.plan.ordinary.get(found.effect, [])]
+        added = self.held_out(self.form_places(), [k for k in ordinary if k not in places])
         self.precision = kept
         return added
 

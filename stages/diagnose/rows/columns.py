@@ -59,7 +59,7 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey) -> Plan:
         shared(f"coefficient {k} with albedo", float("inf"))
     if not chain.free_form:
         for k in range(len(chain.form_tangents())):
-            plan.form.append(shared(f"form {k}", 1.0))
+            plan.form.append(shared(f"form {k}", float("inf")))
     shared("slopes within a pixel", 1.0)
     for place, effect in enumerate(chain.base):
         if effect.scope == "scene":
