@@ -197,8 +197,8 @@ class Whole:
 
     def exclude(self, guise: Guise) -> list[int]:
         """What the nuisance does without beside this effect."""
-        form = self.form_places() if get_effect(guise.effect).of_law else []
-        return [1 + k for k in self.plan.ordinary.get(guise.effect, [])] + list(form)
+        form = self.form_places().tolist() if get_effect(guise.effect).of_law else []
+        return [1 + k for k in self.plan.ordinary.get(guise.effect, [])] + form
 
     def form_places(self) -> NDArray[np.int64]:
         """Places of the columns of another form of the reflectance."""

@@ -145,8 +145,8 @@ def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State],
             values = {parameter.name: (level / scale, error / scale, parameter.unit)}
             total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
             spread = total * (percent[2] - percent[1]) / (4 * percent[0])
-            rms = [math.sqrt(float(x.sum()) / pixels) for x in (before, after)]
-            return Named(effect, values, gain_chance(before, after), total, spread, *rms, percent, [cls.name])
+            was, now = (math.sqrt(float(x.sum()) / pixels) for x in (before, after))
+            return Named(effect, values, gain_chance(before, after), total, spread, was, now, percent, [cls.name])
 
         return make
     return None

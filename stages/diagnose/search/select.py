@@ -112,6 +112,10 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
 
 def take(state: State, view: View, found: Found, group: list[str]) -> str:
     """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
+    cls = get_effect(found.effect)
+    law = max(len(view.plan.form), sum(n.startswith("coefficient") for n in view.plan.shared) // 2)
+    if cls.scatters and not cls.displaces and state.frames <= law:
+        return f"a law of {law} coefficients can give {state.frames} images any brightness: more images than that would tell"
     vector, causes = state.nominal.vector, list(state.causes)
     saved = [(c, c.effect, dict(c.errors)) for c in causes]
     cause = Cause(as_effect(found, state.data, state.frames, view.whole), found, group=group)
