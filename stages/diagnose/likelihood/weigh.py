@@ -208,22 +208,6 @@ class Whole:
         """Those of the places that the data say anything of."""
         return np.array([p for p in places if self.seen[p]], dtype=np.int64)
 
-    def widen(self) -> None:
-        """Let ordinary imperfections be as large as the data have them, where that is more than ordinary (expectation-maximisation)."""
-        places = self.known_places([1 + k for k, sd in self.plan.prior.items() if not math.isinf(sd)])
-        places = np.array([p for p in places if int(p) in self.precision], dtype=np.int64)
-        if not len(places):
-            return
-        least = np.array([self.precision[int(p)] ** -1 for p in places])
-        n = self.nuisance()
-        at = np.searchsorted(n, places)
-        for _ in range(4):
-            scaled, scale = _scaled(self.gram[np.ix_(n, n)] + np.diag(self.weight(n)))
-            inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
-            mean = inverse @ self.gram[n, 0]
-            for p, v in zip(places, np.maximum(mean[at] ** 2 + inverse.diagonal()[at], least), strict=True):
-                self.precision[int(p)] = 1 / float(v)
-
     def weigh(self, guise: Guise) -> tuple[Found, Array]:
         """Evidence for one guise, and the same of every sham."""
         places = self.places(guise)

@@ -94,7 +94,6 @@ def _step(state: State, view: View, last: bool) -> float:
 
 def _amounts(state: State, whole: Whole, places, owners: list[int]) -> list[NDArray[np.float64]]:
     """Moves of all coordinates, their errors and how far they hang on the nuisance; beside what is of the law no other form of it stands."""
-    whole.widen()
     out = list(whole.errors(places))
     law = np.array([type(state.causes[k].effect).of_law for k in owners], dtype=bool)
     if law.any():

@@ -100,8 +100,14 @@ def choose(sure: list[Found]) -> tuple[Found, list[str]]:
 
 def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
     """Whether an effect of the reflectance law stands for another form of it, which has more to add for sure, or a fair share more."""
-    if not get_effect(found.effect).of_law or not len(whole.form_places()):
+    if not get_effect(found.effect).of_law:
         return False
+    if not len(whole.form_places()):
+        out.rejected[found.effect] = (
+            found.gain,
+            "the nominal law is a sum of kernels, and what is left of it has no form of its own",
+        )
+        return True
     added = whole.law_adds(found)
     if interval(added)[0] <= 0 and added.sum() <= (1 - SIMPLER) * found.gain:
         return False
