@@ -59,7 +59,7 @@ def test_planted_cause_is_named(scene, tmp_path, effect):
         assert found["unit"]
 
 
-@pytest.mark.parametrize("seed", [21, 22, 23, 24])
+@pytest.mark.parametrize("seed", [21, *(pytest.param(s, marks=pytest.mark.slow) for s in (22, 23, 24))])
 def test_nothing_hidden_names_nothing(scene, tmp_path, seed):
     answer = diagnose.run(_pairs(scene, tmp_path, {}, seed)).answer
     assert not answer.causes
@@ -81,6 +81,7 @@ def test_every_name_has_a_gain_that_is_sure_and_the_budget_adds_up(scene, tmp_pa
     assert first["residual_rms_after"] < first["residual_rms_before"]
 
 
+@pytest.mark.slow
 def test_another_renderer_with_broad_noise_and_drifting_reflectance(tmp_path):
     """Semi-real: a wrong Sun is found within three errors, though each image has noise of its own, 4 to 16 px wide."""
     said = diagnose.run(semi_real(tmp_path / "p.h5", 1, truth={"sun_azimuth_deg": 4.0})).answer.to_json()
@@ -137,6 +138,7 @@ def test_jackknife_intervals_cover():
     assert held > 270
 
 
+@pytest.mark.slow
 def test_the_apollo_frames_were_never_orthorectified(shared, tmp_path):
     """Real photographs: relief displacement, share 1, and no gain that may be negative."""
     from stages import ingest, project, sample

@@ -154,7 +154,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         return Result(answer, state, None)
     progress(2, 5, "search")
     outcome = search(state, config.most_causes)
-    answer.causes = by_registration(state) + by_search(state) + ([cut(data, state)] if cut else [])
+    answer.causes = by_registration(state) + by_search(state) + [c for c in [cut(data, state) if cut else None] if c]
     answer.rejected = outcome.rejected
     if state.registration is not None:
         answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}

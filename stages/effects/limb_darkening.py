@@ -13,6 +13,7 @@ from stages.physics.photometry import Parameter
 class LimbDarkening(Effect):
     name = "limb_darkening"
     slot = "reflectance"
+    of_law = True
     title = "limb darkening (Lommel-Seeliger share)"
     mechanism = (
         "A dark particulate surface scatters once: brightness goes as mu0 / (mu0 + mu) and not as mu0. A share L of reflectance "

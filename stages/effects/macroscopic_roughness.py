@@ -19,6 +19,7 @@ from stages.physics.photometry.roughness import rough_surface
 class MacroscopicRoughness(Effect):
     name = "macroscopic_roughness"
     slot = "reflectance"
+    of_law = True
     title = "roughness below the DEM's resolution"
     mechanism = (
         "Unresolved slopes shadow and tilt: at low Sun the surface is darker than a smooth one. Hapke's shadowing function and "

@@ -15,6 +15,7 @@ from stages.physics.photometry import Parameter
 class OppositionSurge(Effect):
     name = "opposition_surge"
     slot = "reflectance"
+    of_law = True
     title = "opposition surge"
     mechanism = (
         "Grains hide their own shadows when the Sun stands behind the observer: reflectance is multiplied by "

@@ -15,6 +15,7 @@ from stages.physics.photometry import Parameter
 class PhaseSlope(Effect):
     name = "phase_slope"
     slot = "reflectance"
+    of_law = True
     title = "slope of the phase function"
     mechanism = "Grain size, opacity and maturity set how fast reflectance falls with the phase angle g: exp(-beta g)."
     reference = "Hicks et al. (2011), JGR 116, E00G15 (exponential phase functions of the Moon)"

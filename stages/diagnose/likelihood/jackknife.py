@@ -30,4 +30,19 @@ def gain_interval(before: NDArray[np.float64], after: NDArray[np.float64]) -> tu
     return gain, gain - half, gain + half
 
 
-__all__ = ["gain_interval", "jackknife_error"]
+def gain_chance(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
+    """One-sided chance of such a gain where there is none, by Student's t over the units (U,)."""
+    gain, low, _ = gain_interval(before, after)
+    units = len(before)
+    if not math.isfinite(low):
+        return math.nan
+    error = (gain - low) / float(student.ppf(0.5 + FRACTION / 2, units - 1))
+    return float(student.sf(gain / max(error, 1e-30), units - 1))
+
+
+def nats(before: float, after: float, pixels: float, per_sample: float) -> float:
+    """Log likelihood that a smaller sum of squares gains, with one independent sample in so many pixels."""
+    return 0.5 * pixels / per_sample * math.log(before / after) if before > 0 and after > 0 else math.nan
+
+
+__all__ = ["gain_chance", "gain_interval", "jackknife_error", "nats"]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.special import gammaincc, gammaln
 
 from stages.diagnose.likelihood.jackknife import FRACTION, jackknife_error, student
@@ -148,10 +148,9 @@ class Whole:
         return out
 
     def nuisance(self, without: Sequence[int] = ()) -> NDArray[np.int64]:
-        """Places of the nuisance; ``without`` some, and with the places in it that are negative."""
-        gone = {int(w) for w in without if w >= 0}
-        more = {-int(w) for w in without if w < 0}
-        return np.array([k for k in sorted({*self.precision, *more}) if k not in gone], dtype=np.int64)
+        """Places of the nuisance, ``without`` some."""
+        gone = {int(w) for w in without}
+        return np.array([k for k in sorted(self.precision) if k not in gone], dtype=np.int64)
 
     def weight(self, places: NDArray[np.int64]) -> Array:
         """Inverse prior variances."""
@@ -188,7 +187,7 @@ class Whole:
         a = self.gram[np.ix_(n, n)] + np.diag(self.weight(n))
         scaled, scale = _scaled(a)
         right = np.concatenate([self.gram[np.ix_(n, places)], self.gram[n, :1], self.sham[n]], 1)
-        solved = scale[:, None] * cho_solve(cho_factor(scaled), scale[:, None] * right)
+        solved = scale[:, None] * cho_solve(_root(scaled), scale[:, None] * right)
         j = len(places)
         cross = self.gram[np.ix_(places, n)]
         information = self.gram[np.ix_(places, places)] - cross @ solved[:, :j]
@@ -197,9 +196,17 @@ class Whole:
         return (information + information.T) / 2, score, shams, n
 
     def exclude(self, guise: Guise) -> list[int]:
-        """What the nuisance does without beside this effect, and (negative) what it has more."""
-        beside = [-1 - k for k in self.plan.form] if get_effect(guise.effect).beside_form else []
-        return [1 + k for k in self.plan.ordinary.get(guise.effect, [])] + beside
+        """What the nuisance does without beside this effect."""
+        form = self.form_places().tolist() if get_effect(guise.effect).of_law else []
+        return [1 + k for k in self.plan.ordinary.get(guise.effect, [])] + form
+
+    def form_places(self) -> NDArray[np.int64]:
+        """Places of the columns of another form of the reflectance."""
+        return self.known_places([1 + k for k in self.plan.form])
+
+    def known_places(self, places: Sequence[int]) -> NDArray[np.int64]:
+        """Those of the places that the data say anything of."""
+        return np.array([p for p in places if self.seen[p]], dtype=np.int64)
 
     def weigh(self, guise: Guise) -> tuple[Found, Array]:
         """Evidence for one guise, and the same of every sham."""
@@ -302,12 +309,32 @@ class Whole:
             out.append(_solve(rest[np.ix_(every, every)] + more, rest[every, 0])[len(n) :])
         return np.array(out)
 
-    def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array]:
-        """Amounts and their standard errors: the larger of the likelihood's and the jackknife's."""
+    def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array, Array]:
+        """Amounts, their standard errors (the larger of the likelihood's and the jackknife's), and how far they hang on what is fitted along.
+
+        The last is by how much an amount moves if all ordinary imperfections, or another form of the law alone, are taken for absent.
+        """
         information, score, _, _ = self.reduce(places, exclude)
         inverse = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
         scatter = jackknife_error(self.without_one(places, exclude))
-        return inverse @ score, np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter)
+        amount = inverse @ score
+        free = {1 + k for k, sd in self.plan.prior.items() if math.isinf(sd)}
+        moved = np.zeros(len(places))
+        for gone in (list(self.form_places()), [k for k in self.precision if k not in free]):
+            information, score, _, _ = self.reduce(places, [*exclude, *gone])
+            other = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ score
+            moved = np.maximum(moved, np.abs(other - amount))
+        return amount, np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter), moved
+
+    def law_adds(self, found: Found) -> Array:
+        """(labels,) nats that another form of the reflectance gains on held-out ground beside an effect of the law."""
+        places = self.places(found.guise)
+        kept = dict(self.precision)
+        self.precision |= {int(p): 1e-10 * self.gram[p, p] for p in places}
+        ordinary = [1 + k for k in self.plan.ordinary.get(found.effect, [])]
+        added = self.held_out(self.form_places(), [k for k in ordinary if k not in places])
+        self.precision = kept
+        return added
 
 
 def weigh_all(whole: Whole) -> tuple[dict[str, Found], Array]:
@@ -358,9 +385,19 @@ def _scaled(a: Array) -> tuple[Array, Array]:
     return a * np.outer(scale, scale) + 1e-10 * np.eye(len(a)), scale
 
 
+def _root(scaled: Array) -> tuple[Array, bool]:
+    """Cholesky factor; columns that are alike to single precision, in which products are summed, are kept apart by as much as that takes."""
+    for more in (0.0, 1e-7, 1e-6, 1e-5, 1e-4):
+        try:
+            return cho_factor(scaled + more * np.eye(len(scaled)))
+        except LinAlgError:
+            continue
+    return cho_factor(scaled + 1e-2 * np.eye(len(scaled)))
+
+
 def _solve(a: Array, b: Array) -> Array:
     scaled, scale = _scaled(a)
-    return scale * cho_solve(cho_factor(scaled), scale * b)
+    return scale * cho_solve(_root(scaled), scale * b)
 
 
 def _left(unit: Products, b: Array) -> float:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.diagnose.likelihood.jackknife import gain_interval
+from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, nats
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import Nominal, lit_mask
 from stages.diagnose.model.parallel import per_site
@@ -63,6 +63,15 @@ class Registration:
     squares: dict[str, NDArray[np.float64]]
     rms: dict[str, float]
     shift_error: float
+    pixels: float
+
+    def evidence(self, first: Form, second: Form) -> tuple[float, float, float]:
+        """Chance of the second form's gain over the first where there is none, the gain in nats, and its error."""
+        before, after = self.squares[first.name], self.squares[second.name]
+        gain = self.gain(first, second)
+        total = nats(float(before.sum()), float(after.sum()), self.pixels, CORRELATED)
+        error = abs(total) * (gain.high - gain.low) / (4 * max(abs(gain.percent), 1e-9))
+        return gain_chance(before, after), total, error
 
     def gain(self, first: Form, second: Form) -> Gain:
         """Of the second form over the first."""
@@ -149,7 +158,7 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     every = torch.cat([s.diagonal(dim1=1, dim2=2).sum(1) for s in shifts])
     shift_error = math.sqrt(float(every.median()) * frames / max(len(every), 1))
     return Registration(
-        form, coefficients, share, error, gains, leaning, known, frame, level, by_name, rms, shift_error
+        form, coefficients, share, error, gains, leaning, known, frame, level, by_name, rms, shift_error, pixels
     )
 
 

@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, nats
 from stages.diagnose.likelihood.weigh import interval
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.explain import Registration
-from stages.diagnose.registration.forms import FORMS
+from stages.diagnose.registration.explain import Registration, lit_mask_read
+from stages.diagnose.registration.forms import FORMS, Form
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import SURE
-from stages.effects import Survey, effect_names, get_effect
+from stages.diagnose.settings import CORRELATED, FOLDS, SURE
+from stages.effects import Effect, Survey, effect_names, get_effect
 from stages.effects.filters import gaussian
 
 
@@ -26,7 +29,8 @@ def by_search(state: State) -> list[Named]:
         units = {p.name: p.unit for p in cls.parameters}
         if cls.scope == "scene":
             values = {k: float(v) for k, v in cause.effect.values.items()}
-            found = cls.report(values, cause.errors)
+            whole = {k: math.hypot(e, cause.hangs.get(k, 0.0)) for k, e in cause.errors.items()}
+            found = cls.report(values, whole)
         else:
             found = {cls.parameters[0].name: (cls.size(cause.effect.values), cause.errors.get("rms", 0.0))}
         low, high = interval(cause.found.gains)
@@ -61,10 +65,12 @@ def by_registration(state: State) -> list[Named]:
     return out
 
 
-def _named(effect, parameters, percent: tuple[float, float, float], squares: tuple[float, float]) -> Named:
-    # independent samples of the residual are wider than a pixel; nats are left to the search, where covariances are known
-    before, after = (math.sqrt(max(s, 0.0)) for s in squares)
-    return Named(effect, parameters, math.nan, math.nan, math.nan, before, after, percent, [effect.name])
+def _named(effect, parameters, r: Registration, first: Form, second: Form) -> Named:
+    """The second form's gain over the first."""
+    gain = r.gain(first, second)
+    before, after = r.rms[first.name], r.rms[second.name]
+    percent = (gain.percent, gain.low, gain.high)
+    return Named(effect, parameters, *r.evidence(first, second), before, after, percent, [effect.name])
 
 
 def _leaning(state: State, r: Registration, name: str) -> Named | None:
@@ -77,9 +83,7 @@ def _leaning(state: State, r: Registration, name: str) -> Named | None:
         "rms_px": (size, r.share_error * state.data.lean_px, "px"),
     }
     plain = next(f for f in FORMS if f.terms == r.form.terms and not f.leaning)
-    return _named(
-        effect, parameters, (r.leaning.percent, r.leaning.low, r.leaning.high), (r.rms[plain.name], r.rms[r.form.name])
-    )
+    return _named(effect, parameters, r, plain, r.form)
 
 
 def _shifts(state: State, r: Registration, name: str) -> Named | None:
@@ -94,29 +98,28 @@ def _shifts(state: State, r: Registration, name: str) -> Named | None:
                 best = form, gain
     if best is None:
         return None
-    form, gain = best
+    form, _ = best
     shifts = r.mean_shifts(state.sites, state.frames)
     effect = cls({"east_px": shifts[:, 0], "south_px": shifts[:, 1]}, state.data)
     size = cls.size(effect.values)
     if size < max(cls.tolerance.values()):
         return None
-    return _named(
-        effect,
-        {"rms_px": (size, r.shift_error, "px")},
-        (gain.percent, gain.low, gain.high),
-        (r.rms[first.name], r.rms[form.name]),
-    )
+    return _named(effect, {"rms_px": (size, r.shift_error, "px")}, r, first, form)
 
 
-def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State], Named] | None:
-    """Read effects off the histogram of all pixels, mask what they spoilt, and return what makes the cause of it."""
+def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State], Named | None] | None:
+    """Read effects off the histogram of all pixels, mask what they spoilt, and return what makes the cause of it.
+
+    That is None where clipping the prediction at the level does not surely bring it nearer to ground that the level was not read off from.
+    """
     bright = torch.cat([s.read[s.read_valid].flatten() for s in sites])
     for name in effect_names():
         cls = get_effect(name)
         found = cls.read_off(bright)
         if found is None:
             continue
-        level, error, gain = found
+        level, error, _ = found
+        images, masks = [s.read for s in sites], [s.read_valid for s in sites]
         for site in sites:
             near: Tensor = gaussian(torch.where(site.read_valid, site.read, 0.0), 1.0)
             site.read_valid = (
@@ -124,7 +127,13 @@ def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State],
             )
             site.valid = site.read_valid
 
-        def make(data: Survey, state: State, cls=cls, level=level, error=error, gain=gain) -> Named:
+        def make(
+            data: Survey, state: State, cls=cls, level=level, error=error, images=images, masks=masks
+        ) -> Named | None:
+            before, after, pixels = _clipped(state, images, masks, cls)
+            percent = gain_interval(before, after)
+            if not percent[1] > 0:
+                return None
             scale = 1.0
             if units == "dn":
                 gains = torch.cat([s.gain for s in state.sites])
@@ -134,11 +143,50 @@ def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State],
             (parameter,) = cls.parameters
             effect = cls({parameter.name: level / scale}, data)
             values = {parameter.name: (level / scale, error / scale, parameter.unit)}
-            share = (math.nan, math.nan, math.nan)
-            return Named(effect, values, math.nan, gain, math.sqrt(gain), math.nan, math.nan, share, [cls.name])
+            total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
+            spread = total * (percent[2] - percent[1]) / (4 * percent[0])
+            was, now = (math.sqrt(float(x.sum()) / pixels) for x in (before, after))
+            return Named(effect, values, gain_chance(before, after), total, spread, was, now, percent, [cls.name])
 
         return make
     return None
+
+
+def _clipped(
+    state: State, images: Sequence[Tensor], masks: Sequence[Tensor], cls: type[Effect]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Squared relative residuals of every quarter of a site's ground, without and with the level of the other ground; their pixels."""
+    quarters = [(k, rows) for k, x in enumerate(images) for rows in range(4)]
+
+    def part(k: int, quarter: int, x: Tensor) -> Tensor:
+        side = x.shape[-2] // 4
+        return x[:, quarter * side : (quarter + 1) * side]
+
+    levels = []
+    group = [k if len(images) > 3 else n for n, (k, _) in enumerate(quarters)]
+    for fold in range(FOLDS):
+        rest = [
+            part(*q, images[q[0]])[part(*q, masks[q[0]])]
+            for q, g in zip(quarters, group, strict=True)
+            if g % FOLDS != fold
+        ]
+        found = cls.read_off(torch.cat([r.flatten() for r in rest])) if rest else None
+        levels.append(found[0] if found else math.inf)
+    chains = state.chains()
+    out, count = [], 0.0
+    for (k, quarter), g in zip(quarters, group, strict=True):
+        site = chains[k].site
+        predicted = chains[k].predict() * site.gain[:, None, None] + site.offset[:, None, None]
+        lit = part(k, quarter, masks[k] & lit_mask_read(chains[k]))
+        image, plain = part(k, quarter, images[k]), part(k, quarter, predicted)
+        level = images[k][masks[k]].mean()
+        squares = [
+            (((image - p) * lit / level).double().square().sum()) for p in (plain, plain.clamp(max=levels[g % FOLDS]))
+        ]
+        out.append([float(s) for s in squares])
+        count += float(lit.sum())
+    before, after = np.array(out).T
+    return before, after, max(count, 1.0)
 
 
 __all__ = ["by_histogram", "by_registration", "by_search"]

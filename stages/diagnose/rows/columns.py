@@ -37,7 +37,7 @@ class Plan:
     ordinary: dict[str, list[int]] = field(default_factory=dict)  # effect -> its columns among the nuisance
     form: list[int] = field(
         default_factory=list
-    )  # another form of the reflectance, beside effects that could stand for it
+    )  # of another form of the reflectance: a nuisance of all but effects of the law
     guises: list[Guise] = field(default_factory=list)
     steps: list[tuple[int, str, float]] = field(default_factory=list)  # base effect, coordinate, step: tangents
 
@@ -59,7 +59,7 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey) -> Plan:
         shared(f"coefficient {k} with albedo", float("inf"))
     if not chain.free_form:
         for k in range(len(chain.form_tangents())):
-            plan.form.append(shared(f"form {k}"))
+            plan.form.append(shared(f"form {k}", float("inf")))
     shared("slopes within a pixel", 1.0)
     for place, effect in enumerate(chain.base):
         if effect.scope == "scene":

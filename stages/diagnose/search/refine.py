@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from stages.diagnose.likelihood.weigh import Whole
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import SETTLED, STEPS
 from stages.effects import Survey, get_effect
@@ -64,12 +66,12 @@ def _step(state: State, view: View, last: bool) -> float:
         seen = whole.seen[places]
         for p in places:
             whole.precision.pop(int(p), None)
-        amounts, errors = whole.errors(places[seen])
+        amounts, errors, hangs = _amounts(state, whole, places[seen], [scene[k][1][0] for k in np.flatnonzero(seen)])
         for p in places:
             whole.precision[int(p)] = 1e-10 * whole.gram[p, p]
         alone = {c.effect.name: 0 for c in state.causes}
-        for (_, (place, name, _)), amount, error in zip(
-            [s for s, ok in zip(scene, seen, strict=True) if ok], amounts, errors, strict=True
+        for (_, (place, name, _)), amount, error, hang in zip(
+            [s for s, ok in zip(scene, seen, strict=True) if ok], amounts, errors, hangs, strict=True
         ):
             cause = state.causes[place]
             cls = type(cause.effect)
@@ -82,11 +84,22 @@ def _step(state: State, view: View, last: bool) -> float:
             effect.held = cause.effect.held
             cause.effect = effect
             cause.errors[name] = float(error)
+            cause.hangs[name] = float(hang)
             alone[cls.name] += 1
     for cause in state.causes:
         if cause.found.guise.per_frame:
             largest = max(largest, _step_frames(state, view, cause))
     return largest
+
+
+def _amounts(state: State, whole: Whole, places, owners: list[int]) -> list[NDArray[np.float64]]:
+    """Moves of all coordinates, their errors and how far they hang on the nuisance; beside what is of the law no other form of it stands."""
+    out = list(whole.errors(places))
+    law = np.array([type(state.causes[k].effect).of_law for k in owners], dtype=bool)
+    if law.any():
+        alone = whole.errors(places, list(whole.form_places()))
+        out = [np.where(law, b, a) for a, b in zip(out, alone, strict=True)]
+    return out
 
 
 def _step_frames(state: State, view: View, cause: Cause) -> float:

@@ -15,6 +15,7 @@ from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
 from stages.diagnose.search.refine import as_effect, refine
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import DISCOVERY, NOTABLE, SIMPLER, SURE, TRIED, TRIES
+from stages.effects import get_effect
 
 ODD = "nothing real has the values that fit best"
 
@@ -48,6 +49,7 @@ def search(state: State, most: int) -> Outcome:
                 whole.set_scatter(found.beside)
             found.gains = whole.held_out(whole.places(found.guise), whole.exclude(found.guise), found.spread)
             whole.precision = kept
+        strong = [f for f in strong if not (f in strong[:TRIED] and another_law(view.whole, f, out))]
         tried = sorted(strong[:TRIED], key=lambda f: -f.gain)
         sure = [f for f in tried if f.gain_interval()[0] > 0]
         for f in tried:
@@ -96,8 +98,30 @@ def choose(sure: list[Found]) -> tuple[Found, list[str]]:
     return best, group
 
 
+def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
+    """Whether an effect of the reflectance law stands for another form of it, which has more to add for sure, or a fair share more."""
+    if not get_effect(found.effect).of_law:
+        return False
+    if not len(whole.form_places()):
+        out.rejected[found.effect] = (
+            found.gain,
+            "the nominal law is a sum of kernels, and what is left of it has no form of its own",
+        )
+        return True
+    added = whole.law_adds(found)
+    if interval(added)[0] <= 0 and added.sum() <= (1 - SIMPLER) * found.gain:
+        return False
+    why = f"the nominal law has another form, which gains {added.sum():.0f} nats more beside it; the effect stands for a part of that"
+    out.rejected[found.effect] = (found.gain, why)
+    return True
+
+
 def take(state: State, view: View, found: Found, group: list[str]) -> str:
     """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
+    cls = get_effect(found.effect)
+    law = max(len(view.plan.form), sum(n.startswith("coefficient") for n in view.plan.shared) // 2)
+    if cls.scatters and not cls.displaces and state.frames <= law:
+        return f"a law of {law} coefficients can give {state.frames} images any brightness: more images than that would tell"
     vector, causes = state.nominal.vector, list(state.causes)
     saved = [(c, c.effect, dict(c.errors)) for c in causes]
     cause = Cause(as_effect(found, state.data, state.frames, view.whole), found, group=group)
@@ -183,7 +207,8 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
     cause.rms_before, cause.rms_after = _rms(np.sum(plain, 0), look)
     if type(cause.effect).scope == "image" or len(cause.found.guise.columns) > 1:
         return cause.found.gains, float(whole.gram[0, 0])
-    return whole.held_out(np.array([whole.first - 1])), float(whole.gram[0, 0])
+    form = list(whole.form_places()) if type(cause.effect).of_law else []
+    return whole.held_out(np.array([whole.first - 1]), form), float(whole.gram[0, 0])
 
 
 def _rms(gram: np.ndarray, look: View) -> tuple[float, float]:

@@ -30,6 +30,9 @@ class Cause:
     effect: Effect
     found: Found
     errors: dict[str, float] = field(default_factory=dict)
+    hangs: dict[str, float] = field(
+        default_factory=dict
+    )  # how far values hang on the ordinary imperfections fitted along
     group: list[str] = field(default_factory=list)
     gain_percent: float = float("nan")
     gain_low: float = float("nan")
