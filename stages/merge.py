@@ -92,14 +92,16 @@ def run(
             attributes["scene"] = _moved(str(attributes["scene"]), parts[0], output)
         config = read_config(files[0]) | {"shard": [0, 1]}
         as_geotiff = schema.name in MAPS and config.get("geotiff", True)
+        # a run's own parts lie in the folder beside its output, and go with it
+        foreign = [part for part in parts if f"{output.name}.parts" not in part.parts]
         if as_geotiff:
-            check_outputs([Target(output), Target(tiff, what=f"the GeoTIFF of {output.name}")], parts, overwrite)
+            check_outputs([Target(output), Target(tiff, what=f"the GeoTIFF of {output.name}")], foreign, overwrite)
         if inputs is None and len(files) > 1 and _shard(files[0])[1] > 1:
             # shards of one run: the whole is what that run in one piece would have made, from the same inputs
             attributes |= {k: files[0].attrs[k] for k in ("inputs", "provenance", "folder") if k in files[0].attrs}
             attributes["command"] = whole_command(str(files[0].attrs.get("command", "")), output)
             attributes["parts"] = json.dumps([part.name for part in parts])
-            check_output(output, parts, overwrite)
+            check_output(output, foreign, overwrite)
             inputs = []
         seed = int(files[0].attrs.get("seed", -1))
         with ArtefactWriter(

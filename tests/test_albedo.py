@@ -315,6 +315,6 @@ def test_noisy_images_weigh_less():
     size = 64
     ratio = np.stack([np.full((size, size), v, np.float32) for v in (0.1, -0.1)])
     own = np.repeat([[0.01], [0.04]], LEVELS + 1, axis=1)
-    spread = Spread(np.full(LEVELS + 1, 1e6), own, 1e6, own[:, 0])
+    spread = Spread(np.full(LEVELS + 1, 1e6), own, 1e6, own[:, 0], np.full(LEVELS + 1, 1e6))
     mean, _ = estimate(ratio, np.ones_like(ratio), spread)
     np.testing.assert_allclose(mean, (0.1 / 0.01 - 0.1 / 0.04) / (1 / 0.01 + 1 / 0.04), rtol=1e-3)

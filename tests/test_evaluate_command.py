@@ -148,7 +148,15 @@ def test_extend_scores_the_extended_model_in_further_rows(tmp_path):
 
 def test_training_runs_of_one_model_are_one_learned_row(trained, tmp_path):
     config = train.Config(
-        epochs=1, batch=8, widths=WIDTHS, dropout=(0.0,) * 3, device="cpu", precision="fp32", lr=1e-2, seed=5
+        model="M2",
+        epochs=1,
+        batch=8,
+        widths=WIDTHS,
+        dropout=(0.0,) * 3,
+        device="cpu",
+        precision="fp32",
+        lr=1e-2,
+        seed=5,
     )
     train.run(trained / "pairs.h5", tmp_path / "other.h5", config)
     files = (trained / "pairs.h5", trained / "checkpoint.h5", tmp_path / "other.h5")

@@ -14,7 +14,7 @@ import pytest
 from cluster_scene import assert_same, environment, finish, lunargr, stages, start, write_inputs
 
 from lunargr_cli.options import in_parts
-from schemas import SCENE, ArtefactError, ConfigError, open_artefact
+from schemas import PAIRS, SCENE, ArtefactError, ConfigError, open_artefact
 from stages import ingest, merge, project
 
 
@@ -263,7 +263,7 @@ def test_a_view_says_so_when_a_part_is_gone(small_artefacts, tmp_path):
     assert (tmp_path / "pairs.h5").stat().st_size < 0.2 * small_artefacts["pairs"].stat().st_size
     parts[1].unlink()
     with pytest.raises(ArtefactError, match=r"parts/1\.h5"):
-        open_artefact(tmp_path / "pairs.h5", project.PAIRS)
+        open_artefact(tmp_path / "pairs.h5", PAIRS)
 
 
 def test_merging_keeps_masks_sparse(small_files, tmp_path):
