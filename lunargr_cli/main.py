@@ -14,12 +14,12 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
 from lunargr_cli import INTERRUPTED, commands, quiet_interruptions, signals, stop
-from lunargr_cli.console import flush_out, own_streams, say_error
+from lunargr_cli.console import flush_out, own_streams, say_error, write_out
 from lunargr_cli.options import check_numbers
 from lunargr_cli.paths import guarded
 from schemas.command_line import said
@@ -94,11 +94,28 @@ app = typer.Typer(
     help="Learn a spatially varying reflectance of the Moon from terrain alone, and show what the simulation gets wrong.\n\n"
     "simulate -> ingest -> sample -> project -> train -> infer -> render -> evaluate / match, and diagnose",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
 )
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        write_out(f"lunargr {version('lunargr')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    """Options before a command."""
+
 
 for _module in sorted(
     (importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)),

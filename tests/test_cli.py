@@ -105,3 +105,12 @@ def test_inspect_says_what_made_a_file_and_from_what(small_artefacts, tmp_path):
 def test_usage_errors_keep_click_s_exit_code():
     assert lunargr("sample").returncode == 2
     assert lunargr("sample", "scene.h5", "--no-such-option").returncode == 2
+
+
+def test_version_is_that_of_the_package():
+    from importlib.metadata import version
+
+    done = subprocess.run(
+        [sys.executable, "-m", "lunargr_cli.main", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == f"lunargr {version('lunargr')}" and not done.stderr
