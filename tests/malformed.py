@@ -80,9 +80,9 @@ def good_files(folder: Path) -> Path:
     sample.run(paths["scene"], paths["crops"], sample.Config(count=24, tile_m=640, seed=3))
     project.run(paths["crops"], paths["pairs"], project.Config())
     options = {"epochs": 1, "batch": 8, "dropout": (0.0,) * 3, "device": "cpu", "precision": "fp32", "lr": 1e-2}
-    train.run(paths["pairs"], paths["checkpoint"], train.Config(widths=(4, 4, 8), **options))  # type: ignore[arg-type]
+    train.run(paths["pairs"], paths["checkpoint"], train.Config(model="M2", widths=(4, 4, 8), **options))  # type: ignore[arg-type]
     infer.run(paths["scene"], paths["checkpoint"], paths["svbrdf"], infer.Config(device="cpu"))
-    scoring = evaluate.Config(split="train", bootstrap=0, renderings=True, device="cpu", only=("learned", "global"))
+    scoring = evaluate.Config(split="train", renderings=True, device="cpu", only=("learned", "global"))
     evaluate.run(paths["pairs"], paths["checkpoint"], folder / "evaluation.h5", scoring)
     extension = '[{"effect": "dark_bias", "values": {"iof": 0.001}, "survey": {}}]'
     sizes = {"frame": 1, "axis": 2, "mode": 6, "column": 4, "site": 1, "term": 1}
@@ -105,7 +105,7 @@ def run_here(arguments: Sequence[str], limit: int = LIMIT) -> tuple[int, str]:
     """(exit code, standard error) of a command in this process, as ``main`` ends it; 1 and the traceback's end for a bug."""
     from typer.testing import CliRunner
 
-    from lunargr_cli.console import one_line
+    from lunargr_cli.console import harmless
     from lunargr_cli.main import app
     from schemas.errors import EXIT_CODE, LunargrError
 
@@ -121,7 +121,8 @@ def run_here(arguments: Sequence[str], limit: int = LIMIT) -> tuple[int, str]:
         signal.signal(signal.SIGALRM, before)
     error = result.exception
     if isinstance(error, LunargrError):
-        return EXIT_CODE, f"{result.stderr}lunargr: {one_line(str(error))}\n"
+        line = harmless(" ".join(str(error).split()))
+        return EXIT_CODE, f"{result.stderr}lunargr: {line}\n"
     if error is not None and not isinstance(error, SystemExit):
         return 1, f"{result.stderr}Traceback: {type(error).__name__}: {error}\n"
     return result.exit_code, result.stderr
