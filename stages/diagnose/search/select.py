@@ -84,10 +84,13 @@ def search(state: State, most: int) -> Outcome:
 
 
 def choose(sure: list[Found]) -> tuple[Found, list[str]]:
-    """The best, or one with fewer values that gains nearly as much; and all that gain the same within their scatter."""
+    """The best, or one with fewer values that gains nearly as much; and all that gain the same within their scatter.
+
+    Values per frame can mimic what one value for all does: where the two gain the same, the one value is the cause.
+    """
     best = max(sure, key=lambda f: f.gain)
     if best.guise.per_frame:
-        simple = [f for f in sure if not f.guise.per_frame and f.gain > SIMPLER * best.gain]
+        simple = [f for f in sure if not f.guise.per_frame and _as_good(f, best)]
         best = max(simple, key=lambda f: f.gain, default=best)
     group = []
     for f in sorted(sure, key=lambda f: -f.gain):
@@ -96,6 +99,10 @@ def choose(sure: list[Found]) -> tuple[Found, list[str]]:
             group.append(f.effect)
     group.sort(key=lambda n: n != best.effect)
     return best, group
+
+
+def _as_good(found: Found, best: Found) -> bool:
+    return found.gain > SIMPLER * best.gain or interval(best.gains - found.gains)[0] <= 0
 
 
 def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
