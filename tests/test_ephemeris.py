@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from schemas.errors import ConfigError, GeometryError, InputError
-from stages.physics.bodies import ephemeris, find_body
+from stages.physics.bodies import ephemeris
 from stages.physics.bodies.ephemeris import et_to_utc, parse_utc, subsolar_point, utc_to_et
+from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras import open_camera
 
 
