@@ -295,18 +295,22 @@ class Whole:
                 out[self.labels[k]] += 0.5 * (_left(u, b0) - _left(u, b1))
         return out
 
-    def without_one(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> Array:
-        """(labels, J) amounts with one piece of ground left out each."""
+    def without_one(
+        self, places: NDArray[np.int64], exclude: Sequence[int] = (), spread: float = 0.0, now: Array | None = None
+    ) -> Array:
+        """(labels, J) amounts with one piece of ground left out each; ``spread`` draws them, beside ``now``, to nothing."""
         n = self.nuisance([*places, *exclude])
         every = np.concatenate([n, places])
-        more = np.diag(np.concatenate([self.weight(n), np.zeros(len(places))]))
+        pull = spread**-2 if spread else 0.0
+        more = np.diag(np.concatenate([self.weight(n), np.full(len(places), pull)]))
+        pulled = np.concatenate([np.zeros(len(n)), pull * now if now is not None else np.zeros(len(places))])
         out = []
         for label in sorted(set(self.labels)):
             rest = self.gram.copy()
             for u, own in zip(self.units, self.labels, strict=True):
                 if own == label:
                     rest[np.ix_(u.place, u.place)] -= u.gram
-            out.append(_solve(rest[np.ix_(every, every)] + more, rest[every, 0])[len(n) :])
+            out.append(_solve(rest[np.ix_(every, every)] + more, rest[every, 0] - pulled)[len(n) :])
         return np.array(out)
 
     def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array, Array]:

@@ -32,7 +32,7 @@ def by_search(state: State) -> list[Named]:
             whole = {k: math.hypot(e, cause.hangs.get(k, 0.0)) for k, e in cause.errors.items()}
             found = cls.report(values, whole)
         else:
-            found = {cls.parameters[0].name: (cls.size(cause.effect.values), cause.errors.get("rms", 0.0))}
+            found = {cls.parameters[0].name: (cause.rms, cause.errors.get("rms", math.inf))}
         low, high = interval(cause.found.gains)
         out.append(
             Named(

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.weigh import Whole
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import SETTLED, STEPS
@@ -38,11 +41,11 @@ def as_effect(found, data: Survey, frames: int, whole):
 def refine(state: State) -> View:
     """Fit the nominal model and all causes' values together; sets values and errors; returns the last look."""
     view = None
-    for step in range(STEPS):
+    for _ in range(STEPS):
         state.fit()
         along = [n for n in state.open_names() if _ordinary(n) or get_effect(n).always]
         view = state.look(along, 0)
-        largest = _step(state, view, last=step == STEPS - 1)
+        largest = _step(state, view)
         if largest < SETTLED:
             break
     state.fit()
@@ -55,7 +58,7 @@ def _ordinary(name: str) -> bool:
     return cls.scope == "scene" and bool(cls.tolerance)
 
 
-def _step(state: State, view: View, last: bool) -> float:
+def _step(state: State, view: View) -> float:
     """Move all values; returns the largest move in standard errors."""
     whole, plan = view.whole, view.plan
     scene = [(k, step) for k, step in enumerate(plan.steps)]
@@ -116,15 +119,23 @@ def _step_frames(state: State, view: View, cause: Cause) -> float:
     column, frame = index // whole.frames - min(guise.columns), index % whole.frames
     table = np.stack([np.broadcast_to(np.asarray(cause.effect.values[n], float), (whole.frames,)) for n in names])
     now = table[column, frame] / sizes[column]
-    information, score, _, _ = whole.reduce(places)
     prior = cause.found.spread**-2
+    information, score, _, _ = whole.reduce(places)
     inverse = np.linalg.inv(information + prior * np.eye(len(places)))
     move = inverse @ (score - prior * now)
     out = table.copy()
     out[column, frame] = (now + move) * sizes[column]
     cause.effect = cls({n: torch.from_numpy(out[k].copy()).float() for k, n in enumerate(names)}, state.data)
+    # the mean square of values is that of their estimates, which are drawn to nothing, and their variances
     variance = inverse.diagonal() * sizes[column] ** 2
-    cause.errors["rms"] = float(np.sqrt(variance.mean() / max(len(variance), 1)))
+    frames = max(len(set(frame.tolist())), 1)
+
+    def rms(values: NDArray[np.float64]) -> float:
+        return math.sqrt(float(((values * sizes[column]) ** 2 + variance).sum()) / frames)
+
+    without = [rms(now + m) for m in whole.without_one(places, spread=cause.found.spread, now=now)]
+    cause.rms = rms(now + move)
+    cause.errors["rms"] = float(jackknife_error(np.array(without)))
     return float(np.sqrt((move**2).mean() / max(inverse.diagonal().mean(), 1e-12)))
 
 

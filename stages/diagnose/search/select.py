@@ -130,9 +130,12 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     law = max(len(view.plan.form), sum(n.startswith("coefficient") for n in view.plan.shared) // 2)
     if cls.scatters and not cls.displaces and state.frames <= law:
         return f"a law of {law} coefficients can give {state.frames} images any brightness: more images than that would tell"
+    first = as_effect(found, state.data, state.frames, view.whole)
+    if cls.scope == "scene" and not cls.plausible({k: float(v) for k, v in first.values.items()}, state.data):
+        return ODD
     vector, causes = state.nominal.vector, list(state.causes)
     saved = [(c, c.effect, dict(c.errors)) for c in causes]
-    cause = Cause(as_effect(found, state.data, state.frames, view.whole), found, group=group)
+    cause = Cause(first, found, group=group)
     state.causes.append(cause)
     look = refine(state)
     why = doubt(state, cause) or next(
@@ -163,7 +166,7 @@ def doubt(state: State, cause: Cause) -> str:
     """Why the fitted values cannot be a cause, or ''."""
     cls = type(cause.effect)
     if cls.scope == "image":
-        size, error = cls.size(cause.effect.values), cause.errors.get("rms", 0.0)
+        size, error = cause.rms, cause.errors.get("rms", math.inf)
         least = max(cls.tolerance.values(), default=0.0)
         return f"it is {size:.2g}, and less than {least:.2g} is ordinary" if size - 2 * error < least else ""
     values = {k: float(v) for k, v in cause.effect.values.items()}

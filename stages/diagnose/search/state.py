@@ -33,6 +33,7 @@ class Cause:
     hangs: dict[str, float] = field(
         default_factory=dict
     )  # how far values hang on the ordinary imperfections fitted along
+    rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)
     gain_percent: float = float("nan")
     gain_low: float = float("nan")
