@@ -69,12 +69,12 @@ def _step(state: State, view: View) -> float:
         seen = whole.seen[places]
         for p in places:
             whole.precision.pop(int(p), None)
-        amounts, errors, hangs = _amounts(state, whole, places[seen], [scene[k][1][0] for k in np.flatnonzero(seen)])
+        amounts, errors = _amounts(state, whole, places[seen], [scene[k][1][0] for k in np.flatnonzero(seen)])
         for p in places:
             whole.precision[int(p)] = 1e-10 * whole.gram[p, p]
         alone = {c.effect.name: 0 for c in state.causes}
-        for (_, (place, name, _)), amount, error, hang in zip(
-            [s for s, ok in zip(scene, seen, strict=True) if ok], amounts, errors, hangs, strict=True
+        for (_, (place, name, _)), amount, error in zip(
+            [s for s, ok in zip(scene, seen, strict=True) if ok], amounts, errors, strict=True
         ):
             cause = state.causes[place]
             cls = type(cause.effect)
@@ -87,7 +87,6 @@ def _step(state: State, view: View) -> float:
             effect.held = cause.effect.held
             cause.effect = effect
             cause.errors[name] = float(error)
-            cause.hangs[name] = float(hang)
             alone[cls.name] += 1
     for cause in state.causes:
         if cause.found.guise.per_frame:
@@ -96,7 +95,7 @@ def _step(state: State, view: View) -> float:
 
 
 def _amounts(state: State, whole: Whole, places, owners: list[int]) -> list[NDArray[np.float64]]:
-    """Moves of all coordinates, their errors and how far they hang on the nuisance; beside what is of the law no other form of it stands."""
+    """Moves of all coordinates and their errors; beside what is of the law no other form of it stands."""
     out = list(whole.errors(places))
     law = np.array([type(state.causes[k].effect).of_law for k in owners], dtype=bool)
     if law.any():

@@ -203,7 +203,9 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
                 z, mean = row.patch.transform(brought, look.grid)
                 shared, means = torch.cat([row.shared, z]), torch.cat([row.shared_mean, mean])
                 shared[0], means[0] = shared[0] + z[0], means[0] + mean[0]
-                more = dataclasses.replace(row, shared=shared, shared_mean=means)
+                dark = torch.cat([row.shared_dark, row.patch.shadow(brought)])
+                dark[0] = dark[0] + dark[-1]
+                more = dataclasses.replace(row, shared=shared, shared_mean=means, shared_dark=dark)
                 added.append(products(more, look.model, look.grid, state.frames, None))
                 few = 1 + sum(n.startswith("coefficient") for n in look.plan.shared)
                 less = dataclasses.replace(
@@ -212,6 +214,8 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
                     shared_mean=torch.cat([means[:few], means[-1:]]),
                     own=row.own[:0],
                     own_mean=row.own_mean[:0],
+                    shared_dark=0 * torch.cat([dark[:few], dark[-1:]]),
+                    own_dark=row.own_dark[:0],
                 )
                 plain.append(products(less, flat, look.grid, state.frames, None).gram)
     plan = dataclasses.replace(look.plan, shared=[*look.plan.shared, "secant"])
