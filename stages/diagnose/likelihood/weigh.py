@@ -158,11 +158,10 @@ class Whole:
         """Inverse prior variances."""
         return np.array([self.precision.get(int(k), 1.0) for k in places])
 
-    def let_gains_scatter(self, name_columns: Sequence[int]) -> float:
-        """Estimate the scatter of nuisance per frame by expectation-maximisation and set its prior; returns it."""
-        places = self.frame_places(name_columns)
+    def let_scatter(self, places: NDArray[np.int64]) -> None:
+        """Estimate the scatter of nuisance about nothing by expectation-maximisation and make it their prior."""
         if not len(places):
-            return 0.0
+            return
         spread = 0.3
         for _ in range(8):
             for p in places:
@@ -175,7 +174,6 @@ class Whole:
             spread = math.sqrt(max(float((mean[at] ** 2 + inverse.diagonal()[at]).mean()), 1e-10))
         for p in places:
             self.precision[int(p)] = max(spread, 1e-4) ** -2
-        return spread
 
     def set_scatter(self, spread: float) -> None:
         for p in self.scattered:

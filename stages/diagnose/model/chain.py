@@ -157,9 +157,14 @@ class Chain:
         return self.model.name == RICH
 
     def form_tangents(self) -> list[Tensor]:
-        """d image / d coefficient of a sum of kernels that stands beside the nominal model, (n, H, W) each."""
+        """What another form of the law may add, (n, H, W) each: a sum of kernels, or a nominal one's kernels times cosines, each as bright as the image."""
         if self.free_form:
-            return []
+            angles = self._state.angles
+            cosines = [c - c.mean() for c in (angles.cos_incidence, angles.cos_emission)]
+            lit = self.lit()
+            size = (self.textured * lit).square().mean().sqrt()
+            columns = [t * c for t in self.surface_tangents() for c in cosines]
+            return [x * (size / (x * lit).square().mean().sqrt().clamp(min=1e-12)) for x in columns]
         rich = get_model(RICH)
         zero = torch.zeros(1, len(rich.parameters), 1, 1)
         out = []

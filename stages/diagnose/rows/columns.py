@@ -38,6 +38,7 @@ class Plan:
     form: list[int] = field(
         default_factory=list
     )  # of another form of the reflectance: a nuisance of all but effects of the law
+    free_form: bool = False  # the nominal law is a sum of kernels itself
     guises: list[Guise] = field(default_factory=list)
     steps: list[tuple[int, str, float]] = field(default_factory=list)  # base effect, coordinate, step: tangents
 
@@ -57,9 +58,9 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey) -> Plan:
         shared(f"coefficient {k}", float("inf"))
     for k in free:
         shared(f"coefficient {k} with albedo", float("inf"))
-    if not chain.free_form:
-        for k in range(len(chain.form_tangents())):
-            plan.form.append(shared(f"form {k}", float("inf")))
+    for k in range(len(chain.form_tangents())):
+        plan.form.append(shared(f"form {k}", float("inf")))
+    plan.free_form = chain.free_form
     shared("slopes within a pixel", 1.0)
     for place, effect in enumerate(chain.base):
         if effect.scope == "scene":
@@ -98,10 +99,14 @@ def shared_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
     """
     tangents = chain.surface_tangents()
     bright = chain.site.texture - chain.site.texture.mean()
+    lit = chain.lit()
+    image = chain.textured * lit
+    # how the law goes with albedo, not albedo itself: that is part of the covariance, and effects that all images share would vanish
+    beside = [t - (t * image).sum() / image.square().sum().clamp(min=1e-30) * chain.textured for t in tangents]
     out = [
         chain.site.image - chain.predict(),
         *tangents,
-        *(t * bright for t in tangents),
+        *(t * bright for t in beside),
         *chain.form_tangents(),
         chain.unresolved_slopes(),
     ]

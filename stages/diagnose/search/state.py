@@ -142,12 +142,14 @@ class State:
             tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
         units = per_site(lambda k: products(rows[k], model, grid, self.frames, tricks[k]), range(len(rows)))
         whole = Whole(units, plan, self.frames)
+        if plan.free_form:
+            whole.let_scatter(whole.form_places())
         for name in dict.fromkeys(plan.per_frame):
             if get_effect(name).scatters:
-                columns = [k for k, n in enumerate(plan.per_frame) if n == name]
-                whole.let_gains_scatter(columns)
+                places = whole.frame_places([k for k, n in enumerate(plan.per_frame) if n == name])
+                whole.let_scatter(places)
                 if not get_effect(name).displaces:
-                    whole.scattered = whole.frame_places(columns)
+                    whole.scattered = places
         return View(whole, plan, rows, grid, model)
 
 
