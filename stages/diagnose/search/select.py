@@ -15,7 +15,7 @@ from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
 from stages.diagnose.search.refine import as_effect, refine
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.search.tested import hidden_gains
-from stages.diagnose.settings import DISCOVERY, NOTABLE, SIMPLER, SURE, TRIED, TRIES
+from stages.diagnose.settings import DISCOVERY, FEW_GROUNDS, NOTABLE, SIMPLER, SURE, TRIED, TRIES
 from stages.effects import get_effect
 
 TOO_FEW = "it takes more images"
@@ -156,7 +156,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         if low <= 0:
             why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
     if not why:
-        why = next((contradicted(*part) for part in hidden_gains(state, cause, look) if contradicted(*part)), "")
+        why = contradicted(hidden_gains(state, cause, look))
     if why:
         state.causes[:] = causes
         for c, effect, errors in saved:
@@ -166,14 +166,18 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     return why
 
 
-def contradicted(gains: np.ndarray, unit: str) -> str:
-    """Why test pairs that gain so much on each piece of ground take the name back, or ''."""
-    low, high = interval(gains)
-    return (
-        f"the test pairs contradict it: it gains {gains.sum():.3g} {unit} there ({low:.3g} .. {high:.3g})"
-        if high < 0
-        else ""
-    )
+def contradicted(parts: list[tuple[np.ndarray, str]]) -> str:
+    """Why test pairs that gain so much on each piece of ground take a name back, or ''.
+
+    Too few grounds for an interval speak by their sum, where weighted squares and plain ones agree.
+    """
+    for gains, unit in parts:
+        low, high = interval(gains)
+        if high < 0:
+            return f"the test pairs contradict it: it gains {gains.sum():.3g} {unit} there ({low:.3g} .. {high:.3g})"
+    if parts and all(len(g) < FEW_GROUNDS and g.sum() < 0 for g, _ in parts):
+        return "the test pairs contradict it: it gains " + " and ".join(f"{g.sum():.3g} {unit}" for g, unit in parts)
+    return ""
 
 
 def doubt(state: State, cause: Cause) -> str:
@@ -238,7 +242,8 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
         whole.precision.pop(1 + k, None)
     first = look.whole.first
     whole.precision |= {k + 1: v for k, v in look.whole.precision.items() if k >= first}  # one shared column more
-    whole.precision |= {int(p): look.whole.precision[int(p)] for p in look.whole.form_places()}
+    scattered = look.whole.known_places([1 + k for group in look.plan.scattered for k in group])
+    whole.precision |= {int(p): look.whole.precision[int(p)] for p in scattered}
     cause.rms_before, cause.rms_after = _rms(np.sum(plain, 0), look)
     if type(cause.effect).scope == "image" or len(cause.found.guise.columns) > 1:
         return cause.found.gains, float(whole.gram[0, 0])
