@@ -19,8 +19,9 @@ READERS: dict[str, list[list[str]]] = {
     "scene": [
         ["sample", "scene.h5", "--count", "20", "-o", "out.h5"],
         ["infer", "scene.h5", "checkpoint.h5", "-o", "out.h5"],
-        ["render", "--dem", "scene.h5", "--sun-azimuth", "90", "--sun-elevation", "30", "-o", "out.exr"],
+        ["render", "--dem", "scene.h5", "--model", "M2", "--sun-azimuth", "90", "--sun-elevation", "30", "-o", "out.exr"],
         ["ingest", "scene.h5", "--images", "images.csv", "--crop", "32", "-o", "out.h5"],
+        ["albedo", "svbrdf.h5", "scene.h5", "-o", "out.h5"],
         ["report", "scene.h5", "-o", "out.html"],
     ],
     "crops": [["project", "crops.h5", "-o", "out.h5"], ["inspect", "crops.h5"]],
@@ -48,9 +49,12 @@ READERS: dict[str, list[list[str]]] = {
         ["infer", "scene.h5", "checkpoint.h5", "--device", "cpu", "-o", "out.h5"],
         ["evaluate", "pairs.h5", "checkpoint.h5", "--device", "cpu", "-o", "out.h5"],
         ["match", "pairs.h5", "checkpoint.h5", "--count", "1", "--device", "cpu", "--json", "out.json"],
+        ["export", "checkpoint.h5", "-o", "out.onnx"],
     ],
     "svbrdf": [
         ["render", "svbrdf.h5", "--sun-azimuth", "90", "--sun-elevation", "30", "-o", "out.exr"],
+        ["albedo", "svbrdf.h5", "scene.h5", "-o", "out.h5"],
+        ["view", "svbrdf.h5", "-o", "out.html"],
         ["report", "svbrdf.h5", "-o", "out.html"],
     ],
     "evaluation": [
