@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -19,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import CROPS, SCENE, SPLITS, ArtefactWriter, ConfigError, GeometryError, check_output, open_artefact
+from schemas.files.outputs import Output
 from schemas.provenance import sha256
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.images.table import Frame, load_frames, relative_path, write_frames
 from stages.physics.maps.grid import Grid, read_grid
 from stages.physics.maps.ground_tiles import PositionMasks, Tiles, bounds_deg, split_tiles, tile_edge
 from stages.physics.maps.positions import blocks
-
-Progress = Callable[[int, int, str], None]
 
 LARGEST = 1e9  # m of a tile, crops per km2
 MOST_CROPS = 2**31 - 1  # what an index of a pair can count
@@ -59,9 +58,14 @@ class Part:
 
 
 def run(
-    scene: Path, output: Path, config: Config, overwrite: bool = False, progress: Progress | None = None
+    scene: Path,
+    output: Output | Path,
+    config: Config,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> list[Part]:
     """Write ``crops.h5`` and return the audit of the split. Raises ConfigError or GeometryError."""
+    output = Output.of(output)
     if config.count is not None and config.density is not None:
         raise ConfigError("--count and --density: give one of the two.")
     if config.count is not None and not 1 <= config.count <= MOST_CROPS:
@@ -71,7 +75,7 @@ def run(
             raise ConfigError(f"{option}: expected a number above 0, up to {LARGEST:g}, found {value:g}.")
     if len(config.split) != 3 or min(config.split) < 0 or not math.isclose(sum(config.split), 1, abs_tol=1e-6):
         raise ConfigError(f"--split: expected three shares that sum to 1, found {config.split}.")
-    check_output(output, [scene], overwrite)
+    check_output(output.file, [scene], output.overwrite)
     with open_artefact(scene, SCENE) as file:
         grid = read_grid(file, scene)
         frames = load_frames(file, scene)
@@ -95,7 +99,7 @@ def run(
         parts = audit(chosen, tiles, grid, crop)
         first, last = (len(chosen) * k // config.shard[1] for k in (config.shard[0], config.shard[0] + 1))
         part = slice(first, last)
-        _write(scene, output, file, grid, frames, tiles, chosen, part, crop, config, parts, overwrite, progress)
+        _write(scene, output, file, grid, frames, tiles, chosen, part, crop, config, parts, progress)
     return parts
 
 
@@ -115,14 +119,13 @@ def _choose(
     grid: Grid,
     config: Config,
     rng: np.random.Generator,
-    progress: Progress | None,
+    progress: Progress,
 ) -> NDArray:
     """Crop centres, sorted by frame, row, column. Without replacement within an image (within the scene with ``stack``)."""
     layers = [-1] if config.stack else list(range(len(frames)))
     counts = np.zeros((len(layers), 3, len(positions.blocks)), np.int64)
     for number, block in enumerate(positions.blocks):
-        if progress:
-            progress(number, 2 * len(positions.blocks), "counting positions")
+        progress(number, 2 * len(positions.blocks), "counting positions")
         here = positions.frames_of(block)
         for index, layer in enumerate(layers):
             if layer >= 0 and layer not in here:
@@ -136,8 +139,7 @@ def _choose(
         if wanted[index, k]:
             take[index, k] = _spread(rng, counts[index, k], int(wanted[index, k]))
     for number, block in enumerate(positions.blocks):
-        if progress:
-            progress(len(positions.blocks) + number, 2 * len(positions.blocks), "choosing positions")
+        progress(len(positions.blocks) + number, 2 * len(positions.blocks), "choosing positions")
         if not take[:, :, number].any():
             continue
         here = positions.frames_of(block)
@@ -149,8 +151,7 @@ def _choose(
                 flat = rng.choice(np.flatnonzero(part == k), int(take[index, k, number]), replace=False)
                 row, col = np.unravel_index(np.sort(flat), part.shape)
                 picked.append((layer, k, row + block[0], col + block[1], block, here))
-    if progress:
-        progress(2 * len(positions.blocks), 2 * len(positions.blocks), "choosing positions")
+    progress(2 * len(positions.blocks), 2 * len(positions.blocks), "choosing positions")
     return _records(picked, positions, tiles, config.stack)
 
 
@@ -250,7 +251,7 @@ def audit(chosen: NDArray, tiles: Tiles, grid: Grid, crop: int) -> list[Part]:
 
 def _write(
     scene: Path,
-    output: Path,
+    output: Output,
     file: h5py.File,
     grid: Grid,
     frames: list[Frame],
@@ -260,8 +261,7 @@ def _write(
     crop: int,
     config: Config,
     audited: list[Part],
-    overwrite: bool,
-    progress: Progress | None,
+    progress: Progress,
 ) -> None:
     mine = chosen[part]
     sizes = {"pair": len(mine), "y": crop, "x": crop, "frame": len(frames)}
@@ -269,7 +269,7 @@ def _write(
     attributes = {
         "gsd_m": grid.gsd,
         "body_radius_m": grid.radius,
-        "scene": relative_path(scene, output.resolve().parent),
+        "scene": relative_path(scene, output.file.resolve().parent),
         "scene_sha256": digest,
         "tile_m": tiles.edge * grid.gsd,
         "pairs_in_all_shards": np.int64(len(chosen)),
@@ -278,22 +278,21 @@ def _write(
     stored = asdict(config) | {"crop": crop} | tiles.identity(bounds_deg(grid))
     half = crop // 2
     with ArtefactWriter(
-        output,
+        output.file,
         CROPS,
         sizes,
         config=stored,
         inputs=[scene],
         seed=config.seed,
         attributes=attributes,
-        overwrite=overwrite,
+        overwrite=output.overwrite,
     ) as writer:
         elevation, source = writer.dataset("elevation"), file["elevation"]
         for k, (r, c) in enumerate(zip(mine["row"], mine["col"], strict=True)):
-            if progress and k % 100 == 0:
+            if k % 100 == 0:
                 progress(k, len(mine), "crops")
             elevation[k] = source[r - half : r + half, c - half : c + half]
-        if progress:
-            progress(len(mine), len(mine), "crops")
+        progress(len(mine), len(mine), "crops")
         # The centre of an even crop is the corner shared by its four middle pixels.
         lon, lat = grid.lonlat(mine["row"] - 0.5, mine["col"] - 0.5)
         writer.write("longitude_deg", lon)

@@ -10,7 +10,6 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,9 +21,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from schemas import CHECKPOINT, ArtefactWriter, ConfigError, InputError
-from schemas.files.outputs import Target, check_apart, check_outputs
+from schemas.files.outputs import Output, Target, check_apart, check_outputs
 from schemas.provenance import sha256
 from stages.common.memory import keep_freed_memory
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.common.threads import one_thread_each
 from stages.network.losses import Radiometry, crop_errors
 from stages.network.maps import CoefficientMaps
@@ -43,9 +43,6 @@ from stages.physics.formation.chain import Extension, form
 from stages.physics.photometry import get_model
 
 CHECK_EVERY = 16  # batches: looking at the loss makes a GPU wait
-
-Say = Callable[[str], None]
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
@@ -108,22 +105,21 @@ class Summary:
 
 def run(
     pairs: Path,
-    output: Path,
+    output: Output | Path,
     config: Config,
-    overwrite: bool = False,
-    resume: bool = False,
-    say: Say = lambda line: None,
-    progress: Progress | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Summary:
     """Write ``checkpoint.h5``: the weights of the best validation epoch. Raises ConfigError, InputError, ArtefactError.
 
     After every epoch the whole state goes to a file beside the output, from which ``resume`` goes on to the same result.
     """
+    output = Output.of(output)
     check(config)
-    sidecar = output.with_name(f"{output.stem}.resume.h5")
+    sidecar = output.file.with_name(f"{output.file.stem}.resume.h5")
     inputs = [pairs, *([Path(config.extend)] if config.extend else [])]
-    check_outputs([Target(output)], inputs, overwrite)
-    check_apart([Target(output), Target(sidecar, what=f"the state of the unfinished {output.name}")], inputs)
+    check_outputs([Target(output.file)], inputs, output.overwrite)
+    check_apart([Target(output.file), Target(sidecar, what=f"the state of the unfinished {output.file.name}")], inputs)
     rank, ranks = join_group()
     device = choose_device(config.device)
     if device.type == "cuda" and ranks > 1:
@@ -143,7 +139,7 @@ def run(
         identity = json.dumps(
             asdict(config) | {"device": None, "epochs": epochs, "pairs": sha256(pairs), "ranks": ranks}, sort_keys=True
         )
-        if resume and sidecar.exists():
+        if output.resume and sidecar.exists():
             training.precision = restore(
                 sidecar,
                 identity,
@@ -187,7 +183,7 @@ def run(
             fit_deviations(
                 training.predictor, training.radiometry, reader, train, validation, extensions=training.extensions
             )
-            _write_checkpoint(output, config, training, history, overwrite)
+            _write_checkpoint(output, config, training, history)
             sidecar.unlink(missing_ok=True)
     if ranks > 1:
         dist.barrier()
@@ -221,7 +217,7 @@ def _set_up(
 
 
 def learn_epoch(
-    training: Training, train: NDArray[np.int64], config: Config, epoch: int, progress: Progress | None = None
+    training: Training, train: NDArray[np.int64], config: Config, epoch: int, progress: Progress = show_nothing
 ) -> float:
     """One pass over the training pairs; the mean squared error on the way. Raises InputError where it is not finite."""
     rank, ranks, device = training.rank, training.ranks, training.device
@@ -248,7 +244,7 @@ def learn_epoch(
         if ranks > 1:
             sum_gradients(training.learned)
         training.optimizer.step()
-        if progress and rank == 0:
+        if rank == 0:
             progress(number + 1, len(steps), f"epoch {epoch + 1}/{config.epochs}")
     error_sum, pixel_sum = sums.tolist()
     if not math.isfinite(error_sum):
@@ -367,7 +363,7 @@ def _take(training: Training, state: dict[str, Tensor]) -> None:
         module.load_state_dict({k.split("/", 1)[1]: v for k, v in state.items() if k.startswith(f"{name}/")})
 
 
-def _write_checkpoint(output: Path, config: Config, training: Training, history: History, overwrite: bool) -> None:
+def _write_checkpoint(output: Output, config: Config, training: Training, history: History) -> None:
     """The weights and all that is needed to use them."""
     reader, predictor, radiometry = training.reader, training.predictor, training.radiometry
     trained = set(reader.frame[reader.indices("train")].tolist())
@@ -393,14 +389,14 @@ def _write_checkpoint(output: Path, config: Config, training: Training, history:
         attributes["image_noise"] = predictor.image_noise
     sizes = {"epoch": len(history.train_loss), "frame": len(reader.image_ids)}
     with ArtefactWriter(
-        output,
+        output.file,
         CHECKPOINT,
         sizes,
         config=asdict(config),
         inputs=[reader.path],
         seed=config.seed,
         attributes=attributes,
-        overwrite=overwrite,
+        overwrite=output.overwrite,
     ) as writer:
         for key in ("train_loss", "validation_loss", "epoch_seconds"):
             writer.write(key, np.array(getattr(history, key)))

@@ -14,8 +14,9 @@ import torch
 from evaluation_scene import KnowsTheTruth, make_scene, write_pairs
 
 from stages import train
+from stages.evaluate.comparison import Task, evaluate_pairs
+from stages.evaluate.config import Config
 from stages.evaluate.renderers import read_batch
-from stages.evaluate.run import Config, Task, evaluate_pairs
 
 GAINS = np.array([900.0, 1400.0])  # DN per I/F of the two images
 SMALL = {"model": "M2", "widths": (4, 8), "batch": 8, "device": "cpu", "precision": "fp32", "maps": ("a",)}

@@ -13,6 +13,7 @@ from evaluation_scene import run_command
 from torch.nn import functional
 
 from schemas import ConfigError, RegistryError, read_strings
+from schemas.files.outputs import Output
 from stages import infer, train
 from stages.common.threads import one_thread_each, share_out
 from stages.network.losses import crop_errors, squared_error
@@ -92,7 +93,7 @@ def test_globals_survive_an_interruption(small_artefacts, trained, tmp_path, mon
     with pytest.raises(KeyboardInterrupt):
         train.run(small_artefacts["pairs"], out, config)
     monkeypatch.undo()
-    train.run(small_artefacts["pairs"], out, config, resume=True)
+    train.run(small_artefacts["pairs"], Output(out, resume=True), config)
     first, again = weights(trained), weights(out)
     for name in first:
         np.testing.assert_array_equal(first[name], again[name], err_msg=name)

@@ -16,6 +16,7 @@ import small_scene
 import torch
 
 from schemas import PAIRS, ArtefactError, ArtefactWriter, ConfigError, InputError, RegistryError
+from schemas.files.outputs import Output
 from stages import ingest, project, sample, train
 from stages.network.predictor import load_predictor
 from stages.network.steps import order_steps
@@ -158,12 +159,12 @@ def test_a_cosine_is_not_resumed_with_another_number_of_epochs(
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(train, "_write_checkpoint", stop)
         train.run(small_artefacts["pairs"], out, config(epochs=1, schedule=schedule))
-    again = (small_artefacts["pairs"], out, config(epochs=2, schedule=schedule))
+    again = (small_artefacts["pairs"], Output(out, resume=True), config(epochs=2, schedule=schedule))
     if longer:
-        assert len(train.run(*again, resume=True).history.train_loss) == 2
+        assert len(train.run(*again).history.train_loss) == 2
     else:
         with pytest.raises(ArtefactError, match="other options"):
-            train.run(*again, resume=True)
+            train.run(*again)
 
 
 def test_resume_refuses_another_run(small_artefacts, tmp_path):
@@ -172,7 +173,7 @@ def test_resume_refuses_another_run(small_artefacts, tmp_path):
     side = tmp_path / "checkpoint.resume.h5"
     shutil.copy(out, side)
     with pytest.raises(ArtefactError, match="cannot be resumed"):
-        train.run(small_artefacts["pairs"], out, config(epochs=1), overwrite=True, resume=True)
+        train.run(small_artefacts["pairs"], Output(out, overwrite=True, resume=True), config(epochs=1))
     assert out.exists()
 
 

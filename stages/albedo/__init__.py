@@ -5,6 +5,17 @@ from __future__ import annotations
 
 from stages.albedo.calibrate import Calibration
 from stages.albedo.config import Config, Summary
-from stages.albedo.run import calibrate_to, count_bands, run, source_files, summarise
+from stages.albedo.run import calibrate_to, check_files, count_bands, run, run_part, source_files, summarise
 
-__all__ = ["Calibration", "Config", "Summary", "calibrate_to", "count_bands", "run", "source_files", "summarise"]
+__all__ = [
+    "Calibration",
+    "Config",
+    "Summary",
+    "calibrate_to",
+    "check_files",
+    "count_bands",
+    "run",
+    "run_part",
+    "source_files",
+    "summarise",
+]

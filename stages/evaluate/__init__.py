@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
-from stages.evaluate.run import Config, run
+from stages.evaluate.config import Config
+from stages.evaluate.run import run, run_in_parts
 
-__all__ = ["Config", "run"]
+__all__ = ["Config", "run", "run_in_parts"]

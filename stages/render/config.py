@@ -38,7 +38,7 @@ class Config:
     camera : path of a camera model (JSON), instead of position, attitude, fov and size
     samples : rays per pixel and axis (None: as many as the pixel's footprint asks for)
     model, parameters : a reflectance that is the same everywhere, where the source holds none
-    export : with a trajectory: also a data set of its views, colmap or nerfstudio
+    export : with a trajectory: also a data set of its views, colmap or nerfstudio; png_only : no EXR; shard : every n-th view
     terrain_only : of svbrdf.h5 use the terrain, with ``model``
     """
 
@@ -65,6 +65,8 @@ class Config:
     body: str | None = None
     backplanes_in_tif: bool = False
     export: str | None = None
+    png_only: bool = False
+    shard: tuple[int, int] = (0, 1)
 
 
 @dataclass(frozen=True)

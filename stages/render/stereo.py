@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
-from schemas.files.outputs import atomic_path, check_output
+from schemas.files.outputs import Output, atomic_path, check_output
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.terrain.surface import Surface
@@ -29,7 +29,6 @@ from stages.render.viewpoint import look_at, pinhole_view
 from stages.render.views import render_camera
 
 Floats = NDArray[np.float64]
-Progress = Callable[[int, int, str], None]
 
 SPLITS = (("train", 0.8), ("validation", 0.1), ("test", 0.1))
 TILE_FOOTPRINTS = 2.0  # edge of a tile in footprints seen from straight above
@@ -58,20 +57,21 @@ class StereoConfig:
 
 def run_stereo(
     source: Path,
-    folder: Path,
+    output: Output | Path,
     config: Config,
     stereo: StereoConfig,
-    *,
-    overwrite: bool = False,
-    progress: Progress | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Path:
-    """Render ``stereo.count`` pairs of ``source`` into ``folder``; the path of the manifest. Raises LunargrError.
+    """Render ``stereo.count`` pairs of ``source`` into a folder; the path of the manifest. Raises LunargrError.
 
     config : what is rendered, size and field of view; its Sun and camera are drawn here
     """
+    output = Output.of(output)
+    folder = output.file
     _check(config, stereo)
     manifest = folder / "manifest.json"
-    check_output(manifest, [source], overwrite)
+    check_output(manifest, [source], output.overwrite)
     body = find_body("moon" if config.body is None else config.body)
     own = replace(config, view="pinhole", position=(0.0, 0.0, 0.0))
     check(own)
@@ -81,8 +81,7 @@ def run_stereo(
         relief, world = surface.height_range(), make_world(surface.grid)
         places = _Places(surface, config, stereo, rng)
         for number in range(stereo.count):
-            if progress:
-                progress(number, stereo.count, "pairs")
+            progress(number, stereo.count, "pairs")
             pairs.append(_render_pair(f"pair_{number:05d}", surface, places, own, body, relief, world, folder))
     told = {
         "source": source.name,
@@ -95,8 +94,7 @@ def run_stereo(
     }
     with atomic_path(manifest) as partial:
         partial.write_text(json.dumps(told, indent=1))
-    if progress:
-        progress(stereo.count, stereo.count, "pairs")
+    progress(stereo.count, stereo.count, "pairs")
     return manifest
 
 
@@ -176,7 +174,7 @@ def _render_pair(
         own = replace(config, sun_azimuth_deg=sun["sun_azimuth_deg"], sun_elevation_deg=sun["sun_elevation_deg"])
         files = output_files(folder / f"{name}_{side}.exr", "pinhole")
         light = make_light(surface, own, body, relief)
-        render_camera(surface, camera, light, relief, files, own, f"{name}_{side}", None)
+        render_camera(surface, camera, light, relief, files, own, f"{name}_{side}", show_nothing)
         views.append({"image": files[0].name, "preview": files[1].name, "camera": camera.to_document(), **sun})
         exrs.append(read_exr(files[0]))
         cameras.append(camera)
