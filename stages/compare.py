@@ -128,7 +128,7 @@ def _row(group: Sequence[Trained]) -> dict[str, Any]:
         "mse_crop_sum": float(np.mean(sums)),
         "mse_crop_sum_seed_std": float(np.std(sums, ddof=1)) if several else None,
         "paper_mse_crop_sum": PAPER.get(first.model),
-        "best_epoch": [r.best_epoch + 1 for r in group],
+        "best_epoch": [r.best_epoch for r in group],
         "seeds": [r.seed for r in group],
     }
 

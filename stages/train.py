@@ -43,6 +43,7 @@ from stages.physics.formation.chain import Extension, form
 from stages.physics.photometry import get_model
 
 CHECK_EVERY = 16  # batches: looking at the loss makes a GPU wait
+BACKWARD = 3  # work of learning from a batch over that of looking at it: what progress counts
 
 
 @dataclass(frozen=True)
@@ -155,11 +156,13 @@ def run(
             say(_introduction(training))
         speed = math.nan
         train, validation = reader.indices("train"), reader.indices("validation")
+        work = BACKWARD * math.ceil(len(train) / config.batch), math.ceil(len(validation[rank::ranks]) / config.batch)
         for epoch in range(len(history.train_loss), config.epochs):
             began = time.monotonic()
-            train_loss = learn_epoch(training, train, config, epoch, progress)
+            train_loss = learn_epoch(training, train, config, epoch, _of_all(progress, epoch, config.epochs, work))
             training_seconds = time.monotonic() - began
-            validation_loss = evaluate_loss(training, validation, config.batch)
+            validation_progress = _of_all(progress, epoch, config.epochs, work, work[0]) if rank == 0 else None
+            validation_loss = evaluate_loss(training, validation, config.batch, validation_progress)
             history.train_loss.append(train_loss)
             history.validation_loss.append(validation_loss)
             history.epoch_seconds.append(time.monotonic() - began)
@@ -189,6 +192,17 @@ def run(
         dist.barrier()
         dist.destroy_process_group()
     return Summary(history, speed, training.precision, training.start)
+
+
+def _of_all(
+    progress: Progress | None, epoch: int, epochs: int, work: tuple[int, int], before: int = 0
+) -> Progress | None:
+    """Report work on the whole training. work : of training and of validation in an epoch; before : done in this one"""
+    if progress is None:
+        return None
+    first, total = epoch * sum(work) + before, epochs * sum(work)
+    each = 1 if before else BACKWARD
+    return lambda done, _, what: progress(first + each * done, total, what)
 
 
 def _set_up(
@@ -278,15 +292,19 @@ def _errors(training: Training, batch: Batch, brightness: float, keys: Tensor | 
 
 
 @torch.no_grad()
-def evaluate_loss(training: Training, indices: NDArray[np.int64], batch_size: int) -> float:
+def evaluate_loss(
+    training: Training, indices: NDArray[np.int64], batch_size: int, progress: Progress | None = None
+) -> float:
     """Mean squared error over the valid pixels of some pairs, in evaluation mode; NaN where there are none."""
     training.predictor.eval()
     total, pixels = 0.0, 0.0
     mine = indices[training.rank :: training.ranks]
     steps = [(mine[k : k + batch_size], None) for k in range(0, len(mine), batch_size)]
-    for batch in prefetch(training.reader, steps, training.device):
+    for number, batch in enumerate(prefetch(training.reader, steps, training.device)):
         _, error = _errors(training, batch, brightness=1.0)
         total, pixels = total + float(error), pixels + float(batch.valid.sum())
+        if progress:
+            progress(number + 1, len(steps), "validation")
     return mean_over_ranks(total, pixels, training.ranks, training.device)
 
 
@@ -381,7 +399,7 @@ def _write_checkpoint(output: Output, config: Config, training: Training, histor
         "gsd_m": reader.gsd,
         "body_radius_m": reader.body_radius,
         "image_units": reader.units,
-        "best_epoch": np.int32(history.best_epoch),
+        "best_epoch": np.int32(history.best_epoch + 1),
         "start": json.dumps(training.start),
         "precision": training.precision,
     }
