@@ -18,7 +18,7 @@ from stages import albedo, merge
 from stages.albedo.posterior import Spread, estimate
 from stages.albedo.pyramid import LEVELS
 
-running = sys.modules["stages.albedo.run"]  # the package's ``run`` is the function
+running = sys.modules["stages.albedo.stage"]
 QUIET = albedo.Config(geotiff=False)
 
 

@@ -26,6 +26,7 @@ from stages.pairs.holes import fill_holes
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import get_model, masked_radiance_factor, model_names
 from stages.physics.photometry.deviation import radiance_deviation
+from stages.train import stage
 
 SMALL = {"widths": (4, 8), "epochs": 2, "batch": 16, "lr": 5e-3, "device": "cpu", "precision": "fp32"}
 
@@ -89,7 +90,7 @@ def test_globals_survive_an_interruption(small_artefacts, trained, tmp_path, mon
     """A run that stops after its first epoch goes on to the very same checkpoint."""
     out = tmp_path / "c.h5"
     config = train.Config(model="minnaert", **SMALL)
-    monkeypatch.setattr(train, "learn_epoch", _stop_after_one(train.learn_epoch))
+    monkeypatch.setattr(stage, "learn_epoch", _stop_after_one(stage.learn_epoch))
     with pytest.raises(KeyboardInterrupt):
         train.run(small_artefacts["pairs"], out, config)
     monkeypatch.undo()

@@ -52,7 +52,7 @@ def command(
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output
     from stages import match
-    from stages.match.run import result_lines
+    from stages.match.stage import result_lines
 
     console = Console(quiet)
     config = match.Config(

@@ -1,6 +1,6 @@
 """Seen ground under an unseen image: how well maps with albedo predict photographs that had no part in their albedo.
 
-Another claim than that of unseen ground (``stages.evaluate.run``), and kept apart from it: here other photographs of the
+Another claim than that of unseen ground (``stages.evaluate.stage``), and kept apart from it: here other photographs of the
 same pixels made the albedo. How far the scored Sun stands from the nearest one used is part of the answer.
 """
 

@@ -12,9 +12,10 @@ from schemas.errors import GeometryError
 from stages.common.progress import Progress
 from stages.physics.terrain.shading import BACKPLANES, Light, shade_block
 from stages.physics.terrain.surface import Surface
-from stages.render.config import Config, Summary, Tally
+from stages.render.config import Config, Summary
 from stages.render.pictures import Preview, write_exr, write_geotiff, write_png
 from stages.render.setting import metadata
+from stages.render.tally import Tally
 
 BAND_ROWS = 256
 BAND_PX = 1 << 20  # of a wide map fewer rows at a time: memory does not follow its width

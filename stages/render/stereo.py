@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.terrain.surface import Surface
-from stages.render.config import SUN, Config, check, output_files
+from stages.render.config import SUN, Config, StereoConfig, check, output_files
 from stages.render.dataset import World, make_world, project, ray_directions
 from stages.render.pictures import read_exr, write_exr
 from stages.render.setting import make_light, open_source
@@ -35,24 +35,6 @@ TILE_FOOTPRINTS = 2.0  # edge of a tile in footprints seen from straight above
 ROOM = 1.5  # the part of a tile that a view may cover, in footprints: oblique views reach further
 SAME_PLACE = 1e-3  # of the distance: a farther surface there hides the point
 TRIES = 200
-
-
-@dataclass(frozen=True)
-class StereoConfig:
-    """How pairs are drawn; ranges are uniform.
-
-    altitude : m above the ground (None: an eighth of the map's shorter side in a picture)
-    convergence_deg : between both lines of sight at the ground; off_nadir_deg : of their mean; roll_deg : to either side
-    sun_elevation_deg : of both Suns, each with any azimuth
-    """
-
-    count: int
-    altitude: float | None = None
-    convergence_deg: tuple[float, float] = (4.0, 30.0)
-    off_nadir_deg: float = 8.0
-    roll_deg: float = 20.0
-    sun_elevation_deg: tuple[float, float] = (12.0, 65.0)
-    seed: int = 0
 
 
 def run_stereo(

@@ -20,11 +20,12 @@ from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
 from stages.physics.terrain.shading import BACKPLANES, Light
 from stages.physics.terrain.surface import Surface
-from stages.render.config import SUN, Config, Summary, Tally, check, inputs, output_files, skipped
+from stages.render.config import SUN, Config, Summary, check, inputs, output_files
 from stages.render.dataset import View, export_views
 from stages.render.perspective import apply_sensor, make_scene, render_view
 from stages.render.pictures import Preview, write_exr, write_png
 from stages.render.setting import camera_place, find_camera, make_light, metadata, open_source
+from stages.render.tally import Tally, skipped
 from stages.render.trajectory import ViewRow, read_trajectory
 
 Floats32 = NDArray[np.float32]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from stages.common import page
 from stages.common.page import pictures
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.report import conclusions, maps, results, sections
+from stages.report.config import Config
 from stages.report.diagnosis import diagnosis
 from stages.report.held_out import held_out_images
 
@@ -45,13 +45,6 @@ CAPTIONS = {
     "training_curves": "Loss on training and validation pairs",
     "render": "The map as 'lunargr render' lights it",
 }
-
-
-@dataclass
-class Config:
-    """The page's title."""
-
-    title: str = "Lunar reflectance learned from terrain"
 
 
 def run(

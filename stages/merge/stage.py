@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +12,11 @@ from schemas.command_line import whole_command
 from schemas.files.companions import companions_of
 from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.merge.config import Config
 from stages.merge.joining import join_paths, join_variable
 from stages.merge.parts import MAPS, Parts, open_parts
 from stages.physics.maps.geotiff import write_geotiff
 from stages.physics.maps.grid import read_grid
-
-
-@dataclass(frozen=True)
-class Config:
-    """virtual : large variables stay in the parts, which the output then needs; inputs : what the whole says it was made
-    from, in place of its parts"""
-
-    virtual: bool = False
-    inputs: tuple[Path, ...] | None = None
 
 
 def run(

@@ -18,10 +18,11 @@ from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import Frame, load_frames
 from stages.physics.maps.grid import LocalFrames
-from stages.project.config import Config, Registered, Summary
+from stages.project.config import Config
 from stages.project.geometry import Geometry, check_directions, crop_geometry
 from stages.project.inputs import Scene, check_places, check_sources, open_scene, scene_of
 from stages.project.register import displacement_at, register, write_registration
+from stages.project.summary import Registered, Summary
 from stages.project.writing import Pair, PairDatasets, Tally, kept_decimals
 
 OF_THE_CROP = ("longitude_deg", "latitude_deg", "row", "col", "image_index", "site", "tile", "split")

@@ -8,6 +8,7 @@ from pathlib import Path
 from schemas import ConfigError, atomic_path, check_output
 from schemas.files.outputs import Output
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.view.config import Config
 from stages.view.frames import make_frames
 from stages.view.layers import read_content
 from stages.view.page import make_page
@@ -15,17 +16,6 @@ from stages.view.photographs import read_photographs
 from stages.view.still import still_jpeg
 
 STEPS = 4
-
-
-@dataclass(frozen=True)
-class Config:
-    """What the page holds and shows first; angles in degrees over the map's middle, azimuth from true north."""
-
-    max_px: int = 2048
-    photographs: int = 12
-    sun_azimuth_deg: float = 270.0
-    sun_elevation_deg: float = 25.0
-    title: str | None = None
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +10,11 @@ from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.match.base import Matches, Models, get_matcher
 from stages.match.comparisons import comparisons
+from stages.match.config import Config
 from stages.match.consistency import summarise
 from stages.match.pictures import inside, match_figure, stretch_limits, to_grey
 
 FIGURES = 4  # comparisons that are drawn
-
-
-@dataclass
-class Config:
-    """Options of match; ``count`` crops of ``split`` are drawn with ``seed``."""
-
-    matchers: tuple[str, ...] = ("daisy", "sift")
-    split: str = "test"
-    count: int = 24
-    features_model: Path | None = None
-    lightglue_model: Path | None = None
-    seed: int = 0
-    device: str = "auto"
 
 
 def run(
