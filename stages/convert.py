@@ -6,7 +6,7 @@ Bands are known by their descriptions, never by their position: programs order t
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,11 +17,12 @@ from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
 from schemas import ConfigError, InputError, atomic_path, check_output
+from schemas.files.outputs import Output
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.maps.rasters import open_raster, read_window
 from stages.physics.photometry.conventions import Convention, convert_maps, get_convention, model_difference
 
 BLOCK_VALUES = 1 << 23  # values of all bands held at a time, in float64: 64 MB
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass
@@ -48,16 +49,21 @@ class Report:
 
 
 def run(
-    source: Path, output: Path, config: Config, overwrite: bool = False, progress: Progress | None = None
+    source: Path,
+    output: Output | Path,
+    config: Config,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Report:
     """Convert the coefficient maps of ``source`` into ``output``, a float32 GeoTIFF on the same grid, NaN as nodata.
 
     Raises InputError for a file without the needed bands, ConfigError for conventions that have no conversion or would
     lose something, RegistryError for an unknown convention.
     """
+    output = Output.of(output)
     start, end = get_convention(config.source), get_convention(config.target)
     model_difference(start, end)
-    check_output(output, [source], overwrite)
+    check_output(output.file, [source], output.overwrite)
     losses: dict[str, str] = {}
     valid = 0
     with open_raster(source, "a GeoTIFF of coefficient maps") as data:
@@ -77,7 +83,7 @@ def run(
             "interleave": "band",
             "BIGTIFF": "IF_SAFER",
         }
-        with atomic_path(output) as partial, warnings.catch_warnings():
+        with atomic_path(output.file) as partial, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with rasterio.open(partial, "w", **profile) as target:
                 target.descriptions = tuple(end.names)
@@ -90,8 +96,7 @@ def run(
                     stack = np.stack([np.broadcast_to(v, maps[start.names[0]].shape) for v in result.values()])
                     valid += int(np.isfinite(stack).all(axis=0).sum())
                     target.write(stack.astype(np.float32), window=window)
-                    if progress is not None:
-                        progress(int(window.row_off + window.height), data.height, "convert")
+                    progress(int(window.row_off + window.height), data.height, "convert")
     return Report(end, list(losses.values()), valid)
 
 

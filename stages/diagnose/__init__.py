@@ -26,7 +26,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,7 +34,8 @@ import torch
 
 from schemas import ArtefactError, ConfigError, write_json
 from schemas.files.companions import companions_of
-from schemas.files.outputs import Target, check_outputs
+from schemas.files.outputs import Output, Target, check_outputs
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.diagnose.likelihood.left import budget, peak
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import better_form, relative_misfit
@@ -77,32 +77,30 @@ class Result:
 def run(
     pairs: Path,
     checkpoint: Path | None = None,
+    output: Output | Path | None = None,
     config: Config = Config(),
-    output: Path | None = None,
-    json_file: Path | None = None,
-    report: Path | None = None,
-    overwrite: bool = False,
-    say: Callable[[str], None] | None = None,
-    progress: Callable[[int, int, str], None] | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Result:
     """Diagnose the pairs; write what is asked for. Raises ArtefactError, ConfigError, RegistryError."""
+    output = Output.of(output)
     if config.most_causes < 1 or config.most_pairs < 1 or config.most_images < 1:
         raise ConfigError("diagnose: expected counts of at least 1 for causes, images and pairs.")
     inputs = [p for p in (pairs, checkpoint) if p is not None]
-    named = ((output, "--output"), (json_file, "--json"), (report, "--report"))
-    check_outputs([Target(path, option) for path, option in named if path is not None], inputs, overwrite)
+    named = ((output.path, "--output"), (output.json, "--json"), (output.report, "--report"))
+    check_outputs([Target(path, option) for path, option in named if path is not None], inputs, output.overwrite)
     with PairReader(pairs) as reader:
-        result = diagnose(reader, checkpoint, config, say or (lambda _: None), progress or (lambda *_: None))
+        result = diagnose(reader, checkpoint, config, say, progress)
         image_ids = reader.image_ids
-    with companions_of(output):
-        if json_file is not None:
-            write_json(json_file, result.answer.to_json())
-        if report is not None:
+    with companions_of(output.path):
+        if output.json is not None:
+            write_json(output.json, result.answer.to_json())
+        if output.report is not None:
             from stages.diagnose.result.page import write_page
 
-            write_page(report, result.answer, result.state, image_ids)
-    if output is not None:  # last: where it is, the others are
-        write_diagnosis(output, result.answer, image_ids, inputs, overwrite)
+            write_page(output.report, result.answer, result.state, image_ids)
+    if output.path is not None:  # last: where it is, the others are
+        write_diagnosis(output.path, result.answer, image_ids, inputs, output.overwrite)
     return result
 
 

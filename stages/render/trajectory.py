@@ -65,7 +65,9 @@ def read_trajectory(path: Path) -> list[ViewRow]:
     seen: set[str] = set()
     for row in rows:
         if row.view_id in seen:
-            raise InputError(f"{path}: expected each view_id once, found '{row.view_id}' twice; give each row a name of its own.")
+            raise InputError(
+                f"{path}: expected each view_id once, found '{row.view_id}' twice; give each row a name of its own."
+            )
         seen.add(row.view_id)
     return rows
 
@@ -91,7 +93,9 @@ def _row(path: Path, number: int, record: dict[str, str | None]) -> ViewRow:
     look_at = None
     if "look_longitude_deg" in value or "look_latitude_deg" in value:
         if "look_longitude_deg" not in value or "look_latitude_deg" not in value:
-            raise InputError(f"{where}: expected both look_longitude_deg and look_latitude_deg, found one; give both or none.")
+            raise InputError(
+                f"{where}: expected both look_longitude_deg and look_latitude_deg, found one; give both or none."
+            )
         look_at = (value["look_longitude_deg"], value["look_latitude_deg"], value.get("look_altitude_m", math.nan))
     quaternion = None
     given = [q for q in _QUATERNION if q in value]

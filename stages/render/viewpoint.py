@@ -66,7 +66,9 @@ def pinhole_view(
 ) -> Pinhole:
     """A distortion-free camera; ``fov_deg`` spans the image's width. Raises GeometryError."""
     if not 0.0 < fov_deg < 170.0:
-        raise GeometryError(f"--fov: expected degrees across the image's width between 0 and 170, found {fov_deg:g}; correct it.")
+        raise GeometryError(
+            f"--fov: expected degrees across the image's width between 0 and 170, found {fov_deg:g}; correct it."
+        )
     width, height = size_px
     if not (1 <= width <= 65536 and 1 <= height <= 65536):
         raise GeometryError(f"--size: expected W,H between 1 and 65536 px, found {width},{height}.")

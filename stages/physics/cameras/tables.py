@@ -121,7 +121,9 @@ def read_rotations(document: Mapping[str, Any], key: str, where: str, origin: fl
 def _times(document: Mapping[str, Any], key: str, where: str) -> Floats:
     times = read.array(document, f"{key}.ephemeris_times", where, (-1,))
     if len(times) == 0 or (np.diff(times) <= 0).any():
-        raise InputError(f"{where}: expected rising times in '{key}.ephemeris_times', found {len(times)} that do not; correct the ISD.")
+        raise InputError(
+            f"{where}: expected rising times in '{key}.ephemeris_times', found {len(times)} that do not; correct the ISD."
+        )
     return times
 
 
