@@ -17,6 +17,8 @@ from schemas import ConfigError, InputError, atomic_path, check_output, open_art
 from schemas.files.user_files import check_file, read_json
 from stages.common import page
 from stages.common.page import pictures
+from stages.common.page.diagnosis import conclusions as diagnosed
+from stages.common.page.sentences import Sentence
 from stages.report import conclusions, maps, results, sections
 from stages.report.diagnosis import diagnosis
 from stages.report.held_out import held_out_images
@@ -69,7 +71,7 @@ def run(
     if not files:
         raise ConfigError("report: expected at least one file, found none; give the artefacts of a run.")
     check_output(output, files, overwrite)
-    found: list[tuple[str, page.Section, list[conclusions.Sentence]]] = []
+    found: list[tuple[str, page.Section, list[Sentence]]] = []
     shown: list[Path] = []
     linked: list[Path] = []
     details: list[Markup] = []
@@ -112,7 +114,7 @@ def run(
     return [s.title for s in chapters]
 
 
-Part = tuple[str, page.Section, list[conclusions.Sentence]]  # kind, section, what it says on the first screen
+Part = tuple[str, page.Section, list[Sentence]]  # kind, section, what it says on the first screen
 
 
 def _head(found: Sequence[Part], linked: Sequence[Path], output: Path) -> list[Markup]:
@@ -163,7 +165,7 @@ def _result(result: dict[str, Any], file: Any) -> Part | None:
     if {"models", "differences"} <= keys:
         return "compare", results.comparison(result), []
     if "verdict" in keys:
-        return "diagnosis", diagnosis(result), conclusions.diagnosis(result)
+        return "diagnosis", diagnosis(result), diagnosed(result)
     if {"models", "gains", "claim"} <= keys:
         return "held_out", held_out_images(result), conclusions.held_out_images(result)
     if {"models", "gains"} <= keys:
