@@ -25,7 +25,6 @@ from lunargr_cli.paths import Writes
 
 if TYPE_CHECKING:
     from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
     from stages.project import Registered
 
 NAME, ORDER = "project", 40
@@ -87,7 +86,7 @@ def command(
     """Orthorectify the images onto the crops; add the Sun, the camera and the terrain's horizon."""
     from lunargr_cli.console import Console
     from schemas import ConfigError
-    from schemas.files.outputs import Target, check_outputs
+    from schemas.files.outputs import Output, Target, check_outputs
     from stages import project
 
     console = Console(quiet)
