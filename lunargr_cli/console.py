@@ -22,6 +22,7 @@ from lunargr_cli.progress import Pace, bar_line, progress_words
 from lunargr_cli.spelling import spell
 from schemas.errors import InputError
 
+_BEGAN = time.monotonic()
 LIBRARIES = "LUNARGR_LIBRARY_MESSAGES"  # set: what libraries print on standard error is let through
 # Control codes, marks that turn the direction of writing, halves of surrogate pairs, line separators.
 _STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
@@ -68,6 +69,18 @@ def flush_out() -> None:
 def say_error(message: str) -> None:
     """One line on standard error."""
     print(f"lunargr: {harmless(' '.join(message.split()))}", file=sys.stderr)
+
+
+def say_effort() -> None:
+    """Time and memory of this process and the parts that it had done, on standard error."""
+    import resource
+
+    own, parts = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    processor = sum(r.ru_utime + r.ru_stime for r in (own, parts))
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes
+    memory = max(own.ru_maxrss, parts.ru_maxrss) * unit / 1e6
+    started = time.monotonic() - _BEGAN
+    print(f"lunargr: {started:.1f} s, {processor:.1f} s of processor time, at most {memory:,.0f} MB", file=sys.stderr)
 
 
 @dataclass
@@ -140,11 +153,11 @@ class Console:
             self._bar = False
 
 
-def own_streams() -> None:
+def own_streams(verbose: bool = False) -> None:
     """Standard output and error for our lines alone, also where the shell closed them.
 
     PROJ, libtiff, HDF5 and others print on the error stream from C, Python's libraries by warnings and loggers. What they
-    have to say to a user our own line says; LUNARGR_LIBRARY_MESSAGES=1 lets them speak.
+    have to say to a user our own line says; -v and LUNARGR_LIBRARY_MESSAGES=1 let them speak.
     """
     for number in (0, 1, 2):  # else the first file that is opened gets the place of a closed stream
         try:
@@ -156,7 +169,9 @@ def own_streams() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
-    if os.environ.get(LIBRARIES) or sys.stderr is not sys.__stderr__:  # a caller's own streams are left alone
+    if (
+        verbose or os.environ.get(LIBRARIES) or sys.stderr is not sys.__stderr__
+    ):  # a caller's own streams are left alone
         return
     if not sys.warnoptions:
         warnings.simplefilter("ignore")

@@ -40,12 +40,12 @@ from stages.diagnose.likelihood.left import budget, peak
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import better_form, relative_misfit
 from stages.diagnose.model.nominal import fit, lit_mask, load_nominal
-from stages.diagnose.model.sites import Site, group_pairs, load_site, survey
+from stages.diagnose.model.sites import Site, group_pairs, load_site, number_grounds, survey
 from stages.diagnose.registration.explain import explain
 from stages.diagnose.result.answer import Answer
 from stages.diagnose.result.files import write_diagnosis
 from stages.diagnose.result.named import by_histogram, by_registration, by_search
-from stages.diagnose.result.score import blind_effects, score
+from stages.diagnose.result.score import blind_effects, displacements, score
 from stages.diagnose.search.select import Outcome, search
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import LINE, MISFIT
@@ -114,6 +114,9 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     nominal = load_nominal(checkpoint, config.model, reader.units, config.free)
     train, test = split(reader)
     sites = _load(reader, train, config)
+    hidden = _load(reader, test, dataclasses.replace(config, most_sites=64))
+    number_grounds(sites)
+    number_grounds(hidden)
     answer = Answer("cannot_tell", config={**dataclasses.asdict(config), "checkpoint": str(checkpoint or "")})
     answer.pairs, answer.sites = sum(s.count for s in sites), len(sites)
     answer.images = len({int(f) for s in sites for f in s.frames})
@@ -129,7 +132,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         fit(nominal, sites, [], units, [s.read for s in sites])
     data = survey(sites, frames, units)
     state = State(
-        nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, say=say, progress=progress
+        nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, hidden, say=say, progress=progress
     )
     state.reference = copy.copy(nominal)
     before = _residual(state)
@@ -141,6 +144,8 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     if state.registration.form.name != "none":
         for site, known in zip(sites, state.registration.known, strict=True):
             site.displacement = known
+        for site, found in zip(hidden, displacements(state, [])[1], strict=True):
+            site.displacement = found
     state.fit()
     misfit = relative_misfit(nominal, sites, varied=units == "dn", whole=True) * (0.5 if units == "dn" else 1.0)
     if not misfit < MISFIT:
@@ -152,8 +157,9 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         return Result(answer, state, None)
     progress(2, 5, "search")
     outcome = search(state, config.most_causes)
-    answer.causes = by_registration(state) + by_search(state) + [c for c in [cut(data, state) if cut else None] if c]
-    answer.rejected = outcome.rejected
+    placed, refused = by_registration(state)
+    answer.causes = placed + by_search(state) + [c for c in [cut(data, state) if cut else None] if c]
+    answer.rejected = refused | outcome.rejected
     if state.registration is not None:
         answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}
     view = outcome.view
@@ -171,8 +177,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)
     else:
         answer.verdict = "cannot_tell" if answer.blind else "nothing_significant"
-    hidden = _load(reader, test, dataclasses.replace(config, most_sites=64))
-    answer.held_out = score(state, hidden, answer)
+    answer.held_out = score(state, answer)
     return Result(answer, state, outcome)
 
 

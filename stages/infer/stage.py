@@ -41,7 +41,7 @@ from stages.network.cpu.mapper import Mapper
 from stages.network.predictor import choose_device, load_predictor
 from stages.network.runtime import choose_inference_precision
 from stages.pairs.holes import fill_holes
-from stages.physics.maps.geotiff import EVEN, MapTiff, band_names
+from stages.physics.maps.geotiff import EVEN, MapTiff, band_names, map_tags
 from stages.physics.maps.grid import check_same_body, read_grid
 
 QUANTITY = "radiance factor I/F = pi r, including cos(incidence)"
@@ -109,7 +109,9 @@ def run(
             if config.geotiff and config.shard[1] == 1:
                 stack.enter_context(companions_of(output.file))
                 partial = stack.enter_context(atomic_path(output.geotiff_path))
-                picture = stack.enter_context(MapTiff(partial, grid, band_names(names, maps), attributes))
+                bands = band_names(names, maps)
+                tags = map_tags(bands, writer.file.attrs)
+                picture = stack.enter_context(MapTiff(partial, grid, bands, tags, ["1"] * len(bands)))
             windows = _predict(file, writer, picture, mapper, config, progress)
             share, ranges = _statistics(writer.file, names)
     return Summary(grid, predictor.model.name, share, windows, ranges)

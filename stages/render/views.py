@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import ConfigError, GeometryError
+from schemas.errors import ConfigError, GeometryError, LunargrError
 from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import find_body
@@ -83,8 +83,8 @@ def run_trajectory(
                         surface, camera, light, relief, outputs[view.view_id], own, view.view_id, show_nothing
                     )
                 )
-            except GeometryError as error:
-                raise GeometryError(f"{table.name}, {view.view_id}: {error}") from None
+            except LunargrError as error:
+                raise type(error)(f"{table.name}, {view.view_id}: {error}") from None
         if config.export is not None:
             cameras = [cast(Pinhole, find_camera(surface, _with_row(config, view))) for view in views]
             found = [View(v.view_id, c, outputs[v.view_id][0]) for v, c in zip(views, cameras, strict=True)]

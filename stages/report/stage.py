@@ -17,6 +17,8 @@ from schemas.files.outputs import Output
 from schemas.files.user_files import check_file, read_json
 from stages.common import page
 from stages.common.page import pictures
+from stages.common.page.diagnosis import conclusions as diagnosed
+from stages.common.page.sentences import Sentence
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.report import conclusions, maps, results, sections
 from stages.report.config import Config
@@ -64,7 +66,7 @@ def run(
     if not files:
         raise ConfigError("report: expected at least one file, found none; give the artefacts of a run.")
     check_output(output.file, files, output.overwrite)
-    found: list[tuple[str, page.Section, list[conclusions.Sentence]]] = []
+    found: list[tuple[str, page.Section, list[Sentence]]] = []
     shown: list[Path] = []
     linked: list[Path] = []
     details: list[Markup] = []
@@ -105,7 +107,7 @@ def run(
     return [s.title for s in chapters]
 
 
-Part = tuple[str, page.Section, list[conclusions.Sentence]]  # kind, section, what it says on the first screen
+Part = tuple[str, page.Section, list[Sentence]]  # kind, section, what it says on the first screen
 
 
 def _head(found: Sequence[Part], linked: Sequence[Path], output: Path) -> list[Markup]:
@@ -156,7 +158,7 @@ def _result(result: dict[str, Any], file: Any) -> Part | None:
     if {"models", "differences"} <= keys:
         return "compare", results.comparison(result), []
     if "verdict" in keys:
-        return "diagnosis", diagnosis(result), conclusions.diagnosis(result)
+        return "diagnosis", diagnosis(result), diagnosed(result)
     if {"models", "gains", "claim"} <= keys:
         return "held_out", held_out_images(result), conclusions.held_out_images(result)
     if {"models", "gains"} <= keys:
