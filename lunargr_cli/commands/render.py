@@ -118,6 +118,16 @@ def command(
         Path | None, typer.Option(metavar="FILE", help="diagnosis.h5: add the effects that 'lunargr diagnose' found.")
     ] = None,
     shadows: Annotated[bool, typer.Option("--shadows/--no-shadows", help="Cast shadows, with the Sun's disc.")] = True,
+    bounce: Annotated[
+        bool, typer.Option("--bounce", help="Light that sunlit slopes throw on other terrain, into shadows too.")
+    ] = False,
+    earthshine: Annotated[
+        bool, typer.Option("--earthshine", help="The Earth's light, from where it stands at --time or ...")
+    ] = False,
+    earth_azimuth: Annotated[
+        float | None, typer.Option(metavar="DEG", help="... over the map's middle: clockwise from north ...")
+    ] = None,
+    earth_elevation: Annotated[float | None, typer.Option(metavar="DEG", help="... and above the horizon.")] = None,
     backplanes: Annotated[
         bool, typer.Option("--backplanes", help="Ortho: put the backplanes into the GeoTIFF, too.")
     ] = False,
@@ -168,6 +178,10 @@ def command(
         camera=str(camera) if camera else None,
         samples=samples,
         shadows=shadows,
+        bounce=bounce,
+        earthshine=earthshine,
+        earth_azimuth_deg=earth_azimuth,
+        earth_elevation_deg=earth_elevation,
         model=model,
         parameters=given,
         terrain_only=dem is not None,

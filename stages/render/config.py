@@ -34,6 +34,8 @@ class Config:
     samples : rays per pixel and axis (None: as many as the pixel's footprint asks for)
     model, parameters : a reflectance that is the same everywhere, where the source holds none
     export : with a trajectory: also a data set of its views, colmap or nerfstudio; png_only : no EXR; shard : every n-th view
+    bounce : light that sunlit terrain throws on other terrain, once, between diffuse facets
+    earthshine : the Earth's light, from its place at ``time``, or at an azimuth and elevation over the map's middle
     terrain_only : of svbrdf.h5 use the terrain, with ``model``
     """
 
@@ -53,6 +55,10 @@ class Config:
     camera: str | None = None
     samples: int | None = None
     shadows: bool = True
+    bounce: bool = False
+    earthshine: bool = False
+    earth_azimuth_deg: float | None = None
+    earth_elevation_deg: float | None = None
     model: str | None = None
     parameters: Mapping[str, float] = field(default_factory=dict)
     terrain_only: bool = False
@@ -135,6 +141,9 @@ def check(config: Config, trajectory: bool = False) -> None:
         raise ConfigError(
             f"--size: expected a view of at most {LARGEST_VIEW:,} pixels, found {config.size_px[0]} x {config.size_px[1]}."
         )
+    angles = (config.earth_azimuth_deg, config.earth_elevation_deg)
+    if any(v is not None for v in angles) and (None in angles or not config.earthshine):
+        raise ConfigError("the Earth: expected --earthshine with both --earth-azimuth and --earth-elevation.")
     if config.export is not None and not trajectory:
         raise ConfigError("--export: expected together with --trajectory; a single view makes no data set.")
     if config.export not in (None, *EXPORTS):

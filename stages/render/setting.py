@@ -11,16 +11,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import ConfigError
+from schemas.errors import ConfigError, GeometryError
 from schemas.provenance import raster_record
 from stages.physics.bodies.spheres import Body
 from stages.physics.cameras import Camera
 from stages.physics.images.frame_geometry import open_camera_for
 from stages.physics.images.table import ASTRONOMICAL_UNIT
+from stages.physics.light.earth import EARTH_DISTANCE
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import check_same_body
+from stages.physics.terrain.further_light import Bounce, Earthshine, Hidden, Horizon
 from stages.physics.terrain.shading import Light
-from stages.physics.terrain.sun import Sun, check_sun_is_up, find_sun
+from stages.physics.terrain.sun import Sun, check_sun_is_up, elevation_range, find_sun, place_over
 from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface, open_surface, open_terrain
 from stages.render.config import LARGEST_VIEW, SUN, Config, inputs
@@ -46,8 +48,14 @@ def make_light(
     else:
         sun = _named_sun(surface, config, body)
     span = relief[1] - relief[0]
-    check_sun_is_up(sun, surface.grid, span)
-    horizon = SunHorizon(surface.elevation, surface.grid, sun, span) if config.shadows else None
+    earthshine = _earthshine(surface, config, body, sun, span) if config.earthshine else None
+    horizon: Horizon | None = None
+    if earthshine is not None and elevation_range(sun, surface.grid)[1] < 0:
+        horizon = Hidden()  # by night the Earth shines alone
+    else:
+        check_sun_is_up(sun, surface.grid, span)
+        horizon = SunHorizon(surface.elevation, surface.grid, sun, span) if config.shadows else None
+    bounce = Bounce(surface, sun, horizon) if config.bounce else None
     extensions: list = []
     if config.extension:
         from stages.effects import load_extension
@@ -57,7 +65,29 @@ def make_light(
     position = None
     if config.position is not None:
         position = place(*_three(config.position, "--position"), surface.grid.radius)
-    return Light(sun, horizon, position, extensions)
+    return Light(sun, horizon, position, extensions, earthshine, bounce)
+
+
+def _earthshine(surface: Surface, config: Config, body: Body, sun: Sun, relief: float) -> Earthshine:
+    """The Earth's light over a surface of the Moon. Raises LunargrError."""
+    if body.name != "moon":
+        raise ConfigError(f"--earthshine: expected the Moon, which alone the Earth lights, found --body {body.name}.")
+    grid = surface.grid
+    if config.earth_azimuth_deg is not None and config.earth_elevation_deg is not None:
+        if not -90.0 <= config.earth_elevation_deg <= 90.0:
+            raise GeometryError(
+                f"--earth-elevation: expected degrees in -90..90, found {config.earth_elevation_deg:g}."
+            )
+        position = place_over(grid, config.earth_azimuth_deg, config.earth_elevation_deg, EARTH_DISTANCE)
+    elif config.time is not None:
+        from stages.physics.bodies.ephemeris import earth_position
+
+        position = earth_position(config.time)
+    else:
+        raise ConfigError("--earthshine: expected --time, or --earth-azimuth and --earth-elevation; found neither.")
+    found = Earthshine.over(surface, sun, position, relief, config.shadows)
+    check_sun_is_up(found.disc, grid, relief, "Earth")
+    return found
 
 
 def _named_sun(surface: Surface, config: Config, body: Body) -> Sun:

@@ -131,6 +131,16 @@ class Surface:
             return self.coefficients[:, *part]
         return np.concatenate([self.coefficients[:, *part], self.albedo[part][None]])
 
+    def read_padded(self, row: int, col: int, height: int, width: int, margin: int) -> Floats32:
+        """(height + 2 margin, width + 2 margin) elevations, m, NaN outside the map."""
+        result = np.full((height + 2 * margin, width + 2 * margin), np.nan, np.float32)
+        top, left = max(0, row - margin), max(0, col - margin)
+        bottom = min(self.grid.height, row + height + margin)
+        right = min(self.grid.width, col + width + margin)
+        inner = np.s_[top - row + margin : bottom - row + margin, left - col + margin : right - col + margin]
+        result[inner] = self.elevation[top:bottom, left:right]
+        return result
+
     def height_range(self) -> tuple[float, float]:
         """Lowest and highest elevation, m, by one pass over the DEM. Raises InputError where there is none."""
         low, high = np.inf, -np.inf
