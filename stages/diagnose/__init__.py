@@ -87,7 +87,7 @@ def run(
     if config.most_causes < 1 or config.most_pairs < 1 or config.most_images < 1:
         raise ConfigError("diagnose: expected counts of at least 1 for causes, images and pairs.")
     inputs = [p for p in (pairs, checkpoint) if p is not None]
-    named = ((output.path, "--output"), (output.json, "--json"), (output.report, "--report"))
+    named = ((output.path, "output"), (output.json, "json"), (output.report, "report"))
     check_outputs([Target(path, option) for path, option in named if path is not None], inputs, output.overwrite)
     with PairReader(pairs) as reader:
         result = diagnose(reader, checkpoint, config, say, progress)
