@@ -6,6 +6,7 @@ import dataclasses
 import importlib
 import inspect
 import pkgutil
+from typing import get_type_hints
 
 import pytest
 
@@ -26,15 +27,15 @@ WRITTEN = {
     "widths": dashed, "dropout": dashed, "shard": lambda shard: None if shard == parse_shard(None) else shard,
     "maps": lambda names: None if names == read_names(None) else names, "only": lambda rows: None if rows == () else rows,
     "leave_out": lambda names: None if names == () else names, "free": ",".join,
-    "size_px": lambda size: ",".join(map(str, size)), "parameters": lambda values: None if not values else values,
+    "size_px": lambda size: ",".join(map(str, size)), "parameters": lambda values: values or None,
 }  # fmt: skip
 # Of the same name, but not the setting: where the GeoTIFF goes, not whether; left away for the stage's own choice.
-OTHERS = {("infer", "geotiff"), ("albedo", "geotiff"), ("infer", "body"), ("match", "matchers")}
+OTHERS = {("infer", "geotiff"), ("albedo", "geotiff"), ("match", "matchers")}
 # What commands have beside settings.
 BESIDE = {
     "output", "overwrite", "resume", "quiet", "json_file", "figures", "report", "scheduler", "parts", "no_geotiff", "models",
     "seeds", "held_out_images", "list_effects", "blocks_csv", "dem", "trajectory", "stereo", "altitude", "convergence", "pairs",
-    "images", "seed", "checkpoint", "source", "split",
+    "images", "seed", "checkpoint", "source", "split", "body",
 }  # fmt: skip
 
 
@@ -77,15 +78,9 @@ def test_defaults_are_not_written_down_a_second_time(name):
 def test_simulate_shows_the_defaults_of_its_recipe():
     from stages.simulate import Config
 
-    text = inspect.getdoc(MODULES["simulate"].command) and str(inspect.signature(MODULES["simulate"].command))
-    assert text
-    shown = {
-        name: hint.__metadata__[0].help
-        for name, hint in __import__("typing").get_type_hints(MODULES["simulate"].command, include_extras=True).items()
-        if hasattr(hint, "__metadata__")
-    }
+    hints = get_type_hints(MODULES["simulate"].command, include_extras=True)
     for name in ("size_px", "images", "units", "seed"):
-        assert f"[default: {getattr(Config, name)}]" in shown[name]
+        assert f"[default: {getattr(Config, name)}]" in hints[name].__metadata__[0].help
 
 
 def test_settings_are_spelled_as_the_options_of_the_command_that_runs():
