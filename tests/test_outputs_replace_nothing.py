@@ -187,9 +187,9 @@ def test_an_output_that_nobody_marked_cannot_replace_anything(tmp_path):
     def command(source: Path, result: Path, output: cli.Path) -> None:
         write_json(result, 1)
 
-    from lunargr_cli.options import Output
+    from lunargr_cli.options import OutputFile
 
-    command.__annotations__ = {"source": Path, "result": Path, "output": Output}
+    command.__annotations__ = {"source": Path, "result": Path, "output": OutputFile}
     result = tmp_path / "result.json"
     result.write_text("kept")
     arguments = {"source": tmp_path / "source", "result": result, "output": tmp_path / "o"}
