@@ -9,6 +9,7 @@ import pytest
 from relief import hills, metric_grid
 from render_scene import LAT, LON, lunargr_render, write_dem
 
+from schemas.files.outputs import Output
 from stages import render
 from stages.physics.bodies.ephemeris import earth_position
 from stages.physics.horizon import make_overview
@@ -42,7 +43,8 @@ def added(source, folder, more, **config):
     """What ``more`` adds to the image of the same view without it, and that view's channels."""
     images = []
     for name, extra in (("plain", {}), ("more", more)):
-        render.run(source, folder / f"{name}.exr", render.Config(**SUN, **LAMBERT, **config, **extra), overwrite=True)
+        output = Output(folder / f"{name}.exr", overwrite=True)
+        render.run(source, output, render.Config(**SUN, **LAMBERT, **config, **extra))
         images.append(read_exr(folder / f"{name}.exr"))
     return images[1]["image"] - images[0]["image"], images[1]
 
