@@ -186,11 +186,11 @@ def test_windows_cover_every_pixel_once_blended():
 def test_wrong_inputs_are_refused(small_files, small_artefacts, checkpoint, tmp_path):
     coarse = tmp_path / "coarse.h5"
     ingest.run(small_files.dem, None, coarse, ingest.Config(gsd=60))
-    with pytest.raises(ConfigError, match="--any-gsd"):
+    with pytest.raises(ConfigError, match="`any_gsd`"):
         infer.run(coarse, checkpoint, tmp_path / "m.h5", infer.Config(**FULL))
     with pytest.raises(ArtefactError, match="expected a 'checkpoint'"):
         infer.run(small_artefacts["scene"], small_artefacts["pairs"], tmp_path / "m.h5", infer.Config(**FULL))
-    with pytest.raises(ConfigError, match="--stride"):
+    with pytest.raises(ConfigError, match="`stride`"):
         infer.run(small_artefacts["scene"], checkpoint, tmp_path / "m.h5", infer.Config(window=64, stride=65, **FULL))
     assert not (tmp_path / "m.h5").exists()
 
