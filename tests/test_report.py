@@ -174,7 +174,7 @@ def test_numbers_are_those_of_the_files(page, folder):
     assert f"{gain:+.1f}" in text
     matching = json.loads((folder / "match.json").read_text())["matchers"]["sift"]["learned"]
     assert f"{matching['within_3_px_percent']:.1f}" in text
-    assert "sun elevation" in text and "1.25 +- 0.1 degree" in text and "earthshine" in text
+    assert "sun elevation" in text and "1.25\u00a0+-\u00a00.1\u00a0degree" in text and "earthshine" in text
 
 
 def test_text_of_the_user_is_escaped(page):
