@@ -10,7 +10,6 @@ import datetime
 import hashlib
 import json
 import os
-import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -224,25 +223,6 @@ def _read_sidecar(path: Path) -> dict[str, Any] | None:
 
 def _now() -> str:
     return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-def whole_command(command: str, output: Path) -> str:
-    """What one run would have been called with, from a shard's command line: no --shard, and the whole's name."""
-    words, kept, named, skip = shlex.split(command), [], False, False
-    for word in words:
-        name, equals, _ = word.partition("=")
-        if skip:
-            skip = False
-        elif name == "--shard":
-            skip = not equals
-        elif name in ("-o", "--output"):
-            kept += ["-o", str(output)]
-            skip, named = not equals, True
-        else:
-            kept.append(word)
-    if words and not named:
-        kept += ["-o", str(output)]
-    return shlex.join(kept)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ Bands are known by their descriptions, never by their position: programs order t
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -16,14 +16,15 @@ from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
 from schemas import ConfigError, InputError, atomic_path, check_output
+from schemas.files.outputs import Output
 from schemas.provenance import raster_record
 from schemas.rasters import TIFF_TAG
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.maps.geotiff import BLOCK, EVEN, MapTiff
 from stages.physics.maps.rasters import open_raster, read_window
 from stages.physics.photometry.conventions import Convention, convert_maps, get_convention, model_difference
 
 BLOCK_VALUES = 1 << 23  # values of all bands held at a time, in float64: 64 MB
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass
@@ -50,21 +51,26 @@ class Report:
 
 
 def run(
-    source: Path, output: Path, config: Config, overwrite: bool = False, progress: Progress | None = None
+    source: Path,
+    output: Output | Path,
+    config: Config,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Report:
     """Convert the coefficient maps of ``source`` into ``output``, a float32 GeoTIFF on the same grid, NaN as nodata.
 
     Raises InputError for a file without the needed bands, ConfigError for conventions that have no conversion or would
     lose something, RegistryError for an unknown convention.
     """
+    output = Output.of(output)
     start, end = get_convention(config.source), get_convention(config.target)
     model_difference(start, end)
-    check_output(output, [source], overwrite)
+    check_output(output.file, [source], output.overwrite)
     losses: dict[str, str] = {}
     valid = 0
     with open_raster(source, "a GeoTIFF of coefficient maps") as data:
         indices = band_indices(data, start, config.bands)
-        with atomic_path(output) as partial, warnings.catch_warnings():
+        with atomic_path(output.file) as partial, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             tags = {"CONVENTION": end.name, "RETURNS": end.returns, "CONVERTED_FROM": start.name}
             tags[TIFF_TAG] = raster_record("convert", asdict(config), [source])
@@ -77,8 +83,7 @@ def run(
                     stack = np.stack([np.broadcast_to(v, maps[start.names[0]].shape) for v in result.values()])
                     valid += int(np.isfinite(stack).all(axis=0).sum())
                     target.put(int(window.row_off), 0, stack.astype(np.float32))
-                    if progress is not None:
-                        progress(int(window.row_off + window.height), data.height, "convert")
+                    progress(int(window.row_off + window.height), data.height, "convert")
     return Report(end, list(losses.values()), valid)
 
 

@@ -14,8 +14,11 @@ import torch
 from evaluation_scene import KnowsTheTruth, make_scene, write_pairs
 
 from stages import train
+from stages.evaluate.comparison import Task, evaluate_pairs
+from stages.evaluate.config import Config
 from stages.evaluate.renderers import read_batch
-from stages.evaluate.run import Config, Task, evaluate_pairs
+from stages.train.epoch import evaluate_loss, learn_epoch
+from stages.train.training import set_up
 
 GAINS = np.array([900.0, 1400.0])  # DN per I/F of the two images
 SMALL = {"model": "M2", "widths": (4, 8), "batch": 8, "device": "cpu", "precision": "fp32", "maps": ("a",)}
@@ -97,10 +100,10 @@ def test_validation_runs_without_dropout_and_leaves_the_network_as_it_is(tmp_pat
     pairs = write_pairs(tmp_path / "pairs.h5", pairs_of(), units="dn")
     config = train.Config(**SMALL, dropout=(0.5,), epochs=1)
     with train.PairReader(pairs) as reader:
-        training = train._set_up(reader, config, [], torch.device("cpu"), 0, 1)
-        train.learn_epoch(training, reader.indices("train"), config, 0)
+        training = set_up(reader, config, [], torch.device("cpu"), 0, 1)
+        learn_epoch(training, reader.indices("train"), config, 0)
         before = {k: v.clone() for k, v in training.predictor.state_dict().items()}
-        first, again = (train.evaluate_loss(training, reader.indices("validation"), 4) for _ in range(2))
+        first, again = (evaluate_loss(training, reader.indices("validation"), 4) for _ in range(2))
         assert first == again and math.isfinite(first)
         for key, value in training.predictor.state_dict().items():
             torch.testing.assert_close(value, before[key], rtol=0, atol=0, msg=key)

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from lunargr_cli.main import app
 from schemas import ConfigError, InputError, RegistryError
+from schemas.files.outputs import Output
 from stages import convert
 from stages.physics.photometry import evaluate, get_model, model_names
 from stages.physics.photometry.conventions import conventions, convert_maps, get_convention
@@ -169,13 +170,13 @@ def test_convert_never_touches_its_input_or_an_existing_file(sato, tmp_path):
     source, _ = sato
     config = convert.Config("sato:Hapke", "lunargr:hapke")
     with pytest.raises(ConfigError, match="would replace the input"):
-        convert.run(source, source, config, overwrite=True)
+        convert.run(source, Output(source, overwrite=True), config)
     other = tmp_path / "other.tif"
     other.write_text("mine")
     with pytest.raises(ConfigError, match="exists already"):
         convert.run(source, other, config)
     assert other.read_text() == "mine"
-    convert.run(source, other, config, overwrite=True)
+    convert.run(source, Output(other, overwrite=True), config)
     with pytest.raises(ConfigError, match="cannot hold all"):
         convert.run(source, tmp_path / "asp.tif", convert.Config("sato:Hapke", "asp:Hapke"))
     assert not list(tmp_path.glob("*asp*"))

@@ -130,7 +130,7 @@ def camera_place(camera: Camera) -> NDArray[np.float64]:
 
 def metadata(surface: Surface, config: Config, light: Light) -> dict[str, object]:
     """What a file must say about how it came to be."""
-    told = {k: v for k, v in asdict(config).items() if v not in (None, {}, False)}
+    told = {k: v for k, v in asdict(config).items() if v not in (None, {}, False) and k != "shard"}
     return {
         "source": surface.path.name,
         "model": surface.model.name,
