@@ -36,10 +36,17 @@ pair = pairs.isel(pair=0)
 east, north, up = pair.sun_direction_enu.values
 azimuth, elevation = np.degrees([np.arctan2(east, north), np.arcsin(up)])
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.4), layout="constrained")
-pair.elevation.plot.imshow(ax=axes[0], cmap="cividis", origin="upper")
-pair.image.where(pair.valid == 1).plot.imshow(ax=axes[1], cmap="gray", origin="upper")
-pair.sun_horizon_deg.plot.imshow(ax=axes[2], cmap="magma", origin="upper")
-for axis, title in zip(axes, ("elevation", "image", "horizon towards the Sun"), strict=True):
+shown = (
+    (pair.elevation, "elevation, m", {"cmap": "cividis"}),
+    (
+        pair.image.where(pair.valid == 1),
+        "image, I/F" if pair.image.units == "1" else "image, DN",
+        {"cmap": "gray", "vmin": 0, "robust": True},
+    ),
+    (pair.sun_horizon_deg, "horizon towards the Sun, deg", {"cmap": "magma"}),
+)
+for axis, (data, title, look) in zip(axes, shown, strict=True):
+    data.plot.imshow(ax=axis, origin="upper", cbar_kwargs={"label": "", "shrink": 0.8}, **look)
     axis.set(title=title, xlabel="", ylabel="", aspect="equal")
 print(f"the Sun stands {elevation:.1f} deg high, {azimuth % 360:.1f} deg clockwise from north")
 
@@ -62,10 +69,12 @@ print("coefficients:", ", ".join(maps.coefficient.values))
 # %%
 name = str(maps.map_name.values[0])
 figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-maps.coefficients.sel(coefficient=name).plot.imshow(ax=axes[0], robust=True)
-maps.coefficients_std.sel(map=name).plot.imshow(ax=axes[1], robust=True, cmap="magma")
-axes[0].set(title=f"{name}, {dict((p.name, p.description) for p in model.parameters)[name]}", aspect="equal")
-axes[1].set(title="its standard deviation", aspect="equal")
+means = {p.name: p.description for p in model.parameters}
+bar = {"label": "", "shrink": 0.8}
+maps.coefficients.sel(coefficient=name).plot.imshow(ax=axes[0], robust=True, cbar_kwargs=bar)
+maps.coefficients_std.sel(map=name).plot.imshow(ax=axes[1], robust=True, cmap="magma", cbar_kwargs=bar)
+for axis, title in zip(axes, (f"{name}, {means[name]}", "its standard deviation"), strict=True):
+    axis.set(title=title, xlabel="grid easting, m", ylabel="grid northing, m", aspect="equal")
 
 # %% [markdown]
 # ## Another Sun
@@ -85,8 +94,8 @@ def relight(maps, azimuth_deg, elevation_deg):
     incidence = np.arccos(np.clip(np.tensordot(sun, normal, 1), -1, 1))
     coefficients = {str(n): maps.coefficients.sel(coefficient=n).values.astype(float) for n in maps.coefficient.values}
     iof = evaluate(maps.attrs["model"], coefficients, incidence, np.arccos(normal[2]), np.pi / 2 - elevation)
-    known = np.isfinite(heights)
-    ground = np.where(known, heights, np.nanmin(heights)).astype(np.float32)
+    known = np.isfinite(incidence)  # not beside holes, where there is no slope
+    ground = np.where(np.isfinite(heights), heights, np.nanmin(heights)).astype(np.float32)
     shadow = cast_shadow(ground, gsd, azimuth, elevation) | (incidence > np.pi / 2)
     iof = np.where(known, np.where(shadow, 0.0, np.maximum(iof, 0.0)), np.nan)
     return maps.elevation.copy(data=iof).rename("I/F").assign_attrs(units="1", long_name="I/F")
@@ -96,8 +105,10 @@ suns = [(270, 25), (90, 25), (180, 60)]
 figure, axes = plt.subplots(1, 3, figsize=(12, 4), layout="constrained")
 for axis, (azimuth, elevation) in zip(axes, suns, strict=True):
     lit = relight(maps, azimuth, elevation)
-    lit.plot.imshow(ax=axis, cmap="gray", vmin=0, vmax=float(lit.quantile(0.995)))
-    axis.set(title=f"Sun at azimuth {azimuth}, {elevation} deg high", aspect="equal")
+    lit.plot.imshow(ax=axis, cmap="gray", vmin=0, vmax=0.1, add_colorbar=False)
+    axis.set(
+        title=f"azimuth {azimuth}, {elevation} deg high", xlabel="", ylabel="", xticks=[], yticks=[], aspect="equal"
+    )
 
 # %% [markdown]
 # ## The same by the command
