@@ -163,14 +163,13 @@ def run(
             began = time.monotonic()
             train_loss = learn_epoch(training, train, config, epoch, progress)
             training_seconds = time.monotonic() - began
-            validation_loss = evaluate_loss(training, validation, config.batch)
+            validation_loss, objective = evaluate_loss(training, validation, config.batch, config.brightness)
             history.train_loss.append(train_loss)
             history.validation_loss.append(validation_loss)
+            # chosen by what is minimised: the level of a few crops of validation ground would choose by chance
+            history.objective.append(objective if math.isfinite(objective) else train_loss)
             history.epoch_seconds.append(time.monotonic() - began)
-            criteria = [
-                v if math.isfinite(v) else t for v, t in zip(history.validation_loss, history.train_loss, strict=True)
-            ]
-            if criteria[-1] <= min(criteria):
+            if history.objective[-1] <= min(history.objective):
                 history.best_epoch = epoch
                 best = snapshot(training.predictor, training.radiometry)
             if rank == 0:
@@ -282,16 +281,22 @@ def _errors(training: Training, batch: Batch, brightness: float, keys: Tensor | 
 
 
 @torch.no_grad()
-def evaluate_loss(training: Training, indices: NDArray[np.int64], batch_size: int) -> float:
-    """Mean squared error over the valid pixels of some pairs, in evaluation mode; NaN where there are none."""
+def evaluate_loss(
+    training: Training, indices: NDArray[np.int64], batch_size: int, brightness: float = 1.0
+) -> tuple[float, float]:
+    """Mean squared error and mean of what is minimised over the valid pixels of some pairs, in evaluation mode; NaN where
+    there are none."""
     training.predictor.eval()
-    total, pixels = 0.0, 0.0
+    totals, pixels = [0.0, 0.0], 0.0
     mine = indices[training.rank :: training.ranks]
     steps = [(mine[k : k + batch_size], None) for k in range(0, len(mine), batch_size)]
     for batch in prefetch(training.reader, steps, training.device):
-        _, error = _errors(training, batch, brightness=1.0)
-        total, pixels = total + float(error), pixels + float(batch.valid.sum())
-    return mean_over_ranks(total, pixels, training.ranks, training.device)
+        objective, error = _errors(training, batch, brightness)
+        totals[0] += float(error)
+        totals[1] += float(objective)
+        pixels += float(batch.valid.sum())
+    means = [mean_over_ranks(total, pixels, training.ranks, training.device) for total in totals]
+    return means[0], means[1]
 
 
 def check(config: Config) -> None:

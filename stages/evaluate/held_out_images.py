@@ -31,7 +31,7 @@ from stages.physics.formation.chain import form, illuminate
 from stages.physics.formation.radiometry import crop_range, match_crops
 from stages.physics.maps.grid import unit_vectors
 from stages.physics.photometry import get_model
-from stages.physics.terrain.surface import AlbedoError
+from stages.physics.terrain.surface import SHADOWED, AlbedoError
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
@@ -219,9 +219,13 @@ def _intervals(reader: PairReader, one: Map, k: int, rendered: NDArray) -> tuple
     """Half-widths (h, w), I/F, of the 68 and 95 % intervals of an unseen image about ``rendered``; incidence (h, w), rad."""
     row, col = int(reader.file["row"][k]), int(reader.file["col"][k])
     height, width = reader.size
-    cosine = illuminate(reader.observation([k])).angles.cos_incidence[0].numpy()
-    relative = one.error.relative(row - height // 2, col - width // 2, height, width, cosine)
-    return [r * np.abs(rendered) for r in relative], np.arccos(np.clip(cosine, -1.0, 1.0))
+    state = illuminate(reader.observation([k]))
+    cosine = state.angles.cos_incidence[0].numpy()
+    visible = np.ones_like(cosine) if state.sun_visibility is None else state.sun_visibility[0].numpy()
+    shadow = np.where(cosine > 0, 1 - visible, 1) > SHADOWED
+    sine = max(0.0, float(reader.file["sun_direction_enu"][k][2]))
+    widths = one.error.half_widths(row - height // 2, col - width // 2, rendered, cosine, shadow, sine)
+    return widths, np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
 def _image_scales(reader: PairReader, one: Map, frame: int) -> list[tuple[float, float]]:

@@ -16,7 +16,7 @@ from stages.physics.photometry.deviation import radiance_deviation
 from stages.physics.terrain.ground import BlockGeometry, block_geometry
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.sun_visibility import SunHorizon, visible_share
-from stages.physics.terrain.surface import Surface
+from stages.physics.terrain.surface import SHADOWED, Surface
 
 Floats32 = NDArray[np.float32]
 BACKPLANES = (
@@ -84,15 +84,18 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
         unknown = np.isnan(geometry.cos_incidence) | ~np.isfinite(coefficients.numpy()).all(axis=0)
         image[unknown] = np.nan
         clipped[unknown] = 0
+    shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
+    shadow[np.isnan(geometry.cos_incidence)] = np.nan
     deviation = {}
     if surface.albedo_error is not None:
         # photographs have corrected the coefficients' errors: those of the albedo stand in their place
-        inner, _ = surface.albedo_error.relative(row, col, height, width, geometry.cos_incidence)
-        deviation = {"image_std": inner * image}
+        inner, _ = surface.albedo_error.half_widths(
+            row, col, image, geometry.cos_incidence, shadow > SHADOWED, np.clip(geometry.sun[2], 0.0, 1.0)
+        )
+        inner[np.isnan(image)] = np.nan
+        deviation = {"image_std": inner}
     elif surface.deviations is not None:
         deviation = _image_deviation(surface, geometry, visible, row, col)
-    shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
-    shadow[np.isnan(geometry.cos_incidence)] = np.nan
     return {
         "image": image,
         "clipped": clipped,
