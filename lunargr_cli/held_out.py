@@ -17,7 +17,8 @@ def show_held_out_images(
     overwrite: bool,
 ) -> None:
     """Score maps with albedo on images that did not make it. how : split, seed. Raises LunargrError."""
-    from stages.evaluate.held_out_images import Config, coverage_lines, image_lines, result_lines, run
+    from stages.evaluate.coverage import coverage_lines
+    from stages.evaluate.held_out_images import Config, image_lines, result_lines, run
 
     result = run(pairs, maps, output, Config(*how), json_file, overwrite, console.progress)
     suns = result["nearest_used_sun_deg"]
@@ -30,5 +31,5 @@ def show_held_out_images(
     )
     console.table("by image", *image_lines(result))
     if result["coverage_percent"] is not None:
-        console.table("pixels within the intervals, percent", *coverage_lines(result))
+        console.table("pixels within the intervals, percent", *coverage_lines(result["coverage_percent"]))
     console.say(f"written: {output}, {output.with_suffix('.json')}")

@@ -22,7 +22,7 @@ from stages.network.predictor import Predictor as Network
 from stages.network.predictor import choose_device, load_predictor
 from stages.pairs.reader import PairReader
 
-COUNTS = ("pixels", "data_range")
+COUNTS = ("pixels", "data_range", "within")
 
 
 def write_fit(

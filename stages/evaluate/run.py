@@ -29,6 +29,7 @@ from stages.common.intervals import FEWEST_UNITS, choose_units
 from stages.effects import load_extension
 from stages.effects.extension import check_ground
 from stages.evaluate.core import Scores, score
+from stages.evaluate.coverage import shares
 from stages.evaluate.fitting import choose_fit_pairs, dn_scale, fit_rows, fit_steps
 from stages.evaluate.parts import first_runs, join_scores, load_predictors, read_fit, write_fit, write_scores
 from stages.evaluate.perceptual import Perceptual
@@ -281,6 +282,7 @@ def summarise(task: Task, scores: Scores, scale: float) -> dict[str, Any]:
         "model": task.predictors[0].model.name,
         "fitted_on_pairs": len(train),
         "frames_fitted_on_split": sorted({task.frame_names[f] for f in frames[orphans]}),
+        "coverage_percent": shares(scores.within.sum(axis=2)) if scores.within.any() else None,
         "lpips_unavailable": None if perceptual.available else perceptual.reason,
         "warnings": _warnings(name, len(np.unique(unit)), len(task.predictors), len(np.unique(frames[orphans]))),
     }
