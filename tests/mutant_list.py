@@ -332,9 +332,9 @@ STAGES = (
     ),
     Mutant(
         "stages/physics/horizon/scene.py",
-        "    window = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
+        "    strip = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
         "    top, bottom, left, right = row, row + height, col, col + width\n"
-        "    window = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
+        "    strip = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
         ("tests/test_project.py::test_terrain_outside_the_crop_casts_its_shadow",),
         "only the crop's own terrain casts near shadows",
     ),
