@@ -101,11 +101,11 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
     else:
         image, clipped = _reflected(surface, geometry, visible, window)
         image = image if added is None else image + added
-    shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
-    shadow[np.isnan(geometry.cos_incidence)] = np.nan
     planes = {"image": image, "clipped": clipped}
     if sky is not None:
         planes["sky_view"] = sky[window.within(around).part]
+    shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
+    shadow[np.isnan(geometry.cos_incidence)] = np.nan
     if surface.albedo_error is not None:
         # photographs have corrected the coefficients' errors: those of the albedo stand in their place
         inner, _ = surface.albedo_error.half_widths(
