@@ -77,7 +77,9 @@ def look(
     )
     known = np.isfinite(distances)
     if not known.any():
-        raise GeometryError("the camera does not see the body; check its place, --look-at (or --quaternion) and --fov.")
+        raise GeometryError(
+            "the camera does not see the body; check its place, `look_at` (or `quaternion`) and `fov_deg`."
+        )
     points, distances = points[known], distances[known]
     lon = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
     lat = np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
@@ -122,7 +124,7 @@ def _misses(surface: Surface) -> str:
     lon, lat = grid.lonlat((grid.height - 1) / 2, (grid.width - 1) / 2)
     return (
         f"the view misses {surface.path.name}, whose middle is at longitude {float(lon):.4f}, latitude {float(lat):.4f} deg; "
-        "check the camera's place, --look-at (or --quaternion) and --fov."
+        "check the camera's place, `look_at` (or `quaternion`) and `fov_deg`."
     )
 
 
@@ -145,7 +147,7 @@ def _check_above_ground(surface: Surface, origins: Floats, relief: tuple[float, 
                 ground = float(np.array([1 - v, v]) @ corner @ np.array([1 - u, u]))
         if altitude <= ground:
             raise GeometryError(
-                f"the camera is under the ground: it stands {altitude:.1f} m above the sphere, the ground there at {ground:.1f} m; raise the altitude in --position."
+                f"the camera is under the ground: it stands {altitude:.1f} m above the sphere, the ground there at {ground:.1f} m; raise the altitude in `position`."
             )
 
 

@@ -57,7 +57,7 @@ def learn_epoch(
     error_sum, pixel_sum = sums.tolist()
     if not math.isfinite(error_sum):
         raise InputError(
-            f"{training.reader.path}: the loss is not finite in epoch {epoch + 1}; lower --lr or check the images' units."
+            f"{training.reader.path}: the loss is not finite in epoch {epoch + 1}; lower `lr` or check the images' units."
         )
     return mean_over_ranks(error_sum, pixel_sum, ranks, device)
 

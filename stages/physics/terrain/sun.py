@@ -40,9 +40,9 @@ def sun_from_angles(azimuth_deg: float, elevation_deg: float, grid: Grid, distan
     """The Sun at an azimuth (clockwise from true north) and elevation over the middle of a map. Raises GeometryError."""
     if not 0.0 < elevation_deg <= 90.0:
         raise GeometryError(
-            f"--sun-elevation: expected degrees above the horizon (0..90), found {elevation_deg:g}; the Sun is below the horizon."
+            f"`sun_elevation_deg`: expected degrees above the horizon (0..90), found {elevation_deg:g}; the Sun is below the horizon."
             if elevation_deg <= 0
-            else f"--sun-elevation: expected degrees in 0..90, found {elevation_deg:g}."
+            else f"`sun_elevation_deg`: expected degrees in 0..90, found {elevation_deg:g}."
         )
     return Sun(place_over(grid, azimuth_deg, elevation_deg, distance_au * ASTRONOMICAL_UNIT), SUN_RADIUS / distance_au)
 
@@ -63,7 +63,7 @@ def place_over(grid: Grid, azimuth_deg: float, elevation_deg: float, distance: f
 def sun_from_subsolar(longitude_deg: float, latitude_deg: float, distance_au: float = 1.0) -> Sun:
     """The Sun over its sub-solar point. Raises GeometryError."""
     if not -90.0 <= latitude_deg <= 90.0:
-        raise GeometryError(f"--subsolar-latitude: expected degrees in -90..90, found {latitude_deg:g}.")
+        raise GeometryError(f"`subsolar_latitude_deg`: expected degrees in -90..90, found {latitude_deg:g}.")
     return Sun(unit_vectors(longitude_deg, latitude_deg) * distance_au * ASTRONOMICAL_UNIT, SUN_RADIUS / distance_au)
 
 
@@ -83,8 +83,8 @@ def find_sun(
     subsolar = subsolar_longitude_deg is not None or subsolar_latitude_deg is not None
     if angles + subsolar + (time is not None) != 1:
         raise ConfigError(
-            "the Sun: expected one of --sun-azimuth with --sun-elevation, --subsolar-longitude with --subsolar-latitude, "
-            f"or --time; found {'none' if not (angles or subsolar or time) else 'more than one'}."
+            "the Sun: expected one of `sun_azimuth_deg` with `sun_elevation_deg`, `subsolar_longitude_deg` with `subsolar_latitude_deg`, "
+            f"or `time`; found {'none' if not (angles or subsolar or time) else 'more than one'}."
         )
     if time is not None:
         from stages.physics.bodies.ephemeris import subsolar_point
@@ -94,11 +94,11 @@ def find_sun(
     if subsolar:
         if subsolar_longitude_deg is None or subsolar_latitude_deg is None:
             raise ConfigError(
-                "the Sun: expected both --subsolar-longitude and --subsolar-latitude, found one; give both."
+                "the Sun: expected both `subsolar_longitude_deg` and `subsolar_latitude_deg`, found one; give both."
             )
         return sun_from_subsolar(subsolar_longitude_deg, subsolar_latitude_deg, distance_au or 1.0)
     if azimuth_deg is None or elevation_deg is None:
-        raise ConfigError("the Sun: expected both --sun-azimuth and --sun-elevation, found one; give both.")
+        raise ConfigError("the Sun: expected both `sun_azimuth_deg` and `sun_elevation_deg`, found one; give both.")
     return sun_from_angles(azimuth_deg, elevation_deg, grid, distance_au or 1.0)
 
 

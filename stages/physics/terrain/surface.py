@@ -173,7 +173,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
             if kind == "svbrdf":
                 if model is not None:
                     raise ConfigError(
-                        f"--model: {path.name} holds its own reflectance ({file.attrs['model']}); to render its terrain with another model give --dem {path.name}."
+                        f"`model`: {path.name} holds its own reflectance ({file.attrs['model']}); to render its terrain with another model give `dem` {path.name}."
                     )
                 reflectance = stored_model(path, str(file.attrs["model"]))
                 _check_names(path, reflectance, read_strings(file, "coefficient_name"))
@@ -227,7 +227,7 @@ def _named_model(path: Path, model: str | None) -> ReflectanceModel:
     """Raises ConfigError: which reflectance a picture shows is nobody's to guess."""
     if model is None:
         raise ConfigError(
-            f"{path}: holds a terrain and no reflectance; name one with --dem {path} --model NAME ('lunargr models' lists them), "
+            f"{path}: holds a terrain and no reflectance; name one with `dem` {path} `model` NAME ('lunargr models' lists them), "
             "or render the svbrdf.h5 of 'lunargr infer'."
         )
     return get_model(model)
@@ -250,7 +250,7 @@ def _uniform(model: ReflectanceModel, parameters: Mapping[str, float]) -> NDArra
         bounds = next(p for p in model.parameters if p.name == name)
         if not bounds.lower <= value <= bounds.upper:
             raise ConfigError(
-                f"--parameters: expected {name} of {model.name} in {bounds.lower:g}..{bounds.upper:g}, found {value:g}."
+                f"`parameters`: expected {name} of {model.name} in {bounds.lower:g}..{bounds.upper:g}, found {value:g}."
             )
     return np.array([parameters.get(p.name, p.default) for p in model.parameters], np.float32)
 
