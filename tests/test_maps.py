@@ -246,9 +246,15 @@ def test_the_map_carries_its_deviations(small_artefacts, trained, tmp_path):
     assert predictor.image_noise > 0
     with h5py.File(small_artefacts["scene"]) as file:
         elevation, known = file["elevation"][...], file["dem_valid"][...].astype(bool)
-    coefficients, deviations = predictor.coefficients_and_deviations(
-        torch.from_numpy(fill_holes(elevation, known))[None]
-    )
+    filled = torch.from_numpy(fill_holes(elevation, known))[None]
+    coefficients = predictor.coefficients(filled)
+    with torch.no_grad():
+        predictor.eval()
+        stride = predictor.net.stride
+        padding = (0, -filled.shape[2] % stride, 0, -filled.shape[1] % stride)
+        padded = torch.nn.functional.pad(filled[:, None], padding, mode="replicate")[:, 0]
+        shifted = predictor.shifted(padded)[..., : filled.shape[1], : filled.shape[2]]
+    deviations = dict(zip(predictor.maps.maps, predictor.maps.deviations(shifted, dim=1).unbind(1), strict=True))
     with h5py.File(tmp_path / "map.h5") as file:
         assert read_strings(file, "map_name") == list(deviations) == ["albedo"]
         found = file["coefficients_std"][0]

@@ -28,11 +28,6 @@ class _SquaredError(torch.autograd.Function):
         return residual * (2 * gradients[0]), None, None
 
 
-def masked_mse(predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
-    """Mean squared error over valid pixels; 0 where there are none."""
-    return squared_error(predicted, measured, valid) / valid.sum().clamp(min=1)
-
-
 def crop_errors(predicted: Tensor, measured: Tensor, valid: Tensor, brightness: float) -> tuple[Tensor, Tensor]:
     """Sums over crops (B, H, W): of squared errors less the part that each crop's own gain would explain, and of all.
 

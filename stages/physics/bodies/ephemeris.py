@@ -98,14 +98,6 @@ def body_name(body: str | Body) -> str:
     return (body.name if isinstance(body, Body) else str(body)).strip().lower()
 
 
-def body_rotation(time_utc: str | datetime, body: str | Body = "moon") -> Floats:
-    """(3, 3), takes ICRF vectors to body-fixed ones at that time. Raises GeometryError for a body without a model."""
-    name = body_name(body)
-    if name not in ORIENTATIONS:
-        raise _unknown(name)
-    return ORIENTATIONS[name].rotation(_days(parse_utc(time_utc).tdb))
-
-
 # --- the Sun --------------------------------------------------------------------------------------------------------
 
 

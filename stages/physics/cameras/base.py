@@ -7,7 +7,7 @@ Image coordinates here are CSM's: (line, sample), the first pixel's centre at (0
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -101,51 +101,6 @@ class Camera(ABC):
             )
         if missing != "nearest":
             points = np.where(hit[..., None], points, np.nan)
-        return points
-
-    def image_to_terrain(
-        self,
-        line: ArrayLike,
-        sample: ArrayLike,
-        height_at: Callable[[Floats, Floats], Floats],
-        tolerance: float = 1e-3,
-        iterations: int = 50,
-    ) -> Floats:
-        """(..., 3) body-fixed points where the rays meet a terrain; NaN where they do not, or leave it.
-
-        height_at : (longitude, latitude in degrees) -> metres above the sphere of the equatorial radius, NaN outside
-        tolerance : m, between the ray and the terrain
-        Each step raises the sphere to the terrain under the last answer, with the secant's slope where two steps
-        give one; over terrain steeper than the ray the answer may be the second surface that it crosses.
-        """
-        origin, direction = self.rays(line, sample)
-        radius = self.semi_axes[0]
-        height = np.zeros(origin.shape[:-1])
-        previous_height: Floats | None = None
-        previous_gap: Floats | None = None
-        points = np.full_like(origin, np.nan)
-        done = np.zeros(height.shape, bool)
-        for _ in range(iterations):
-            trial, hit = meet_ellipsoid(origin, direction, radius + height, radius + height)
-            r = np.linalg.norm(trial, axis=-1)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                longitude = np.degrees(np.arctan2(trial[..., 1], trial[..., 0]))
-                latitude = np.degrees(np.arcsin(np.clip(trial[..., 2] / r, -1, 1)))
-                terrain = np.asarray(height_at(longitude, latitude), float)
-                gap = np.where(hit, terrain, np.nan) - height
-                found = np.abs(gap) < tolerance
-                points = np.where((found & ~done)[..., None], trial, points)
-                done |= found
-                if (done | ~np.isfinite(gap)).all():
-                    break
-                step = gap
-                if previous_gap is not None and previous_height is not None:
-                    slope = (gap - previous_gap) / (height - previous_height)
-                    secant = -gap / slope
-                    usable = np.isfinite(secant) & (slope < -0.2) & (np.abs(secant) < 10 * np.abs(gap) + 1)
-                    step = np.where(usable, secant, 0.5 * gap)
-            previous_height, previous_gap = height, gap
-            height = np.where(done | ~np.isfinite(step), height, height + step)
         return points
 
 

@@ -29,7 +29,6 @@ class Observation:
     sun_direction : (B, 3), unit, ENU along the crop's axes
     camera_position : (B, 3), m from the crop's centre
     sun_horizon : (B, H, W), rad, or None where nothing casts shadows
-    sky_view : (B, H, W), 1, or None
     detector_sample, detector_line : (B, H, W), px, or None
     frame : (B,) int64, index of the source image, or None
     site : (B,) int64, number of the ground site, or None
@@ -41,7 +40,6 @@ class Observation:
     gsd: float
     body_radius: float
     sun_horizon: Tensor | None = None
-    sky_view: Tensor | None = None
     detector_sample: Tensor | None = None
     detector_line: Tensor | None = None
     frame: Tensor | None = None

@@ -120,23 +120,6 @@ def capture_shifts(
     return Shifts(shifts, errors, np.array([[s.quality for s in line] for line in found]))
 
 
-def estimate_shift(
-    image: ArrayLike,
-    rendering: ArrayLike,
-    valid: ArrayLike | None = None,
-    weights: ArrayLike | None = None,
-    max_shift: float = 8.0,
-    patterns: Sequence[ArrayLike] = (),
-) -> Shift:
-    """The one shift of a whole ``image`` against its ``rendering``: see :func:`capture_shifts`.
-
-    weights : (H, W) >= 0, for example less in shadow. Never raises for poor evidence: see ``Shift.refused``.
-    Raises GeometryError for shapes that differ.
-    """
-    pictures = prepare(image, rendering, valid, weights, patterns)
-    return block_shift(pictures, (0, 0, *pictures.image.shape), max_shift)
-
-
 def prepare(
     image: ArrayLike,
     rendering: ArrayLike,

@@ -16,6 +16,7 @@ from stages.physics.light.earth import EARTH_RADIUS, earth_irradiance, earth_pha
 from stages.physics.light.sky import Surroundings, terrain_light
 from stages.physics.maps.window import Window
 from stages.physics.photometry import masked_radiance_factor
+from stages.physics.photometry.quantities import to_reflectance_factor
 from stages.physics.terrain.ground import block_geometry
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.sun_visibility import SunHorizon, visible_share
@@ -73,7 +74,7 @@ def diffuse_albedo(surface: Surface, window: Window) -> Floats32:
     incidence, emission = torch.full(shape, STANDARD), torch.zeros(shape)
     angles = Angles.from_angles(incidence, emission, incidence)
     value = masked_radiance_factor(surface.model, surface.model.unpack(coefficients, dim=0), angles).numpy()
-    value = np.maximum(value, 0) / np.float32(math.cos(STANDARD))
+    value = to_reflectance_factor(np.maximum(value, 0), np.full_like(value, math.cos(STANDARD)))
     value[~np.isfinite(coefficients.numpy()).all(axis=0)] = np.nan
     return value
 
