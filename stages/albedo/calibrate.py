@@ -16,17 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from stages.albedo.intervals import GAUSSIAN, Stack, unseen_intervals
 from stages.albedo.posterior import Spread, settle
 from stages.albedo.pyramid import LEVELS, bands
 from stages.albedo.references import Box, Look, References, overlap
+from stages.common.arrays import Floats, Floats32
 from stages.common.progress import Progress, show_nothing
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 WINDOW_PX = 128
 WINDOWS_PER_IMAGE = 16

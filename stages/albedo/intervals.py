@@ -19,9 +19,7 @@ from scipy.special import ndtri, stdtrit
 
 from stages.albedo.posterior import Spread, estimate, settle
 from stages.albedo.references import Look
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
+from stages.common.arrays import Floats, Floats32
 
 SHARES = (0.6827, 0.95)
 GAUSSIAN = (1.0, 1.96)  # where nothing can be left out

@@ -13,12 +13,9 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.albedo.pyramid import LEVELS, bands, collapse, enlarge, reduce
-
-Floats32 = NDArray[np.float32]
-Floats = NDArray[np.float64]
+from stages.common.arrays import Floats, Floats32
 
 FREEDOM = 4.0  # degrees of freedom of Student's distribution, as Lange et al. recommend
 ITERATIONS = 8

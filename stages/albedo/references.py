@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.physics.horizon.scene import Overview, horizon_in_scene
 from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import ASTRONOMICAL_UNIT, Frame
@@ -23,7 +24,6 @@ from stages.physics.terrain.shading import Light, shade_block
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.surface import SHADOWED, Surface
 
-Floats32 = NDArray[np.float32]
 Box = tuple[int, int, int, int]  # row, col, height, width
 
 OPEN_IMAGES = 64  # files that stay open between windows

@@ -53,11 +53,7 @@ class _Exported(torch.nn.Module):
 
 
 def run(
-    checkpoint: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
+    checkpoint: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Summary:
     """Write ``output`` (.onnx) and its card beside it (.md). Raises LunargrError."""
     output = Output.of(output)

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from schemas.errors import InputError
 from schemas.files.outputs import atomic_path
+from stages.common.arrays import Floats
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
 from stages.render.pictures import DISPLAY_GAMMA, read_exr
 
-Floats = NDArray[np.float64]
 POINTS_PER_SIDE = 24  # of each view, on which the sparse points are picked
 SAME_PLACE = 2e-3  # of the distance: a point that another view sees this near is the same
 GL_AXES = np.diag([1.0, -1.0, -1.0])  # nerfstudio's cameras look along -z, with y up

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rasterio.transform import Affine
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats, Floats32
 from stages.physics.cameras.base import Camera
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.formation.chain import Observation, State
@@ -26,9 +27,6 @@ from stages.physics.terrain.surface import Surface
 from stages.render.ray_points import HitAngles, hit_angles, hit_points, sample_maps
 from stages.render.raycast import HIT, MISS, HeightField, Hits, build_height_field, cast
 from stages.render.viewpoint import pixel_footprint
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 MOST_SAMPLES = 8  # rays per pixel and axis; beyond, the terrain itself is averaged first
 RAYS_AT_ONCE = 1 << 19

@@ -15,11 +15,7 @@ from stages.render.views import render_camera
 
 
 def run(
-    source: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
+    source: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Summary:
     """Render one view of ``source`` (svbrdf.h5, scene.h5 or a DEM). Raises LunargrError.
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
 from schemas.files.outputs import Output, atomic_path, check_output
+from stages.common.arrays import Floats
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.cameras.pinhole import Pinhole
@@ -27,8 +28,6 @@ from stages.render.pictures import read_exr, write_exr
 from stages.render.setting import make_light, open_source
 from stages.render.viewpoint import look_at, pinhole_view
 from stages.render.views import render_camera
-
-Floats = NDArray[np.float64]
 
 SPLITS = (("train", 0.8), ("validation", 0.1), ("test", 0.1))
 TILE_FOOTPRINTS = 2.0  # edge of a tile in footprints seen from straight above

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 
+from stages.common.arrays import Floats
 from stages.physics.maps.grid import Grid
 from stages.simulate.hidden import Hidden, find
 from stages.simulate.orbits import Pass, Strip
 from stages.simulate.recipe import Config
 
 Array = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

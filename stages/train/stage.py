@@ -46,11 +46,7 @@ class Summary:
 
 
 def run(
-    pairs: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
+    pairs: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Summary:
     """Write ``checkpoint.h5``: the weights of the best validation epoch. Raises ConfigError, InputError, ArtefactError.
 

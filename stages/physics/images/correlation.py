@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from stages.common.arrays import Floats
+
 Mask = NDArray[np.bool_]
 
 # sigma of the mean that is taken off: albedo is strongest over long distances, shading over short ones

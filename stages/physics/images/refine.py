@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-Floats = NDArray[np.float64]
+from stages.common.arrays import Floats
+
 Mask = NDArray[np.bool_]
 
 ITERATIONS = 30

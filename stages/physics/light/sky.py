@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats32
 from stages.physics.horizon.scene import Overview
 from stages.physics.maps.window import Window
 
-Floats32 = NDArray[np.float32]
 CELLS_PER_DISTANCE = 32  # steps and cells grow with distance: a cell is seen under 1/32 rad
 
 

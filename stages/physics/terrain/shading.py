@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.physics.formation.chain import Extension, Observation, State, form
 from stages.physics.formation.geometry import Angles
 from stages.physics.maps.window import Window
@@ -20,7 +21,6 @@ from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.sun_visibility import visible_share
 from stages.physics.terrain.surface import SHADOWED, Surface
 
-Floats32 = NDArray[np.float32]
 BACKPLANES = (
     "incidence_deg",
     "emission_deg",
