@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 
-from stages.common.arrays import Floats
+from stages.common.arrays import Floats, Floats32
 from stages.physics.maps.grid import Grid
 from stages.simulate.hidden import Hidden, find
 from stages.simulate.orbits import Pass, Strip
 from stages.simulate.recipe import Config
-
-Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -154,7 +152,7 @@ def footprint(config: Config, shot: Pass, x: Floats, y: Floats, number: int) -> 
     return inside
 
 
-def resample(radiance: Array, row: Floats, col: Floats, window: tuple[int, int, int, int]) -> Array:
+def resample(radiance: Floats32, row: Floats, col: Floats, window: tuple[int, int, int, int]) -> Floats32:
     """Cubic interpolation of a window of the blurred radiance at DEM pixel coordinates."""
     u, v = (col - window[1]).astype(np.float32), (row - window[0]).astype(np.float32)
     return np.asarray(cv2.remap(radiance, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.float32)
@@ -174,13 +172,13 @@ def move(config: Config, shot: Pass, detector: Detector, lattice: Lattice, step:
 
 
 def respond(
-    image: Array,
-    echo: Array | None,
+    image: Floats32,
+    echo: Floats32 | None,
     lattice: Lattice,
     shot: Pass,
     detector: Detector,
     hidden: list[Hidden],
-) -> Array:
+) -> Floats32:
     """The hidden detector effects, in the order of the hardware: echo, dark signal, columns, gain, response, clipping."""
     if (effect := find(hidden, "echo")) and echo is not None:
         image = image + np.float32(effect["fraction"]) * echo
@@ -200,7 +198,7 @@ def respond(
     return image
 
 
-def add_noise(image: Array, config: Config, detector: Detector, rng: np.random.Generator) -> Array:
+def add_noise(image: Floats32, config: Config, detector: Detector, rng: np.random.Generator) -> Floats32:
     """Shot and read noise, in electrons."""
     electrons = image * np.float32(detector.electrons)
     sigma = np.sqrt(np.maximum(electrons, 0) + np.float32(config.read_noise**2))

@@ -17,9 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-from stages.common.arrays import Floats
-
-Mask = NDArray[np.bool_]
+from stages.common.arrays import Floats, Mask
 
 ITERATIONS = 30
 LEAST_PIXELS = 200  # that must stay usable while the image is moved under the template
