@@ -18,7 +18,6 @@ from stages.evaluate.comparison import Task, evaluate_pairs
 from stages.evaluate.config import Config
 from stages.evaluate.renderers import read_batch
 from stages.pairs.reader import PairReader
-from stages.train import stage
 from stages.train.epoch import evaluate_loss, learn_epoch
 from stages.train.training import set_up
 
@@ -87,8 +86,10 @@ def test_the_best_epoch_is_that_of_the_lowest_validation_loss(tmp_path, monkeypa
         written.append(epoch)
         return 10.0 - epoch
 
-    monkeypatch.setattr(stage, "learn_epoch", learn)
-    monkeypatch.setattr(stage, "evaluate_loss", lambda training, *_: (9.0 - written[-1], validation[written[-1]]))
+    monkeypatch.setattr("stages.train.stage.learn_epoch", learn)
+    monkeypatch.setattr(
+        "stages.train.stage.evaluate_loss", lambda training, *_: (9.0 - written[-1], validation[written[-1]])
+    )
     pairs = write_pairs(tmp_path / "pairs.h5", pairs_of(), units="dn")
     summary = train.run(pairs, tmp_path / "c.h5", train.Config(**SMALL, epochs=4))
     assert summary.history.best_epoch == 1
