@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from schemas.errors import ConfigError
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
