@@ -57,11 +57,11 @@ def make_light(
         horizon = SunHorizon(surface.elevation, surface.grid, sun, span) if config.shadows else None
     bounce = Bounce(surface, sun, horizon) if config.bounce else None
     extensions: list = []
-    if config.extension:
+    if config.extend:
         from stages.effects import load_extension
 
         # the diagnosed images are not this one: their own values must not be taken for it
-        extensions = load_extension(Path(config.extension), ["rendered"])
+        extensions = load_extension(Path(config.extend), ["rendered"])
     position = None
     if config.position is not None:
         position = place(*_three(config.position, "`position`"), surface.grid.radius)

@@ -1,6 +1,6 @@
 """The one geographic split of a scene: square ground tiles, dealt to training, validation and test by a hash.
 
-It hangs on the scene, `tile_m`, `split` and `seed` only, not on what is sampled: see `stages/sample.py`.
+It hangs on the scene, `tile_m`, `split` and `seed` only, not on what is sampled: see `stages/sample`.
 """
 
 from __future__ import annotations
