@@ -34,7 +34,8 @@ TURN = 30e3  # m over which the Sun's azimuth turns by 1 deg on the Moon
 @dataclass(frozen=True)
 class Look:
     """One photograph on a window. measured : (h, w) as in the file, NaN where it says nothing; predicted : (h, w) I/F;
-    cos_incidence : (h, w)"""
+    cos_incidence : (h, w)
+    """
 
     measured: Floats32
     predicted: Floats32

@@ -22,7 +22,10 @@ MAXIMUM_PIXELS = 30_000
 
 
 def batches_of(reader: PairReader, indices: NDArray[np.int64], size: int = 32) -> Iterator[Batch]:
-    """At most about MAXIMUM_PAIRS of some pairs."""
+    """At most about MAXIMUM_PAIRS of some pairs.
+
+    indices : (n,), of pairs
+    """
     step = max(1, len(indices) // MAXIMUM_PAIRS)
     chosen = indices[::step]
     for first in range(0, len(chosen), size):

@@ -86,7 +86,10 @@ def choose_device(name: str) -> torch.device:
 
 
 def write_state(group: h5py.Group, state: Mapping[str, Tensor]) -> None:
-    """A state dict as plain HDF5 arrays, no pickle."""
+    """A state dict as plain HDF5 arrays, no pickle.
+
+    state : by name, tensors of any shape
+    """
     for name, tensor in state.items():
         group.create_dataset(name, data=tensor.detach().cpu().numpy(), track_order=True)
 

@@ -41,7 +41,10 @@ def fit_deviations(
     validation: NDArray[np.int64],
     extensions: Sequence[Extension] = (),
 ) -> None:
-    """Write the last layer of the deviations, and ``image_noise``, into a trained predictor."""
+    """Write the last layer of the deviations, and ``image_noise``, into a trained predictor.
+
+    train, validation : (n,), indices of pairs
+    """
     predictor.eval()
     seen = _look(predictor, radiometry, reader, train, extensions)
     residual, effects, features = seen

@@ -61,7 +61,10 @@ def check_weights(
 
 
 def check_finite(path: Path, state: dict[str, torch.Tensor]) -> None:
-    """Raises ArtefactError for weights that are not finite: every map made with them would be empty."""
+    """Raises ArtefactError for weights that are not finite: every map made with them would be empty.
+
+    state : by name, tensors of any shape
+    """
     for name, value in state.items():
         if not math.isfinite(float(value.double().sum())):
             raise ArtefactError(

@@ -105,7 +105,10 @@ def look(
 
 
 def shell_crossing(origins: Floats, directions: Floats, inner: float, outer: float) -> tuple[Floats, Floats]:
-    """Distances along rays at which they enter and leave the shell between two spheres; NaN where they miss it."""
+    """Distances along rays at which they enter and leave the shell between two spheres; NaN where they miss it.
+
+    origins, directions : (n, 3), m and unit; inner, outer : radii, m; returns (n,) each, m
+    """
     along = (origins * directions).sum(-1)
     closest2 = (origins * origins).sum(-1) - along**2
     with np.errstate(invalid="ignore"):
@@ -194,7 +197,10 @@ def _added(surface: Surface, light: Light, window: Window) -> Floats32 | None:
 
 
 def coarsen(values: Floats32, factor: int) -> Floats32:
-    """Means of whole factor x factor blocks, over what is known (NaN where nothing is)."""
+    """Means of whole factor x factor blocks, over what is known (NaN where nothing is).
+
+    values : (H, W); returns (H // factor, W // factor)
+    """
     height, width = (n // factor for n in values.shape)
     blocks = values[: height * factor, : width * factor].reshape(height, factor, width, factor)
     known = np.isfinite(blocks)

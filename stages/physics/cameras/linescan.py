@@ -85,7 +85,10 @@ class LineScan(Camera):
         return camera
 
     def times(self, line: ArrayLike) -> Floats:
-        """Seconds from ``centre_time`` of image lines."""
+        """Seconds from ``centre_time`` of image lines.
+
+        line : (...,) px; returns the same shape
+        """
         line = np.asarray(line, float)
         k = np.clip(np.searchsorted(self.line_starts, line, side="right") - 1, 0, None)
         return self.line_times[k] + self.line_rates[k] * (line - self.line_starts[k])

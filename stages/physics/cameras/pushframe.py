@@ -139,7 +139,10 @@ class PushFrame(Camera):
         return self.times[self.piece(line)]
 
     def ground_to_image(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """As of every camera; NaN too where a place falls between two framelets, more than half a line from both."""
+        """As of every camera; NaN too where a place falls between two framelets, more than half a line from both.
+
+        points : (..., 3) body-fixed, m; returns line and sample, (...,) px each
+        """
         points = np.asarray(points, float)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         line, sample = np.empty(len(flat)), np.empty(len(flat))

@@ -90,9 +90,11 @@ class Extension(Protocol):
     """A physical effect that extends the chain (``stages/effects``)."""
 
     @property
-    def slot(self) -> str: ...
+    def slot(self) -> str:
+        """One of SLOTS."""
 
-    def apply(self, state: State) -> None: ...
+    def apply(self, state: State) -> None:
+        """Change what the slot may change."""
 
 
 def form(
