@@ -82,6 +82,7 @@ def command(
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output
     from stages import evaluate
+    from stages.evaluate.coverage import coverage_lines
     from stages.evaluate.table import basis, gain_lines, result_lines
 
     console = Console(quiet)
@@ -105,6 +106,8 @@ def command(
     columns, cells = gain_lines(result)
     if cells:
         console.table(f"what the learned reflectance gains, paired over ground: {basis(result)}", columns, cells)
+    if result["coverage_percent"] is not None:
+        console.table("pixels within the learned intervals, percent", *coverage_lines(result["coverage_percent"]))
     for sentence in result["conclusions"]:
         console.say(sentence)
     for warning in result["warnings"]:

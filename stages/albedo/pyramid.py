@@ -6,9 +6,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Floats32 = NDArray[np.float32]
+from stages.common.arrays import Floats32
 
 LEVELS = 5  # bands of 1, 2, 4, 8 and 16 px; everything larger is one band more
 CELL_PX = 1 << LEVELS

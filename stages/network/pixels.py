@@ -62,7 +62,9 @@ def sample_pixels(
     found: list[list[Tensor]] = []
     for batch in batches_of(reader, indices):
         o = batch.observation
-        seen = facets.look(o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius)
+        seen = facets.angles_and_light(
+            o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius
+        )
         assert seen is not None and o.frame is not None  # on the CPU, without gradients
         angles, light = seen
         image = (batch.image - offset[o.frame, None, None]) / gain[o.frame, None, None]

@@ -16,7 +16,7 @@ from torch import Tensor
 from schemas.artefacts import CHECKPOINT
 from schemas.errors import ArtefactError, ConfigError, RegistryError
 from schemas.reading import open_artefact, read_config, read_strings
-from stages.network.maps import CoefficientMaps
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.normalisation import scale_elevation
 from stages.network.stored import check_finite, check_weights, read_layout
 from stages.network.unet import UNet
@@ -59,6 +59,16 @@ class Predictor(torch.nn.Module):
     def coefficients(self, elevation: Tensor) -> Tensor:
         """(B, H, W) m -> (B, C, H, W), in evaluation mode. H and W need not be multiples of the network's stride."""
         return self.maps.stack(self._evaluated(elevation), dim=1)
+
+    @torch.no_grad()
+    def coefficients_and_deviations(self, elevation: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """(B, H, W) m -> coefficients (B, C, H, W), and the standard deviations (B, H, W) of those that are maps, by name.
+
+        ``photometry.deviation.radiance_deviation`` makes the image's of them; ``image_noise`` comes on top.
+        """
+        shifted = self._evaluated(elevation)
+        deviations = self.maps.deviations(shifted, dim=1)
+        return self.maps.stack(shifted, dim=1), dict(zip(self.maps.maps, deviations.unbind(1), strict=True))
 
     def _evaluated(self, elevation: Tensor) -> Tensor:
         """(B, H, W) m -> :meth:`shifted` in evaluation mode."""

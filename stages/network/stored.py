@@ -10,7 +10,7 @@ import h5py
 import torch
 
 from schemas.errors import ArtefactError
-from stages.network.maps import CoefficientMaps
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.unet import UNet
 
 WIDEST, DEEPEST = 65536, 12  # channels of a stage, stages: beyond any network, and short of any machine's memory

@@ -11,12 +11,10 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats
 from stages.physics.maps.grid import Grid, unit_vectors
-
-Floats = NDArray[np.float64]
 
 TOLERANCE = 0.005  # px, of the fitted polynomial against the projection itself
 _DEGREES = (1, 2, 3, 4, 5, 7, 9)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from schemas.errors import InputError
 from schemas.files.outputs import atomic_path
+from stages.common.arrays import Floats32
 
-Floats32 = NDArray[np.float32]
 DISPLAY_GAMMA = 2.2
 
 

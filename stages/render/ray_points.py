@@ -9,11 +9,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats
 from stages.physics.terrain.ground import slope_difference
 from stages.render.chart import chart_gradient
 from stages.render.raycast import HeightField, Hits, turn
-
-Floats = NDArray[np.float64]
 
 
 def hit_points(hits: Hits, origins: Floats, directions: Floats) -> Floats:

@@ -7,11 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.render.config import Summary
-
-Floats32 = NDArray[np.float32]
 
 
 def skipped(view_id: str, files: Sequence[Path], size: tuple[int, int]) -> Summary:

@@ -6,15 +6,14 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats
 from stages.physics.cameras.base import Camera
 from stages.physics.cameras.document import quaternion_matrix
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import unit_vectors
 
-Floats = NDArray[np.float64]
 NEAR_NADIR = math.radians(1.0)  # closer to straight down than this, "up in the image" means north
 
 

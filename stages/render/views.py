@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError, LunargrError
 from schemas.files.outputs import Output, Target, check_outputs
+from stages.common.arrays import Floats32
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras.base import Camera
@@ -27,8 +27,6 @@ from stages.render.pictures import Preview, write_exr, write_png
 from stages.render.setting import camera_place, find_camera, make_light, metadata, open_source
 from stages.render.tally import Tally, skipped
 from stages.render.trajectory import ViewRow, read_trajectory
-
-Floats32 = NDArray[np.float32]
 
 
 def run_trajectory(
@@ -130,8 +128,8 @@ def render_camera(
     with contextlib.ExitStack() as stack:
         exr = None
         if ".exr" in named:
-            told = metadata(surface, config, light)
-            exr = stack.enter_context(write_exr(named[".exr"], camera.lines, camera.samples, channels, told))
+            facts = metadata(surface, config, light)
+            exr = stack.enter_context(write_exr(named[".exr"], camera.lines, camera.samples, channels, facts))
         for band in bands:
             if exr:
                 exr.write(band)

@@ -17,9 +17,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.simulate.noise import gradient_noise
-
-Array = NDArray[np.float32]
 
 EQUILIBRIUM_PER_KM2 = 10**-1.1  # craters > 1 km per km2, cumulative slope -2
 PRODUCTION_SLOPE, EQUILIBRIUM_SLOPE = 3.0, 2.0
@@ -165,7 +164,7 @@ def fresh_profile(r: NDArray) -> NDArray:
 
 
 @lru_cache(maxsize=1)
-def profile_table(states: int = 40, samples: int = 320) -> tuple[Array, float]:
+def profile_table(states: int = 40, samples: int = 320) -> tuple[Floats32, float]:
     """Profiles worn by diffusion: (states, samples) heights over diameter, and the spacing in radii.
 
     State k has K = kappa t / R^2 = WORN_OUT (k / (states - 1))^2, plus a little that even fresh rims have. The
@@ -273,7 +272,9 @@ def _stamp(
                             ejecta[r, c] += np.float32(fresh * fade * streak)
 
 
-def stamp(craters: Craters, x0: float, y0: float, step: float, shape: tuple[int, int]) -> tuple[Array, Array, Array]:
+def stamp(
+    craters: Craters, x0: float, y0: float, step: float, shape: tuple[int, int]
+) -> tuple[Floats32, Floats32, Floats32]:
     """Heights (m), freshness of walls and near ejecta (0..1) and rays of ejecta (0..) of a block.
 
     (x0, y0) is the centre of the first pixel; rows run south. Largest first, so that the result is the same however

@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 
+from stages.common.arrays import Floats, Floats32
 from stages.physics.maps.grid import Grid
 from stages.simulate.hidden import Hidden, find
 from stages.simulate.orbits import Pass, Strip
 from stages.simulate.recipe import Config
-
-Array = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ class Lattice:
     y: Floats
 
     @classmethod
-    def of(cls, image: Grid, first: int, height: int, scene: Grid) -> Lattice:
+    def fit(cls, image: Grid, first: int, height: int, scene: Grid) -> Lattice:
         """The lattice of ``height`` lines of an image from line ``first`` on, by a cubic fit to the projection."""
         rows = np.linspace(first, first + height - 1, 9)
         cols = np.linspace(0, image.width - 1, 9)
@@ -159,7 +157,7 @@ def footprint(config: Config, shot: Pass, x: Floats, y: Floats, number: int) -> 
     return inside
 
 
-def resample(radiance: Array, row: Floats, col: Floats, window: tuple[int, int, int, int]) -> Array:
+def resample(radiance: Floats32, row: Floats, col: Floats, window: tuple[int, int, int, int]) -> Floats32:
     """Cubic interpolation of a window of the blurred radiance at DEM pixel coordinates.
 
     radiance : (h, w) I/F of the window (row, col, height, width); row, col : (H, W) px; returns (H, W)
@@ -182,13 +180,13 @@ def move(config: Config, shot: Pass, detector: Detector, lattice: Lattice, step:
 
 
 def respond(
-    image: Array,
-    echo: Array | None,
+    image: Floats32,
+    echo: Floats32 | None,
     lattice: Lattice,
     shot: Pass,
     detector: Detector,
     hidden: list[Hidden],
-) -> Array:
+) -> Floats32:
     """The hidden detector effects, in the order of the hardware: echo, dark signal, columns, gain, response, clipping.
 
     image, echo : (H, W), I/F
@@ -211,7 +209,7 @@ def respond(
     return image
 
 
-def add_noise(image: Array, config: Config, detector: Detector, rng: np.random.Generator) -> Array:
+def add_noise(image: Floats32, config: Config, detector: Detector, rng: np.random.Generator) -> Floats32:
     """Shot and read noise, in electrons.
 
     image : (H, W), I/F

@@ -20,9 +20,9 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError, InputError
+from stages.common.arrays import Floats
 from stages.physics.bodies.orientations import CENTURY, ORIENTATIONS
 from stages.physics.bodies.small_bodies import ELEMENTS, GAUSS, Elements, small_body_state
 from stages.physics.bodies.spheres import Body
@@ -30,7 +30,6 @@ from stages.physics.bodies.spheres import Body
 if TYPE_CHECKING:
     from astropy.time import Time
 
-Floats = NDArray[np.float64]
 KERNELS_VARIABLE = "LUNARGR_SPICE_KERNELS"
 AU = 149597870700.0  # m, IAU 2012 definition
 SPEED_OF_LIGHT = 299792458.0  # m/s

@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError, InputError, RegistryError
 from schemas.files.user_files import read_json
-
-Floats = NDArray[np.float64]
+from stages.common.arrays import Floats
 
 
 class Camera(ABC):

@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import GeometryError, InputError
+from stages.common.arrays import Floats
 from stages.physics.bodies.spheres import find_body
 
-Floats = NDArray[np.float64]
 LARGEST_IMAGE = 100_000_000  # lines, samples: longer than any strip from orbit
 ROTATION_TOLERANCE = 1e-6
 LOWEST_CAMERA, FARTHEST_CAMERA = 0.5, 1e13  # of the radius (bodies are far from round), m

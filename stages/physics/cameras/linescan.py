@@ -81,7 +81,7 @@ class LineScan(Camera):
             check_times(where, key, times, float(ends.min()), float(ends.max()))
         origin, axis = camera.rays(camera.lines / 2, camera.samples / 2)
         object.__setattr__(camera, "detector", detector.facing(origin, axis, camera.semi_axes[0]))
-        object.__setattr__(camera, "_search", _Search.of(camera, where))
+        object.__setattr__(camera, "_search", _Search.for_camera(camera, where))
         return camera
 
     def times(self, line: ArrayLike) -> Floats:
@@ -165,7 +165,7 @@ class _Search:
     slope: float
 
     @classmethod
-    def of(cls, camera: LineScan, where: str) -> _Search:
+    def for_camera(cls, camera: LineScan, where: str) -> _Search:
         margin = max(2.0, 0.01 * camera.lines)
         ends = camera.times(np.array([-margin, camera.lines + margin]))
         wanted = 4 * max(len(camera.positions.values), len(camera.pointing.values))

@@ -12,12 +12,12 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from schemas.errors import InputError
+from stages.common.arrays import Floats
 from stages.physics.cameras import document as read
 
-Floats = NDArray[np.float64]
 LEAST_NODES = 25  # of the even position table
 _UNITS = {"m": 1.0, "km": 1000.0}
 

@@ -111,7 +111,9 @@ def form(
     """
     if not extensions:
         o = observation
-        known = facets.look(o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius)
+        known = facets.angles_and_light(
+            o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius
+        )
         if known is not None:
             return model.lit(coefficients, *known)
     state = illuminate(observation, extensions)

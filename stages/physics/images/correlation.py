@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from stages.common.arrays import Floats, Mask
 
 # sigma of the mean that is taken off: albedo is strongest over long distances, shading over short ones
 HIGH_PASS_PX = 4.0

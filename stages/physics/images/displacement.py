@@ -11,12 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
+from stages.common.arrays import Floats
 from stages.physics.maps.grid import Grid, unit_vectors
 
-Floats = NDArray[np.float64]
 FORMS = ("constant", "affine", "field")  # from the plainest on
 # (row, col, height m) -> (dx, dy) px that all of the relief displacement makes there
 Relief = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]

@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats, Mask
 from stages.physics.images.displacement import FORMS, Basis, Field
 from stages.physics.images.registration import Shift
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 LEAST_BLOCKS = {"constant": 4, "affine": 8, "field": 12}
 WORST_FIELD_SIGMA_PX = 0.25

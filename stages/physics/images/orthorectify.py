@@ -16,11 +16,11 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats
 from stages.physics.cameras import Camera
 from stages.physics.images.area_means import ReadWindow, area_means
 from stages.physics.maps.grid import CSM_CENTRE, Grid, unit_vectors
 
-Floats = NDArray[np.float64]
 # (row, col) arrays -> (dx, dy) px along columns and rows, as registration finds them
 Displacement = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]
 

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from stages.common.arrays import Floats, Mask
 
 ITERATIONS = 30
 LEAST_PIXELS = 200  # that must stay usable while the image is moved under the template
@@ -63,7 +62,7 @@ def refine(
             use = whole & _seen(solid, cell)
             if use.sum() < LEAST_PIXELS:
                 return NOWHERE
-            region = _Region.of(cell, use, templates, weight)
+            region = _Region.around(cell, use, templates, weight)
         fit = _linear_fit(moved, region, None)
         if fit is None:
             return NOWHERE
@@ -102,7 +101,7 @@ class _Region:
     projector: Floats
 
     @classmethod
-    def of(cls, cell: tuple[int, int, int, int], use: Mask, templates: Sequence[Floats], weight: Floats) -> _Region:
+    def around(cls, cell: tuple[int, int, int, int], use: Mask, templates: Sequence[Floats], weight: Floats) -> _Region:
         flat = np.flatnonzero(use)
         columns = [*templates, np.ones(use.shape)]
         design, east, south = (

@@ -14,15 +14,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import spline_filter
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats, Mask
 from stages.physics.images.correlation import combined_correlation, masked_correlation, small_structure
 from stages.physics.images.refine import refine
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Box = tuple[int, int, int, int]  # row, col, height, width
 
 BLOCK_PX = 64

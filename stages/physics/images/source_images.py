@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
+from stages.common.arrays import Floats
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras import Camera
 from stages.physics.images.area_means import area_means
@@ -33,7 +34,6 @@ from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, check_body, require_crs
 
-Floats = NDArray[np.float64]
 Box = tuple[int, int, int, int]
 
 

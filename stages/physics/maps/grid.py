@@ -15,12 +15,13 @@ import h5py
 import numpy as np
 import rasterio
 import rasterio.warp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from rasterio.crs import CRS
 from rasterio.errors import CRSError
 from rasterio.transform import Affine
 
 from schemas.errors import ArtefactError, GeometryError, InputError
+from stages.common.arrays import Floats
 from stages.physics.bodies.spheres import RADII, Body, find_body
 
 GDAL_CENTRE = 0.5  # GDAL's coordinate of the centre of the first pixel
@@ -28,8 +29,6 @@ CSM_CENTRE = 0.5
 ISIS_CENTRE = 1.0
 BODY_TOLERANCE = 0.005  # of the radius: mean, equatorial and reference spheres of one body
 _ELLIPSOID = re.compile(r"(?:SPHEROID|ELLIPSOID)\[\"[^\"]*\",\s*([0-9.eE+]+),\s*([0-9.eE+]+)")
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from rasterio.windows import Window
 from schemas.errors import InputError
 from schemas.files.hdf5 import silence_hdf5
 from schemas.files.user_files import check_file
+from stages.common.arrays import Mask
 from stages.common.memory import return_freed_memory
 from stages.physics.maps.grid import Grid, ellipsoid_of, latitude_squash
 
@@ -37,8 +38,6 @@ _SPECIAL_UINT16 = (0, 1, 2, 65534, 65535)
 _SPECIAL_UINT8 = (0, 255)
 
 LARGEST_WINDOW = 1 << 22  # source pixels that are warped at a time: 0.2 GB with all that is made of them
-
-Mask = NDArray[np.bool_]
 
 
 @contextlib.contextmanager

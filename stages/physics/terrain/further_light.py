@@ -8,8 +8,8 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from stages.common.arrays import Floats, Floats32
 from stages.physics.formation.geometry import Angles
 from stages.physics.horizon.scene import make_overview
 from stages.physics.light.earth import EARTH_RADIUS, earth_irradiance, earth_phase
@@ -22,8 +22,6 @@ from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.sun_visibility import SunHorizon, visible_share
 from stages.physics.terrain.surface import Surface
 
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 STANDARD = math.radians(30)  # incidence and phase of the standard geometry (30, 0, 30) of maps and laboratories
 FINEST = 2  # px per cell of the map's means around a window
 OVERVIEW_PX = 2048

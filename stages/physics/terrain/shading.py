@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.physics.formation.chain import Extension, Observation, State, form
 from stages.physics.formation.geometry import Angles
 from stages.physics.maps.window import Window
@@ -18,9 +19,8 @@ from stages.physics.terrain.further_light import Bounce, Earthshine, Horizon
 from stages.physics.terrain.ground import BlockGeometry, block_geometry
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.sun_visibility import visible_share
-from stages.physics.terrain.surface import Surface
+from stages.physics.terrain.surface import SHADOWED, Surface
 
-Floats32 = NDArray[np.float32]
 BACKPLANES = (
     "incidence_deg",
     "emission_deg",
@@ -106,14 +106,17 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
     planes = {"image": image, "clipped": clipped}
     if sky is not None:
         planes["sky_view"] = sky[window.within(around).part]
-    if surface.albedo_error is not None:
-        # photographs have corrected the coefficients' errors: those of the albedo stand in their place
-        inner, _ = surface.albedo_error.relative(row, col, height, width, geometry.cos_incidence)
-        planes["image_std"] = inner * image
-    elif surface.deviations is not None:
-        planes["image_std"] = _image_deviation(surface, geometry, visible, window)
     shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
     shadow[np.isnan(geometry.cos_incidence)] = np.nan
+    if surface.albedo_error is not None:
+        # photographs have corrected the coefficients' errors: those of the albedo stand in their place
+        inner, _ = surface.albedo_error.half_widths(
+            row, col, image, geometry.cos_incidence, shadow > SHADOWED, np.clip(geometry.sun[2], 0.0, 1.0)
+        )
+        inner[np.isnan(image)] = np.nan
+        planes["image_std"] = inner
+    elif surface.deviations is not None:
+        planes["image_std"] = _image_deviation(surface, geometry, visible, window)
     return planes | {
         "incidence_deg": _degrees(geometry.cos_incidence),
         "emission_deg": _degrees(geometry.cos_emission),
