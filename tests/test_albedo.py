@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import h5py
@@ -18,7 +17,6 @@ from stages import albedo, merge
 from stages.albedo.posterior import Spread, estimate, settle
 from stages.albedo.pyramid import LEVELS
 
-running = sys.modules["stages.albedo.stage"]
 QUIET = albedo.Config(geotiff=False)
 
 
@@ -197,7 +195,7 @@ def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
     from lunargr_cli.fanout.stages import run_albedo
 
     # blocks so small that the map has four rows of them
-    monkeypatch.setattr(running, "BLOCK_PX", 64)
+    monkeypatch.setattr("stages.albedo.stage.BLOCK_PX", 64)
     config = replace(QUIET, geotiff=True)
     names = ("albedo", "albedo_std", "albedo_images", "coefficients", "elevation", "albedo_gain", "albedo_image_std")
     whole = tmp_path / "whole.h5"
@@ -228,7 +226,7 @@ def interrupt(*arguments, **options):
 
 
 def test_blocks_leave_no_seams(planted, found, monkeypatch):
-    monkeypatch.setattr(running, "BLOCK_PX", 64)
+    monkeypatch.setattr("stages.albedo.stage.BLOCK_PX", 64)
     blocks = made(planted, name="blocks.h5")[0]
     assert np.nanmax(np.abs(np.log(blocks / found[0]))) < 0.1 * np.nanmedian(found[1])
 
