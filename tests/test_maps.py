@@ -16,8 +16,8 @@ from schemas import ConfigError, RegistryError, read_strings
 from schemas.files.outputs import Output
 from stages import infer, train
 from stages.common.threads import one_thread_each, share_out
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.losses import crop_errors, squared_error
-from stages.network.maps import CoefficientMaps
 from stages.network.pieces import PIECE, convolution, sum_over_crops
 from stages.network.pixels import Pixels, fit_pixels
 from stages.network.predictor import load_predictor
@@ -246,15 +246,9 @@ def test_the_map_carries_its_deviations(small_artefacts, trained, tmp_path):
     assert predictor.image_noise > 0
     with h5py.File(small_artefacts["scene"]) as file:
         elevation, known = file["elevation"][...], file["dem_valid"][...].astype(bool)
-    filled = torch.from_numpy(fill_holes(elevation, known))[None]
-    coefficients = predictor.coefficients(filled)
-    with torch.no_grad():
-        predictor.eval()
-        stride = predictor.net.stride
-        padding = (0, -filled.shape[2] % stride, 0, -filled.shape[1] % stride)
-        padded = torch.nn.functional.pad(filled[:, None], padding, mode="replicate")[:, 0]
-        shifted = predictor.shifted(padded)[..., : filled.shape[1], : filled.shape[2]]
-    deviations = dict(zip(predictor.maps.maps, predictor.maps.deviations(shifted, dim=1).unbind(1), strict=True))
+    coefficients, deviations = predictor.coefficients_and_deviations(
+        torch.from_numpy(fill_holes(elevation, known))[None]
+    )
     with h5py.File(tmp_path / "map.h5") as file:
         assert read_strings(file, "map_name") == list(deviations) == ["albedo"]
         found = file["coefficients_std"][0]

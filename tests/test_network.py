@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.losses import Radiometry, squared_error
-from stages.network.maps import CoefficientMaps
 from stages.network.normalisation import scale_elevation
 from stages.network.predictor import Predictor
 from stages.network.runtime import choose_inference_precision

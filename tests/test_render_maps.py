@@ -19,7 +19,7 @@ from stages import render
 from stages.physics.maps.grid import Grid, unit_vectors
 from stages.physics.photometry import evaluate
 from stages.physics.terrain import sun_visibility as light
-from stages.render import maps
+from stages.render import ortho
 from stages.render.pictures import read_exr, stretch
 
 
@@ -96,8 +96,8 @@ def test_blocks_make_no_difference(hilly_map, tmp_path, monkeypatch):
     path, *_ = hilly_map
     config = render.Config(sun_azimuth_deg=100.0, sun_elevation_deg=20.0)
     render.run(path, tmp_path / "whole.exr", config)
-    monkeypatch.setattr(maps, "BAND_ROWS", 33)
-    monkeypatch.setattr(maps, "BAND_COLUMNS", 71)
+    monkeypatch.setattr(ortho, "BAND_ROWS", 33)
+    monkeypatch.setattr(ortho, "BAND_COLUMNS", 71)
     render.run(path, tmp_path / "blocks.exr", config)
     whole, blocks = read_exr(tmp_path / "whole.exr"), read_exr(tmp_path / "blocks.exr")
     for name in whole:

@@ -39,6 +39,7 @@ FRAMES = (
 
 
 def angle(name: str, dim: str, limit: float, description: str) -> Variable:
+    """A finite angle within +-``limit`` degrees along one dimension."""
     return Variable(name, (dim,), "f8", "degree", description, minimum=-limit, maximum=limit, finite=True)
 
 

@@ -1,5 +1,6 @@
 """Stage albedo. stage: from files to files; references: photographs against the map; calibrate: gains and errors; pyramid: scales;
-posterior: the estimate; prior: what the network says of its own errors; intervals: how far unseen images lie; writing: the new map."""
+posterior: the estimate; prior: what the network says of its own errors; intervals: how far unseen images lie; writing: the new map.
+"""
 
 from __future__ import annotations
 

@@ -41,7 +41,8 @@ class Calibration:
     """gain, offset : (n,), measured = gain x I/F x albedo + offset; spread : variances of log ratios;
     error : relative variance of an image's error at the cosines of incidence ``COSINES``; interval : (2, bins), half-widths
     of the 68 and 95 % intervals of an unseen image, in standard deviations, by the same bins; shadow : (2,) the same in
-    shadow, I/F over the sine of the Sun's elevation"""
+    shadow, I/F over the sine of the Sun's elevation
+    """
 
     gain: Floats
     offset: Floats
@@ -228,7 +229,8 @@ def _line(expected: Floats, measured: Floats, with_offset: bool) -> tuple[float,
 
 def _variances(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], count: int) -> Spread:
     """Variance components by moments of pairs of images: products for what is shared; for the rest what a square has
-    beyond that, or what differences say where this is more (errors that neighbours share would hide in differences)."""
+    beyond that, or what differences say where this is more (errors that neighbours share would hide in differences).
+    """
     levels = LEVELS + 2  # the last are whole pixels
     product, weight, difference, reach = (np.zeros((levels, count, count)) for _ in range(4))
     square, sums, pixels = (np.zeros((levels, count)) for _ in range(3))

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Config:
     """leave_out : image ids that must not enter; fold : (k, n) leaves out every n-th image from the k-th on (0-based), None:
-    all enter; geotiff : whether the map is written as a GeoTIFF as well."""
+    all enter; geotiff : whether the map is written as a GeoTIFF as well.
+    """
 
     leave_out: tuple[str, ...] = ()
     fold: tuple[int, int] | None = None
@@ -26,7 +27,8 @@ class Config:
 @dataclass(frozen=True)
 class Summary:
     """For the lines at the end. covered_share : of the map's valid pixels, those that an image saw; shared_std, prior_std :
-    relative spread of the albedo that images share, and of its error where images enter, medians"""
+    relative spread of the albedo that images share, and of its error where images enter, medians
+    """
 
     images: tuple[str, ...]
     left_out: tuple[str, ...]

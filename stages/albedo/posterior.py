@@ -25,7 +25,8 @@ ITERATIONS = 8
 class Spread:
     """Variances of log ratios. shared : (LEVELS + 1,) of the albedo that all images show, by band; own : (n, LEVELS + 1)
     of each image's error; shared_px, own_px : (), (n,) of whole pixels; prior : (LEVELS + 1,) of what the map may be wrong
-    by where no image says more"""
+    by where no image says more
+    """
 
     shared: Floats
     own: Floats

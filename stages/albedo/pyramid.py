@@ -1,5 +1,6 @@
 """Structure by size: Laplacian pyramids of images with gaps (Burt & Adelson 1983, IEEE Trans. Commun. 31:532), each
-level smoothed by normalised convolution (Knutsson & Westin 1993, CVPR:515) so that unknown pixels say nothing."""
+level smoothed by normalised convolution (Knutsson & Westin 1993, CVPR:515) so that unknown pixels say nothing.
+"""
 
 from __future__ import annotations
 

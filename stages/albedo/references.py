@@ -34,7 +34,8 @@ TURN = 30e3  # m over which the Sun's azimuth turns by 1 deg on the Moon
 @dataclass(frozen=True)
 class Look:
     """One photograph on a window. measured : (h, w) as in the file, NaN where it shows no known ground; predicted : (h, w)
-    I/F, 0 in shadow; usable : (h, w) bool, lit and away from shadows; shadow : (h, w) bool; sun_sine : of the Sun's elevation"""
+    I/F, 0 in shadow; usable : (h, w) bool, lit and away from shadows; shadow : (h, w) bool; sun_sine : of the Sun's elevation
+    """
 
     measured: Floats32
     predicted: Floats32

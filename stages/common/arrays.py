@@ -1,4 +1,4 @@
-"""Arrays by what they hold. Shapes stand in docstrings."""
+"""Names of array types."""
 
 from __future__ import annotations
 

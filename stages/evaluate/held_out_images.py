@@ -163,7 +163,8 @@ def _score(
     reader: PairReader, maps: Sequence[Map], chosen: Sequence[tuple[int, int]], writer: ArtefactWriter, progress: Any
 ) -> dict[str, NDArray]:
     """Sums of squares (rows, pairs), pixels, ssim, nearest Suns (rad); ``within`` (3, bands, pairs): pixels
-    by incidence, and of those the ones within the 68 and the 95 % intervals."""
+    by incidence, and of those the ones within the 68 and the 95 % intervals.
+    """
     count = len(chosen)
     found: dict[str, NDArray] = {
         "squares": np.zeros((len(ROWS), count)),

@@ -9,7 +9,10 @@ from torch import Tensor, nn
 
 
 def squared_error(predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
-    """Sum of squared errors over valid pixels; its gradient is that in ``predicted`` only."""
+    """Sum of squared errors over valid pixels; its gradient is that in ``predicted`` only.
+
+    predicted, measured, valid : (B, H, W), in the same unit
+    """
     return _SquaredError.apply(predicted, measured, valid)
 
 
@@ -60,9 +63,11 @@ class Radiometry(nn.Module):
         self.shift = nn.Parameter(offset / scale, requires_grad=not calibrated)
 
     def gain(self) -> Tensor:
+        """(F,) of each image."""
         return self.scale * (self.log_gain - self.log_gain.mean()).exp()
 
     def offset(self) -> Tensor:
+        """(F,) of each image."""
         return self.scale * self.shift
 
     def of_crops(self, frame: Tensor) -> tuple[Tensor, Tensor]:

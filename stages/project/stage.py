@@ -79,7 +79,8 @@ class Crops:
 @dataclass(frozen=True)
 class View:
     """What one image shows of its crops. rows, cols : (m,) of their middles; mean : (m,) m; local : their frames;
-    field : what registration takes off, None without"""
+    field : what registration takes off, None without
+    """
 
     source: Source
     field: Field | None

@@ -40,10 +40,6 @@ class Chart:
         """Body-fixed (..., 3) -> local frame, origin still at the body's centre."""
         return points @ self.axes.T
 
-    def to_body(self, points: Floats) -> Floats:
-        """Local frame (..., 3) -> body-fixed."""
-        return points @ self.axes
-
 
 def fit_chart(grid: Grid) -> Chart:
     """The chart of a grid. Raises GeometryError where the grid is too large for one (a good part of the body)."""

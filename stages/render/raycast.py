@@ -57,7 +57,10 @@ class Hits:
 
 
 def build_height_field(elevation: NDArray[np.float32], grid: Grid) -> HeightField:
-    """Prepare a DEM for rays: one pass over it. Raises GeometryError where it holds no cell of four known heights."""
+    """Prepare a DEM for rays: one pass over it. Raises GeometryError where it holds no cell of four known heights.
+
+    elevation : (H, W), m, NaN = unknown
+    """
     elevation = np.ascontiguousarray(elevation, np.float32)
     height, width = elevation.shape
     if height < 2 or width < 2:

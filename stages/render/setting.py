@@ -162,12 +162,12 @@ def camera_place(camera: Camera) -> NDArray[np.float64]:
 
 def metadata(surface: Surface, config: Config, light: Light) -> dict[str, object]:
     """What a file must say about how it came to be."""
-    told = {k: v for k, v in asdict(config).items() if v not in (None, {}, False) and k != "shard"}
+    facts = {k: v for k, v in asdict(config).items() if v not in (None, {}, False) and k != "shard"}
     return {
         "source": surface.path.name,
         "model": surface.model.name,
         "quantity": "radiance factor I/F = pi r, including cos(incidence)",
         "sun_position_mcmf": " ".join(f"{v:.6e}" for v in light.sun.position),
-        "config": " ".join(f"{k}={v}" for k, v in sorted(told.items())),
-        "record": raster_record("render", told, inputs(surface.path, config)),
+        "config": " ".join(f"{k}={v}" for k, v in sorted(facts.items())),
+        "record": raster_record("render", facts, inputs(surface.path, config)),
     }

@@ -9,7 +9,7 @@ from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import find_body
 from stages.render.config import Config, Summary, check, inputs, output_files
-from stages.render.maps import render_map
+from stages.render.ortho import render_map
 from stages.render.setting import find_camera, make_light, open_source
 from stages.render.views import render_camera
 

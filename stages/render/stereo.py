@@ -64,7 +64,7 @@ def run_stereo(
         for number in range(stereo.count):
             progress(number, stereo.count, "pairs")
             pairs.append(_render_pair(f"pair_{number:05d}", surface, places, own, body, relief, world, folder))
-    told = {
+    document = {
         "source": source.name,
         "pixel_centre": 0.5,
         "unit": "m",
@@ -74,7 +74,7 @@ def run_stereo(
         "pairs": pairs,
     }
     with atomic_path(manifest) as partial:
-        partial.write_text(json.dumps(told, indent=1))
+        partial.write_text(json.dumps(document, indent=1))
     progress(stereo.count, stereo.count, "pairs")
     return manifest
 
@@ -129,8 +129,8 @@ class _Places:
 
 def _split_tiles(count: int, rng: np.random.Generator) -> list[str]:
     """A split per tile: shares as in SPLITS, at least one tile of each."""
-    numbers = [max(1, round(share * count)) for _, share in SPLITS[1:]]
-    names = [name for (name, _), n in zip(SPLITS[1:], numbers, strict=True) for _ in range(n)]
+    counts = [max(1, round(share * count)) for _, share in SPLITS[1:]]
+    names = [name for (name, _), n in zip(SPLITS[1:], counts, strict=True) for _ in range(n)]
     names = ["train"] * (count - len(names)) + names
     return [names[k] for k in rng.permutation(count)]
 

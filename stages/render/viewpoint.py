@@ -63,7 +63,10 @@ def rotation_from_quaternion(quaternion: Sequence[float]) -> Floats:
 def pinhole_view(
     position: Floats, rotation: Floats, fov_deg: float, size_px: tuple[int, int], radius: float
 ) -> Pinhole:
-    """A distortion-free camera; ``fov_deg`` spans the image's width. Raises GeometryError."""
+    """A distortion-free camera; ``fov_deg`` spans the image's width. Raises GeometryError.
+
+    position : (3,) body-fixed, m; rotation : (3, 3) camera axes to body-fixed; radius : m
+    """
     if not 0.0 < fov_deg < 170.0:
         raise GeometryError(
             f"`fov_deg`: expected degrees across the image's width between 0 and 170, found {fov_deg:g}; correct it."

@@ -128,8 +128,8 @@ def render_camera(
     with contextlib.ExitStack() as stack:
         exr = None
         if ".exr" in named:
-            told = metadata(surface, config, light)
-            exr = stack.enter_context(write_exr(named[".exr"], camera.lines, camera.samples, channels, told))
+            facts = metadata(surface, config, light)
+            exr = stack.enter_context(write_exr(named[".exr"], camera.lines, camera.samples, channels, facts))
         for band in bands:
             if exr:
                 exr.write(band)

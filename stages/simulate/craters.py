@@ -49,13 +49,17 @@ class Craters:
         return len(self.x)
 
     def select(self, keep: NDArray) -> Craters:
+        """Those that ``keep``, (n,) bool or indices, names."""
         return Craters(
             *(a[keep] for a in (self.x, self.y, self.diameter, self.age, self.depth_factor, self.seed)),
         )
 
 
 def cumulative_density(diameter: NDArray | float, density: float, transition: float) -> NDArray:
-    """Craters larger than ``diameter`` (m) per m2: equilibrium below ``transition`` (m), production above."""
+    """Craters larger than ``diameter`` (m) per m2: equilibrium below ``transition`` (m), production above.
+
+    diameter : (n,) or a number
+    """
     d = np.asarray(diameter, float)
     at_transition = density * EQUILIBRIUM_PER_KM2 * (transition / 1000.0) ** -EQUILIBRIUM_SLOPE * 1e-6
     slope = np.where(d < transition, EQUILIBRIUM_SLOPE, PRODUCTION_SLOPE)
@@ -142,7 +146,10 @@ def _bury(x, y, diameter, time, luck, order, start, rows, columns, cell, x0, y0)
 
 
 def fresh_profile(r: NDArray) -> NDArray:
-    """Height over diameter of a fresh simple crater at r radii from its centre."""
+    """Height over diameter of a fresh simple crater at r radii from its centre.
+
+    r : (n,); returns (n,). Rim and depth after Pike (1977), ejecta after McGetchin et al. (1973)
+    """
     r = np.asarray(r, float)
     # flat floor, parabolic foot, straight wall at the angle of repose (tan = 2 DEPTH WALL = 0.67)
     foot = FLOOR + 2 * (1 - FLOOR - 1 / WALL)

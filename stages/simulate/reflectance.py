@@ -109,7 +109,10 @@ class Truth:
         return [self.albedo_name, *filter(None, [self.lobe_name])]
 
     def maps(self, geometry: Floats32, free: Floats32) -> dict[str, Floats32]:
-        """The parameters that vary by place, from the logarithms of the albedo's factors."""
+        """The parameters that vary by place, from the logarithms of the albedo's factors.
+
+        geometry, free : (H, W); returns (H, W) by name
+        """
         maps = {self.albedo_name: self._bounded(self.albedo_name, np.exp(geometry + free))}
         if self.lobe_name:
             maps[self.lobe_name] = self._bounded(self.lobe_name, 1 - 0.22 * np.tanh(geometry / 0.4))

@@ -94,7 +94,8 @@ def evaluate_loss(
     progress: Progress = show_nothing,
 ) -> tuple[float, float]:
     """Mean squared error and mean of what is minimised over the valid pixels of some pairs, in evaluation mode; NaN where
-    there are none."""
+    there are none.
+    """
     training.predictor.eval()
     totals, pixels = [0.0, 0.0], 0.0
     mine = indices[training.rank :: training.ranks]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.losses import Radiometry
-from stages.network.maps import CoefficientMaps
 from stages.network.predictor import Predictor
 from stages.network.runtime import choose_precision
 from stages.network.unet import UNet

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 
 from stages.common.memory import keep_freed_memory
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.losses import squared_error
-from stages.network.maps import CoefficientMaps
 from stages.network.predictor import Predictor
 from stages.network.runtime import choose_precision
 from stages.network.unet import UNet

@@ -94,6 +94,7 @@ def et_to_utc(ephemeris_time: float) -> str:
 
 
 def body_name(body: str | Body) -> str:
+    """The name in lower case."""
     return (body.name if isinstance(body, Body) else str(body)).strip().lower()
 
 

@@ -51,7 +51,10 @@ class Camera(ABC):
         return None
 
     def ephemeris_time(self, line: ArrayLike) -> Floats | None:
-        """Seconds of TDB since J2000 of each line; None where the model holds no time."""
+        """Seconds of TDB since J2000 of each line; None where the model holds no time.
+
+        line : (...,) px; returns the same shape
+        """
         return None
 
     def position(self, line: ArrayLike, sample: ArrayLike | None = None) -> Floats:
@@ -63,12 +66,15 @@ class Camera(ABC):
         """Which exposure took each line, where the image is pieced together of several that overlap on the ground.
 
         None for an image in one piece, over which places move steadily as they do over the ground.
+
+        line : (...,) px; returns the same shape
         """
         return None
 
     def ground_to_piece(self, points: ArrayLike, piece: ArrayLike) -> tuple[Floats, Floats]:
         """As :meth:`ground_to_image`, in a given exposure (indices that broadcast with the points); lines are held
-        where that exposure's own pixels are, so that its neighbours in the image do not mix in."""
+        where that exposure's own pixels are, so that its neighbours in the image do not mix in.
+        """
         return self.ground_to_image(points)
 
     def edge_lines(self, count: int) -> Floats:
@@ -76,7 +82,10 @@ class Camera(ABC):
         return np.linspace(0.0, self.lines, count)
 
     def inside(self, line: ArrayLike, sample: ArrayLike) -> NDArray[np.bool_]:
-        """Whether image coordinates lie on the detector."""
+        """Whether image coordinates lie on the detector.
+
+        line, sample : (...,) px, broadcast against each other
+        """
         line, sample = np.asarray(line, float), np.asarray(sample, float)
         return (line >= 0) & (line <= self.lines) & (sample >= 0) & (sample <= self.samples)
 
@@ -138,6 +147,7 @@ def register(cls: type[Camera]) -> type[Camera]:
 
 
 def camera_kinds() -> list[str]:
+    """The registered kinds of cameras, sorted."""
     return sorted({cls.kind for cls in _CAMERAS.values()})
 
 

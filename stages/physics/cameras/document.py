@@ -29,6 +29,7 @@ def value(document: Mapping[str, Any], key: str, where: str) -> Any:
 
 
 def number(document: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:
+    """A finite number. Raises InputError."""
     if default is not None and not has(document, key):
         return default
     found = value(document, key, where)
@@ -66,6 +67,7 @@ def array(document: Mapping[str, Any], key: str, where: str, shape: tuple[int, .
 
 
 def has(document: Mapping[str, Any], key: str) -> bool:
+    """Whether a dotted key is there."""
     here: Any = document
     for part in key.split("."):
         if not isinstance(here, Mapping) or part not in here:
@@ -75,6 +77,7 @@ def has(document: Mapping[str, Any], key: str) -> bool:
 
 
 def size(document: Mapping[str, Any], key: str, where: str) -> int:
+    """A number of lines or samples. Raises InputError."""
     result = number(document, key, where)
     if not 1 <= result <= LARGEST_IMAGE or result != int(result):
         raise InputError(

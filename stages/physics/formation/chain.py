@@ -90,9 +90,11 @@ class Extension(Protocol):
     """A physical effect that extends the chain (``stages/effects``)."""
 
     @property
-    def slot(self) -> str: ...
+    def slot(self) -> str:
+        """One of SLOTS."""
 
-    def apply(self, state: State) -> None: ...
+    def apply(self, state: State) -> None:
+        """Change what the slot may change."""
 
 
 def form(
@@ -109,7 +111,9 @@ def form(
     """
     if not extensions:
         o = observation
-        known = facets.look(o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius)
+        known = facets.angles_and_light(
+            o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius
+        )
         if known is not None:
             return model.lit(coefficients, *known)
     state = illuminate(observation, extensions)

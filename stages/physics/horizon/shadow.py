@@ -261,7 +261,10 @@ def _state(sweep: Sweep, parallel: bool) -> NDArray[np.float32]:
 def sweep_shadow(
     grid: NDArray[np.float32], gsd: PixelSize, azimuth: float, sun_elevation: float, body_radius: float | None
 ) -> NDArray[np.bool_]:
-    """True where terrain hides a Sun at this azimuth and elevation (rad); see ``horizon.cast_shadow``."""
+    """True where terrain hides a Sun at this azimuth and elevation (rad); see ``horizon.cast_shadow``.
+
+    grid : (H, W), m; returns (H, W)
+    """
     sweep, tables = _tables(grid.shape, gsd, azimuth, sun_elevation, body_radius)
     out = np.empty(grid.shape, dtype=np.bool_)
     parallel = grid.size > SMALL

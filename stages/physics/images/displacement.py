@@ -37,6 +37,7 @@ class Basis:
 
     @property
     def size(self) -> int:
+        """Parts that it is made of."""
         return {"constant": 1, "affine": 3}.get(self.form, (self.cells[0] + 3) * (self.cells[1] + 3))
 
     def matrix(self, row: Floats, col: Floats) -> Floats:
@@ -119,6 +120,7 @@ class Field:
 
     @property
     def accepted(self) -> bool:
+        """Whether the evidence was enough."""
         return not self.refused
 
     @property

@@ -161,7 +161,10 @@ def _ground(terrain: Terrain, row: NDArray, col: NDArray, displacement: Displace
 
 
 def bilinear(values: NDArray, row: NDArray, col: NDArray) -> Floats:
-    """Between pixel centres, continued evenly beyond the outermost; whole indices need no neighbour."""
+    """Between pixel centres, continued evenly beyond the outermost; whole indices need no neighbour.
+
+    values : (H, W); row, col : (...,) px; returns (...,)
+    """
     row, col = np.asarray(row, float), np.asarray(col, float)
     r = np.clip(np.floor(row).astype(int), 0, max(0, values.shape[0] - 2))
     c = np.clip(np.floor(col).astype(int), 0, max(0, values.shape[1] - 2))

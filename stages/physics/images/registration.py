@@ -56,6 +56,7 @@ class Shift:
 
     @property
     def accepted(self) -> bool:
+        """Whether the evidence was enough."""
         return not self.refused
 
     @property
@@ -127,7 +128,11 @@ def prepare(
     patterns: Sequence[ArrayLike] = (),
     relief: Floats | None = None,
 ) -> Pictures:
-    """Band-pass all of it once. Raises GeometryError for shapes that differ."""
+    """Band-pass all of it once. Raises GeometryError for shapes that differ.
+
+    image, rendering, valid, weights, relief : (H, W), and so is each of the ``patterns``; NaN = unknown
+    weights : 0 or more, for example less in shadow; relief : displacement of the ground by height
+    """
     image, rendering = np.asarray(image, float), np.asarray(rendering, float)
     if image.ndim != 2 or image.shape != rendering.shape:
         raise GeometryError(

@@ -40,7 +40,8 @@ Box = tuple[int, int, int, int]
 @dataclass(frozen=True)
 class Pixels:
     """A window of the scene's grid. values : (h, w) float32, NaN where not seen; valid : (h, w) bool;
-    ortho : the camera's side of it, None for map-projected images."""
+    ortho : the camera's side of it, None for map-projected images.
+    """
 
     values: NDArray[np.float32]
     valid: NDArray[np.bool_]
@@ -48,6 +49,8 @@ class Pixels:
 
 
 class Source(Protocol):
+    """An image whose pixels can be read onto the grid of a scene."""
+
     def box(self) -> Box | None:
         """(row, col, height, width) on the grid that holds all that the image shows, None where it lies elsewhere."""
 
@@ -90,6 +93,7 @@ class MapSource:
     camera_position: Floats
 
     def box(self) -> Box | None:
+        """As of every source."""
         if rasters.source_window(self.dataset, self.grid, margin=0) is None:
             return None
         image = self.dataset
@@ -106,12 +110,14 @@ class MapSource:
         return r0, c0, max(0, r1 - r0), max(0, c1 - c0)
 
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
+        """As of every source; resampled from one map to the other."""
         if field is None or field.refused:
             part = self.grid.window(row, col, height, width)
             return Pixels(*rasters.warp(self.dataset, part, rasters.choose_resampling(self.dataset, part)[0]), None)
         return Pixels(*self._read_moved(row, col, height, width, field), None)
 
     def relief(self, reference: float) -> Relief | None:
+        """As of every source."""
         return relief_displacement(self.grid, self.camera_position, reference)
 
     def _read_moved(
@@ -159,12 +165,15 @@ class CameraSource:
     sun_position: Floats
 
     def box(self) -> Box | None:
+        """As of every source."""
         return footprint(self.camera, self.grid, self.heights)
 
     def relief(self, reference: float) -> Relief | None:
+        """None: orthorectification has taken it off."""
         return None
 
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
+        """As of every source; orthorectified with the scene's elevations."""
         r0, c0, r1, c1 = self._surroundings(row, col, height, width)
         piece = np.asarray(self.elevation[r0:r1, c0:c1], dtype=float)
         terrain = Terrain(piece, self.grid.window(r0, c0, r1 - r0, c1 - c0))

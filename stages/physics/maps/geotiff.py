@@ -40,13 +40,20 @@ class Placed(Protocol):
     """Where a raster lies: a grid, or another raster that is open."""
 
     @property
-    def crs(self) -> CRS | None: ...
+    def crs(self) -> CRS | None:
+        """None where unknown."""
+
     @property
-    def transform(self) -> Affine: ...
+    def transform(self) -> Affine:
+        """GDAL's, pixel corners to map coordinates."""
+
     @property
-    def height(self) -> int: ...
+    def height(self) -> int:
+        """px"""
+
     @property
-    def width(self) -> int: ...
+    def width(self) -> int:
+        """px"""
 
 
 class MapTiff:

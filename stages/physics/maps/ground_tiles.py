@@ -81,6 +81,7 @@ class PositionMasks:
         return [int(k) for k in np.flatnonzero(meets)]
 
     def mask(self, frame: int, block: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+        """(height, width) bool: where a crop of an image may be centred; block : row, column, height, width."""
         row, col, h, w = block
         if self.stored:
             return self.file["valid_position"][frame, row : row + h, col : col + w].astype(bool)

@@ -172,6 +172,8 @@ def transform_points(grid: Grid, dataset: DatasetReader, x: NDArray, y: NDArray)
     """Map coordinates of a grid -> those of a raster on the same body.
 
     A geographic raster may count longitudes 0..360 or -180..180: the points follow the raster's own domain.
+
+    x, y : (n,) in the units of either CRS; returns (n,) each
     """
     if grid.squash == latitude_squash(dataset.crs):
         tx, ty = rasterio.warp.transform(grid.crs, dataset.crs, x, y)

@@ -31,7 +31,8 @@ BLOCK_PX = 1024
 class Horizon(Protocol):
     """Elevation of the terrain horizon towards a source of light, rad, for any window of a map."""
 
-    def window(self, row: int, col: int, height: int, width: int) -> Floats32: ...
+    def window(self, row: int, col: int, height: int, width: int) -> Floats32:
+        """(height, width) rad; NaN where the elevation is."""
 
 
 class Hidden:
@@ -52,7 +53,10 @@ class Earthshine:
 
     @staticmethod
     def over(surface: Surface, sun: Sun, earth_position: Floats, relief: float, shadows: bool) -> Earthshine:
-        """The Earth at a place, body-fixed, m, lit by the Sun as it stands. relief : m, lowest to highest point."""
+        """The Earth at a place, body-fixed, m, lit by the Sun as it stands. relief : m, lowest to highest point.
+
+        earth_position : (3,)
+        """
         grid = surface.grid
         middle = grid.local_frames((grid.height - 1) / 2, (grid.width - 1) / 2).up[0] * grid.radius
         distance = float(np.linalg.norm(earth_position - middle))

@@ -64,6 +64,7 @@ class Floor:
         self.below: torch.Tensor | None = None
 
     def apply(self, state: State) -> None:
+        """Clip the reflectance."""
         self.below = state.reflectance < 0
         state.reflectance = state.reflectance.clamp(min=0)
 
@@ -77,6 +78,7 @@ class Added:
         self._radiance = torch.from_numpy(np.nan_to_num(radiance))[None]
 
     def apply(self, state: State) -> None:
+        """Have it added once the Sun's own light is known."""
         state.further_light.append(self._add)
 
     def _add(self, state: State) -> None:
@@ -186,6 +188,7 @@ def form_window(
     """I/F of a window through the whole formation chain with its extensions, tile by tile with a margin; where it was clipped.
 
     added : I/F that further light adds, on the window padded by HALO_PX
+    returns (h, w) float32 each
     """
     shape = (surface.grid.height, surface.grid.width)
     around = window.padded(HALO_PX, shape)

@@ -176,4 +176,5 @@ def point_spread(step: float, image_gsd: float, sigma_px: float, extra_sigma2_px
 
 
 def blur(image: Floats32, kernel: Floats32) -> Floats32:
+    """image : (H, W); kernel : (n,), applied along rows and columns; edges repeated."""
     return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE), np.float32)

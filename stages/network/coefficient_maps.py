@@ -71,7 +71,10 @@ class CoefficientMaps(nn.Module):
         return dict(zip((*self.maps, *self.rest), (*bounded.unbind(1), *everywhere), strict=True))
 
     def stack(self, shifted: Tensor, dim: int) -> Tensor:
-        """All parameters along ``dim``, in the model's order."""
+        """All parameters along ``dim``, in the model's order.
+
+        shifted : (B, channels, H, W) with dim 1, or alike; returns (B, C, H, W)
+        """
         bounded = self._bounded(shifted.narrow(dim, 0, len(self.maps)), dim, self.maps)
         if not self.rest:
             return bounded
@@ -81,7 +84,10 @@ class CoefficientMaps(nn.Module):
         return torch.stack([found[name] for name in self.names], dim=dim)
 
     def deviations(self, shifted: Tensor, dim: int) -> Tensor:
-        """Standard deviations of the maps along ``dim``, in the maps' order; at most half of a parameter's range."""
+        """Standard deviations of the maps along ``dim``, in the maps' order; at most half of a parameter's range.
+
+        shifted : (B, channels, H, W) with dim 1, or alike; returns (B, M, H, W)
+        """
         count = len(self.maps)
         half = [(p.upper - p.lower) / 2 for p in self.model.parameters if p.name in self.maps]
         shape = [1] * shifted.ndim
