@@ -25,7 +25,8 @@ def test_the_list_of_commands_is_up_to_date():
 
 
 @pytest.mark.parametrize("code", PYTHON)
-def test_python_examples_run(code):
+def test_python_examples_run(code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # they write files
     exec(compile(code, "docs/python.md", "exec"), {})
 
 
