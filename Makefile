@@ -82,7 +82,8 @@ D := demo
 # One split of the scene for everything that is sampled from it: a quarter of its ground tiles is for testing, 20 at least.
 DEMO_SPLIT := --split 65/10/25
 # fp32: the README's figures must not hang on whether a processor is made for bf16
-DEMO_TRAIN := --epochs 6 --precision fp32
+# batches of 8: few pairs need many steps
+DEMO_TRAIN := --epochs 6 --batch 8 --precision fp32
 DEMO_RUNS := $(foreach seed,0 1 2,$(D)/checkpoint_$(seed).h5)
 
 demo: $(D)/report.html ## run every stage on the embedded scene and name a report to open

@@ -91,7 +91,20 @@ def evaluated(result: dict[str, Any], names: Iterable[str], more: list[list[str]
         lines
         + table(["model", "what it may know", "MSE", "SSIM"], [*rows, *more])
         + said(conclusions.evaluation(result))
+        + covered(result)
     )
+
+
+def covered(result: dict[str, Any]) -> list[str]:
+    """What the error bars hold."""
+    found = result.get("coverage_percent")
+    if not found:
+        return []
+    bands = [band["95"] for band in found.get("by_incidence", []) if band["pixels"]]
+    spread = f"; by incidence those of 95 % hold {min(bands):.1f} to {max(bands):.1f} %" if bands else ""
+    return [
+        f"- Intervals that should hold 68 and 95 % of the pixels hold {found['68']:.1f} and {found['95']:.1f} %{spread}."
+    ]
 
 
 def brief(result: dict[str, Any]) -> list[str]:
@@ -130,12 +143,7 @@ def held_out(root: Path, folder: str, command: str) -> list[str]:
     ]  # fmt: skip
     lines = [f"Claim: {result['claim']}; {conclusions.basis(result)}, {len(result['images'])} images."]
     lines += table(["map", "MSE", "SSIM"], rows) + said(conclusions.held_out_images(result))
-    coverage = result.get("coverage_percent")
-    if coverage:
-        lines.append(
-            f"- Intervals that should hold 68 and 95 % of the pixels hold {coverage['68']:.1f} and {coverage['95']:.1f} %."
-        )
-    return lines
+    return lines + covered(result)
 
 
 def matched(root: Path, folder: str, command: str) -> list[str]:

@@ -12,7 +12,8 @@ def show_held_out_images(
     console: Console, pairs: Path, maps: list[Path], output: Output, split: str, seed: int
 ) -> None:
     """Score maps with albedo on images that did not make it. Raises LunargrError."""
-    from stages.evaluate.held_out_images import Config, coverage_lines, image_lines, result_lines, run
+    from stages.evaluate.coverage import coverage_lines
+    from stages.evaluate.held_out_images import Config, image_lines, result_lines, run
 
     result = run(pairs, maps, output, Config(split, seed), console.say, console.progress)
     suns = result["nearest_used_sun_deg"]
@@ -25,5 +26,5 @@ def show_held_out_images(
     )
     console.table("by image", *image_lines(result))
     if result["coverage_percent"] is not None:
-        console.table("pixels within the intervals, percent", *coverage_lines(result))
+        console.table("pixels within the intervals, percent", *coverage_lines(result["coverage_percent"]))
     console.say(f"written: {output.file}, {output.file.with_suffix('.json')}")

@@ -453,6 +453,13 @@ _ALBEDO = (
         "half-width of the 68 % interval of an unseen image's pixel, in hypot(albedo_std / albedo, median image's own std)",
     ),
     _of_images("albedo_interval_95", ("incidence_bin",), "f8", "1", "the same of the 95 % interval"),
+    _of_images(
+        "albedo_interval_shadow",
+        ("level",),
+        "f8",
+        "1",
+        "half-widths of the 68 and 95 % intervals in shadow, I/F over the sine of the Sun's elevation",
+    ),
 )
 
 SVBRDF = declare(
@@ -469,6 +476,7 @@ SVBRDF = declare(
             "frame": "images that the albedo was made of",
             "band": "structure sizes, fine to coarse",
             "incidence_bin": "bins of the cosine of incidence",
+            "level": "68 and 95 % intervals",
         },
         variables=_GRID
         + (

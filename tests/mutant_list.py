@@ -23,8 +23,8 @@ ALL = "np.arange(reader.count)"
 KNOWN = (
     Mutant(
         "stages/train/stage.py",
-        "                v if math.isfinite(v) else t for v, t in zip(",
-        "                t for v, t in zip(",
+        "history.objective.append(objective if math.isfinite(objective) else train_loss)",
+        "history.objective.append(train_loss)",
         (f"{LEAKS}::test_the_best_epoch_is_that_of_the_lowest_validation_loss",),
         "the best epoch is chosen by the training loss",
     ),

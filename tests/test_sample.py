@@ -132,9 +132,9 @@ def test_impossible_requests_are_refused(small_artefacts, tmp_path):
         ({"tile_m": 100.0}, ConfigError, "at least one crop"),
         ({"crop": 40}, ConfigError, "multiple of 16"),
         ({"count": 5, "density": 1.0}, ConfigError, "one of the two"),
-        ({"count": 0}, ConfigError, "--count: expected 1"),
+        ({"count": 0}, ConfigError, "`count`: expected 1"),
         ({"crop": 0}, ConfigError, "multiple of 16"),
-        ({"tile_m": float("nan")}, ConfigError, "--tile-m"),
+        ({"tile_m": float("nan")}, ConfigError, "`tile_m`"),
         ({"crop": 320, "tile_m": 6400.0}, GeometryError, "no crop"),
     ]:
         with pytest.raises(kind, match=words):
@@ -186,5 +186,5 @@ def test_a_scene_with_room_has_twenty_test_tiles(small_artefacts, tmp_path):
 
 
 def test_a_crop_larger_than_the_scene_s_tiles_asks_for_larger_tiles(small_artefacts, tmp_path):
-    with pytest.raises(ConfigError, match="--tile-m"):
+    with pytest.raises(ConfigError, match="`tile_m`"):
         sample.run(small_artefacts["scene"], tmp_path / "c.h5", sample.Config(crop=256, count=5))

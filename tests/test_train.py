@@ -217,11 +217,11 @@ def test_bad_requests_are_refused_and_leave_nothing(small_artefacts, tmp_path):
     pairs = small_artefacts["pairs"]
     for options, kind, words in [
         ({"model": "M9"}, RegistryError, "choose one of"),
-        ({"lr": -1.0}, ConfigError, "--lr"),
-        ({"epochs": 0}, ConfigError, "--epochs"),
+        ({"lr": -1.0}, ConfigError, "`lr`"),
+        ({"epochs": 0}, ConfigError, "`epochs`"),
         ({"widths": (4, 4, 4, 4, 4, 4, 4)}, ConfigError, "multiple of 64"),
-        ({"schedule": "steps"}, ConfigError, "--schedule"),
-        ({"device": "abacus"}, ConfigError, "--device"),
+        ({"schedule": "steps"}, ConfigError, "`schedule`"),
+        ({"device": "abacus"}, ConfigError, "`device`"),
     ]:
         with pytest.raises(kind, match=words):
             train.run(pairs, out, config(**options))
@@ -253,7 +253,11 @@ def test_the_losses_are_means_over_valid_pixels(small_artefacts):
             batch.observation, training.predictor.model, training.predictor.coefficients(batch.observation.elevation)
         )
         expected = (rendered - batch.image)[batch.valid].double().square().mean().item()
-        assert evaluate_loss(training, part, 7) == pytest.approx(expected, rel=1e-4)
+        error, objective = evaluate_loss(training, part, 7)
+        assert error == objective == pytest.approx(expected, rel=1e-4)
+        error, objective = evaluate_loss(training, part, 7, 0.1)
+        assert error == pytest.approx(expected, rel=1e-4)
+        assert 0.05 * expected < objective < 0.95 * error  # without most of what each crop's own gain explains
         learned = learn_epoch(training, part, options, 0)
         assert learned == pytest.approx(expected, rel=0.5)  # batch normalisation by the batch, not the running mean
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from stages.albedo.intervals import GAUSSIAN, unseen_intervals
+from stages.albedo.intervals import GAUSSIAN, Stack, unseen_intervals
 from stages.albedo.posterior import Spread, settle
 from stages.albedo.pyramid import LEVELS, bands
 from stages.albedo.references import Box, Look, References, overlap
@@ -35,6 +35,7 @@ ROUNDS = 6
 SETTLED = 0.05  # relative change of all variances below which no further round is made
 COSINES = np.linspace(0.0, 1.0, 17)  # bins of cos(incidence) over which the error may differ
 STEPS = 200  # of the fit of variances to those of differences
+OUTLYING = 4.0  # robust standard deviations
 FARTHEST = 3.0  # |log ratio| beyond which nothing is measured any more
 
 
@@ -42,26 +43,29 @@ FARTHEST = 3.0  # |log ratio| beyond which nothing is measured any more
 class Calibration:
     """gain, offset : (n,), measured = gain x I/F x albedo + offset; spread : variances of log ratios;
     error : relative variance of an image's error at the cosines of incidence ``COSINES``; interval : (2, bins), half-widths
-    of the 68 and 95 % intervals of an unseen image, in standard deviations, by the same bins"""
+    of the 68 and 95 % intervals of an unseen image, in standard deviations, by the same bins; shadow : (2,) the same in
+    shadow, I/F over the sine of the Sun's elevation"""
 
     gain: Floats
     offset: Floats
     spread: Spread
     error: Floats
     interval: Floats
+    shadow: Floats
 
     def ratio(self, k: int, look: Look) -> tuple[Floats32, Floats32]:
         """(log of measured / predicted, confidence), both 0 where the image says nothing."""
         expected = self.gain[k] * look.predicted
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.log(np.maximum((look.measured - self.offset[k]) / expected, np.exp(-FARTHEST)))
-        known = np.isfinite(ratio)
+        known = np.isfinite(ratio) & look.usable
         ratio = np.where(known, np.minimum(ratio, FARTHEST), 0).astype(np.float32)
         confidence = 1.0 / np.interp(look.cos_incidence, _middles(), self.error)
         return ratio, np.where(known, confidence, 0).astype(np.float32)
 
     def write(self, path: Path) -> None:
-        values = {"gain": self.gain, "offset": self.offset, "error": self.error, "interval": self.interval}
+        values = {"gain": self.gain, "offset": self.offset, "error": self.error}
+        values |= {"interval": self.interval, "shadow": self.shadow}
         values |= {
             "prior": self.spread.prior,
             "shared": self.spread.shared,
@@ -77,7 +81,7 @@ class Calibration:
         shared_px = float(text.pop("shared_px"))
         v = {k: np.array(values, float) for k, values in text.items()}
         spread = Spread(v["shared"], v["own"], shared_px, v["own_px"], v["prior"])
-        return Calibration(v["gain"], v["offset"], spread, v["error"], v["interval"])
+        return Calibration(v["gain"], v["offset"], spread, v["error"], v["interval"], v["shadow"])
 
 
 @dataclass
@@ -132,28 +136,56 @@ def calibrate(samples: Sequence[Sample], count: int, units: str) -> Calibration:
     bins = len(COSINES) - 1
     spread = Spread(np.full(LEVELS + 1, 0.01), own, 0.01, own[:, 0].copy(), np.full(LEVELS + 1, 0.01))
     unknown = np.tile(np.array(GAUSSIAN)[:, None], bins)
-    result = Calibration(np.ones(count), np.zeros(count), spread, np.ones(bins), unknown)
+    result = Calibration(np.ones(count), np.zeros(count), spread, np.ones(bins), unknown, np.zeros(2))
     albedo: list[Any] = [0.0] * len(samples)
     for _ in range(ROUNDS):
         gain, offset = _scales(samples, albedo, count, units)
         result = replace(result, gain=gain, offset=offset)
         stacks = [_stack(result, sample) for sample in samples]
         albedo = [
-            settle(ratio, confidence, result.spread.of(sample.images))
+            settle(ratio, confidence.copy(), result.spread.of(sample.images))
             for sample, (ratio, confidence) in zip(samples, stacks, strict=True)
         ]
+        _tame(samples, stacks, albedo, count)
         before = result.spread.own_px
-        result = replace(result, spread=_variances(samples, stacks, count), error=_error(samples, stacks, albedo))
+        result = replace(result, spread=_variances(samples, stacks, count))
+        result = replace(result, error=_error(samples, stacks, albedo, result.spread.own_px))
         if np.abs(np.log(np.maximum(result.spread.own_px, 1e-12) / np.maximum(before, 1e-12))).max() < SETTLED:
             break
-    seen = [(*_stack(result, s), s.images, [look.cos_incidence for look in s.looks]) for s in samples]
-    shift = np.log(result.gain) if units == "iof" else np.zeros(count)
-    return replace(result, interval=_rounded(unseen_intervals(seen, result.spread, shift, COSINES)))
+    interval, shadow = unseen_intervals([_unseen(result, sample, units) for sample in samples], result.spread, COSINES)
+    return replace(result, interval=_rounded(interval), shadow=_rounded(shadow))
+
+
+def _unseen(calibration: Calibration, sample: Sample, units: str) -> Stack:
+    """A window with its images in I/F as one who has not seen them takes them: calibrated ones have no gain of their own."""
+    scaled = [
+        look.measured if units == "iof" else (look.measured - calibration.offset[k]) / calibration.gain[k]
+        for k, look in zip(sample.images, sample.looks, strict=True)
+    ]
+    return Stack(*_stack(calibration, sample), sample.images, sample.looks, [v.astype(np.float32) for v in scaled])
 
 
 def _stack(calibration: Calibration, sample: Sample) -> tuple[Floats32, Floats32]:
     found = [calibration.ratio(k, look) for k, look in zip(sample.images, sample.looks, strict=True)]
     return np.stack([f[0] for f in found]), np.stack([f[1] for f in found])
+
+
+def _tame(
+    samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], albedo: Sequence[Any], count: int
+) -> None:
+    """Bring ratios far from what the images agree on back to OUTLYING robust standard deviations of their image, in place.
+
+    Moments then mean something. Weights by pixel in their place would mix with the ratios in the bands.
+    """
+    away: list[list[Floats32]] = [[] for _ in range(count)]
+    for sample, (ratio, confidence), location in zip(samples, stacks, albedo, strict=True):
+        for k, values, known in zip(sample.images, ratio, confidence > 0, strict=True):
+            away[k].append(np.abs(values - location)[known][::7])
+    bounds = [OUTLYING * 1.4826 * float(np.median(np.concatenate(v))) if any(map(len, v)) else 0.0 for v in away]
+    for sample, (ratio, _), location in zip(samples, stacks, albedo, strict=True):
+        for k, values in zip(sample.images, ratio, strict=True):
+            bound = np.float32(bounds[k])
+            values[:] = location + np.clip(values - location, -bound, bound)
 
 
 def _scales(samples: Sequence[Sample], albedo: Sequence[Any], count: int, units: str) -> tuple[Floats, Floats]:
@@ -164,7 +196,7 @@ def _scales(samples: Sequence[Sample], albedo: Sequence[Any], count: int, units:
     pairs: list[list[tuple[Floats, Floats]]] = [[] for _ in range(count)]
     for sample, log_albedo in zip(samples, albedo, strict=True):
         for k, look in zip(sample.images, sample.looks, strict=True):
-            known = np.isfinite(look.measured)
+            known = look.usable
             expected = (look.predicted * np.exp(log_albedo))[known]
             pairs[k].append((expected[::7].astype(float), look.measured[known][::7].astype(float)))
     gain, offset = np.ones(count), np.zeros(count)
@@ -292,16 +324,18 @@ def _rounded(values: Any) -> Any:
     return np.where(values == 0, 0.0, np.round(values * size) / size)
 
 
-def _error(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], albedo: Sequence[Any]) -> Floats:
-    """Variance of images about what they agree on by cos(incidence), relative to the median bin's."""
+def _error(
+    samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], albedo: Sequence[Any], own_px: Floats
+) -> Floats:
+    """Variance of images about what they agree on by cos(incidence), in units of each image's own, relative to the mean bin's."""
     square, pixels = np.zeros(len(COSINES) - 1), np.zeros(len(COSINES) - 1)
     for sample, (ratio, confidence), location in zip(samples, stacks, albedo, strict=True):
         several = (confidence > 0).sum(axis=0) > 1
-        for look, values, known in zip(sample.looks, ratio, confidence > 0, strict=True):
+        for k, look, values, known in zip(sample.images, sample.looks, ratio, confidence > 0, strict=True):
             use = known & several
             bins = np.clip(np.digitize(look.cos_incidence[use], COSINES) - 1, 0, len(square) - 1)
             # the middle of a distribution with long tails: squares up to 9 robust variances
-            residual = (values - location)[use].astype(float)
+            residual = (values - location)[use].astype(float) / np.sqrt(max(own_px[k], 1e-12))
             bound = 3 * 1.4826 * float(np.median(np.abs(residual))) if residual.size else 0.0
             square += np.bincount(bins, np.minimum(np.abs(residual), bound) ** 2, len(square))
             pixels += np.bincount(bins, minlength=len(square))

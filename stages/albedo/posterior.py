@@ -100,9 +100,9 @@ def _unrest(residual: Floats32, confidence: Floats32, own: float) -> Floats32:
 
 @numba.njit(cache=True, nogil=True)
 def _settle(ratio, confidence, own, prior, location):
-    """Iteratively reweighted mean of every pixel with the prior at 0, started at the weighted median."""
+    """Iteratively reweighted mean of every pixel with the prior at 0, started at the median."""
     count, height, width = ratio.shape
-    values, precision, weights = np.empty(count + 1), np.empty(count + 1), np.empty(count)
+    values, precision, weights = np.empty(count + 1), np.empty(count), np.empty(count)
     for r in range(height):
         for c in range(width):
             n = 0
@@ -114,15 +114,8 @@ def _settle(ratio, confidence, own, prior, location):
             if n == 0:
                 location[r, c] = 0.0
                 continue
-            values[n], precision[n] = 0.0, prior
-            order = np.argsort(values[: n + 1])
-            half, total = 0.5 * precision[: n + 1].sum(), 0.0
-            middle = 0.0
-            for i in range(n + 1):
-                total += precision[order[i]]
-                if total >= half:
-                    middle = values[order[i]]
-                    break
+            values[n] = 0.0
+            middle = np.median(values[: n + 1])  # not by weight: the image of least noise has its cosmic rays, too
             for _ in range(ITERATIONS):
                 top, bottom = 0.0, prior
                 for i in range(n):

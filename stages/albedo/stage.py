@@ -111,7 +111,12 @@ def _run(
         sizes = {d: ground.map[d].shape[0] for d in ("coefficient", "y", "x")}
         if "map_name" in ground.map:
             sizes["map"] = len(ground.map["map_name"])
-        sizes |= {"frame": len(ground.references.frames), "band": LEVELS + 1, "incidence_bin": len(COSINES) - 1}
+        sizes |= {
+            "frame": len(ground.references.frames),
+            "band": LEVELS + 1,
+            "incidence_bin": len(COSINES) - 1,
+            "level": 2,
+        }
         with contextlib.ExitStack() as stack:
             writer = stack.enter_context(
                 ArtefactWriter(

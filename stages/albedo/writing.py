@@ -73,3 +73,4 @@ class Maps:
         writer.write("albedo_bin_cos_incidence", 0.5 * (COSINES[1:] + COSINES[:-1]))
         writer.write("albedo_interval_68", found.interval[0])
         writer.write("albedo_interval_95", found.interval[1])
+        writer.write("albedo_interval_shadow", found.shadow)

@@ -19,6 +19,7 @@ CLEAR = math.radians(
     15.0
 )  # rad of the Sun above facet and horizon: lower, a slope error of a degree is 7 % of brightness and more
 RUGGED = 1.35  # ... and on rugged ground so many times its rms slope, since facets that seem to face the Sun are chosen by the DEM's errors
+SHADOWED = 30  # pixels of deep shadow in a piece of an image, below which their mean is not used
 FEWEST_PIXELS = 400  # of an image in a crop: fewer do not give a spectrum
 
 # --- registration ---

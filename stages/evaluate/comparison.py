@@ -15,6 +15,7 @@ from stages.common.progress import Progress, show_nothing
 from stages.effects import load_extension
 from stages.evaluate.config import Config
 from stages.evaluate.core import Scores, score
+from stages.evaluate.coverage import shares
 from stages.evaluate.fitting import Fitting, choose_fit_pairs, dn_scale, fit_rows
 from stages.evaluate.perceptual import Perceptual
 from stages.evaluate.renderers import Predictor, Reader
@@ -123,6 +124,7 @@ def summarise(task: Task, scores: Scores, scale: float) -> dict[str, Any]:
         "model": task.predictors[0].model.name,
         "fitted_on_pairs": len(train),
         "frames_fitted_on_split": sorted({task.frame_names[f] for f in frames[orphans]}),
+        "coverage_percent": shares(scores.within.sum(axis=2)) if scores.within.any() else None,
         "lpips_unavailable": None if perceptual.available else perceptual.reason,
         "warnings": _warnings(name, len(np.unique(unit)), len(task.predictors), len(np.unique(frames[orphans]))),
     }

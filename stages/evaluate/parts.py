@@ -25,7 +25,7 @@ from stages.pairs.reader import PairReader
 
 # (what, function, its arguments for every part, suffix) -> the parts that function(path, **arguments) wrote, in order
 Fan = Callable[[str, Callable[..., Any], Sequence[Mapping[str, Any]], str], list[Path]]
-COUNTS = ("pixels", "data_range")
+COUNTS = ("pixels", "data_range", "within")
 PART_BATCHES = 32
 
 

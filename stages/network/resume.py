@@ -20,10 +20,11 @@ from stages.network.predictor import Predictor, first_misfit, read_state, write_
 
 @dataclass
 class History:
-    """One entry per finished epoch."""
+    """One entry per finished epoch. objective : what is minimised, on validation ground; the least of it is kept"""
 
     train_loss: list[float] = field(default_factory=list)
     validation_loss: list[float] = field(default_factory=list)
+    objective: list[float] = field(default_factory=list)
     epoch_seconds: list[float] = field(default_factory=list)
     best_epoch: int = -1
 

@@ -57,7 +57,7 @@ def learn_epoch(
     error_sum, pixel_sum = sums.tolist()
     if not math.isfinite(error_sum):
         raise InputError(
-            f"{training.reader.path}: the loss is not finite in epoch {epoch + 1}; lower --lr or check the images' units."
+            f"{training.reader.path}: the loss is not finite in epoch {epoch + 1}; lower `lr` or check the images' units."
         )
     return mean_over_ranks(error_sum, pixel_sum, ranks, device)
 
@@ -87,19 +87,27 @@ def _errors(training: Training, batch: Batch, brightness: float, keys: Tensor | 
 
 @torch.no_grad()
 def evaluate_loss(
-    training: Training, indices: NDArray[np.int64], batch_size: int, progress: Progress = show_nothing
-) -> float:
-    """Mean squared error over the valid pixels of some pairs, in evaluation mode; NaN where there are none."""
+    training: Training,
+    indices: NDArray[np.int64],
+    batch_size: int,
+    brightness: float = 1.0,
+    progress: Progress = show_nothing,
+) -> tuple[float, float]:
+    """Mean squared error and mean of what is minimised over the valid pixels of some pairs, in evaluation mode; NaN where
+    there are none."""
     training.predictor.eval()
-    total, pixels = 0.0, 0.0
+    totals, pixels = [0.0, 0.0], 0.0
     mine = indices[training.rank :: training.ranks]
     steps = [(mine[k : k + batch_size], None) for k in range(0, len(mine), batch_size)]
     for number, batch in enumerate(prefetch(training.reader, steps, training.device)):
-        _, error = _errors(training, batch, brightness=1.0)
-        total, pixels = total + float(error), pixels + float(batch.valid.sum())
+        objective, error = _errors(training, batch, brightness)
+        totals[0] += float(error)
+        totals[1] += float(objective)
+        pixels += float(batch.valid.sum())
         if training.rank == 0:
             progress(number + 1, len(steps), "validation")
-    return mean_over_ranks(total, pixels, training.ranks, training.device)
+    means = [mean_over_ranks(total, pixels, training.ranks, training.device) for total in totals]
+    return means[0], means[1]
 
 
 def of_all(progress: Progress, epoch: int, epochs: int, work: tuple[int, int], before: int = 0) -> Progress:

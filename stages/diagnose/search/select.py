@@ -130,9 +130,12 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     law = max(len(view.plan.form), sum(n.startswith("coefficient") for n in view.plan.shared) // 2)
     if cls.scatters and not cls.displaces and state.frames <= law:
         return f"a law of {law} coefficients can give {state.frames} images any brightness: more images than that would tell"
+    first = as_effect(found, state.data, state.frames, view.whole)
+    if cls.scope == "scene" and not cls.plausible({k: float(v) for k, v in first.values.items()}, state.data):
+        return ODD
     vector, causes = state.nominal.vector, list(state.causes)
     saved = [(c, c.effect, dict(c.errors)) for c in causes]
-    cause = Cause(as_effect(found, state.data, state.frames, view.whole), found, group=group)
+    cause = Cause(first, found, group=group)
     state.causes.append(cause)
     look = refine(state)
     why = doubt(state, cause) or next(
@@ -163,7 +166,7 @@ def doubt(state: State, cause: Cause) -> str:
     """Why the fitted values cannot be a cause, or ''."""
     cls = type(cause.effect)
     if cls.scope == "image":
-        size, error = cls.size(cause.effect.values), cause.errors.get("rms", 0.0)
+        size, error = cause.rms, cause.errors.get("rms", math.inf)
         least = max(cls.tolerance.values(), default=0.0)
         return f"it is {size:.2g}, and less than {least:.2g} is ordinary" if size - 2 * error < least else ""
     values = {k: float(v) for k, v in cause.effect.values.items()}
@@ -200,7 +203,9 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
                 z, mean = row.patch.transform(brought, look.grid)
                 shared, means = torch.cat([row.shared, z]), torch.cat([row.shared_mean, mean])
                 shared[0], means[0] = shared[0] + z[0], means[0] + mean[0]
-                more = dataclasses.replace(row, shared=shared, shared_mean=means)
+                dark = torch.cat([row.shared_dark, row.patch.shadow(brought)])
+                dark[0] = dark[0] + dark[-1]
+                more = dataclasses.replace(row, shared=shared, shared_mean=means, shared_dark=dark)
                 added.append(products(more, look.model, look.grid, state.frames, None))
                 few = 1 + sum(n.startswith("coefficient") for n in look.plan.shared)
                 less = dataclasses.replace(
@@ -209,6 +214,8 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
                     shared_mean=torch.cat([means[:few], means[-1:]]),
                     own=row.own[:0],
                     own_mean=row.own_mean[:0],
+                    shared_dark=0 * torch.cat([dark[:few], dark[-1:]]),
+                    own_dark=row.own_dark[:0],
                 )
                 plain.append(products(less, flat, look.grid, state.frames, None).gram)
     plan = dataclasses.replace(look.plan, shared=[*look.plan.shared, "secant"])

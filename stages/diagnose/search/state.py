@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from stages.diagnose.likelihood.covariance import Covariance, estimate, texture
-from stages.diagnose.likelihood.products import Products, Rows, make_shams, products, whitened_residual
+from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_variance, texture
+from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
 from stages.diagnose.likelihood.weigh import Found, Whole
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import Nominal, fit
@@ -30,9 +30,7 @@ class Cause:
     effect: Effect
     found: Found
     errors: dict[str, float] = field(default_factory=dict)
-    hangs: dict[str, float] = field(
-        default_factory=dict
-    )  # how far values hang on the ordinary imperfections fitted along
+    rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)
     gain_percent: float = float("nan")
     gain_low: float = float("nan")
@@ -132,13 +130,14 @@ class State:
             for patch in patches:
                 z, mean = patch.transform(shared, grid)
                 z_own, mean_own = patch.transform(own, grid)
-                out.append(Rows(patch, z, mean, z_own, mean_own))
+                out.append(Rows(patch, z, mean, z_own, mean_own, patch.shadow(shared), patch.shadow(own)))
             return out
 
         rows = [r for part in per_site(of, range(len(chains))) for r in part]
         model = estimate([r.patch for r in rows], [(r.shared[0], r.shared_mean[0]) for r in rows], grid, self.frames)
+        model.dark = shadow_variance([r.patch for r in rows], [r.shared_dark[0] for r in rows])
         self.covariance = model
-        tricks: list[tuple[Tensor, Tensor] | None] = [None] * len(rows)
+        tricks: list[Residual | None] = [None] * len(rows)
         if shams:
             tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
         units = per_site(lambda k: products(rows[k], model, grid, self.frames, tricks[k]), range(len(rows)))
@@ -150,11 +149,6 @@ class State:
                 if not get_effect(name).displaces:
                     whole.scattered = whole.frame_places(columns)
         return View(whole, plan, rows, grid, model)
-
-    def plain(self, view: View) -> list[Products]:
-        """Products of the same rows without weights: what a squared residual is."""
-        flat = Covariance.white(view.grid.annuli, self.frames)
-        return per_site(lambda r: products(r, flat, view.grid, self.frames, None), view.rows)
 
 
 @dataclass
