@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import os
 import shutil
 import sys
@@ -93,7 +92,7 @@ class Console:
 
     quiet: bool = False
     _pace: Pace = field(default_factory=Pace)
-    _shown: float = field(default=-math.inf)
+    _shown: float = field(default_factory=time.monotonic)
     _bar: bool = field(default=False)
 
     def say(self, message: str) -> None:
