@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import shutil
 import sys
@@ -92,7 +93,7 @@ class Console:
 
     quiet: bool = False
     _pace: Pace = field(default_factory=Pace)
-    _shown: float = field(default_factory=time.monotonic)
+    _shown: float | None = field(default=None)
     _bar: bool = field(default=False)
 
     def say(self, message: str) -> None:
@@ -106,6 +107,8 @@ class Console:
         raise_again()
         times = self._pace.report(done, total)
         terminal, now = sys.stderr.isatty(), time.monotonic()
+        if self._shown is None:  # a short loop leaves one line in a log
+            self._shown = -math.inf if terminal else now
         if self.quiet or (done < total and now - self._shown < (0.1 if terminal else 10.0)):
             return
         self._shown = now

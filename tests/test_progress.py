@@ -105,7 +105,7 @@ def test_a_log_gets_a_line_now_and_then(monkeypatch):
     log, clock = io.StringIO(), Clock()
     monkeypatch.setattr(sys, "stderr", log)
     monkeypatch.setattr(lunargr_cli.console.time, "monotonic", clock)
-    console = Console(_pace=Pace(clock), _shown=clock.now)
+    console = Console(_pace=Pace(clock))
     for done in range(101):
         console.progress(done, 100, "rows")
         clock.now += 1.0
