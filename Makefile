@@ -11,7 +11,7 @@ LUNARGR := $(BIN)/lunargr
 STAMP := $(VENV)/.installed
 SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 
-.PHONY: help install demo demo-paper figures test test-slow mutants fuzz endurance lint bench campaign campaign-real docs vendor-js reproduce-apollo15 reproduce-models clean
+.PHONY: help install demo demo-paper figures test test-slow mutants fuzz endurance lint bench campaign campaign-real docs wheel vendor-js reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -64,6 +64,9 @@ docs: $(STAMP) ## write the generated parts of docs/ again, and build the site i
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "Open $(abspath build/site/index.html)"
+
+wheel: $(STAMP) ## build/dist/*.whl; URL=https://... of the repository puts its pictures and links on the package's page
+	LUNARGR_URL=$(URL) $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/dist .
 
 VENDOR := stages/view/assets/vendor
 

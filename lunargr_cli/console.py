@@ -93,7 +93,7 @@ class Console:
 
     quiet: bool = False
     _pace: Pace = field(default_factory=Pace)
-    _shown: float = field(default=-math.inf)
+    _shown: float | None = field(default=None)
     _bar: bool = field(default=False)
 
     def say(self, message: str) -> None:
@@ -107,6 +107,8 @@ class Console:
         raise_again()
         times = self._pace.report(done, total)
         terminal, now = sys.stderr.isatty(), time.monotonic()
+        if self._shown is None:  # a short loop leaves one line in a log
+            self._shown = -math.inf if terminal else now
         if self.quiet or (done < total and now - self._shown < (0.1 if terminal else 10.0)):
             return
         self._shown = now
