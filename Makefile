@@ -28,10 +28,10 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 test: $(STAMP) ## the tests that every change must pass (under 10 minutes on two cores)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 test-slow: $(STAMP) ## the longer checks
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 mutants: $(STAMP) ## plant bugs one at a time and see whether the tests notice, before a release; ONLY=word for some
 	OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py --only "$(ONLY)"

@@ -18,6 +18,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from stages.common.page.diagnosis import conclusions as diagnosis_sentences  # noqa: E402
+from stages.common.page.sentences import Sentence  # noqa: E402
 from stages.report import conclusions  # noqa: E402
 from stages.report.held_out import TITLES as MAPS  # noqa: E402
 
@@ -61,7 +63,7 @@ def with_bounds(value: float, low: float | None, high: float | None, spread: flo
     return f"{text} ({ends})"
 
 
-def said(sentences: list[conclusions.Sentence]) -> list[str]:
+def said(sentences: list[Sentence]) -> list[str]:
     return [f"- {text}" for text, _ in sentences]
 
 
@@ -158,7 +160,7 @@ def matched(root: Path, folder: str, command: str) -> list[str]:
 
 
 def diagnosed(root: Path, folder: str, command: str) -> list[str]:
-    return said(conclusions.diagnosis(read(root, f"{folder}/diagnosis.json", command)))
+    return said(diagnosis_sentences(read(root, f"{folder}/diagnosis.json", command)))
 
 
 def apollo15(root: Path) -> list[str]:

@@ -32,7 +32,7 @@ def check_scheduler(text: str | None) -> str | None:
     return text
 
 
-Output = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True), Writes.FILE]
+OutputFile = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True), Writes.FILE]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")]
 Shard = Annotated[

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from schemas.artefacts import CHECKPOINT, CROPS, DIAGNOSIS, EVALUATION, PAIRS, SCENE, SPLITS, SVBRDF, UNITS
 from schemas.declaration import SCHEMAS, Attribute, Schema, Variable, get_schema
@@ -16,6 +15,7 @@ from schemas.errors import (
     LunargrError,
     RegistryError,
 )
+from schemas.later import imported_later
 from schemas.truth import TRUTH
 
 # Where those are who need h5py: `lunargr --help` must answer at once.
@@ -36,11 +36,7 @@ if TYPE_CHECKING:
     from schemas.writing import ArtefactWriter
 
 
-def __getattr__(name: str) -> Any:
-    if name in _LATER:
-        return getattr(importlib.import_module(f"schemas.{_LATER[name]}"), name)
-    raise AttributeError(f"module 'schemas' has no attribute '{name}'")
-
+__getattr__ = imported_later(__name__, _LATER)
 
 __all__ = [
     "CHECKPOINT",

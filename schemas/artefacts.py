@@ -410,7 +410,9 @@ CHECKPOINT = declare(
             *_PLACE,
             Attribute("output_scale", "factor of the network's raw output", True, "number", 0.0, LARGEST_GSD),
             Attribute("image_units", "units of the training images", choices=("iof", "dn")),
-            Attribute("best_epoch", "epoch whose weights are in /weights", True, "integer", 0, LARGEST_COUNT),
+            Attribute(
+                "best_epoch", "epoch whose weights are in /weights, the first is 1", True, "integer", 1, LARGEST_COUNT
+            ),
         ),
     )
 )

@@ -22,21 +22,21 @@ ALL = "np.arange(reader.count)"
 # What outside checks planted and the tests of that time did not notice. (Those in stages/diagnose are still to come.)
 KNOWN = (
     Mutant(
-        "stages/train.py",
+        "stages/train/stage.py",
         "history.objective.append(objective if math.isfinite(objective) else train_loss)",
         "history.objective.append(train_loss)",
         (f"{LEAKS}::test_the_best_epoch_is_that_of_the_lowest_validation_loss",),
         "the best epoch is chosen by the training loss",
     ),
     Mutant(
-        "stages/train.py",
+        "stages/train/training.py",
         "elevation_scale(reader, train))",
         f"elevation_scale(reader, {ALL}))",
         (f"{LEAKS}::test_test_pairs_change_nothing_of_a_checkpoint",),
         "the elevation scale is taken from all parts of the split",
     ),
     Mutant(
-        "stages/train.py",
+        "stages/train/training.py",
         "fit_start(reader, train, model, config.positive)",
         f"fit_start(reader, {ALL}, model, config.positive)",
         (f"{LEAKS}::test_test_pairs_change_nothing_of_a_checkpoint",),
@@ -50,7 +50,7 @@ KNOWN = (
         "gains and offsets are fitted on all parts of the split",
     ),
     Mutant(
-        "stages/train.py",
+        "stages/train/stage.py",
         "predictor, training.radiometry, reader, train, validation, extensions",
         'predictor, training.radiometry, reader, train, reader.indices("test"), extensions',
         (f"{LEAKS}::test_test_pairs_change_nothing_of_a_checkpoint",),
@@ -79,7 +79,7 @@ KNOWN = (
         "the intervals of gains are not paired",
     ),
     Mutant(
-        "stages/evaluate/run.py",
+        "stages/evaluate/comparison.py",
         "    unit, name = choose_units(tile, site)\n    frames",
         "    unit, name = np.arange(len(tile)), 'tile'\n    frames",
         ("tests/test_evaluate.py::test_tiles_are_the_witnesses_and_rows_are_paired_by_them",),
@@ -317,14 +317,14 @@ STAGES = (
         "test crops lie across tiles",
     ),
     Mutant(
-        "stages/project/run.py",
+        "stages/project/stage.py",
         "mean, radius, frame.sun_position(), frame.camera_position(radius))",
         "mean, radius, frames[0].sun_position(), frame.camera_position(radius))",
         ("tests/test_project.py::test_every_crop_has_the_sun_and_the_camera_of_its_own_image",),
         "crops get the Sun of another image",
     ),
     Mutant(
-        "stages/project/run.py",
+        "stages/project/stage.py",
         "mean, radius, frame.sun_position(), frame.camera_position(radius))",
         "mean, radius, frame.sun_position(), frames[-1].camera_position(radius))",
         ("tests/test_project.py::test_every_crop_has_the_sun_and_the_camera_of_its_own_image",),
@@ -339,7 +339,7 @@ STAGES = (
         "only the crop's own terrain casts near shadows",
     ),
     Mutant(
-        "stages/project/run.py",
+        "stages/project/stage.py",
         "        math.atan2(east, north) % (2 * math.pi),",
         "        math.atan2(north, east) % (2 * math.pi),",
         ("tests/test_project.py::test_terrain_outside_the_crop_casts_its_shadow",),
@@ -353,7 +353,7 @@ STAGES = (
         "gradients are half as large",
     ),
     Mutant(
-        "stages/train.py",
+        "stages/train/epoch.py",
         "    training.predictor.eval()\n    total, pixels",
         "    training.predictor.train()\n    total, pixels",
         (f"{LEAKS}::test_validation_runs_without_dropout_and_leaves_the_network_as_it_is",),
@@ -374,7 +374,7 @@ STAGES = (
         "augmentation turns vectors the wrong way",
     ),
     Mutant(
-        "stages/train.py",
+        "stages/train/epoch.py",
         "error.detach().double(), pixels])\n",
         "error.detach().double(), torch.ones_like(pixels)])\n",
         ("tests/test_train.py::test_the_losses_are_means_over_valid_pixels",),
@@ -416,7 +416,7 @@ STAGES = (
         "the map holds coefficients where there is no terrain",
     ),
     Mutant(
-        "stages/infer/run.py",
+        "stages/infer/stage.py",
         "writer.write_crs(grid.crs_wkt, grid.transform)",
         "writer.write_crs(grid.crs_wkt, grid.window(0, 1, 1, 1).transform)",
         ("tests/test_infer.py::test_gdal_places_the_netcdf_variable",),

@@ -12,6 +12,7 @@ import OpenImageIO as oiio
 import small_scene
 from small_scene import LAT, LON, RADIUS, local_xy
 
+from schemas.files.outputs import Output
 from stages import ingest, project, sample
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import unit_vectors
@@ -68,9 +69,9 @@ def write_frame(folder, view, image, **columns):
 
 def run_all(dem, images, folder, **config):
     """project's summary and pairs.h5, with scene.h5 and crops.h5 beside it; ``config`` is project's."""
-    ingest.run(dem, images, folder / "scene.h5", ingest.Config(gsd=20, crop=32), overwrite=True)
-    sample.run(folder / "scene.h5", folder / "crops.h5", sample.Config(count=60, crop=32), overwrite=True)
-    summary = project.run(folder / "crops.h5", folder / "pairs.h5", project.Config(**config), overwrite=True)
+    ingest.run(dem, images, Output(folder / "scene.h5", overwrite=True), ingest.Config(gsd=20, crop=32))
+    sample.run(folder / "scene.h5", Output(folder / "crops.h5", overwrite=True), sample.Config(count=60, crop=32))
+    summary = project.run(folder / "crops.h5", Output(folder / "pairs.h5", overwrite=True), project.Config(**config))
     return summary, folder / "pairs.h5"
 
 

@@ -13,11 +13,12 @@ from albedo_scene import NOISE, SIZE, SUNS, photograph, photographs, plant, text
 from evaluation_scene import run_command
 
 from schemas import ArtefactError, ConfigError, InputError
+from schemas.files.outputs import Output
 from stages import albedo, merge
 from stages.albedo.posterior import Spread, estimate, settle
 from stages.albedo.pyramid import LEVELS
 
-running = sys.modules["stages.albedo.run"]  # the package's ``run`` is the function
+running = sys.modules["stages.albedo.stage"]
 QUIET = albedo.Config(geotiff=False)
 
 
@@ -29,7 +30,7 @@ def read(path, *names):
 def made(planted, config=QUIET, name="albedo.h5"):
     """(albedo, std, images) of a planted scene."""
     out = planted.folder / name
-    albedo.run(planted.map, planted.scene, out, config, overwrite=True)
+    albedo.run(planted.map, planted.scene, Output(out, overwrite=True), config)
     return read(out, "albedo", "albedo_std", "albedo_images")
 
 
@@ -192,6 +193,7 @@ def test_gain_and_offset_of_images_in_dn_do_not_matter(rng, tmp_path):
 
 
 def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
+    from lunargr_cli.fanout.job import Work
     from lunargr_cli.fanout.stages import run_albedo
 
     # blocks so small that the map has four rows of them
@@ -209,10 +211,10 @@ def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
     with monkeypatch.context() as broken:
         broken.setattr("stages.merge.run", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            run_albedo(planted.map, planted.scene, resumed, config, None, 3, scheduler=None, overwrite=False)
+            run_albedo(planted.map, planted.scene, Output(resumed), config, Work(parts=3))
     left = sorted((tmp_path / "resumed.h5.parts").rglob("map-*.h5"))
     left[1].unlink()
-    run_albedo(planted.map, planted.scene, resumed, config, None, 3, scheduler=None, overwrite=False)
+    run_albedo(planted.map, planted.scene, Output(resumed), config, Work(parts=3))
     for other in ("merged", "resumed"):
         for name, a, b in zip(names, read(whole, *names), read(tmp_path / f"{other}.h5", *names), strict=True):
             assert a.tobytes() == b.tobytes(), (other, name)
@@ -262,7 +264,7 @@ def test_held_out_images_are_never_those_that_made_the_albedo(planted, tmp_path)
     assert {row["image_id"] for row in scored} == {f"IMG{k}" for k in (0, 2, 4)}
     assert read(folds[0], "albedo_image_id")[0].astype(str).tolist() == used
     everything = planted.folder / "albedo.h5"
-    albedo.run(planted.map, planted.scene, everything, QUIET, overwrite=True)
+    albedo.run(planted.map, planted.scene, Output(everything, overwrite=True), QUIET)
     code, said = run_command("evaluate", pairs, everything, "--held-out-images", "-o", tmp_path / "no.h5")
     assert code == 3 and "--fold" in said and not (tmp_path / "no.h5").exists()
 
@@ -272,7 +274,7 @@ def test_bad_input_is_refused_in_one_line(planted, found, tmp_path):
 
     def refused(error, words, svbrdf=planted.map, scene=planted.scene, output=out, config=QUIET):
         with pytest.raises(error, match=words) as caught:
-            albedo.run(svbrdf, scene, output, config, overwrite=True)
+            albedo.run(svbrdf, scene, Output(output, overwrite=True), config)
         assert "\n" not in str(caught.value)
         assert not out.exists()
 

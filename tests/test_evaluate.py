@@ -12,10 +12,11 @@ from evaluation_scene import A, B, C, KnowsTheTruth, make_scene
 
 from stages.common.intervals import ERROR, LOG, ratio_interval
 from stages.evaluate import fit
+from stages.evaluate.comparison import Task, evaluate_pairs
+from stages.evaluate.config import Config
 from stages.evaluate.fitting import choose_fit_pairs, sample_pixels
 from stages.evaluate.metrics import ssim
 from stages.evaluate.renderers import Constant, Renderer, read_batch, unit_images
-from stages.evaluate.run import Config, Task, evaluate_pairs
 from stages.physics.photometry import get_model
 
 REQUIRED = {

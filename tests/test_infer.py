@@ -129,6 +129,9 @@ def test_svbrdf_opens_in_xarray_with_coordinates(small_artefacts, checkpoint, tm
     infer.run(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", infer.Config(**FULL))
     with xarray.open_dataset(tmp_path / "map.h5", engine="h5netcdf") as data:
         assert list(data["coefficient_name"].values) == ["a", "b", "c"]
+        b = data["coefficients"].sel(coefficient="b")
+        np.testing.assert_array_equal(b, data["coefficients"][1])
+        assert b.dims == ("y", "x") and data["coefficients_std"].sel(map="c").dims == ("y", "x")
         assert data["coefficients"].attrs["grid_mapping"] == "crs"
         assert float(data["y"][0]) > float(data["y"][-1])
         assert data["x"].attrs["standard_name"] == "projection_x_coordinate" or data["x"].attrs["units"] == "m"

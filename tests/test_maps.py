@@ -13,6 +13,7 @@ from evaluation_scene import run_command
 from torch.nn import functional
 
 from schemas import ConfigError, RegistryError, read_strings
+from schemas.files.outputs import Output
 from stages import infer, train
 from stages.common.threads import one_thread_each, share_out
 from stages.network.losses import crop_errors, squared_error
@@ -25,6 +26,7 @@ from stages.pairs.holes import fill_holes
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import get_model, masked_radiance_factor, model_names
 from stages.physics.photometry.deviation import radiance_deviation
+from stages.train import stage
 
 SMALL = {"widths": (4, 8), "epochs": 2, "batch": 16, "lr": 5e-3, "device": "cpu", "precision": "fp32"}
 
@@ -88,11 +90,11 @@ def test_globals_survive_an_interruption(small_artefacts, trained, tmp_path, mon
     """A run that stops after its first epoch goes on to the very same checkpoint."""
     out = tmp_path / "c.h5"
     config = train.Config(model="minnaert", **SMALL)
-    monkeypatch.setattr(train, "learn_epoch", _stop_after_one(train.learn_epoch))
+    monkeypatch.setattr(stage, "learn_epoch", _stop_after_one(stage.learn_epoch))
     with pytest.raises(KeyboardInterrupt):
         train.run(small_artefacts["pairs"], out, config)
     monkeypatch.undo()
-    train.run(small_artefacts["pairs"], out, config, resume=True)
+    train.run(small_artefacts["pairs"], Output(out, resume=True), config)
     first, again = weights(trained), weights(out)
     for name in first:
         np.testing.assert_array_equal(first[name], again[name], err_msg=name)

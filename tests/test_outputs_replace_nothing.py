@@ -174,7 +174,7 @@ def test_the_parts_behind_a_virtual_artefact_are_inputs(monkeypatch, capsys, inp
     for k in range(2):
         config = sample.Config(count=20, tile_m=1280, seed=3, shard=(k, 2))
         sample.run(inputs / "scene.h5", tmp_path / f"part{k}.h5", config)
-    merge.run([tmp_path / "part0.h5", tmp_path / "part1.h5"], tmp_path / "whole.h5", virtual=True)
+    merge.run([tmp_path / "part0.h5", tmp_path / "part1.h5"], tmp_path / "whole.h5", merge.Config(virtual=True))
     refused(monkeypatch, capsys, tmp_path, ["project", "whole.h5", "-o", "part1.h5", "--overwrite"], "part1.h5")
 
 

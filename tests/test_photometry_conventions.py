@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from lunargr_cli.main import app
 from schemas import ConfigError, InputError, RegistryError
+from schemas.files.outputs import Output
 from stages import convert
 from stages.physics.photometry import evaluate, get_model, model_names
 from stages.physics.photometry.conventions import conventions, convert_maps, get_convention
@@ -128,7 +129,7 @@ def write_maps(path, maps, nodata=None, descriptions=True):
 @pytest.fixture
 def sato(tmp_path, rng):
     """A Sato map whose bands stand in another order than the convention's, with a nodata pixel."""
-    maps = sample(get_convention("sato:Hapke"), rng, (7, 5))
+    maps = sample(get_convention("sato:Hapke"), rng, (27, 5))
     maps = {name: maps[name] for name in reversed(maps)}
     for values in maps.values():
         values[2, 3] = -9999.0
@@ -137,7 +138,7 @@ def sato(tmp_path, rng):
 
 def test_convert_writes_the_same_reflectance(sato, tmp_path, monkeypatch):
     source, maps = sato
-    monkeypatch.setattr(convert, "BLOCK_VALUES", 5 * 9 * 2)  # two rows at a time
+    monkeypatch.setattr(convert, "BLOCK_VALUES", 5 * 9 * 8)  # eight rows at a time
     steps = []
     report = convert.run(
         source,
@@ -145,8 +146,8 @@ def test_convert_writes_the_same_reflectance(sato, tmp_path, monkeypatch):
         convert.Config("sato:Hapke", "lunargr:hapke"),
         progress=lambda done, total, what: steps.append((done, total)),
     )
-    assert report.valid_pixels == 34
-    assert steps[-1] == (7, 7)
+    assert report.valid_pixels == 134
+    assert steps[-1] == (27, 27)
     assert len(steps) == 4
     with rasterio.open(source) as before, rasterio.open(tmp_path / "ours.tif") as after:
         assert (after.crs, after.transform, after.shape) == (before.crs, before.transform, before.shape)
@@ -155,7 +156,7 @@ def test_convert_writes_the_same_reflectance(sato, tmp_path, monkeypatch):
         assert after.tags()["CONVENTION"] == "lunargr:hapke"
         ours = dict(zip(after.descriptions, after.read(), strict=True))
     assert np.isnan(ours["w"][2, 3])
-    assert np.isfinite(ours["w"]).sum() == 34
+    assert np.isfinite(ours["w"]).sum() == 134
     written = evaluate("hapke", {k: v[0, 0] for k, v in ours.items()}, *GEOMETRY)
     direct = evaluate(
         "hapke",
@@ -169,13 +170,13 @@ def test_convert_never_touches_its_input_or_an_existing_file(sato, tmp_path):
     source, _ = sato
     config = convert.Config("sato:Hapke", "lunargr:hapke")
     with pytest.raises(ConfigError, match="would replace the input"):
-        convert.run(source, source, config, overwrite=True)
+        convert.run(source, Output(source, overwrite=True), config)
     other = tmp_path / "other.tif"
     other.write_text("mine")
     with pytest.raises(ConfigError, match="exists already"):
         convert.run(source, other, config)
     assert other.read_text() == "mine"
-    convert.run(source, other, config, overwrite=True)
+    convert.run(source, Output(other, overwrite=True), config)
     with pytest.raises(ConfigError, match="cannot hold all"):
         convert.run(source, tmp_path / "asp.tif", convert.Config("sato:Hapke", "asp:Hapke"))
     assert not list(tmp_path.glob("*asp*"))
@@ -214,7 +215,7 @@ def test_convert_command(sato, tmp_path):
     arguments = ["convert", str(source), "--from", "sato:Hapke", "--to", "asp:hapke", "-o", str(tmp_path / "asp.tif")]
     result = CliRunner().invoke(app, [*arguments, "--approximate"])
     assert result.exit_code == 0, result.output
-    assert "asp:Hapke, 34 valid pixels; its formula gives r = I/F / pi" in result.output
+    assert "asp:Hapke, 134 valid pixels; its formula gives r = I/F / pi" in result.output
     assert "lost: the H function" in result.output
     with rasterio.open(tmp_path / "asp.tif") as data:
         assert data.descriptions == ("omega", "b", "c", "B0", "h")

@@ -82,7 +82,7 @@ def test_ortho_image_is_the_model_at_the_backplanes_angles_and_the_map_to_the_pi
         assert tif.crs == grid.crs
         assert math.isnan(tif.nodata)
         assert tif.descriptions == ("image",)
-        assert tif.tags()["MODEL"] == "M2"
+        assert tif.tags()["model"] == "M2"
         np.testing.assert_array_equal(tif.read(1), exr["image"])
     picture = oiio.ImageBuf(str(tmp_path / "o.png"))
     pixels = picture.get_pixels(oiio.UINT8)

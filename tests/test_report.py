@@ -16,6 +16,7 @@ import pytest
 from evaluation_scene import make_scene, run_command, write_pairs
 
 from schemas import DIAGNOSIS, SCENE, SVBRDF, ArtefactWriter
+from schemas.files.outputs import Output
 from stages import evaluate, match, report, train
 from stages.report import conclusions
 from stages.report.maps import round_length
@@ -96,7 +97,7 @@ def folder(tmp_path_factory):
     files = (folder / "pairs.h5", folder / "checkpoint.h5")
     evaluate.run(*files, folder / "evaluation.h5", evaluate.Config(device="cpu"))
     settings = match.Config(("sift",), count=2, device="cpu")
-    match.run(list(files), settings, json_file=folder / "match.json", figures=folder)
+    match.run(list(files), Output(folder / "match.json", figures=folder), settings)
     _write_maps(folder, rng)
     extra = {"report": json.dumps(FOUND), "extension": "[]"}
     with ArtefactWriter(folder / "diagnosis.h5", DIAGNOSIS, {"frame": 1}, attributes=extra, seed=0) as out:
@@ -332,7 +333,7 @@ def test_a_page_of_view_is_linked_given_or_beside(folder, tmp_path):
     report.run([folder / "match.json", given], tmp_path / "out" / "report.html", report.Config())
     assert '<a href="../sub/a%20map.html">' in (tmp_path / "out" / "report.html").read_text()
     (tmp_path / "out" / "view.html").write_text("page")
-    report.run([folder / "match.json"], tmp_path / "out" / "report.html", report.Config(), overwrite=True)
+    report.run([folder / "match.json"], Output(tmp_path / "out" / "report.html", overwrite=True), report.Config())
     assert '<a href="view.html">' in (tmp_path / "out" / "report.html").read_text()
 
 

@@ -118,7 +118,7 @@ def test_every_model_here_states_its_formula_for_the_page():
 def test_a_model_without_a_formula_for_the_page_is_refused_with_those_that_have_one(hilly_map, tmp_path, monkeypatch):
     monkeypatch.setattr(type(get_model("M2")), "glsl", None)
     with pytest.raises(RegistryError, match=r"its model M2 has no formula for a page.*akimov.*M1, M3"):
-        view.run(hilly_map[0], tmp_path / "o.html", view.Config())
+        view.run(hilly_map[0], None, tmp_path / "o.html", view.Config())
     assert not (tmp_path / "o.html").exists()
 
 
@@ -133,7 +133,7 @@ def test_a_model_without_a_formula_for_the_page_is_refused_with_those_that_have_
 )
 def test_options_that_make_no_page(hilly_map, tmp_path, config, output, message):
     with pytest.raises(ConfigError, match=message):
-        view.run(hilly_map[0], tmp_path / output, config)
+        view.run(hilly_map[0], None, tmp_path / output, config)
 
 
 def test_files_that_make_no_page(hilly_map, small_artefacts, tmp_path):
@@ -147,13 +147,13 @@ def test_files_that_make_no_page(hilly_map, small_artefacts, tmp_path):
         (path, small_artefacts["pairs"], "this map's scene"),
     ):
         with pytest.raises(LunargrError, match=message):
-            view.run(source, tmp_path / "o.html", view.Config(), pairs=pairs)
+            view.run(source, pairs, tmp_path / "o.html", view.Config())
     assert not list(tmp_path.glob("*.html"))
 
 
 def test_the_page_asks_for_nothing_outside_itself_and_a_title_cannot_break_it(hilly_map, tmp_path):
     title = "</script><b>A & B"
-    view.run(hilly_map[0], tmp_path / "o.html", view.Config(title=title))
+    view.run(hilly_map[0], None, tmp_path / "o.html", view.Config(title=title))
     text = (tmp_path / "o.html").read_text()
     assert "default-src 'none'" in text
     assert not re.search(r"<(script|link|img|iframe)[^>]+(src|href)=\"(?!data:)", text)

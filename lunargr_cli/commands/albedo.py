@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.options import (
-    Output,
+    OutputFile,
     Overwrite,
     Parts,
     Quiet,
@@ -41,7 +41,7 @@ def command(
     ] = None,
     no_geotiff: Annotated[bool, typer.Option("--no-geotiff", help="Write the HDF5 map only.")] = False,
     shard: Shard = None,
-    output: Output = Path("svbrdf_albedo.h5"),
+    output: OutputFile = Path("svbrdf_albedo.h5"),
     scheduler: Scheduler = None,
     resume: ResumeParts = False,
     parts: Parts = None,
@@ -55,11 +55,13 @@ def command(
     """
     from lunargr_cli.console import Console
     from schemas import ConfigError
+    from schemas.files.outputs import Output
     from stages import albedo
 
     if geotiff and no_geotiff:
         raise ConfigError(f"--geotiff {geotiff} and --no-geotiff: expected one of them, found both.")
     console = Console(quiet)
+    to = Output(output, overwrite, geotiff=geotiff)
     config = albedo.Config(
         leave_out=tuple(name.strip() for name in leave_out.split(",") if name.strip()) if leave_out else (),
         fold=_fold(fold),
@@ -67,12 +69,12 @@ def command(
         geotiff=not no_geotiff,
     )
     if in_parts(scheduler, resume, parts, shard):
+        from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_albedo
 
-        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
-        found = run_albedo(svbrdf, scene, output, config, geotiff, parts, **how)
+        found = run_albedo(svbrdf, scene, to, config, Work(scheduler, parts, console.say, console.progress))
     else:
-        found = albedo.run(svbrdf, scene, output, config, geotiff, overwrite, console.progress)
+        found = albedo.run(svbrdf, scene, to, config, console.say, console.progress)
     mean, std, low, high = found.albedo
     console.say(
         f"{output}: albedo from {len(found.images)} images over {found.covered_share:.1%} of the map, "

@@ -52,8 +52,8 @@ def command(
     """
     from lunargr_cli.console import Console
     from lunargr_cli.options import read_numbers
-    from schemas import SPLITS, ConfigError, write_json
-    from schemas.files.outputs import Target, check_outputs
+    from schemas import SPLITS, ConfigError
+    from schemas.files.outputs import Output, Target, check_outputs
     from stages import compare, evaluate, train
     from stages.physics.photometry import get_model
 
@@ -67,7 +67,7 @@ def command(
     train.check(train.Config(device=device, **settings))
     if split not in dict(SPLITS):
         raise ConfigError(f"--split: expected one of {', '.join(dict(SPLITS))}, found '{split}'.")
-    table, curves = output / "comparison.json", output / "validation_curves.png"
+    table, curves = output / compare.TABLE, output / compare.CURVES
     check_outputs([Target(table), Target(curves)], [pairs], overwrite or resume)
     made = [output / f"{name}_seed{k}.{end}" for name in names for k in range(seeds) for end in ENDS]
     made += [output / f"{name}.{split}.{end}" for name in names for end in ("h5", "json")]
@@ -80,14 +80,12 @@ def command(
             config = train.Config(model=name, seed=seed, device=device, **settings)
             if not (resume and checkpoint.exists() and _same(checkpoint, config, pairs)):
                 console.say(f"training {name}, seed {seed} ({number * seeds + seed + 1} of {seeds * len(names)})")
-                train.run(pairs, checkpoint, config, overwrite or resume, resume, console.say, console.progress)
+                train.run(pairs, Output(checkpoint, overwrite or resume, resume), config, console.say, console.progress)
         if not (resume and evaluation.exists() and _made_from(evaluation, [pairs, *checkpoints])):
             scoring = evaluate.Config(split=split, renderings=False, device=device, only=("learned",))
-            evaluate.run(pairs, checkpoints, evaluation, scoring, overwrite=True, progress=console.progress)
+            evaluate.run(pairs, checkpoints, Output(evaluation, overwrite=True), scoring, console.say, console.progress)
         files.append((evaluation, checkpoints))
-    result = compare.run(files, table, curves)
-    if json_file is not None:
-        write_json(json_file, result)
+    result = compare.run(files, Output(output, overwrite=True, json=json_file))
     console.table(
         f"{len(names)} models x {seeds} seeds on {result['crops']} {split} crops, {result['tiles']} ground tiles",
         *compare.result_lines(result),

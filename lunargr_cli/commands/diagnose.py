@@ -51,8 +51,10 @@ def command(
 ) -> None:
     """Name the physical causes of the difference between measured and simulated images."""
     from schemas import ConfigError
+    from schemas.files.outputs import Output
 
     console = Console(quiet)
+    to = Output(output, overwrite, json=json_file, report=report)
     if list_effects:
         _list(console)
         return
@@ -64,13 +66,12 @@ def command(
     chosen = tuple(name.strip() for name in free.split(",") if name.strip())
     config = diagnose.Config(model, chosen, most_causes, most_pairs=most_pairs, seed=seed)
     if scheduler:
+        from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_diagnose
 
-        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
-        answer = run_diagnose(pairs, checkpoint, output, json_file, report, config, **how)
+        answer = run_diagnose(pairs, checkpoint, to, config, Work(scheduler, None, console.say, console.progress))
     else:
-        progress = console.progress
-        result = diagnose.run(pairs, checkpoint, config, output, json_file, report, overwrite, console.say, progress)
+        result = diagnose.run(pairs, checkpoint, to, config, console.say, console.progress)
         answer = result.answer.to_json()
     rows = [
         (

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import MOST, Device, Json, Output, Overwrite, Quiet, ResumeParts, Scheduler, Seed
+from lunargr_cli.options import MOST, Device, Json, OutputFile, Overwrite, Quiet, ResumeParts, Scheduler, Seed
 from lunargr_cli.paths import Writes
 
 NAME, ORDER = "evaluate", 70
@@ -22,7 +22,7 @@ def command(
             help="From 'lunargr train', several being training runs of one model; with --held-out-images maps from 'lunargr albedo'.",
         ),
     ],
-    output: Output = Path("evaluation.h5"),
+    output: OutputFile = Path("evaluation.h5"),
     held_out_images: Annotated[
         bool,
         typer.Option("--held-out-images", help="Score seen ground under images that did not make the map's albedo."),
@@ -67,25 +67,28 @@ def command(
     model from several seeds make the learned rows means over training runs, whose spread is part of the intervals.
     """
     from lunargr_cli.console import Console
+    from schemas.files.outputs import Output
     from stages import evaluate
     from stages.evaluate.coverage import coverage_lines
     from stages.evaluate.table import basis, gain_lines, result_lines
 
     console = Console(quiet)
+    to = Output(output, overwrite, json=json_file, figures=figures)
     if held_out_images:
         from lunargr_cli.held_out import show_held_out_images
 
-        show_held_out_images(console, pairs, checkpoints, output, (split, seed), json_file, overwrite)
+        show_held_out_images(console, pairs, checkpoints, to, split, seed)
         return
-    config = evaluate.Config(split, batch, fit_pairs, renderings, seed, device, tuple(only or ()))
-    more: dict[str, Any] = {"extend": extend, "json_file": json_file, "figures": figures, "overwrite": overwrite}
-    more["progress"] = console.progress
+    extension = str(extend) if extend else None
+    config = evaluate.Config(split, batch, fit_pairs, renderings, seed, device, tuple(only or ()), extension)
     if scheduler is not None or resume:
+        from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_evaluate
 
-        result = run_evaluate(pairs, checkpoints, output, config, scheduler=scheduler, say=console.say, **more)
+        work = Work(scheduler, None, console.say, console.progress)
+        result = run_evaluate(pairs, checkpoints, to, config, work)
     else:
-        result = evaluate.run(pairs, checkpoints, output, config, **more)
+        result = evaluate.run(pairs, checkpoints, to, config, console.say, console.progress)
     columns, cells = result_lines(result)
     unit = "I/F" if result["image_units"] == "iof" else f"shares of {result['dn_full_range']:.0f} DN"
     console.table(f"split '{split}': {basis(result)}; errors in {unit}", columns, cells)

@@ -11,7 +11,7 @@ from lunargr_cli.options import (
     MOST,
     BodyOption,
     Device,
-    Output,
+    OutputFile,
     Overwrite,
     Parts,
     Quiet,
@@ -57,7 +57,7 @@ def command(
     body: BodyOption = None,
     device: Device = "auto",
     shard: Shard = None,
-    output: Output = Path("svbrdf.h5"),
+    output: OutputFile = Path("svbrdf.h5"),
     scheduler: Scheduler = None,
     resume: ResumeParts = False,
     parts: Parts = None,
@@ -66,10 +66,12 @@ def command(
 ) -> None:
     """Predict georeferenced maps of reflectance coefficients for a DEM of any size."""
     import contextlib
+    from dataclasses import replace
 
     from lunargr_cli.console import Console
     from schemas import ConfigError
     from schemas.files.locks import scratch_path
+    from schemas.files.outputs import Output
     from stages import infer
 
     if precision not in ("auto", "fp32", "bf16"):
@@ -77,6 +79,7 @@ def command(
     if geotiff and no_geotiff:
         raise ConfigError(f"--geotiff {geotiff} and --no-geotiff: expected one of them, found both.")
     console = Console(quiet)
+    to = Output(output, overwrite, geotiff=geotiff)
     config = infer.Config(
         window=window,
         stride=stride,
@@ -88,7 +91,7 @@ def command(
         geotiff=not no_geotiff,
     )
     interrupted = scheduler is not None or resume  # may have got as far as the GeoTIFF: its parts tell
-    infer.check_files([terrain, checkpoint], output, geotiff, config, overwrite, replace_tiff=interrupted)
+    infer.check_files([terrain, checkpoint], replace(to, resume=interrupted), config)
     gridding = None
     if infer.open_terrain(terrain):
         infer.check_body(terrain, body)
@@ -100,17 +103,19 @@ def command(
             gsd=None if any_gsd else load_predictor(checkpoint).gsd, body="moon" if body is None else body
         )
     if in_parts(scheduler, resume, parts, shard):
+        from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_infer
 
-        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
-        found = run_infer(terrain, checkpoint, output, config, gridding, geotiff, parts, **how)
+        found = run_infer(
+            terrain, checkpoint, to, config, gridding, Work(scheduler, parts, console.say, console.progress)
+        )
     else:
         scene = terrain
         with contextlib.ExitStack() as stack:
             if gridding is not None:
                 scene = stack.enter_context(scratch_path(output, "grid"))
                 ingest.run(terrain, None, scene, gridding, progress=console.progress)
-            found = infer.run(scene, checkpoint, output, config, geotiff, overwrite, console.progress)
+            found = infer.run(scene, checkpoint, to, config, console.say, console.progress)
     console.say(
         f"{output}: {found.grid.height} x {found.grid.width} px at {found.grid.gsd:g} m, {found.valid_share:.1%} valid"
     )

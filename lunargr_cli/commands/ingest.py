@@ -10,7 +10,7 @@ import typer
 from lunargr_cli.options import (
     MOST,
     BodyOption,
-    Output,
+    OutputFile,
     Overwrite,
     Parts,
     Quiet,
@@ -40,7 +40,7 @@ def command(
     crop: Annotated[
         int, typer.Option("--crop", min=1, max=MOST, help="Crop size in pixels that valid positions are made for.")
     ] = 128,
-    output: Output = Path("scene.h5"),
+    output: OutputFile = Path("scene.h5"),
     body: BodyOption = None,
     skip_outside: Annotated[
         bool, typer.Option("--skip-outside", help="Leave out images that do not touch the DEM.")
@@ -54,19 +54,21 @@ def command(
 ) -> None:
     """Bring a DEM to a metric grid and find where crops of each image may be centred."""
     from lunargr_cli.console import Console
+    from schemas.files.outputs import Output
     from stages import ingest
 
     console = Console(quiet)
+    to = Output(output, overwrite)
     config = ingest.Config(
         gsd=gsd, crop=crop, body="moon" if body is None else body, skip_outside=skip_outside, shard=parse_shard(shard)
     )
     if in_parts(scheduler, resume, parts, shard):
+        from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_ingest
 
-        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
-        found = run_ingest(dem, images, output, config, parts, **how)
+        found = run_ingest(dem, images, to, config, Work(scheduler, parts, console.say, console.progress))
     else:
-        found = ingest.run(dem, images, output, config, overwrite, console.progress)
+        found = ingest.run(dem, images, to, config, console.say, console.progress)
     grid, (low, high) = found.grid, found.elevation_range
     method = "reprojected to a local metric grid" if found.resampled else "area means of the DEM's own grid"
     console.say(

@@ -50,16 +50,16 @@ def command(
     beside Hapke matched to each crop's range, as in the Lunar-G2R paper.
     """
     from lunargr_cli.console import Console
+    from schemas.files.outputs import Output
     from stages import match
-    from stages.match.run import result_lines
+    from stages.match.stage import result_lines
 
     console = Console(quiet)
     config = match.Config(
         tuple(matcher or ("daisy", "sift")), split, count, features_model, lightglue_model, seed, device
     )
-    result = match.run(
-        files, config, json_file=json_file, figures=figures, overwrite=overwrite, progress=console.progress
-    )
+    to = Output(overwrite=overwrite, json=json_file, figures=figures)
+    result = match.run(files, to, config, console.say, console.progress)
     columns, cells = result_lines(result)
     extent = f"{result['crops']} picture(s) of 512 x 384 on {result['tiles']} ground tile(s)"
     console.table(f"matching consistency over {extent}", columns, cells)

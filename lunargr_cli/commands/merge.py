@@ -26,8 +26,9 @@ def command(
 ) -> None:
     """Join the parts that shards wrote into the artefact that one run would have written."""
     from lunargr_cli.console import Console
+    from schemas.files.outputs import Output
     from stages import merge
 
     console = Console(quiet)
-    schema = merge.run(parts, output, overwrite, console.progress, virtual)
+    schema = merge.run(parts, Output(output, overwrite), merge.Config(virtual), console.say, console.progress)
     console.say(f"{output}: {len(parts)} parts of '{schema.name}' merged")

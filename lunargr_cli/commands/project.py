@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import typer.core
 
-from lunargr_cli.options import Output, Overwrite, Parts, Quiet, ResumeParts, Scheduler, Shard, in_parts, parse_shard
+from lunargr_cli.options import (
+    OutputFile,
+    Overwrite,
+    Parts,
+    Quiet,
+    ResumeParts,
+    Scheduler,
+    Shard,
+    in_parts,
+    parse_shard,
+)
 from lunargr_cli.paths import Writes
 
 if TYPE_CHECKING:
@@ -66,7 +76,7 @@ def command(
         bool, typer.Option("--exact", help="Keep all digits of float32, not those that matter: three times the size.")
     ] = False,
     shard: Shard = None,
-    output: Output = Path("pairs.h5"),
+    output: OutputFile = Path("pairs.h5"),
     scheduler: Scheduler = None,
     resume: ResumeParts = False,
     parts: Parts = None,
@@ -76,10 +86,11 @@ def command(
     """Orthorectify the images onto the crops; add the Sun, the camera and the terrain's horizon."""
     from lunargr_cli.console import Console
     from schemas import ConfigError
-    from schemas.files.outputs import Target, check_outputs
+    from schemas.files.outputs import Output, Target, check_outputs
     from stages import project
 
     console = Console(quiet)
+    to = Output(output, overwrite)
     if blocks_csv is not None:
         if register is None:
             raise typer.BadParameter("needs --register", param_hint="--shifts")
@@ -92,14 +103,14 @@ def command(
         exact=exact,
     )
     if in_parts(scheduler, resume, parts, shard):
+        from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_project
 
         if blocks_csv is not None:
             raise ConfigError("--shifts: parts do not keep the blocks' own shifts; leave out --scheduler and --resume.")
-        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
-        found = run_project(crops, output, config, parts, **how)
+        found = run_project(crops, to, config, Work(scheduler, parts, console.say, console.progress))
     else:
-        found = project.run(crops, output, config, overwrite, console.progress)
+        found = project.run(crops, to, config, console.say, console.progress)
     (i0, i1), (e0, e1) = found.incidence_deg, found.emission_deg
     console.say(
         f"{output}: {found.pairs} pairs, {found.valid_share:.1%} of pixels valid, {found.shadowed_share:.1%} of these in cast shadow; "

@@ -147,6 +147,7 @@ def command(
     if parameters and dem is None:
         raise ConfigError("--parameters: expected together with --dem; an svbrdf.h5 holds its own coefficients.")
     from lunargr_cli.console import Console
+    from schemas.files.outputs import Output
     from stages import render
 
     given = _parameters(parameters or [])
@@ -174,8 +175,10 @@ def command(
         body=body,
         backplanes_in_tif=backplanes,
         export=export,
+        png_only=png_only,
+        shard=parse_shard(shard),
     )
-    console = Console(quiet)
+    console, to = Console(quiet), Output(output, overwrite, resume)
     if stereo is not None:
         if trajectory is not None or camera or position or shard or resume:
             raise ConfigError(
@@ -183,27 +186,17 @@ def command(
             )
         low, high = _numbers(convergence, "--convergence", (2,)) or (4.0, 30.0)
         drawn = render.StereoConfig(stereo, altitude, (low, high), seed=seed)
-        manifest = render.run_stereo(path, output, config, drawn, overwrite=overwrite, progress=console.progress)
+        manifest = render.run_stereo(path, to, config, drawn, console.say, console.progress)
         console.say(f"{manifest}: {stereo} stereo pairs")
         return
     if trajectory is not None:
-        results = render.run_trajectory(
-            path,
-            trajectory,
-            output,
-            config,
-            shard=parse_shard(shard),
-            resume=resume,
-            overwrite=overwrite,
-            suffix=".png" if png_only else ".exr",
-            progress=console.progress,
-        )
+        results = render.run_trajectory(path, trajectory, to, config, console.say, console.progress)
     else:
         if shard is not None or resume:
             raise ConfigError(
                 "--shard and --resume: expected together with --trajectory; a single view is one piece of work."
             )
-        results = [render.run(path, output, config, overwrite=overwrite, progress=console.progress)]
+        results = [render.run(path, to, config, console.say, console.progress)]
     if json_file is not None:
         _write_json(json_file, results)
     console.table(

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import MOST, Output, Overwrite, Parts, Quiet, Scheduler, Seed, Shard, in_parts, parse_shard
+from lunargr_cli.options import MOST, OutputFile, Overwrite, Parts, Quiet, Scheduler, Seed, Shard, in_parts, parse_shard
 
 NAME, ORDER = "sample", 30
 
@@ -36,7 +36,7 @@ def command(
     split: Annotated[str, typer.Option("--split", help="Shares of train/validation/test.")] = "80/10/10",
     seed: Seed = 0,
     shard: Shard = None,
-    output: Output = Path("crops.h5"),
+    output: OutputFile = Path("crops.h5"),
     scheduler: Scheduler = None,
     parts: Parts = None,
     overwrite: Overwrite = False,
@@ -45,6 +45,7 @@ def command(
     """Choose crop centres per image and split them by ground tile, with no ground shared between the parts."""
     from lunargr_cli.console import Console
     from schemas import ConfigError
+    from schemas.files.outputs import Output
     from stages import sample
 
     try:
@@ -54,6 +55,7 @@ def command(
     except (ValueError, ZeroDivisionError):
         raise ConfigError(f"--split: expected three shares like 80/10/10, found '{split}'.") from None
     console = Console(quiet)
+    to = Output(output, overwrite)
     config = sample.Config(
         crop=crop,
         count=count,
@@ -65,11 +67,11 @@ def command(
         shard=parse_shard(shard),
     )
     if in_parts(scheduler, False, parts, shard):
+        from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_sample
 
-        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
-        audit = run_sample(scene, output, config, parts, **how)
+        audit = run_sample(scene, to, config, Work(scheduler, parts, console.say, console.progress))
     else:
-        audit = sample.run(scene, output, config, overwrite, console.progress)
+        audit = sample.run(scene, to, config, console.say, console.progress)
     rows = [(p.name, p.pairs, p.images, p.tiles, f"{p.ground_km2:.2f}", f"{p.shared_km2:.2f}") for p in audit]
     console.table("split by ground tile", ("part", "pairs", "images", "tiles", "ground km2", "shared km2"), rows)

@@ -64,10 +64,11 @@ def command(
         write_out(recipe_json(config))
         return
     from schemas import write_json
+    from schemas.files.outputs import Output
     from stages.simulate.stage import run
 
     console = Console(quiet)
-    summary = run(output, config, overwrite, console.progress)
+    summary = run(Output(output, overwrite), config, console.say, console.progress)
     rows = [
         (
             i.shot.image_id,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import MOST, Device, Output, Overwrite, Quiet, Resume, Seed
+from lunargr_cli.options import MOST, Device, OutputFile, Overwrite, Quiet, Resume, Seed
 
 NAME, ORDER = "train", 50
 
@@ -57,7 +57,7 @@ def command(
     ] = None,
     seed: Seed = 0,
     device: Device = "auto",
-    output: Output = Path("checkpoint.h5"),
+    output: OutputFile = Path("checkpoint.h5"),
     overwrite: Overwrite = False,
     resume: Resume = False,
     quiet: Quiet = False,
@@ -65,6 +65,7 @@ def command(
     """Learn reflectance from terrain through the differentiable renderer. Several processes: run under torchrun."""
     from lunargr_cli.console import Console
     from lunargr_cli.options import read_names, read_numbers
+    from schemas.files.outputs import Output
     from stages import train
 
     console = Console(quiet)
@@ -85,7 +86,7 @@ def command(
         precision=precision,
         extend=str(extend) if extend else None,
     )
-    found = train.run(pairs, output, config, overwrite, resume, console.say, console.progress)
+    found = train.run(pairs, Output(output, overwrite, resume), config, console.say, console.progress)
     best = found.history.best_epoch
     console.say(
         f"{output}: best epoch {best + 1}, validation MSE {found.history.validation_loss[best]:.4e}; "

@@ -7,14 +7,14 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Output, Overwrite, Quiet
+from lunargr_cli.options import OutputFile, Overwrite, Quiet
 
 NAME, ORDER = "view", 61
 
 
 def command(
     source: Annotated[Path, typer.Argument(metavar="SVBRDF.h5", help="Reflectance map from 'lunargr infer'.")],
-    output: Output = Path("view.html"),
+    output: OutputFile = Path("view.html"),
     pairs: Annotated[
         Path | None, typer.Option("--pairs", metavar="PAIRS.h5", help="Show measured photographs beside the map.")
     ] = None,
@@ -37,11 +37,12 @@ def command(
     lunargr view svbrdf.h5 --pairs pairs.h5 -o view.html
     """
     from lunargr_cli.console import Console
+    from schemas.files.outputs import Output
     from stages import view
 
     console = Console(quiet)
     config = view.Config(max_px, photographs, sun_azimuth, sun_elevation, title)
-    made = view.run(source, output, config, pairs=pairs, overwrite=overwrite, progress=console.progress)
+    made = view.run(source, pairs, Output(output, overwrite), config, console.say, console.progress)
     smaller = f", means of {made.factor} x {made.factor} px" if made.factor > 1 else ""
     console.say(
         f"{output}: {made.height} x {made.width} px{smaller}, {made.model}, {made.layers} maps, "

@@ -37,6 +37,41 @@ class Target:
     what: str = "the output"
 
 
+@dataclass(frozen=True)
+class Output:
+    """Where a stage writes, and what it may replace.
+
+    path : the artefact, page or folder; None for stages that are asked for `json`, `figures` or `report` alone
+    overwrite : whether what exists may be replaced; resume : whether to go on with what an interrupted run left
+    geotiff : of a map, None for its own name with .tif; json, figures (a folder), report : None for none
+    """
+
+    path: Path | None = None
+    overwrite: bool = False
+    resume: bool = False
+    geotiff: Path | None = None
+    json: Path | None = None
+    figures: Path | None = None
+    report: Path | None = None
+
+    @classmethod
+    def of(cls, where: Output | Path | None) -> Output:
+        """A bare path is an output that replaces nothing."""
+        return where if isinstance(where, Output) else cls(where)
+
+    @property
+    def file(self) -> Path:
+        """The path, where there must be one. Raises ConfigError."""
+        if self.path is None:
+            raise ConfigError("expected the name of an output, found none.")
+        return self.path
+
+    @property
+    def geotiff_path(self) -> Path:
+        """Where a map's GeoTIFF goes."""
+        return self.geotiff or self.file.with_suffix(".tif")
+
+
 @contextlib.contextmanager
 def protect(inputs: Iterable[Path]) -> Iterator[None]:
     """Within this block no file is written in the place of one of these, or of one that they name, whoever writes it."""

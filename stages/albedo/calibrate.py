@@ -10,7 +10,7 @@ agree it is 0 and the map stays as it is. (Moment estimates of variance componen
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,10 @@ from stages.albedo.intervals import GAUSSIAN, Stack, unseen_intervals
 from stages.albedo.posterior import Spread, settle
 from stages.albedo.pyramid import LEVELS, bands
 from stages.albedo.references import Box, Look, References, overlap
+from stages.common.progress import Progress, show_nothing
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
-Progress = Callable[[int, int, str], None]
 
 WINDOW_PX = 128
 WINDOWS_PER_IMAGE = 16
@@ -115,11 +115,10 @@ def choose_windows(shape: tuple[int, int], boxes: Sequence[Box]) -> list[Box]:
     return chosen
 
 
-def take_samples(references: References, windows: Sequence[Box], progress: Progress | None = None) -> list[Sample]:
+def take_samples(references: References, windows: Sequence[Box], progress: Progress = show_nothing) -> list[Sample]:
     samples = []
     for number, box in enumerate(windows):
-        if progress:
-            progress(number, len(windows), "calibration windows")
+        progress(number, len(windows), "calibration windows")
         sample = Sample()
         for k in references.overlapping(box):
             look = references.look(k, box)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from schemas.errors import ConfigError
-from stages.physics.images.table import Frame
+
+if TYPE_CHECKING:
+    from stages.physics.images.table import Frame
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,17 +34,18 @@ import torch
 
 from schemas import ArtefactError, ConfigError, write_json
 from schemas.files.companions import companions_of
-from schemas.files.outputs import Target, check_outputs
+from schemas.files.outputs import Output, Target, check_outputs
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.diagnose.likelihood.left import budget, peak
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import better_form, relative_misfit
 from stages.diagnose.model.nominal import fit, lit_mask, load_nominal
-from stages.diagnose.model.sites import Site, group_pairs, load_site, survey
+from stages.diagnose.model.sites import Site, group_pairs, load_site, number_grounds, survey
 from stages.diagnose.registration.explain import explain
 from stages.diagnose.result.answer import Answer
 from stages.diagnose.result.files import write_diagnosis
 from stages.diagnose.result.named import by_histogram, by_registration, by_search
-from stages.diagnose.result.score import blind_effects, score
+from stages.diagnose.result.score import blind_effects, displacements, score
 from stages.diagnose.search.select import Outcome, search
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import LINE, MISFIT
@@ -77,32 +77,30 @@ class Result:
 def run(
     pairs: Path,
     checkpoint: Path | None = None,
+    output: Output | Path | None = None,
     config: Config = Config(),
-    output: Path | None = None,
-    json_file: Path | None = None,
-    report: Path | None = None,
-    overwrite: bool = False,
-    say: Callable[[str], None] | None = None,
-    progress: Callable[[int, int, str], None] | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Result:
     """Diagnose the pairs; write what is asked for. Raises ArtefactError, ConfigError, RegistryError."""
+    output = Output.of(output)
     if config.most_causes < 1 or config.most_pairs < 1 or config.most_images < 1:
         raise ConfigError("diagnose: expected counts of at least 1 for causes, images and pairs.")
     inputs = [p for p in (pairs, checkpoint) if p is not None]
-    named = ((output, "--output"), (json_file, "--json"), (report, "--report"))
-    check_outputs([Target(path, option) for path, option in named if path is not None], inputs, overwrite)
+    named = ((output.path, "--output"), (output.json, "--json"), (output.report, "--report"))
+    check_outputs([Target(path, option) for path, option in named if path is not None], inputs, output.overwrite)
     with PairReader(pairs) as reader:
-        result = diagnose(reader, checkpoint, config, say or (lambda _: None), progress or (lambda *_: None))
+        result = diagnose(reader, checkpoint, config, say, progress)
         image_ids = reader.image_ids
-    with companions_of(output):
-        if json_file is not None:
-            write_json(json_file, result.answer.to_json())
-        if report is not None:
+    with companions_of(output.path):
+        if output.json is not None:
+            write_json(output.json, result.answer.to_json())
+        if output.report is not None:
             from stages.diagnose.result.page import write_page
 
-            write_page(report, result.answer, result.state, image_ids)
-    if output is not None:  # last: where it is, the others are
-        write_diagnosis(output, result.answer, image_ids, inputs, overwrite)
+            write_page(output.report, result.answer, result.state, image_ids)
+    if output.path is not None:  # last: where it is, the others are
+        write_diagnosis(output.path, result.answer, image_ids, inputs, output.overwrite)
     return result
 
 
@@ -116,6 +114,9 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     nominal = load_nominal(checkpoint, config.model, reader.units, config.free)
     train, test = split(reader)
     sites = _load(reader, train, config)
+    hidden = _load(reader, test, dataclasses.replace(config, most_sites=64))
+    number_grounds(sites)
+    number_grounds(hidden)
     answer = Answer("cannot_tell", config={**dataclasses.asdict(config), "checkpoint": str(checkpoint or "")})
     answer.pairs, answer.sites = sum(s.count for s in sites), len(sites)
     answer.images = len({int(f) for s in sites for f in s.frames})
@@ -131,7 +132,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         fit(nominal, sites, [], units, [s.read for s in sites])
     data = survey(sites, frames, units)
     state = State(
-        nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, say=say, progress=progress
+        nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, hidden, say=say, progress=progress
     )
     state.reference = copy.copy(nominal)
     before = _residual(state)
@@ -143,6 +144,8 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     if state.registration.form.name != "none":
         for site, known in zip(sites, state.registration.known, strict=True):
             site.displacement = known
+        for site, found in zip(hidden, displacements(state, [])[1], strict=True):
+            site.displacement = found
     state.fit()
     misfit = relative_misfit(nominal, sites, varied=units == "dn", whole=True) * (0.5 if units == "dn" else 1.0)
     if not misfit < MISFIT:
@@ -154,8 +157,9 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         return Result(answer, state, None)
     progress(2, 5, "search")
     outcome = search(state, config.most_causes)
-    answer.causes = by_registration(state) + by_search(state) + [c for c in [cut(data, state) if cut else None] if c]
-    answer.rejected = outcome.rejected
+    placed, refused = by_registration(state)
+    answer.causes = placed + by_search(state) + [c for c in [cut(data, state) if cut else None] if c]
+    answer.rejected = refused | outcome.rejected
     if state.registration is not None:
         answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}
     view = outcome.view
@@ -173,8 +177,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)
     else:
         answer.verdict = "cannot_tell" if answer.blind else "nothing_significant"
-    hidden = _load(reader, test, dataclasses.replace(config, most_sites=64))
-    answer.held_out = score(state, hidden, answer)
+    answer.held_out = score(state, answer)
     return Result(answer, state, outcome)
 
 

@@ -1,4 +1,4 @@
-"""Gaussian filtering with a signed variance, and the standardised terrain fields that albedo may follow."""
+"""Gaussian filtering with a signed variance, curvature and gradients of images."""
 
 from __future__ import annotations
 
@@ -32,3 +32,11 @@ def laplacian(image: Tensor, gsd: float) -> Tensor:
     centre = wide[:, 1:-1, 1:-1]
     ring = wide[:, :-2, 1:-1] + wide[:, 2:, 1:-1] + wide[:, 1:-1, :-2] + wide[:, 1:-1, 2:]
     return (ring - 4 * centre) / (gsd * gsd)
+
+
+def gradients(image: Tensor) -> tuple[Tensor, Tensor]:
+    """Change per pixel to the east and to the south, by fourth-order differences; image : (..., H, W)."""
+    wide = pad(image.flatten(0, -3)[:, None], (2,) * 4, mode="replicate")[:, 0]
+    east = (8 * (wide[:, 2:-2, 3:-1] - wide[:, 2:-2, 1:-3]) - (wide[:, 2:-2, 4:] - wide[:, 2:-2, :-4])) / 12
+    south = (8 * (wide[:, 3:-1, 2:-2] - wide[:, 1:-3, 2:-2]) - (wide[:, 4:, 2:-2] - wide[:, :-4, 2:-2])) / 12
+    return east.view(image.shape), south.view(image.shape)

@@ -1,6 +1,6 @@
 """Seen ground under an unseen image: how well maps with albedo predict photographs that had no part in their albedo.
 
-Another claim than that of unseen ground (``stages.evaluate.run``), and kept apart from it: here other photographs of the
+Another claim than that of unseen ground (``stages.evaluate.stage``), and kept apart from it: here other photographs of the
 same pixels made the albedo. How far the scored Sun stands from the nearest one used is part of the answer.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 
 from schemas import EVALUATION, SVBRDF, ArtefactError, ArtefactWriter, check_output, open_artefact, write_json
 from schemas.files.companions import companions_of
+from schemas.files.outputs import Output
 from schemas.reading import read_strings
 from stages.common.intervals import ERROR, choose_units, gain_interval, ratio_interval
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.evaluate.coverage import BANDS_DEG, count_within, shares
 from stages.evaluate.metrics import ssim
 from stages.pairs.reader import PairReader
@@ -33,7 +35,6 @@ from stages.physics.photometry import get_model
 from stages.physics.terrain.surface import SHADOWED, AlbedoError
 
 Floats = NDArray[np.float64]
-Progress = Callable[[int, int, str], None]
 
 CLAIM = "seen ground, unseen images"
 ROWS = ("terrain", "albedo", "terrain_gain_offset", "albedo_gain_offset")
@@ -72,20 +73,20 @@ class Map:
 def run(
     pairs: Path,
     maps: Sequence[Path],
-    output: Path,
+    output: Output | Path,
     config: Config,
-    json_file: Path | None = None,
-    overwrite: bool = False,
-    progress: Progress | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> dict[str, Any]:
     """Score every pair of the split whose image had no part in one of the maps; returns what the JSON holds.
 
     maps : of `lunargr albedo`, such as those of all folds; a pair is scored on the first that its image did not make.
     Raises LunargrError.
     """
-    reports = [output.with_suffix(".json"), *([json_file] if json_file else [])]
-    for path in (output, *reports):
-        check_output(path, [pairs, *maps], overwrite)
+    output = Output.of(output)
+    reports = [output.file.with_suffix(".json"), *([output.json] if output.json else [])]
+    for path in (output.file, *reports):
+        check_output(path, [pairs, *maps], output.overwrite)
     with PairReader(pairs) as reader, contextlib.ExitStack() as stack:
         opened = [_open(path, reader, stack) for path in maps]
         chosen = _choose(reader, opened, config.split)
@@ -93,7 +94,7 @@ def run(
         inputs = [pairs, *maps]
         settings = {"split": config.split, "seed": config.seed, "held_out_images": True}
         with ArtefactWriter(
-            output, EVALUATION, sizes, config=settings, inputs=inputs, seed=config.seed, overwrite=overwrite
+            output.file, EVALUATION, sizes, config=settings, inputs=inputs, seed=config.seed, overwrite=output.overwrite
         ) as writer:
             scores = _score(reader, opened, chosen, writer, progress)
             result = _conclude(reader, opened, chosen, scores, config)
@@ -106,7 +107,7 @@ def run(
             writer.write("ssim", scores["ssim"])
             writer.file.attrs["split"] = config.split
             writer.file.attrs["metrics"] = json.dumps(result)
-            with companions_of(output):
+            with companions_of(output.file):
                 for report in reports:
                     write_json(report, result)
     return result
@@ -175,8 +176,7 @@ def _score(
     measured_out, rendered_out = writer.dataset("measured"), writer.dataset("rendered")
     scales: dict[tuple[int, int], list[tuple[float, float]]] = {}
     for n, (k, number) in enumerate(chosen):
-        if progress:
-            progress(n, count, "held-out crops")
+        progress(n, count, "held-out crops")
         one = maps[number]
         if reader.units == "dn" and (int(reader.frame[k]), number) not in scales:
             scales[int(reader.frame[k]), number] = _image_scales(reader, one, int(reader.frame[k]))

@@ -2,6 +2,17 @@
 
 from __future__ import annotations
 
-from stages.export.onnx_file import Config, Summary, run
+from typing import TYPE_CHECKING
 
-__all__ = ["Config", "Summary", "run"]
+from schemas.later import imported_later
+from stages.export.config import Config
+
+if TYPE_CHECKING:
+    from stages.export.onnx_file import Summary, run
+
+__getattr__ = imported_later(__name__, {"Summary": "onnx_file", "run": "onnx_file"})
+__all__ = [
+    "Config",
+    "Summary",
+    "run",
+]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from stages.physics.maps.grid import Grid
+if TYPE_CHECKING:
+    from stages.physics.maps.grid import Grid
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from schemas import (
     GeometryError,
     InputError,
 )
-from stages.ingest.config import Progress
+from stages.common.progress import Progress, show_nothing
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, local_metric_crs
 
@@ -39,7 +39,7 @@ class Plan:
 
 
 def plan_grid(
-    dem: Path, dataset: DatasetReader, gsd: float | None, radius: float, progress: Progress | None = None
+    dem: Path, dataset: DatasetReader, gsd: float | None, radius: float, progress: Progress = show_nothing
 ) -> Plan:
     """Area means where the DEM's grid is metric and divides the GSD, otherwise a local metric grid."""
     rasters.check_single_band(dem, dataset, "a DEM")
@@ -110,7 +110,7 @@ def _is_metre(dataset: DatasetReader) -> bool:
     return abs((dataset.crs.linear_units_factor[1] if dataset.crs.is_projected else 0) - 1) < 1e-6
 
 
-def _holds_radii(dem: Path, dataset: DatasetReader, radius: float, progress: Progress | None) -> bool:
+def _holds_radii(dem: Path, dataset: DatasetReader, radius: float, progress: Progress) -> bool:
     """Whether the DEM counts from the body's centre; and whether its numbers can be metres at all."""
     size = 256
     windows = [
@@ -155,13 +155,12 @@ def _holds_radii(dem: Path, dataset: DatasetReader, radius: float, progress: Pro
     return False
 
 
-def _first_elevations(dem: Path, dataset: DatasetReader, progress: Progress | None) -> NDArray[np.float64]:
+def _first_elevations(dem: Path, dataset: DatasetReader, progress: Progress) -> NDArray[np.float64]:
     """The first block of a raster that holds any value. Raises InputError where none does."""
     rows, cols = dataset.block_shapes[0]
     down, across = math.ceil(dataset.height / rows), math.ceil(dataset.width / cols)
     for r in range(down):
-        if progress:
-            progress(r, down, "rows of blocks without elevations")
+        progress(r, down, "rows of blocks without elevations")
         for c in range(across):
             # a sparse GeoTIFF leaves out blocks of nodata: a DEM of these is looked through in seconds
             if dataset.driver == "GTiff" and not dataset.get_tag_item(f"BLOCK_OFFSET_{c}_{r}", "TIFF", bidx=1):

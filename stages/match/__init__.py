@@ -2,6 +2,16 @@
 
 from __future__ import annotations
 
-from stages.match.run import Config, run
+from typing import TYPE_CHECKING
 
-__all__ = ["Config", "run"]
+from schemas.later import imported_later
+from stages.match.config import Config
+
+if TYPE_CHECKING:
+    from stages.match.stage import run
+
+__getattr__ = imported_later(__name__, {"run": "stage"})
+__all__ = [
+    "Config",
+    "run",
+]

@@ -15,7 +15,7 @@ from schemas import ArtefactWriter, InputError
 from stages.physics.images.orthorectify import Ortho
 from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
-from stages.project.config import Registered, Summary
+from stages.project.summary import Registered, Summary
 
 # Digits after the point, which pairs.h5 keeps; docs/scaling.md says what they do to a rendering.
 IOF_DECIMALS, COUNT_DECIMALS, HORIZON_DECIMALS = 5, 1, 1

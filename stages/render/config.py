@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from schemas.errors import ConfigError
-
-Floats32 = NDArray[np.float32]
 
 VIEWS = ("ortho", "pinhole")
 EXPORTS = ("colmap", "nerfstudio")
@@ -38,7 +33,7 @@ class Config:
     camera : path of a camera model (JSON), instead of position, attitude, fov and size
     samples : rays per pixel and axis (None: as many as the pixel's footprint asks for)
     model, parameters : a reflectance that is the same everywhere, where the source holds none
-    export : with a trajectory: also a data set of its views, colmap or nerfstudio
+    export : with a trajectory: also a data set of its views, colmap or nerfstudio; png_only : no EXR; shard : every n-th view
     terrain_only : of svbrdf.h5 use the terrain, with ``model``
     """
 
@@ -65,6 +60,26 @@ class Config:
     body: str | None = None
     backplanes_in_tif: bool = False
     export: str | None = None
+    png_only: bool = False
+    shard: tuple[int, int] = (0, 1)
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """How pairs are drawn; ranges are uniform.
+
+    altitude : m above the ground (None: an eighth of the map's shorter side in a picture)
+    convergence_deg : between both lines of sight at the ground; off_nadir_deg : of their mean; roll_deg : to either side
+    sun_elevation_deg : of both Suns, each with any azimuth
+    """
+
+    count: int
+    altitude: float | None = None
+    convergence_deg: tuple[float, float] = (4.0, 30.0)
+    off_nadir_deg: float = 8.0
+    roll_deg: float = 20.0
+    sun_elevation_deg: tuple[float, float] = (12.0, 65.0)
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -130,43 +145,3 @@ def check(config: Config, trajectory: bool = False) -> None:
         raise ConfigError("--view pinhole: expected --position LON,LAT,ALT or --camera FILE; found neither.")
     if config.look_at is not None and config.quaternion is not None:
         raise ConfigError("--view pinhole: expected --look-at or --quaternion, found both.")
-
-
-def skipped(view_id: str, files: Sequence[Path], size: tuple[int, int]) -> Summary:
-    """The line of a view that was there already."""
-    nothing = (math.nan, math.nan)
-    return Summary(view_id, tuple(files), size, math.nan, math.nan, math.nan, nothing, 0, skipped=True)
-
-
-class Tally:
-    """Shares and means gathered from bands."""
-
-    def __init__(self) -> None:
-        self.pixels = self.known = self.clipped = 0
-        self.total = self.dark = 0.0
-        self.low, self.high = math.inf, -math.inf
-
-    def add(self, band: Mapping[str, Floats32]) -> None:
-        image, known = band["image"], np.isfinite(band["image"])
-        self.pixels += image.size
-        self.known += int(known.sum())
-        self.clipped += int((band["clipped"][known] > 0).sum())
-        self.total += float(image[known].sum(dtype=np.float64))
-        self.dark += float(np.nansum(np.where(known, band["shadow"], np.nan), dtype=np.float64))
-        incidence = band["incidence_deg"][np.isfinite(band["incidence_deg"])]
-        if incidence.size:
-            self.low, self.high = min(self.low, float(incidence.min())), max(self.high, float(incidence.max()))
-
-    def summary(self, view_id: str, files: Sequence[Path], size: tuple[int, int], samples: int) -> Summary:
-        n = max(self.known, 1)
-        return Summary(
-            view_id,
-            tuple(files),
-            size,
-            self.known / max(self.pixels, 1),
-            self.total / n,
-            self.dark / n,
-            (self.low, self.high),
-            samples,
-            clipped=self.clipped,
-        )

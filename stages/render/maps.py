@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from schemas.errors import GeometryError
+from schemas.files.outputs import atomic_path
+from schemas.rasters import TIFF_TAG
+from stages.common.progress import Progress
+from stages.physics.maps.geotiff import MapTiff
 from stages.physics.terrain.shading import BACKPLANES, Light, shade_block
 from stages.physics.terrain.surface import Surface
-from stages.render.config import Config, Summary, Tally
-from stages.render.pictures import Preview, write_exr, write_geotiff, write_png
+from stages.render.config import Config, Summary
+from stages.render.pictures import Preview, write_exr, write_png
 from stages.render.setting import metadata
+from stages.render.tally import Tally
 
-Progress = Callable[[int, int, str], None]
 BAND_ROWS = 256
 BAND_PX = 1 << 20  # of a wide map fewer rows at a time: memory does not follow its width
 BAND_COLUMNS = 1024
@@ -28,7 +32,7 @@ def render_map(
     relief: tuple[float, float],
     files: Sequence[Path],
     config: Config,
-    progress: Progress | None,
+    progress: Progress,
 ) -> Summary:
     """The whole map, streamed to its files band by band."""
     grid = surface.grid
@@ -47,11 +51,14 @@ def render_map(
         for suffix in (".tif", ".tiff"):
             if suffix in named:
                 units = [UNITS.get(b, "degree") for b in bands]
-                tif = stack.enter_context(write_geotiff(named[suffix], grid, bands, told, units))
-        rows = max(32, min(BAND_ROWS, BAND_PX // grid.width // 16 * 16))  # EXR packs 16 rows together
+                tags = {TIFF_TAG if k == "record" else k: v for k, v in told.items()}
+                partial = stack.enter_context(atomic_path(named[suffix]))
+                tif = stack.enter_context(MapTiff(partial, grid, bands, tags, units))
+        rows = max(
+            32, min(BAND_ROWS, BAND_PX // grid.width // 16 * 16)
+        )  # EXR packs 16 rows together, a GeoTIFF's levels 8
         for row in range(0, grid.height, rows):
-            if progress:
-                progress(row, grid.height, "rows")
+            progress(row, grid.height, "rows")
             height = min(rows, grid.height - row)
             band = {c: np.empty((height, grid.width), np.float32) for c in wanted}
             for col in range(0, grid.width, BAND_COLUMNS):
@@ -63,7 +70,7 @@ def render_map(
             if exr:
                 exr.write(band)
             if tif:
-                tif.write(np.stack([band[b] for b in bands]))
+                tif.put(row, 0, np.stack([band[b] for b in bands]))
             preview.add(band["image"])
             tally.add(band)
         if tally.known == 0:
@@ -71,6 +78,5 @@ def render_map(
                 f"{surface.path}: expected valid coefficients and elevations, found none; nothing to render."
             )
         write_png(named[".png"], preview.image())
-    if progress:
-        progress(grid.height, grid.height, "rows")
+    progress(grid.height, grid.height, "rows")
     return tally.summary(files[0].stem, files, (grid.width, grid.height), 1)

@@ -1,4 +1,4 @@
-"""Writing rendered images: EXR with named channels, cloud-optimised GeoTIFF, and PNG previews that look right.
+"""Writing rendered images: EXR with named channels, and PNG previews that look right.
 
 Writers take bands of rows from the top down, so that an image of any size passes through little memory, and leave
 nothing behind where they are interrupted.
@@ -14,16 +14,10 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-import rasterio
-import rasterio.shutil
 from numpy.typing import NDArray
-from rasterio.errors import RasterioError
-from rasterio.windows import Window
 
 from schemas.errors import InputError
-from schemas.files.locks import partial_path
 from schemas.files.outputs import atomic_path
-from stages.physics.maps.grid import Grid
 
 Floats32 = NDArray[np.float32]
 DISPLAY_GAMMA = 2.2
@@ -104,68 +98,6 @@ def read_exr(path: Path) -> dict[str, Floats32]:
     if pixels is None:
         raise InputError(f"{path}: expected a whole EXR image, found a truncated one; write it again.")
     return {name: np.ascontiguousarray(pixels[..., k]) for k, name in enumerate(names)}
-
-
-class GeoTiffWriter:
-    """Rows of a GeoTIFF as they come."""
-
-    def __init__(self, path: Path, target: rasterio.io.DatasetWriter) -> None:
-        self._path, self._target = path, target
-        self._row = 0
-
-    def write(self, bands: NDArray) -> None:
-        """Append rows: (bands, rows, W), NaN where there is nothing."""
-        rows, width = bands.shape[1:]
-        try:
-            self._target.write(bands, window=Window(0, self._row, width, rows))
-        except RasterioError as error:
-            raise _failed(self._path, str(error.__cause__ or error)) from None
-        self._row += rows
-
-
-@contextlib.contextmanager
-def _scratch(path: Path) -> Iterator[Path]:
-    """A file of strips beside the output, only a way to the cloud-optimised one, which GDAL must make in one go."""
-    scratch = path.with_name(f"{partial_path(path).stem}.strips.tif")
-    try:
-        yield scratch
-    finally:
-        with contextlib.suppress(OSError):
-            scratch.unlink()
-
-
-@contextlib.contextmanager
-def write_geotiff(
-    path: Path, grid: Grid, bands: Sequence[str], tags: Mapping[str, Any] | None = None, units: Sequence[str] = ()
-) -> Iterator[GeoTiffWriter]:
-    """A cloud-optimised float32 GeoTIFF on ``grid``, to the pixel; NaN is nodata, bands and tags carry their names."""
-    with atomic_path(path) as partial, _scratch(path) as plain:
-        profile = {
-            "driver": "GTiff",
-            "height": grid.height,
-            "width": grid.width,
-            "count": len(bands),
-            "dtype": "float32",
-            "crs": grid.crs,
-            "transform": grid.transform,
-            "nodata": float("nan"),
-            "BIGTIFF": "IF_SAFER",
-            "INTERLEAVE": "BAND",
-        }
-        with rasterio.open(plain, "w", **profile) as target:
-            for k, name in enumerate(bands, start=1):
-                target.set_band_description(k, name)
-                if units:
-                    target.set_band_unit(k, units[k - 1])
-            target.update_tags(**{k.upper(): str(v) for k, v in (tags or {}).items()})
-            yield GeoTiffWriter(path, target)
-        try:
-            rasterio.shutil.copy(
-                str(plain), str(partial), driver="COG", COMPRESS="DEFLATE", LEVEL="1", PREDICTOR="YES",
-                BIGTIFF="IF_SAFER", OVERVIEW_RESAMPLING="AVERAGE", NUM_THREADS="ALL_CPUS",
-            )  # fmt: skip
-        except RasterioError as error:
-            raise _failed(path, str(error.__cause__ or error)) from None
 
 
 class Preview:

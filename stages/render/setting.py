@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import ConfigError
+from schemas.provenance import raster_record
 from stages.physics.bodies.spheres import Body
 from stages.physics.cameras import Camera
 from stages.physics.images.frame_geometry import open_camera_for
@@ -22,7 +23,7 @@ from stages.physics.terrain.shading import Light
 from stages.physics.terrain.sun import Sun, check_sun_is_up, find_sun
 from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface, open_surface, open_terrain
-from stages.render.config import LARGEST_VIEW, SUN, Config
+from stages.render.config import LARGEST_VIEW, SUN, Config, inputs
 from stages.render.viewpoint import look_at, pinhole_view, place, rotation_from_quaternion
 
 
@@ -129,11 +130,12 @@ def camera_place(camera: Camera) -> NDArray[np.float64]:
 
 def metadata(surface: Surface, config: Config, light: Light) -> dict[str, object]:
     """What a file must say about how it came to be."""
-    told = {k: v for k, v in asdict(config).items() if v not in (None, {}, False)}
+    told = {k: v for k, v in asdict(config).items() if v not in (None, {}, False) and k != "shard"}
     return {
         "source": surface.path.name,
         "model": surface.model.name,
         "quantity": "radiance factor I/F = pi r, including cos(incidence)",
         "sun_position_mcmf": " ".join(f"{v:.6e}" for v in light.sun.position),
         "config": " ".join(f"{k}={v}" for k, v in sorted(told.items())),
+        "record": raster_record("render", told, inputs(surface.path, config)),
     }

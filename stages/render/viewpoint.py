@@ -22,7 +22,7 @@ def place(longitude_deg: float, latitude_deg: float, altitude: float, radius: fl
     """(3,) body-fixed, m; altitude in metres above the reference sphere. Raises GeometryError."""
     if not -90.0 <= latitude_deg <= 90.0 or not -360.0 <= longitude_deg <= 360.0:
         raise GeometryError(
-            f"expected a longitude in -360..360 and a latitude in -90..90 deg, found {longitude_deg:g}, {latitude_deg:g}."
+            f"expected a longitude in -360..360 and a latitude in -90..90 deg, found {longitude_deg:g}, {latitude_deg:g}; correct it."
         )
     return unit_vectors(longitude_deg, latitude_deg) * (radius + altitude)
 
@@ -66,7 +66,9 @@ def pinhole_view(
 ) -> Pinhole:
     """A distortion-free camera; ``fov_deg`` spans the image's width. Raises GeometryError."""
     if not 0.0 < fov_deg < 170.0:
-        raise GeometryError(f"--fov: expected degrees across the image's width between 0 and 170, found {fov_deg:g}.")
+        raise GeometryError(
+            f"--fov: expected degrees across the image's width between 0 and 170, found {fov_deg:g}; correct it."
+        )
     width, height = size_px
     if not (1 <= width <= 65536 and 1 <= height <= 65536):
         raise GeometryError(f"--size: expected W,H between 1 and 65536 px, found {width},{height}.")

@@ -2,6 +2,16 @@
 
 from __future__ import annotations
 
-from stages.report.run import Config, run
+from typing import TYPE_CHECKING
 
-__all__ = ["Config", "run"]
+from schemas.later import imported_later
+from stages.report.config import Config
+
+if TYPE_CHECKING:
+    from stages.report.stage import run
+
+__getattr__ = imported_later(__name__, {"run": "stage"})
+__all__ = [
+    "Config",
+    "run",
+]

@@ -140,7 +140,7 @@ def checkpoint(file: h5py.File) -> page.Section:
     epochs = np.arange(1, len(train) + 1)
     axes.plot(epochs, train, color="#8a929c", label="training", marker="o", markersize=2.5)
     axes.plot(epochs, validation, color="#3b8ecb", label="validation", marker="o", markersize=2.5)
-    axes.axvline(best + 1, color="#c08a2e", linewidth=1, linestyle=":", label=f"kept: epoch {best + 1}")
+    axes.axvline(best, color="#c08a2e", linewidth=1, linestyle=":", label=f"kept: epoch {best}")
     axes.locator_params(axis="x", integer=True)
     positive = np.concatenate([train, validation])
     if np.all(positive[np.isfinite(positive)] > 0):
@@ -150,7 +150,7 @@ def checkpoint(file: h5py.File) -> page.Section:
     section.add(
         page.paragraph(
             f"Model {file.attrs['model']} with coefficients {', '.join(names)}; {len(train)} epochs in "
-            f"{seconds.sum() / 60:.1f} min. The kept weights have a validation error of {validation[best]:.4g}."
+            f"{seconds.sum() / 60:.1f} min. The kept weights have a validation error of {validation[best - 1]:.4g}."
         ),
         page.chart(pictures.chart_svg(figure, "training"), "Training and validation loss"),
     )

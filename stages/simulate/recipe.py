@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import ConfigError, InputError
-from schemas.files.user_files import read_json
 from stages.simulate.hidden import Hidden, parse_hidden
 
 Range = tuple[float, float]
@@ -224,6 +223,8 @@ def _check(config: Config, where: str) -> None:
 
 def read_recipe(path: Path) -> dict[str, Any]:
     """The keys of a recipe file. Raises InputError."""
+    from schemas.files.user_files import read_json
+
     values = read_json(path, "a recipe in JSON ('lunargr simulate --print-recipe' writes one)")
     if not isinstance(values, dict):
         raise InputError(f"{path}: expected a JSON object of recipe keys, found {type(values).__name__}; mend it.")

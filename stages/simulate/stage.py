@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from schemas.files.outputs import Target, atomic_folder, atomic_path, check_outputs
+from schemas.files.outputs import Output, Target, atomic_folder, atomic_path, check_outputs
 from schemas.provenance import SIDECAR, sidecar
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.images.table import ASTRONOMICAL_UNIT
 from stages.physics.maps.grid import Grid, local_metric_crs, unit_vectors
 from stages.simulate import sensor
@@ -25,8 +26,6 @@ from stages.simulate.reflectance import MARGIN, Truth, albedo
 from stages.simulate.render import Scene, View, blur, point_spread, radiance
 from stages.simulate.terrain import Terrain
 from stages.simulate.write import NODATA_FLOAT, ImageFile, ImageTruth, geotiff, table_row, write_table, write_truth
-
-Progress = Callable[[int, int, str], None]
 
 GROUND_ROWS = 512  # DEM rows made at once
 IN_MEMORY = 6e8  # bytes of truth kept in memory; more is mapped from a temporary file
@@ -45,20 +44,21 @@ class Summary:
     hidden: list[Hidden]
 
 
-def run(folder: Path, config: Config, overwrite: bool = False, progress: Progress | None = None) -> Summary:
-    """Simulate a scene into ``folder``: dem.tif, images/*.tif, images.csv, truth.h5, truth.tif, record.json.
+def run(output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing) -> Summary:
+    """Simulate a scene into a folder: dem.tif, images/*.tif, images.csv, truth.h5, truth.tif, record.json.
 
-    Raises ConfigError where files exist and ``overwrite`` is not given.
+    Raises ConfigError where files exist that may not be replaced.
     """
-    folder = Path(folder)
+    output = Output.of(output)
+    folder = output.file
     hidden = config.hidden_effects()
     truth = Truth(config)
     shots = plan_passes(config)
     names = [f"images/{shot.image_id}.tif" for shot in shots]
     made = ("dem.tif", "images.csv", "truth.h5", "truth.tif", SIDECAR, *names)
-    check_outputs([Target(folder / name) for name in made], overwrite=overwrite)
+    check_outputs([Target(folder / name) for name in made], overwrite=output.overwrite)
     with atomic_folder(folder, SIDECAR) as staging:  # all of it or nothing: images without their truth are of no use
-        summary = _make_scene(staging, config, shots, names, hidden, truth, progress or (lambda *_: None))
+        summary = _make_scene(staging, config, shots, names, hidden, truth, progress)
     return replace(summary, folder=folder)
 
 

@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 
 from schemas import TRUTH, ArtefactWriter, atomic_path
+from schemas.provenance import pack_record
+from schemas.rasters import TIFF_TAG
 from stages.physics.formation.geometry import Angles
+from stages.physics.maps.geotiff import MapTiff
 from stages.physics.maps.grid import Grid
 from stages.simulate.hidden import CHOICES, Hidden, find
 from stages.simulate.orbits import Pass, direction, sub_point
@@ -185,7 +188,6 @@ def write_truth(
             attributes=attributes,
         ) as out,
         atomic_path(raster) as partial,
-        geotiff(partial, working, "float32", float("nan"), len(names) + 1, compress="deflate", predictor=3) as tif,
     ):
         out.write_crs(working.crs_wkt, working.transform)
         x, _ = working.xy(np.zeros(working.width), np.arange(working.width))
@@ -193,11 +195,11 @@ def write_truth(
         out.write("x", x)
         out.write("y", y)
         out.write("coefficient_name", names)
-        for band, name in enumerate((*names, "standard_iof"), start=1):
-            tif.set_band_description(band, name)
-        tif.update_tags(MODEL=scene.truth.model.name, QUANTITY="I/F")
-        for first in range(0, working.height, 256):
-            _write_truth_rows(out, tif, config, scene, first, min(256, working.height - first))
+        bands = [*names, "standard_iof"]
+        tags = {"model": scene.truth.model.name, "quantity": "I/F", TIFF_TAG: pack_record(out.file.attrs)}
+        with MapTiff(partial, working, bands, tags, ["1"] * len(bands)) as tif:
+            for first in range(0, working.height, 256):
+                _write_truth_rows(out, tif, config, scene, first, min(256, working.height - first))
         _write_images(out, images)
         out.write("crater_x", kept.x + half_x)
         out.write("crater_y", kept.y + half_y)
@@ -205,19 +207,17 @@ def write_truth(
         out.write("crater_age", kept.age)
 
 
-def _write_truth_rows(out: ArtefactWriter, tif: Any, config: Config, scene: Scene, first: int, count: int) -> None:
+def _write_truth_rows(out: ArtefactWriter, tif: MapTiff, config: Config, scene: Scene, first: int, count: int) -> None:
     factor = config.factor
     rows = slice(first * factor, (first + count) * factor)
     geometry, free = np.asarray(scene.log_geometry[rows]), np.asarray(scene.log_free[rows])
     maps = {name: area_mean(values, factor) for name, values in scene.truth.maps(geometry, free).items()}
     here = slice(first, first + count)
-    window = Window(0, first, tif.width, count)
-    for k, (_, values) in enumerate(maps.items()):
+    for k, values in enumerate(maps.values()):
         out.dataset("coefficients")[k, here] = values
-        tif.write(values, k + 1, window=window)
     standard = standard_iof(scene, maps)
     out.dataset("standard_iof")[here] = standard
-    tif.write(standard, len(maps) + 1, window=window)
+    tif.put(first, 0, np.stack([*maps.values(), standard]).astype(np.float32))
     out.dataset("elevation")[here] = area_mean(np.asarray(scene.elevation[rows]), factor)
     out.dataset("log_albedo_geometry")[here] = area_mean(geometry, factor)
     out.dataset("log_albedo_free")[here] = area_mean(free, factor)

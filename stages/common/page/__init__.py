@@ -93,6 +93,11 @@ def link(address: str, text: str) -> Markup:
     return _part("link", address, text)
 
 
+def budget(shares: Iterable[tuple[str, float]]) -> Markup:
+    """A bar in parts, each with its name and percent below it."""
+    return _part("budget", list(shares))
+
+
 def grid(figures: Iterable[Markup]) -> Markup:
     return _part("grid", list(figures))
 

@@ -36,7 +36,7 @@ class Products:
     place: NDArray[np.int64]
     sham: NDArray[np.float64]
     sham_squares: NDArray[np.float64]
-    site: int
+    ground: int
 
 
 def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> tuple[Tensor, Tensor]:
@@ -47,6 +47,16 @@ def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> tuple[Tensor
         torch.linalg.cholesky(model.mean_matrix(rows.patch)), rows.shared_mean[0].double()[:, None], upper=False
     )
     return white, mean[:, 0]
+
+
+def weighed_squares(z: Tensor, mean: Tensor, patch: Patch, model: Covariance, grid: Grid) -> float:
+    """A residual's square under the inverse covariance; z : (n, K), mean : (n,)."""
+    white = torch.einsum("kij,jk->ik", _factor(model, patch, grid)[grid.bins], z)
+    squares = float((white.real.square() + white.imag.square()).sum())
+    if patch.free:
+        return squares
+    lower = torch.linalg.cholesky(model.mean_matrix(patch))
+    return squares + float(torch.linalg.solve_triangular(lower, mean.double()[:, None], upper=False).square().sum())
 
 
 def _real(z: Tensor) -> Tensor:
@@ -122,7 +132,7 @@ def products(rows: Rows, model: Covariance, grid: Grid, frames: int, shams: tupl
                 upper = torch.linalg.solve_triangular(lower.T, mean.double().T, upper=True)  # (n, R)
                 parts[1] = parts[1] + torch.einsum("an,nr->anr", rows.own_mean.double(), upper).flatten(0, 1)
         sham = torch.cat(parts).numpy()
-    return Products(torch.cat([top, low]).numpy(), place, sham, squares, patch.site)
+    return Products(torch.cat([top, low]).numpy(), place, sham, squares, patch.ground)
 
 
 def make_shams(
@@ -159,4 +169,4 @@ def _mirror(grid: Grid) -> Tensor:
     return back[flipped]
 
 
-__all__ = ["Products", "Rows", "make_shams", "products", "whitened_residual"]
+__all__ = ["Products", "Rows", "make_shams", "products", "weighed_squares", "whitened_residual"]

@@ -80,10 +80,10 @@ class Whole:
         self.folds = [f for f in self.folds if len(f)]
 
     def _labels(self) -> list[int]:
-        """Which units are left out together: sites, where there are enough of them."""
-        sites = sorted({u.site for u in self.units})
-        if len(sites) >= 4:
-            return [sites.index(u.site) for u in self.units]
+        """Which units are left out together: all that lie on one ground, where there are enough grounds."""
+        grounds = sorted({u.ground for u in self.units})
+        if len(grounds) >= 4:
+            return [grounds.index(u.ground) for u in self.units]
         return list(range(len(self.units)))
 
     def _let_coefficients_drift(self) -> None:

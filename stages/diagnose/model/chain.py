@@ -10,6 +10,7 @@ from torch import Tensor
 
 from stages.diagnose.model.sites import Site
 from stages.effects import Effect
+from stages.effects.filters import gradients
 from stages.physics.formation import chain as formation
 from stages.physics.formation import geometry
 from stages.physics.formation.chain import State
@@ -73,6 +74,7 @@ class Chain:
         # of the image that they belong to: it changes once its texture is known
         self._tangents: tuple[Tensor | None, list[Tensor]] = (None, [])
         self._slope_tangents: tuple[Tensor | None, tuple[Tensor, Tensor]] = (None, (self.textured, self.textured))
+        self._gradients: tuple[Tensor | None, tuple[Tensor, Tensor]] = (None, (self.textured, self.textured))
         self._unresolved: tuple[Tensor | None, Tensor] = (None, self.textured)
 
     @property
@@ -116,6 +118,21 @@ class Chain:
             state = self._illuminate(effects)
             return self._expose(state, self._surface(state), effects)
         return self._expose(self._state, self._state.reflectance, effects)
+
+    def displaced(self, effect: Effect) -> Tensor:
+        """What a small displacement adds, (n, H, W): it times the image's gradients, on lit ground.
+
+        A finite one would bring in the image's curvature as well, and be taken for its sharpness.
+        """
+        state = copy.copy(self._state)
+        state.displacement = None
+        effect.apply(state)
+        if state.displacement is None:
+            return torch.zeros_like(self.textured)
+        if self._gradients[0] is not self.textured:
+            self._gradients = self.textured, gradients(self.textured)
+        (east, south), (far, down) = self._gradients[1], state.displacement
+        return (east * far + south * down) * self.lit()
 
     def surface_tangents(self, keep: bool = True) -> list[Tensor]:
         """d image / d coefficient, one (n, H, W) per free coefficient: the nominal model's own freedom."""

@@ -176,7 +176,7 @@ def _normal_equations(
     masks = [lit_mask(chain) for chain in chains]
     if units == "dn":
         for chain, raw, mask in zip(chains, measured, masks, strict=True):
-            _scale(chain.site, raw, chain.textured, mask)
+            scale_images(chain.site, raw, chain.textured, mask)
     dark = DARK * _brightness(chains, masks)
 
     def of(place: int) -> tuple[Tensor, Tensor, float, float]:
@@ -241,7 +241,7 @@ def _near(residual: Tensor, weight: Tensor) -> Tensor:
     return out
 
 
-def _scale(site: Site, raw: Tensor, predicted: Tensor, mask: Tensor) -> None:
+def scale_images(site: Site, raw: Tensor, predicted: Tensor, mask: Tensor) -> None:
     """Gain and offset per pair by least squares; the image in I/F follows."""
     weight = mask.double()
     n = weight.sum((-2, -1)).clamp(min=1)

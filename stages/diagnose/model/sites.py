@@ -26,6 +26,7 @@ class Site:
     gain, offset : (n,), measured = gain x I/F + offset; 1 and 0 for calibrated images
     texture : (H, W), relative albedo of the ground beyond the nominal model
     displacement : where each image looks for its pixels, (columns east, rows south), px, broadcastable to it
+    ground : number that sites share whose crops overlap: what is learned on one is known on the other
     """
 
     observation: Observation
@@ -40,6 +41,7 @@ class Site:
     offset: Tensor
     texture: Tensor
     displacement: tuple[Tensor, Tensor] | None = None
+    ground: int = 0
 
     @property
     def count(self) -> int:
@@ -81,6 +83,21 @@ def group_pairs(reader: PairReader, pairs: NDArray[np.int64], most: int) -> list
             members = members[np.linspace(0, len(members) - 1, most).round().astype(int)]
         groups.append(members)
     return sorted(groups, key=lambda g: -len(g))
+
+
+def number_grounds(sites: list[Site]) -> None:
+    """Sites whose crops overlap get the same ``ground``, others each its own."""
+    placed = len({s.place for s in sites}) > 1  # files without rows and columns do not say
+    for k, site in enumerate(sites):
+        site.ground = k
+    for k, site in enumerate(sites):
+        height, width = site.image.shape[-2:]
+        for other in sites[:k]:
+            beside = abs(site.place[0] - other.place[0]) >= height or abs(site.place[1] - other.place[1]) >= width
+            if placed and not beside and other.ground != site.ground:
+                old, new = site.ground, other.ground
+                for any_ in sites:
+                    any_.ground = new if any_.ground == old else any_.ground
 
 
 def survey(sites: list[Site], frames: int, units: str) -> Survey:

@@ -15,6 +15,7 @@ from torch import Tensor
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.registration.capture import fine
 from stages.diagnose.settings import BROAD, FIELD_ORDER
+from stages.effects.filters import gradients
 from stages.effects.relief_displacement import lean
 from stages.physics.formation.chain import displace
 
@@ -70,13 +71,6 @@ class Matched:
     basis: Tensor
     leaning: tuple[Tensor, Tensor]
     part: Tensor
-
-
-def gradients(image: Tensor) -> tuple[Tensor, Tensor]:
-    east, south = torch.zeros_like(image), torch.zeros_like(image)
-    east[..., 1:-1] = (image[..., 2:] - image[..., :-2]) / 2
-    south[..., 1:-1, :] = (image[..., 2:, :] - image[..., :-2, :]) / 2
-    return east, south
 
 
 def aligned(image: Tensor, valid: Tensor, east: Tensor, south: Tensor) -> tuple[Tensor, Tensor]:

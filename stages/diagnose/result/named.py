@@ -50,19 +50,23 @@ def by_search(state: State) -> list[Named]:
     return out
 
 
-def by_registration(state: State) -> list[Named]:
-    """What explains where the images lie: relief displacement, and shifts of whole images beyond ordinary ones."""
+def by_registration(state: State) -> tuple[list[Named], dict[str, tuple[float, str]]]:
+    """What explains where the images lie: relief displacement, and shifts of whole images beyond ordinary ones; and what was refused."""
     r = state.registration
     if r is None:
-        return []
-    out = []
+        return [], {}
+    r.test(state.hidden, state.nominal)
+    out: list[Named] = []
+    refused: dict[str, tuple[float, str]] = {}
     for name in effect_names():
         cls = get_effect(name)
         if cls.displaces and cls.never_named:
-            made = _leaning(state, r, name) if cls.leans else _shifts(state, r, name)
-            if made is not None:
+            made, why = _leaning(state, r, name) if cls.leans else _shifts(state, r, name)
+            if made is not None and why:
+                refused[name] = (made.gain, why)
+            elif made is not None:
                 out.append(made)
-    return out
+    return out, refused
 
 
 def _named(effect, parameters, r: Registration, first: Form, second: Form) -> Named:
@@ -73,9 +77,9 @@ def _named(effect, parameters, r: Registration, first: Form, second: Form) -> Na
     return Named(effect, parameters, *r.evidence(first, second), before, after, percent, [effect.name])
 
 
-def _leaning(state: State, r: Registration, name: str) -> Named | None:
+def _leaning(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
     if not r.form.leaning or not r.leaning.low > 0 or abs(r.share) < SURE * r.share_error:
-        return None
+        return None, ""
     effect = get_effect(name)({"share": r.share}, state.data)
     size = abs(r.share) * state.data.lean_px
     parameters = {
@@ -83,28 +87,24 @@ def _leaning(state: State, r: Registration, name: str) -> Named | None:
         "rms_px": (size, r.share_error * state.data.lean_px, "px"),
     }
     plain = next(f for f in FORMS if f.terms == r.form.terms and not f.leaning)
-    return _named(effect, parameters, r, plain, r.form)
+    return _named(effect, parameters, r, plain, r.form), r.doubt(plain.name, r.form.name, ("own", "own, leaning"))
 
 
-def _shifts(state: State, r: Registration, name: str) -> Named | None:
+def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
     """Named where one shift per frame gains for sure, alone or beside relief displacement, and is more than ordinary."""
     cls = get_effect(name)
     first = next(f for f in FORMS if f.terms == 0 and f.leaning == r.form.leaning)
-    best = None
-    for form in FORMS:
-        if form.leaning == r.form.leaning and 0 < form.terms <= r.form.terms:
-            gain = r.gain(first, form)
-            if gain.low > 0 and (best is None or gain.low > best[1].low):
-                best = form, gain
-    if best is None:
-        return None
-    form, _ = best
+    forms = [f for f in FORMS if f.leaning == r.form.leaning and 0 < f.terms <= r.form.terms]
+    if not forms:
+        return None, ""
     shifts = r.mean_shifts(state.sites, state.frames)
     effect = cls({"east_px": shifts[:, 0], "south_px": shifts[:, 1]}, state.data)
     size = cls.size(effect.values)
     if size < max(cls.tolerance.values()):
-        return None
-    return _named(effect, {"rms_px": (size, r.shift_error, "px")}, r, first, form)
+        return None, ""
+    doubts = [(r.doubt(first.name, f.name, (first.name, f.name)), f) for f in forms]
+    why, form = min(doubts, key=lambda d: (bool(d[0]), -r.gain(first, d[1]).low))
+    return _named(effect, {"rms_px": (size, r.shift_error, "px")}, r, first, form), why
 
 
 def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State], Named | None] | None:

@@ -9,8 +9,10 @@ import numpy as np
 import torch
 
 from stages.diagnose.likelihood.jackknife import gain_interval
-from stages.diagnose.model.nominal import Nominal, _scale, lit_mask
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.nominal import scale_images
 from stages.diagnose.model.sites import Site
+from stages.diagnose.registration.explain import lit_mask_read
 from stages.diagnose.registration.forms import aligned
 from stages.diagnose.result.answer import Answer, HeldOut
 from stages.diagnose.search.select import Outcome
@@ -19,44 +21,61 @@ from stages.diagnose.settings import SURE
 from stages.effects import Effect, effect_names, get_effect
 
 
-def score(state: State, sites: Sequence[Site], answer: Answer) -> HeldOut:
-    """Squared errors of both models on the same pixels; what registration found counts where it is named, else both have it."""
-    if not sites or not answer.causes or state.reference is None:
+def score(state: State, answer: Answer) -> HeldOut:
+    """Squared errors of both models on the same pixels, with the same nuisance: gains of dn images, smooth fields of displacement.
+
+    Relative to brightness for dn images, else in I/F. What registration found counts where it is named, else both have it.
+    """
+    if not state.hidden or not answer.causes or state.reference is None:
         return HeldOut()
-    named = any(c.effect.displaces for c in answer.causes)
-    effects = [c.effect for c in answer.causes if not c.effect.displaces or not c.effect.never_named]
-    before, after, counts = np.zeros(len(sites)), np.zeros(len(sites)), np.zeros(len(sites))
-    pairs = 0
-    for k, site in enumerate(sites):
-        moved = site.read, site.read_valid
-        if state.registration is not None:
-            moved = aligned(site.read, site.read_valid, *state.registration.at(state.nominal.chain(site, [])))
-        plain = (site.read, site.read_valid) if named else moved
-        mask = lit_mask(state.reference.chain(site, [])) & moved[1] & plain[1]
-        for into, model, chosen, image in (
-            (before, state.reference, [], plain[0]),
-            (after, state.nominal, effects, moved[0]),
-        ):
-            into[k] = _squares(site, model, chosen, image, mask, state.units == "dn")
-        counts[k] = float(mask.sum())
-        pairs += site.count
-    if not counts.sum() > 0:
+    named = [c.effect for c in answer.causes if c.effect.displaces and c.effect.never_named]
+    effects = [c.effect for c in answer.causes if c.effect not in named]
+    plain, moved = displacements(state, named)
+    units = max(s.ground for s in state.hidden) + 1
+    before, after, count = np.zeros(units), np.zeros(units), 0.0
+    for site, first, last in zip(state.hidden, plain, moved, strict=True):
+        images = [aligned(site.read, site.read_valid, *d) if d else (site.read, site.read_valid) for d in (first, last)]
+        mask = lit_mask_read(state.reference.chain(site, [])) & images[0][1] & images[1][1]
+        before[site.ground] += _squares(site, state.reference.chain(site, []), images[0][0], mask, state.free_gains)
+        after[site.ground] += _squares(site, state.nominal.chain(site, effects), images[1][0], mask, state.free_gains)
+        count += float(mask.sum())
+    if not count > 0:
         return HeldOut()
     _, low, high = gain_interval(before, after)
-    total = counts.sum()
-    return HeldOut(pairs, len(sites), before.sum() / total, after.sum() / total, low, high)
+    pairs = sum(s.count for s in state.hidden)
+    return HeldOut(pairs, len(state.hidden), before.sum() / count, after.sum() / count, low, high)
 
 
-def _squares(
-    site: Site, model: Nominal, effects: Sequence[Effect], image: torch.Tensor, mask: torch.Tensor, free: bool
-) -> float:
+def displacements(state: State, named: Sequence[Effect]) -> tuple[Fields, Fields]:
+    """Where the test images look under the nominal and the extended model; None: where the ground is.
+
+    Beyond one shift per frame a field is a nuisance: either model then has each image's own.
+    """
+    r, nothing = state.registration, [None] * len(state.hidden)
+    if r is None or r.form.name == "none":
+        return nothing, nothing
+    leans = any(e.leans for e in named)
+    if leans or r.form.terms > 1:
+        share = r.share if r.form.leaning else 0.0
+        last = r.settled(state.hidden, state.nominal, share)
+        return (r.settled(state.hidden, state.nominal, 0.0) if leans else last), last
+    last = [r.at(state.nominal.chain(site, [])) for site in state.hidden]
+    return (nothing if named else last), last
+
+
+Fields = list[tuple[torch.Tensor, torch.Tensor]] | list[None]
+
+
+def _squares(site: Site, chain: Chain, image: torch.Tensor, mask: torch.Tensor, free: bool) -> float:
     site.image = image
-    predicted = model.chain(site, effects).predict()
+    predicted = chain.predict()
+    error = ((image - predicted) * mask).double()
     if free:
-        _scale(site, image, predicted, mask)
-    scale = site.gain[:, None, None].abs()
-    error = (site.image - predicted).double() * (scale / scale.mean() if free else 1.0)
-    return float((error * mask).square().sum())
+        scale_images(site, image, predicted, mask)
+        weight = mask.double()
+        level = (image * weight).sum((-2, -1)) / weight.sum((-2, -1)).clamp(min=1)
+        error = (site.image - predicted) * weight * (site.gain / level.clamp(min=1e-9))[:, None, None]
+    return float(error.square().sum())
 
 
 def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:

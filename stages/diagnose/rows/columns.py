@@ -71,6 +71,8 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey) -> Plan:
     named = [e.name for e in chain.base if e.scope == "image"]
     for name in [*named, *(n for n in names if n not in named)]:
         cls = get_effect(name)
+        if cls.never_named and not cls.always:
+            continue
         if cls.scope == "scene":
             for trial in cls.trials(data):
                 places = tuple(shared(name) for _ in trial.columns)
@@ -124,9 +126,11 @@ def frame_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
         if not guise.per_frame:
             continue
         cls = get_effect(guise.effect)
-        lit = chain.lit() if cls.displaces else 1.0
         for column in guise.trial.columns:
             ((name, size),) = column.items()
+            if cls.displaces:
+                out.append(chain.displaced(cls({name: torch.full((frames,), size)}, data)))
+                continue
             if guise.effect in base:
                 effect = chain.base[base[guise.effect]]
                 moved = chain.replace(
@@ -134,7 +138,7 @@ def frame_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
                 )
             else:
                 moved = chain.render(cls({name: torch.full((frames,), size)}, data))
-            out.append((moved - chain.textured) * lit)
+            out.append(moved - chain.textured)
     return torch.stack(out) if out else torch.zeros(0, *chain.textured.shape)
 
 

@@ -76,6 +76,7 @@ class Patch:
 
     number: int
     site: int
+    ground: int
     images: Tensor
     rows: slice
     columns: slice
@@ -179,6 +180,7 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
                 Patch(
                     (number * pieces + i) * pieces + j,
                     number,
+                    chain.site.ground,
                     images,
                     rows,
                     columns,

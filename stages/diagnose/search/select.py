@@ -14,6 +14,7 @@ from stages.diagnose.likelihood.products import products
 from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
 from stages.diagnose.search.refine import as_effect, refine
 from stages.diagnose.search.state import Cause, State, View
+from stages.diagnose.search.tested import hidden_gains
 from stages.diagnose.settings import DISCOVERY, NOTABLE, SIMPLER, SURE, TRIED, TRIES
 from stages.effects import get_effect
 
@@ -144,6 +145,11 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         cause.found = dataclasses.replace(cause.found, gains=gains)
         if low <= 0:
             why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
+    if not why:
+        tested = hidden_gains(state, cause, look)
+        low, high = interval(tested)
+        if high < 0:
+            why = f"the test pairs contradict it: it gains {tested.sum():.0f} nats there ({low:.0f} .. {high:.0f})"
     if why:
         state.causes[:] = causes
         for c, effect, errors in saved:

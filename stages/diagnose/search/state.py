@@ -50,6 +50,7 @@ class State:
     units: str
     has: frozenset[str]
     seed: int
+    hidden: list[Site] = field(default_factory=list)  # of the test pairs, which nothing is fitted to
     registration: Registration | None = None
     causes: list[Cause] = field(default_factory=list)
     covariance: Covariance | None = None

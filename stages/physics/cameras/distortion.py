@@ -32,7 +32,7 @@ def read_distortion(document: Mapping[str, Any], where: str) -> tuple[int, NDArr
     """(model code, coefficients) of an ISD's ``optical_distortion``. Raises InputError or RegistryError."""
     models = read.value(document, "optical_distortion", where)
     if not isinstance(models, Mapping) or len(models) != 1:
-        raise InputError(f"{where}: expected one model in 'optical_distortion', found {models!r:.80}.")
+        raise InputError(f"{where}: expected one model in 'optical_distortion', found {models!r:.80}; correct the ISD.")
     name = next(iter(models))
     key = f"optical_distortion.{name}"
     lowered = str(name).lower()

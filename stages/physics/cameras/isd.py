@@ -50,11 +50,11 @@ class Detector:
         if not determinant or not focal_length:
             raise GeometryError(
                 f"{where}: expected 'focal2pixel_lines' and 'focal2pixel_samples' that span the detector and a focal "
-                f"length other than 0, found determinant {determinant:g} and {focal_length:g} mm."
+                f"length other than 0, found determinant {determinant:g} and {focal_length:g} mm; correct the ISD."
             )
         summing = _pair(document, "detector_line_summing", "detector_sample_summing", where)
         if min(summing) <= 0:
-            raise GeometryError(f"{where}: expected detector summing above 0, found {summing}.")
+            raise GeometryError(f"{where}: expected detector summing above 0, found {summing}; correct the ISD.")
         code, coefficients = read_distortion(document, where)
         return cls(
             focal_length=focal_length,
@@ -139,7 +139,7 @@ class Exposure:
         major, minor = _pair(document, "radii.semimajor", "radii.semiminor", where)
         axes = major * metres, minor * metres
         if min(axes) <= 0:
-            raise GeometryError(f"{where}: expected radii above 0, found {axes} m.")
+            raise GeometryError(f"{where}: expected radii above 0, found {axes} m; correct the ISD.")
         centre = read.number(document, "center_ephemeris_time", where)
         return cls(
             lines=read.size(document, "image_lines", where),

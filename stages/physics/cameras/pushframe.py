@@ -206,7 +206,7 @@ def _framelets(document: Mapping[str, Any], lines: int, summing: float, where: s
 def _flag(document: Mapping[str, Any], key: str, where: str) -> bool:
     found = read.value(document, key, where)
     if not isinstance(found, bool):
-        raise InputError(f"{where}: expected true or false in '{key}', found {found!r:.40}.")
+        raise InputError(f"{where}: expected true or false in '{key}', found {found!r:.40}; correct the ISD.")
     return found
 
 

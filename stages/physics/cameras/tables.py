@@ -88,7 +88,7 @@ def read_states(document: Mapping[str, Any], key: str, where: str, origin: float
     times = _times(document, key, where)
     unit = str(read.value(document, f"{key}.unit", where) if read.has(document, f"{key}.unit") else "km").lower()
     if unit not in _UNITS:
-        raise InputError(f"{where}: expected the unit m or km in '{key}.unit', found '{unit}'.")
+        raise InputError(f"{where}: expected the unit m or km in '{key}.unit', found '{unit}'; correct the ISD.")
     positions = read.array(document, f"{key}.positions", where, (-1, 3)) * _UNITS[unit]
     velocities = None
     if read.has(document, f"{key}.velocities"):
@@ -96,7 +96,7 @@ def read_states(document: Mapping[str, Any], key: str, where: str, origin: float
     for name, table in (("positions", positions), ("velocities", velocities)):
         if table is not None and len(table) != len(times):
             raise InputError(
-                f"{where}: expected {len(times)} entries in '{key}.{name}' as in its times, found {len(table)}."
+                f"{where}: expected {len(times)} entries in '{key}.{name}' as in its times, found {len(table)}; correct the ISD."
             )
     if velocities is not None and not velocities.any():
         velocities = None  # some writers fill what they do not know with zeros
@@ -109,7 +109,7 @@ def read_rotations(document: Mapping[str, Any], key: str, where: str, origin: fl
     quaternions = read.array(document, f"{key}.quaternions", where, (-1, 4))
     if len(quaternions) != len(times):
         raise InputError(
-            f"{where}: expected {len(times)} entries in '{key}.quaternions' as in its times, found {len(quaternions)}."
+            f"{where}: expected {len(times)} entries in '{key}.quaternions' as in its times, found {len(quaternions)}; correct the ISD."
         )
     quaternions = read.check_quaternions(quaternions, f"{where}: '{key}.quaternions'")
     constant = np.eye(3)
@@ -121,7 +121,9 @@ def read_rotations(document: Mapping[str, Any], key: str, where: str, origin: fl
 def _times(document: Mapping[str, Any], key: str, where: str) -> Floats:
     times = read.array(document, f"{key}.ephemeris_times", where, (-1,))
     if len(times) == 0 or (np.diff(times) <= 0).any():
-        raise InputError(f"{where}: expected rising times in '{key}.ephemeris_times', found {len(times)} that do not.")
+        raise InputError(
+            f"{where}: expected rising times in '{key}.ephemeris_times', found {len(times)} that do not; correct the ISD."
+        )
     return times
 
 

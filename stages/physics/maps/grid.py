@@ -21,7 +21,7 @@ from rasterio.errors import CRSError
 from rasterio.transform import Affine
 
 from schemas.errors import ArtefactError, GeometryError, InputError
-from stages.physics.bodies.spheres import Body, find_body
+from stages.physics.bodies.spheres import RADII, Body, find_body
 
 GDAL_CENTRE = 0.5  # GDAL's coordinate of the centre of the first pixel
 CSM_CENTRE = 0.5
@@ -173,14 +173,26 @@ def _parsed(wkt: str) -> CRS:
 @lru_cache(maxsize=256)
 def sphere_crs(radius: float) -> CRS:
     """Longitude and latitude on the reference sphere."""
-    return CRS.from_proj4(f"+proj=longlat +R={radius!r} +no_defs")
+    return _named(f"+proj=longlat +R={radius!r} +no_defs", radius)
 
 
 def local_metric_crs(longitude_deg: float, latitude_deg: float, radius: float) -> CRS:
     """Oblique stereographic about a place: shapes are true (conformal), scale grows by (d / 2R)^2."""
-    return CRS.from_proj4(
-        f"+proj=stere +lat_0={latitude_deg:.6f} +lon_0={longitude_deg:.6f} +k=1 +x_0=0 +y_0=0 +R={radius!r} +units=m +no_defs"
+    return _named(
+        f"+proj=stere +lat_0={latitude_deg:.6f} +lon_0={longitude_deg:.6f} +k=1 +x_0=0 +y_0=0 +R={radius!r} +units=m +no_defs",
+        radius,
+        f"local stereographic at {abs(latitude_deg):.3f} {'S' if latitude_deg < 0 else 'N'} {longitude_deg:.3f} E",
     )
+
+
+def _named(proj: str, radius: float, projection: str = "") -> CRS:
+    """The CRS with names that QGIS and gdalinfo can show, in place of 'unknown'."""
+    body = next((name.capitalize() for name, r in RADII.items() if r == radius), "sphere")
+    sphere = f"{body}, radius {radius:.10g} m"
+    wkt = CRS.from_proj4(proj).to_wkt()
+    for kind, name in (("PROJCS", f"{body} {projection}"), ("GEOGCS", sphere), ("DATUM", sphere), ("SPHEROID", sphere)):
+        wkt = wkt.replace(f'{kind}["unknown"', f'{kind}["{name}"')
+    return CRS.from_wkt(wkt)
 
 
 def crs_radius(crs: CRS) -> float | None:

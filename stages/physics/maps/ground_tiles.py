@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +17,9 @@ from geographiclib.geodesic import Geodesic
 from numpy.typing import NDArray
 
 from schemas import ConfigError
+from stages.common.progress import Progress
 from stages.physics.maps.grid import Grid
 from stages.physics.maps.positions import blocks, valid_positions
-
-Progress = Callable[[int, int, str], None]
 
 TEST_TILES = 20  # where --tile-m is left to us and the scene is large enough: intervals over fewer are wide
 WITH_ROOM = 0.8  # of the tiles, in which a crop fits: images end, elevations have holes
@@ -142,7 +140,7 @@ def split_tiles(
     edge: int,
     split: tuple[float, float, float],
     seed: int,
-    progress: Progress | None,
+    progress: Progress,
 ) -> Tiles:
     """Give every tile with valid ground to a part, in the order of a hash, so that the parts' ground is near their shares.
 
@@ -152,8 +150,7 @@ def split_tiles(
     ground, room = np.zeros(shape), np.zeros(shape, bool)
     before, behind = positions.scene_crop // 2, positions.scene_crop - positions.scene_crop // 2 - 1
     for number, block in enumerate(positions.blocks):
-        if progress:
-            progress(number, len(positions.blocks), "tiles")
+        progress(number, len(positions.blocks), "tiles")
         row, col, h, w = block
         part_of_scene = np.s_[row : row + h, col : col + w]
         covered, centres = np.zeros((h, w), bool), np.zeros((h, w), bool)
@@ -165,8 +162,7 @@ def split_tiles(
         r, c = (v + first for v, first in zip(np.nonzero(centres), (row, col), strict=True))
         inside = ((r - before) // edge == (r + behind) // edge) & ((c - before) // edge == (c + behind) // edge)
         room[r[inside] // edge, c[inside] // edge] = True
-    if progress:
-        progress(len(positions.blocks), len(positions.blocks), "tiles")
+    progress(len(positions.blocks), len(positions.blocks), "tiles")
     if not room.any():  # tiles are smaller than the scene's crops: smaller ones will be asked for
         room = ground > 0
     part = np.where(ground > 0, 0 if split[0] > 0 else -1, -1).astype(np.int8)

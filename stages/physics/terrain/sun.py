@@ -88,10 +88,12 @@ def find_sun(
         return sun_from_subsolar(point.longitude_deg, point.latitude_deg, point.distance_au)
     if subsolar:
         if subsolar_longitude_deg is None or subsolar_latitude_deg is None:
-            raise ConfigError("the Sun: expected both --subsolar-longitude and --subsolar-latitude, found one.")
+            raise ConfigError(
+                "the Sun: expected both --subsolar-longitude and --subsolar-latitude, found one; give both."
+            )
         return sun_from_subsolar(subsolar_longitude_deg, subsolar_latitude_deg, distance_au or 1.0)
     if azimuth_deg is None or elevation_deg is None:
-        raise ConfigError("the Sun: expected both --sun-azimuth and --sun-elevation, found one.")
+        raise ConfigError("the Sun: expected both --sun-azimuth and --sun-elevation, found one; give both.")
     return sun_from_angles(azimuth_deg, elevation_deg, grid, distance_au or 1.0)
 
 

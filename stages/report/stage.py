@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,15 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from schemas import ConfigError, InputError, atomic_path, check_output, open_artefact, read_kind
+from schemas.files.outputs import Output
 from schemas.files.user_files import check_file, read_json
 from stages.common import page
 from stages.common.page import pictures
+from stages.common.page.diagnosis import conclusions as diagnosed
+from stages.common.page.sentences import Sentence
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.report import conclusions, maps, results, sections
+from stages.report.config import Config
 from stages.report.diagnosis import diagnosis
 from stages.report.held_out import held_out_images
 
@@ -45,20 +49,12 @@ CAPTIONS = {
 }
 
 
-@dataclass
-class Config:
-    """The page's title."""
-
-    title: str = "Lunar reflectance learned from terrain"
-
-
 def run(
     files: Sequence[Path],
-    output: Path,
+    output: Output | Path,
     config: Config,
-    *,
-    overwrite: bool = False,
-    progress: Callable[[int, int, str], None] | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> list[str]:
     """Write the page and return the titles of its sections.
 
@@ -66,17 +62,17 @@ def run(
     `lunargr view` to link to, in any order; `view.html` beside the output is linked, too
     Raises ConfigError, ArtefactError, InputError.
     """
+    output = Output.of(output)
     if not files:
         raise ConfigError("report: expected at least one file, found none; give the artefacts of a run.")
-    check_output(output, files, overwrite)
-    found: list[tuple[str, page.Section, list[conclusions.Sentence]]] = []
+    check_output(output.file, files, output.overwrite)
+    found: list[tuple[str, page.Section, list[Sentence]]] = []
     shown: list[Path] = []
     linked: list[Path] = []
     details: list[Markup] = []
     seen: list[Any] = []  # evaluation.h5 and the evaluation.json beside it are one result
     for number, path in enumerate(sorted(files, key=lambda p: p.suffix.lower() == ".json")):
-        if progress is not None:
-            progress(number, len(files), "report")
+        progress(number, len(files), "report")
         if path.suffix.lower() in PICTURES:
             shown.append(path)
             continue
@@ -102,17 +98,16 @@ def run(
         chapters.append(page.Section("Provenance", details))
     if not chapters:
         raise ConfigError("report: expected artefacts or results of lunargr, found nothing that can be shown.")
-    if progress is not None:
-        progress(len(files), len(files), "report")
-    head = _head(found, linked, output)
+    progress(len(files), len(files), "report")
+    head = _head(found, linked, output.file)
     subtitle = f"made by lunargr {version('lunargr')} from {len(files)} files"
     footer = "Every number and picture on this page is read from the files named under Provenance."
-    with atomic_path(output) as partial:
+    with atomic_path(output.file) as partial:
         partial.write_text(page.page(config.title, subtitle, head, chapters, footer), encoding="utf-8")
     return [s.title for s in chapters]
 
 
-Part = tuple[str, page.Section, list[conclusions.Sentence]]  # kind, section, what it says on the first screen
+Part = tuple[str, page.Section, list[Sentence]]  # kind, section, what it says on the first screen
 
 
 def _head(found: Sequence[Part], linked: Sequence[Path], output: Path) -> list[Markup]:
@@ -163,7 +158,7 @@ def _result(result: dict[str, Any], file: Any) -> Part | None:
     if {"models", "differences"} <= keys:
         return "compare", results.comparison(result), []
     if "verdict" in keys:
-        return "diagnosis", diagnosis(result), conclusions.diagnosis(result)
+        return "diagnosis", diagnosis(result), diagnosed(result)
     if {"models", "gains", "claim"} <= keys:
         return "held_out", held_out_images(result), conclusions.held_out_images(result)
     if {"models", "gains"} <= keys:

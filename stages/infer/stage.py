@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -29,8 +29,9 @@ from schemas import (
 )
 from schemas.files.companions import companions_of
 from schemas.files.hdf5 import silence_hdf5
-from schemas.files.outputs import Target, check_apart, check_outputs
+from schemas.files.outputs import Output, Target, check_apart, check_outputs
 from stages.common.memory import keep_freed_memory, return_freed_memory
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.infer.config import Config, Summary
 from stages.infer.parallel import in_order, side_by_side
 from stages.infer.terrain import TerrainReader, valid_part
@@ -40,10 +41,8 @@ from stages.network.cpu.mapper import Mapper
 from stages.network.predictor import choose_device, load_predictor
 from stages.network.runtime import choose_inference_precision
 from stages.pairs.holes import fill_holes
-from stages.physics.maps.geotiff import EVEN, MapTiff, band_names
+from stages.physics.maps.geotiff import EVEN, MapTiff, band_names, map_tags
 from stages.physics.maps.grid import check_same_body, read_grid
-
-Progress = Callable[[int, int, str], None]
 
 QUANTITY = "radiance factor I/F = pi r, including cos(incidence)"
 GSD_TOLERANCE = 0.05  # relative; beyond it the network would meet terrain at a scale it never saw
@@ -52,15 +51,15 @@ GSD_TOLERANCE = 0.05  # relative; beyond it the network would meet terrain at a 
 def run(
     scene: Path,
     checkpoint: Path,
-    output: Path,
+    output: Output | Path,
     config: Config,
-    geotiff: Path | None = None,
-    overwrite: bool = False,
-    progress: Progress | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Summary:
-    """Write ``svbrdf.h5`` and, beside it or at ``geotiff``, a cloud-optimised GeoTIFF if wanted. Raises ConfigError, ArtefactError."""
+    """Write ``svbrdf.h5`` and, if wanted, a cloud-optimised GeoTIFF. Raises ConfigError, ArtefactError."""
+    output = Output.of(output)
     window_and_stride(config)
-    tiff = check_files([scene, checkpoint], output, geotiff, config, overwrite)
+    check_files([scene, checkpoint], output, config)
     device = choose_device(config.device)
     keep_freed_memory()
     predictor = load_predictor(checkpoint, device)
@@ -88,13 +87,13 @@ def run(
         with contextlib.ExitStack() as stack:
             writer = stack.enter_context(
                 ArtefactWriter(
-                    output,
+                    output.file,
                     SVBRDF,
                     sizes,
                     config=asdict(config),
                     inputs=[scene, checkpoint],
                     attributes=attributes,
-                    overwrite=overwrite,
+                    overwrite=output.overwrite,
                 )
             )
             writer.write_crs(grid.crs_wkt, grid.transform)
@@ -108,30 +107,24 @@ def run(
             picture = None
             # a shard holds some rows only; the GeoTIFF is made of the merged whole
             if config.geotiff and config.shard[1] == 1:
-                stack.enter_context(companions_of(output))
-                partial = stack.enter_context(atomic_path(tiff))
-                picture = stack.enter_context(MapTiff(partial, grid, band_names(names, maps), attributes))
+                stack.enter_context(companions_of(output.file))
+                partial = stack.enter_context(atomic_path(output.geotiff_path))
+                bands = band_names(names, maps)
+                tags = map_tags(bands, writer.file.attrs)
+                picture = stack.enter_context(MapTiff(partial, grid, bands, tags, ["1"] * len(bands)))
             windows = _predict(file, writer, picture, mapper, config, progress)
             share, ranges = _statistics(writer.file, names)
     return Summary(grid, predictor.model.name, share, windows, ranges)
 
 
-def check_files(
-    inputs: Sequence[Path],
-    output: Path,
-    geotiff: Path | None,
-    config: Config,
-    overwrite: bool,
-    replace_tiff: bool = False,
-) -> Path:
-    """Where the GeoTIFF goes, if one is wanted; refuse outputs that cannot be written. Raises ConfigError."""
-    tiff = geotiff or output.with_suffix(".tif")
-    check_outputs([Target(output)], inputs, overwrite)
+def check_files(inputs: Sequence[Path], output: Output, config: Config) -> None:
+    """Refuse outputs that cannot be written. A run that is resumed may have got as far as the GeoTIFF. Raises ConfigError."""
+    target = Target(output.file)
+    check_outputs([target], inputs, output.overwrite)
     if config.geotiff:
-        picture = Target(tiff, "--geotiff (or --no-geotiff)", f"the GeoTIFF of {output.name}")
-        check_apart([Target(output), picture], inputs)
-        check_outputs([picture], inputs, overwrite or replace_tiff)
-    return tiff
+        picture = Target(output.geotiff_path, "--geotiff (or --no-geotiff)", f"the GeoTIFF of {output.file.name}")
+        check_apart([target, picture], inputs)
+        check_outputs([picture], inputs, output.overwrite or output.resume)
 
 
 def count_bands(scene: Path, config: Config) -> int:
@@ -154,7 +147,7 @@ def _predict(
     picture: MapTiff | None,
     mapper: Mapper,
     config: Config,
-    progress: Progress | None,
+    progress: Progress,
 ) -> int:
     """Run the network over all windows of the shard's rows; the number of windows."""
     elevation, dem_valid = file["elevation"], file["dem_valid"]
@@ -185,8 +178,7 @@ def _predict(
         if blend and number > begun:
             begun = number
             blend.begin(boxes[number])
-        if progress:
-            progress(min(done, rows), rows, "rows of windows")
+        progress(min(done, rows), rows, "rows of windows")
         if strip is None:
             continue
         row, col, values = strip
@@ -202,8 +194,7 @@ def _predict(
         pass
     if picture and not at_once:
         picture.put_all(*(f for f in (outputs.coefficients, outputs.deviations) if f is not None))
-    if progress:
-        progress(rows, rows, "rows of windows")
+    progress(rows, rows, "rows of windows")
     return len(boxes)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from schemas import SCENE, SVBRDF, ArtefactError, ArtefactWriter, InputError, atomic_path, check_output, open_artefact
 from schemas.files.companions import companions_of
+from schemas.files.outputs import Output
 from schemas.reading import read_strings
 from stages.albedo.calibrate import COSINES, Calibration, calibrate, choose_windows, take_samples
 from stages.albedo.config import Config, Summary, used_frames
@@ -26,6 +27,7 @@ from stages.albedo.prior import terrain_variance
 from stages.albedo.pyramid import HALO_PX, LEVELS
 from stages.albedo.references import Box, References
 from stages.albedo.writing import Maps, copy_map, kept_attributes
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import find_body
 from stages.physics.horizon.scene import make_overview
 from stages.physics.images.table import Frame, load_frames
@@ -33,7 +35,6 @@ from stages.physics.maps.geotiff import write_geotiff
 from stages.physics.maps.grid import read_grid
 from stages.physics.terrain.surface import Surface, open_surface
 
-Progress = Callable[[int, int, str], None]
 Floats32 = NDArray[np.float32]
 
 BLOCK_PX = 768
@@ -87,18 +88,24 @@ def open_ground(svbrdf: Path, scene: Path, config: Config) -> Iterator[Ground]:
 def run(
     svbrdf: Path,
     scene: Path,
-    output: Path,
+    output: Output | Path,
     config: Config,
-    geotiff: Path | None = None,
-    overwrite: bool = False,
-    progress: Progress | None = None,
-    calibration: Path | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Summary:
-    """Write the map ``output`` with albedo. calibration : of :func:`calibrate_to`, made here where None. Raises LunargrError."""
-    tiff = geotiff or output.with_suffix(".tif")
-    check_output(output, [svbrdf, scene, *source_files(scene)], overwrite)
-    if config.geotiff:
-        check_output(tiff, [svbrdf, scene, output, *source_files(scene)], overwrite)
+    """Write the map with albedo. Raises LunargrError."""
+    return _run(svbrdf, scene, None, Output.of(output), config, progress)
+
+
+def run_part(svbrdf: Path, scene: Path, calibration: Path, output: Path, config: Config) -> Summary:
+    """:func:`run` for one shard, with the calibration of :func:`calibrate_to` that all shards share."""
+    return _run(svbrdf, scene, calibration, Output(output, overwrite=True), config, show_nothing)
+
+
+def _run(
+    svbrdf: Path, scene: Path, calibration: Path | None, output: Output, config: Config, progress: Progress
+) -> Summary:
+    check_files([svbrdf, scene, *source_files(scene)], output, config)
     with open_ground(svbrdf, scene, config) as ground:
         found = Calibration.read(calibration) if calibration else _calibrate(svbrdf, scene, ground, progress)
         sizes = {d: ground.map[d].shape[0] for d in ("coefficient", "y", "x")}
@@ -113,13 +120,13 @@ def run(
         with contextlib.ExitStack() as stack:
             writer = stack.enter_context(
                 ArtefactWriter(
-                    output,
+                    output.file,
                     SVBRDF,
                     sizes,
                     config=asdict(config),
                     inputs=[svbrdf, scene],
                     attributes=kept_attributes(ground.map),
-                    overwrite=overwrite,
+                    overwrite=output.overwrite,
                 )
             )
             edge = _edge(ground)
@@ -132,19 +139,26 @@ def run(
                 maps.put(block, *work_block(ground, found, block))
             maps.close()
             if config.geotiff and config.shard[1] == 1:
-                stack.enter_context(companions_of(output))
-                partial = stack.enter_context(atomic_path(tiff))
-                write_geotiff(partial, writer.file, read_grid(writer.file, output))
+                stack.enter_context(companions_of(output.file))
+                partial = stack.enter_context(atomic_path(output.geotiff_path))
+                write_geotiff(partial, writer.file, read_grid(writer.file, output.file))
             return _summary(writer.file, config, scene)
+
+
+def check_files(inputs: Sequence[Path], output: Output, config: Config) -> None:
+    """Refuse outputs that cannot be written. A run that is resumed may have got as far as the GeoTIFF. Raises ConfigError."""
+    check_output(output.file, inputs, output.overwrite)
+    if config.geotiff:
+        check_output(output.geotiff_path, [*inputs, output.file], output.overwrite or output.resume)
 
 
 def calibrate_to(path: Path, svbrdf: Path, scene: Path, config: Config) -> None:
     """Write the calibration that all parts of one map share, as JSON."""
     with open_ground(svbrdf, scene, config) as ground, atomic_path(path) as partial:
-        _calibrate(svbrdf, scene, ground, None).write(partial)
+        _calibrate(svbrdf, scene, ground, show_nothing).write(partial)
 
 
-def _calibrate(svbrdf: Path, scene: Path, ground: Ground, progress: Progress | None) -> Calibration:
+def _calibrate(svbrdf: Path, scene: Path, ground: Ground, progress: Progress) -> Calibration:
     references = ground.references
     windows = choose_windows(ground.map["valid"].shape, references.boxes)
     samples = take_samples(references, windows, progress)
@@ -231,15 +245,13 @@ def _own_rows(ground: Ground, edge: int, config: Config) -> tuple[int, int]:
     return first, last
 
 
-def _blocks(ground: Ground, edge: int, own: tuple[int, int], progress: Progress | None) -> Iterator[Box]:
+def _blocks(ground: Ground, edge: int, own: tuple[int, int], progress: Progress) -> Iterator[Box]:
     cols = ground.map["valid"].shape[1]
     for row in range(own[0], own[1], edge):
-        if progress:
-            progress(row - own[0], own[1] - own[0], "rows")
+        progress(row - own[0], own[1] - own[0], "rows")
         for col in range(0, cols, edge):
             yield row, col, min(edge, own[1] - row), min(edge, cols - col)
-    if progress:
-        progress(own[1] - own[0], own[1] - own[0], "rows")
+    progress(own[1] - own[0], own[1] - own[0], "rows")
 
 
 def _check_same_grid(svbrdf: Path, file: h5py.File, scene: Path, terrain: h5py.File) -> None:

@@ -27,7 +27,9 @@ from schemas import (
     read_config,
 )
 from schemas.files.hdf5 import silence_hdf5
-from stages.ingest.config import Config, Progress
+from schemas.files.outputs import Output
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.ingest.config import Config
 from stages.ingest.elevation import take_elevation, write_elevation
 from stages.ingest.plan import plan_grid
 from stages.ingest.validity import check_frames, with_digests, write_validity
@@ -56,22 +58,23 @@ class Summary:
 def run(
     dem: Path,
     images: Path | None,
-    output: Path,
+    output: Output | Path,
     config: Config,
-    overwrite: bool = False,
-    progress: Progress | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Summary:
     """Write ``scene.h5``. Raises InputError, GeometryError or ConfigError; then nothing is written.
 
     dem : a raster, or a scene whose grid and elevations are taken as they are. Shards are cut in two steps: of a raster
     without images, its rows; of a scene with images, the images.
     """
+    output = Output.of(output)
     if config.crop < 16 or config.crop % 2 or config.crop > LARGEST_CROP:
         raise ConfigError(f"--crop: expected an even number of pixels, 16 .. {LARGEST_CROP}; found {config.crop}.")
     body = find_body(config.body)
     frames = read_frames(images, body) if images else []
     named = [p for f in frames for p in (f.path, f.camera) if p is not None]
-    check_output(output, [dem, *([images] if images else []), *named], overwrite)
+    check_output(output.file, [dem, *([images] if images else []), *named], output.overwrite)
     index, count = config.shard
     with _open_terrain(dem, images, config, body, progress) as terrain:
         if frames and config.crop > min(terrain.grid.height, terrain.grid.width):
@@ -84,13 +87,13 @@ def run(
             )
         sizes = {"frame": len(mine), "y": terrain.grid.height, "x": terrain.grid.width, "window": 4}
         with ArtefactWriter(
-            output,
+            output.file,
             SCENE,
             sizes,
             config=terrain.config,
             inputs=[dem] + ([images] if images else []),
             attributes=terrain.attributes | {"crop_px": np.int32(config.crop)},
-            overwrite=overwrite,
+            overwrite=output.overwrite,
         ) as writer:
             _write_grid(writer, terrain.grid)
             known, low, high = terrain.write(writer, progress)
@@ -116,7 +119,7 @@ def run(
                 raise _no_positions(images, config, terrain.grid.gsd)
             writer.write("valid_area_m2", np.array(areas))
             write_frames(writer, [with_digests(frame) for frame in mine])
-    return summarise(output, tuple(skipped))
+    return summarise(output.file, tuple(skipped))
 
 
 def summarise(scene: Path, skipped: tuple[str, ...] = ()) -> Summary:
@@ -149,9 +152,7 @@ class Terrain:
 
 
 @contextlib.contextmanager
-def _open_terrain(
-    dem: Path, images: Path | None, config: Config, body: Body, progress: Progress | None
-) -> Iterator[Terrain]:
+def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, progress: Progress) -> Iterator[Terrain]:
     index, count = config.shard
     if is_artefact(dem):
         if images is None:

@@ -11,26 +11,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import CROPS, PAIRS, ArtefactWriter, InputError, check_output, open_artefact
+from schemas.files.outputs import Output
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.horizon.scene import horizon_in_scene
 from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import Frame, load_frames
 from stages.physics.maps.grid import LocalFrames
-from stages.project.config import Config, Progress, Registered, Summary
+from stages.project.config import Config
 from stages.project.geometry import Geometry, check_directions, crop_geometry
 from stages.project.inputs import Scene, check_places, check_sources, open_scene, scene_of
 from stages.project.register import displacement_at, register, write_registration
+from stages.project.summary import Registered, Summary
 from stages.project.writing import Pair, PairDatasets, Tally, kept_decimals
 
 OF_THE_CROP = ("longitude_deg", "latitude_deg", "row", "col", "image_index", "site", "tile", "split")
 
 
 def run(
-    crops: Path, output: Path, config: Config, overwrite: bool = False, progress: Progress | None = None
+    crops: Path,
+    output: Output | Path,
+    config: Config,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Summary:
     """Write ``pairs.h5``. Raises ArtefactError, ConfigError, InputError or GeometryError; then nothing is written."""
+    output = Output.of(output)
     config.check()
-    check_output(output, [crops, scene_of(crops, config)], overwrite)
+    check_output(output.file, [crops, scene_of(crops, config)], output.overwrite)
     with open_artefact(crops, CROPS) as file, open_scene(crops, file, config) as scene:
         frames = load_frames(file, crops)
         total, size = file["elevation"].shape[:2]
@@ -39,16 +47,16 @@ def run(
         check_places(crops, file, scene.elevation.shape)
         units = _units(crops, file, frames, part)
         with ArtefactWriter(
-            output,
+            output.file,
             PAIRS,
             {"pair": part.stop - part.start, "y": size, "x": size, "enu": 3, "frame": len(frames)},
             config=asdict(config),
             inputs=[crops, scene.path],
             seed=int(file.attrs["seed"]),
             attributes={"gsd_m": scene.grid.gsd, "body_radius_m": scene.grid.radius},
-            overwrite=overwrite,
+            overwrite=output.overwrite,
         ) as writer:
-            return _project(writer, Crops(file, part), scene, frames, units, config, progress or (lambda *_: None))
+            return _project(writer, Crops(file, part), scene, frames, units, config, progress)
 
 
 @dataclass(frozen=True)

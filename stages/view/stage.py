@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from schemas import ConfigError, atomic_path, check_output
+from schemas.files.outputs import Output
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.view.config import Config
 from stages.view.frames import make_frames
 from stages.view.layers import read_content
 from stages.view.page import make_page
 from stages.view.photographs import read_photographs
 from stages.view.still import still_jpeg
 
-Progress = Callable[[int, int, str], None]
 STEPS = 4
-
-
-@dataclass(frozen=True)
-class Config:
-    """What the page holds and shows first; angles in degrees over the map's middle, azimuth from true north."""
-
-    max_px: int = 2048
-    photographs: int = 12
-    sun_azimuth_deg: float = 270.0
-    sun_elevation_deg: float = 25.0
-    title: str | None = None
 
 
 @dataclass(frozen=True)
@@ -43,32 +33,32 @@ class Summary:
 
 def run(
     source: Path,
-    output: Path,
+    pairs: Path | None,
+    output: Output | Path,
     config: Config,
-    *,
-    pairs: Path | None = None,
-    overwrite: bool = False,
-    progress: Progress | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Summary:
     """Write the page of ``source`` (svbrdf.h5), with photographs of ``pairs`` where given. Raises LunargrError."""
-    _check(config, output)
-    check_output(output, [source, *([pairs] if pairs else [])], overwrite)
-    say = progress or (lambda done, total, what: None)
-    say(0, STEPS, "reading maps")
+    output = Output.of(output)
+    path = output.file
+    _check(config, path)
+    check_output(path, [source, *([pairs] if pairs else [])], output.overwrite)
+    progress(0, STEPS, "reading maps")
     content = read_content(source, config.max_px)
     frames = make_frames(content.grid)
     photographs = []
     if pairs is not None:
         photographs = read_photographs(pairs, content.grid, content.factor, frames, config.photographs)
-    say(1, STEPS, "still picture")
+    progress(1, STEPS, "still picture")
     still = still_jpeg(content, config.sun_azimuth_deg, config.sun_elevation_deg)
-    say(2, STEPS, "packing")
+    progress(2, STEPS, "packing")
     start = {"azimuth": config.sun_azimuth_deg, "elevation": config.sun_elevation_deg}
     text = make_page(content, frames, photographs, still, start, config.title or source.stem)
-    say(3, STEPS, "writing")
-    with atomic_path(output) as partial:
+    progress(3, STEPS, "writing")
+    with atomic_path(path) as partial:
         partial.write_text(text, encoding="utf-8")
-    say(STEPS, STEPS, "page")
+    progress(STEPS, STEPS, "page")
     return Summary(
         content.grid.height,
         content.grid.width,
@@ -76,13 +66,13 @@ def run(
         content.model.name,
         len(content.coefficients) + len(content.others),
         len(photographs),
-        output.stat().st_size,
+        path.stat().st_size,
     )
 
 
-def _check(config: Config, output: Path) -> None:
-    if output.suffix.lower() not in (".html", ".htm"):
-        raise ConfigError(f"{output}: expected a name that ends in .html; choose another --output.")
+def _check(config: Config, page: Path) -> None:
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise ConfigError(f"{page}: expected a name that ends in .html; choose another --output.")
     if not 16 <= config.max_px <= 8192:
         raise ConfigError(f"--max-px: expected pixels in 16..8192, found {config.max_px}.")
     if not 0 < config.sun_elevation_deg <= 90:

@@ -2,44 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from schemas import ConfigError, atomic_path, write_json
-from schemas.files.outputs import Target, check_outputs
+from schemas.files.outputs import Output, Target, check_outputs
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.match.base import Matches, Models, get_matcher
 from stages.match.comparisons import comparisons
+from stages.match.config import Config
 from stages.match.consistency import summarise
 from stages.match.pictures import inside, match_figure, stretch_limits, to_grey
 
 FIGURES = 4  # comparisons that are drawn
 
 
-@dataclass
-class Config:
-    """Options of match; ``count`` crops of ``split`` are drawn with ``seed``."""
-
-    matchers: tuple[str, ...] = ("daisy", "sift")
-    split: str = "test"
-    count: int = 24
-    features_model: Path | None = None
-    lightglue_model: Path | None = None
-    seed: int = 0
-    device: str = "auto"
-
-
 def run(
     files: list[Path],
+    output: Output | Path | None,
     config: Config,
-    *,
-    json_file: Path | None = None,
-    figures: Path | None = None,
-    overwrite: bool = False,
-    progress: Callable[[int, int, str], None] | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> dict[str, Any]:
-    """Match every comparison with every matcher; returns what the JSON holds. Raises LunargrError."""
+    """Match every comparison with every matcher; returns what the JSON holds. Raises LunargrError.
+
+    output : the JSON and the folder of pictures, where they are wanted; a bare path is the JSON's
+    """
+    output = Output.of(output)
+    json_file, figures = output.json or output.path, output.figures
     if config.count < 1:
         raise ConfigError(f"--count: expected at least 1, found {config.count}.")
     targets = [] if json_file is None else [Target(json_file, "--json")]
@@ -47,14 +37,13 @@ def run(
         names = (figures / _picture(m, k) for m in config.matchers for k in range(FIGURES))
         targets += [Target(path, "--figures") for path in dict.fromkeys(names)]
     networks = [path for path in (config.features_model, config.lightglue_model) if path is not None]
-    check_outputs(targets, [*files, *networks], overwrite)
+    check_outputs(targets, [*files, *networks], output.overwrite)
     models = Models(config.features_model, config.lightglue_model)
     matchers = [get_matcher(name, models) for name in config.matchers]
     total, source = comparisons(files, config.split, config.count, config.seed, config.device)
     collected: dict[str, dict[str, list[Matches]]] = {m.name: {} for m in matchers}
     ground: list[int] = []
-    if progress is not None:
-        progress(0, total, "match")
+    progress(0, total, "match")
     for number, comparison in enumerate(source):
         ground.append(comparison.ground)
         limits = stretch_limits(comparison.measured)
@@ -72,8 +61,7 @@ def run(
                     match_figure(measured, pictures, found, f"{comparison.label}, {matcher.title}"),
                     figures / _picture(matcher.name, number),
                 )
-        if progress is not None:
-            progress(number + 1, total, "match")
+        progress(number + 1, total, "match")
     result = {
         "size_px": [512, 384],
         "crops": total,
