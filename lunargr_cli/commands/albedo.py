@@ -34,6 +34,14 @@ def command(
         str | None,
         typer.Option("--fold", metavar="K/N", help="Leave out every N-th image from the K-th (1-based) on."),
     ] = None,
+    register: Annotated[
+        str | None,
+        typer.Option(
+            "--register",
+            metavar="FORM",
+            help="Take off how far each image lies from its rendering: constant, affine or field, as 'lunargr project'.",
+        ),
+    ] = None,
     geotiff: Annotated[
         Path | None,
         typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif)."),
@@ -65,6 +73,7 @@ def command(
     config = albedo.Config(
         leave_out=tuple(name.strip() for name in leave_out.split(",") if name.strip()) if leave_out else (),
         fold=_fold(fold),
+        register=register,
         shard=parse_shard(shard),
         geotiff=not no_geotiff,
     )
