@@ -25,6 +25,14 @@ def command(
         str | None,
         typer.Option("--fold", metavar="K/N", help="Leave out every N-th image from the K-th (1-based) on."),
     ] = None,
+    register: Annotated[
+        str | None,
+        typer.Option(
+            "--register",
+            metavar="FORM",
+            help="Take off how far each image lies from its rendering: constant, affine or field, as 'lunargr project'.",
+        ),
+    ] = Config.register,
     geotiff: options.GeoTiff = None,
     no_geotiff: options.NoGeoTiff = False,
     shard: options.Shard = None,
@@ -40,7 +48,8 @@ def command(
     The albedo multiplies the I/F of the map. Where photographs agree it is theirs; where they do not, and where there are
     none, it is 1 and the map stays as the terrain gave it. Rendering, evaluation and GeoTIFF take it into account.
     """
-    config = Config(options.read_names(leave_out), _fold(fold), options.parse_shard(shard), geotiff=not no_geotiff)
+    made = {"leave_out": options.read_names(leave_out), "fold": _fold(fold), "geotiff": not no_geotiff}
+    config = options.configure(Config, locals(), **made, shard=options.parse_shard(shard))
     from lunargr_cli.console import Console
     from stages import albedo
 

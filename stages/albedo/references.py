@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stages.common.arrays import Floats32
 from stages.physics.horizon.scene import Overview, horizon_in_scene
+from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import ASTRONOMICAL_UNIT, Frame
 from stages.physics.light.sun_disc import SUN_RADIUS
@@ -81,11 +82,17 @@ class References(contextlib.AbstractContextManager):
     ) -> None:
         self.surface, self.elevation, self.overview, self.heights = surface, elevation, overview, heights
         self.frames, self.boxes = frames, boxes
+        self._fields: Sequence[Field | None] = [None] * len(frames)
         self._open: OrderedDict[int, tuple[Source, contextlib.ExitStack]] = OrderedDict()
 
     def __exit__(self, *error: object) -> None:
         while self._open:
             self._open.popitem()[1][1].close()
+
+    def take_off(self, fields: Sequence[Field | None]) -> None:
+        """Read each image from now on without the displacement that registration found; none where empty."""
+        if fields:
+            self._fields = fields
 
     def overlapping(self, box: Box) -> list[int]:
         """Images that may show something of a window."""
@@ -94,7 +101,7 @@ class References(contextlib.AbstractContextManager):
     def look(self, k: int, box: Box) -> Look | None:
         """Image ``k`` on a window, None where it shows nothing that counts."""
         row, col, height, width = box
-        pixels = self._source(k).read(row, col, height, width)
+        pixels = self.source(k).read(row, col, height, width, self._fields[k])
         if not pixels.valid.any():
             return None
         frame, surface = self.frames[k], self.surface
@@ -118,7 +125,8 @@ class References(contextlib.AbstractContextManager):
         shadow = block["shadow"] > SHADOWED
         return Look(measured, block["image"], cosine, usable, shadow, math.sin(max(0.0, elevation)))
 
-    def _source(self, k: int) -> Source:
+    def source(self, k: int) -> Source:
+        """The open image ``k``."""
         if k in self._open:
             self._open.move_to_end(k)
             return self._open[k][0]

@@ -93,8 +93,9 @@ def evaluate_loss(
     brightness: float = 1.0,
     progress: Progress = show_nothing,
 ) -> tuple[float, float]:
-    """Mean squared error and mean of what is minimised over the valid pixels of some pairs, in evaluation mode; NaN where
-    there are none.
+    """Mean squared error and mean of what is minimised over the valid pixels of some pairs, in evaluation mode.
+
+    NaN where there are no pairs.
     """
     training.predictor.eval()
     totals, pixels = [0.0, 0.0], 0.0
