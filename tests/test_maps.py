@@ -17,11 +17,11 @@ from schemas.files.outputs import Output
 from stages import infer, train
 from stages.common.threads import one_thread_each, share_out
 from stages.network.coefficient_maps import CoefficientMaps
+from stages.network.crop_sums import PIECE, convolution, sum_over_crops
+from stages.network.deviations import _likelihood
 from stages.network.losses import crop_errors, squared_error
-from stages.network.pieces import PIECE, convolution, sum_over_crops
 from stages.network.pixels import Pixels, fit_pixels
 from stages.network.predictor import load_predictor
-from stages.network.spread import _likelihood
 from stages.pairs.holes import fill_holes
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import get_model, masked_radiance_factor, model_names

@@ -12,8 +12,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.losses import Radiometry, squared_error
 from stages.network.normalisation import scale_elevation
+from stages.network.precision import choose_inference_precision
 from stages.network.predictor import Predictor
-from stages.network.runtime import choose_inference_precision
 from stages.network.unet import UNet
 from stages.pairs.holes import FILL_REACH, fill_holes
 from stages.pairs.reader import PairReader

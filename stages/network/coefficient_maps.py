@@ -1,4 +1,4 @@
-"""From what the network gives to the parameters of a reflectance model: some by place, the others the same everywhere."""
+"""The parameters of a reflectance model from a network's output: some as maps, the others the same everywhere."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class CoefficientMaps(nn.Module):
         return output.float() * self.output_scale + self.start[:, None, None]
 
     def combine(self, shifted: Tensor, everywhere: Sequence[Tensor]) -> Tensor | dict[str, Tensor]:
-        """Maps (B, channels, H, W) and the values of the others, each broadcasting to (B, H, W) -> what ``formation.form`` takes."""
+        """Maps (B, channels, H, W) and the values of the others, each broadcasting to (B, H, W) -> what ``formation.chain.form`` takes."""
         bounded = self._bounded(shifted.narrow(1, 0, len(self.maps)), 1, self.maps)
         if not self.rest:
             return bounded

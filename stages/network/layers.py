@@ -34,7 +34,7 @@ class BatchNorm(nn.BatchNorm2d):
 
     @torch.no_grad()
     def note(self, mean: Tensor, variance: Tensor, count: Tensor) -> None:
-        """Let a batch's statistics (float64) into the running ones.
+        """Update the running statistics with those of a batch (float64).
 
         mean, variance : (C,); count : (), values per channel
         """
@@ -87,7 +87,7 @@ class _SharedNorm(torch.autograd.Function):
 
 
 class Dropout(nn.Module):
-    """Dropout whose pattern hangs on a key of each crop and on the layer, and on nothing else.
+    """Dropout whose pattern depends on a key of each crop and on the layer, and on nothing else.
 
     A crop loses the same values whichever process works on it, and beside whichever other crops.
     """

@@ -17,7 +17,7 @@ def squared_error(predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
 
 
 class _SquaredError(torch.autograd.Function):
-    """One pass back, where autograd takes four: the residual, 0 where invalid, is its own gradient."""
+    """The residual, 0 where invalid, is kept as the gradient: one pass over memory, where autograd takes four."""
 
     @staticmethod
     def forward(ctx: Any, predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:

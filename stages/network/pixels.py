@@ -22,7 +22,7 @@ MAXIMUM_PIXELS = 30_000
 
 
 def batches_of(reader: PairReader, indices: NDArray[np.int64], size: int = 32) -> Iterator[Batch]:
-    """At most about MAXIMUM_PAIRS of some pairs.
+    """Batches of evenly chosen pairs, at most about MAXIMUM_PAIRS of them.
 
     indices : (n,), of pairs
     """

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from stages.network.cpu.fused_layers import join, norm_act, pool, quarter_weights
+from stages.network.crop_sums import convolution
 from stages.network.layers import SLOPE, BatchNorm, Dropout, draw_keys
-from stages.network.pieces import convolution
 
 WIDTHS = (16, 32, 64, 128, 256)
 DROPOUT = (0.1, 0.1, 0.2, 0.2, 0.3)
@@ -142,7 +142,7 @@ class UNet(nn.Module):
         return self.plain_features(x, keys)
 
     def plain_features(self, x: Tensor, keys: Tensor) -> Tensor:
-        """The same as one writes a network down.
+        """The features by plain PyTorch operations: what GPUs run and the fused form is tested against.
 
         x : (B, 1, H, W), scaled heights; keys : (B,); returns (B, F, H, W)
         """

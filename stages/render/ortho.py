@@ -17,7 +17,7 @@ from stages.physics.terrain.shading import BACKPLANES, Light, shade_block
 from stages.physics.terrain.surface import Surface
 from stages.render.config import Config, Summary
 from stages.render.pictures import Preview, write_exr, write_png
-from stages.render.setting import metadata
+from stages.render.setup import metadata
 from stages.render.tally import Tally
 
 BAND_ROWS = 256

@@ -1,4 +1,4 @@
-"""The stage: one view."""
+"""One view of a terrain, as a map or through a camera."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import find_body
 from stages.render.config import Config, Summary, check, inputs, output_files
 from stages.render.ortho import render_map
-from stages.render.setting import find_camera, make_light, open_source
+from stages.render.setup import find_camera, make_light, open_source
 from stages.render.views import render_camera
 
 

@@ -25,7 +25,7 @@ from stages.physics.terrain.surface import Surface
 from stages.render.config import SUN, Config, StereoConfig, check, output_files
 from stages.render.dataset import World, make_world, project, ray_directions
 from stages.render.pictures import read_exr, write_exr
-from stages.render.setting import make_light, open_source
+from stages.render.setup import make_light, open_source
 from stages.render.viewpoint import look_at, pinhole_view
 from stages.render.views import render_camera
 

@@ -24,7 +24,7 @@ from stages.render.config import SUN, Config, Summary, check, inputs, output_fil
 from stages.render.dataset import View, export_views
 from stages.render.perspective import apply_sensor, make_scene, render_view
 from stages.render.pictures import Preview, write_exr, write_png
-from stages.render.setting import camera_place, find_camera, make_light, metadata, open_source
+from stages.render.setup import camera_place, find_camera, make_light, metadata, open_source
 from stages.render.tally import Tally, skipped
 from stages.render.trajectory import ViewRow, read_trajectory
 
@@ -92,7 +92,7 @@ def run_trajectory(
 
 
 def _with_row(config: Config, view: ViewRow) -> Config:
-    """The command's options with what a row of the table says in their place; a row's Sun replaces the whole Sun."""
+    """The configuration of one row: what the row leaves empty stays as it is; a row's Sun replaces the whole Sun."""
     own = replace(
         config,
         position=view.position,

@@ -235,5 +235,5 @@ def read_recipe(path: Path) -> dict[str, Any]:
 
 
 def recipe_json(config: Config) -> str:
-    """The recipe as JSON that a recipe file holds."""
+    """The content of a recipe file."""
     return json.dumps(dataclasses.asdict(config), indent=1)

@@ -51,7 +51,7 @@ def _far_rays(out, x0, y0, step, sx, sy, edge, seed):
 
 
 def albedo(config: Config, ground: Ground, row: int, col: int) -> Albedo:
-    """Of a block that carries MARGIN pixels around it; ``row``, ``col`` are of its first inner pixel."""
+    """The albedo of a block that carries MARGIN pixels around it; ``row``, ``col`` are of its first inner pixel."""
     step = config.dem_gsd
     inner = (slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
     elevation = ground.elevation

@@ -1,4 +1,4 @@
-"""The network's steps between convolutions as single operations on the CPU, differentiable: see ``kernels``."""
+"""The network's steps between convolutions as single operations on the CPU, differentiable: see ``training_kernels``."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Angles and sunlight of every facet of a batch of crops, in one pass over its elevations.
 
-The same as ``geometry`` and ``penumbra`` give, to rounding, for training and prediction on the CPU, where only coefficients
+The same as ``geometry`` and ``light.sun_disc`` give, to rounding, for training and prediction on the CPU, where only coefficients
 have gradients: every operation of theirs is a pass over memory, and all of them cost more than a model and its gradient.
 """
 

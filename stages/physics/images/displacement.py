@@ -24,7 +24,7 @@ Relief = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
 
 @dataclass(frozen=True)
 class Basis:
-    """What a displacement is a mixture of.
+    """Basis functions over the ground whose weighted sum is a displacement: a constant, a plane, or cubic B-splines.
 
     form : one of FORMS; origin : (row, col), the middle for 'affine', the first knot for 'field'
     step : px, what the places are divided by, the distance of the knots; cells : (rows, cols) between the knots of a field

@@ -161,7 +161,7 @@ def _ground(terrain: Terrain, row: NDArray, col: NDArray, displacement: Displace
 
 
 def bilinear(values: NDArray, row: NDArray, col: NDArray) -> Floats:
-    """Between pixel centres, continued evenly beyond the outermost; whole indices need no neighbour.
+    """Bilinear samples between pixel centres, extrapolated beyond the outermost.
 
     values : (H, W); row, col : (...,) px; returns (...,)
     """

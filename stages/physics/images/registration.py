@@ -21,8 +21,7 @@ from schemas.errors import GeometryError
 from stages.common.arrays import Floats, Mask
 from stages.physics.images.correlation import combined_correlation, masked_correlation, small_structure
 from stages.physics.images.refine import refine
-
-Box = tuple[int, int, int, int]  # row, col, height, width
+from stages.physics.maps.window import Box
 
 BLOCK_PX = 64
 LEAST_PIXELS = 400
@@ -35,7 +34,7 @@ WORST_SIGMA_PX = 0.5
 
 @dataclass(frozen=True)
 class Shift:
-    """One block's answer.
+    """The shift of one block, how sure it is, and why it is refused where it is.
 
     dx, dy : px along columns and rows; sigma : px, standard error of the worse axis
     correlation : between image and rendering at that shift, small structure only; lead : over the next best place
@@ -128,7 +127,7 @@ def prepare(
     patterns: Sequence[ArrayLike] = (),
     relief: Floats | None = None,
 ) -> Pictures:
-    """Band-pass all of it once. Raises GeometryError for shapes that differ.
+    """Band-pass an image, its rendering and what else it may show, once for all blocks. Raises GeometryError for shapes that differ.
 
     image, rendering, valid, weights, relief : (H, W), and so is each of the ``patterns``; NaN = unknown
     weights : 0 or more, for example less in shadow; relief : displacement of the ground by height

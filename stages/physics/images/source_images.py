@@ -33,8 +33,7 @@ from stages.physics.images.orthorectify import (
 from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, check_body, require_crs
-
-Box = tuple[int, int, int, int]
+from stages.physics.maps.window import Box
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ class MapSource:
     camera_position: Floats
 
     def box(self) -> Box | None:
-        """As of every source."""
+        """See :meth:`Source.box`."""
         if rasters.source_window(self.dataset, self.grid, margin=0) is None:
             return None
         image = self.dataset
@@ -110,14 +109,14 @@ class MapSource:
         return r0, c0, max(0, r1 - r0), max(0, c1 - c0)
 
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
-        """As of every source; resampled from one map to the other."""
+        """See :meth:`Source.read`; resampled from one map to the other."""
         if field is None or field.refused:
             part = self.grid.window(row, col, height, width)
             return Pixels(*rasters.warp(self.dataset, part, rasters.choose_resampling(self.dataset, part)[0]), None)
         return Pixels(*self._read_moved(row, col, height, width, field), None)
 
     def relief(self, reference: float) -> Relief | None:
-        """As of every source."""
+        """See :meth:`Source.relief`."""
         return relief_displacement(self.grid, self.camera_position, reference)
 
     def _read_moved(
@@ -165,7 +164,7 @@ class CameraSource:
     sun_position: Floats
 
     def box(self) -> Box | None:
-        """As of every source."""
+        """See :meth:`Source.box`."""
         return footprint(self.camera, self.grid, self.heights)
 
     def relief(self, reference: float) -> Relief | None:
@@ -173,7 +172,7 @@ class CameraSource:
         return None
 
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
-        """As of every source; orthorectified with the scene's elevations."""
+        """See :meth:`Source.read`; orthorectified with the scene's elevations."""
         r0, c0, r1, c1 = self._surroundings(row, col, height, width)
         piece = np.asarray(self.elevation[r0:r1, c0:c1], dtype=float)
         terrain = Terrain(piece, self.grid.window(r0, c0, r1 - r0, c1 - c0))

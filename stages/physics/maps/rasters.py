@@ -88,7 +88,7 @@ def _check_numbers(path: Path, what: str, dataset: DatasetReader) -> None:
 
 
 def check_single_band(path: Path, dataset: DatasetReader, what: str) -> None:
-    """Refuse rasters of several bands: which of them is meant, nobody said. Masks (alpha) are none. Raises InputError."""
+    """Refuse rasters of several bands; masks (alpha) do not count. Raises InputError."""
     bands = sum(kind != ColorInterp.alpha for kind in dataset.colorinterp)
     if bands > 1:
         raise InputError(

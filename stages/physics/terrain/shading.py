@@ -53,9 +53,9 @@ class Light:
 
 
 class Floor:
-    """Formulas that are fitted, such as a polynomial's, fall below 0 near the terminator; no ground does.
+    """Clips the I/F of lit facets at 0, as the first step of the chain's reflectance; ``below`` (B, H, W) says where.
 
-    Clips the I/F of lit facets at 0, as the first step of the chain's reflectance; ``below`` (B, H, W) says where.
+    Fitted formulas, such as a polynomial's, fall below 0 near the terminator.
     """
 
     slot = "reflectance"
@@ -185,7 +185,7 @@ def _image_deviation(surface: Surface, geometry: BlockGeometry, visible: Floats3
 def form_window(
     surface: Surface, light: Light, window: Window, added: Floats32 | None = None
 ) -> tuple[Floats32, Floats32]:
-    """I/F of a window through the whole formation chain with its extensions, tile by tile with a margin; where it was clipped.
+    """I/F of a window through the formation chain with its extensions, tile by tile, and 1 where the model's was below 0.
 
     added : I/F that further light adds, on the window padded by HALO_PX
     returns (h, w) float32 each

@@ -229,7 +229,7 @@ def stored_model(path: Path, name: str) -> ReflectanceModel:
 
 
 def _named_model(path: Path, model: str | None) -> ReflectanceModel:
-    """Raises ConfigError: which reflectance a picture shows is nobody's to guess."""
+    """The model that was asked for. Raises ConfigError where none was: a terrain has no reflectance of its own."""
     if model is None:
         raise ConfigError(
             f"{path}: holds a terrain and no reflectance; name one with `dem` {path} `model` NAME ('lunargr models' lists them), "

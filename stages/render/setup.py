@@ -1,4 +1,4 @@
-"""From options to a terrain, a light and a camera."""
+"""The terrain, the light and the camera that a configuration asks for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a checkpoint must hold for its network to be built: checked by its shapes, before anything of their size is made."""
+"""Names and shapes that a checkpoint must hold for its network, checked before any memory of their size is taken."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far coefficient maps are from the truth: a standard deviation for each, from the residuals of the images.
+"""Standard deviations of coefficient maps, from the residuals of the images.
 
 A residual is taken for the sum of independent errors: of each map, by its effect on the pixel, and of the image itself,
 
