@@ -78,7 +78,12 @@ def test_globals_are_learned_and_constant_in_the_map(small_artefacts, trained, t
         (k,) = json.loads(file.attrs["globals"]).values()
         start = json.loads(file.attrs["start"])
     assert 0 < k < 2 and k != start["k"]
-    infer.run(small_artefacts["scene"], trained, tmp_path / "map.h5", infer.Config(device="cpu", geotiff=False))
+    infer.run(
+        small_artefacts["scene"],
+        trained,
+        tmp_path / "map.h5",
+        infer.Config(device="cpu", precision="fp32", geotiff=False),
+    )
     with h5py.File(tmp_path / "map.h5") as file:
         valid = file["valid"][...].astype(bool)
         albedo, constant = (plane[valid] for plane in file["coefficients"][...])
@@ -241,7 +246,7 @@ def test_the_image_deviation_is_that_of_drawn_parameters(rng):
 
 def test_the_map_carries_its_deviations(small_artefacts, trained, tmp_path):
     """In strips and from a whole window alike, positive, by name; the GeoTIFF has them as bands."""
-    infer.run(small_artefacts["scene"], trained, tmp_path / "map.h5", infer.Config(device="cpu"))
+    infer.run(small_artefacts["scene"], trained, tmp_path / "map.h5", infer.Config(device="cpu", precision="fp32"))
     predictor = load_predictor(trained)
     assert predictor.image_noise > 0
     with h5py.File(small_artefacts["scene"]) as file:
