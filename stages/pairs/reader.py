@@ -41,7 +41,6 @@ class Batch:
             "sun_direction",
             "camera_position",
             "sun_horizon",
-            "sky_view",
             "detector_sample",
             "detector_line",
             "frame",
@@ -51,7 +50,7 @@ class Batch:
         return Batch(o, self.image.to(device, non_blocking=True), self.valid.to(device, non_blocking=True))
 
 
-FIELDS = ("elevation", "image", "valid", "sun_horizon_deg", "sky_view")
+FIELDS = ("elevation", "image", "valid", "sun_horizon_deg")
 DETECTOR = ("detector_sample", "detector_line")
 
 
@@ -168,7 +167,6 @@ class PairReader:
             gsd=self.gsd,
             body_radius=self.body_radius,
             sun_horizon=optional("sun_horizon_deg"),
-            sky_view=optional("sky_view"),
             detector_sample=optional("detector_sample"),
             detector_line=optional("detector_line"),
             frame=torch.from_numpy(self.frame[rows]),
@@ -223,7 +221,7 @@ def _without_holes(elevation: NDArray[np.float32]) -> NDArray[np.float32]:
 def _turn(batch: Batch, symmetries: NDArray) -> None:
     o = batch.observation
     fields = [batch.image, batch.valid, o.elevation]
-    fields += [f for f in (o.sun_horizon, o.sky_view, o.detector_sample, o.detector_line) if f is not None]
+    fields += [f for f in (o.sun_horizon, o.detector_sample, o.detector_line) if f is not None]
     for k, symmetry in enumerate(symmetries):
         if symmetry:
             for field in fields:
