@@ -90,6 +90,19 @@ def test_a_shadow_or_a_cosmic_ray_in_one_image_leaves_no_mark(rng, tmp_path):
     assert np.nanmax(np.abs(np.log(marked / clean))) < 0.1
 
 
+def test_what_one_image_shows_alone_loses_its_weight(rng):
+    """A pixel 20 sigma from what five other images agree on counts a hundredth; its neighbours keep theirs."""
+    ratio = rng.normal(0, 0.01, (6, 32, 32)).astype(np.float32)
+    ratio[2, 16, 16] += 0.2
+    confidence = np.ones_like(ratio)
+    spread = Spread(
+        np.full(LEVELS + 1, 0.04), np.full((6, LEVELS + 1), 1e-4), 0.04, np.full(6, 1e-4), np.zeros(LEVELS + 1)
+    )
+    location = settle(ratio, confidence, spread)
+    assert confidence[2, 16, 16] < 0.03 * np.median(confidence[2])
+    assert np.median(confidence) > 0.5 and abs(location[16, 16]) < 0.02
+
+
 def test_shifted_images_count_less(rng, tmp_path):
     truth = np.exp(texture(rng))
     images = photographs(rng, truth)
