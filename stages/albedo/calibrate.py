@@ -65,6 +65,7 @@ class Calibration:
         return ratio, np.where(known, confidence, 0).astype(np.float32)
 
     def write(self, path: Path) -> None:
+        """Write it as JSON."""
         values = {"gain": self.gain, "offset": self.offset, "error": self.error}
         values |= {"interval": self.interval, "shadow": self.shadow}
         values |= {
@@ -79,6 +80,7 @@ class Calibration:
 
     @staticmethod
     def read(path: Path) -> Calibration:
+        """Read what :meth:`write` wrote."""
         text = json.loads(path.read_text())
         shared_px, fields = float(text.pop("shared_px")), tuple(from_text(text.pop("fields")))
         v = {k: np.array(values, float) for k, values in text.items()}
@@ -118,6 +120,7 @@ def choose_windows(shape: tuple[int, int], boxes: Sequence[Box]) -> list[Box]:
 
 
 def take_samples(references: References, windows: Sequence[Box], progress: Progress = show_nothing) -> list[Sample]:
+    """What the images show of some windows, one sample each."""
     samples = []
     for number, box in enumerate(windows):
         progress(number, len(windows), "calibration windows")
