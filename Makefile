@@ -47,8 +47,10 @@ lint: $(STAMP) ## ruff, formatting and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(STAMP) ## speed and memory, each beside a named peer in the same run
-	for script in tests/benchmarks/bench_*.py; do echo "== $$script"; $(BIN)/python $$script; done
+bench: $(STAMP) ## speed and memory, each beside a named peer in the same run; on a quiet machine, then make figures; ONLY=word for some
+	mkdir -p results/bench
+	for script in tests/benchmarks/bench_*$(ONLY)*.py; do echo "== $$script"; \
+	  $(BIN)/python $$script | tee results/bench/$$(basename $$script .py).txt; done
 
 campaign: $(STAMP) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
 	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign

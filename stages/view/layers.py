@@ -16,10 +16,11 @@ from rasterio.transform import Affine
 from schemas import SVBRDF, ArtefactError, InputError, RegistryError, open_artefact, read_strings
 from stages.physics.maps.grid import Grid, read_grid
 from stages.physics.photometry import ReflectanceModel, get_model, model_names
+from stages.physics.photometry.albedo_factor import FACTOR, AlbedoFactor
 
 Floats32 = NDArray[np.float32]
 READ_ROWS = 512
-_OWN = ("x", "y", "coefficients", "coefficient_name", "elevation", "valid", "crs")
+_OWN = ("x", "y", "coefficients", "coefficient_name", "albedo", "elevation", "valid", "crs")
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,9 @@ def read_content(path: Path, max_px: int) -> Content:
             Layer(p.name, p.description, p.unit, _shrunk(file["coefficients"], (k,), factor))
             for k, p in enumerate(model.parameters)
         ]
+        if "albedo" in file:  # what `lunargr render` multiplies by, too
+            model = AlbedoFactor(model)
+            coefficients.append(Layer("albedo", FACTOR.description, FACTOR.unit, _shrunk(file["albedo"], (), factor)))
         others = _others(file, full, names, factor)
     known = np.isfinite(elevation)
     for layer in coefficients:
