@@ -150,6 +150,15 @@ def test_gdal_places_the_netcdf_variable(small_artefacts, checkpoint, tmp_path):
         np.testing.assert_allclose(data.xy(0, 0), (scene["x"][0], scene["y"][0]), atol=1e-6)
 
 
+def test_the_georeference_is_that_of_the_coordinates(small_artefacts, checkpoint, tmp_path):
+    infer.run(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", infer.Config(geotiff=False, **FULL))
+    with h5py.File(tmp_path / "map.h5") as file:
+        left, width, _, top, _, height = map(float, file["crs"].attrs["GeoTransform"].split())
+        x, y = file["x"][...], file["y"][...]
+    np.testing.assert_allclose(x, left + width * (np.arange(len(x)) + 0.5), atol=1e-6)
+    np.testing.assert_allclose(y, top + height * (np.arange(len(y)) + 0.5), atol=1e-6)
+
+
 def test_shards_make_the_same_map(small_artefacts, checkpoint, reference, tmp_path):
     parts = []
     for k in range(3):

@@ -17,6 +17,7 @@ from stages import train
 from stages.evaluate.comparison import Task, evaluate_pairs
 from stages.evaluate.config import Config
 from stages.evaluate.renderers import read_batch
+from stages.pairs.reader import PairReader
 from stages.train.epoch import evaluate_loss, learn_epoch
 from stages.train.training import set_up
 
@@ -85,8 +86,10 @@ def test_the_best_epoch_is_that_of_the_lowest_validation_loss(tmp_path, monkeypa
         written.append(epoch)
         return 10.0 - epoch
 
-    monkeypatch.setattr(train, "learn_epoch", learn)
-    monkeypatch.setattr(train, "evaluate_loss", lambda training, *_: (9.0 - written[-1], validation[written[-1]]))
+    monkeypatch.setattr("stages.train.stage.learn_epoch", learn)
+    monkeypatch.setattr(
+        "stages.train.stage.evaluate_loss", lambda training, *_: (9.0 - written[-1], validation[written[-1]])
+    )
     pairs = write_pairs(tmp_path / "pairs.h5", pairs_of(), units="dn")
     summary = train.run(pairs, tmp_path / "c.h5", train.Config(**SMALL, epochs=4))
     assert summary.history.best_epoch == 1
@@ -99,7 +102,7 @@ def test_validation_runs_without_dropout_and_leaves_the_network_as_it_is(tmp_pat
     """In training mode dropout would draw, and batch normalisation would learn from validation ground."""
     pairs = write_pairs(tmp_path / "pairs.h5", pairs_of(), units="dn")
     config = train.Config(**SMALL, dropout=(0.5,), epochs=1)
-    with train.PairReader(pairs) as reader:
+    with PairReader(pairs) as reader:
         training = set_up(reader, config, [], torch.device("cpu"), 0, 1)
         learn_epoch(training, reader.indices("train"), config, 0)
         before = {k: v.clone() for k, v in training.predictor.state_dict().items()}

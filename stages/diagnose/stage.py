@@ -102,6 +102,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, hidden, say=say, progress=progress
     )
     state.reference = copy.copy(nominal)
+    state.leave_out_rare_images()
     before = _residual(state)
     if not before > 0:
         answer.note, answer.blind = "too few pixels of the pairs show fully lit ground", effect_names()

@@ -158,24 +158,23 @@ class Whole:
         """Inverse prior variances."""
         return np.array([self.precision.get(int(k), 1.0) for k in places])
 
-    def let_gains_scatter(self, name_columns: Sequence[int]) -> float:
-        """Estimate the scatter of nuisance per frame by expectation-maximisation and set its prior; returns it."""
-        places = self.frame_places(name_columns)
+    def let_scatter(self, places: NDArray[np.int64]) -> None:
+        """Estimate the scatter of nuisance about nothing by expectation-maximisation and make it their prior."""
         if not len(places):
-            return 0.0
+            return
+        places = np.sort(places)
         spread = 0.3
         for _ in range(8):
             for p in places:
                 self.precision[int(p)] = spread**-2
             n = self.nuisance()
             at = np.searchsorted(n, places)
-            a = self.gram[np.ix_(n, n)] + np.diag(self.weight(n))
-            inverse = np.linalg.inv(_scaled(a)[0]) * np.outer(*(2 * [_scaled(a)[1]]))
+            scaled, scale = _scaled(self.gram[np.ix_(n, n)] + np.diag(self.weight(n)))
+            inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
             mean = inverse @ self.gram[n, 0]
             spread = math.sqrt(max(float((mean[at] ** 2 + inverse.diagonal()[at]).mean()), 1e-10))
         for p in places:
             self.precision[int(p)] = max(spread, 1e-4) ** -2
-        return spread
 
     def set_scatter(self, spread: float) -> None:
         for p in self.scattered:

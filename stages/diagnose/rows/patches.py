@@ -170,6 +170,7 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
     image = chain.predict()
     _, height, width = image.shape
     lit = lit_mask(chain)
+    kept = torch.tensor([k not in chain.site.left_out for k in range(len(image))])
     level = (image * lit).sum((-2, -1)) / lit.sum((-2, -1)).clamp(min=1)
     scale = torch.maximum(image, DARKEST * level[:, None, None]).clamp(min=1e-6)
     # what is bright all the same is lit ground that the DEM does not know of
@@ -182,7 +183,7 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
             rows, columns = slice(i * h, (i + 1) * h), slice(j * w, (j + 1) * w)
             here = use[:, rows, columns]
             seen = (here & lit[:, rows, columns]).sum((-2, -1))
-            images = torch.nonzero((seen >= min(FEWEST_PIXELS, 0.3 * h * w)) & (level > 0))[:, 0]
+            images = torch.nonzero((seen >= min(FEWEST_PIXELS, 0.3 * h * w)) & (level > 0) & kept)[:, 0]
             if not len(images):
                 continue
             weight = here[images].float() * window(h, w)

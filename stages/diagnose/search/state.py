@@ -19,7 +19,7 @@ from stages.diagnose.registration.explain import Registration
 from stages.diagnose.registration.forms import aligned
 from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, shared_columns
 from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patches
-from stages.diagnose.settings import SHAMS
+from stages.diagnose.settings import SEEN, SHAMS
 from stages.effects import Effect, Survey, get_effect
 
 
@@ -90,6 +90,15 @@ class State:
         for site, known in zip(self.sites, kept, strict=True):
             site.texture = known
 
+    def leave_out_rare_images(self) -> None:
+        """Images that show too few pieces of ground, unless that is all there are."""
+        _, pieces = self.grid()
+        patches = [p for k, chain in enumerate(self.chains()) for p in make_patches(k, chain, pieces, self.free_gains)]
+        seen = torch.bincount(torch.cat([p.frames for p in patches]), minlength=self.frames) if patches else None
+        if seen is not None and int(seen.max()) >= SEEN:
+            for site in self.sites:
+                site.left_out = frozenset(k for k, f in enumerate(site.frames) if seen[f] < SEEN)
+
     def learn_texture(self) -> None:
         """Estimate the covariance from the bare residual, and with it the ground's albedo, which effects go with."""
         chains = self.chains()
@@ -142,12 +151,14 @@ class State:
             tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
         units = per_site(lambda k: products(rows[k], model, grid, self.frames, tricks[k]), range(len(rows)))
         whole = Whole(units, plan, self.frames)
+        for group in plan.scattered:
+            whole.let_scatter(whole.known_places([1 + k for k in group]))
         for name in dict.fromkeys(plan.per_frame):
             if get_effect(name).scatters:
-                columns = [k for k, n in enumerate(plan.per_frame) if n == name]
-                whole.let_gains_scatter(columns)
+                places = whole.frame_places([k for k, n in enumerate(plan.per_frame) if n == name])
+                whole.let_scatter(places)
                 if not get_effect(name).displaces:
-                    whole.scattered = whole.frame_places(columns)
+                    whole.scattered = places
         return View(whole, plan, rows, grid, model)
 
 
