@@ -155,8 +155,10 @@ $(D)/checkpoint_m2.h5: $(D)/pairs.h5
 $(D)/m2.h5: $(D)/pairs.h5 $(D)/checkpoint_m2.h5
 	$(LUNARGR) evaluate $^ --only learned --only learned_gain_offset -o $@ --overwrite
 
-figures: ## write every figure of README.md and docs/ from what demo, reproduce-apollo15 and reproduce-models left
+figures: ## write every figure of README.md and docs/, and the notebook, from what demo, reproduce-* and bench left
 	$(BIN)/python examples/figures.py
+	@# the notebook trains its own network for two passes, and keeps it
+	if [ -f $(D)/pairs.h5 ]; then cd $(D) && ../$(BIN)/python ../examples/notebook_page.py; fi
 
 # --- real photographs: Apollo 15 metric camera frames over the GLD100 elevation model ------------------------------
 
