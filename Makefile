@@ -11,7 +11,7 @@ LUNARGR := $(BIN)/lunargr
 STAMP := $(VENV)/.installed
 SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 
-.PHONY: help install demo demo-paper figures test test-slow mutants fuzz endurance lint bench campaign campaign-real docs vendor-js reproduce-apollo15 reproduce-models clean
+.PHONY: help install demo demo-paper figures test test-slow mutants fuzz endurance lint bench campaign campaign-real docs wheel vendor-js reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -28,10 +28,10 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 test: $(STAMP) ## the tests that every change must pass (under 10 minutes on two cores)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 test-slow: $(STAMP) ## the longer checks
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m slow
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 mutants: $(STAMP) ## plant bugs one at a time and see whether the tests notice, before a release; ONLY=word for some
 	OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py --only "$(ONLY)"
@@ -47,8 +47,10 @@ lint: $(STAMP) ## ruff, formatting and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(STAMP) ## speed and memory, each beside a named peer in the same run
-	for script in tests/benchmarks/bench_*.py; do echo "== $$script"; $(BIN)/python $$script; done
+bench: $(STAMP) ## speed and memory, each beside a named peer in the same run; on a quiet machine, then make figures; ONLY=word for some
+	mkdir -p results/bench
+	for script in tests/benchmarks/bench_*$(ONLY)*.py; do echo "== $$script"; \
+	  $(BIN)/python $$script | tee results/bench/$$(basename $$script .py).txt; done
 
 campaign: $(STAMP) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
 	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign
@@ -65,6 +67,9 @@ docs: $(STAMP) ## write the generated parts of docs/ again, and build the site i
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "Open $(abspath build/site/index.html)"
 
+wheel: $(STAMP) ## build/dist/*.whl; URL=https://... of the repository puts its pictures and links on the package's page
+	LUNARGR_URL=$(URL) $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/dist .
+
 VENDOR := stages/view/assets/vendor
 
 vendor-js: ## bundle three.js for the page of `lunargr view` again (needs npm; versions in its package.json)
@@ -79,7 +84,8 @@ D := demo
 # One split of the scene for everything that is sampled from it: a quarter of its ground tiles is for testing, 20 at least.
 DEMO_SPLIT := --split 65/10/25
 # fp32: the README's figures must not hang on whether a processor is made for bf16
-DEMO_TRAIN := --epochs 6 --precision fp32
+# batches of 8: few pairs need many steps
+DEMO_TRAIN := --epochs 6 --batch 8 --precision fp32
 DEMO_RUNS := $(foreach seed,0 1 2,$(D)/checkpoint_$(seed).h5)
 
 demo: $(D)/report.html ## run every stage on the embedded scene and name a report to open
@@ -149,13 +155,17 @@ $(D)/checkpoint_m2.h5: $(D)/pairs.h5
 $(D)/m2.h5: $(D)/pairs.h5 $(D)/checkpoint_m2.h5
 	$(LUNARGR) evaluate $^ --only learned --only learned_gain_offset -o $@ --overwrite
 
-figures: ## write every figure of README.md and docs/ from what demo, reproduce-apollo15 and reproduce-models left
+figures: ## write every figure of README.md and docs/, and the notebook, from what demo, reproduce-* and bench left
 	$(BIN)/python examples/figures.py
+	@# the notebook trains its own network for two passes, and keeps it
+	if [ -f $(D)/pairs.h5 ]; then cd $(D) && ../$(BIN)/python ../examples/notebook_page.py; fi
 
 # --- real photographs: Apollo 15 metric camera frames over the GLD100 elevation model ------------------------------
 
 A := results/apollo15
 A_DATA := $(SHARED)/data/apollo15
+A_RUNS := $(foreach seed,0 1 2,$(A)/checkpoint_$(seed).h5)
+A_FOLDS := $(foreach fold,1 2 3 4 5,$(A)/fold_$(fold).h5)
 
 reproduce-apollo15: $(A)/report.html ## the same stages on five real Apollo 15 frames (needs the reference data)
 	@echo; echo "Open $(abspath $(A)/report.html)"
@@ -171,19 +181,26 @@ $(A)/crops.h5: $(A)/scene.h5
 $(A)/pairs.h5: $(A)/crops.h5
 	$(LUNARGR) project $< --register field -o $@ --overwrite
 
-$(A)/checkpoint.h5: $(A)/pairs.h5
-	$(LUNARGR) train $< --model kernels --epochs 6 --precision fp32 -o $@ --overwrite --resume
+$(A_RUNS): $(A)/checkpoint_%.h5: $(A)/pairs.h5
+	$(LUNARGR) train $< --model kernels --epochs 6 --precision fp32 --seed $* -o $@ --overwrite --resume
 
-$(A)/svbrdf.h5: $(A)/scene.h5 $(A)/checkpoint.h5
+$(A)/svbrdf.h5: $(A)/scene.h5 $(A)/checkpoint_0.h5
 	$(LUNARGR) infer $^ -o $@ --overwrite
 
 $(A)/render.exr: $(A)/svbrdf.h5
 	$(LUNARGR) render $< --subsolar-longitude 79 --subsolar-latitude 0.243 -o $@ --overwrite
 
-$(A)/evaluation.h5: $(A)/pairs.h5 $(A)/checkpoint.h5
+# the map with albedo from all frames but one, for each of the five
+$(A_FOLDS): $(A)/fold_%.h5: $(A)/svbrdf.h5 $(A)/scene.h5
+	$(LUNARGR) albedo $^ --fold $*/5 --register field --no-geotiff -o $@ --overwrite
+
+$(A)/held_out.h5: $(A)/pairs.h5 $(A_FOLDS)
+	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite
+
+$(A)/evaluation.h5: $(A)/pairs.h5 $(A_RUNS)
 	$(LUNARGR) evaluate $^ -o $@ --figures $(A)/figures --overwrite
 
-$(A)/match.json: $(A)/pairs.h5 $(A)/checkpoint.h5
+$(A)/match.json: $(A)/pairs.h5 $(A)/checkpoint_0.h5
 	$(LUNARGR) match $^ --count 12 --json $@ --figures $(A)/figures --overwrite
 
 $(A)/diagnosis.h5: $(A)/scene.h5
@@ -191,16 +208,16 @@ $(A)/diagnosis.h5: $(A)/scene.h5
 	$(LUNARGR) project $(A)/stack_crops.h5 -o $(A)/stack.h5 --overwrite
 	$(LUNARGR) diagnose $(A)/stack.h5 --model hapke -o $@ --json $(A)/diagnosis.json --report $(A)/diagnosis.html --overwrite
 
-$(A)/report.html: $(A)/evaluation.h5 $(A)/match.json $(A)/render.exr $(A)/diagnosis.h5
-	$(LUNARGR) report $(A)/scene.h5 $(A)/crops.h5 $(A)/pairs.h5 $(A)/checkpoint.h5 $(A)/svbrdf.h5 $(A)/evaluation.h5 $(A)/match.json \
-	    $(A)/diagnosis.json $(A)/render.png -o $@ --title "Apollo 15 metric camera over GLD100" --overwrite
+$(A)/report.html: $(A)/evaluation.h5 $(A)/held_out.h5 $(A)/match.json $(A)/render.exr $(A)/diagnosis.h5
+	$(LUNARGR) report $(A)/scene.h5 $(A)/crops.h5 $(A)/pairs.h5 $(A)/checkpoint_0.h5 $(A)/svbrdf.h5 $(A)/evaluation.h5 $(A)/held_out.h5 \
+	    $(A)/match.json $(A)/diagnosis.json $(A)/render.png -o $@ --title "Apollo 15 metric camera over GLD100" --overwrite
 
 # --- the paper's model comparison ----------------------------------------------------------------------------------
 
 MODELS_PAIRS ?= $(D)/pairs.h5
 
 reproduce-models: $(MODELS_PAIRS) ## train M1..M6, kernels and Hapke from three seeds on the same pairs; the paper's table with spreads
-	$(LUNARGR) compare $< -o results/models --seeds 3 --epochs 8 --precision fp32 --json results/models.json --resume
+	$(LUNARGR) compare $< -o results/models --seeds 3 --epochs 4 --batch 8 --precision fp32 --json results/models.json --resume
 
 clean: ## remove what the targets made, except .venv
 	rm -rf demo results build *.egg-info .pytest_cache .ruff_cache .mypy_cache

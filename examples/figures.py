@@ -18,6 +18,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from stages.common.page.diagnosis import conclusions as diagnosis_sentences  # noqa: E402
+from stages.common.page.sentences import Sentence  # noqa: E402
 from stages.report import conclusions  # noqa: E402
 from stages.report.held_out import TITLES as MAPS  # noqa: E402
 
@@ -61,7 +63,7 @@ def with_bounds(value: float, low: float | None, high: float | None, spread: flo
     return f"{text} ({ends})"
 
 
-def said(sentences: list[conclusions.Sentence]) -> list[str]:
+def said(sentences: list[Sentence]) -> list[str]:
     return [f"- {text}" for text, _ in sentences]
 
 
@@ -89,7 +91,20 @@ def evaluated(result: dict[str, Any], names: Iterable[str], more: list[list[str]
         lines
         + table(["model", "what it may know", "MSE", "SSIM"], [*rows, *more])
         + said(conclusions.evaluation(result))
+        + covered(result)
     )
+
+
+def covered(result: dict[str, Any]) -> list[str]:
+    """What the error bars hold."""
+    found = result.get("coverage_percent")
+    if not found:
+        return []
+    bands = [band["95"] for band in found.get("by_incidence", []) if band["pixels"]]
+    spread = f"; by incidence those of 95 % hold {min(bands):.1f} to {max(bands):.1f} %" if bands else ""
+    return [
+        f"- Intervals that should hold 68 and 95 % of the pixels hold {found['68']:.1f} and {found['95']:.1f} %{spread}."
+    ]
 
 
 def brief(result: dict[str, Any]) -> list[str]:
@@ -126,14 +141,10 @@ def held_out(root: Path, folder: str, command: str) -> list[str]:
          "-" if row.get("ssim") is None else f"{row['ssim']:.3f}"]
         for name, row in result["models"].items()
     ]  # fmt: skip
-    lines = [f"Claim: {result['claim']}; {conclusions.basis(result)}, {len(result['images'])} images."]
+    unit = "" if result.get("image_units") == "iof" else " MSE in DN squared."
+    lines = [f"Claim: {result['claim']}; {conclusions.basis(result)}, {len(result['images'])} images.{unit}"]
     lines += table(["map", "MSE", "SSIM"], rows) + said(conclusions.held_out_images(result))
-    coverage = result.get("coverage_percent")
-    if coverage:
-        lines.append(
-            f"- Intervals that should hold 68 and 95 % of the pixels hold {coverage['68']:.1f} and {coverage['95']:.1f} %."
-        )
-    return lines
+    return lines + covered(result)
 
 
 def matched(root: Path, folder: str, command: str) -> list[str]:
@@ -150,7 +161,7 @@ def matched(root: Path, folder: str, command: str) -> list[str]:
 
 
 def diagnosed(root: Path, folder: str, command: str) -> list[str]:
-    return said(conclusions.diagnosis(read(root, f"{folder}/diagnosis.json", command)))
+    return said(diagnosis_sentences(read(root, f"{folder}/diagnosis.json", command)))
 
 
 def apollo15(root: Path) -> list[str]:
@@ -184,6 +195,99 @@ def commands(_: Path) -> list[str]:
     return [f"    {re.sub(r'^ +', '    ', line)}" for line in lines.splitlines()]
 
 
+def benchmark(root: Path, name: str) -> list[str]:
+    """What a benchmark printed, word for word."""
+    try:
+        said = (root / f"results/bench/{name}.txt").read_text().rstrip()
+    except FileNotFoundError:
+        raise Absent(f"results/bench/{name}.txt", f"make bench ONLY={name.removeprefix('bench_')}") from None
+    return ["```text", *said.splitlines(), "```"]
+
+
+SIZES = (
+    ("scene.h5", "Mpx of the working grid", "scene.h5:elevation"),
+    ("crops.h5", "pair", "crops.h5:elevation"),
+    ("pairs.h5", "pair", "pairs.h5:elevation"),
+    ("checkpoint_0.h5", "", ""),
+    ("svbrdf.h5", "Mpx", "svbrdf.h5:elevation"),
+    ("svbrdf.tif", "Mpx", "svbrdf.h5:elevation"),
+    ("svbrdf_albedo.h5", "Mpx", "svbrdf_albedo.h5:elevation"),
+    ("evaluation.h5", "crop", "evaluation.h5:measured"),
+    ("render.exr", "Mpx", "svbrdf.h5:elevation"),
+    ("view.html", "Mpx", "svbrdf.h5:elevation"),
+)
+
+
+def sizes(root: Path) -> list[str]:
+    """Bytes of the demo's files, and of each unit in them."""
+    import h5py
+
+    rows = []
+    for name, unit, counted in SIZES:
+        try:
+            size = (root / "demo" / name).stat().st_size
+            per = "-"
+            if counted:
+                file, variable = counted.split(":")
+                with h5py.File(root / "demo" / file) as opened:
+                    shape = opened[variable].shape
+                number = shape[0] if len(shape) == 3 else shape[0] * shape[1] / 1e6
+                per = (
+                    f"{size / number / 1e3:,.0f} kB a {unit}"
+                    if len(shape) == 3
+                    else f"{size / number / 1e6:.1f} MB a {unit}"
+                )
+        except FileNotFoundError:
+            raise Absent(f"demo/{name}", DEMO) from None
+        rows.append([f"`{name}`", f"{size / 1e6:.1f} MB", per])
+    return table(["file of the demo", "size", "each"], rows)
+
+
+# Tycho: a DEM of 95 x 90 km at 1 m worked on at 5 m, 667 images of 5,000 x 50,000 px and the Lunar-G2R paper's pairs.
+# Global: the Moon at 100 m and a tenth of overlap, in local maps. (stage, work at Tycho, at global scale, in the table's unit)
+CAMPAIGNS = (
+    ("ingest", 8550.0, 4180.0),
+    ("ingest --images", 667 * 250.0, None),
+    ("sample", 83.614, None),
+    ("project", 83.614, None),
+    ("infer", 342.0, 4180.0),
+    ("render", 342.0, 4180.0),
+    ("evaluate", 8.337, None),
+)
+
+
+def campaigns(root: Path) -> list[str]:
+    """Processor time of large work, from the rates that bench_scaling measured and wrote into the page."""
+    try:
+        text = (root / "docs" / "scaling.md").read_text()
+    except FileNotFoundError:
+        raise Absent("docs/scaling.md", "python tests/benchmarks/bench_scaling.py --docs docs/scaling.md") from None
+    rates = {m[1]: (m[2], float(m[3]), m[4]) for m in RATE.finditer(text)}
+    rows = []
+    for stage, *works in CAMPAIGNS:
+        if stage not in rates:
+            raise Absent(f"the rate of {stage}", "python tests/benchmarks/bench_scaling.py --docs docs/scaling.md")
+        peaks, rate, unit = rates[stage]
+        memory = max(float(p.replace(",", "")) for p in peaks.split(", ")) / 1e3
+        times = ["" if work is None else duration(rate * work) for work in works]
+        rows.append(
+            [
+                f"`{stage}`",
+                f"{works[0]:,.3g} {unit}" if works[0] < 1e3 else f"{works[0]:,.0f} {unit}",
+                *times,
+                f"{memory:.1f} GB",
+            ]
+        )
+    return table(["stage", "work at Tycho", "Tycho", "global 100 m map", "memory"], rows)
+
+
+RATE = re.compile(r"^\| `([a-z -]+)` \| [^|]*\| ([^|]*?) \|.*\| ([0-9.]+) s per ([^|]*?) \|$", re.M)
+
+
+def duration(seconds: float) -> str:
+    return f"{seconds / 60:.1f} min" if seconds < 3600 else f"{seconds / 3600:.1f} h"
+
+
 BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "demo-commands": commands,
     "demo": demo,
@@ -192,9 +296,16 @@ BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "demo-match": lambda root: matched(root, "demo", DEMO),
     "demo-diagnosis": lambda root: diagnosed(root, "demo", DEMO),
     "apollo15": apollo15,
+    "apollo15-held-out": lambda root: held_out(root, "results/apollo15", APOLLO),
     "apollo15-match": lambda root: matched(root, "results/apollo15", APOLLO),
     "apollo15-diagnosis": lambda root: diagnosed(root, "results/apollo15", APOLLO),
     "models": models,
+    "demo-sizes": sizes,
+    "campaigns": campaigns,
+    "bench-training": lambda root: benchmark(root, "bench_training"),
+    "bench-layer": lambda root: benchmark(root, "bench_layer"),
+    "bench-inference": lambda root: benchmark(root, "bench_inference"),
+    "bench-view": lambda root: benchmark(root, "bench_view"),
 }
 
 

@@ -7,17 +7,22 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
+import shutil
 import sys
 import time
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from lunargr_cli import raise_again
+from lunargr_cli.progress import Pace, bar_line, progress_words
+from lunargr_cli.spelling import spell
 from schemas.errors import InputError
 
+_BEGAN = time.monotonic()
 LIBRARIES = "LUNARGR_LIBRARY_MESSAGES"  # set: what libraries print on standard error is let through
 # Control codes, marks that turn the direction of writing, halves of surrogate pairs, line separators.
 _STEERING = ("Cc", "Cf", "Cs", "Zl", "Zp")
@@ -66,51 +71,63 @@ def say_error(message: str) -> None:
     print(f"lunargr: {harmless(' '.join(message.split()))}", file=sys.stderr)
 
 
+def say_effort() -> None:
+    """Time and memory of this process and the parts that it had done, on standard error."""
+    import resource
+
+    own, parts = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    processor = sum(r.ru_utime + r.ru_stime for r in (own, parts))
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes
+    memory = max(own.ru_maxrss, parts.ru_maxrss) * unit / 1e6
+    started = time.monotonic() - _BEGAN
+    print(f"lunargr: {started:.1f} s, {processor:.1f} s of processor time, at most {memory:,.0f} MB", file=sys.stderr)
+
+
 @dataclass
 class Console:
     """The messages and progress of one command.
 
-    ``stage.run`` takes ``console.progress`` as a callable ``(done, total, what)``; on a terminal the line is redrawn,
-    in a log file it is printed every ten seconds.
+    ``stage.run`` takes ``console.progress`` as a callable ``(done, total, what)``; on a terminal it is a bar that is redrawn,
+    in a log file a line every ten seconds.
     """
 
     quiet: bool = False
-    _started: float = field(default_factory=time.monotonic)
-    _shown: float = field(default=0.0)
-    _open_line: bool = field(default=False)
+    _pace: Pace = field(default_factory=Pace)
+    _shown: float | None = field(default=None)
+    _bar: bool = field(default=False)
 
     def say(self, message: str) -> None:
         """A line for the person at the terminal."""
         if not self.quiet:
-            self._end_line()
-            print(harmless(message), file=sys.stderr, flush=True)
+            self._wipe_bar()
+            print(harmless(spell(message)), file=sys.stderr, flush=True)
 
     def progress(self, done: int, total: int, what: str = "") -> None:
         """Show how far a long loop is and how long it still takes."""
         raise_again()
-        now = time.monotonic()
-        if done == 0:
-            self._started = now
-        terminal = sys.stderr.isatty()
+        times = self._pace.report(done, total)
+        terminal, now = sys.stderr.isatty(), time.monotonic()
+        if self._shown is None:  # a short loop leaves one line in a log
+            self._shown = -math.inf if terminal else now
         if self.quiet or (done < total and now - self._shown < (0.1 if terminal else 10.0)):
             return
         self._shown = now
-        elapsed = now - self._started
-        left = f", {_duration(elapsed / done * (total - done))} left" if 0 < done < total else ""
-        line = harmless(f"{what or 'progress'}: {done}/{total} ({_duration(elapsed)}{left})")
+        what = harmless(what or "progress")
         if terminal:
+            plain = not (sys.stderr.encoding or "").lower().startswith("utf")
+            line = bar_line(what, done, total, times, shutil.get_terminal_size().columns, plain)
             print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
-            self._open_line = True
+            self._bar = True
             if done >= total:
-                self._end_line()
+                self._end_bar()
         elif done:
-            print(line, file=sys.stderr, flush=True)
+            print(f"{what}: {progress_words(done, total, times)}", file=sys.stderr, flush=True)
 
     def table(self, title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         """A result table on standard output, plain enough for a log and a pipe."""
         if self.quiet:
             return
-        self._end_line()
+        self._wipe_bar()
         from rich import box
         from rich.console import Console as RichConsole
         from rich.table import Table
@@ -126,17 +143,23 @@ class Console:
         with _standard_output():
             RichConsole(file=sys.stdout, width=width, highlight=False, markup=False).print(table)
 
-    def _end_line(self) -> None:
-        if self._open_line:
+    def _wipe_bar(self) -> None:
+        """Take the unfinished bar away: the next report draws it again below what is said now."""
+        if self._bar:
+            print("\r\x1b[K", end="", file=sys.stderr)
+            self._bar = False
+
+    def _end_bar(self) -> None:
+        if self._bar:
             print(file=sys.stderr)
-            self._open_line = False
+            self._bar = False
 
 
-def own_streams() -> None:
+def own_streams(verbose: bool = False) -> None:
     """Standard output and error for our lines alone, also where the shell closed them.
 
     PROJ, libtiff, HDF5 and others print on the error stream from C, Python's libraries by warnings and loggers. What they
-    have to say to a user our own line says; LUNARGR_LIBRARY_MESSAGES=1 lets them speak.
+    have to say to a user our own line says; -v and LUNARGR_LIBRARY_MESSAGES=1 let them speak.
     """
     for number in (0, 1, 2):  # else the first file that is opened gets the place of a closed stream
         try:
@@ -148,7 +171,9 @@ def own_streams() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
-    if os.environ.get(LIBRARIES) or sys.stderr is not sys.__stderr__:  # a caller's own streams are left alone
+    if (
+        verbose or os.environ.get(LIBRARIES) or sys.stderr is not sys.__stderr__
+    ):  # a caller's own streams are left alone
         return
     if not sys.warnoptions:
         warnings.simplefilter("ignore")
@@ -159,15 +184,3 @@ def own_streams() -> None:
     os.close(nowhere)
     # For good: C libraries go on talking while Python ends.
     sys.stderr = os.fdopen(own, "w", buffering=1, errors="backslashreplace")
-
-
-Progress = Callable[[int, int, str], None]
-
-
-def _duration(seconds: float) -> str:
-    seconds = round(seconds)
-    if seconds < 60:
-        return f"{seconds} s"
-    if seconds < 3600:
-        return f"{seconds // 60} min {seconds % 60:02d} s"
-    return f"{seconds // 3600} h {seconds % 3600 // 60:02d} min"

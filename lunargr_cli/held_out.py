@@ -5,30 +5,26 @@ from __future__ import annotations
 from pathlib import Path
 
 from lunargr_cli.console import Console
+from schemas.files.outputs import Output
 
 
 def show_held_out_images(
-    console: Console,
-    pairs: Path,
-    maps: list[Path],
-    output: Path,
-    how: tuple[str, int],
-    json_file: Path | None,
-    overwrite: bool,
+    console: Console, pairs: Path, maps: list[Path], output: Output, split: str, seed: int
 ) -> None:
-    """Score maps with albedo on images that did not make it. how : split, seed. Raises LunargrError."""
-    from stages.evaluate.held_out_images import Config, coverage_lines, image_lines, result_lines, run
+    """Score maps with albedo on images that did not make it. Raises LunargrError."""
+    from stages.evaluate.coverage import coverage_lines
+    from stages.evaluate.held_out_images import Config, image_lines, result_lines, run
 
-    result = run(pairs, maps, output, Config(*how), json_file, overwrite, console.progress)
+    result = run(pairs, maps, output, Config(split, seed), console.say, console.progress)
     suns = result["nearest_used_sun_deg"]
     columns, cells = result_lines(result)
     console.table(
-        f"{result['claim']}: {result['pairs']} crops of split '{how[0]}', {result['tiles']} ground tiles, "
+        f"{result['claim']}: {result['pairs']} crops of split '{split}', {result['tiles']} ground tiles, "
         f"Suns {suns['least']:.1f} to {suns['most']:.1f} deg from the nearest one used",
         columns,
         cells,
     )
     console.table("by image", *image_lines(result))
     if result["coverage_percent"] is not None:
-        console.table("pixels within the intervals, percent", *coverage_lines(result))
-    console.say(f"written: {output}, {output.with_suffix('.json')}")
+        console.table("pixels within the intervals, percent", *coverage_lines(result["coverage_percent"]))
+    console.say(f"written: {output.file}, {output.file.with_suffix('.json')}")

@@ -19,15 +19,18 @@ from typing import Annotated, Any
 import typer
 
 from lunargr_cli import INTERRUPTED, commands, quiet_interruptions, signals, stop
-from lunargr_cli.console import flush_out, own_streams, say_error, write_out
+from lunargr_cli.console import flush_out, own_streams, say_effort, say_error, write_out
 from lunargr_cli.options import check_numbers
 from lunargr_cli.paths import guarded
+from lunargr_cli.spelling import running, spell
 from schemas.command_line import said
 from schemas.errors import EXIT_CODE, InputError, LunargrError
 from schemas.files.locks import claim
 
 # Threads that wait for each other by spinning slow a busy machine down many times over. Read when torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+VERBOSE = ("--verbose", "-v")
 
 
 def _command_line() -> str:
@@ -41,12 +44,18 @@ def _command_line() -> str:
 
 
 def _checked(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, which no number that is not finite reaches."""
+    """The command, which no number that is not finite reaches, and whose errors name its options."""
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
-        check_numbers(command, inspect.signature(command).bind(*arguments, **options).arguments)
-        command(*arguments, **options)
+        before = running.set(command)
+        try:
+            check_numbers(command, inspect.signature(command).bind(*arguments, **options).arguments)
+            command(*arguments, **options)
+        except LunargrError as error:
+            raise type(error)(spell(str(error))) from None
+        finally:
+            running.reset(before)
 
     return run
 
@@ -113,6 +122,12 @@ def _options(
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and stop.")
     ] = False,
+    verbose: Annotated[
+        bool,
+        typer.Option(
+            *VERBOSE, help="Let libraries say their own, and tell time and memory at the end; before or after COMMAND."
+        ),
+    ] = False,
 ) -> None:
     """Options before a command."""
 
@@ -122,12 +137,26 @@ for _module in sorted(
     key=lambda module: module.ORDER,
 ):
     _command = _checked(_alone(_module.command, getattr(_module, "SHARED_OUTPUT", False)))
-    app.command(name=_module.NAME, cls=getattr(_module, "CLASS", None))(_command)
+    # Named, the first sentence is wrapped in the list of commands; left to click, it is cut off.
+    _summary = " ".join((_module.command.__doc__ or "").split()).split(". ")[0].rstrip(".")
+    app.command(name=_module.NAME, cls=getattr(_module, "CLASS", None), short_help=_summary)(_command)
+
+
+def take_verbose(words: list[str]) -> bool:
+    """Take -v out of a command line, wherever it stands: it is no part of what a command does, nor of its record."""
+    end = words.index("--") if "--" in words else len(words)
+    kept = [word for word in words[:end] if word not in VERBOSE]
+    verbose = len(kept) < end
+    words[:end] = kept
+    return verbose
 
 
 def main() -> None:
     """Run the command line; a LunargrError is one line on standard error and exit code 3."""
-    own_streams()
+    words = sys.argv[1:]
+    verbose = take_verbose(words)
+    sys.argv[1:] = words
+    own_streams(verbose)
     for number in (signal.SIGINT, signal.SIGTERM):  # a Slurm time limit or `kill` unwinds like Ctrl-C
         signal.signal(number, stop)
     quiet_interruptions()
@@ -138,6 +167,8 @@ def main() -> None:
             app()
         finally:
             flush_out()
+            if verbose:
+                say_effort()
     except BaseException as error:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is left to tidy while Python ends
         # What an interruption breaks may say something else: a library that was just being imported, for one.

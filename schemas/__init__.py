@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from schemas.artefacts import CHECKPOINT, CROPS, DIAGNOSIS, EVALUATION, PAIRS, SCENE, SPLITS, SVBRDF, UNITS
 from schemas.declaration import SCHEMAS, Attribute, Schema, Variable, get_schema
@@ -16,19 +15,8 @@ from schemas.errors import (
     LunargrError,
     RegistryError,
 )
+from schemas.later import imported_later
 from schemas.truth import TRUTH
-
-# Where those are who need h5py: `lunargr --help` must answer at once.
-_LATER = {
-    "ArtefactWriter": "writing",
-    "atomic_path": "files.outputs",
-    "check_output": "files.outputs",
-    "open_artefact": "reading",
-    "read_config": "reading",
-    "read_kind": "reading",
-    "read_strings": "reading",
-    "write_json": "files.outputs",
-}
 
 if TYPE_CHECKING:
     from schemas.files.outputs import atomic_path, check_output, write_json
@@ -36,11 +24,7 @@ if TYPE_CHECKING:
     from schemas.writing import ArtefactWriter
 
 
-def __getattr__(name: str) -> Any:
-    if name in _LATER:
-        return getattr(importlib.import_module(f"schemas.{_LATER[name]}"), name)
-    raise AttributeError(f"module 'schemas' has no attribute '{name}'")
-
+__getattr__ = imported_later(__name__, "files.outputs", "reading", "writing")
 
 __all__ = [
     "CHECKPOINT",

@@ -10,7 +10,6 @@ import datetime
 import hashlib
 import json
 import os
-import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -24,6 +23,7 @@ from schemas.checks import parse_json
 from schemas.command_line import said
 from schemas.declaration import Schema
 from schemas.errors import ArtefactError
+from schemas.rasters import raster_text
 
 CONVENTIONS = "CF-1.11"
 SIDECAR = "record.json"  # beside files that cannot carry a record themselves: rasters and tables
@@ -75,6 +75,22 @@ def current_command() -> tuple[str, str] | None:
 
 def describe_run(schema: Schema, config: Mapping[str, Any], inputs: Sequence[Path], seed: int | None) -> dict[str, Any]:
     """The root attributes that say who makes an artefact now, and from what."""
+    about = {"title": schema.title, "lunargr_schema": schema.name, "schema_version": np.int32(schema.version)}
+    return {"Conventions": CONVENTIONS} | about | _describe(schema.stage, config, inputs, seed)
+
+
+def raster_record(stage: str, config: Mapping[str, Any], inputs: Sequence[Path]) -> str:
+    """The same for a GeoTIFF or EXR, which holds it as one line of JSON: see ``schemas.rasters``."""
+    return pack_record({"lunargr_schema": stage} | _describe(stage, config, inputs, None))
+
+
+def pack_record(root: Mapping[str, Any]) -> str:
+    """Root attributes of an artefact as the one line that a raster of the same run holds."""
+    record, ancestors = _unpack(root, "the run")
+    return json.dumps({"record": record, "provenance": ancestors}, sort_keys=True)
+
+
+def _describe(stage: str, config: Mapping[str, Any], inputs: Sequence[Path], seed: int | None) -> dict[str, Any]:
     sources = [{"name": Path(p).name, "sha256": sha256(Path(p))} for p in inputs]
     command, folder = current_command() or ("", "")
     ancestors: dict[str, dict[str, Any]] = {}
@@ -84,12 +100,8 @@ def describe_run(schema: Schema, config: Mapping[str, Any], inputs: Sequence[Pat
         if own is not None:
             ancestors[source["sha256"]] = own
     return {
-        "Conventions": CONVENTIONS,
-        "title": schema.title,
-        "lunargr_schema": schema.name,
-        "schema_version": np.int32(schema.version),
         "lunargr_version": version("lunargr"),
-        "history": f"{_now()} {command or 'lunargr ' + schema.stage}",
+        "history": f"{_now()} {command or 'lunargr ' + stage}",
         "command": command,
         "folder": folder,
         "config": json.dumps(config, default=str, sort_keys=True),
@@ -105,7 +117,7 @@ def read_record(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, 
     digests: list[tuple[str, str]] = []
     try:
         if not h5py.is_hdf5(path):
-            return _read_sidecar(path), {}
+            return _read_raster(path)
         with h5py.File(path, "r") as file:
             root = {k: (v.decode() if isinstance(v, bytes) else v) for k, v in file.attrs.items()}
             if root.get("lunargr_schema") == "scene" and "sha256" in file and "camera_sha256" in file:
@@ -115,6 +127,23 @@ def read_record(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, 
         return None, {}
     if "lunargr_schema" not in root:
         return None, {}
+    record, ancestors = _unpack(root, path)
+    if digests:
+        record["images"] = {"count": len(digests), "sha256": digest_of(d for pair in digests for d in pair if d)}
+    return record, ancestors
+
+
+def _read_raster(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, Any]]]:
+    """The same of a GeoTIFF or EXR that holds its record, or has it beside it."""
+    text = raster_text(path)
+    if not text:
+        return _read_sidecar(path), {}
+    found = parse_json(text, f"{path}: its record")
+    record, ancestors = (found.get(k) if isinstance(found, dict) else None for k in ("record", "provenance"))
+    return _checked(path, record, ancestors)
+
+
+def _unpack(root: Mapping[str, Any], path: object) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
     record = {
         "schema": str(root["lunargr_schema"]),
         "history": str(root.get("history", "")),
@@ -125,9 +154,11 @@ def read_record(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, 
         "config": _parse(path, root, "config", "{}"),
         "inputs": _parse(path, root, "inputs", "[]"),
     }
-    if digests:
-        record["images"] = {"count": len(digests), "sha256": digest_of(d for pair in digests for d in pair if d)}
-    ancestors = _parse(path, root, "provenance", "{}")
+    return _checked(path, record, _parse(path, root, "provenance", "{}"))
+
+
+def _checked(path: object, record: Any, ancestors: Any) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Both, if :func:`chain` can follow them. Raises ArtefactError."""
     if not (_is_record(record) and isinstance(ancestors, dict) and all(_is_record(r) for r in ancestors.values())):
         raise ArtefactError(
             f"{path}: expected records of the files it descends from in 'inputs' and 'provenance', found something else; "
@@ -136,7 +167,7 @@ def read_record(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, 
     return record, ancestors
 
 
-def _parse(path: Path, root: Mapping[str, Any], name: str, absent: str) -> Any:
+def _parse(path: object, root: Mapping[str, Any], name: str, absent: str) -> Any:
     return parse_json(str(root.get(name, absent)), f"{path}: root attribute '{name}'")
 
 
@@ -192,25 +223,6 @@ def _read_sidecar(path: Path) -> dict[str, Any] | None:
 
 def _now() -> str:
     return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-def whole_command(command: str, output: Path) -> str:
-    """What one run would have been called with, from a shard's command line: no --shard, and the whole's name."""
-    words, kept, named, skip = shlex.split(command), [], False, False
-    for word in words:
-        name, equals, _ = word.partition("=")
-        if skip:
-            skip = False
-        elif name == "--shard":
-            skip = not equals
-        elif name in ("-o", "--output"):
-            kept += ["-o", str(output)]
-            skip, named = not equals, True
-        else:
-            kept.append(word)
-    if words and not named:
-        kept += ["-o", str(output)]
-    return shlex.join(kept)
 
 
 @dataclass(frozen=True)

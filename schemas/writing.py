@@ -67,13 +67,14 @@ class ArtefactWriter:
             except OSError as error:
                 if is_full_disk(error):
                     raise
-                raise ConfigError(f"{self.path}: cannot be written ({error}); choose another --output.") from None
+                raise ConfigError(f"{self.path}: cannot be written ({error}); choose another `output`.") from None
             for key, value in self._root_attributes.items():
                 self.file.attrs[key] = value
             for order, (name, size) in enumerate(self.sizes.items()):
                 if name not in self.schema:  # a coordinate variable carries its own scale
-                    scale = self.file.create_dataset(name, shape=(size,), dtype=">f4")
-                    scale.make_scale(_BARE_DIMENSION % size)
+                    named = f"{name}_name" in self.schema
+                    scale = self.file.create_dataset(name, (size,), h5py.string_dtype() if named else ">f4")
+                    scale.make_scale(name if named else _BARE_DIMENSION % size)
                     scale.attrs["_Netcdf4Dimid"] = np.int32(order)
             for name, size in self.sizes.items():
                 if name in self.schema:
@@ -94,6 +95,7 @@ class ArtefactWriter:
                 error = RuntimeError(f"{self.schema.name}: written without {', '.join(missing)}")
                 self._stack.__exit__(type(error), error, None)
                 raise error
+            self._name_coordinates()
             error = self._flush()
         self._failed = error is not None
         if is_full_disk(error):
@@ -103,6 +105,13 @@ class ArtefactWriter:
         self._kept.clear()
         if kind is None and error is not None:
             raise error
+
+    def _name_coordinates(self) -> None:
+        """A dimension whose entries have names gets them as its coordinate: xarray's ``sel(coefficient="a")`` takes them."""
+        for dim in self.sizes:
+            if f"{dim}_name" in self.schema and f"{dim}_name" in self.file:
+                self.file[dim][...] = self.file[f"{dim}_name"][...]
+                self.file[dim].attrs["long_name"] = self.schema[f"{dim}_name"].description
 
     def _flush(self) -> BaseException | None:
         """Write everything that HDF5 still holds; what went wrong, now or where a dataset was let go of."""

@@ -24,11 +24,20 @@ from schemas import (
     read_strings,
     write_json,
 )
+from schemas.files.outputs import Output
 from stages.common.intervals import ERROR, LOG, ground_variance, join, ratio_interval, run_variance, two_sided_p
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 
 # Validation MSE summed over a crop of 128 x 128 px, where the Lunar-G2R paper's text gives it.
 PAPER = {"M1": 4.51, "M2": 4.06, "M6": 5.34}
-LEVEL = 0.05
+TABLE, CURVES = "comparison.json", "validation_curves.png"  # within the folder of a comparison
+
+
+@dataclass(frozen=True)
+class Config:
+    """level : of significance, after Holm's adjustment, below which a difference is called larger than its noise"""
+
+    level: float = 0.05
 
 
 @dataclass
@@ -77,7 +86,7 @@ def read_runs(evaluation: Path, checkpoints: Sequence[Path]) -> list[Trained]:
     return runs
 
 
-def compare(runs: Sequence[Trained]) -> dict[str, Any]:
+def compare(runs: Sequence[Trained], config: Config = Config()) -> dict[str, Any]:
     """The table of models, best first, and every pair of them with the noise of their difference.
 
     The logarithm of the ratio of two mean MSE has the variance of both means over seeds plus that of a paired jackknife
@@ -95,7 +104,7 @@ def compare(runs: Sequence[Trained]) -> dict[str, Any]:
     mean = {m: float(np.mean([r.mse for r in g])) for m, g in groups.items()}
     order = sorted(models, key=mean.__getitem__)
     pairs = [_difference(groups[a], groups[b]) for a, b in combinations(order, 2)]
-    _holm(pairs)
+    _holm(pairs, config.level)
     tile = runs[0].tile
     return {
         "models": {m: _row(groups[m]) for m in order},
@@ -119,7 +128,7 @@ def _row(group: Sequence[Trained]) -> dict[str, Any]:
         "mse_crop_sum": float(np.mean(sums)),
         "mse_crop_sum_seed_std": float(np.std(sums, ddof=1)) if several else None,
         "paper_mse_crop_sum": PAPER.get(first.model),
-        "best_epoch": [r.best_epoch + 1 for r in group],
+        "best_epoch": [r.best_epoch for r in group],
         "seeds": [r.seed for r in group],
     }
 
@@ -149,7 +158,7 @@ def _difference(better: Sequence[Trained], worse: Sequence[Trained]) -> dict[str
     return found
 
 
-def _holm(pairs: list[dict[str, Any]]) -> None:
+def _holm(pairs: list[dict[str, Any]], level: float) -> None:
     """Add Holm's adjusted p and the verdict to every pair."""
     known = sorted((p for p in pairs if p["p"] is not None), key=lambda p: p["p"])
     running = 0.0
@@ -158,7 +167,7 @@ def _holm(pairs: list[dict[str, Any]]) -> None:
         pair["p_adjusted"] = running
     for pair in pairs:
         pair.setdefault("p_adjusted", None)
-        pair["larger_than_noise"] = None if pair["p"] is None else pair["p_adjusted"] < LEVEL
+        pair["larger_than_noise"] = None if pair["p"] is None else pair["p_adjusted"] < level
 
 
 def _number(value: float) -> float | None:
@@ -166,15 +175,20 @@ def _number(value: float) -> float | None:
 
 
 def run(
-    files: Sequence[tuple[Path, Sequence[Path]]], json_file: Path | None = None, figures: Path | None = None
+    files: Sequence[tuple[Path, Sequence[Path]]],
+    output: Output | Path,
+    config: Config = Config(),
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> dict[str, Any]:
-    """Compare the runs behind (evaluation, checkpoints) of every model; writes JSON and the curves where asked."""
+    """Compare the runs behind (evaluation, checkpoints) of every model; writes JSON and curves into the folder ``output``."""
+    output = Output.of(output)
     runs = [run for evaluation, checkpoints in files for run in read_runs(evaluation, checkpoints)]
-    result = compare(runs)
-    if json_file is not None:
-        write_json(json_file, result)
-    if figures is not None:
-        write_curves(runs, figures)
+    result = compare(runs, config)
+    write_curves(runs, output.file / CURVES)
+    for path in (output.file / TABLE, output.json):
+        if path is not None:
+            write_json(path, result)
     return result
 
 

@@ -6,22 +6,25 @@ Bands are known by their descriptions, never by their position: programs order t
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import rasterio
 from rasterio.errors import NotGeoreferencedWarning
 from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
 from schemas import ConfigError, InputError, atomic_path, check_output
+from schemas.files.outputs import Output
+from schemas.provenance import raster_record
+from schemas.rasters import TIFF_TAG
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.physics.maps.geotiff import BLOCK, EVEN, MapTiff
 from stages.physics.maps.rasters import open_raster, read_window
 from stages.physics.photometry.conventions import Convention, convert_maps, get_convention, model_difference
 
 BLOCK_VALUES = 1 << 23  # values of all bands held at a time, in float64: 64 MB
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass
@@ -48,50 +51,35 @@ class Report:
 
 
 def run(
-    source: Path, output: Path, config: Config, overwrite: bool = False, progress: Progress | None = None
+    source: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Report:
     """Convert the coefficient maps of ``source`` into ``output``, a float32 GeoTIFF on the same grid, NaN as nodata.
 
     Raises InputError for a file without the needed bands, ConfigError for conventions that have no conversion or would
     lose something, RegistryError for an unknown convention.
     """
+    output = Output.of(output)
     start, end = get_convention(config.source), get_convention(config.target)
     model_difference(start, end)
-    check_output(output, [source], overwrite)
+    check_output(output.file, [source], output.overwrite)
     losses: dict[str, str] = {}
     valid = 0
     with open_raster(source, "a GeoTIFF of coefficient maps") as data:
         indices = band_indices(data, start, config.bands)
-        profile = {
-            "driver": "GTiff",
-            "height": data.height,
-            "width": data.width,
-            "count": len(end.quantities),
-            "dtype": "float32",
-            "crs": data.crs,
-            "transform": data.transform,
-            "nodata": float("nan"),
-            "tiled": True,
-            "compress": "deflate",
-            "predictor": 3,
-            "interleave": "band",
-            "BIGTIFF": "IF_SAFER",
-        }
-        with atomic_path(output) as partial, warnings.catch_warnings():
+        with atomic_path(output.file) as partial, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(partial, "w", **profile) as target:
-                target.descriptions = tuple(end.names)
-                target.units = tuple(unit for _, unit in end.quantities)
-                target.update_tags(CONVENTION=end.name, RETURNS=end.returns, CONVERTED_FROM=start.name)
+            tags = {"CONVENTION": end.name, "RETURNS": end.returns, "CONVERTED_FROM": start.name}
+            tags[TIFF_TAG] = raster_record("convert", asdict(config), [source])
+            units = [unit for _, unit in end.quantities]
+            with MapTiff(partial, data, end.names, tags, units) as target:
                 for window in _strips(data, len(indices)):
                     maps = {name: read_window(data, window, band) for name, band in indices.items()}
                     result, lost = convert_maps(maps, start.name, end.name, config.approximate)
                     losses = {**lost, **losses}  # the first example of each
                     stack = np.stack([np.broadcast_to(v, maps[start.names[0]].shape) for v in result.values()])
                     valid += int(np.isfinite(stack).all(axis=0).sum())
-                    target.write(stack.astype(np.float32), window=window)
-                    if progress is not None:
-                        progress(int(window.row_off + window.height), data.height, "convert")
+                    target.put(int(window.row_off), 0, stack.astype(np.float32))
+                    progress(int(window.row_off + window.height), data.height, "convert")
     return Report(end, list(losses.values()), valid)
 
 
@@ -102,7 +90,7 @@ def band_indices(data: DatasetReader, convention: Convention, names: Sequence[st
     if not any(found):
         raise InputError(
             f"{data.name}: expected band descriptions {wanted} for {convention.name}, found none; "
-            f"name the bands in their order in the file, as in --bands {wanted}."
+            f"name the bands in their order in the file, as in `bands` {wanted}."
         )
     indices = {}
     for name in convention.names:
@@ -111,7 +99,7 @@ def band_indices(data: DatasetReader, convention: Convention, names: Sequence[st
         if len(bands) != 1:
             raise InputError(
                 f"{data.name}: expected one band '{name}' for {convention.name}, found {len(bands)} among "
-                f"'{', '.join(found)}'; name the bands in their order in the file with --bands."
+                f"'{', '.join(found)}'; name the bands in their order in the file with `bands`."
             )
         indices[name] = bands[0]
     return indices
@@ -122,7 +110,7 @@ def _named(data: DatasetReader, names: Sequence[str]) -> list[str]:
     if not any("=" in name for name in names):
         if len(names) != data.count:
             raise ConfigError(
-                f"--bands: expected {data.count} names for the {data.count} bands of {data.name}, found {len(names)}; "
+                f"`bands`: expected {data.count} names for the {data.count} bands of {data.name}, found {len(names)}; "
                 "give only those that are wanted as NAME=INDEX."
             )
         return list(names)
@@ -130,14 +118,14 @@ def _named(data: DatasetReader, names: Sequence[str]) -> list[str]:
     for item in names:
         name, _, index = item.partition("=")
         if not index.strip().isdigit() or not 1 <= int(index) <= data.count:
-            raise ConfigError(f"--bands: expected NAME=INDEX with an index from 1 to {data.count}, found '{item}'.")
+            raise ConfigError(f"`bands`: expected NAME=INDEX with an index from 1 to {data.count}, found '{item}'.")
         found[int(index) - 1] = name.strip()
     return found
 
 
 def _strips(data: DatasetReader, bands: int) -> Iterator[Window]:
-    """Windows of whole rows, a multiple of the output's tile height where that fits the memory."""
+    """Windows of whole rows, as the output needs them: a multiple of its tile height where that fits the memory."""
     rows = max(1, BLOCK_VALUES // max(1, data.width * bands))
-    rows = rows // 256 * 256 or rows
+    rows = rows // BLOCK * BLOCK or max(EVEN, rows // EVEN * EVEN)
     for row in range(0, data.height, rows):
         yield Window(0, row, data.width, min(rows, data.height - row))

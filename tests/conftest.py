@@ -16,11 +16,24 @@ ROOT = Path(__file__).resolve().parent.parent
 SHARED = Path(os.environ.get("LUNARGR_SHARED", ROOT.parent / "shared"))
 
 
+# Two workers take one file after the other: with the longest ones first, none of them waits for the other at the end.
+LONGEST = (
+    "test_fanout",
+    "test_diagnose_commands",
+    "test_diagnose",
+    "test_cameras_registration",
+    "test_view_browser",
+    "test_provenance",
+)
+
+
 def pytest_collection_modifyitems(items):
-    """`-m shared` and `-m "not shared"` choose by what a test asks for: nobody has to mark it."""
+    """The longest files first. `-m shared` and `-m "not shared"` choose by what a test asks for: nobody has to mark it."""
     for item in items:
         if "shared" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.shared)
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 
 
 @pytest.fixture(scope="session")

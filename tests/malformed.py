@@ -55,8 +55,10 @@ def all_cases() -> list[Case]:
     """Every malformed input, each with a name of its own."""
     from malformed_artefacts import artefact_cases
     from malformed_inputs import camera_cases, option_cases, raster_cases, recipe_cases, table_cases
+    from malformed_views import view_cases
 
     cases = [*artefact_cases(), *table_cases(), *camera_cases(), *recipe_cases(), *raster_cases(), *option_cases()]
+    cases += view_cases()
     twice = [name for name, count in Counter(c.name for c in cases).items() if count > 1]
     if twice:
         raise ValueError(f"cases of one name: {twice[:5]}")
@@ -69,6 +71,7 @@ def good_files(folder: Path) -> Path:
 
     import small_scene
     from malformed_inputs import write_camera
+    from malformed_views import write_views
 
     from schemas import DIAGNOSIS, ArtefactWriter
     from stages import evaluate, infer, ingest, project, sample, train
@@ -90,6 +93,7 @@ def good_files(folder: Path) -> Path:
     with ArtefactWriter(folder / "diagnosis.h5", DIAGNOSIS, sizes, attributes=attributes) as out:
         out.write("image_id", ["IMG0"])
     write_camera(folder / "camera.json")
+    write_views(folder)
     return folder
 
 
@@ -189,9 +193,16 @@ def controls() -> Iterator[Case]:
     """The commands of the cases on good files: where these fail, nothing that is refused means anything."""
     from malformed_artefacts import READERS
     from malformed_inputs import CONTROLS
+    from malformed_views import CONVERT, MERGE, TRAJECTORY
 
     seen = set()
-    for arguments in (*(words for readers in READERS.values() for words in readers), *CONTROLS):
+    for arguments in (
+        *(words for readers in READERS.values() for words in readers),
+        *CONTROLS,
+        TRAJECTORY,
+        MERGE,
+        CONVERT,
+    ):
         if tuple(arguments) not in seen and arguments[0] != "diagnose":  # takes minutes
             seen.add(tuple(arguments))
             yield Case("control: " + " ".join(arguments), arguments)

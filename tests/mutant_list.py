@@ -19,24 +19,45 @@ class Mutant:
 LEAKS = "tests/test_leaks.py"
 ALL = "np.arange(reader.count)"
 
-# What outside checks planted and the tests of that time did not notice. (Those in stages/diagnose are still to come.)
+# What outside checks planted and the tests of that time did not notice.
 KNOWN = (
     Mutant(
-        "stages/train.py",
-        "                v if math.isfinite(v) else t for v, t in zip(",
-        "                t for v, t in zip(",
+        "stages/diagnose/stage.py",
+        "test = np.flatnonzero(reader.split == 2)",
+        "test = np.flatnonzero(reader.split != 2)",
+        ("tests/test_diagnose_leaks.py::test_the_score_is_of_the_test_pairs",),
+        "the diagnosis is scored on the pairs that it learned from",
+    ),
+    Mutant(
+        "stages/diagnose/stage.py",
+        "train = np.flatnonzero(reader.split != 2)",
+        "train = np.arange(reader.count)",
+        ("tests/test_diagnose_leaks.py::test_causes_are_learned_without_the_test_pairs",),
+        "the diagnosis learns from the test pairs, too",
+    ),
+    Mutant(
+        "stages/diagnose/likelihood/weigh.py",
+        "found.p = (1 + float((largest >= found.surprise).sum())) / (1 + len(largest))",
+        "found.p = 0.0",
+        ("tests/test_diagnose_leaks.py::test_p_tells_what_was_planted_from_what_was_not",),
+        "every p of the diagnosis is 0",
+    ),
+    Mutant(
+        "stages/train/stage.py",
+        "history.objective.append(objective if math.isfinite(objective) else train_loss)",
+        "history.objective.append(train_loss)",
         (f"{LEAKS}::test_the_best_epoch_is_that_of_the_lowest_validation_loss",),
         "the best epoch is chosen by the training loss",
     ),
     Mutant(
-        "stages/train.py",
+        "stages/train/training.py",
         "elevation_scale(reader, train))",
         f"elevation_scale(reader, {ALL}))",
         (f"{LEAKS}::test_test_pairs_change_nothing_of_a_checkpoint",),
         "the elevation scale is taken from all parts of the split",
     ),
     Mutant(
-        "stages/train.py",
+        "stages/train/training.py",
         "fit_start(reader, train, model, config.positive)",
         f"fit_start(reader, {ALL}, model, config.positive)",
         (f"{LEAKS}::test_test_pairs_change_nothing_of_a_checkpoint",),
@@ -50,7 +71,7 @@ KNOWN = (
         "gains and offsets are fitted on all parts of the split",
     ),
     Mutant(
-        "stages/train.py",
+        "stages/train/stage.py",
         "predictor, training.radiometry, reader, train, validation, extensions",
         'predictor, training.radiometry, reader, train, reader.indices("test"), extensions',
         (f"{LEAKS}::test_test_pairs_change_nothing_of_a_checkpoint",),
@@ -79,7 +100,7 @@ KNOWN = (
         "the intervals of gains are not paired",
     ),
     Mutant(
-        "stages/evaluate/run.py",
+        "stages/evaluate/comparison.py",
         "    unit, name = choose_units(tile, site)\n    frames",
         "    unit, name = np.arange(len(tile)), 'tile'\n    frames",
         ("tests/test_evaluate.py::test_tiles_are_the_witnesses_and_rows_are_paired_by_them",),
@@ -162,7 +183,7 @@ PHYSICS = (
         "stages/physics/formation/facets.py",
         "q = (above[j] - below[j]) * step - bend",
         "q = (below[j] - above[j]) * step - bend",
-        ("tests/test_evaluate.py::test_the_true_coefficients_leave_only_the_noise",),
+        ("tests/test_formation.py::test_one_pass_gives_what_the_chain_gives",),
         "rows run north in the fused geometry",
     ),
     Mutant(
@@ -209,10 +230,10 @@ PHYSICS = (
     ),
     Mutant(
         "stages/physics/horizon/sweeps.py",
-        "        position = shear * np.arange(rows)\n",
-        "        position = shear * (np.arange(rows) + 1)\n",
+        "            1 / max(abs(east), abs(north)),\n",
+        "            1.0,\n",
         ("tests/test_horizon.py::test_dome",),
-        "lines of the horizon are off by one row",
+        "a step along an oblique ray is as long as one along a row",
     ),
     Mutant(
         "stages/physics/horizon/scene.py",
@@ -299,7 +320,7 @@ STAGES = (
         "stages/physics/maps/ground_tiles.py",
         "r0, r1 = (row - half) // self.edge, (row + half - 1) // self.edge",
         "r0, r1 = (row - half) // self.edge, (row + half - 2) // self.edge",
-        ("tests/test_sample.py::test_parts_share_no_pixel_of_ground",),
+        ("tests/test_sample.py::test_a_footprint_ends_where_its_tile_does",),
         "crops reach one row into the next tile's ground",
     ),
     Mutant(
@@ -317,14 +338,14 @@ STAGES = (
         "test crops lie across tiles",
     ),
     Mutant(
-        "stages/project/run.py",
+        "stages/project/stage.py",
         "mean, radius, frame.sun_position(), frame.camera_position(radius))",
         "mean, radius, frames[0].sun_position(), frame.camera_position(radius))",
         ("tests/test_project.py::test_every_crop_has_the_sun_and_the_camera_of_its_own_image",),
         "crops get the Sun of another image",
     ),
     Mutant(
-        "stages/project/run.py",
+        "stages/project/stage.py",
         "mean, radius, frame.sun_position(), frame.camera_position(radius))",
         "mean, radius, frame.sun_position(), frames[-1].camera_position(radius))",
         ("tests/test_project.py::test_every_crop_has_the_sun_and_the_camera_of_its_own_image",),
@@ -332,14 +353,14 @@ STAGES = (
     ),
     Mutant(
         "stages/physics/horizon/scene.py",
-        "    window = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
+        "    strip = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
         "    top, bottom, left, right = row, row + height, col, col + width\n"
-        "    window = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
+        "    strip = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
         ("tests/test_project.py::test_terrain_outside_the_crop_casts_its_shadow",),
         "only the crop's own terrain casts near shadows",
     ),
     Mutant(
-        "stages/project/run.py",
+        "stages/project/stage.py",
         "        math.atan2(east, north) % (2 * math.pi),",
         "        math.atan2(north, east) % (2 * math.pi),",
         ("tests/test_project.py::test_terrain_outside_the_crop_casts_its_shadow",),
@@ -353,9 +374,9 @@ STAGES = (
         "gradients are half as large",
     ),
     Mutant(
-        "stages/train.py",
-        "    training.predictor.eval()\n    total, pixels",
-        "    training.predictor.train()\n    total, pixels",
+        "stages/train/epoch.py",
+        "    training.predictor.eval()\n    totals, pixels",
+        "    training.predictor.train()\n    totals, pixels",
         (f"{LEAKS}::test_validation_runs_without_dropout_and_leaves_the_network_as_it_is",),
         "validation runs in training mode",
     ),
@@ -374,7 +395,7 @@ STAGES = (
         "augmentation turns vectors the wrong way",
     ),
     Mutant(
-        "stages/train.py",
+        "stages/train/epoch.py",
         "error.detach().double(), pixels])\n",
         "error.detach().double(), torch.ones_like(pixels)])\n",
         ("tests/test_train.py::test_the_losses_are_means_over_valid_pixels",),
@@ -416,10 +437,10 @@ STAGES = (
         "the map holds coefficients where there is no terrain",
     ),
     Mutant(
-        "stages/infer/run.py",
+        "stages/infer/stage.py",
         "writer.write_crs(grid.crs_wkt, grid.transform)",
         "writer.write_crs(grid.crs_wkt, grid.window(0, 1, 1, 1).transform)",
-        ("tests/test_infer.py::test_gdal_places_the_netcdf_variable",),
+        ("tests/test_infer.py::test_the_georeference_is_that_of_the_coordinates",),
         "the map lies one pixel to the east",
     ),
     Mutant(
@@ -520,7 +541,7 @@ STAGES = (
         "stages/albedo/posterior.py",
         "                    confidence[k, r, c] *= weights[i]\n",
         "",
-        ("tests/test_albedo.py::test_a_shadow_or_a_cosmic_ray_in_one_image_leaves_no_mark",),
+        ("tests/test_albedo.py::test_what_one_image_shows_alone_loses_its_weight",),
         "outliers keep their full weight in the albedo",
     ),
     Mutant(

@@ -10,8 +10,10 @@ import h5py
 import numpy as np
 import OpenImageIO as oiio
 import small_scene
+from camera_rays import image_to_terrain, looking_at
 from small_scene import LAT, LON, RADIUS, local_xy
 
+from schemas.files.outputs import Output
 from stages import ingest, project, sample
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import unit_vectors
@@ -25,7 +27,7 @@ def overhead_camera(east: float = 0.0, north: float = 0.0) -> Pinhole:
     to_east = np.cross([0, 0, 1.0], up)
     to_east /= np.linalg.norm(to_east)
     shift = east * to_east + north * np.cross(up, to_east)
-    return Pinhole.looking_at(up * (RADIUS + ALTITUDE) + shift, up * RADIUS + shift, math.radians(3.4), (400, 380))
+    return looking_at(up * (RADIUS + ALTITUDE) + shift, up * RADIUS + shift, math.radians(3.4), (400, 380))
 
 
 def photograph(view: Pinhole, height=small_scene.height, reflect=small_scene.radiance_factor) -> np.ndarray:
@@ -35,7 +37,7 @@ def photograph(view: Pinhole, height=small_scene.height, reflect=small_scene.rad
         return height(*local_xy(longitude, latitude))
 
     line, sample_ = np.meshgrid(np.arange(view.lines) + 0.5, np.arange(view.samples) + 0.5, indexing="ij")
-    points = view.image_to_terrain(line, sample_, height_at, tolerance=0.05)
+    points = image_to_terrain(view, line, sample_, height_at, tolerance=0.05)
     radius = np.linalg.norm(points, axis=-1)
     x, y = local_xy(
         np.degrees(np.arctan2(points[..., 1], points[..., 0])), np.degrees(np.arcsin(points[..., 2] / radius))
@@ -68,9 +70,9 @@ def write_frame(folder, view, image, **columns):
 
 def run_all(dem, images, folder, **config):
     """project's summary and pairs.h5, with scene.h5 and crops.h5 beside it; ``config`` is project's."""
-    ingest.run(dem, images, folder / "scene.h5", ingest.Config(gsd=20, crop=32), overwrite=True)
-    sample.run(folder / "scene.h5", folder / "crops.h5", sample.Config(count=60, crop=32), overwrite=True)
-    summary = project.run(folder / "crops.h5", folder / "pairs.h5", project.Config(**config), overwrite=True)
+    ingest.run(dem, images, Output(folder / "scene.h5", overwrite=True), ingest.Config(gsd=20, crop=32))
+    sample.run(folder / "scene.h5", Output(folder / "crops.h5", overwrite=True), sample.Config(count=60, crop=32))
+    summary = project.run(folder / "crops.h5", Output(folder / "pairs.h5", overwrite=True), project.Config(**config))
     return summary, folder / "pairs.h5"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import h5py
@@ -11,13 +10,15 @@ import pytest
 import rasterio
 from albedo_scene import NOISE, SIZE, SUNS, photograph, photographs, plant, texture
 from evaluation_scene import run_command
+from scipy.ndimage import shift
 
 from schemas import ArtefactError, ConfigError, InputError
+from schemas.files.outputs import Output
 from stages import albedo, merge
-from stages.albedo.posterior import Spread, estimate
+from stages.albedo import stage as running
+from stages.albedo.posterior import Spread, estimate, settle
 from stages.albedo.pyramid import LEVELS
 
-running = sys.modules["stages.albedo.run"]  # the package's ``run`` is the function
 QUIET = albedo.Config(geotiff=False)
 
 
@@ -29,7 +30,7 @@ def read(path, *names):
 def made(planted, config=QUIET, name="albedo.h5"):
     """(albedo, std, images) of a planted scene."""
     out = planted.folder / name
-    albedo.run(planted.map, planted.scene, out, config, overwrite=True)
+    albedo.run(planted.map, planted.scene, Output(out, overwrite=True), config)
     return read(out, "albedo", "albedo_std", "albedo_images")
 
 
@@ -91,19 +92,34 @@ def test_a_shadow_or_a_cosmic_ray_in_one_image_leaves_no_mark(rng, tmp_path):
     assert np.nanmax(np.abs(np.log(marked / clean))) < 0.1
 
 
+def test_what_one_image_shows_alone_loses_its_weight(rng):
+    """A pixel 20 sigma from what five other images agree on counts a hundredth; its neighbours keep theirs."""
+    ratio = rng.normal(0, 0.01, (6, 32, 32)).astype(np.float32)
+    ratio[2, 16, 16] += 0.2
+    confidence = np.ones_like(ratio)
+    spread = Spread(
+        np.full(LEVELS + 1, 0.04), np.full((6, LEVELS + 1), 1e-4), 0.04, np.full(6, 1e-4), np.zeros(LEVELS + 1)
+    )
+    location = settle(ratio, confidence, spread)
+    assert confidence[2, 16, 16] < 0.03 * np.median(confidence[2])
+    assert np.median(confidence) > 0.5 and abs(location[16, 16]) < 0.02
+
+
 def test_shifted_images_count_less(rng, tmp_path):
     truth = np.exp(texture(rng))
     images = photographs(rng, truth)
     images[1] = np.roll(images[1], 2, axis=1)
     shifted = plant(tmp_path, truth, images)
     factor, _, _ = made(shifted)
+    (own,) = read(tmp_path / "albedo.h5", "albedo_image_std")
+    assert own[1, 0] > 2 * np.median(own[:, 0])
     without, _, _ = made(shifted, replace(QUIET, leave_out=("IMG1",)), "without.h5")
     plain = np.mean(
         [np.log(image / photograph(np.ones_like(truth), sun)) for image, sun in zip(images, SUNS, strict=True)], 0
     )
     inner = np.s_[8:-8, 8:-8]
     error, best, mean = (rms(log[inner] - np.log(truth)[inner]) for log in (np.log(factor), np.log(without), plain))
-    assert error < 2 * best
+    assert error < 1.15 * best
     assert error < 0.4 * mean
 
 
@@ -190,10 +206,11 @@ def test_gain_and_offset_of_images_in_dn_do_not_matter(rng, tmp_path):
 
 
 def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
+    from lunargr_cli.fanout.job import Work
     from lunargr_cli.fanout.stages import run_albedo
 
     # blocks so small that the map has four rows of them
-    monkeypatch.setattr(running, "BLOCK_PX", 64)
+    monkeypatch.setattr("stages.albedo.stage.BLOCK_PX", 64)
     config = replace(QUIET, geotiff=True)
     names = ("albedo", "albedo_std", "albedo_images", "coefficients", "elevation", "albedo_gain", "albedo_image_std")
     whole = tmp_path / "whole.h5"
@@ -207,10 +224,10 @@ def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
     with monkeypatch.context() as broken:
         broken.setattr("stages.merge.run", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            run_albedo(planted.map, planted.scene, resumed, config, None, 3, scheduler=None, overwrite=False)
+            run_albedo(planted.map, planted.scene, Output(resumed), config, Work(parts=3))
     left = sorted((tmp_path / "resumed.h5.parts").rglob("map-*.h5"))
     left[1].unlink()
-    run_albedo(planted.map, planted.scene, resumed, config, None, 3, scheduler=None, overwrite=False)
+    run_albedo(planted.map, planted.scene, Output(resumed), config, Work(parts=3))
     for other in ("merged", "resumed"):
         for name, a, b in zip(names, read(whole, *names), read(tmp_path / f"{other}.h5", *names), strict=True):
             assert a.tobytes() == b.tobytes(), (other, name)
@@ -224,7 +241,7 @@ def interrupt(*arguments, **options):
 
 
 def test_blocks_leave_no_seams(planted, found, monkeypatch):
-    monkeypatch.setattr(running, "BLOCK_PX", 64)
+    monkeypatch.setattr("stages.albedo.stage.BLOCK_PX", 64)
     blocks = made(planted, name="blocks.h5")[0]
     assert np.nanmax(np.abs(np.log(blocks / found[0]))) < 0.1 * np.nanmedian(found[1])
 
@@ -260,7 +277,7 @@ def test_held_out_images_are_never_those_that_made_the_albedo(planted, tmp_path)
     assert {row["image_id"] for row in scored} == {f"IMG{k}" for k in (0, 2, 4)}
     assert read(folds[0], "albedo_image_id")[0].astype(str).tolist() == used
     everything = planted.folder / "albedo.h5"
-    albedo.run(planted.map, planted.scene, everything, QUIET, overwrite=True)
+    albedo.run(planted.map, planted.scene, Output(everything, overwrite=True), QUIET)
     code, said = run_command("evaluate", pairs, everything, "--held-out-images", "-o", tmp_path / "no.h5")
     assert code == 3 and "--fold" in said and not (tmp_path / "no.h5").exists()
 
@@ -270,7 +287,7 @@ def test_bad_input_is_refused_in_one_line(planted, found, tmp_path):
 
     def refused(error, words, svbrdf=planted.map, scene=planted.scene, output=out, config=QUIET):
         with pytest.raises(error, match=words) as caught:
-            albedo.run(svbrdf, scene, output, config, overwrite=True)
+            albedo.run(svbrdf, scene, Output(output, overwrite=True), config)
         assert "\n" not in str(caught.value)
         assert not out.exists()
 
@@ -310,6 +327,19 @@ def relative(copy, source):
             file["path"][k] = str(source.parent / name)
 
 
+def test_of_images_that_an_outlier_befell_the_most_precise_one_has_no_last_word():
+    """A cosmic ray in the image of least noise: its weight alone must not choose what the others are measured by."""
+    size = 16
+    ratio = np.zeros((4, size, size), np.float32)
+    ratio[0, 8, 8] = 3.0
+    own_px = np.array([1e-5, 1e-3, 1e-3, 1e-3])
+    levels = np.ones(LEVELS + 1)
+    spread = Spread(0.01 * levels, own_px[:, None] * levels, 0.01, own_px, 0.01 * levels)
+    confidence = np.ones_like(ratio)
+    assert abs(settle(ratio, confidence, spread)[8, 8]) < 0.1
+    assert confidence[0, 8, 8] < 1e-3 * np.median(confidence[0])
+
+
 def test_noisy_images_weigh_less():
     """Two images that differ everywhere alike: the mean by inverse variances, its deviation that of the two together."""
     size = 64
@@ -318,3 +348,32 @@ def test_noisy_images_weigh_less():
     spread = Spread(np.full(LEVELS + 1, 1e6), own, 1e6, own[:, 0], np.full(LEVELS + 1, 1e6))
     mean, _ = estimate(ratio, np.ones_like(ratio), spread)
     np.testing.assert_allclose(mean, (0.1 / 0.01 - 0.1 / 0.04) / (1 / 0.01 + 1 / 0.04), rtol=1e-3)
+
+
+def test_what_registration_finds_is_taken_off_by_all_shards(rng, tmp_path, monkeypatch):
+    """Images three pixels aside: where that is told, the albedo is as sharp as if they were not, whoever reads them."""
+    from stages.albedo.calibrate import Calibration
+    from stages.physics.images.displacement import Basis, Field
+
+    truth = np.exp(texture(rng))
+    images = [shift(image, (0, 3), mode="nearest") for image in photographs(rng, truth)]
+    scene = plant(tmp_path, truth, images)
+    aside = Field(Basis("constant", (0.0, 0.0)), np.array([[3.0], [0.0]]), 16, 16, 0.1, 0.1, 0.9)
+    monkeypatch.setattr(running, "register", lambda references, form, progress: [aside] * len(references.frames))
+    config = replace(QUIET, register="constant")
+    inner = np.s_[8:-8, 8:-8]
+    moved, stayed = (np.log(made(scene, c)[0] / truth)[inner] for c in (config, QUIET))
+    assert rms(moved - moved.mean()) < 0.25 * rms(stayed - stayed.mean())
+    path, again, part = (tmp_path / name for name in ("calibration.json", "again.json", "part.h5"))
+    albedo.calibrate_to(path, scene.map, scene.scene, config)
+    Calibration.read(path).write(again)
+    assert again.read_bytes() == path.read_bytes()
+    whole = made(scene, config)[0]
+    running.run_part(scene.map, scene.scene, path, part, config)
+    np.testing.assert_array_equal(read(part, "albedo")[0], whole)
+
+
+def test_an_unknown_form_of_registration_is_refused(planted, tmp_path):
+    with pytest.raises(ConfigError, match=r"--register: expected one of constant, affine, field, found 'rubber'"):
+        made(planted, replace(QUIET, register="rubber"), "no.h5")
+    assert not (planted.folder / "no.h5").exists()

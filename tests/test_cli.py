@@ -40,6 +40,14 @@ def test_every_stage_has_a_command():
         assert f"  {stage} " in out
 
 
+def test_the_list_of_commands_cuts_no_sentence_off(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    out = lunargr("--help").stdout
+    assert "..." not in out.split("Commands:")[1]
+    assert "Learn reflectance from terrain through the differentiable renderer" in out
+    assert max(map(len, out.splitlines())) <= 80
+
+
 @pytest.mark.parametrize("stage", STAGES)
 def test_help_explains_every_option(stage):
     from typer.main import get_command

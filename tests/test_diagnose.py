@@ -16,6 +16,7 @@ from planted import semi_real
 from typer.testing import CliRunner
 
 from schemas import ArtefactError
+from schemas.files.outputs import Output
 from stages import diagnose
 from stages.effects import effect_names, load_extension
 
@@ -45,7 +46,8 @@ def _pairs(scene, folder, effect, seed=11, **changes):
 def test_planted_cause_is_named(scene, tmp_path, effect):
     """... and every kind of cause can be written, reported, and read back as an extension of the model."""
     files = [tmp_path / name for name in ("d.h5", "d.json", "d.html")]
-    diagnose.run(_pairs(scene, tmp_path, {effect: PLANTS[effect]}), None, diagnose.Config(), *files)
+    output = Output(files[0], json=files[1], report=files[2])
+    diagnose.run(_pairs(scene, tmp_path, {effect: PLANTS[effect]}), None, output)
     answer = json.loads(files[1].read_text())
     assert [e.name for e in load_extension(files[0])] == [c["effect"] for c in answer["causes"]]
     assert answer["verdict"] == "named"

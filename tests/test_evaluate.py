@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +12,11 @@ from evaluation_scene import A, B, C, KnowsTheTruth, make_scene
 
 from stages.common.intervals import ERROR, LOG, ratio_interval
 from stages.evaluate import fit
+from stages.evaluate.comparison import Task, evaluate_pairs
+from stages.evaluate.config import Config
 from stages.evaluate.fitting import choose_fit_pairs, sample_pixels
 from stages.evaluate.metrics import ssim
 from stages.evaluate.renderers import Constant, Renderer, read_batch, unit_images
-from stages.evaluate.run import Config, Task, evaluate_pairs
 from stages.physics.photometry import get_model
 
 REQUIRED = {
@@ -321,6 +323,36 @@ def test_a_learned_row_that_is_no_better_is_not_praised(scene):
         only = ("learned", "global")
         result, *_ = _evaluate(scene, predictor=predictor, only=only)
         assert words in result["conclusions"][0]
+
+
+@pytest.mark.parametrize("units", ["iof", "dn"])
+def test_the_intervals_that_networks_predict_are_counted_over_all_runs(scene, units):
+    """True coefficients: the images' noise is all there is. A second run that allows for none of it holds no pixel."""
+
+    class Unsure(KnowsTheTruth):
+        def __init__(self, factor):
+            super().__init__()
+            self.image_noise = factor * scene.noise
+
+        def coefficients_and_deviations(self, elevation):
+            return self.coefficients(elevation), {"a": torch.full_like(elevation, 1e-9)}
+
+    gain = 100.0 if units == "dn" else 1.0
+    images = replace(scene, images=(gain * scene.images).astype(np.float32))
+    result, *_ = _evaluate(images, units, Unsure(1.0), only=("learned", "global"))
+    found = result["coverage_percent"]
+    assert found["pixels"] == result["valid_pixels"]
+    assert found["68"] == pytest.approx(68, abs=1) and found["95"] == pytest.approx(95, abs=1)
+    seen = [band for band in found["by_incidence"] if band["pixels"] > 2000]
+    assert len(seen) > 2 and all(band["95"] == pytest.approx(95, abs=1.5) for band in seen)
+    both, *_ = _evaluate(images, units, [Unsure(1.0), Unsure(1e-3)], only=("learned", "global"))
+    assert both["coverage_percent"]["pixels"] == 2 * found["pixels"]
+    assert both["coverage_percent"]["95"] == pytest.approx(found["95"] / 2, abs=0.5)
+    json.dumps(both, allow_nan=False)
+
+
+def test_networks_that_predict_no_deviations_have_no_coverage(whole):
+    assert whole[0]["coverage_percent"] is None
 
 
 def test_training_runs_are_averaged_and_their_spread_widens_the_interval(scene):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from stages.evaluate.coverage import coverage
+from stages.evaluate.coverage import count_within, gaussian_widths, shares
 from stages.evaluate.metrics import psnr, squared_error, ssim
 from stages.physics.formation.radiometry import full_scale, match_crops
 
@@ -115,6 +115,10 @@ def test_full_scale_of_digital_numbers(largest, expected):
     assert full_scale(largest) == expected
 
 
+def coverage(measured, predicted, std, incidence):
+    return shares(count_within(np.abs(measured - predicted), gaussian_widths(std), incidence))
+
+
 def test_coverage_of_honest_and_of_half_as_large_deviations(rng):
     std = rng.uniform(0.002, 0.02, 200_000)
     predicted = rng.uniform(0.05, 0.2, std.size)
@@ -122,14 +126,14 @@ def test_coverage_of_honest_and_of_half_as_large_deviations(rng):
     incidence = np.radians(rng.uniform(0, 90, std.size))
     honest = coverage(measured, predicted, std, incidence)
     assert honest["pixels"] == std.size
-    assert (honest["within_68_percent"], honest["within_95_percent"]) == pytest.approx((68, 95), abs=0.3)
+    assert (honest["68"], honest["95"]) == pytest.approx((68, 95), abs=0.3)
     for band in honest["by_incidence"]:
-        assert band["within_95_percent"] == pytest.approx(95, abs=0.5)
+        assert band["95"] == pytest.approx(95, abs=0.5)
     bold = np.where(np.degrees(incidence) > 60, std / 2, std)
     bands = coverage(measured, predicted, bold, incidence)["by_incidence"]
-    steep = [b["within_95_percent"] for b in bands if b["incidence_low_deg"] >= 60]
+    steep = [b["95"] for b in bands if b["incidence_low_deg"] >= 60]
     assert steep == pytest.approx([67.3] * len(steep), abs=1)  # P(|z| < .98)
-    assert bands[0]["within_95_percent"] == pytest.approx(95, abs=0.5)
+    assert bands[0]["95"] == pytest.approx(95, abs=0.5)
 
 
 def test_pixels_without_a_deviation_do_not_count():
@@ -137,8 +141,7 @@ def test_pixels_without_a_deviation_do_not_count():
     std = np.array([0.01, np.nan, 0.01, 0.01])
     found = coverage(values, values + [0.0, 0.0, 0.015, 0.03], std, np.zeros(4))
     assert found["pixels"] == 3
-    assert (found["within_68_percent"], found["within_95_percent"]) == pytest.approx((100 / 3, 200 / 3))
+    assert (found["68"], found["95"]) == pytest.approx((100 / 3, 200 / 3))
     assert found["by_incidence"][-1] == {
-        "incidence_low_deg": 75.0, "incidence_high_deg": 90.0, "pixels": 0, "within_68_percent": None,
-        "within_95_percent": None,
+        "incidence_low_deg": 75.0, "incidence_high_deg": 90.0, "pixels": 0, "68": None, "95": None,
     }  # fmt: skip

@@ -236,12 +236,12 @@ def test_a_scene_by_hand_is_a_dem_in_rows_and_then_its_images(small_files, tmp_p
     rows = [tmp_path / f"rows{k}.h5" for k in range(3)]
     for k, part in enumerate(rows):
         ingest.run(small_files.dem, None, part, ingest.Config(**config, shard=(k, 3)))
-    merge.run(rows, tmp_path / "grid.h5", virtual=virtual)
+    merge.run(rows, tmp_path / "grid.h5", merge.Config(virtual))
     images = [tmp_path / f"images{k}.h5" for k in range(2)]
     for k, part in enumerate(images):
         ingest.run(tmp_path / "grid.h5", small_files.images, part, ingest.Config(crop=32, block=100, shard=(k, 2)))
         assert part.stat().st_size < 0.7 * (tmp_path / "whole.h5").stat().st_size  # no elevations of its own
-    merge.run(images, tmp_path / "scene.h5", virtual=virtual)
+    merge.run(images, tmp_path / "scene.h5", merge.Config(virtual))
     assert_same(tmp_path / "whole.h5", tmp_path / "scene.h5")
     found, whole = ingest.summarise(tmp_path / "scene.h5"), ingest.summarise(tmp_path / "whole.h5")
     assert (found.elevation_range, found.dem_valid_share) == (whole.elevation_range, whole.dem_valid_share)

@@ -14,8 +14,12 @@ import torch
 from evaluation_scene import KnowsTheTruth, make_scene, write_pairs
 
 from stages import train
+from stages.evaluate.comparison import Task, evaluate_pairs
+from stages.evaluate.config import Config
 from stages.evaluate.renderers import read_batch
-from stages.evaluate.run import Config, Task, evaluate_pairs
+from stages.pairs.reader import PairReader
+from stages.train.epoch import evaluate_loss, learn_epoch
+from stages.train.training import set_up
 
 GAINS = np.array([900.0, 1400.0])  # DN per I/F of the two images
 SMALL = {"model": "M2", "widths": (4, 8), "batch": 8, "device": "cpu", "precision": "fp32", "maps": ("a",)}
@@ -70,7 +74,7 @@ def test_validation_pairs_choose_the_epoch_and_scale_the_deviations_and_do_nothi
 
 
 def test_the_best_epoch_is_that_of_the_lowest_validation_loss(tmp_path, monkeypatch):
-    """The training loss falls all along; the checkpoint holds the weights of the second epoch and says so."""
+    """Of what is minimised, there: training and squared errors fall all along; the checkpoint holds the second epoch."""
     validation = [3.0, 1.0, 2.0, 4.0]
     name, written = None, []
 
@@ -82,13 +86,15 @@ def test_the_best_epoch_is_that_of_the_lowest_validation_loss(tmp_path, monkeypa
         written.append(epoch)
         return 10.0 - epoch
 
-    monkeypatch.setattr(train, "learn_epoch", learn)
-    monkeypatch.setattr(train, "evaluate_loss", lambda training, *_: validation[written[-1]])
+    monkeypatch.setattr("stages.train.stage.learn_epoch", learn)
+    monkeypatch.setattr(
+        "stages.train.stage.evaluate_loss", lambda training, *_: (9.0 - written[-1], validation[written[-1]])
+    )
     pairs = write_pairs(tmp_path / "pairs.h5", pairs_of(), units="dn")
     summary = train.run(pairs, tmp_path / "c.h5", train.Config(**SMALL, epochs=4))
     assert summary.history.best_epoch == 1
     with h5py.File(tmp_path / "c.h5") as file:
-        assert file.attrs["best_epoch"] == 1
+        assert file.attrs["best_epoch"] == 2  # counted from 1, as on the terminal
         np.testing.assert_allclose(file["weights"][name][...], 0.02, rtol=1e-6)
 
 
@@ -96,12 +102,12 @@ def test_validation_runs_without_dropout_and_leaves_the_network_as_it_is(tmp_pat
     """In training mode dropout would draw, and batch normalisation would learn from validation ground."""
     pairs = write_pairs(tmp_path / "pairs.h5", pairs_of(), units="dn")
     config = train.Config(**SMALL, dropout=(0.5,), epochs=1)
-    with train.PairReader(pairs) as reader:
-        training = train._set_up(reader, config, [], torch.device("cpu"), 0, 1)
-        train.learn_epoch(training, reader.indices("train"), config, 0)
+    with PairReader(pairs) as reader:
+        training = set_up(reader, config, [], torch.device("cpu"), 0, 1)
+        learn_epoch(training, reader.indices("train"), config, 0)
         before = {k: v.clone() for k, v in training.predictor.state_dict().items()}
-        first, again = (train.evaluate_loss(training, reader.indices("validation"), 4) for _ in range(2))
-        assert first == again and math.isfinite(first)
+        first, again = (evaluate_loss(training, reader.indices("validation"), 4) for _ in range(2))
+        assert first == again and math.isfinite(first[0])
         for key, value in training.predictor.state_dict().items():
             torch.testing.assert_close(value, before[key], rtol=0, atol=0, msg=key)
 

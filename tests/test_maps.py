@@ -13,18 +13,20 @@ from evaluation_scene import run_command
 from torch.nn import functional
 
 from schemas import ConfigError, RegistryError, read_strings
+from schemas.files.outputs import Output
 from stages import infer, train
 from stages.common.threads import one_thread_each, share_out
+from stages.network.coefficient_maps import CoefficientMaps
+from stages.network.crop_sums import PIECE, convolution, sum_over_crops
+from stages.network.deviations import _likelihood
 from stages.network.losses import crop_errors, squared_error
-from stages.network.maps import CoefficientMaps
-from stages.network.pieces import PIECE, convolution, sum_over_crops
 from stages.network.pixels import Pixels, fit_pixels
 from stages.network.predictor import load_predictor
-from stages.network.spread import _likelihood
 from stages.pairs.holes import fill_holes
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import get_model, masked_radiance_factor, model_names
 from stages.physics.photometry.deviation import radiance_deviation
+from stages.train import stage
 
 SMALL = {"widths": (4, 8), "epochs": 2, "batch": 16, "lr": 5e-3, "device": "cpu", "precision": "fp32"}
 
@@ -64,7 +66,7 @@ def test_unknown_maps_list_the_choices(small_artefacts, tmp_path):
         train.run(small_artefacts["pairs"], out, train.Config(model="hapke", maps=("w", "x")))
     code, message = run_command("train", small_artefacts["pairs"], "--maps", "w,x", "-o", out)
     assert code == 3 and "\n" not in message and "choose one of" in message
-    with pytest.raises(ConfigError, match="--positive"):
+    with pytest.raises(ConfigError, match="`positive`"):
         train.run(small_artefacts["pairs"], out, train.Config(model="hapke", positive=True))
     assert not out.exists()
 
@@ -76,7 +78,12 @@ def test_globals_are_learned_and_constant_in_the_map(small_artefacts, trained, t
         (k,) = json.loads(file.attrs["globals"]).values()
         start = json.loads(file.attrs["start"])
     assert 0 < k < 2 and k != start["k"]
-    infer.run(small_artefacts["scene"], trained, tmp_path / "map.h5", infer.Config(device="cpu", geotiff=False))
+    infer.run(
+        small_artefacts["scene"],
+        trained,
+        tmp_path / "map.h5",
+        infer.Config(device="cpu", precision="fp32", geotiff=False),
+    )
     with h5py.File(tmp_path / "map.h5") as file:
         valid = file["valid"][...].astype(bool)
         albedo, constant = (plane[valid] for plane in file["coefficients"][...])
@@ -88,11 +95,11 @@ def test_globals_survive_an_interruption(small_artefacts, trained, tmp_path, mon
     """A run that stops after its first epoch goes on to the very same checkpoint."""
     out = tmp_path / "c.h5"
     config = train.Config(model="minnaert", **SMALL)
-    monkeypatch.setattr(train, "learn_epoch", _stop_after_one(train.learn_epoch))
+    monkeypatch.setattr(stage, "learn_epoch", _stop_after_one(stage.learn_epoch))
     with pytest.raises(KeyboardInterrupt):
         train.run(small_artefacts["pairs"], out, config)
     monkeypatch.undo()
-    train.run(small_artefacts["pairs"], out, config, resume=True)
+    train.run(small_artefacts["pairs"], Output(out, resume=True), config)
     first, again = weights(trained), weights(out)
     for name in first:
         np.testing.assert_array_equal(first[name], again[name], err_msg=name)
@@ -239,7 +246,7 @@ def test_the_image_deviation_is_that_of_drawn_parameters(rng):
 
 def test_the_map_carries_its_deviations(small_artefacts, trained, tmp_path):
     """In strips and from a whole window alike, positive, by name; the GeoTIFF has them as bands."""
-    infer.run(small_artefacts["scene"], trained, tmp_path / "map.h5", infer.Config(device="cpu"))
+    infer.run(small_artefacts["scene"], trained, tmp_path / "map.h5", infer.Config(device="cpu", precision="fp32"))
     predictor = load_predictor(trained)
     assert predictor.image_noise > 0
     with h5py.File(small_artefacts["scene"]) as file:

@@ -134,7 +134,7 @@ def test_unknown_matcher_lists_the_choices():
 
 @pytest.mark.parametrize("name", ["aliked", "disk"])
 def test_learned_matchers_say_what_they_miss(name, tmp_path):
-    with pytest.raises(ConfigError, match="--features-model"):
+    with pytest.raises(ConfigError, match="`features_model`"):
         get_matcher(name)
     with pytest.raises(InputError, match="no such file"):
         get_matcher(name, Models(tmp_path / "absent.onnx"))
@@ -162,8 +162,8 @@ def trained(tmp_path_factory):
 
 def test_match_of_pairs_and_of_kept_renderings_agree(trained):
     config = match.Config(matchers=("sift",), count=4, device="cpu")
-    direct = match.run([trained / "pairs.h5", trained / "checkpoint.h5"], config)
-    kept = match.run([trained / "evaluation.h5"], config)
+    direct = match.run([trained / "pairs.h5", trained / "checkpoint.h5"], None, config)
+    kept = match.run([trained / "evaluation.h5"], None, config)
     assert set(direct["matchers"]["sift"]) == {"learned", "hapke_minmax"}
     for name, row in direct["matchers"]["sift"].items():
         assert row["matches"] > 20
@@ -186,7 +186,7 @@ def test_image_files_are_matched(texture, tmp_path):
     for name, (dx, dy) in {"measured": (0, 0), "same": (0, 0), "shifted": (4, 0)}.items():
         cv2.imwrite(str(tmp_path / f"{name}.png"), _window(texture, dx, dy))
     files = [tmp_path / f"{n}.png" for n in ("measured", "same", "shifted")]
-    rows = match.run(files, match.Config(matchers=("sift",)))["matchers"]["sift"]
+    rows = match.run(files, None, match.Config(matchers=("sift",)))["matchers"]["sift"]
     assert rows["same"]["within_1_px_percent"] == 100
     assert rows["shifted"]["within_3_px_percent"] < 10 and rows["shifted"]["within_5_px_percent"] > 90
 

@@ -11,7 +11,9 @@ import h5py
 import pytest
 from cluster_scene import LUNARGR, assert_same, environment, lunargr
 
-from schemas.provenance import chain, whole_command
+from schemas.command_line import whole_command
+from schemas.files.outputs import Output
+from schemas.provenance import chain
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +117,9 @@ def test_the_chain_goes_back_to_simulate(tmp_path):
     assert code == 0 and script.count("\nlunargr simulate -o ") == 1
     with open(tmp_path / "s/images.csv", "a") as table:
         table.write("\n")
-    ingest.run(tmp_path / "s/dem.tif", tmp_path / "s/images.csv", scene, ingest.Config(gsd=5, crop=32), overwrite=True)
+    ingest.run(
+        tmp_path / "s/dem.tif", tmp_path / "s/images.csv", Output(scene, overwrite=True), ingest.Config(gsd=5, crop=32)
+    )
     steps = {s.name: s for s in chain(scene)}
     assert steps["images.csv"].record is None and steps["dem.tif"].record is not None
 

@@ -15,7 +15,7 @@ from rasterio.warp import Resampling, reproject
 from schemas import ConfigError, InputError, RegistryError, open_artefact
 from schemas.truth import TRUTH
 from stages.simulate import make_config, read_recipe, recipe_json, run, stage
-from stages.simulate import render as render_module
+from stages.simulate import radiance as render_module
 
 R = 1737400.0
 SMALL = {"size_px": 288, "images": 10, "crater_largest": 260.0, "hidden": [], "seed": 3}
@@ -282,7 +282,7 @@ def test_bad_files_and_existing_outputs(scene, tmp_path):
     with pytest.raises(InputError, match="JSON"):
         read_recipe(tmp_path / "bad.json")
     before = (folder / "dem.tif").stat().st_mtime_ns
-    with pytest.raises(ConfigError, match="--overwrite"):
+    with pytest.raises(ConfigError, match="`overwrite`"):
         run(folder, config)
     assert (folder / "dem.tif").stat().st_mtime_ns == before
     with pytest.raises(RegistryError, match="reflectance model"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 from cluster_scene import LUNARGR, environment
 
 from lunargr_cli.console import Console, harmless, say_error, write_out
+from lunargr_cli.main import take_verbose
 from stages.common import caches
 
 
@@ -178,3 +180,16 @@ def test_a_quiet_command_that_succeeds_says_nothing_on_standard_error(tmp_path):
     ):
         done = shell(f"lunargr {line} --quiet", tmp_path)
         assert (done.returncode, done.stderr) == (0, b""), (line, done.stderr)
+
+
+@pytest.mark.parametrize("line", ["lunargr -v schema pairs", "lunargr schema pairs --verbose"])
+def test_verbose_tells_time_and_memory_wherever_it_stands(tmp_path, line):
+    done = shell(line, tmp_path)
+    assert done.returncode == 0 and b"elevation" in done.stdout
+    assert re.fullmatch(rb"lunargr: [\d.]+ s, [\d.]+ s of processor time, at most \d+ MB\n", done.stderr)
+
+
+def test_verbose_is_no_part_of_the_command_line():
+    words = ["train", "p.h5", "-v", "--", "-v"]
+    assert take_verbose(words) and words == ["train", "p.h5", "--", "-v"]
+    assert not take_verbose(words)

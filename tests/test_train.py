@@ -16,6 +16,7 @@ import small_scene
 import torch
 
 from schemas import PAIRS, ArtefactError, ArtefactWriter, ConfigError, InputError, RegistryError
+from schemas.files.outputs import Output
 from stages import ingest, project, sample, train
 from stages.network.predictor import load_predictor
 from stages.network.steps import order_steps
@@ -24,6 +25,9 @@ from stages.network.uniform import fit_radiometry, fit_uniform
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form
 from stages.physics.photometry import get_model
+from stages.train import stage
+from stages.train.epoch import evaluate_loss, learn_epoch
+from stages.train.training import set_up
 
 SMALL = {
     "model": "M2",
@@ -156,14 +160,14 @@ def test_a_cosine_is_not_resumed_with_another_number_of_epochs(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(train, "_write_checkpoint", stop)
+        patch.setattr(stage, "write_checkpoint", stop)
         train.run(small_artefacts["pairs"], out, config(epochs=1, schedule=schedule))
-    again = (small_artefacts["pairs"], out, config(epochs=2, schedule=schedule))
+    again = (small_artefacts["pairs"], Output(out, resume=True), config(epochs=2, schedule=schedule))
     if longer:
-        assert len(train.run(*again, resume=True).history.train_loss) == 2
+        assert len(train.run(*again).history.train_loss) == 2
     else:
         with pytest.raises(ArtefactError, match="other options"):
-            train.run(*again, resume=True)
+            train.run(*again)
 
 
 def test_resume_refuses_another_run(small_artefacts, tmp_path):
@@ -172,7 +176,7 @@ def test_resume_refuses_another_run(small_artefacts, tmp_path):
     side = tmp_path / "checkpoint.resume.h5"
     shutil.copy(out, side)
     with pytest.raises(ArtefactError, match="cannot be resumed"):
-        train.run(small_artefacts["pairs"], out, config(epochs=1), overwrite=True, resume=True)
+        train.run(small_artefacts["pairs"], Output(out, overwrite=True, resume=True), config(epochs=1))
     assert out.exists()
 
 
@@ -213,11 +217,11 @@ def test_bad_requests_are_refused_and_leave_nothing(small_artefacts, tmp_path):
     pairs = small_artefacts["pairs"]
     for options, kind, words in [
         ({"model": "M9"}, RegistryError, "choose one of"),
-        ({"lr": -1.0}, ConfigError, "--lr"),
-        ({"epochs": 0}, ConfigError, "--epochs"),
+        ({"lr": -1.0}, ConfigError, "`lr`"),
+        ({"epochs": 0}, ConfigError, "`epochs`"),
         ({"widths": (4, 4, 4, 4, 4, 4, 4)}, ConfigError, "multiple of 64"),
-        ({"schedule": "steps"}, ConfigError, "--schedule"),
-        ({"device": "abacus"}, ConfigError, "--device"),
+        ({"schedule": "steps"}, ConfigError, "`schedule`"),
+        ({"device": "abacus"}, ConfigError, "`device`"),
     ]:
         with pytest.raises(kind, match=words):
             train.run(pairs, out, config(**options))
@@ -241,7 +245,7 @@ def test_the_losses_are_means_over_valid_pixels(small_artefacts):
     """Of a network that does not learn, evaluated by hand; the training loss is the same mean without dropout."""
     options = config(augment=False, dropout=(0.0,), batch=7, lr=1e-12)
     with PairReader(small_artefacts["pairs"]) as reader:
-        training = train._set_up(reader, options, [], torch.device("cpu"), 0, 1)
+        training = set_up(reader, options, [], torch.device("cpu"), 0, 1)
         part = reader.indices("train")[:20]
         training.predictor.eval()
         batch = reader.batch(part)
@@ -249,8 +253,12 @@ def test_the_losses_are_means_over_valid_pixels(small_artefacts):
             batch.observation, training.predictor.model, training.predictor.coefficients(batch.observation.elevation)
         )
         expected = (rendered - batch.image)[batch.valid].double().square().mean().item()
-        assert train.evaluate_loss(training, part, 7) == pytest.approx(expected, rel=1e-4)
-        learned = train.learn_epoch(training, part, options, 0)
+        error, objective = evaluate_loss(training, part, 7)
+        assert error == objective == pytest.approx(expected, rel=1e-4)
+        error, objective = evaluate_loss(training, part, 7, 0.1)
+        assert error == pytest.approx(expected, rel=1e-4)
+        assert 0.05 * expected < objective < 0.95 * error  # without most of what each crop's own gain explains
+        learned = learn_epoch(training, part, options, 0)
         assert learned == pytest.approx(expected, rel=0.5)  # batch normalisation by the batch, not the running mean
 
 

@@ -61,13 +61,20 @@ def test_content_has_every_map_of_the_file(hilly_map):
         deviation.attrs["units"] = "1"
         albedo = file.create_dataset("albedo", data=np.full(elevation.shape, 1.1, np.float32))
         albedo.attrs["long_name"] = "relative to what the terrain predicts"
+        counts = file.create_dataset("albedo_images", data=np.full(elevation.shape, 3, np.uint8))
+        counts.attrs["long_name"] = "how many made it"
+        file["coefficients_std"] = np.abs(coefficients[1:2]).astype(np.float32)  # of those that vary by place
+        file["map_name"] = np.array(["b"], h5py.string_dtype())
         file["samples"] = np.arange(7)  # not a map
     content = read_content(path, 2048)
     assert content.factor == 1 and content.grid.transform == grid.transform
     np.testing.assert_array_equal(content.elevation, elevation.astype(np.float32))
-    assert [layer.name for layer in content.coefficients] == ["a", "b", "c"]
-    assert [layer.name for layer in content.others] == [*(f"coefficient_std_{k}" for k in "abc"), "albedo"]
-    assert content.others[3].title == "albedo: relative to what the terrain predicts"
+    assert [layer.name for layer in content.coefficients] == ["a", "b", "c", "albedo"]  # albedo is in the picture
+    expected = ["albedo_images", *(f"coefficient_std_{k}" for k in "abc"), "coefficients_std_b"]
+    assert sorted(layer.name for layer in content.others) == expected
+    titles = {layer.name: layer.title for layer in content.others}
+    assert titles["albedo_images"] == "albedo images: how many made it"
+    assert content.model.formula.startswith("albedo_factor (")
 
 
 def test_a_large_map_is_shown_as_means_at_the_same_place(hilly_map):
@@ -118,7 +125,7 @@ def test_every_model_here_states_its_formula_for_the_page():
 def test_a_model_without_a_formula_for_the_page_is_refused_with_those_that_have_one(hilly_map, tmp_path, monkeypatch):
     monkeypatch.setattr(type(get_model("M2")), "glsl", None)
     with pytest.raises(RegistryError, match=r"its model M2 has no formula for a page.*akimov.*M1, M3"):
-        view.run(hilly_map[0], tmp_path / "o.html", view.Config())
+        view.run(hilly_map[0], None, tmp_path / "o.html", view.Config())
     assert not (tmp_path / "o.html").exists()
 
 
@@ -126,14 +133,14 @@ def test_a_model_without_a_formula_for_the_page_is_refused_with_those_that_have_
     ("config", "output", "message"),
     [
         (view.Config(), "o.png", r"ends in \.html"),
-        (view.Config(max_px=3), "o.html", "--max-px"),
-        (view.Config(sun_elevation_deg=0.0), "o.html", "--sun-elevation"),
-        (view.Config(photographs=0), "o.html", "--photographs"),
+        (view.Config(max_px=3), "o.html", "`max_px`"),
+        (view.Config(sun_elevation_deg=0.0), "o.html", "`sun_elevation_deg`"),
+        (view.Config(photographs=0), "o.html", "`photographs`"),
     ],
 )
 def test_options_that_make_no_page(hilly_map, tmp_path, config, output, message):
     with pytest.raises(ConfigError, match=message):
-        view.run(hilly_map[0], tmp_path / output, config)
+        view.run(hilly_map[0], None, tmp_path / output, config)
 
 
 def test_files_that_make_no_page(hilly_map, small_artefacts, tmp_path):
@@ -147,13 +154,13 @@ def test_files_that_make_no_page(hilly_map, small_artefacts, tmp_path):
         (path, small_artefacts["pairs"], "this map's scene"),
     ):
         with pytest.raises(LunargrError, match=message):
-            view.run(source, tmp_path / "o.html", view.Config(), pairs=pairs)
+            view.run(source, pairs, tmp_path / "o.html", view.Config())
     assert not list(tmp_path.glob("*.html"))
 
 
 def test_the_page_asks_for_nothing_outside_itself_and_a_title_cannot_break_it(hilly_map, tmp_path):
     title = "</script><b>A & B"
-    view.run(hilly_map[0], tmp_path / "o.html", view.Config(title=title))
+    view.run(hilly_map[0], None, tmp_path / "o.html", view.Config(title=title))
     text = (tmp_path / "o.html").read_text()
     assert "default-src 'none'" in text
     assert not re.search(r"<(script|link|img|iframe)[^>]+(src|href)=\"(?!data:)", text)

@@ -12,6 +12,7 @@ from browser import chromium, read_dom, run_in_page
 from relief import hills
 from render_scene import LAT, LON, make_grid, smooth_maps, write_svbrdf
 
+from schemas.files.outputs import Output
 from stages import render, view
 from stages.physics.photometry import evaluate, get_model, model_names
 from stages.render.pictures import read_exr
@@ -37,7 +38,7 @@ def make_map(folder, model: str):
 
 
 def rendered(path, folder, **config):
-    render.run(path, folder / "r.exr", render.Config(**config), overwrite=True)
+    render.run(path, Output(folder / "r.exr", overwrite=True), render.Config(**config))
     image = read_exr(folder / "r.exr")["image"]
     return np.where(np.isfinite(image), np.maximum(image, 0), np.nan)
 
@@ -45,7 +46,7 @@ def rendered(path, folder, **config):
 @pytest.mark.parametrize("model", FAMILIES)
 def test_the_page_shows_what_render_gives(tmp_path, model):
     path, page = make_map(tmp_path, model), tmp_path / "v.html"
-    view.run(path, page, view.Config())
+    view.run(path, None, page, view.Config())
     calls = ",".join(f"lunargr.pixels({{azimuth: {a}, elevation: {e}}})" for a, e in SUNS)
     for (azimuth, elevation), found in zip(SUNS, run_in_page(page, f"return [{calls}]"), strict=True):
         expected = rendered(path, tmp_path, sun_azimuth_deg=azimuth, sun_elevation_deg=elevation)
@@ -57,9 +58,26 @@ def test_the_page_shows_what_render_gives(tmp_path, model):
     assert np.nanmin(expected) < 0.9 * np.nanmax(expected)
 
 
+@pytest.mark.parametrize("model", ["hapke", "kernels"])
+def test_albedo_from_photographs_is_in_the_picture(tmp_path, model):
+    """As `lunargr render` has it: a factor on the I/F of the coefficients, place by place."""
+    path, page = make_map(tmp_path, model), tmp_path / "v.html"
+    albedo = 1 + 0.5 * np.sin(np.arange(96)[:, None] / 9) * np.cos(np.arange(128) / 7)
+    with h5py.File(path, "r+") as file:
+        file["albedo"] = albedo.astype(np.float32)
+    view.run(path, None, page, view.Config())
+    calls = "return [lunargr.pixels({azimuth: 270, elevation: 35}), lunargr.head.fields.map((l) => l.name)]"
+    found, layers = run_in_page(page, calls)
+    expected = rendered(path, tmp_path, sun_azimuth_deg=270.0, sun_elevation_deg=35.0)
+    found = found.reshape(expected.shape)
+    assert np.nanmean(found) == pytest.approx(np.nanmean(expected), rel=0.01)
+    assert np.nanquantile(np.abs(found - expected), 0.9) < 0.005 * np.nanmean(expected)
+    assert layers.count("albedo") == 1
+
+
 def test_light_that_goes_to_a_camera(tmp_path):
     path, page = make_map(tmp_path, "hapke"), tmp_path / "v.html"
-    view.run(path, page, view.Config())
+    view.run(path, None, page, view.Config())
     config = {"sun_azimuth_deg": 120.0, "sun_elevation_deg": 30.0, "shadows": False}
     # 2 km up over the middle of the map, where the page's axes begin: straight above it, 45 degrees at its border
     expected = rendered(path, tmp_path, position=(LON, LAT, 2000.0), **config)
@@ -76,7 +94,7 @@ def test_values_layers_and_the_address(tmp_path):
         grid_shape = file["elevation"].shape
         file["coefficient_std"] = np.full((3, *grid_shape), 0.002, np.float32)
         elevation, a = file["elevation"][70, 100], file["coefficients"][0, 70, 100]
-    view.run(path, page, view.Config(sun_azimuth_deg=100.0, sun_elevation_deg=20.0))
+    view.run(path, None, page, view.Config(sun_azimuth_deg=100.0, sun_elevation_deg=20.0))
     found = run_in_page(
         page,
         """
@@ -113,22 +131,20 @@ def test_photographs_match_the_page_under_their_own_sun(small_artefacts, tmp_pat
     from test_view import map_of
 
     page = tmp_path / "v.html"
-    view.run(
-        map_of(small_artefacts["scene"], tmp_path), page, view.Config(photographs=2), pairs=small_artefacts["pairs"]
-    )
+    view.run(map_of(small_artefacts["scene"], tmp_path), small_artefacts["pairs"], page, view.Config(photographs=2))
     text = run_in_page(page, "lunargr.photograph(1); return document.getElementById('photograph-text').textContent")
     assert float(re.search(r"correlation (-?[\d.]+)", text).group(1)) > 0.8, text
 
 
 def test_the_page_works_under_its_own_policy_of_no_network_at_all(tmp_path):
     page = tmp_path / "v.html"
-    view.run(make_map(tmp_path, "M2"), page, view.Config())
+    view.run(make_map(tmp_path, "M2"), None, page, view.Config())
     assert 'data-lunargr="ready"' in read_dom(page)
 
 
 def test_without_webgl_there_is_a_sentence_and_a_picture(tmp_path):
     page = tmp_path / "v.html"
-    view.run(make_map(tmp_path, "M2"), page, view.Config())
+    view.run(make_map(tmp_path, "M2"), None, page, view.Config())
     found = run_in_page(
         page,
         """const picture = document.querySelector("#fallback img");

@@ -7,18 +7,9 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import (
-    Output,
-    Overwrite,
-    Parts,
-    Quiet,
-    ResumeParts,
-    Scheduler,
-    Shard,
-    in_parts,
-    parse_shard,
-)
-from lunargr_cli.paths import Writes
+from lunargr_cli import options
+from schemas.errors import ConfigError
+from stages.albedo import Config
 
 NAME, ORDER = "albedo", 61
 
@@ -34,45 +25,42 @@ def command(
         str | None,
         typer.Option("--fold", metavar="K/N", help="Leave out every N-th image from the K-th (1-based) on."),
     ] = None,
-    geotiff: Annotated[
-        Path | None,
-        typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif)."),
-        Writes.FILE,
-    ] = None,
-    no_geotiff: Annotated[bool, typer.Option("--no-geotiff", help="Write the HDF5 map only.")] = False,
-    shard: Shard = None,
-    output: Output = Path("svbrdf_albedo.h5"),
-    scheduler: Scheduler = None,
-    resume: ResumeParts = False,
-    parts: Parts = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    register: Annotated[
+        str | None,
+        typer.Option(
+            "--register",
+            metavar="FORM",
+            help="Take off how far each image lies from its rendering: constant, affine or field, as 'lunargr project'.",
+        ),
+    ] = Config.register,
+    geotiff: options.GeoTiff = None,
+    no_geotiff: options.NoGeoTiff = False,
+    shard: options.Shard = None,
+    output: options.OutputFile = Path("svbrdf_albedo.h5"),
+    scheduler: options.Scheduler = None,
+    resume: options.ResumeParts = False,
+    parts: options.Parts = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Add per-pixel albedo to a reflectance map, from all photographs of the scene.
 
     The albedo multiplies the I/F of the map. Where photographs agree it is theirs; where they do not, and where there are
     none, it is 1 and the map stays as the terrain gave it. Rendering, evaluation and GeoTIFF take it into account.
     """
+    made = {"leave_out": options.read_names(leave_out), "fold": _fold(fold), "geotiff": not no_geotiff}
+    config = options.configure(Config, locals(), **made, shard=options.parse_shard(shard))
     from lunargr_cli.console import Console
-    from schemas import ConfigError
     from stages import albedo
 
-    if geotiff and no_geotiff:
-        raise ConfigError(f"--geotiff {geotiff} and --no-geotiff: expected one of them, found both.")
-    console = Console(quiet)
-    config = albedo.Config(
-        leave_out=tuple(name.strip() for name in leave_out.split(",") if name.strip()) if leave_out else (),
-        fold=_fold(fold),
-        shard=parse_shard(shard),
-        geotiff=not no_geotiff,
-    )
-    if in_parts(scheduler, resume, parts, shard):
+    console, to = Console(quiet), options.to_map(output, overwrite, geotiff, no_geotiff)
+    if options.in_parts(scheduler, resume, parts, shard):
+        from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_albedo
 
-        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
-        found = run_albedo(svbrdf, scene, output, config, geotiff, parts, **how)
+        found = run_albedo(svbrdf, scene, to, config, Work(scheduler, parts, console.say, console.progress))
     else:
-        found = albedo.run(svbrdf, scene, output, config, geotiff, overwrite, console.progress)
+        found = albedo.run(svbrdf, scene, to, config, console.say, console.progress)
     mean, std, low, high = found.albedo
     console.say(
         f"{output}: albedo from {len(found.images)} images over {found.covered_share:.1%} of the map, "
@@ -92,8 +80,6 @@ def command(
 
 def _fold(text: str | None) -> tuple[int, int] | None:
     """'2/4' -> (1, 4). Raises ConfigError."""
-    from schemas import ConfigError
-
     if text is None:
         return None
     first, _, last = text.partition("/")

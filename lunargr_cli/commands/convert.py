@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Output, Overwrite, Quiet
+from lunargr_cli.options import OutputFile, Overwrite, Quiet
 
 NAME, ORDER = "convert", 86
 
@@ -20,7 +20,7 @@ def command(
     end: Annotated[
         str, typer.Option("--to", metavar="SYSTEM:MODEL", help="Convention of the output, e.g. lunargr:hapke.")
     ],
-    output: Output,
+    output: OutputFile,
     bands: Annotated[
         str | None,
         typer.Option(
@@ -37,12 +37,13 @@ def command(
 ) -> None:
     """Write coefficient maps in another program's convention; 'lunargr models --conventions' lists them."""
     from lunargr_cli.console import Console
+    from lunargr_cli.options import read_names
+    from schemas.files.outputs import Output
     from stages import convert
 
     console = Console(quiet)
-    names = None if bands is None else [name.strip() for name in bands.split(",")]
-    config = convert.Config(start, end, names, approximate)
-    report = convert.run(source, output, config, overwrite, console.progress)
+    config = convert.Config(start, end, None if bands is None else read_names(bands), approximate)
+    report = convert.run(source, Output(output, overwrite), config, console.say, console.progress)
     for loss in report.losses:
         console.say(f"lost: {loss}")
     console.say(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import MOST, Device, Json, Output, Overwrite, Quiet, ResumeParts, Scheduler, Seed
+from lunargr_cli import options
 from lunargr_cli.paths import Writes
+from stages.evaluate import Config
 
 NAME, ORDER = "evaluate", 70
 
@@ -22,12 +23,12 @@ def command(
             help="From 'lunargr train', several being training runs of one model; with --held-out-images maps from 'lunargr albedo'.",
         ),
     ],
-    output: Output = Path("evaluation.h5"),
+    output: options.OutputFile = Path("evaluation.h5"),
     held_out_images: Annotated[
         bool,
         typer.Option("--held-out-images", help="Score seen ground under images that did not make the map's albedo."),
     ] = False,
-    split: Annotated[str, typer.Option("--split", help="train, validation or test.")] = "test",
+    split: Annotated[str, typer.Option("--split", help="train, validation or test.")] = Config.split,
     extend: Annotated[
         Path | None,
         typer.Option("--extend", metavar="FILE", help="Also score the extended model of 'lunargr diagnose'."),
@@ -39,8 +40,10 @@ def command(
     ] = None,
     fit_pairs: Annotated[
         int,
-        typer.Option("--fit-pairs", min=0, max=MOST, help="Most train pairs that baselines are fitted on (0: all)."),
-    ] = 4096,
+        typer.Option(
+            "--fit-pairs", min=0, max=options.MOST, help="Most train pairs that baselines are fitted on (0: all)."
+        ),
+    ] = Config.fit_pairs,
     renderings: Annotated[
         bool | None,
         typer.Option(
@@ -51,14 +54,16 @@ def command(
         list[str] | None,
         typer.Option("--only", metavar="ROW", help="Score only this row of the table; may be repeated."),
     ] = None,
-    batch: Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Crops in memory at a time.")] = 16,
-    seed: Seed = 0,
-    device: Device = "auto",
-    json_file: Json = None,
-    scheduler: Scheduler = None,
-    resume: ResumeParts = False,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    batch: Annotated[
+        int, typer.Option("--batch", min=1, max=options.MOST, help="Crops in memory at a time.")
+    ] = Config.batch,
+    seed: options.Seed = Config.seed,
+    device: options.Device = Config.device,
+    json_file: options.Json = None,
+    scheduler: options.Scheduler = None,
+    resume: options.ResumeParts = False,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Score the learned model and its baselines on one split: MSE, PSNR, SSIM, LPIPS, with 95 % intervals.
 
@@ -66,31 +71,36 @@ def command(
     the train split in the same way for every model; their errors are shares of the full DN range. Checkpoints of one
     model from several seeds make the learned rows means over training runs, whose spread is part of the intervals.
     """
+    config = options.configure(Config, locals(), only=tuple(only or ()), extend=str(extend) if extend else None)
     from lunargr_cli.console import Console
+    from schemas.files.outputs import Output
     from stages import evaluate
+    from stages.evaluate.coverage import coverage_lines
     from stages.evaluate.table import basis, gain_lines, result_lines
 
     console = Console(quiet)
+    to = Output(output, overwrite, json=json_file, figures=figures)
     if held_out_images:
         from lunargr_cli.held_out import show_held_out_images
 
-        show_held_out_images(console, pairs, checkpoints, output, (split, seed), json_file, overwrite)
+        show_held_out_images(console, pairs, checkpoints, to, split, seed)
         return
-    config = evaluate.Config(split, batch, fit_pairs, renderings, seed, device, tuple(only or ()))
-    more: dict[str, Any] = {"extend": extend, "json_file": json_file, "figures": figures, "overwrite": overwrite}
-    more["progress"] = console.progress
     if scheduler is not None or resume:
+        from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_evaluate
 
-        result = run_evaluate(pairs, checkpoints, output, config, scheduler=scheduler, say=console.say, **more)
+        work = Work(scheduler, None, console.say, console.progress)
+        result = run_evaluate(pairs, checkpoints, to, config, work)
     else:
-        result = evaluate.run(pairs, checkpoints, output, config, **more)
+        result = evaluate.run(pairs, checkpoints, to, config, console.say, console.progress)
     columns, cells = result_lines(result)
     unit = "I/F" if result["image_units"] == "iof" else f"shares of {result['dn_full_range']:.0f} DN"
     console.table(f"split '{split}': {basis(result)}; errors in {unit}", columns, cells)
     columns, cells = gain_lines(result)
     if cells:
         console.table(f"what the learned reflectance gains, paired over ground: {basis(result)}", columns, cells)
+    if result["coverage_percent"] is not None:
+        console.table("pixels within the learned intervals, percent", *coverage_lines(result["coverage_percent"]))
     for sentence in result["conclusions"]:
         console.say(sentence)
     for warning in result["warnings"]:

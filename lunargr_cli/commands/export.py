@@ -7,23 +7,25 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Output, Overwrite, Quiet
+from lunargr_cli.options import OutputFile, Overwrite, Quiet
+from stages.export import Config
 
 NAME, ORDER = "export", 62
 
 
 def command(
     checkpoint: Annotated[Path, typer.Argument(help="checkpoint.h5 from 'lunargr train'.")],
-    output: Output = Path("model.onnx"),
-    opset: Annotated[int, typer.Option("--opset", help="ONNX operator set.")] = 17,
+    output: OutputFile = Path("model.onnx"),
+    opset: Annotated[int, typer.Option("--opset", help="ONNX operator set.")] = Config.opset,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Write a trained network as ONNX for maps of any size, with a model card (.md) beside it."""
     from lunargr_cli.console import Console
+    from schemas.files.outputs import Output
     from stages import export
 
-    made = export.run(checkpoint, output, export.Config(opset), overwrite=overwrite)
+    made = export.run(checkpoint, Output(output, overwrite), Config(opset))
     Console(quiet).say(
         f"{output}: {made.model}, coefficients {', '.join(made.coefficients)}, sizes in multiples of {made.stride} px, "
         f"{made.size / 1e6:.1f} MB; {made.card} says what it is"

@@ -7,19 +7,8 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import (
-    MOST,
-    BodyOption,
-    Output,
-    Overwrite,
-    Parts,
-    Quiet,
-    ResumeParts,
-    Scheduler,
-    Shard,
-    in_parts,
-    parse_shard,
-)
+from lunargr_cli import options
+from stages.ingest import Config
 
 NAME, ORDER = "ingest", 20
 
@@ -38,35 +27,35 @@ def command(
         float | None, typer.Option("--gsd", help="Working ground sample distance, m (default: the DEM's own).")
     ] = None,
     crop: Annotated[
-        int, typer.Option("--crop", min=1, max=MOST, help="Crop size in pixels that valid positions are made for.")
-    ] = 128,
-    output: Output = Path("scene.h5"),
-    body: BodyOption = None,
+        int,
+        typer.Option("--crop", min=1, max=options.MOST, help="Crop size in pixels that valid positions are made for."),
+    ] = Config.crop,
+    output: options.OutputFile = Path("scene.h5"),
+    body: options.BodyOption = Config.body,
     skip_outside: Annotated[
         bool, typer.Option("--skip-outside", help="Leave out images that do not touch the DEM.")
-    ] = False,
-    shard: Shard = None,
-    scheduler: Scheduler = None,
-    resume: ResumeParts = False,
-    parts: Parts = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    ] = Config.skip_outside,
+    shard: options.Shard = None,
+    scheduler: options.Scheduler = None,
+    resume: options.ResumeParts = False,
+    parts: options.Parts = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Bring a DEM to a metric grid and find where crops of each image may be centred."""
+    config = options.configure(Config, locals(), shard=options.parse_shard(shard))
     from lunargr_cli.console import Console
+    from schemas.files.outputs import Output
     from stages import ingest
 
-    console = Console(quiet)
-    config = ingest.Config(
-        gsd=gsd, crop=crop, body="moon" if body is None else body, skip_outside=skip_outside, shard=parse_shard(shard)
-    )
-    if in_parts(scheduler, resume, parts, shard):
+    console, to = Console(quiet), Output(output, overwrite)
+    if options.in_parts(scheduler, resume, parts, shard):
+        from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_ingest
 
-        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
-        found = run_ingest(dem, images, output, config, parts, **how)
+        found = run_ingest(dem, images, to, config, Work(scheduler, parts, console.say, console.progress))
     else:
-        found = ingest.run(dem, images, output, config, overwrite, console.progress)
+        found = ingest.run(dem, images, to, config, console.say, console.progress)
     grid, (low, high) = found.grid, found.elevation_range
     method = "reprojected to a local metric grid" if found.resampled else "area means of the DEM's own grid"
     console.say(

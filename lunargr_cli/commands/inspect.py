@@ -3,29 +3,65 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json, Overwrite
+from schemas.errors import ArtefactError
 
 if TYPE_CHECKING:
     from schemas.provenance import Step
 
 NAME, ORDER = "inspect", 90
+SHOWN = 16  # digits of a SHA-256 on the terminal; --json has all
 
 
 def command(
-    file: Annotated[Path, typer.Argument(help="Any artefact of lunargr.")],
+    file: Annotated[Path, typer.Argument(help="Any artefact of lunargr: HDF5, GeoTIFF or EXR.")],
     json_file: Json = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Say what an artefact is, who made it and from what; check it against its schema."""
-    from schemas import open_artefact, read_kind, write_json
+    from schemas import write_json
     from schemas.provenance import chain
+    from schemas.rasters import raster_kind
+
+    found = _of_raster(file) if raster_kind(file) else _of_artefact(file)
+    steps = chain(file)
+    if raster_kind(file) and steps[-1].record is None:
+        raise ArtefactError(
+            f"{file}: expected a raster that a lunargr command wrote, found no record of one; gdalinfo and oiiotool read others."
+        )
+    if json_file is not None:
+        content = {"file": file.name, "schema": found.schema, "attributes": found.attributes, found.what: found.parts}
+        write_json(json_file, content | {"chain": [asdict(s) for s in steps]})
+    console = Console()
+    write_out(f"{file}: {found.title}\n")
+    rows = [(n, *(v for v in part.values() if isinstance(v, str))) for n, part in found.parts.items()]
+    console.table(found.what, ("name", *found.columns), rows)
+    shown = {k: v for k, v in found.attributes.items() if k != "provenance"}
+    console.table("attributes", ("name", "value"), shown.items())
+    console.table("made by, in this order", ("file", "command", "version", "seed", "sha256"), [_row(s) for s in steps])
+
+
+@dataclass(frozen=True)
+class Found:
+    """parts : the variables or bands by name, what is text in them stands in the table under ``columns``"""
+
+    schema: str
+    title: str
+    what: str
+    columns: tuple[str, ...]
+    parts: dict[str, dict[str, Any]]
+    attributes: dict[str, Any]
+
+
+def _of_artefact(file: Path) -> Found:
+    from schemas import open_artefact, read_kind
 
     schema = read_kind(file)
     with open_artefact(file, schema) as data:
@@ -34,33 +70,32 @@ def command(
             name: {
                 "dims": list(schema[name].dims) if name in schema else [],
                 "shape": list(data[name].shape),
+                "size": "x".join(map(str, data[name].shape)) or "scalar",
                 "dtype": str(data[name].dtype),
             }
             for name in data
             if hasattr(data[name], "shape")
             and not str(data[name].attrs.get("NAME", "")).startswith("This is a netCDF dim")
         }
-    steps = chain(file)
-    if json_file is not None:
-        content = {"file": file.name, "schema": schema.name, "attributes": attributes, "variables": variables}
-        write_json(json_file, content | {"chain": [asdict(s) for s in steps]})
-    console = Console()
-    write_out(
-        f"{file}: {schema.title} ('{schema.name}', version {schema.version}, written by 'lunargr {schema.stage}')\n"
-    )
-    console.table(
-        "variables",
-        ("name", "shape", "type"),
-        [(n, "x".join(map(str, v["shape"])) or "scalar", v["dtype"]) for n, v in variables.items()],
-    )
-    shown = {k: v for k, v in attributes.items() if k != "provenance"}
-    console.table("attributes", ("name", "value"), shown.items())
-    console.table("made by, in this order", ("file", "command", "version", "seed", "sha256"), [_row(s) for s in steps])
+    title = f"{schema.title} ('{schema.name}', version {schema.version}, written by 'lunargr {schema.stage}')"
+    return Found(schema.name, title, "variables", ("shape", "type"), variables, attributes)
+
+
+def _of_raster(file: Path) -> Found:
+    from schemas.rasters import read_raster
+
+    found = read_raster(file)
+    size = "x".join(map(str, found.shape))
+    bands = {
+        name: {"shape": list(found.shape), "size": size, "unit": unit, "dtype": kind}
+        for name, unit, kind in found.bands
+    }
+    return Found(found.kind, found.kind, "bands", ("shape", "unit", "type"), bands, dict(found.tags))
 
 
 def _row(step: Step) -> tuple[object, ...]:
     record = step.record
     if record is None:
-        return step.name, "(given)", "", "", step.sha256
+        return step.name, "(given)", "", "", step.sha256[:SHOWN]
     how = record["command"] or f"(Python) {record['schema']} {json.dumps(record['config'], sort_keys=True)}"
-    return step.name, how, record["version"], "" if record["seed"] < 0 else record["seed"], step.sha256
+    return step.name, how, record["version"], "" if record["seed"] < 0 else record["seed"], step.sha256[:SHOWN]

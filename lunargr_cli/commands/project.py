@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import typer.core
 
-from lunargr_cli.options import Output, Overwrite, Parts, Quiet, ResumeParts, Scheduler, Shard, in_parts, parse_shard
+from lunargr_cli import options
 from lunargr_cli.paths import Writes
+from schemas.errors import ConfigError
+from stages.project import Config
 
 if TYPE_CHECKING:
     from lunargr_cli.console import Console
@@ -20,18 +22,16 @@ if TYPE_CHECKING:
 NAME, ORDER = "project", 40
 
 
-FORMS = ("constant", "affine", "field")  # as in stages.physics.images.displacement, which is slow to import
-
-
 class CLASS(typer.core.TyperCommand):
     """``--register`` alone means ``--register constant``: typer knows no option whose value may be left out."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Write out what ``--register`` alone means."""
         full = []
         for k, word in enumerate(args):
             full.append(word)
             if word == "--register" and not _is_value(args[k + 1 : k + 2]):
-                full.append(FORMS[0])
+                full.append("constant")
         return super().parse_args(ctx, full)
 
 
@@ -56,7 +56,7 @@ def command(
     ] = None,
     max_shift: Annotated[
         float, typer.Option("--max-shift", help="How far to search when registering, px of the scene's grid.")
-    ] = 8.0,
+    ] = Config.max_shift,
     blocks_csv: Annotated[
         Path | None,
         typer.Option("--shifts", metavar="CSV", help="Also write each block's own shift to a table."),
@@ -64,42 +64,35 @@ def command(
     ] = None,
     exact: Annotated[
         bool, typer.Option("--exact", help="Keep all digits of float32, not those that matter: three times the size.")
-    ] = False,
-    shard: Shard = None,
-    output: Output = Path("pairs.h5"),
-    scheduler: Scheduler = None,
-    resume: ResumeParts = False,
-    parts: Parts = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    ] = Config.exact,
+    shard: options.Shard = None,
+    output: options.OutputFile = Path("pairs.h5"),
+    scheduler: options.Scheduler = None,
+    resume: options.ResumeParts = False,
+    parts: options.Parts = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Orthorectify the images onto the crops; add the Sun, the camera and the terrain's horizon."""
+    config = options.configure(Config, locals(), scene=str(scene) if scene else None, shard=options.parse_shard(shard))
     from lunargr_cli.console import Console
-    from schemas import ConfigError
-    from schemas.files.outputs import Target, check_outputs
+    from schemas.files.outputs import Output, Target, check_outputs
     from stages import project
 
-    console = Console(quiet)
+    console, to = Console(quiet), Output(output, overwrite)
     if blocks_csv is not None:
         if register is None:
             raise typer.BadParameter("needs --register", param_hint="--shifts")
-        check_outputs([Target(output), Target(blocks_csv, "--shifts")], [crops], overwrite)
-    config = project.Config(
-        scene=str(scene) if scene else None,
-        shard=parse_shard(shard),
-        register=register,
-        max_shift=max_shift,
-        exact=exact,
-    )
-    if in_parts(scheduler, resume, parts, shard):
+        check_outputs([Target(output), Target(blocks_csv, "blocks_csv")], [crops], overwrite)
+    if options.in_parts(scheduler, resume, parts, shard):
+        from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_project
 
         if blocks_csv is not None:
             raise ConfigError("--shifts: parts do not keep the blocks' own shifts; leave out --scheduler and --resume.")
-        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
-        found = run_project(crops, output, config, parts, **how)
+        found = run_project(crops, to, config, Work(scheduler, parts, console.say, console.progress))
     else:
-        found = project.run(crops, output, config, overwrite, console.progress)
+        found = project.run(crops, to, config, console.say, console.progress)
     (i0, i1), (e0, e1) = found.incidence_deg, found.emission_deg
     console.say(
         f"{output}: {found.pairs} pairs, {found.valid_share:.1%} of pixels valid, {found.shadowed_share:.1%} of these in cast shadow; "

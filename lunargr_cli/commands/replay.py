@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lunargr_cli.console import write_out
+from schemas.errors import ArtefactError
 
 if TYPE_CHECKING:
     from schemas.provenance import Step
@@ -18,13 +19,20 @@ if TYPE_CHECKING:
 NAME, ORDER = "replay", 91
 
 
-def command(file: Annotated[Path, typer.Argument(help="Any artefact of lunargr.")]) -> None:
+def command(file: Annotated[Path, typer.Argument(help="Any artefact of lunargr: HDF5, GeoTIFF or EXR.")]) -> None:
     """Print the chain of commands that makes an artefact again, as a shell script; nothing is run."""
     from schemas import open_artefact, read_kind
     from schemas.provenance import chain
+    from schemas.rasters import raster_kind
 
-    open_artefact(file, read_kind(file)).close()
-    write_out("\n".join(script(chain(file))))
+    if not raster_kind(file):
+        open_artefact(file, read_kind(file)).close()
+    steps = chain(file)
+    if steps[-1].record is None:
+        raise ArtefactError(
+            f"{file}: expected an artefact that holds the command of its run, found none; nothing to replay."
+        )
+    write_out("\n".join(script(steps)))
 
 
 def script(steps: Sequence[Step]) -> Iterator[str]:

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import Output, Overwrite, Quiet
+from lunargr_cli.options import OutputFile, Overwrite, Quiet
+from stages.report import Config
 
 NAME, ORDER = "report", 85
 
@@ -21,17 +22,16 @@ def command(
             "and pages of 'lunargr view' (.html) to link to.",
         ),
     ],
-    output: Output = Path("report.html"),
-    title: Annotated[
-        str, typer.Option("--title", help="Title of the page.")
-    ] = "Lunar reflectance learned from terrain",
+    output: OutputFile = Path("report.html"),
+    title: Annotated[str, typer.Option("--title", help="Title of the page.")] = Config.title,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Put maps, tables, curves and pictures of a run on one HTML page that needs nothing else, in light or dark."""
     from lunargr_cli.console import Console
+    from schemas.files.outputs import Output
     from stages import report
 
     console = Console(quiet)
-    titles = report.run(files, output, report.Config(title), overwrite=overwrite, progress=console.progress)
+    titles = report.run(files, Output(output, overwrite), Config(title), console.say, console.progress)
     console.say(f"{output}: {', '.join(titles)}")

@@ -7,21 +7,29 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import MOST, Output, Overwrite, Parts, Quiet, Scheduler, Seed, Shard, in_parts, parse_shard
+from lunargr_cli import options
+from schemas.errors import ConfigError
+from stages.sample import Config
 
 NAME, ORDER = "sample", 30
+DEFAULT_SPLIT = "/".join(f"{100 * share:g}" for share in Config.split)
 
 
 def command(
     scene: Annotated[Path, typer.Argument(help="scene.h5 from 'lunargr ingest'.")],
     crop: Annotated[
         int | None,
-        typer.Option("--crop", min=1, max=MOST, help="Crop size in pixels, a multiple of 16 (default: the scene's)."),
+        typer.Option(
+            "--crop", min=1, max=options.MOST, help="Crop size in pixels, a multiple of 16 (default: the scene's)."
+        ),
     ] = None,
     count: Annotated[
         int | None,
         typer.Option(
-            "--count", min=1, max=MOST, help="Crops in all; with --stack, places in all (default: 100 per image)."
+            "--count",
+            min=1,
+            max=options.MOST,
+            help="Crops in all; with --stack, places in all (default: 100 per image).",
         ),
     ] = None,
     density: Annotated[
@@ -29,47 +37,43 @@ def command(
     ] = None,
     stack: Annotated[
         bool, typer.Option("--stack", help="Crop every image that covers a chosen place: pairs share a 'site'.")
-    ] = False,
+    ] = Config.stack,
     tile_m: Annotated[
         float | None, typer.Option("--tile-m", help="Edge of a ground tile of the split, m (default: up to 4 crops).")
     ] = None,
-    split: Annotated[str, typer.Option("--split", help="Shares of train/validation/test.")] = "80/10/10",
-    seed: Seed = 0,
-    shard: Shard = None,
-    output: Output = Path("crops.h5"),
-    scheduler: Scheduler = None,
-    parts: Parts = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    split: Annotated[str, typer.Option("--split", help="Shares of train/validation/test.")] = DEFAULT_SPLIT,
+    seed: options.Seed = Config.seed,
+    shard: options.Shard = None,
+    output: options.OutputFile = Path("crops.h5"),
+    scheduler: options.Scheduler = None,
+    parts: options.Parts = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Choose crop centres per image and split them by ground tile, with no ground shared between the parts."""
+    config = options.configure(Config, locals(), split=_shares(split), shard=options.parse_shard(shard))
     from lunargr_cli.console import Console
-    from schemas import ConfigError
+    from schemas.files.outputs import Output
     from stages import sample
 
+    console, to = Console(quiet), Output(output, overwrite)
+    if options.in_parts(scheduler, False, parts, shard):
+        from lunargr_cli.fanout.job import Work
+        from lunargr_cli.fanout.stages import run_sample
+
+        audit = run_sample(scene, to, config, Work(scheduler, parts, console.say, console.progress))
+    else:
+        audit = sample.run(scene, to, config, console.say, console.progress)
+    rows = [(p.name, p.pairs, p.images, p.tiles, f"{p.ground_km2:.2f}", f"{p.shared_km2:.2f}") for p in audit]
+    console.table("split by ground tile", ("part", "pairs", "images", "tiles", "ground km2", "shared km2"), rows)
+
+
+def _shares(text: str) -> tuple[float, float, float]:
+    """'80/10/10' -> (0.8, 0.1, 0.1). Raises ConfigError."""
     try:
-        shares = [float(v) for v in split.split("/")]
+        shares = [float(v) for v in text.split("/")]
         total = sum(shares)
         first, second, third = (v / total for v in shares)
     except (ValueError, ZeroDivisionError):
-        raise ConfigError(f"--split: expected three shares like 80/10/10, found '{split}'.") from None
-    console = Console(quiet)
-    config = sample.Config(
-        crop=crop,
-        count=count,
-        density=density,
-        stack=stack,
-        tile_m=tile_m,
-        split=(first, second, third),
-        seed=seed,
-        shard=parse_shard(shard),
-    )
-    if in_parts(scheduler, False, parts, shard):
-        from lunargr_cli.fanout.stages import run_sample
-
-        how = {"scheduler": scheduler, "overwrite": overwrite, "say": console.say, "progress": console.progress}
-        audit = run_sample(scene, output, config, parts, **how)
-    else:
-        audit = sample.run(scene, output, config, overwrite, console.progress)
-    rows = [(p.name, p.pairs, p.images, p.tiles, f"{p.ground_km2:.2f}", f"{p.shared_km2:.2f}") for p in audit]
-    console.table("split by ground tile", ("part", "pairs", "images", "tiles", "ground km2", "shared km2"), rows)
+        raise ConfigError(f"--split: expected three shares like 80/10/10, found '{text}'.") from None
+    return first, second, third

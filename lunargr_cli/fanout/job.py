@@ -17,11 +17,10 @@ from typing import Any
 from lunargr_cli.fanout.engines import Engine, Here, Task, open_dask
 from schemas.errors import ConfigError, InputError
 from schemas.files.locks import claim
-from schemas.files.outputs import check_output
+from schemas.files.outputs import Output, check_output
 from schemas.provenance import sha256
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 
-Progress = Callable[[int, int, str], None]
-Say = Callable[[str], None]
 PATIENCE = 20  # seconds
 
 
@@ -32,7 +31,7 @@ class Job:
     folder: Path
     engine: Engine
     say: Say
-    progress: Progress | None
+    progress: Progress
     again: bool  # an earlier run was interrupted
 
     def fan(
@@ -48,40 +47,63 @@ class Job:
         if len(todo) < count:
             self.say(f"{what}: {count - len(todo)} of {count} parts are there already")
         done = count - len(todo)
-        if self.progress:
-            self.progress(0, count, f"{what}, parts")
+        self.progress(0, count, f"{what}, parts")
         for _ in self.engine.work(todo):
             done += 1
-            if self.progress:
-                self.progress(done, count, f"{what}, parts")
+            self.progress(done, count, f"{what}, parts")
         for path in paths:
             _await(path)
         return paths
 
 
-@contextlib.contextmanager
-def open_job(
-    output: Path,
-    stage: str,
-    options: Mapping[str, Any],
-    inputs: Sequence[Path],
-    *,
-    scheduler: str | None = None,
-    sources: Sequence[Path] = (),
-    overwrite: bool = False,
-    say: Say = lambda line: None,
-    progress: Progress | None = None,
-) -> Iterator[Job]:
-    """The parts of ``output`` beside it, gone when all ends well and kept when it does not.
+@dataclass(frozen=True)
+class Work:
+    """How a command works in parts. scheduler : None for this process; parts : how many, None for by size"""
 
-    options, inputs : what decides the result, with the inputs' contents; sources : files too many to read for that,
-    known by size and time of change. Parts of another command are thrown away.
+    scheduler: str | None = None
+    parts: int | None = None
+    say: Say = say_nothing
+    progress: Progress = show_nothing
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What decides a result. inputs : known by their contents; sources : files too many to read for that, known by size
+    and time of change
     """
-    check_output(output, [*inputs, *sources], overwrite)
-    with claim(output):
-        identity = _identity(stage, options, inputs, sources)
-        root = output.with_name(f"{output.name}.parts")
-        folder = root / identity[:16]
+
+    stage: str
+    options: Mapping[str, Any]
+    inputs: Sequence[Path]
+    sources: Sequence[Path] = ()
+
+    def digest(self) -> str:
+        """Raises InputError for inputs that are not there."""
+        for path in self.inputs:
+            if not path.is_file():
+                raise InputError(f"{path}: no such file; check the path or run the stage that writes it.")
+        what = {
+            "stage": self.stage,
+            "version": version("lunargr"),
+            "options": dict(self.options),
+            "inputs": [sha256(path) for path in self.inputs],
+            "sources": [_state(path) for path in self.sources],
+        }
+        return hashlib.sha256(json.dumps(what, sort_keys=True, default=str).encode()).hexdigest()
+
+
+@contextlib.contextmanager
+def open_job(output: Output, identity: Identity, work: Work) -> Iterator[Job]:
+    """The parts of an output beside it, gone when all ends well and kept when it does not.
+
+    Parts of another command, by ``identity``, are thrown away.
+    """
+    path = output.file
+    check_output(path, [*identity.inputs, *identity.sources], output.overwrite)
+    with claim(path):
+        digest = identity.digest()
+        root = path.with_name(f"{path.name}.parts")
+        folder = root / digest[:16]
         for other in root.iterdir() if root.is_dir() else ():
             if other != folder:
                 shutil.rmtree(other, ignore_errors=True)
@@ -92,9 +114,9 @@ def open_job(
             raise ConfigError(f"{root}: cannot be made a folder ({error.strerror}); choose another --output.") from None
         for left in folder.glob(".*partial-*"):  # of killed workers
             left.unlink(missing_ok=True)
-        engine: Any = open_dask(scheduler, folder) if scheduler else contextlib.nullcontext(Here())
+        engine: Any = open_dask(work.scheduler, folder) if work.scheduler else contextlib.nullcontext(Here())
         with engine as working:
-            yield Job(folder.resolve(), working, say, progress, again)
+            yield Job(folder.resolve(), working, work.say, work.progress, again)
         shutil.rmtree(root, ignore_errors=True)
 
 
@@ -109,20 +131,6 @@ def _await(path: Path) -> None:
         f"{path}: a worker says that it wrote this part, but it is not here; "
         "--scheduler needs workers that see the same files under the same names."
     )
-
-
-def _identity(stage: str, options: Mapping[str, Any], inputs: Sequence[Path], sources: Sequence[Path]) -> str:
-    for path in inputs:
-        if not path.is_file():
-            raise InputError(f"{path}: no such file; check the path or run the stage that writes it.")
-    what = {
-        "stage": stage,
-        "version": version("lunargr"),
-        "options": dict(options),
-        "inputs": [sha256(path) for path in inputs],
-        "sources": [_state(path) for path in sources],
-    }
-    return hashlib.sha256(json.dumps(what, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def _state(path: Path) -> list[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import shutil
@@ -10,39 +11,39 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from lunargr_cli.fanout.job import open_job
+from lunargr_cli.fanout.job import Identity, Job, Work, open_job
 from schemas import ConfigError, atomic_path
 from schemas.files.companions import companions_of
-from schemas.files.outputs import Target, check_output, check_outputs
+from schemas.files.outputs import Output, Target, check_output, check_outputs
+from stages.common.progress import Progress
 
 # What a part holds where --parts does not say: some minutes of work on real data.
 BANDS_OF_DEM, BANDS_OF_MAP, BANDS_OF_ALBEDO, PAIRS, SAMPLES = 8, 8, 1, 512, 4
 
 
-def run_ingest(dem: Path, images: Path | None, output: Path, config: Any, parts: int | None, **how: Any) -> Any:
+def run_ingest(dem: Path, images: Path | None, output: Output, config: Any, work: Work) -> Any:
     """The DEM's rows, then each image by itself on the grid that these give."""
     from stages import ingest, merge
 
     dem, images = dem.resolve(), images and images.resolve()
     inputs = [dem] + ([images] if images else [])
-    with _job(
-        output, "ingest", config, parts, inputs, ingest.source_files(images, config) if images else (), how
-    ) as job:
+    sources = ingest.source_files(images, config) if images else ()
+    with _job(output, "ingest", config, inputs, sources, work) as job:
         grid = dem
         if not ingest.is_artefact(dem):
             bands = ingest.count_bands(dem, config)
-            cut = _cut(config, parts or math.ceil(bands / BANDS_OF_DEM), bands)
+            cut = _cut(config, work.parts or math.ceil(bands / BANDS_OF_DEM), bands)
             pieces = job.fan("dem", ingest_part, [{"dem": dem, "images": None, "config": c} for c in cut])
             grid = job.folder / "grid.h5"
             if images is not None:
-                merge.run(pieces, grid, True, virtual=True, inputs=[dem])
+                merge.run(pieces, Output(grid, overwrite=True), merge.Config(virtual=True, inputs=(dem,)))
         if images is not None:
             number = len(ingest.image_names(images, config))
-            cut = _cut(replace(config, gsd=None), parts or number, number)
+            cut = _cut(replace(config, gsd=None), work.parts or number, number)
             pieces = job.fan("images", ingest_part, [{"dem": grid, "images": images, "config": c} for c in cut])
             ingest.check_positions(pieces, images, config)
-        merge.run(pieces, output, how["overwrite"], job.progress, inputs=inputs)
-    found = ingest.summarise(output)
+        merge.run(pieces, output, merge.Config(inputs=tuple(inputs)), progress=job.progress)
+    found = ingest.summarise(output.file)
     if images is not None:
         kept = {frame.image_id for frame in found.frames}
         found = replace(found, skipped=tuple(n for n in ingest.image_names(images, config) if n not in kept))
@@ -50,185 +51,159 @@ def run_ingest(dem: Path, images: Path | None, output: Path, config: Any, parts:
 
 
 def ingest_part(path: Path, dem: Path, images: Path | None, config: Any) -> None:
+    """Write one shard of scene.h5."""
     from stages import ingest
 
-    ingest.run(dem, images, path, config, overwrite=True)
+    ingest.run(dem, images, Output(path, overwrite=True), config)
 
 
-def run_sample(scene: Path, output: Path, config: Any, parts: int | None, **how: Any) -> Any:
+def run_sample(scene: Path, output: Output, config: Any, work: Work) -> Any:
     """Every part chooses all places, which is quick, and cuts out its share of the crops."""
     from stages import merge, sample
 
     scene = scene.resolve()
-    with _job(output, "sample", config, parts, [scene], (), how) as job:
-        cut = _cut(config, parts or SAMPLES)
+    with _job(output, "sample", config, [scene], (), work) as job:
+        cut = _cut(config, work.parts or SAMPLES)
         pieces = job.fan("crops", sample_part, [{"scene": scene, "config": c} for c in cut])
-        merge.run(pieces, output, how["overwrite"], job.progress, inputs=[scene])
-    return sample.read_audit(output)
+        merge.run(pieces, output, merge.Config(inputs=(scene,)), progress=job.progress)
+    return sample.read_audit(output.file)
 
 
 def sample_part(path: Path, scene: Path, config: Any) -> None:
+    """Write one shard of crops.h5."""
     from stages import sample
 
-    sample.run(scene, path, config, overwrite=True)
+    sample.run(scene, Output(path, overwrite=True), config)
 
 
-def run_project(crops: Path, output: Path, config: Any, parts: int | None, **how: Any) -> Any:
+def run_project(crops: Path, output: Output, config: Any, work: Work) -> Any:
+    """pairs.h5 from shards that run side by side."""
     from stages import merge, project
 
     crops = crops.resolve()
     if config.scene:
         config = replace(config, scene=str(Path(config.scene).resolve()))
     scene = project.scene_of(crops, config)
-    with _job(output, "project", config, parts, [crops, scene], project.source_files(crops), how) as job:
+    with _job(output, "project", config, [crops, scene], project.source_files(crops), work) as job:
         pairs = project.count_pairs(crops)
-        cut = _cut(config, parts or math.ceil(pairs / PAIRS), pairs)
+        cut = _cut(config, work.parts or math.ceil(pairs / PAIRS), pairs)
         pieces = job.fan("pairs", project_part, [{"crops": crops, "config": c} for c in cut])
-        merge.run(pieces, output, how["overwrite"], job.progress, inputs=[crops, scene])
-    return project.summarise(output)
+        merge.run(pieces, output, merge.Config(inputs=(crops, scene)), progress=job.progress)
+    return project.summarise(output.file)
 
 
 def project_part(path: Path, crops: Path, config: Any) -> None:
+    """Write one shard of pairs.h5."""
     from stages import project
 
-    project.run(crops, path, config, overwrite=True)
+    project.run(crops, Output(path, overwrite=True), config)
 
 
-def run_infer(
-    terrain: Path,
-    checkpoint: Path,
-    output: Path,
-    config: Any,
-    gridding: Any,
-    geotiff: Path | None,
-    parts: int | None,
-    **how: Any,
-) -> Any:
+def run_infer(terrain: Path, checkpoint: Path, output: Output, config: Any, gridding: Any, work: Work) -> Any:
     """gridding : the ingest.Config for a terrain that is a raster, None for a scene"""
-    from stages import infer, ingest, merge
+    from stages import infer, ingest
 
-    terrain, checkpoint, tiff = terrain.resolve(), checkpoint.resolve(), geotiff or output.with_suffix(".tif")
-    with _job(output, "infer", config, parts, [terrain, checkpoint], (), how, {"gridding": gridding}) as job:
-        replace_tiff = how["overwrite"] or job.again  # an interrupted run may have got as far as that
-        infer.check_files([terrain, checkpoint], output, geotiff, config, how["overwrite"], replace_tiff)
+    terrain, checkpoint = terrain.resolve(), checkpoint.resolve()
+    with _job(output, "infer", config, [terrain, checkpoint], (), work, {"gridding": gridding}) as job:
+        output = replace(output, resume=job.again)
+        infer.check_files([terrain, checkpoint], output, config)
         scene = terrain
         if gridding is not None:
             scene = job.folder / "scene.h5"
             if not scene.exists():
                 ingest.run(terrain, None, scene, gridding, progress=job.progress)
         bands = infer.count_bands(scene, config)
-        cut = _cut(config, parts or math.ceil(bands / BANDS_OF_MAP), bands)
+        cut = _cut(config, work.parts or math.ceil(bands / BANDS_OF_MAP), bands)
         pieces = job.fan("map", infer_part, [{"scene": scene, "checkpoint": checkpoint, "config": c} for c in cut])
-        if config.geotiff and replace_tiff:
-            tiff.unlink(missing_ok=True)
-        merge.run(pieces, output, how["overwrite"], job.progress, inputs=[terrain, checkpoint], geotiff=tiff)
-    return infer.summarise(output, len(pieces))
+        _merge_map(pieces, output, config, [terrain, checkpoint], job.progress)
+    return infer.summarise(output.file, len(pieces))
+
+
+def _merge_map(pieces: list[Path], output: Output, config: Any, inputs: list[Path], progress: Progress) -> None:
+    """A map from its parts. An interrupted run may have got as far as the GeoTIFF."""
+    from stages import merge
+
+    if config.geotiff and (output.overwrite or output.resume):
+        output.geotiff_path.unlink(missing_ok=True)
+    merge.run(pieces, output, merge.Config(inputs=tuple(inputs)), progress=progress)
 
 
 def infer_part(path: Path, scene: Path, checkpoint: Path, config: Any) -> None:
+    """Write one shard of svbrdf.h5; the whole map gets its GeoTIFF when they are merged."""
     from stages import infer
 
-    infer.run(scene, checkpoint, path, config, overwrite=True)
+    infer.run(scene, checkpoint, Output(path, overwrite=True), config)
     path.with_suffix(".tif").unlink(missing_ok=True)  # where one part is the whole
 
 
-def run_albedo(
-    svbrdf: Path, scene: Path, output: Path, config: Any, geotiff: Path | None, parts: int | None, **how: Any
-) -> Any:
+def run_albedo(svbrdf: Path, scene: Path, output: Output, config: Any, work: Work) -> Any:
     """What the images say of themselves once, then the map's rows."""
-    from stages import albedo, merge
+    from stages import albedo
 
-    svbrdf, scene, tiff = svbrdf.resolve(), scene.resolve(), geotiff or output.with_suffix(".tif")
+    svbrdf, scene = svbrdf.resolve(), scene.resolve()
     sources = albedo.source_files(scene)
-    check_output(output, sources, how["overwrite"])
-    with _job(output, "albedo", config, parts, [svbrdf, scene], sources, how) as job:
-        replace_tiff = how["overwrite"] or job.again  # an interrupted run may have got as far as that
-        if config.geotiff:
-            check_output(tiff, [svbrdf, scene, output, *sources], replace_tiff)
+    check_output(output.file, sources, output.overwrite)
+    with _job(output, "albedo", config, [svbrdf, scene], sources, work) as job:
+        output = replace(output, resume=job.again)
+        albedo.check_files([svbrdf, scene, *sources], output, config)
         files = {"svbrdf": svbrdf, "scene": scene}
         [calibration] = job.fan("calibration", calibration_part, [files | {"config": config}], ".json")
         bands = albedo.count_bands(svbrdf, scene, config)
-        cut = _cut(config, parts or math.ceil(bands / BANDS_OF_ALBEDO), bands)
+        cut = _cut(config, work.parts or math.ceil(bands / BANDS_OF_ALBEDO), bands)
         pieces = job.fan("map", albedo_part, [files | {"config": c, "calibration": calibration} for c in cut])
-        if config.geotiff and replace_tiff:
-            tiff.unlink(missing_ok=True)
-        merge.run(pieces, output, how["overwrite"], job.progress, inputs=[svbrdf, scene], geotiff=tiff)
-    return albedo.summarise(output, scene)
+        _merge_map(pieces, output, config, [svbrdf, scene], job.progress)
+    return albedo.summarise(output.file, scene)
 
 
 def calibration_part(path: Path, svbrdf: Path, scene: Path, config: Any) -> None:
+    """Fit the images' gains and offsets, which all shards share."""
     from stages import albedo
 
     albedo.calibrate_to(path, svbrdf, scene, config)
 
 
 def albedo_part(path: Path, svbrdf: Path, scene: Path, config: Any, calibration: Path) -> None:
+    """Write one shard of a map with albedo."""
     from stages import albedo
 
-    albedo.run(svbrdf, scene, path, config, overwrite=True, calibration=calibration)
+    albedo.run_part(svbrdf, scene, calibration, path, config)
     path.with_suffix(".tif").unlink(missing_ok=True)  # where one part is the whole
 
 
-def run_evaluate(
-    pairs: Path,
-    checkpoints: Sequence[Path],
-    output: Path,
-    config: Any,
-    extend: Path | None,
-    json_file: Path | None,
-    figures: Path | None,
-    **how: Any,
-) -> Any:
+def run_evaluate(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Any, work: Work) -> Any:
+    """evaluation.h5 from shards that run side by side."""
     from stages import evaluate
 
-    pairs, checkpoints, extend = pairs.resolve(), [c.resolve() for c in checkpoints], extend and extend.resolve()
-    inputs = [pairs, *checkpoints, *([extend] if extend else [])]
-    with _job(output, "evaluate", config, None, inputs, (), how) as job:
-        return evaluate.run(
-            pairs,
-            checkpoints,
-            output,
-            config,
-            extend=extend,
-            json_file=json_file,
-            figures=figures,
-            overwrite=how["overwrite"],
-            progress=job.progress,
-            fan=job.fan,
-        )
+    pairs, checkpoints = pairs.resolve(), [c.resolve() for c in checkpoints]
+    inputs = [pairs, *checkpoints, *([Path(config.extend)] if config.extend else [])]
+    with _job(output, "evaluate", config, inputs, (), work) as job:
+        return evaluate.run_in_parts(pairs, checkpoints, output, config, job.fan)
 
 
-def run_diagnose(
-    pairs: Path,
-    checkpoint: Path | None,
-    output: Path | None,
-    json_file: Path | None,
-    report: Path | None,
-    config: Any,
-    **how: Any,
-) -> dict[str, Any]:
+def run_diagnose(pairs: Path, checkpoint: Path | None, output: Output, config: Any, work: Work) -> dict[str, Any]:
     """One part: a search uses a few hundred pairs and decides one thing after the other. Returns the JSON's content."""
-    if output is None:
+    if output.path is None:
         raise ConfigError("diagnose: expected --output with --scheduler (the part lies beside it), found none.")
     pairs, checkpoint = pairs.resolve(), checkpoint and checkpoint.resolve()
     inputs = [pairs, *([checkpoint] if checkpoint else [])]
-    named = ((output, "--output"), (json_file, "--json"), (report, "--report"))
-    check_outputs([Target(path, option) for path, option in named if path is not None], inputs, how["overwrite"])
-    with _job(output, "diagnose", config, None, inputs, (), how) as job:
+    named = ((output.path, "output"), (output.json, "json"), (output.report, "report"))
+    check_outputs([Target(path, option) for path, option in named if path is not None], inputs, output.overwrite)
+    with _job(output, "diagnose", config, inputs, (), work) as job:
         arguments = {"pairs": pairs, "checkpoint": checkpoint, "config": config}
         (piece,) = job.fan("diagnosis", diagnose_part, [arguments])
-        for made, wanted in ((".json", json_file), (".html", report), (".h5", output)):
+        for made, wanted in ((".json", output.json), (".html", output.report), (".h5", output.path)):
             if wanted is not None:
-                with companions_of(output), atomic_path(wanted) as partial:
+                with companions_of(output.path), atomic_path(wanted) as partial:
                     shutil.copyfile(piece.with_suffix(made), partial)
         return json.loads(piece.with_suffix(".json").read_text())
 
 
 def diagnose_part(path: Path, pairs: Path, checkpoint: Path | None, config: Any) -> None:
+    """Diagnose where one engine runs a whole stage."""
     from stages import diagnose
 
-    texts = path.with_suffix(".json"), path.with_suffix(".html")
-    diagnose.run(pairs, checkpoint, config, path, *texts, overwrite=True)
+    json_file, report = path.with_suffix(".json"), path.with_suffix(".html")
+    diagnose.run(pairs, checkpoint, Output(path, overwrite=True, json=json_file, report=report), config)
 
 
 def _cut(config: Any, count: int, most: int | None = None) -> list[Any]:
@@ -237,14 +212,13 @@ def _cut(config: Any, count: int, most: int | None = None) -> list[Any]:
 
 
 def _job(
-    output: Path,
+    output: Output,
     stage: str,
     config: Any,
-    parts: int | None,
     inputs: Sequence[Path],
     sources: Sequence[Path],
-    how: dict[str, Any],
+    work: Work,
     more: dict[str, Any] | None = None,
-) -> Any:
-    options = asdict(config) | {"parts": parts} | (more or {})
-    return open_job(output, stage, options, inputs, sources=sources, **how)
+) -> contextlib.AbstractContextManager[Job]:
+    options = asdict(config) | {"parts": work.parts} | (more or {})
+    return open_job(output, Identity(stage, options, inputs, sources), work)

@@ -1,10 +1,28 @@
-"""Stage albedo. run: the stage; references: photographs against the map; calibrate: gains and errors; pyramid: scales;
-posterior: the estimate; prior: what the network says of its own errors; intervals: how far unseen images lie; writing: the new map."""
+"""Stage albedo. stage: from files to files; references: photographs against the map; calibrate: gains and errors; pyramid: scales;
+posterior: the estimate; prior: what the network says of its own errors; intervals: how far unseen images lie; writing: the new map.
+"""
 
 from __future__ import annotations
 
-from stages.albedo.calibrate import Calibration
-from stages.albedo.config import Config, Summary
-from stages.albedo.run import calibrate_to, count_bands, run, source_files, summarise
+from typing import TYPE_CHECKING
 
-__all__ = ["Calibration", "Config", "Summary", "calibrate_to", "count_bands", "run", "source_files", "summarise"]
+from schemas.later import imported_later
+from stages.albedo.config import Config, Summary
+
+if TYPE_CHECKING:
+    from stages.albedo.calibrate import Calibration
+    from stages.albedo.stage import calibrate_to, check_files, count_bands, run, run_part, source_files, summarise
+
+__getattr__ = imported_later(__name__, "stage", "calibrate")
+__all__ = [
+    "Calibration",
+    "Config",
+    "Summary",
+    "calibrate_to",
+    "check_files",
+    "count_bands",
+    "run",
+    "run_part",
+    "source_files",
+    "summarise",
+]

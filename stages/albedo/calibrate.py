@@ -16,17 +16,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from stages.albedo.intervals import GAUSSIAN, unseen_intervals
+from stages.albedo.intervals import GAUSSIAN, Stack, unseen_intervals
 from stages.albedo.posterior import Spread, settle
 from stages.albedo.pyramid import LEVELS, bands
 from stages.albedo.references import Box, Look, References, overlap
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
-Progress = Callable[[int, int, str], None]
+from stages.albedo.registered import as_text, from_text
+from stages.common.arrays import Floats, Floats32
+from stages.common.progress import Progress, show_nothing
+from stages.physics.images.displacement import Field
 
 WINDOW_PX = 128
 WINDOWS_PER_IMAGE = 16
@@ -35,6 +34,7 @@ ROUNDS = 6
 SETTLED = 0.05  # relative change of all variances below which no further round is made
 COSINES = np.linspace(0.0, 1.0, 17)  # bins of cos(incidence) over which the error may differ
 STEPS = 200  # of the fit of variances to those of differences
+OUTLYING = 4.0  # robust standard deviations
 FARTHEST = 3.0  # |log ratio| beyond which nothing is measured any more
 
 
@@ -42,48 +42,57 @@ FARTHEST = 3.0  # |log ratio| beyond which nothing is measured any more
 class Calibration:
     """gain, offset : (n,), measured = gain x I/F x albedo + offset; spread : variances of log ratios;
     error : relative variance of an image's error at the cosines of incidence ``COSINES``; interval : (2, bins), half-widths
-    of the 68 and 95 % intervals of an unseen image, in standard deviations, by the same bins"""
+    of the 68 and 95 % intervals of an unseen image, in standard deviations, by the same bins; shadow : (2,) the same in
+    shadow, I/F over the sine of the Sun's elevation; fields : what registration takes off each image, empty without it
+    """
 
     gain: Floats
     offset: Floats
     spread: Spread
     error: Floats
     interval: Floats
+    shadow: Floats
+    fields: tuple[Field | None, ...] = ()
 
     def ratio(self, k: int, look: Look) -> tuple[Floats32, Floats32]:
         """(log of measured / predicted, confidence), both 0 where the image says nothing."""
         expected = self.gain[k] * look.predicted
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.log(np.maximum((look.measured - self.offset[k]) / expected, np.exp(-FARTHEST)))
-        known = np.isfinite(ratio)
+        known = np.isfinite(ratio) & look.usable
         ratio = np.where(known, np.minimum(ratio, FARTHEST), 0).astype(np.float32)
         confidence = 1.0 / np.interp(look.cos_incidence, _middles(), self.error)
         return ratio, np.where(known, confidence, 0).astype(np.float32)
 
     def write(self, path: Path) -> None:
-        values = {"gain": self.gain, "offset": self.offset, "error": self.error, "interval": self.interval}
+        """Write it as JSON."""
+        values = {"gain": self.gain, "offset": self.offset, "error": self.error}
+        values |= {"interval": self.interval, "shadow": self.shadow}
         values |= {
             "prior": self.spread.prior,
             "shared": self.spread.shared,
             "own": self.spread.own,
             "own_px": self.spread.own_px,
         }
-        text = {k: v.tolist() for k, v in values.items()} | {"shared_px": self.spread.shared_px}
+        text: dict[str, Any] = {k: v.tolist() for k, v in values.items()} | {"shared_px": self.spread.shared_px}
+        text["fields"] = as_text(self.fields)
         path.write_text(json.dumps(text))
 
     @staticmethod
     def read(path: Path) -> Calibration:
+        """Read what :meth:`write` wrote."""
         text = json.loads(path.read_text())
-        shared_px = float(text.pop("shared_px"))
+        shared_px, fields = float(text.pop("shared_px")), tuple(from_text(text.pop("fields")))
         v = {k: np.array(values, float) for k, values in text.items()}
         spread = Spread(v["shared"], v["own"], shared_px, v["own_px"], v["prior"])
-        return Calibration(v["gain"], v["offset"], spread, v["error"], v["interval"])
+        return Calibration(v["gain"], v["offset"], spread, v["error"], v["interval"], v["shadow"], fields)
 
 
 @dataclass
 class Sample:
-    """One window with all images that see it."""
+    """One window with all images that see it. prior : (h, w) variance of what the map may be wrong by, None where unknown"""
 
+    prior: Floats32 | None = None
     images: list[int] = field(default_factory=list)
     looks: list[Look] = field(default_factory=list)
 
@@ -111,12 +120,17 @@ def choose_windows(shape: tuple[int, int], boxes: Sequence[Box]) -> list[Box]:
     return chosen
 
 
-def take_samples(references: References, windows: Sequence[Box], progress: Progress | None = None) -> list[Sample]:
+def take_samples(
+    references: References,
+    windows: Sequence[Box],
+    progress: Progress = show_nothing,
+    prior: Callable[[Box], Floats32 | None] = lambda box: None,
+) -> list[Sample]:
+    """What the images show of some windows, one sample each. prior : (h, w) of a window's, as :func:`posterior.estimate` takes it"""
     samples = []
     for number, box in enumerate(windows):
-        if progress:
-            progress(number, len(windows), "calibration windows")
-        sample = Sample()
+        progress(number, len(windows), "calibration windows")
+        sample = Sample(prior(box))
         for k in references.overlapping(box):
             look = references.look(k, box)
             if look is not None:
@@ -133,28 +147,57 @@ def calibrate(samples: Sequence[Sample], count: int, units: str) -> Calibration:
     bins = len(COSINES) - 1
     spread = Spread(np.full(LEVELS + 1, 0.01), own, 0.01, own[:, 0].copy(), np.full(LEVELS + 1, 0.01))
     unknown = np.tile(np.array(GAUSSIAN)[:, None], bins)
-    result = Calibration(np.ones(count), np.zeros(count), spread, np.ones(bins), unknown)
+    result = Calibration(np.ones(count), np.zeros(count), spread, np.ones(bins), unknown, np.zeros(2))
     albedo: list[Any] = [0.0] * len(samples)
     for _ in range(ROUNDS):
         gain, offset = _scales(samples, albedo, count, units)
         result = replace(result, gain=gain, offset=offset)
         stacks = [_stack(result, sample) for sample in samples]
         albedo = [
-            settle(ratio, confidence, result.spread.of(sample.images))
+            settle(ratio, confidence.copy(), result.spread.of(sample.images))
             for sample, (ratio, confidence) in zip(samples, stacks, strict=True)
         ]
+        _tame(samples, stacks, albedo, count)
         before = result.spread.own_px
-        result = replace(result, spread=_variances(samples, stacks, count), error=_error(samples, stacks, albedo))
+        result = replace(result, spread=_variances(samples, stacks, count))
+        result = replace(result, error=_error(samples, stacks, albedo, result.spread.own_px))
         if np.abs(np.log(np.maximum(result.spread.own_px, 1e-12) / np.maximum(before, 1e-12))).max() < SETTLED:
             break
-    seen = [(*_stack(result, s), s.images, [look.cos_incidence for look in s.looks]) for s in samples]
-    shift = np.log(result.gain) if units == "iof" else np.zeros(count)
-    return replace(result, interval=_rounded(unseen_intervals(seen, result.spread, shift, COSINES)))
+    interval, shadow = unseen_intervals([_unseen(result, sample, units) for sample in samples], result.spread, COSINES)
+    return replace(result, interval=_rounded(interval), shadow=_rounded(shadow))
+
+
+def _unseen(calibration: Calibration, sample: Sample, units: str) -> Stack:
+    """A window with its images in I/F as one who has not seen them takes them: calibrated ones have no gain of their own."""
+    scaled = [
+        look.measured if units == "iof" else (look.measured - calibration.offset[k]) / calibration.gain[k]
+        for k, look in zip(sample.images, sample.looks, strict=True)
+    ]
+    measured = [v.astype(np.float32) for v in scaled]
+    return Stack(*_stack(calibration, sample), sample.images, sample.looks, measured, sample.prior)
 
 
 def _stack(calibration: Calibration, sample: Sample) -> tuple[Floats32, Floats32]:
     found = [calibration.ratio(k, look) for k, look in zip(sample.images, sample.looks, strict=True)]
     return np.stack([f[0] for f in found]), np.stack([f[1] for f in found])
+
+
+def _tame(
+    samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], albedo: Sequence[Any], count: int
+) -> None:
+    """Bring ratios far from what the images agree on back to OUTLYING robust standard deviations of their image, in place.
+
+    Moments then mean something. Weights by pixel in their place would mix with the ratios in the bands.
+    """
+    away: list[list[Floats32]] = [[] for _ in range(count)]
+    for sample, (ratio, confidence), location in zip(samples, stacks, albedo, strict=True):
+        for k, values, known in zip(sample.images, ratio, confidence > 0, strict=True):
+            away[k].append(np.abs(values - location)[known][::7])
+    bounds = [OUTLYING * 1.4826 * float(np.median(np.concatenate(v))) if any(map(len, v)) else 0.0 for v in away]
+    for sample, (ratio, _), location in zip(samples, stacks, albedo, strict=True):
+        for k, values in zip(sample.images, ratio, strict=True):
+            bound = np.float32(bounds[k])
+            values[:] = location + np.clip(values - location, -bound, bound)
 
 
 def _scales(samples: Sequence[Sample], albedo: Sequence[Any], count: int, units: str) -> tuple[Floats, Floats]:
@@ -165,7 +208,7 @@ def _scales(samples: Sequence[Sample], albedo: Sequence[Any], count: int, units:
     pairs: list[list[tuple[Floats, Floats]]] = [[] for _ in range(count)]
     for sample, log_albedo in zip(samples, albedo, strict=True):
         for k, look in zip(sample.images, sample.looks, strict=True):
-            known = np.isfinite(look.measured)
+            known = look.usable
             expected = (look.predicted * np.exp(log_albedo))[known]
             pairs[k].append((expected[::7].astype(float), look.measured[known][::7].astype(float)))
     gain, offset = np.ones(count), np.zeros(count)
@@ -200,7 +243,8 @@ def _line(expected: Floats, measured: Floats, with_offset: bool) -> tuple[float,
 
 def _variances(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], count: int) -> Spread:
     """Variance components by moments of pairs of images: products for what is shared; for the rest what a square has
-    beyond that, or what differences say where this is more (errors that neighbours share would hide in differences)."""
+    beyond that, or what differences say where this is more (errors that neighbours share would hide in differences).
+    """
     levels = LEVELS + 2  # the last are whole pixels
     product, weight, difference, reach = (np.zeros((levels, count, count)) for _ in range(4))
     square, sums, pixels = (np.zeros((levels, count)) for _ in range(3))
@@ -293,16 +337,18 @@ def _rounded(values: Any) -> Any:
     return np.where(values == 0, 0.0, np.round(values * size) / size)
 
 
-def _error(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], albedo: Sequence[Any]) -> Floats:
-    """Variance of images about what they agree on by cos(incidence), relative to the median bin's."""
+def _error(
+    samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], albedo: Sequence[Any], own_px: Floats
+) -> Floats:
+    """Variance of images about what they agree on by cos(incidence), in units of each image's own, relative to the mean bin's."""
     square, pixels = np.zeros(len(COSINES) - 1), np.zeros(len(COSINES) - 1)
     for sample, (ratio, confidence), location in zip(samples, stacks, albedo, strict=True):
         several = (confidence > 0).sum(axis=0) > 1
-        for look, values, known in zip(sample.looks, ratio, confidence > 0, strict=True):
+        for k, look, values, known in zip(sample.images, sample.looks, ratio, confidence > 0, strict=True):
             use = known & several
             bins = np.clip(np.digitize(look.cos_incidence[use], COSINES) - 1, 0, len(square) - 1)
             # the middle of a distribution with long tails: squares up to 9 robust variances
-            residual = (values - location)[use].astype(float)
+            residual = (values - location)[use].astype(float) / np.sqrt(max(own_px[k], 1e-12))
             bound = 3 * 1.4826 * float(np.median(np.abs(residual))) if residual.size else 0.0
             square += np.bincount(bins, np.minimum(np.abs(residual), bound) ** 2, len(square))
             pixels += np.bincount(bins, minlength=len(square))

@@ -13,12 +13,9 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.albedo.pyramid import LEVELS, bands, collapse, enlarge, reduce
-
-Floats32 = NDArray[np.float32]
-Floats = NDArray[np.float64]
+from stages.common.arrays import Floats, Floats32
 
 FREEDOM = 4.0  # degrees of freedom of Student's distribution, as Lange et al. recommend
 ITERATIONS = 8
@@ -28,7 +25,8 @@ ITERATIONS = 8
 class Spread:
     """Variances of log ratios. shared : (LEVELS + 1,) of the albedo that all images show, by band; own : (n, LEVELS + 1)
     of each image's error; shared_px, own_px : (), (n,) of whole pixels; prior : (LEVELS + 1,) of what the map may be wrong
-    by where no image says more"""
+    by where no image says more
+    """
 
     shared: Floats
     own: Floats
@@ -37,6 +35,7 @@ class Spread:
     prior: Floats
 
     def of(self, images: list[int]) -> Spread:
+        """The same for some of the images."""
         return Spread(self.shared, self.own[images], self.shared_px, self.own_px[images], self.prior)
 
 
@@ -100,9 +99,9 @@ def _unrest(residual: Floats32, confidence: Floats32, own: float) -> Floats32:
 
 @numba.njit(cache=True, nogil=True)
 def _settle(ratio, confidence, own, prior, location):
-    """Iteratively reweighted mean of every pixel with the prior at 0, started at the weighted median."""
+    """Iteratively reweighted mean of every pixel with the prior at 0, started at the median."""
     count, height, width = ratio.shape
-    values, precision, weights = np.empty(count + 1), np.empty(count + 1), np.empty(count)
+    values, precision, weights = np.empty(count + 1), np.empty(count), np.empty(count)
     for r in range(height):
         for c in range(width):
             n = 0
@@ -114,15 +113,8 @@ def _settle(ratio, confidence, own, prior, location):
             if n == 0:
                 location[r, c] = 0.0
                 continue
-            values[n], precision[n] = 0.0, prior
-            order = np.argsort(values[: n + 1])
-            half, total = 0.5 * precision[: n + 1].sum(), 0.0
-            middle = 0.0
-            for i in range(n + 1):
-                total += precision[order[i]]
-                if total >= half:
-                    middle = values[order[i]]
-                    break
+            values[n] = 0.0
+            middle = np.median(values[: n + 1])  # not by weight: the image of least noise has its cosmic rays, too
             for _ in range(ITERATIONS):
                 top, bottom = 0.0, prior
                 for i in range(n):

@@ -13,17 +13,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.physics.horizon.scene import Overview, horizon_in_scene
+from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import ASTRONOMICAL_UNIT, Frame
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import Grid
+from stages.physics.maps.window import Box, Window
 from stages.physics.terrain.shading import Light, shade_block
 from stages.physics.terrain.sun import Sun
-from stages.physics.terrain.surface import Surface
-
-Floats32 = NDArray[np.float32]
-Box = tuple[int, int, int, int]  # row, col, height, width
+from stages.physics.terrain.surface import SHADOWED, Surface
 
 OPEN_IMAGES = 64  # files that stay open between windows
 SHADOW_MARGIN_PX = 2  # a shadow's edge lies so well where the DEM and the registration say
@@ -32,12 +32,16 @@ TURN = 30e3  # m over which the Sun's azimuth turns by 1 deg on the Moon
 
 @dataclass(frozen=True)
 class Look:
-    """One photograph on a window. measured : (h, w) as in the file, NaN where it says nothing; predicted : (h, w) I/F;
-    cos_incidence : (h, w)"""
+    """One photograph on a window. measured : (h, w) as in the file, NaN where it shows no known ground; predicted : (h, w)
+    I/F, 0 in shadow; usable : (h, w) bool, lit and away from shadows; shadow : (h, w) bool; sun_sine : of the Sun's elevation
+    """
 
     measured: Floats32
     predicted: Floats32
     cos_incidence: Floats32
+    usable: NDArray[np.bool_]
+    shadow: NDArray[np.bool_]
+    sun_sine: float
 
 
 class SceneHorizon:
@@ -56,7 +60,7 @@ class SceneHorizon:
                 h, w = min(edge, row + height - r), min(edge, col + width - c)
                 azimuth, elevation = self._sun.over(grid, r + (h - 1) / 2, c + (w - 1) / 2)
                 result[r - row : r - row + h, c - col : c - col + w] = horizon_in_scene(
-                    self._elevation, self._overview, r, c, h, w, grid.gsd, azimuth,
+                    self._elevation, self._overview, Window(r, c, h, w), grid.gsd, azimuth,
                     sun_elevation=elevation, body_radius=grid.radius,
                 )  # fmt: skip
         return result
@@ -76,11 +80,17 @@ class References(contextlib.AbstractContextManager):
     ) -> None:
         self.surface, self.elevation, self.overview, self.heights = surface, elevation, overview, heights
         self.frames, self.boxes = frames, boxes
+        self._fields: Sequence[Field | None] = [None] * len(frames)
         self._open: OrderedDict[int, tuple[Source, contextlib.ExitStack]] = OrderedDict()
 
     def __exit__(self, *error: object) -> None:
         while self._open:
             self._open.popitem()[1][1].close()
+
+    def take_off(self, fields: Sequence[Field | None]) -> None:
+        """Read each image from now on without the displacement that registration found; none where empty."""
+        if fields:
+            self._fields = fields
 
     def overlapping(self, box: Box) -> list[int]:
         """Images that may show something of a window."""
@@ -89,7 +99,7 @@ class References(contextlib.AbstractContextManager):
     def look(self, k: int, box: Box) -> Look | None:
         """Image ``k`` on a window, None where it shows nothing that counts."""
         row, col, height, width = box
-        pixels = self._source(k).read(row, col, height, width)
+        pixels = self.source(k).read(row, col, height, width, self._fields[k])
         if not pixels.valid.any():
             return None
         frame, surface = self.frames[k], self.surface
@@ -103,13 +113,18 @@ class References(contextlib.AbstractContextManager):
         lit = (block["shadow"] == 0).astype(np.uint8)
         side = 2 * SHADOW_MARGIN_PX + 1
         far = cv2.erode(lit, np.ones((side, side), np.uint8), borderValue=1).astype(bool)
-        usable = far & pixels.valid & np.isfinite(pixels.values) & (block["image"] > 0)
+        known = pixels.valid & np.isfinite(pixels.values) & np.isfinite(block["image"])
+        usable = far & known & (block["image"] > 0)
         if not usable.any():
             return None
         cosine = np.cos(np.radians(block["incidence_deg"]))
-        return Look(np.where(usable, pixels.values, np.nan).astype(np.float32), block["image"], cosine)
+        measured = np.where(known, pixels.values, np.nan).astype(np.float32)
+        _, elevation = sun.over(surface.grid, row + (height - 1) / 2, col + (width - 1) / 2)
+        shadow = block["shadow"] > SHADOWED
+        return Look(measured, block["image"], cosine, usable, shadow, math.sin(max(0.0, elevation)))
 
-    def _source(self, k: int) -> Source:
+    def source(self, k: int) -> Source:
+        """The open image ``k``."""
         if k in self._open:
             self._open.move_to_end(k)
             return self._open[k][0]

@@ -55,6 +55,7 @@ class Maps:
         self._writer, self._frames, self._calibration = writer, frames, calibration
 
     def put(self, block: Box, *values: NDArray) -> None:
+        """Write one block of every map, each (height, width)."""
         row, col, height, width = block
         for target, part in zip(self._maps, values, strict=True):
             target[row : row + height, col : col + width] = part
@@ -73,3 +74,4 @@ class Maps:
         writer.write("albedo_bin_cos_incidence", 0.5 * (COSINES[1:] + COSINES[:-1]))
         writer.write("albedo_interval_68", found.interval[0])
         writer.write("albedo_interval_95", found.interval[1])
+        writer.write("albedo_interval_shadow", found.shadow)

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
-from stages.evaluate.run import Config, run
+from typing import TYPE_CHECKING
 
-__all__ = ["Config", "run"]
+from schemas.later import imported_later
+from stages.evaluate.config import Config
+
+if TYPE_CHECKING:
+    from stages.evaluate.stage import run, run_in_parts
+
+__getattr__ = imported_later(__name__, "stage")
+__all__ = ["Config", "run", "run_in_parts"]

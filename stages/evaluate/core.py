@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from stages.evaluate.coverage import BANDS_DEG, count_within, gaussian_widths
 from stages.evaluate.metrics import psnr, squared_error, ssim
 from stages.evaluate.perceptual import Perceptual
-from stages.evaluate.renderers import Reader, batches, read_batch
+from stages.evaluate.renderers import Batch, Reader, batches, read_batch
 from stages.evaluate.rows import Row
 from stages.physics.formation.radiometry import crop_range
 
@@ -23,6 +24,8 @@ class Scores:
 
     squared_error : (M, N) sums over valid pixels; ssim (crop range), ssim_range_1, lpips : (M, N)
     pixels, data_range : (N,)
+    within : (3, bands, N) of the row 'learned', summed over training runs: pixels by incidence, and those within the 68 and
+    95 % intervals that the networks predict (``coverage.count_within``)
     """
 
     names: list[str]
@@ -32,6 +35,7 @@ class Scores:
     lpips: np.ndarray
     pixels: np.ndarray
     data_range: np.ndarray
+    within: np.ndarray
 
     @property
     def mse(self) -> np.ndarray:
@@ -52,7 +56,7 @@ class Scores:
         """The scores with one row for each name."""
         names = list(dict.fromkeys(self.names))
         fields = {f: np.stack([self.runs(n, f).mean(axis=0) for n in names]) for f in PER_ROW}
-        return Scores(names=names, **fields, pixels=self.pixels, data_range=self.data_range)
+        return Scores(names=names, **fields, pixels=self.pixels, data_range=self.data_range, within=self.within)
 
 
 def score(
@@ -78,6 +82,7 @@ def score(
         lpips=np.full((m, n), np.nan),
         pixels=np.zeros(n, np.int64),
         data_range=np.zeros(n),
+        within=np.zeros((3, len(BANDS_DEG) - 1, n), np.int64),
     )
     done = 0
     for chosen in batches(indices, size):
@@ -91,6 +96,8 @@ def score(
         for k, row in enumerate(rows):
             rendered = row.renderer.image(batch, row.how).numpy()
             images.append(rendered)
+            if row.name == "learned":
+                _count_within(scores.within[:, :, where], row, batch, rendered)
             scores.squared_error[k, where] = squared_error(measured, rendered, usable)
             for b in range(len(chosen)):
                 crop = (measured[b], rendered[b], usable[b])
@@ -103,3 +110,14 @@ def score(
         done += len(chosen)
         tick(len(chosen))
     return scores
+
+
+def _count_within(counts: np.ndarray, row: Row, batch: Batch, rendered: np.ndarray) -> None:
+    """Add one training run's to ``counts`` (3, bands, B), where its network predicts deviations."""
+    std = row.renderer.deviation(batch)
+    if std is None:
+        return
+    away = np.where(batch.usable.numpy(), np.abs(rendered - batch.image.numpy()), np.nan)
+    incidence = np.arccos(np.clip(batch.state.angles.cos_incidence.numpy(), -1.0, 1.0))
+    for b in range(len(away)):
+        counts[:, :, b] += count_within(away[b], gaussian_widths(std[b].numpy()), incidence[b])

@@ -72,7 +72,7 @@ def training_curves(checkpoint: Path) -> Any:
 
     with open_artefact(checkpoint, CHECKPOINT) as file:
         train, validation = file["train_loss"][...], file["validation_loss"][...]
-        best, model = int(file.attrs["best_epoch"]) + 1, file.attrs["model"]
+        best, model = int(file.attrs["best_epoch"]), file.attrs["model"]
     epochs = np.arange(1, len(train) + 1)
     figure, axes = plt.subplots(figsize=(6, 3.6))
     axes.plot(epochs, train, color="#8a8f98", label="training")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,6 +15,28 @@ from stages.physics.formation.radiometry import full_scale
 
 SAMPLE_PIXELS = 100_000  # for sets that are fitted to a random sample
 LEVENBERG_PIXELS = 20_000  # of these, for models that are not linear: a handful of parameters needs no more
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """What free parameters are fitted on.
+
+    train, orphans : indices of pairs; frames : how many images there are; scale : full range of DN; size : pairs at a time
+    """
+
+    reader: Reader
+    train: np.ndarray
+    orphans: np.ndarray
+    frames: int
+    calibrated: bool
+    scale: float
+    size: int
+    seed: int
+
+    @property
+    def steps(self) -> int:
+        """How many pairs ``fit_rows`` reads."""
+        return len(self.train) if self.calibrated else 2 * len(self.train) + len(self.orphans)
 
 
 def choose_fit_pairs(reader: Reader, wanted: np.ndarray, limit: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -39,30 +62,19 @@ def _thin(indices: np.ndarray, frame: np.ndarray, limit: int, seed: int) -> np.n
     return np.sort(np.concatenate(kept))
 
 
-def fit_rows(
-    reader: Reader,
-    rows: Sequence[Row],
-    train: np.ndarray,
-    orphans: np.ndarray,
-    frames: int,
-    calibrated: bool,
-    scale: float,
-    size: int,
-    seed: int,
-    tick: Callable[[int], None] = lambda count: None,
-) -> None:
-    """Fit everything that is free in the renderers of ``rows`` on ``train``.
+def fit_rows(data: Fitting, rows: Sequence[Row], tick: Callable[[int], None] = lambda count: None) -> None:
+    """Fit everything that is free in the renderers of ``rows`` on the train pairs.
 
-    Uncalibrated frames without train pairs get their gain and offset from ``orphans``, which no shared coefficient sees.
+    Uncalibrated frames without train pairs get their gain and offset from the orphans, which no shared coefficient sees.
     """
     renderers = list({row.renderer.name: row.renderer for row in rows}.values())
-    _fit_sets(reader, renderers, train, frames, calibrated, scale, size, seed, tick)
-    if calibrated:
+    _fit_sets(data, renderers, tick)
+    if data.calibrated:
         return
-    grams = {r.name: (fit.FrameGram(1, frames), fit.FrameGram(1, frames)) for r in renderers}
-    for part, indices in enumerate((train, orphans)):
-        for chosen in batches(indices, size):
-            batch = read_batch(reader, chosen, scale)
+    grams = {r.name: (fit.FrameGram(1, data.frames), fit.FrameGram(1, data.frames)) for r in renderers}
+    for part, indices in enumerate((data.train, data.orphans)):
+        for chosen in batches(indices, data.size):
+            batch = read_batch(data.reader, chosen, data.scale)
             for renderer in renderers:
                 features = renderer.radiance_factor(batch)[:, None]
                 grams[renderer.name][part].add(features, batch.image, batch.usable, batch.frame)
@@ -74,23 +86,9 @@ def fit_rows(
         renderer.gain, renderer.offset = fit.solve_gain_offset(joined, np.ones(1))
 
 
-def fit_steps(train: np.ndarray, orphans: np.ndarray, calibrated: bool) -> int:
-    """How many pairs ``fit_rows`` reads."""
-    return len(train) if calibrated else 2 * len(train) + len(orphans)
-
-
-def _fit_sets(
-    reader: Reader,
-    renderers: Sequence[Renderer],
-    train: np.ndarray,
-    frames: int,
-    calibrated: bool,
-    scale: float,
-    size: int,
-    seed: int,
-    tick: Callable[[int], None],
-) -> None:
+def _fit_sets(data: Fitting, renderers: Sequence[Renderer], tick: Callable[[int], None]) -> None:
     """One coefficient set for all ground for every renderer that has one."""
+    frames, calibrated = data.frames, data.calibrated
     of = {r.name: r for r in renderers}
     shared = [of[name] for name in ("global", "global_extended") if name in of]
     exact = bool(shared) and shared[0].model.linear
@@ -99,10 +97,10 @@ def _fit_sets(
     gram = fit.FrameGram(len(shared[0].model.parameters), frames) if exact else None
     albedo_gram = fit.FrameGram(1, frames)
     samples: list[fit.PixelSample] = []
-    rng = np.random.default_rng(seed)
-    per_crop = max(1, SAMPLE_PIXELS // max(1, len(train)))
-    for chosen in batches(train, size) if exact or sampled or albedo else ():
-        batch = read_batch(reader, chosen, scale)
+    rng = np.random.default_rng(data.seed)
+    per_crop = max(1, SAMPLE_PIXELS // max(1, len(data.train)))
+    for chosen in batches(data.train, data.size) if exact or sampled or albedo else ():
+        batch = read_batch(data.reader, chosen, data.scale)
         if gram is not None:
             gram.add(unit_images(shared[0].model, batch), batch.image, batch.usable, batch.frame)
         if albedo is not None:

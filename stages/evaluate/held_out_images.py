@@ -1,16 +1,15 @@
 """Seen ground under an unseen image: how well maps with albedo predict photographs that had no part in their albedo.
 
-Another claim than that of unseen ground (``stages.evaluate.run``), and kept apart from it: here other photographs of the
+Another claim than that of unseen ground (``stages.evaluate.stage``), and kept apart from it: here other photographs of the
 same pixels made the albedo. How far the scored Sun stands from the nearest one used is part of the answer.
 """
 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,19 +21,19 @@ from numpy.typing import NDArray
 
 from schemas import EVALUATION, SVBRDF, ArtefactError, ArtefactWriter, check_output, open_artefact, write_json
 from schemas.files.companions import companions_of
+from schemas.files.outputs import Output
 from schemas.reading import read_strings
+from stages.common.arrays import Floats
 from stages.common.intervals import ERROR, choose_units, gain_interval, ratio_interval
-from stages.evaluate.coverage import BANDS_DEG
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.evaluate.coverage import BANDS_DEG, count_within, shares
 from stages.evaluate.metrics import ssim
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form, illuminate
 from stages.physics.formation.radiometry import crop_range, match_crops
 from stages.physics.maps.grid import unit_vectors
 from stages.physics.photometry import get_model
-from stages.physics.terrain.surface import AlbedoError
-
-Floats = NDArray[np.float64]
-Progress = Callable[[int, int, str], None]
+from stages.physics.terrain.surface import SHADOWED, AlbedoError
 
 CLAIM = "seen ground, unseen images"
 ROWS = ("terrain", "albedo", "terrain_gain_offset", "albedo_gain_offset")
@@ -73,20 +72,20 @@ class Map:
 def run(
     pairs: Path,
     maps: Sequence[Path],
-    output: Path,
+    output: Output | Path,
     config: Config,
-    json_file: Path | None = None,
-    overwrite: bool = False,
-    progress: Progress | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> dict[str, Any]:
     """Score every pair of the split whose image had no part in one of the maps; returns what the JSON holds.
 
     maps : of `lunargr albedo`, such as those of all folds; a pair is scored on the first that its image did not make.
     Raises LunargrError.
     """
-    reports = [output.with_suffix(".json"), *([json_file] if json_file else [])]
-    for path in (output, *reports):
-        check_output(path, [pairs, *maps], overwrite)
+    output = Output.of(output)
+    reports = [output.file.with_suffix(".json"), *([output.json] if output.json else [])]
+    for path in (output.file, *reports):
+        check_output(path, [pairs, *maps], output.overwrite)
     with PairReader(pairs) as reader, contextlib.ExitStack() as stack:
         opened = [_open(path, reader, stack) for path in maps]
         chosen = _choose(reader, opened, config.split)
@@ -94,7 +93,7 @@ def run(
         inputs = [pairs, *maps]
         settings = {"split": config.split, "seed": config.seed, "held_out_images": True}
         with ArtefactWriter(
-            output, EVALUATION, sizes, config=settings, inputs=inputs, seed=config.seed, overwrite=overwrite
+            output.file, EVALUATION, sizes, config=settings, inputs=inputs, seed=config.seed, overwrite=output.overwrite
         ) as writer:
             scores = _score(reader, opened, chosen, writer, progress)
             result = _conclude(reader, opened, chosen, scores, config)
@@ -107,7 +106,7 @@ def run(
             writer.write("ssim", scores["ssim"])
             writer.file.attrs["split"] = config.split
             writer.file.attrs["metrics"] = json.dumps(result)
-            with companions_of(output):
+            with companions_of(output.file):
                 for report in reports:
                     write_json(report, result)
     return result
@@ -118,7 +117,7 @@ def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> Map:
     file = stack.enter_context(open_artefact(path, SVBRDF))
     if "albedo" not in file:
         raise ArtefactError(
-            f"{path}:/albedo: expected a map with albedo, found none; run 'lunargr albedo' with --fold."
+            f"{path}:/albedo: expected a map with albedo, found none; run 'lunargr albedo' with `fold`."
         )
     suns = unit_vectors(file["albedo_subsolar_longitude_deg"][...], file["albedo_subsolar_latitude_deg"][...])
     error = AlbedoError.read(file)
@@ -155,7 +154,7 @@ def _choose(reader: PairReader, maps: Sequence[Map], split: str) -> list[tuple[i
     if not chosen:
         raise ArtefactError(
             f"{maps[0].path}: expected pairs of split '{split}' whose image did not make the albedo, found none; "
-            "run 'lunargr albedo' with --fold or --leave-out."
+            "run 'lunargr albedo' with `fold` or `leave_out`."
         )
     return chosen
 
@@ -164,7 +163,8 @@ def _score(
     reader: PairReader, maps: Sequence[Map], chosen: Sequence[tuple[int, int]], writer: ArtefactWriter, progress: Any
 ) -> dict[str, NDArray]:
     """Sums of squares (rows, pairs), pixels, ssim, nearest Suns (rad); ``within`` (3, bands, pairs): pixels
-    by incidence, and of those the ones within the 68 and the 95 % intervals."""
+    by incidence, and of those the ones within the 68 and the 95 % intervals.
+    """
     count = len(chosen)
     found: dict[str, NDArray] = {
         "squares": np.zeros((len(ROWS), count)),
@@ -176,8 +176,7 @@ def _score(
     measured_out, rendered_out = writer.dataset("measured"), writer.dataset("rendered")
     scales: dict[tuple[int, int], list[tuple[float, float]]] = {}
     for n, (k, number) in enumerate(chosen):
-        if progress:
-            progress(n, count, "held-out crops")
+        progress(n, count, "held-out crops")
         one = maps[number]
         if reader.units == "dn" and (int(reader.frame[k]), number) not in scales:
             scales[int(reader.frame[k]), number] = _image_scales(reader, one, int(reader.frame[k]))
@@ -200,9 +199,8 @@ def _score(
         if reader.units == "iof":
             away = np.abs(pictures[1][0].numpy() - measured[0].numpy())
             widths, incidence = _intervals(reader, one, k, pictures[1][0].numpy())
-            bands = np.clip(np.digitize(np.degrees(incidence), BANDS_DEG) - 1, 0, len(BANDS_DEG) - 2)[mask]
-            for level, inside in enumerate([np.ones_like(mask), *(away <= w for w in widths)]):
-                found["within"][level, :, n] = np.bincount(bands, inside[mask], len(BANDS_DEG) - 1)
+            away[~mask] = np.nan
+            found["within"][:, :, n] = count_within(away, widths, incidence)
     return found
 
 
@@ -219,9 +217,13 @@ def _intervals(reader: PairReader, one: Map, k: int, rendered: NDArray) -> tuple
     """Half-widths (h, w), I/F, of the 68 and 95 % intervals of an unseen image about ``rendered``; incidence (h, w), rad."""
     row, col = int(reader.file["row"][k]), int(reader.file["col"][k])
     height, width = reader.size
-    cosine = illuminate(reader.observation([k])).angles.cos_incidence[0].numpy()
-    relative = one.error.relative(row - height // 2, col - width // 2, height, width, cosine)
-    return [r * np.abs(rendered) for r in relative], np.arccos(np.clip(cosine, -1.0, 1.0))
+    state = illuminate(reader.observation([k]))
+    cosine = state.angles.cos_incidence[0].numpy()
+    visible = np.ones_like(cosine) if state.sun_visibility is None else state.sun_visibility[0].numpy()
+    shadow = np.where(cosine > 0, 1 - visible, 1) > SHADOWED
+    sine = max(0.0, float(reader.file["sun_direction_enu"][k][2]))
+    widths = one.error.half_widths(row - height // 2, col - width // 2, rendered, cosine, shadow, sine)
+    return widths, np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
 def _image_scales(reader: PairReader, one: Map, frame: int) -> list[tuple[float, float]]:
@@ -309,23 +311,9 @@ def _conclude(
         "valid_pixels": int(pixels.sum()),
         "image_units": reader.units,
         "nearest_used_sun_deg": {"least": float(suns.min()), "mean": float(suns.mean()), "most": float(suns.max())},
-        "coverage_percent": None if reader.units == "dn" else _coverage(scores["within"].sum(axis=2)),
+        "coverage_percent": None if reader.units == "dn" else shares(scores["within"].sum(axis=2)),
         "used_images": [one.used for one in maps],
     }
-
-
-def _coverage(within: Floats) -> dict[str, Any]:
-    """Percent of pixels within the 68 and 95 % intervals, in all and by incidence. within : (3, bands), pixels first"""
-
-    def shares(counts: Floats) -> dict[str, Any]:
-        values = [100 * float(v / counts[0]) if counts[0] else None for v in counts[1:]]
-        return {"pixels": int(counts[0]), "68": values[0], "95": values[1]}
-
-    bands = [
-        {"incidence_low_deg": low, "incidence_high_deg": high} | shares(within[:, k])
-        for k, (low, high) in enumerate(itertools.pairwise(BANDS_DEG))
-    ]
-    return shares(within.sum(axis=1)) | {"by_incidence": bands}
 
 
 def _known(value: float) -> float | None:
@@ -363,15 +351,3 @@ def image_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         for row in result["images"]
     ]
     return ["unseen image", "crops", "nearest Sun used, deg", "MSE terrain", "MSE with albedo"], cells
-
-
-def coverage_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Columns and cells of the table of coverage by incidence."""
-    found = result["coverage_percent"]
-    rows = [(f"{b['incidence_low_deg']:.0f} to {b['incidence_high_deg']:.0f} deg", b) for b in found["by_incidence"]]
-    cells = [
-        [name, str(row["pixels"]), f"{row['68']:.1f}", f"{row['95']:.1f}"]
-        for name, row in [*rows, ("all", found)]
-        if row["pixels"]
-    ]
-    return ["incidence", "pixels", "within 68 %", "within 95 %"], cells

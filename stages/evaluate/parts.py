@@ -3,40 +3,73 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from schemas import atomic_path
+from schemas import write_json
 from schemas.files.hdf5 import silence_hdf5
-from stages.effects import load_extension
+from schemas.files.outputs import atomic_path
+from stages.evaluate.comparison import Task, load_predictors, make_task
+from stages.evaluate.config import Config
 from stages.evaluate.core import PER_ROW, Scores, score
-from stages.evaluate.fitting import choose_fit_pairs, dn_scale, fit_rows
+from stages.evaluate.fitting import fit_rows
 from stages.evaluate.perceptual import Perceptual
 from stages.evaluate.renderers import Constant
-from stages.evaluate.rows import Row, make_renderers, make_rows
-from stages.network.predictor import Predictor as Network
-from stages.network.predictor import choose_device, load_predictor
+from stages.evaluate.rows import Row
 from stages.pairs.reader import PairReader
 
-COUNTS = ("pixels", "data_range")
+# (what, function, its arguments for every part, suffix) -> the parts that function(path, **arguments) wrote, in order
+Fan = Callable[[str, Callable[..., Any], Sequence[Mapping[str, Any]], str], list[Path]]
+COUNTS = ("pixels", "data_range", "within")
+PART_BATCHES = 32
 
 
-def write_fit(
-    path: Path, pairs: Path, checkpoints: Sequence[Path], extend: Path | None, config: Any, wanted: np.ndarray
-) -> None:
+@dataclass(frozen=True)
+class Kept:
+    """The crops that are kept. first : rows whose renderings they are, where there are any"""
+
+    measured: h5py.Dataset
+    rendered: h5py.Dataset | None
+    first: Sequence[int]
+
+    def put(self, position: int, crops: np.ndarray, images: list[np.ndarray]) -> None:
+        """crops : (B, H, W) from ``position`` on; images : the same of every row"""
+        self.measured[position : position + len(crops)] = crops
+        if self.rendered is not None:
+            for k, row in enumerate(self.first):
+                self.rendered[k, position : position + len(crops)] = images[row]
+
+
+def score_in_parts(
+    task: Task, pairs: Path, checkpoints: Sequence[Path], fan: Fan, kept: Kept
+) -> tuple[list[Row], Scores, float]:
+    """Fit once, then score some crops in every part. Returns rows, their scores, and the scale of DN."""
+    config = task.config
+    if config.extend:
+        config = replace(config, extend=str(Path(config.extend).resolve()))
+    shared: dict[str, Any] = {"pairs": pairs, "checkpoints": checkpoints, "config": config}
+    [fitted] = fan("fit", write_fit, [shared | {"wanted": task.wanted}], ".json")
+    rows = task.rows()
+    scale = read_fit(fitted, rows)
+    step = PART_BATCHES * config.batch  # whole batches: the network sees the same ones whatever the parts
+    todo = [
+        shared | {"fitted": fitted, "wanted": task.wanted[k : k + step], "renderings": kept.rendered is not None}
+        for k in range(0, len(task.wanted), step)
+    ]
+    return rows, join_scores(fan("scores", write_scores, todo, ".h5"), rows, kept), scale
+
+
+def write_fit(path: Path, pairs: Path, checkpoints: Sequence[Path], config: Config, wanted: np.ndarray) -> None:
     """Fit what is free and write it as JSON: numbers survive that to the last bit."""
     with PairReader(pairs) as reader:
-        rows = _rows(reader, checkpoints, extend, config)
-        calibrated = reader.units == "iof"
-        train, orphans = choose_fit_pairs(reader, wanted, config.fit_pairs, config.seed)
-        everything = np.concatenate([train, orphans, wanted])
-        scale = 1.0 if calibrated else dn_scale(reader, everything, config.batch)
-        frames = len(reader.image_ids)
-        fit_rows(reader, rows, train, orphans, frames, calibrated, scale, config.batch, config.seed)
+        task = make_task(reader, load_predictors(checkpoints, config), wanted, config)
+        rows, fitting = task.rows(), task.fitting()
+        fit_rows(fitting, rows)
     numbers = {
         row.renderer.name: {
             "coefficients": row.renderer.coefficients.values.tolist()
@@ -48,8 +81,7 @@ def write_fit(
         }
         for row in rows
     }
-    with atomic_path(path) as partial:
-        partial.write_text(json.dumps({"scale": scale, "renderers": numbers}))
+    write_json(path, {"scale": fitting.scale, "renderers": numbers})
 
 
 def read_fit(path: Path, rows: Sequence[Row]) -> float:
@@ -66,23 +98,11 @@ def read_fit(path: Path, rows: Sequence[Row]) -> float:
     return float(found["scale"])
 
 
-def load_predictors(checkpoints: Sequence[Path], device: str) -> list[Network]:
-    """One for each training run."""
-    return [load_predictor(path, choose_device(device)) for path in checkpoints]
-
-
-def _rows(reader: PairReader, checkpoints: Sequence[Path], extend: Path | None, config: Any) -> list[Row]:
-    predictors = load_predictors(checkpoints, config.device)
-    extensions = load_extension(extend, reader.image_ids) if extend else []
-    return make_rows(make_renderers(predictors, extensions), len(predictors), bool(extensions), config.only)
-
-
 def write_scores(
     path: Path,
     pairs: Path,
     checkpoints: Sequence[Path],
-    extend: Path | None,
-    config: Any,
+    config: Config,
     fitted: Path,
     wanted: np.ndarray,
     renderings: bool,
@@ -90,21 +110,15 @@ def write_scores(
     """Score every row on the crops ``wanted``."""
     silence_hdf5()
     with PairReader(pairs) as reader, atomic_path(path) as partial, h5py.File(partial, "w") as file:
-        rows = _rows(reader, checkpoints, extend, config)
+        rows = make_task(reader, load_predictors(checkpoints, config), wanted, config).rows()
         scale = read_fit(fitted, rows)
-        shape = (len(wanted), *reader.size)
+        shape, first = (len(wanted), *reader.size), first_runs(rows)
         chunks = (1, *reader.size)
         measured = file.create_dataset("measured", shape, "f4", chunks=chunks)
         rendered: h5py.Dataset | None = None
         if renderings:
-            rendered = file.create_dataset("rendered", (len(first_runs(rows)), *shape), "f4", chunks=(1, *chunks))
-
-        def keep(position: int, crops: np.ndarray, images: list[np.ndarray]) -> None:
-            measured[position : position + len(crops)] = crops
-            if rendered is not None:
-                for k, row in enumerate(first_runs(rows)):
-                    rendered[k, position : position + len(crops)] = images[row]
-
+            rendered = file.create_dataset("rendered", (len(first), *shape), "f4", chunks=(1, *chunks))
+        keep = Kept(measured, rendered, first).put
         scores = score(reader, rows, wanted, scale, config.batch, Perceptual(), keep, lambda count: None)
         for name in (*PER_ROW, *COUNTS):
             file[name] = getattr(scores, name)
@@ -115,9 +129,7 @@ def first_runs(rows: Sequence[Row]) -> list[int]:
     return [k for k, row in enumerate(rows) if row.run == 0]
 
 
-def join_scores(
-    parts: Sequence[Path], rows: Sequence[Row], measured: h5py.Dataset, rendered: h5py.Dataset | None
-) -> Scores:
+def join_scores(parts: Sequence[Path], rows: Sequence[Row], kept: Kept) -> Scores:
     """The scores of all parts in their order; the crops go where they belong."""
     tables: dict[str, list[np.ndarray]] = {name: [] for name in (*PER_ROW, *COUNTS)}
     place = 0
@@ -127,9 +139,9 @@ def join_scores(
                 found.append(file[name][...])
             count = file["measured"].shape[0]
             for k in range(count):
-                measured[place + k] = file["measured"][k]
-                if rendered is not None:
-                    rendered[:, place + k] = file["rendered"][:, k]
+                kept.measured[place + k] = file["measured"][k]
+                if kept.rendered is not None:
+                    kept.rendered[:, place + k] = file["rendered"][:, k]
             place += count
     joined: dict[str, Any] = {name: np.concatenate(found, axis=-1) for name, found in tables.items()}
     return Scores(names=[row.name for row in rows], **joined)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -14,6 +15,7 @@ from schemas.errors import ArtefactError
 from stages.physics.formation.chain import Extension, Observation, State, expose, form, illuminate
 from stages.physics.formation.radiometry import match_crops
 from stages.physics.photometry import ReflectanceModel, get_model, masked_radiance_factor
+from stages.physics.photometry.deviation import radiance_deviation
 
 
 class Reader(Protocol):
@@ -24,9 +26,14 @@ class Reader(Protocol):
     site: np.ndarray
     frame: np.ndarray
 
-    def observation(self, indices: np.ndarray) -> Observation: ...
-    def image(self, indices: np.ndarray) -> Tensor: ...
-    def valid(self, indices: np.ndarray) -> Tensor: ...
+    def observation(self, indices: np.ndarray) -> Observation:
+        """Everything about these pairs but their images."""
+
+    def image(self, indices: np.ndarray) -> Tensor:
+        """(B, H, W) measured."""
+
+    def valid(self, indices: np.ndarray) -> Tensor:
+        """(B, H, W) bool."""
 
 
 class Predictor(Protocol):
@@ -34,8 +41,14 @@ class Predictor(Protocol):
 
     model: ReflectanceModel
 
-    def coefficients(self, elevation: Tensor) -> Tensor: ...
-    def parameters(self) -> Iterator[Tensor]: ...
+    def coefficients(self, elevation: Tensor) -> Tensor:
+        """(B, H, W) m -> (B, C, H, W)."""
+
+    def coefficients_and_deviations(self, elevation: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """(B, H, W) m -> (B, C, H, W), and standard deviations (B, H, W) by name."""
+
+    def parameters(self) -> Iterator[Tensor]:
+        """Its weights; they tell the device."""
 
 
 @dataclass
@@ -66,6 +79,7 @@ def read_batch(reader: Reader, indices: np.ndarray, scale: float) -> Batch:
 
 
 def batches(indices: np.ndarray, size: int) -> Iterator[np.ndarray]:
+    """The indices (n,) in parts of at most ``size``."""
     for start in range(0, len(indices), size):
         yield indices[start : start + size]
 
@@ -75,6 +89,7 @@ class Renderer:
     """One compared model, with gain and offset per frame (1 and 0 for calibrated images).
 
     coefficients : batch -> tensor that broadcasts to (B, C, H, W), in the order of ``model.parameters``
+    spread : batch -> standard deviation of a photograph's pixel about the rendering, (B, H, W) I/F; None where not known
     """
 
     name: str
@@ -84,6 +99,13 @@ class Renderer:
     scale: float = 1.0
     gain: np.ndarray | None = None
     offset: np.ndarray | None = None
+    spread: Callable[[Batch], Tensor] | None = None
+
+    def deviation(self, batch: Batch) -> Tensor | None:
+        """``spread`` on the scale of the images; None where not known."""
+        if self.spread is None:
+            return None
+        return self.spread(batch) * self.scale * self._per_crop(self.gain, batch, 1.0).abs()
 
     def radiance_factor(self, batch: Batch) -> Tensor:
         """I/F, (B, H, W), 0 on pixels that are not usable."""
@@ -144,23 +166,39 @@ class Constant:
     values: np.ndarray
 
     def __call__(self, batch: Batch) -> Tensor:
+        """The values, for every pixel alike."""
         return torch.as_tensor(self.values, dtype=torch.float32)[None, :, None, None]
 
 
-def learned(predictor: Predictor) -> Callable[[Batch], Tensor]:
-    """The network's coefficients from the crop's elevation; computed once per batch."""
-    device = next((p.device for p in predictor.parameters()), torch.device("cpu"))
+def learned(predictor: Predictor) -> tuple[Callable[[Batch], Tensor], Callable[[Batch], Tensor] | None]:
+    """The network's coefficients from the crop's elevation, and the spread of photographs that it predicts (``Renderer``).
 
+    Computed once per batch; a checkpoint without deviations has no spread.
+    """
+    device = next((p.device for p in predictor.parameters()), torch.device("cpu"))
+    noise = float(getattr(predictor, "image_noise", math.nan))
     key = f"coefficients of {id(predictor)}"
 
-    def coefficients(batch: Batch) -> Tensor:
+    def look(batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         if key not in batch.memo:
+            elevation = batch.observation.elevation.to(device)
             with torch.no_grad():
-                elevation = batch.observation.elevation.to(device)
-                batch.memo[key] = predictor.coefficients(elevation).float().cpu()
+                if math.isnan(noise):
+                    coefficients, deviations = predictor.coefficients(elevation), dict[str, Tensor]()
+                else:
+                    coefficients, deviations = predictor.coefficients_and_deviations(elevation)
+            batch.memo[key] = coefficients.float().cpu(), {k: v.float().cpu() for k, v in deviations.items()}
         return batch.memo[key]
 
-    return coefficients
+    def spread(batch: Batch) -> Tensor:
+        coefficients, deviations = look(batch)
+        values = predictor.model.unpack(coefficients, dim=1)
+        found = radiance_deviation(predictor.model, values, deviations, batch.state.angles)
+        if batch.state.sun_visibility is not None:
+            found = found * batch.state.sun_visibility
+        return found.square().add(noise**2).sqrt()
+
+    return lambda batch: look(batch)[0], None if math.isnan(noise) else spread
 
 
 def published(name: str) -> tuple[ReflectanceModel, np.ndarray]:

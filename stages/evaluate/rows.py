@@ -77,8 +77,8 @@ def make_renderers(predictors: Sequence[Predictor], extensions: Sequence[Extensi
     start = Constant(np.array([p.default for p in model.parameters]))
     made = []
     for run, predictor in enumerate(predictors):
-        network = learned(predictor)
-        made.append(Renderer(run_name("learned", run), model, network))
+        network, spread = learned(predictor)
+        made.append(Renderer(run_name("learned", run), model, network, spread=spread))
         made.append(Renderer(run_name("learned_extended", run), model, network, tuple(extensions)))
     made.append(Renderer("global", model, start))
     made.append(Renderer("global_extended", model, start, tuple(extensions)))

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
-from stages.export.onnx_file import Config, Summary, run
+from typing import TYPE_CHECKING
 
+from schemas.later import imported_later
+from stages.export.config import Config
+
+if TYPE_CHECKING:
+    from stages.export.onnx_file import Summary, run
+
+__getattr__ = imported_later(__name__, "onnx_file")
 __all__ = ["Config", "Summary", "run"]

@@ -14,21 +14,16 @@ from torch import Tensor
 
 from schemas import CHECKPOINT, ConfigError, atomic_path, check_output, open_artefact
 from schemas.files.companions import companions_of
+from schemas.files.outputs import Output
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.export.card import model_card
-from stages.network.maps import CoefficientMaps
+from stages.export.config import Config
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.normalisation import scale_elevation
 from stages.network.predictor import Predictor, load_predictor
 from stages.network.unet import UNet
 
-OPSET = 17
 INPUT, OUTPUT = "elevation", "coefficients"
-
-
-@dataclass(frozen=True)
-class Config:
-    """opset : of ONNX"""
-
-    opset: int = OPSET
 
 
 @dataclass(frozen=True)
@@ -57,15 +52,19 @@ class _Exported(torch.nn.Module):
         return self.maps.stack(self.maps.shifted(self.net.read_out(features)), dim=1)
 
 
-def run(checkpoint: Path, output: Path, config: Config, *, overwrite: bool = False) -> Summary:
+def run(
+    checkpoint: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
+) -> Summary:
     """Write ``output`` (.onnx) and its card beside it (.md). Raises LunargrError."""
-    if output.suffix.lower() != ".onnx":
-        raise ConfigError(f"{output}: expected a name that ends in .onnx; choose another --output.")
+    output = Output.of(output)
+    path = output.file
+    if path.suffix.lower() != ".onnx":
+        raise ConfigError(f"{path}: expected a name that ends in .onnx; choose another `output`.")
     if not 13 <= config.opset <= 20:
-        raise ConfigError(f"--opset: expected 13..20, found {config.opset}.")
-    card = output.with_suffix(".md")
-    for path in (output, card):
-        check_output(path, [checkpoint], overwrite)
+        raise ConfigError(f"`opset`: expected 13..20, found {config.opset}.")
+    card = path.with_suffix(".md")
+    for made in (path, card):
+        check_output(made, [checkpoint], output.overwrite)
     predictor = load_predictor(checkpoint)
     with open_artefact(checkpoint, CHECKPOINT) as file:
         told = {k: str(file.attrs[k]) for k in ("history", "lunargr_version", "config", "inputs") if k in file.attrs}
@@ -73,9 +72,9 @@ def run(checkpoint: Path, output: Path, config: Config, *, overwrite: bool = Fal
         best = int(file.attrs["best_epoch"])
     data = to_onnx(predictor, config.opset, told)
     names = tuple(p.name for p in predictor.model.parameters)
-    with companions_of(output), atomic_path(output) as partial, atomic_path(card) as text:
+    with companions_of(path), atomic_path(path) as partial, atomic_path(card) as text:
         partial.write_bytes(data)
-        text.write_text(model_card(output.name, checkpoint.name, predictor, told, losses, best), encoding="utf-8")
+        text.write_text(model_card(path.name, checkpoint.name, predictor, told, losses, best), encoding="utf-8")
     return Summary(predictor.model.name, names, predictor.net.stride, len(data), card)
 
 

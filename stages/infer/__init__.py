@@ -1,11 +1,17 @@
-"""Stage infer. run: the stage; windows: where the map is cut; terrain: the DEM in rows; working: threads; writing: the map."""
+"""Stage infer. stage: from files to files; windows: where the map is cut; terrain: the DEM in rows; working: threads; writing: the map."""
 
 from __future__ import annotations
 
-from stages.infer.config import Config, Summary
-from stages.infer.run import check_body, check_files, count_bands, open_terrain, run, summarise
-from stages.infer.windows import axis_windows, blend_weights
+from typing import TYPE_CHECKING
 
+from schemas.later import imported_later
+from stages.infer.config import Config, Summary
+
+if TYPE_CHECKING:
+    from stages.infer.stage import check_body, check_files, count_bands, open_terrain, run, summarise
+    from stages.infer.windows import axis_windows, blend_weights
+
+__getattr__ = imported_later(__name__, "stage", "windows")
 __all__ = [
     "Config",
     "Summary",

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from stages.physics.maps.grid import Grid
+if TYPE_CHECKING:
+    from stages.physics.maps.grid import Grid
 
 
 @dataclass(frozen=True)
 class Config:
     """window, stride : px; windows overlap by their difference and are blended; None: as large as the machine likes best;
-    offset : px, shifts their grid; precision : fp32, bf16, or auto (see ``stages.network.runtime``); geotiff : whether the
+    offset : px, shifts their grid; precision : fp32, bf16, or auto (see ``stages.network.precision``); geotiff : whether the
     map is written as a GeoTIFF as well.
     """
 
@@ -18,7 +20,7 @@ class Config:
     stride: int | None = None
     offset: int = 0
     device: str = "auto"
-    precision: str = "fp32"
+    precision: str = "auto"
     any_gsd: bool = False
     shard: tuple[int, int] = (0, 1)
     geotiff: bool = True

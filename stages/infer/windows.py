@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from schemas import ConfigError
 from stages.infer.config import Config
-
-Box = tuple[int, int, int, int]  # row, col, height, width
+from stages.physics.maps.window import Box
 
 BAND = 1024  # rows, by which shards share a map out; the window where the network cannot run strip by strip
 # Context costs a wide window little, and one that runs from north to south nothing but at its ends. Memory follows the width.
@@ -25,7 +24,7 @@ def window_and_stride(config: Config) -> tuple[int, int]:
     stride = window if config.stride is None else config.stride  # windows carry their context: they need no overlap
     if window < 16 or not 1 <= stride <= window:
         raise ConfigError(
-            f"--window and --stride: expected 1 <= stride <= window and window >= 16, found {stride} and {window}."
+            f"`window` and `stride`: expected 1 <= stride <= window and window >= 16, found {stride} and {window}."
         )
     return window, stride
 

@@ -17,7 +17,8 @@ from schemas import (
     ArtefactWriter,
     InputError,
 )
-from stages.ingest.config import Config, Progress
+from stages.common.progress import Progress
+from stages.ingest.config import Config
 from stages.ingest.plan import Plan
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid
@@ -45,16 +46,16 @@ def area_mean(fine: NDArray, factor: int) -> NDArray[np.float32]:
 
 
 def write_elevation(
-    dem: Path, dataset: DatasetReader, plan: Plan, config: Config, writer: ArtefactWriter, progress: Progress | None
+    dem: Path, dataset: DatasetReader, plan: Plan, config: Config, writer: ArtefactWriter, progress: Progress
 ) -> tuple[int, float, float]:
+    """Resample the DEM onto the grid, piece by piece; valid pixels, lowest and highest elevation, m."""
     grid = plan.grid
     elevation, dem_valid = writer.dataset("elevation"), writer.dataset("dem_valid")
     first, last = writer.file.attrs.get("shard_rows", (0, grid.height))
     todo = [b for b in _pieces(dataset, grid, config) if first <= b[0] < last]
     seen, low, high = 0, math.inf, -math.inf
     for number, (row, col, height, width) in enumerate(todo):
-        if progress:
-            progress(number, len(todo), "DEM blocks")
+        progress(number, len(todo), "DEM blocks")
         if plan.factor:
             values = _read_means(dataset, plan, plan.factor, (row, col, height, width))
         else:
@@ -68,8 +69,7 @@ def write_elevation(
         if good.any():
             seen += int(good.sum())
             low, high = min(low, float(values[good].min())), max(high, float(values[good].max()))
-    if progress:
-        progress(len(todo), len(todo), "DEM blocks")
+    progress(len(todo), len(todo), "DEM blocks")
     if not seen and config.shard[1] == 1:
         raise InputError(f"{dem}: expected elevations, found only nodata on the grid at {grid.gsd:g} m.")
     return seen, low, high
@@ -107,7 +107,7 @@ def _read_means(dataset: DatasetReader, plan: Plan, n: int, piece: tuple[int, in
 
 
 def take_elevation(
-    scene: Path, file: h5py.File, view: bool, writer: ArtefactWriter, progress: Progress | None
+    scene: Path, file: h5py.File, view: bool, writer: ArtefactWriter, progress: Progress
 ) -> tuple[int, float, float]:
     """The elevations of another scene; a shard, of which there may be hundreds, only looks into it."""
     for name in ("elevation", "dem_valid"):

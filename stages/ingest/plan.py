@@ -18,7 +18,7 @@ from schemas import (
     GeometryError,
     InputError,
 )
-from stages.ingest.config import Progress
+from stages.common.progress import Progress, show_nothing
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, local_metric_crs
 
@@ -39,7 +39,7 @@ class Plan:
 
 
 def plan_grid(
-    dem: Path, dataset: DatasetReader, gsd: float | None, radius: float, progress: Progress | None = None
+    dem: Path, dataset: DatasetReader, gsd: float | None, radius: float, progress: Progress = show_nothing
 ) -> Plan:
     """Area means where the DEM's grid is metric and divides the GSD, otherwise a local metric grid."""
     rasters.check_single_band(dem, dataset, "a DEM")
@@ -47,13 +47,13 @@ def plan_grid(
     east, north = rasters.pixel_size_at(dataset, radius, dataset.height / 2, dataset.width / 2)
     native = max(east, north)
     if gsd is not None and not (math.isfinite(gsd) and gsd > 0):
-        raise ConfigError(f"--gsd: expected a positive number of metres, found {gsd}.")
+        raise ConfigError(f"`gsd`: expected a positive number of metres, found {gsd}.")
     if not (math.isfinite(native) and native > 0):
         raise GeometryError(f"{dem}: its georeference puts the DEM off the body; check its CRS and transform.")
     wanted = native if gsd is None else gsd
     if wanted < 0.5 * native:
         raise ConfigError(
-            f"--gsd: expected at least half the DEM's own {native:g} m, found {wanted:g}; detail cannot be invented."
+            f"`gsd`: expected at least half the DEM's own {native:g} m, found {wanted:g}; detail cannot be invented."
         )
     holds_radii = _holds_radii(dem, dataset, radius, progress)
     t = dataset.transform
@@ -74,7 +74,7 @@ def plan_grid(
         if true_square and true_scale and fits:
             height, width = dataset.height // factor, dataset.width // factor
             if min(height, width) < 1:
-                raise ConfigError(f"--gsd: {wanted:g} m is coarser than the whole DEM; choose a finer one.")
+                raise ConfigError(f"`gsd`: {wanted:g} m is coarser than the whole DEM; choose a finer one.")
             transform = t @ Affine.scale(factor)
             return Plan(
                 Grid(dataset.crs.to_wkt(), transform, height, width, radius), factor, Resampling.average, holds_radii
@@ -110,7 +110,7 @@ def _is_metre(dataset: DatasetReader) -> bool:
     return abs((dataset.crs.linear_units_factor[1] if dataset.crs.is_projected else 0) - 1) < 1e-6
 
 
-def _holds_radii(dem: Path, dataset: DatasetReader, radius: float, progress: Progress | None) -> bool:
+def _holds_radii(dem: Path, dataset: DatasetReader, radius: float, progress: Progress) -> bool:
     """Whether the DEM counts from the body's centre; and whether its numbers can be metres at all."""
     size = 256
     windows = [
@@ -127,7 +127,7 @@ def _holds_radii(dem: Path, dataset: DatasetReader, radius: float, progress: Pro
     if abs(middle) > 0.5 * radius:
         if abs(middle - radius) > 0.05 * radius:
             raise InputError(
-                f"{dem}: expected metres above the sphere or radii near {radius:g} m, found values near {middle:g}; check units and --body."
+                f"{dem}: expected metres above the sphere or radii near {radius:g} m, found values near {middle:g}; check units and `body`."
             )
         return True
     kilometres_radius = (
@@ -155,13 +155,12 @@ def _holds_radii(dem: Path, dataset: DatasetReader, radius: float, progress: Pro
     return False
 
 
-def _first_elevations(dem: Path, dataset: DatasetReader, progress: Progress | None) -> NDArray[np.float64]:
+def _first_elevations(dem: Path, dataset: DatasetReader, progress: Progress) -> NDArray[np.float64]:
     """The first block of a raster that holds any value. Raises InputError where none does."""
     rows, cols = dataset.block_shapes[0]
     down, across = math.ceil(dataset.height / rows), math.ceil(dataset.width / cols)
     for r in range(down):
-        if progress:
-            progress(r, down, "rows of blocks without elevations")
+        progress(r, down, "rows of blocks without elevations")
         for c in range(across):
             # a sparse GeoTIFF leaves out blocks of nodata: a DEM of these is looked through in seconds
             if dataset.driver == "GTiff" and not dataset.get_tag_item(f"BLOCK_OFFSET_{c}_{r}", "TIFF", bidx=1):

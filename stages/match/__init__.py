@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
-from stages.match.run import Config, run
+from typing import TYPE_CHECKING
 
+from schemas.later import imported_later
+from stages.match.config import Config
+
+if TYPE_CHECKING:
+    from stages.match.stage import run
+
+__getattr__ = imported_later(__name__, "stage")
 __all__ = ["Config", "run"]

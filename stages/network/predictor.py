@@ -16,9 +16,9 @@ from torch import Tensor
 from schemas.artefacts import CHECKPOINT
 from schemas.errors import ArtefactError, ConfigError, RegistryError
 from schemas.reading import open_artefact, read_config, read_strings
-from stages.network.maps import CoefficientMaps
+from stages.network.checkpoint_layout import check_finite, check_weights, read_layout
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.normalisation import scale_elevation
-from stages.network.stored import check_finite, check_weights, read_layout
 from stages.network.unet import UNet
 from stages.physics.photometry import get_model
 
@@ -85,18 +85,21 @@ def choose_device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if not re.fullmatch(r"cpu|cuda(:\d{1,3})?", name, re.ASCII):
-        raise ConfigError(f"--device: expected cpu, cuda, cuda:N or auto, found '{name}'.")
+        raise ConfigError(f"`device`: expected cpu, cuda, cuda:N or auto, found '{name}'.")
     device = torch.device(name)
     count = torch.cuda.device_count()
     if device.type == "cuda" and (device.index or 0) >= count:
         raise ConfigError(
-            f"--device: expected one of {count} CUDA devices, found '{name}'; use --device cpu or another."
+            f"`device`: expected one of {count} CUDA devices, found '{name}'; use `device` cpu or another."
         )
     return device
 
 
 def write_state(group: h5py.Group, state: Mapping[str, Tensor]) -> None:
-    """A state dict as plain HDF5 arrays, no pickle."""
+    """A state dict as plain HDF5 arrays, no pickle.
+
+    state : by name, tensors of any shape
+    """
     for name, tensor in state.items():
         group.create_dataset(name, data=tensor.detach().cpu().numpy(), track_order=True)
 
@@ -120,7 +123,7 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
         name = str(file.attrs["model"])
         if model is not None and model.lower() != name.lower():
             raise ArtefactError(
-                f"{path}: expected a checkpoint for model '{model}', found one for '{name}'; train again or drop --model."
+                f"{path}: expected a checkpoint for model '{model}', found one for '{name}'; train again or drop `model`."
             )
         try:
             reflectance = get_model(name)

@@ -20,15 +20,17 @@ from stages.network.predictor import Predictor, first_misfit, read_state, write_
 
 @dataclass
 class History:
-    """One entry per finished epoch."""
+    """One entry per finished epoch. objective : what is minimised, on validation ground; the least of it is kept"""
 
     train_loss: list[float] = field(default_factory=list)
     validation_loss: list[float] = field(default_factory=list)
+    objective: list[float] = field(default_factory=list)
     epoch_seconds: list[float] = field(default_factory=list)
     best_epoch: int = -1
 
 
 def snapshot(predictor: Predictor, radiometry: Radiometry) -> dict[str, Tensor]:
+    """A copy of all weights, by name."""
     state = {f"predictor/{k}": v.detach().clone() for k, v in predictor.state_dict().items()}
     return state | {f"radiometry/{k}": v.detach().clone() for k, v in radiometry.state_dict().items()}
 
@@ -43,6 +45,7 @@ def save(
     best: dict[str, Tensor],
     precision: str,
 ) -> None:
+    """Write the state of an unfinished run, whole or not at all; best : weights of the best epoch, tensors of any shape."""
     state = optimizer.state_dict()
     with atomic_path(sidecar) as partial, h5py.File(partial, "w", track_order=True) as file:
         file.attrs["identity"] = identity
@@ -74,7 +77,10 @@ def restore(
     best: dict[str, Tensor],
     device: torch.device,
 ) -> str:
-    """Load the state of an interrupted run; returns its precision. Raises ArtefactError where it was another run's."""
+    """Load the state of an interrupted run; returns its precision. Raises ArtefactError where it was another run's.
+
+    best : the weights of the best epoch so far, tensors of any shape, changed in place
+    """
     silence_hdf5()
     try:
         with h5py.File(sidecar, "r") as file:

@@ -1,15 +1,22 @@
 """project: orthorectify the images onto the crops and add Sun, camera and horizon: `pairs.h5`."""
 
-from stages.project.config import Config, Progress, Registered, Summary
-from stages.project.geometry import Geometry, crop_geometry
-from stages.project.inputs import count_pairs, scene_of, source_files
-from stages.project.run import run
-from stages.project.summary import summarise
+from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from schemas.later import imported_later
+from stages.project.config import Config
+
+if TYPE_CHECKING:
+    from stages.project.geometry import Geometry, crop_geometry
+    from stages.project.inputs import count_pairs, scene_of, source_files
+    from stages.project.stage import run
+    from stages.project.summary import Registered, Summary, summarise
+
+__getattr__ = imported_later(__name__, "stage", "geometry", "inputs", "summary")
 __all__ = [
     "Config",
     "Geometry",
-    "Progress",
     "Registered",
     "Summary",
     "count_pairs",

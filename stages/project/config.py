@@ -1,22 +1,18 @@
-"""What project is asked for, and what it answers."""
+"""What project is asked for."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
-from schemas import ConfigError
-from stages.physics.images.displacement import FORMS, Field
-from stages.physics.images.registration import Shift
-
-Progress = Callable[[int, int, str], None]
+from schemas.errors import ConfigError
 
 
 @dataclass(frozen=True)
 class Config:
     """scene : overrides the scene that crops.h5 names; register : None, or the freest form of displacement that may be taken
     off ('constant', 'affine', 'field'); max_shift : px searched; exact : keep float32 as it is instead of the digits that
-    matter."""
+    matter.
+    """
 
     scene: str | None = None
     shard: tuple[int, int] = (0, 1)
@@ -26,29 +22,9 @@ class Config:
 
     def check(self) -> None:
         """Raises ConfigError."""
+        from stages.physics.images.displacement import FORMS
+
         if self.register not in (None, *FORMS):
-            raise ConfigError(f"--register: expected 'constant', 'affine' or 'field', found '{self.register}'.")
+            raise ConfigError(f"`register`: expected 'constant', 'affine' or 'field', found '{self.register}'.")
         if not 1.0 <= self.max_shift <= 32.0:
-            raise ConfigError(f"--max-shift: expected 1 to 32 px, found {self.max_shift:g}.")
-
-
-@dataclass(frozen=True)
-class Registered:
-    """How one image lay against its rendering: the displacement that was taken off, and each block's own answer."""
-
-    image_id: str
-    field: Field
-    blocks: tuple[tuple[float, float, Shift], ...]  # row and column of the middle, and the shift there
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What project wrote, for the line at the end."""
-
-    pairs: int
-    valid_share: float
-    incidence_deg: tuple[float, float]
-    emission_deg: tuple[float, float]
-    shadowed_share: float
-    registered: tuple[Registered, ...] = ()
+            raise ConfigError(f"`max_shift`: expected 1 to 32 px, found {self.max_shift:g}.")

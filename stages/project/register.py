@@ -14,8 +14,9 @@ from stages.physics.images.displacement import Field
 from stages.physics.images.register_frame import choose_blocks, register_frame
 from stages.physics.images.source_images import Source
 from stages.physics.images.table import Frame
-from stages.project.config import Config, Registered
+from stages.project.config import Config
 from stages.project.inputs import Scene
+from stages.project.summary import Registered
 
 
 def register(frame: Frame, index: int, source: Source, crops: h5py.File, scene: Scene, config: Config) -> Registered:

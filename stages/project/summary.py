@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,30 @@ from numpy.typing import NDArray
 
 from schemas import PAIRS, open_artefact
 from schemas.reading import unpack
-from stages.project.config import Summary
+from stages.physics.images.displacement import Field
+from stages.physics.images.registration import Shift
+
+
+@dataclass(frozen=True)
+class Registered:
+    """How one image lay against its rendering: the displacement that was taken off, and each block's own answer."""
+
+    image_id: str
+    field: Field
+    blocks: tuple[tuple[float, float, Shift], ...]  # row and column of the middle, and the shift there
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What project wrote, for the line at the end."""
+
+    pairs: int
+    valid_share: float
+    incidence_deg: tuple[float, float]
+    emission_deg: tuple[float, float]
+    shadowed_share: float
+    registered: tuple[Registered, ...] = ()
 
 
 def summarise(pairs: Path) -> Summary:

@@ -15,7 +15,7 @@ from schemas import ArtefactWriter, InputError
 from stages.physics.images.orthorectify import Ortho
 from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
-from stages.project.config import Registered, Summary
+from stages.project.summary import Registered, Summary
 
 # Digits after the point, which pairs.h5 keeps; docs/scaling.md says what they do to a rendering.
 IOF_DECIMALS, COUNT_DECIMALS, HORIZON_DECIMALS = 5, 1, 1
@@ -27,7 +27,8 @@ DISPLACEMENT = ("displacement_col_px", "displacement_row_px")
 @dataclass(frozen=True)
 class Pair:
     """One crop of one image. image, elevation, valid, horizon (rad) : (h, w); sun, camera : (3,);
-    displacement : (dx, dy) px at its middle, taken off; ortho : the camera's side, None for map-projected images"""
+    displacement : (dx, dy) px at its middle, taken off; ortho : the camera's side, None for map-projected images
+    """
 
     image: NDArray[np.float32]
     elevation: NDArray[np.float32]
@@ -89,6 +90,7 @@ class Tally:
     emission: list[float] = field(default_factory=list)
 
     def add(self, pair: Pair) -> None:
+        """Count one pair."""
         up = pair.sun[2]
         self.pairs += 1
         self.valid += int(pair.valid.sum())

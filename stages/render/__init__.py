@@ -2,43 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
+from typing import TYPE_CHECKING
 
-from schemas.files.companions import companions_of
-from schemas.files.outputs import Target, check_outputs
-from stages.physics.bodies.spheres import find_body
-from stages.render.config import Config, Summary, check, inputs, output_files
-from stages.render.maps import render_map
-from stages.render.setting import find_camera, make_light, open_source
-from stages.render.stereo import StereoConfig, run_stereo
-from stages.render.views import render_camera, run_trajectory
+from schemas.later import imported_later
+from stages.render.config import Config, StereoConfig, Summary
 
-Progress = Callable[[int, int, str], None]
+if TYPE_CHECKING:
+    from stages.render.stage import run
+    from stages.render.stereo import run_stereo
+    from stages.render.views import run_trajectory
 
-
-def run(
-    source: Path, output: Path, config: Config, overwrite: bool = False, progress: Progress | None = None
-) -> Summary:
-    """Render one view of ``source`` (svbrdf.h5, scene.h5 or a DEM). Raises LunargrError.
-
-    output : NAME.exr writes NAME.exr, NAME.png and, for ortho views, NAME.tif; NAME.tif and NAME.png leave the EXR out
-    """
-    check(config)
-    body = find_body("moon" if config.body is None else config.body)
-    files = output_files(output, config.view)
-    targets = [
-        Target(path, what="the output" if path == output else f"{path.suffix} beside {output.name}") for path in files
-    ]
-    check_outputs(targets, inputs(source, config), overwrite)
-    with companions_of(output), open_source(source, config, body) as surface:
-        relief = surface.height_range()
-        if config.view == "ortho":
-            light = make_light(surface, config, body, relief)
-            return render_map(surface, light, relief, files, config, progress)
-        camera = find_camera(surface, config)
-        light = make_light(surface, config, body, relief, camera)
-        return render_camera(surface, camera, light, relief, files, config, output.stem, progress)
-
-
+__getattr__ = imported_later(__name__, "stage", "stereo", "views")
 __all__ = ["Config", "StereoConfig", "Summary", "run", "run_stereo", "run_trajectory"]

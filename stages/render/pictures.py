@@ -1,4 +1,4 @@
-"""Writing rendered images: EXR with named channels, cloud-optimised GeoTIFF, and PNG previews that look right.
+"""Writing rendered images: EXR with named channels, and PNG previews that look right.
 
 Writers take bands of rows from the top down, so that an image of any size passes through little memory, and leave
 nothing behind where they are interrupted.
@@ -14,18 +14,12 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-import rasterio
-import rasterio.shutil
 from numpy.typing import NDArray
-from rasterio.errors import RasterioError
-from rasterio.windows import Window
 
 from schemas.errors import InputError
-from schemas.files.locks import partial_path
 from schemas.files.outputs import atomic_path
-from stages.physics.maps.grid import Grid
+from stages.common.arrays import Floats32
 
-Floats32 = NDArray[np.float32]
 DISPLAY_GAMMA = 2.2
 
 
@@ -36,7 +30,7 @@ def _failed(path: Path, message: str) -> OSError | InputError:
         if stat.f_bavail * stat.f_frsize < 1 << 20:
             return OSError(28, "No space left on device")
     return InputError(
-        f"{path}: cannot be written ({' '.join(message.split())}); free some space or choose another --output."
+        f"{path}: cannot be written ({' '.join(message.split())}); free some space or choose another `output`."
     )
 
 
@@ -106,68 +100,6 @@ def read_exr(path: Path) -> dict[str, Floats32]:
     return {name: np.ascontiguousarray(pixels[..., k]) for k, name in enumerate(names)}
 
 
-class GeoTiffWriter:
-    """Rows of a GeoTIFF as they come."""
-
-    def __init__(self, path: Path, target: rasterio.io.DatasetWriter) -> None:
-        self._path, self._target = path, target
-        self._row = 0
-
-    def write(self, bands: NDArray) -> None:
-        """Append rows: (bands, rows, W), NaN where there is nothing."""
-        rows, width = bands.shape[1:]
-        try:
-            self._target.write(bands, window=Window(0, self._row, width, rows))
-        except RasterioError as error:
-            raise _failed(self._path, str(error.__cause__ or error)) from None
-        self._row += rows
-
-
-@contextlib.contextmanager
-def _scratch(path: Path) -> Iterator[Path]:
-    """A file of strips beside the output, only a way to the cloud-optimised one, which GDAL must make in one go."""
-    scratch = path.with_name(f"{partial_path(path).stem}.strips.tif")
-    try:
-        yield scratch
-    finally:
-        with contextlib.suppress(OSError):
-            scratch.unlink()
-
-
-@contextlib.contextmanager
-def write_geotiff(
-    path: Path, grid: Grid, bands: Sequence[str], tags: Mapping[str, Any] | None = None, units: Sequence[str] = ()
-) -> Iterator[GeoTiffWriter]:
-    """A cloud-optimised float32 GeoTIFF on ``grid``, to the pixel; NaN is nodata, bands and tags carry their names."""
-    with atomic_path(path) as partial, _scratch(path) as plain:
-        profile = {
-            "driver": "GTiff",
-            "height": grid.height,
-            "width": grid.width,
-            "count": len(bands),
-            "dtype": "float32",
-            "crs": grid.crs,
-            "transform": grid.transform,
-            "nodata": float("nan"),
-            "BIGTIFF": "IF_SAFER",
-            "INTERLEAVE": "BAND",
-        }
-        with rasterio.open(plain, "w", **profile) as target:
-            for k, name in enumerate(bands, start=1):
-                target.set_band_description(k, name)
-                if units:
-                    target.set_band_unit(k, units[k - 1])
-            target.update_tags(**{k.upper(): str(v) for k, v in (tags or {}).items()})
-            yield GeoTiffWriter(path, target)
-        try:
-            rasterio.shutil.copy(
-                str(plain), str(partial), driver="COG", COMPRESS="DEFLATE", LEVEL="1", PREDICTOR="YES",
-                BIGTIFF="IF_SAFER", OVERVIEW_RESAMPLING="AVERAGE", NUM_THREADS="ALL_CPUS",
-            )  # fmt: skip
-        except RasterioError as error:
-            raise _failed(path, str(error.__cause__ or error)) from None
-
-
 class Preview:
     """A picture of at most ``limit`` pixels a side, gathered from rows as they come (means of whole pixels)."""
 
@@ -221,7 +153,10 @@ def stretch(
 
 
 def write_png(path: Path, image: Floats32, limits: tuple[float, float] | None = None) -> tuple[float, float]:
-    """A stretched 8-bit preview, transparent (and black beneath) where ``image`` is NaN; returns the limits used."""
+    """A stretched 8-bit preview, transparent (and black beneath) where ``image`` is NaN; returns the limits used.
+
+    image : (H, W), I/F
+    """
     grey, limits = stretch(image, limits)
     alpha = np.isfinite(image).astype(np.uint8)
     pixels = np.stack([grey * alpha, alpha * np.uint8(255)], axis=-1)

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
-from schemas.files.outputs import atomic_path, check_output
+from schemas.files.outputs import Output, atomic_path, check_output
+from stages.common.arrays import Floats
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.terrain.surface import Surface
-from stages.render.config import SUN, Config, check, output_files
+from stages.render.config import SUN, Config, StereoConfig, check, output_files
 from stages.render.dataset import World, make_world, project, ray_directions
 from stages.render.pictures import read_exr, write_exr
-from stages.render.setting import make_light, open_source
+from stages.render.setup import make_light, open_source
 from stages.render.viewpoint import look_at, pinhole_view
 from stages.render.views import render_camera
-
-Floats = NDArray[np.float64]
-Progress = Callable[[int, int, str], None]
 
 SPLITS = (("train", 0.8), ("validation", 0.1), ("test", 0.1))
 TILE_FOOTPRINTS = 2.0  # edge of a tile in footprints seen from straight above
@@ -38,40 +36,23 @@ SAME_PLACE = 1e-3  # of the distance: a farther surface there hides the point
 TRIES = 200
 
 
-@dataclass(frozen=True)
-class StereoConfig:
-    """How pairs are drawn; ranges are uniform.
-
-    altitude : m above the ground (None: an eighth of the map's shorter side in a picture)
-    convergence_deg : between both lines of sight at the ground; off_nadir_deg : of their mean; roll_deg : to either side
-    sun_elevation_deg : of both Suns, each with any azimuth
-    """
-
-    count: int
-    altitude: float | None = None
-    convergence_deg: tuple[float, float] = (4.0, 30.0)
-    off_nadir_deg: float = 8.0
-    roll_deg: float = 20.0
-    sun_elevation_deg: tuple[float, float] = (12.0, 65.0)
-    seed: int = 0
-
-
 def run_stereo(
     source: Path,
-    folder: Path,
+    output: Output | Path,
     config: Config,
     stereo: StereoConfig,
-    *,
-    overwrite: bool = False,
-    progress: Progress | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> Path:
-    """Render ``stereo.count`` pairs of ``source`` into ``folder``; the path of the manifest. Raises LunargrError.
+    """Render ``stereo.count`` pairs of ``source`` into a folder; the path of the manifest. Raises LunargrError.
 
     config : what is rendered, size and field of view; its Sun and camera are drawn here
     """
+    output = Output.of(output)
+    folder = output.file
     _check(config, stereo)
     manifest = folder / "manifest.json"
-    check_output(manifest, [source], overwrite)
+    check_output(manifest, [source], output.overwrite)
     body = find_body("moon" if config.body is None else config.body)
     own = replace(config, view="pinhole", position=(0.0, 0.0, 0.0))
     check(own)
@@ -81,10 +62,9 @@ def run_stereo(
         relief, world = surface.height_range(), make_world(surface.grid)
         places = _Places(surface, config, stereo, rng)
         for number in range(stereo.count):
-            if progress:
-                progress(number, stereo.count, "pairs")
+            progress(number, stereo.count, "pairs")
             pairs.append(_render_pair(f"pair_{number:05d}", surface, places, own, body, relief, world, folder))
-    told = {
+    document = {
         "source": source.name,
         "pixel_centre": 0.5,
         "unit": "m",
@@ -94,22 +74,21 @@ def run_stereo(
         "pairs": pairs,
     }
     with atomic_path(manifest) as partial:
-        partial.write_text(json.dumps(told, indent=1))
-    if progress:
-        progress(stereo.count, stereo.count, "pairs")
+        partial.write_text(json.dumps(document, indent=1))
+    progress(stereo.count, stereo.count, "pairs")
     return manifest
 
 
 def _check(config: Config, stereo: StereoConfig) -> None:
     if stereo.count < 1:
-        raise ConfigError(f"--stereo: expected at least 1 pair, found {stereo.count}.")
+        raise ConfigError(f"`stereo`: expected at least 1 pair, found {stereo.count}.")
     low, high = stereo.convergence_deg
     if not 0 < low <= high <= 90:
-        raise ConfigError(f"--convergence: expected LOW,HIGH degrees in 0..90, found {low:g},{high:g}.")
+        raise ConfigError(f"`convergence`: expected LOW,HIGH degrees in 0..90, found {low:g},{high:g}.")
     if stereo.altitude is not None and not stereo.altitude > 0:
-        raise ConfigError(f"--altitude: expected metres above 0, found {stereo.altitude:g}.")
+        raise ConfigError(f"`altitude`: expected metres above 0, found {stereo.altitude:g}.")
     if any(getattr(config, name) is not None for name in SUN):
-        raise ConfigError("--stereo: expected no Sun; each picture gets one of its own.")
+        raise ConfigError("`stereo`: expected no Sun; each picture gets one of its own.")
 
 
 class _Places:
@@ -126,7 +105,7 @@ class _Places:
         rows, cols = (int(n * grid.gsd / self.tile) for n in (grid.height, grid.width))
         if rows * cols < len(SPLITS):
             raise ConfigError(
-                f"--stereo: expected ground for {len(SPLITS)} tiles of {self.tile:.4g} m, one per split, found {rows} x {cols}; lower --altitude or --fov."
+                f"`stereo`: expected ground for {len(SPLITS)} tiles of {self.tile:.4g} m, one per split, found {rows} x {cols}; lower `altitude` or `fov_deg`."
             )
         self.corners = [(r, c) for r in range(rows) for c in range(cols)]
         self.splits = _split_tiles(len(self.corners), rng)
@@ -150,8 +129,8 @@ class _Places:
 
 def _split_tiles(count: int, rng: np.random.Generator) -> list[str]:
     """A split per tile: shares as in SPLITS, at least one tile of each."""
-    numbers = [max(1, round(share * count)) for _, share in SPLITS[1:]]
-    names = [name for (name, _), n in zip(SPLITS[1:], numbers, strict=True) for _ in range(n)]
+    counts = [max(1, round(share * count)) for _, share in SPLITS[1:]]
+    names = [name for (name, _), n in zip(SPLITS[1:], counts, strict=True) for _ in range(n)]
     names = ["train"] * (count - len(names)) + names
     return [names[k] for k in rng.permutation(count)]
 
@@ -176,7 +155,7 @@ def _render_pair(
         own = replace(config, sun_azimuth_deg=sun["sun_azimuth_deg"], sun_elevation_deg=sun["sun_elevation_deg"])
         files = output_files(folder / f"{name}_{side}.exr", "pinhole")
         light = make_light(surface, own, body, relief)
-        render_camera(surface, camera, light, relief, files, own, f"{name}_{side}", None)
+        render_camera(surface, camera, light, relief, files, own, f"{name}_{side}", show_nothing)
         views.append({"image": files[0].name, "preview": files[1].name, "camera": camera.to_document(), **sun})
         exrs.append(read_exr(files[0]))
         cameras.append(camera)

@@ -51,24 +51,31 @@ def read_trajectory(path: Path) -> list[ViewRow]:
     names = [name.strip() for name in reader.fieldnames or []]
     for name in ("longitude_deg", "latitude_deg", "altitude_m"):
         if name not in names:
-            raise InputError(f"{path}: expected a column '{name}', found {', '.join(names) or 'nothing'}.")
+            raise InputError(f"{path}: expected a column '{name}', found {', '.join(names) or 'nothing'}; add it.")
     unknown = [name for name in names if name not in _KNOWN]
     if unknown:
         raise InputError(f"{path}: unknown column '{unknown[0]}'; known are: {', '.join(_KNOWN)}.")
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"{path}: expected each column once, found '{twice[0]}' twice; remove one.")
     reader.fieldnames = names
     rows = [_row(path, number, record) for number, record in enumerate(reader, start=1)]
     if not rows:
-        raise InputError(f"{path}: expected at least one view, found none.")
+        raise InputError(f"{path}: expected at least one view, found none; write one row per view.")
     seen: set[str] = set()
     for row in rows:
         if row.view_id in seen:
-            raise InputError(f"{path}: expected each view_id once, found '{row.view_id}' twice.")
+            raise InputError(
+                f"{path}: expected each view_id once, found '{row.view_id}' twice; give each row a name of its own."
+            )
         seen.add(row.view_id)
     return rows
 
 
 def _row(path: Path, number: int, record: dict[str, str | None]) -> ViewRow:
     where = f"{path}: view {number}"
+    if None in record:
+        raise InputError(f"{where}: expected as many cells as columns, found more; correct the row.")
     text = {k: (v or "").strip() for k, v in record.items() if k is not None and not isinstance(v, list)}
     value: dict[str, float] = {}
     for name in _NUMBERS:
@@ -79,21 +86,23 @@ def _row(path: Path, number: int, record: dict[str, str | None]) -> ViewRow:
         except ValueError:
             value[name] = math.nan
         if not math.isfinite(value[name]):
-            raise InputError(f"{where}: expected a number in column '{name}', found '{text[name]}'.")
+            raise InputError(f"{where}: expected a number in column '{name}', found '{text[name]}'; correct it.")
     for name in ("longitude_deg", "latitude_deg", "altitude_m"):
         if name not in value:
-            raise InputError(f"{where}: expected a number in column '{name}', found nothing.")
+            raise InputError(f"{where}: expected a number in column '{name}', found nothing; fill it in.")
     look_at = None
     if "look_longitude_deg" in value or "look_latitude_deg" in value:
         if "look_longitude_deg" not in value or "look_latitude_deg" not in value:
-            raise InputError(f"{where}: expected both look_longitude_deg and look_latitude_deg, found one.")
+            raise InputError(
+                f"{where}: expected both look_longitude_deg and look_latitude_deg, found one; give both or none."
+            )
         look_at = (value["look_longitude_deg"], value["look_latitude_deg"], value.get("look_altitude_m", math.nan))
     quaternion = None
     given = [q for q in _QUATERNION if q in value]
     if given:
         if len(given) < 4 or look_at is not None:
             raise InputError(
-                f"{where}: expected either a place to look at or all of qw, qx, qy, qz, found both or too few."
+                f"{where}: expected either a place to look at or all of qw, qx, qy, qz, found both or too few; keep one of them."
             )
         quaternion = tuple(value[q] for q in _QUATERNION)
     sun: dict[str, float | str] = {
@@ -112,7 +121,7 @@ def _row(path: Path, number: int, record: dict[str, str | None]) -> ViewRow:
     view_id = text.get("view_id") or f"view_{number:04d}"
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", view_id):
         raise InputError(
-            f"{where}: expected a view_id that can name a file (letters, digits, . _ -), found '{view_id}'."
+            f"{where}: expected a view_id that can name a file (letters, digits, . _ -), found '{view_id}'; rename the view."
         )
     return ViewRow(
         view_id=view_id,

@@ -6,15 +6,14 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats
 from stages.physics.cameras.base import Camera
 from stages.physics.cameras.document import quaternion_matrix
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import unit_vectors
 
-Floats = NDArray[np.float64]
 NEAR_NADIR = math.radians(1.0)  # closer to straight down than this, "up in the image" means north
 
 
@@ -22,7 +21,7 @@ def place(longitude_deg: float, latitude_deg: float, altitude: float, radius: fl
     """(3,) body-fixed, m; altitude in metres above the reference sphere. Raises GeometryError."""
     if not -90.0 <= latitude_deg <= 90.0 or not -360.0 <= longitude_deg <= 360.0:
         raise GeometryError(
-            f"expected a longitude in -360..360 and a latitude in -90..90 deg, found {longitude_deg:g}, {latitude_deg:g}."
+            f"expected a longitude in -360..360 and a latitude in -90..90 deg, found {longitude_deg:g}, {latitude_deg:g}; correct it."
         )
     return unit_vectors(longitude_deg, latitude_deg) * (radius + altitude)
 
@@ -36,7 +35,7 @@ def look_at(position: Floats, target: Floats, roll_deg: float = 0.0) -> Floats:
     forward = target - position
     distance = float(np.linalg.norm(forward))
     if distance < 1e-6:
-        raise GeometryError("--look-at: expected a place other than the camera's, found the same.")
+        raise GeometryError("`look_at`: expected a place other than the camera's, found the same.")
     forward = forward / distance
     up = position / np.linalg.norm(position)
     if math.acos(min(1.0, abs(float(forward @ up)))) < NEAR_NADIR:
@@ -56,7 +55,7 @@ def rotation_from_quaternion(quaternion: Sequence[float]) -> Floats:
     norm = float(np.linalg.norm(q)) if q.shape == (4,) else math.nan
     if not abs(norm - 1.0) < 0.01:
         raise GeometryError(
-            f"--quaternion: expected four numbers w,x,y,z of unit length, found {', '.join(f'{v:g}' for v in np.ravel(q))}."
+            f"`quaternion`: expected four numbers w,x,y,z of unit length, found {', '.join(f'{v:g}' for v in np.ravel(q))}."
         )
     return quaternion_matrix(q / norm)
 
@@ -64,12 +63,17 @@ def rotation_from_quaternion(quaternion: Sequence[float]) -> Floats:
 def pinhole_view(
     position: Floats, rotation: Floats, fov_deg: float, size_px: tuple[int, int], radius: float
 ) -> Pinhole:
-    """A distortion-free camera; ``fov_deg`` spans the image's width. Raises GeometryError."""
+    """A distortion-free camera; ``fov_deg`` spans the image's width. Raises GeometryError.
+
+    position : (3,) body-fixed, m; rotation : (3, 3) camera axes to body-fixed; radius : m
+    """
     if not 0.0 < fov_deg < 170.0:
-        raise GeometryError(f"--fov: expected degrees across the image's width between 0 and 170, found {fov_deg:g}.")
+        raise GeometryError(
+            f"`fov_deg`: expected degrees across the image's width between 0 and 170, found {fov_deg:g}; correct it."
+        )
     width, height = size_px
     if not (1 <= width <= 65536 and 1 <= height <= 65536):
-        raise GeometryError(f"--size: expected W,H between 1 and 65536 px, found {width},{height}.")
+        raise GeometryError(f"`size_px`: expected W,H between 1 and 65536 px, found {width},{height}.")
     focal = 0.5 * width / math.tan(math.radians(0.5 * fov_deg))
     return Pinhole(
         lines=height,

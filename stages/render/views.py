@@ -3,72 +3,69 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.errors import ConfigError, GeometryError
-from schemas.files.outputs import Target, check_outputs
+from schemas.errors import ConfigError, GeometryError, LunargrError
+from schemas.files.outputs import Output, Target, check_outputs
+from stages.common.arrays import Floats32
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras.base import Camera
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
 from stages.physics.terrain.shading import BACKPLANES, Light
 from stages.physics.terrain.surface import Surface
-from stages.render.config import SUN, Config, Summary, Tally, check, inputs, output_files, skipped
+from stages.render.config import SUN, Config, Summary, check, inputs, output_files
 from stages.render.dataset import View, export_views
 from stages.render.perspective import apply_sensor, make_scene, render_view
 from stages.render.pictures import Preview, write_exr, write_png
-from stages.render.setting import camera_place, find_camera, make_light, metadata, open_source
+from stages.render.setup import camera_place, find_camera, make_light, metadata, open_source
+from stages.render.tally import Tally, skipped
 from stages.render.trajectory import ViewRow, read_trajectory
-
-Floats32 = NDArray[np.float32]
-Progress = Callable[[int, int, str], None]
 
 
 def run_trajectory(
     source: Path,
     table: Path,
-    folder: Path,
+    output: Output | Path,
     config: Config,
-    *,
-    shard: tuple[int, int] = (0, 1),
-    resume: bool = False,
-    overwrite: bool = False,
-    suffix: str = ".exr",
-    progress: Progress | None = None,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
 ) -> list[Summary]:
     """Render the views of a trajectory table into a folder, one EXR and PNG per row. Raises LunargrError.
 
-    resume : leave alone what is there already; shard : only every n-th view
+    An output that is resumed leaves alone what is there already; a shard is every n-th view.
     """
+    output = Output.of(output)
+    folder, (index, count) = output.file, config.shard
     if config.camera:
-        raise ConfigError("--trajectory: expected no --camera; each row places its own pinhole camera.")
+        raise ConfigError("`trajectory`: expected no `camera`; each row places its own pinhole camera.")
     config = replace(config, view="pinhole")
     check(config, trajectory=True)
-    if config.export is not None and shard[1] > 1:
+    if config.export is not None and count > 1:
         raise ConfigError(
-            "--export: expected without --shard; render the shards, then export with --resume and no --shard."
+            "`export`: expected without `shard`; render the shards, then export with `resume` and no `shard`."
         )
-    if config.export is not None and suffix != ".exr":
-        raise ConfigError("--export: expected EXR files, which hold the depths; drop --png-only.")
+    if config.export is not None and config.png_only:
+        raise ConfigError("`export`: expected EXR files, which hold the depths; drop `png_only`.")
     body = find_body("moon" if config.body is None else config.body)
-    views = read_trajectory(table)[shard[0] :: shard[1]]
+    views = read_trajectory(table)[index::count]
+    suffix = ".png" if config.png_only else ".exr"
     outputs = {view.view_id: output_files(folder / f"{view.view_id}{suffix}", "pinhole") for view in views}
-    done = {v.view_id for v in views if resume and all(p.exists() for p in outputs[v.view_id])}
+    done = {v.view_id for v in views if output.resume and all(p.exists() for p in outputs[v.view_id])}
     targets = [Target(path) for view in views if view.view_id not in done for path in outputs[view.view_id]]
-    check_outputs(targets, [table, *inputs(source, config)], overwrite or resume)
+    check_outputs(targets, [table, *inputs(source, config)], output.overwrite or output.resume)
     results: list[Summary] = []
     with open_source(source, config, body) as surface:
         relief = surface.height_range()
         lights: dict[str, Light] = {}  # a Sun that stays serves many views with one horizon
         for number, view in enumerate(views):
-            if progress:
-                progress(number, len(views), "views")
+            progress(number, len(views), "views")
             if view.view_id in done:
                 results.append(skipped(view.view_id, outputs[view.view_id], config.size_px))
                 continue
@@ -80,21 +77,22 @@ def run_trajectory(
                 camera = find_camera(surface, own)
                 light = replace(lights[key], camera_position=camera_place(camera))
                 results.append(
-                    render_camera(surface, camera, light, relief, outputs[view.view_id], own, view.view_id, None)
+                    render_camera(
+                        surface, camera, light, relief, outputs[view.view_id], own, view.view_id, show_nothing
+                    )
                 )
-            except GeometryError as error:
-                raise GeometryError(f"{table.name}, {view.view_id}: {error}") from None
+            except LunargrError as error:
+                raise type(error)(f"{table.name}, {view.view_id}: {error}") from None
         if config.export is not None:
             cameras = [cast(Pinhole, find_camera(surface, _with_row(config, view))) for view in views]
             found = [View(v.view_id, c, outputs[v.view_id][0]) for v, c in zip(views, cameras, strict=True)]
             export_views(found, surface.grid, folder, config.export)
-    if progress:
-        progress(len(views), len(views), "views")
+    progress(len(views), len(views), "views")
     return results
 
 
 def _with_row(config: Config, view: ViewRow) -> Config:
-    """The command's options with what a row of the table says in their place; a row's Sun replaces the whole Sun."""
+    """The configuration of one row: what the row leaves empty stays as it is; a row's Sun replaces the whole Sun."""
     own = replace(
         config,
         position=view.position,
@@ -116,7 +114,7 @@ def render_camera(
     files: Sequence[Path],
     config: Config,
     view_id: str,
-    progress: Progress | None,
+    progress: Progress,
 ) -> Summary:
     """One view, streamed to its files band by band."""
     light = replace(light, camera_position=camera_place(camera))
@@ -130,8 +128,8 @@ def render_camera(
     with contextlib.ExitStack() as stack:
         exr = None
         if ".exr" in named:
-            told = metadata(surface, config, light)
-            exr = stack.enter_context(write_exr(named[".exr"], camera.lines, camera.samples, channels, told))
+            facts = metadata(surface, config, light)
+            exr = stack.enter_context(write_exr(named[".exr"], camera.lines, camera.samples, channels, facts))
         for band in bands:
             if exr:
                 exr.write(band)
@@ -139,11 +137,10 @@ def render_camera(
             tally.add(band)
             ground |= bool(np.isfinite(band["depth"]).any())
             done += len(band["image"])
-            if progress:
-                progress(done, camera.lines, "lines")
+            progress(done, camera.lines, "lines")
         if not ground:
             raise GeometryError(
-                f"the view misses {surface.path.name}: no pixel sees valid ground; check the camera's place, --look-at (or --quaternion) and --fov."
+                f"the view misses {surface.path.name}: no pixel sees valid ground; check the camera's place, `look_at` (or `quaternion`) and `fov_deg`."
             )
         write_png(named[".png"], preview.image())
     return tally.summary(view_id, files, (camera.samples, camera.lines), scene.samples)

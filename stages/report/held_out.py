@@ -7,7 +7,8 @@ from typing import Any
 from markupsafe import Markup
 
 from stages.common import page
-from stages.report.conclusions import basis, bounds, verdict
+from stages.common.page.sentences import bounds, verdict
+from stages.report.conclusions import basis
 
 TITLES = {
     "terrain": "map from terrain",

@@ -11,7 +11,8 @@ from markupsafe import Markup
 
 from stages.common import page
 from stages.common.page import pictures
-from stages.report.conclusions import basis, bounds, verdict
+from stages.common.page.sentences import bounds, verdict
+from stages.report.conclusions import basis
 
 COLOURS = {
     "learned": "#3b8ecb",

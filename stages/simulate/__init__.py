@@ -5,10 +5,18 @@ craters.py      population, profiles, decay                 terrain.py   the gro
 reflectance.py  the truth's albedo and other parameters     orbits.py    times, Sun, spacecraft, strips
 render.py       light from each DEM pixel                   sensor.py    optics, response, noise, footprints
 hidden.py       what the pipeline is not told               write.py     DEM, images, table, truth
-run.py          the stage: all of it in order
+stage.py        the stage: all of it in order
 """
 
-from stages.simulate.recipe import Config, make_config, read_recipe, recipe_json
-from stages.simulate.stage import Summary, run
+from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from schemas.later import imported_later
+from stages.simulate.recipe import Config, make_config, read_recipe, recipe_json
+
+if TYPE_CHECKING:
+    from stages.simulate.stage import Summary, run
+
+__getattr__ = imported_later(__name__, "stage")
 __all__ = ["Config", "Summary", "make_config", "read_recipe", "recipe_json", "run"]

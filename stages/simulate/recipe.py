@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import ConfigError, InputError
-from schemas.files.user_files import read_json
 from stages.simulate.hidden import Hidden, parse_hidden
 
 Range = tuple[float, float]
@@ -71,6 +70,7 @@ class Config:
     hidden: list[dict[str, Any]] = field(default_factory=lambda: [{"effect": "dark_bias"}])
 
     def hidden_effects(self) -> list[Hidden]:
+        """The hidden effects with their parameters."""
         return parse_hidden(self.hidden)
 
     @property
@@ -80,10 +80,12 @@ class Config:
 
     @property
     def extent(self) -> float:
+        """m, of the scene's side"""
         return self.size_px * self.gsd
 
     @property
     def dem_size(self) -> int:
+        """px, of the DEM's side"""
         return self.size_px * self.factor
 
 
@@ -224,11 +226,14 @@ def _check(config: Config, where: str) -> None:
 
 def read_recipe(path: Path) -> dict[str, Any]:
     """The keys of a recipe file. Raises InputError."""
-    values = read_json(path, "a recipe in JSON ('lunargr simulate --print-recipe' writes one)")
+    from schemas.files.user_files import read_json
+
+    values = read_json(path, "a recipe in JSON ('lunargr simulate' with `print_recipe` writes one)")
     if not isinstance(values, dict):
         raise InputError(f"{path}: expected a JSON object of recipe keys, found {type(values).__name__}; mend it.")
     return values
 
 
 def recipe_json(config: Config) -> str:
+    """The content of a recipe file."""
     return json.dumps(dataclasses.asdict(config), indent=1)

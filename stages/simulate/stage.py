@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -13,20 +13,19 @@ from numpy.typing import NDArray
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from schemas.files.outputs import Target, atomic_folder, atomic_path, check_outputs
+from schemas.files.outputs import Output, Target, atomic_folder, atomic_path, check_outputs
 from schemas.provenance import SIDECAR, sidecar
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.images.table import ASTRONOMICAL_UNIT
 from stages.physics.maps.grid import Grid, local_metric_crs, unit_vectors
 from stages.simulate import sensor
 from stages.simulate.hidden import Hidden, find
 from stages.simulate.orbits import RADIUS, Pass, plan_passes
+from stages.simulate.radiance import Scene, View, blur, point_spread, radiance
 from stages.simulate.recipe import Config
 from stages.simulate.reflectance import MARGIN, Truth, albedo
-from stages.simulate.render import Scene, View, blur, point_spread, radiance
 from stages.simulate.terrain import Terrain
 from stages.simulate.write import NODATA_FLOAT, ImageFile, ImageTruth, geotiff, table_row, write_table, write_truth
-
-Progress = Callable[[int, int, str], None]
 
 GROUND_ROWS = 512  # DEM rows made at once
 IN_MEMORY = 6e8  # bytes of truth kept in memory; more is mapped from a temporary file
@@ -45,20 +44,21 @@ class Summary:
     hidden: list[Hidden]
 
 
-def run(folder: Path, config: Config, overwrite: bool = False, progress: Progress | None = None) -> Summary:
-    """Simulate a scene into ``folder``: dem.tif, images/*.tif, images.csv, truth.h5, truth.tif, record.json.
+def run(output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing) -> Summary:
+    """Simulate a scene into a folder: dem.tif, images/*.tif, images.csv, truth.h5, truth.tif, record.json.
 
-    Raises ConfigError where files exist and ``overwrite`` is not given.
+    Raises ConfigError where files exist that may not be replaced.
     """
-    folder = Path(folder)
+    output = Output.of(output)
+    folder = output.file
     hidden = config.hidden_effects()
     truth = Truth(config)
     shots = plan_passes(config)
     names = [f"images/{shot.image_id}.tif" for shot in shots]
     made = ("dem.tif", "images.csv", "truth.h5", "truth.tif", SIDECAR, *names)
-    check_outputs([Target(folder / name) for name in made], overwrite=overwrite)
+    check_outputs([Target(folder / name) for name in made], overwrite=output.overwrite)
     with atomic_folder(folder, SIDECAR) as staging:  # all of it or nothing: images without their truth are of no use
-        summary = _make_scene(staging, config, shots, names, hidden, truth, progress or (lambda *_: None))
+        summary = _make_scene(staging, config, shots, names, hidden, truth, progress)
     return replace(summary, folder=folder)
 
 
@@ -69,23 +69,23 @@ def _make_scene(
     names: Sequence[str],
     hidden: list[Hidden],
     truth: Truth,
-    say: Progress,
+    progress: Progress,
 ) -> Summary:
     """Every file of the scene, in ``folder``."""
     terrain = Terrain(config)
     grid = scene_grid(config, config.dem_gsd, config.dem_size)
     with _truth_arrays(folder, config.dem_size) as (elevation, log_geometry, log_free):
         scene = Scene(grid, elevation, log_geometry, log_free, truth)
-        _make_ground(config, terrain, scene, say)
+        _make_ground(config, terrain, scene, progress)
         dem_valid = _write_dem(folder / "dem.tif", config, scene, hidden)
         images, covered, rows = [], [], []
         for k, (shot, name) in enumerate(zip(shots, names, strict=True)):
-            say(k, len(shots), "images")
+            progress(k, len(shots), "images")
             image, share = _make_image(folder / name, config, scene, shot, k, hidden)
             images.append(image)
             covered.append(share)
             rows.append(table_row(config, shot, name, hidden))
-        say(len(shots), len(shots), "images")
+        progress(len(shots), len(shots), "images")
         working = scene_grid(config, config.gsd, config.size_px)
         write_truth(folder / "truth.h5", config, scene, working, terrain.craters, images, hidden)
     write_table(folder / "images.csv", rows)
@@ -113,10 +113,10 @@ def _truth_arrays(folder: Path, size: int) -> Iterator[list[NDArray[np.float32]]
         yield [np.memmap(Path(scratch) / f"{k}.f4", np.float32, "w+", shape=shape) for k in range(3)]
 
 
-def _make_ground(config: Config, terrain: Terrain, scene: Scene, say: Progress) -> None:
+def _make_ground(config: Config, terrain: Terrain, scene: Scene, progress: Progress) -> None:
     size = config.dem_size
     for first in range(0, size, GROUND_ROWS):
-        say(first, size, "terrain rows")
+        progress(first, size, "terrain rows")
         count = min(GROUND_ROWS, size - first)
         ground = terrain.block(first - MARGIN, -MARGIN, count + 2 * MARGIN, size + 2 * MARGIN)
         logs = albedo(config, ground, first, 0)
@@ -124,7 +124,7 @@ def _make_ground(config: Config, terrain: Terrain, scene: Scene, say: Progress) 
         scene.elevation[rows] = ground.elevation[MARGIN:-MARGIN, MARGIN:-MARGIN]
         scene.log_geometry[rows] = logs.geometry
         scene.log_free[rows] = logs.free
-    say(size, size, "terrain rows")
+    progress(size, size, "terrain rows")
 
 
 def _write_dem(path: Path, config: Config, scene: Scene, hidden: list[Hidden]) -> float:
@@ -178,6 +178,22 @@ def _dem_inside(config: Config, x: NDArray, y: NDArray, phases: NDArray) -> NDAr
     return (x < edge(y, phases[0])) & (-x < edge(y, phases[1])) & (y < edge(x, phases[2])) & (-y < edge(x, phases[3]))
 
 
+@dataclass(frozen=True)
+class Exposure:
+    """What makes one image of the ground's light.
+
+    kernel : (n,) float32, point spread on the DEM's grid; reach : DEM px around a place that its signal comes from
+    """
+
+    config: Config
+    scene: Scene
+    view: View
+    kernel: NDArray[np.float32]
+    reach: int
+    detector: sensor.Detector
+    hidden: list[Hidden]
+
+
 def _make_image(
     path: Path, config: Config, scene: Scene, shot: Pass, number: int, hidden: list[Hidden]
 ) -> tuple[ImageTruth, float]:
@@ -196,6 +212,7 @@ def _make_image(
     detector = sensor.make_detector(config, shot, hidden, expected, rng)
     echo = find(hidden, "echo")
     reach = len(kernel) // 2 + 4 + (int(echo["lag_px"] * shot.gsd / step) + 2 if echo else 0)
+    exposure = Exposure(config, scene, view, kernel, reach, detector, hidden)
     band = int(max(64, min(image.height, WINDOW_PIXELS * (step / shot.gsd) ** 2 / image.width)))
     total, count = 0.0, 0
     with atomic_path(path) as partial:
@@ -203,11 +220,11 @@ def _make_image(
         with out.file:
             for first in range(0, image.height, band):
                 rows = min(band, image.height - first)
-                lattice = sensor.Lattice.of(image, first, rows, scene.grid)
+                lattice = sensor.Lattice.fit(image, first, rows, scene.grid)
                 inside = sensor.footprint(config, shot, lattice.x, lattice.y, number)
                 signal = np.zeros(inside.shape, np.float32)
                 if inside.any():
-                    signal = _signal(config, scene, view, lattice, inside, kernel, detector, hidden, reach)
+                    signal = _signal(exposure, lattice, inside)
                     total += float(signal[inside].sum(dtype=np.float64))
                     count += int(inside.sum())
                 # drawn for every pixel: the noise is then the same however the image is cut into bands
@@ -218,26 +235,17 @@ def _make_image(
     return ImageTruth(shot, detector, mean, float(noise)), count * shot.gsd**2 / config.extent**2
 
 
-def _signal(
-    config: Config,
-    scene: Scene,
-    view: View,
-    lattice: sensor.Lattice,
-    inside: NDArray[np.bool_],
-    kernel: NDArray[np.float32],
-    detector: sensor.Detector,
-    hidden: list[Hidden],
-    reach: int,
-) -> NDArray[np.float32]:
-    """The noise-free signal, I/F, of a band of an image."""
-    size = config.dem_size
-    row, col = sensor.move(config, view.shot, detector, lattice, scene.grid.gsd)
+def _signal(exposure: Exposure, lattice: sensor.Lattice, inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The noise-free signal, I/F, of a band of an image; lattice and inside : (rows, columns) of the band."""
+    scene, view, detector, hidden = exposure.scene, exposure.view, exposure.detector, exposure.hidden
+    size, reach = exposure.config.dem_size, exposure.reach
+    row, col = sensor.move(exposure.config, view.shot, detector, lattice, scene.grid.gsd)
     r0, r1 = int(row[inside].min()) - reach, int(row[inside].max()) + reach + 1
     c0, c1 = int(col[inside].min()) - reach, int(col[inside].max()) + reach + 1
     r0, c0, r1, c1 = max(0, r0), max(0, c0), min(size, r1), min(size, c1)
     window = (r0, c0, r1 - r0, c1 - c0)
     wanted = _wanted(row[inside], col[inside], window, reach)
-    light = blur(radiance(scene, view, window, wanted, hidden), kernel)
+    light = blur(radiance(scene, view, window, wanted, hidden), exposure.kernel)
     signal = sensor.resample(light, row, col, window)
     late = None
     if echo := find(hidden, "echo"):

@@ -15,15 +15,18 @@ from numpy.typing import NDArray
 from rasterio.windows import Window
 
 from schemas import TRUTH, ArtefactWriter, atomic_path
+from schemas.provenance import pack_record
+from schemas.rasters import TIFF_TAG
+from stages.common.arrays import Floats32
 from stages.physics.formation.geometry import Angles
+from stages.physics.maps.geotiff import MapTiff
 from stages.physics.maps.grid import Grid
 from stages.simulate.hidden import CHOICES, Hidden, find
 from stages.simulate.orbits import Pass, direction, sub_point
+from stages.simulate.radiance import Scene
 from stages.simulate.recipe import Config
-from stages.simulate.render import Scene
 from stages.simulate.sensor import Detector
 
-Array = NDArray[np.float32]
 NODATA_FLOAT = -3.4028226550889045e38  # the NULL of 32-bit ISIS cubes, as LROC's products carry it
 NODATA_INT16 = -32768
 NODATA_DN = 0
@@ -83,7 +86,8 @@ class ImageFile:
         self.file.set_band_description(1, "DN" if units == "dn" else "radiance factor I/F")
         self.file.update_tags(IMAGE_ID=shot.image_id, START_TIME=shot.start_time)
 
-    def write(self, first: int, image: Array, inside: NDArray[np.bool_], detector: Detector) -> None:
+    def write(self, first: int, image: Floats32, inside: NDArray[np.bool_], detector: Detector) -> None:
+        """Write lines from ``first`` on; image : (h, W) I/F; inside : (h, W), where there is data."""
         window = Window(0, first, self.grid.width, len(image))
         if self.units == "dn":
             counts = np.clip(np.rint(detector.gain * image + detector.offset), 1, 4095)
@@ -120,6 +124,7 @@ def table_row(config: Config, shot: Pass, path: str, hidden: list[Hidden]) -> di
 
 
 def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write images.csv, whole or not at all."""
     with atomic_path(path) as partial, open(partial, "w", newline="", encoding="utf-8") as stream:
         table = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
         table.writeheader()
@@ -185,7 +190,6 @@ def write_truth(
             attributes=attributes,
         ) as out,
         atomic_path(raster) as partial,
-        geotiff(partial, working, "float32", float("nan"), len(names) + 1, compress="deflate", predictor=3) as tif,
     ):
         out.write_crs(working.crs_wkt, working.transform)
         x, _ = working.xy(np.zeros(working.width), np.arange(working.width))
@@ -193,11 +197,11 @@ def write_truth(
         out.write("x", x)
         out.write("y", y)
         out.write("coefficient_name", names)
-        for band, name in enumerate((*names, "standard_iof"), start=1):
-            tif.set_band_description(band, name)
-        tif.update_tags(MODEL=scene.truth.model.name, QUANTITY="I/F")
-        for first in range(0, working.height, 256):
-            _write_truth_rows(out, tif, config, scene, first, min(256, working.height - first))
+        bands = [*names, "standard_iof"]
+        tags = {"model": scene.truth.model.name, "quantity": "I/F", TIFF_TAG: pack_record(out.file.attrs)}
+        with MapTiff(partial, working, bands, tags, ["1"] * len(bands)) as tif:
+            for first in range(0, working.height, 256):
+                _write_truth_rows(out, tif, config, scene, first, min(256, working.height - first))
         _write_images(out, images)
         out.write("crater_x", kept.x + half_x)
         out.write("crater_y", kept.y + half_y)
@@ -205,26 +209,27 @@ def write_truth(
         out.write("crater_age", kept.age)
 
 
-def _write_truth_rows(out: ArtefactWriter, tif: Any, config: Config, scene: Scene, first: int, count: int) -> None:
+def _write_truth_rows(out: ArtefactWriter, tif: MapTiff, config: Config, scene: Scene, first: int, count: int) -> None:
     factor = config.factor
     rows = slice(first * factor, (first + count) * factor)
     geometry, free = np.asarray(scene.log_geometry[rows]), np.asarray(scene.log_free[rows])
     maps = {name: area_mean(values, factor) for name, values in scene.truth.maps(geometry, free).items()}
     here = slice(first, first + count)
-    window = Window(0, first, tif.width, count)
-    for k, (_, values) in enumerate(maps.items()):
+    for k, values in enumerate(maps.values()):
         out.dataset("coefficients")[k, here] = values
-        tif.write(values, k + 1, window=window)
     standard = standard_iof(scene, maps)
     out.dataset("standard_iof")[here] = standard
-    tif.write(standard, len(maps) + 1, window=window)
+    tif.put(first, 0, np.stack([*maps.values(), standard]).astype(np.float32))
     out.dataset("elevation")[here] = area_mean(np.asarray(scene.elevation[rows]), factor)
     out.dataset("log_albedo_geometry")[here] = area_mean(geometry, factor)
     out.dataset("log_albedo_free")[here] = area_mean(free, factor)
 
 
-def standard_iof(scene: Scene, maps: dict[str, Array]) -> Array:
-    """I/F of level ground at incidence 30, emission 0, phase 30 deg."""
+def standard_iof(scene: Scene, maps: dict[str, Floats32]) -> Floats32:
+    """I/F of level ground at incidence 30, emission 0, phase 30 deg.
+
+    maps : (H, W) by name; returns (H, W)
+    """
     import torch
 
     angles = [torch.deg2rad(torch.tensor(v)) for v in (30.0, 0.0, 30.0)]
@@ -258,7 +263,8 @@ def _write_images(out: ArtefactWriter, images: Sequence[ImageTruth]) -> None:
         out.write(name, np.array(values, float))
 
 
-def area_mean(values: Array, factor: int) -> Array:
+def area_mean(values: Floats32, factor: int) -> Floats32:
+    """(H, W) -> (H / factor, W / factor) means over whole blocks."""
     height, width = values.shape
     blocks = values.reshape(height // factor, factor, width // factor, factor)
     return blocks.mean(axis=(1, 3), dtype=np.float64).astype(np.float32)

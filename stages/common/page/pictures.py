@@ -39,6 +39,7 @@ def photo_uri(picture: np.ndarray, quality: int = 85) -> str:
 
 
 def uri_of(content: bytes, kind: str) -> str:
+    """A file's content as a data: URI."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
@@ -116,7 +117,7 @@ def chart_svg(figure: Any, salt: str) -> str:
 
     stream = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": salt, "font.family": "sans-serif"}):
-        figure.savefig(stream, format="svg", transparent=True, metadata={"Date": None})
+        figure.savefig(stream, format="svg", dpi=200, transparent=True, metadata={"Date": None})
     svg = stream.getvalue()
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)

@@ -47,6 +47,7 @@ class Nominal:
         return self.maps[site.number] * vector
 
     def chain(self, site: Site, base: Sequence[Effect], moved: Sequence[Effect] = ()) -> Chain:
+        """The formation chain of one site with these effects."""
         free = self.free if self.predictor is None else None  # maps may still drift
         return Chain(site, self.model, self.coefficients(site), base, moved, free)
 
@@ -71,7 +72,7 @@ def load_nominal(checkpoint: Path | None, model: str, units: str, free: Sequence
     if predictor.image_units != units:
         raise ArtefactError(
             f"{checkpoint}: expected a checkpoint for images in '{units}', found one for '{predictor.image_units}'; "
-            "train on the pairs that are to be diagnosed, or use --model."
+            "train on the pairs that are to be diagnosed, or use `model`."
         )
     count = len(predictor.model.parameters)
     return Nominal(predictor.model, torch.ones(count), torch.zeros(count, dtype=torch.bool), predictor)

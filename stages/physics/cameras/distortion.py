@@ -32,7 +32,7 @@ def read_distortion(document: Mapping[str, Any], where: str) -> tuple[int, NDArr
     """(model code, coefficients) of an ISD's ``optical_distortion``. Raises InputError or RegistryError."""
     models = read.value(document, "optical_distortion", where)
     if not isinstance(models, Mapping) or len(models) != 1:
-        raise InputError(f"{where}: expected one model in 'optical_distortion', found {models!r:.80}.")
+        raise InputError(f"{where}: expected one model in 'optical_distortion', found {models!r:.80}; correct the ISD.")
     name = next(iter(models))
     key = f"optical_distortion.{name}"
     lowered = str(name).lower()
@@ -154,12 +154,18 @@ def _each(model, k, x, y, forward, out_x, out_y):
 
 
 def undistort_arrays(model: int, k: NDArray, dx: NDArray, dy: NDArray) -> tuple[NDArray, NDArray]:
-    """:func:`undistort` for arrays of one shape."""
+    """:func:`undistort` for arrays.
+
+    dx, dy : (n,) mm or px, as the model counts; k : (m,) its coefficients; returns (n,) each
+    """
     return _arrays(model, k, dx, dy, False)
 
 
 def distort_arrays(model: int, k: NDArray, ux: NDArray, uy: NDArray) -> tuple[NDArray, NDArray]:
-    """:func:`distort` for arrays of one shape."""
+    """:func:`distort` for arrays.
+
+    ux, uy : (n,) mm or px, as the model counts; k : (m,) its coefficients; returns (n,) each
+    """
     return _arrays(model, k, ux, uy, True)
 
 

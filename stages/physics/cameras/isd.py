@@ -12,15 +12,14 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats
 from stages.physics.cameras import document as read
 from stages.physics.cameras.base import meet_ellipsoid
 from stages.physics.cameras.distortion import distort, distort_arrays, read_distortion, undistort_arrays
 from stages.physics.cameras.tables import Rotations, States, read_rotations, read_states
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -50,11 +49,11 @@ class Detector:
         if not determinant or not focal_length:
             raise GeometryError(
                 f"{where}: expected 'focal2pixel_lines' and 'focal2pixel_samples' that span the detector and a focal "
-                f"length other than 0, found determinant {determinant:g} and {focal_length:g} mm."
+                f"length other than 0, found determinant {determinant:g} and {focal_length:g} mm; correct the ISD."
             )
         summing = _pair(document, "detector_line_summing", "detector_sample_summing", where)
         if min(summing) <= 0:
-            raise GeometryError(f"{where}: expected detector summing above 0, found {summing}.")
+            raise GeometryError(f"{where}: expected detector summing above 0, found {summing}; correct the ISD.")
         code, coefficients = read_distortion(document, where)
         return cls(
             focal_length=focal_length,
@@ -139,7 +138,7 @@ class Exposure:
         major, minor = _pair(document, "radii.semimajor", "radii.semiminor", where)
         axes = major * metres, minor * metres
         if min(axes) <= 0:
-            raise GeometryError(f"{where}: expected radii above 0, found {axes} m.")
+            raise GeometryError(f"{where}: expected radii above 0, found {axes} m; correct the ISD.")
         centre = read.number(document, "center_ephemeris_time", where)
         return cls(
             lines=read.size(document, "image_lines", where),

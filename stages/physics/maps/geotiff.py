@@ -9,7 +9,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import h5py
 import numpy as np
@@ -17,10 +17,13 @@ import rasterio
 import rasterio.io
 from numba import njit
 from numpy.typing import NDArray
+from rasterio.crs import CRS
 from rasterio.errors import RasterioIOError
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
+from schemas.provenance import pack_record
+from schemas.rasters import TIFF_TAG
 from schemas.reading import read_strings
 from stages.physics.maps import cog
 from stages.physics.maps.grid import Grid
@@ -33,19 +36,37 @@ DIRECT = 3  # overviews made of what is at hand; the smaller ones, a 64th of the
 EVEN = 1 << DIRECT  # px
 
 
-class MapTiff:
-    """A GeoTIFF that is written as its map is made: one band per coefficient and deviation, named; nodata NaN. Use as a context manager.
+class Placed(Protocol):
+    """Where a raster lies: a grid, or another raster that is open."""
 
-    Overviews are means of what is known. Every level grows in a file of its own beside ``path``;
+    @property
+    def crs(self) -> CRS | None:
+        """None where unknown."""
+
+    @property
+    def transform(self) -> Affine:
+        """GDAL's, pixel corners to map coordinates."""
+
+    @property
+    def height(self) -> int:
+        """px"""
+
+    @property
+    def width(self) -> int:
+        """px"""
+
+
+class MapTiff:
+    """A GeoTIFF that is written as its map is made, with named bands; nodata NaN. Use as a context manager.
+
+    units : of the bands, or none. Overviews are means of what is known. Every level grows in a file of its own beside ``path``.
     """
 
-    def __init__(self, path: Path, grid: Grid, names: Sequence[str], attributes: Mapping[str, Any]) -> None:
-        self.path, self.grid, self.names = path, grid, list(names)
-        self.tags = {key: str(attributes[key]) for key in TAGS}
-        self.tags |= {
-            "coefficients": json.dumps([n for n in self.names if not n.endswith("_std")]),
-            "software": "lunargr",
-        }
+    def __init__(
+        self, path: Path, grid: Placed, names: Sequence[str], tags: Mapping[str, Any], units: Sequence[str] = ()
+    ) -> None:
+        self.path, self.grid, self.names, self.units = path, grid, list(names), list(units)
+        self.tags = {"software": "lunargr"} | {key: str(value) for key, value in tags.items()}
         # Halved until it fits into a block.
         overviews = max(0, math.ceil(math.log2(max(grid.height, grid.width) / BLOCK)))
         self.shapes = [(-(-grid.height >> k), -(-grid.width >> k)) for k in range(overviews + 1)]
@@ -103,6 +124,8 @@ class MapTiff:
         if level == 0:
             file.update_tags(**self.tags)
             file.descriptions = self.names
+            if self.units:
+                file.units = self.units
         return file
 
     def _halve(self, level: int) -> None:
@@ -123,13 +146,22 @@ def _told() -> Iterator[None]:
 
 
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
-    """The map that an open artefact holds, as a cloud-optimised GeoTIFF; standard deviations and albedo are bands more."""
+    """The map that an open artefact holds, as a cloud-optimised GeoTIFF; with standard deviations and albedo as further bands."""
     fields = [file[name] for name in ("coefficients", "coefficients_std") if name in file]
     maps = read_strings(file, "map_name") if len(fields) > 1 else []
     further = [name for name in ALBEDO_BANDS if name in file]
     names = [*band_names(read_strings(file, "coefficient_name"), maps), *further]
-    with MapTiff(path, grid, names, file.attrs) as tiff:
+    with MapTiff(path, grid, names, map_tags(names, file.attrs), ["1"] * len(names)) as tiff:
         tiff.put_all(*fields, *(file[name] for name in further))
+
+
+def map_tags(names: Sequence[str], root: Mapping[str, Any]) -> dict[str, str]:
+    """What the GeoTIFF of a map says of it. root : of its artefact"""
+    return {
+        **{key: str(root[key]) for key in TAGS},
+        "coefficients": json.dumps([n for n in names if not n.endswith("_std")]),
+        TIFF_TAG: pack_record(root),
+    }
 
 
 def band_names(coefficients: Sequence[str], maps: Sequence[str]) -> list[str]:

@@ -1,6 +1,6 @@
 """The one geographic split of a scene: square ground tiles, dealt to training, validation and test by a hash.
 
-It hangs on the scene, --tile-m, --split and --seed only, not on what is sampled: see `stages/sample.py`.
+It hangs on the scene, `tile_m`, `split` and `seed` only, not on what is sampled: see `stages/sample`.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,10 +17,9 @@ from geographiclib.geodesic import Geodesic
 from numpy.typing import NDArray
 
 from schemas import ConfigError
+from stages.common.progress import Progress
 from stages.physics.maps.grid import Grid
 from stages.physics.maps.positions import blocks, valid_positions
-
-Progress = Callable[[int, int, str], None]
 
 TEST_TILES = 20  # where --tile-m is left to us and the scene is large enough: intervals over fewer are wide
 WITH_ROOM = 0.8  # of the tiles, in which a crop fits: images end, elevations have holes
@@ -83,6 +81,7 @@ class PositionMasks:
         return [int(k) for k in np.flatnonzero(meets)]
 
     def mask(self, frame: int, block: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+        """(height, width) bool: where a crop of an image may be centred; block : row, column, height, width."""
         row, col, h, w = block
         if self.stored:
             return self.file["valid_position"][frame, row : row + h, col : col + w].astype(bool)
@@ -103,7 +102,7 @@ class _Layer:
 def tile_edge(grid: Grid, positions: PositionMasks, shares: tuple[float, float, float], tile_m: float | None) -> int:
     """Edge of a ground tile in pixels; metres are measured along the body with a geodesic at the scene's centre.
 
-    Without --tile-m it follows from the scene and the shares alone, not from the crops that are asked for.
+    Without `tile_m` it follows from the scene and the shares alone, not from the crops that are asked for.
     """
     crop = positions.crop
     if tile_m is not None:
@@ -112,13 +111,13 @@ def tile_edge(grid: Grid, positions: PositionMasks, shares: tuple[float, float, 
         metres = Geodesic(grid.radius, 0).Inverse(lat[0], lon[0], lat[1], lon[1])["s12"] / 100
         edge = min(round(tile_m / metres), 4 * max(grid.height, grid.width))
         if edge < crop:
-            raise ConfigError(f"--tile-m: expected at least one crop ({crop * metres:g} m), found {tile_m:g} m.")
+            raise ConfigError(f"`tile_m`: expected at least one crop ({crop * metres:g} m), found {tile_m:g} m.")
         return edge
     edge = _scene_edge(positions, shares)
     if edge < crop:
         raise ConfigError(
-            f"--crop: expected at most {edge} px, the ground tiles of this scene's split, found {crop}; "
-            "name larger tiles with --tile-m here and wherever else this scene is sampled."
+            f"`crop`: expected at most {edge} px, the ground tiles of this scene's split, found {crop}; "
+            "name larger tiles with `tile_m` here and wherever else this scene is sampled."
         )
     return edge
 
@@ -142,7 +141,7 @@ def split_tiles(
     edge: int,
     split: tuple[float, float, float],
     seed: int,
-    progress: Progress | None,
+    progress: Progress,
 ) -> Tiles:
     """Give every tile with valid ground to a part, in the order of a hash, so that the parts' ground is near their shares.
 
@@ -152,8 +151,7 @@ def split_tiles(
     ground, room = np.zeros(shape), np.zeros(shape, bool)
     before, behind = positions.scene_crop // 2, positions.scene_crop - positions.scene_crop // 2 - 1
     for number, block in enumerate(positions.blocks):
-        if progress:
-            progress(number, len(positions.blocks), "tiles")
+        progress(number, len(positions.blocks), "tiles")
         row, col, h, w = block
         part_of_scene = np.s_[row : row + h, col : col + w]
         covered, centres = np.zeros((h, w), bool), np.zeros((h, w), bool)
@@ -165,8 +163,7 @@ def split_tiles(
         r, c = (v + first for v, first in zip(np.nonzero(centres), (row, col), strict=True))
         inside = ((r - before) // edge == (r + behind) // edge) & ((c - before) // edge == (c + behind) // edge)
         room[r[inside] // edge, c[inside] // edge] = True
-    if progress:
-        progress(len(positions.blocks), len(positions.blocks), "tiles")
+    progress(len(positions.blocks), len(positions.blocks), "tiles")
     if not room.any():  # tiles are smaller than the scene's crops: smaller ones will be asked for
         room = ground > 0
     part = np.where(ground > 0, 0 if split[0] > 0 else -1, -1).astype(np.int8)

@@ -26,6 +26,7 @@ from rasterio.windows import Window
 from schemas.errors import InputError
 from schemas.files.hdf5 import silence_hdf5
 from schemas.files.user_files import check_file
+from stages.common.arrays import Mask
 from stages.common.memory import return_freed_memory
 from stages.physics.maps.grid import Grid, ellipsoid_of, latitude_squash
 
@@ -37,8 +38,6 @@ _SPECIAL_UINT16 = (0, 1, 2, 65534, 65535)
 _SPECIAL_UINT8 = (0, 255)
 
 LARGEST_WINDOW = 1 << 22  # source pixels that are warped at a time: 0.2 GB with all that is made of them
-
-Mask = NDArray[np.bool_]
 
 
 @contextlib.contextmanager
@@ -79,7 +78,7 @@ def _check_numbers(path: Path, what: str, dataset: DatasetReader) -> None:
     if "complex" in dataset.dtypes[0] or dataset.dtypes[0] == "cint16":
         raise InputError(
             f"{path}: expected {what} of real numbers, found {dataset.dtypes[0]}; take one part "
-            "(gdal_calc.py --calc='numpy.real(A)')."
+            "(gdal_calc.py, 'numpy.real(A)')."
         )
     scale, offset = dataset.scales[0], dataset.offsets[0]
     if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
@@ -89,7 +88,7 @@ def _check_numbers(path: Path, what: str, dataset: DatasetReader) -> None:
 
 
 def check_single_band(path: Path, dataset: DatasetReader, what: str) -> None:
-    """Refuse rasters of several bands: which of them is meant, nobody said. Masks (alpha) are none. Raises InputError."""
+    """Refuse rasters of several bands; masks (alpha) do not count. Raises InputError."""
     bands = sum(kind != ColorInterp.alpha for kind in dataset.colorinterp)
     if bands > 1:
         raise InputError(
@@ -114,9 +113,7 @@ def check_metres(path: Path, dataset: DatasetReader) -> None:
     known = {"km": 1000.0, "kilometre": 1000.0, "kilometer": 1000.0, "kilometers": 1000.0, "kilometres": 1000.0}
     known |= {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 12 / 39.37, "us-ft": 12 / 39.37}
     metres = factor if factor != 1.0 else known.get(unit)
-    advice = (
-        f"convert them (gdal_calc.py --calc='A*{metres:g}')" if metres else "convert them, or set the unit that is true"
-    )
+    advice = f"convert them (gdal_calc.py, 'A*{metres:g}')" if metres else "convert them, or set the unit that is true"
     raise InputError(
         f"{path}: expected elevations in metres, found the unit '{unit}'; {advice} and say so (gdal_edit.py -units m)."
     )
@@ -175,6 +172,8 @@ def transform_points(grid: Grid, dataset: DatasetReader, x: NDArray, y: NDArray)
     """Map coordinates of a grid -> those of a raster on the same body.
 
     A geographic raster may count longitudes 0..360 or -180..180: the points follow the raster's own domain.
+
+    x, y : (n,) in the units of either CRS; returns (n,) each
     """
     if grid.squash == latitude_squash(dataset.crs):
         tx, ty = rasterio.warp.transform(grid.crs, dataset.crs, x, y)

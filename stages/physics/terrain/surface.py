@@ -16,14 +16,15 @@ from rasterio.windows import Window
 from schemas.artefacts import SCENE, SVBRDF
 from schemas.errors import ArtefactError, ConfigError, InputError, RegistryError
 from schemas.reading import open_artefact, read_kind, read_strings
+from stages.common.arrays import Floats32
 from stages.physics.bodies.spheres import Body
 from stages.physics.maps.grid import Grid, check_body, read_grid, require_crs
 from stages.physics.maps.rasters import check_metres, check_single_band, open_raster, pixel_size_at, read_window
 from stages.physics.photometry import ReflectanceModel, get_model
 from stages.physics.photometry.albedo_factor import AlbedoFactor
 
-Floats32 = NDArray[np.float32]
 _HDF5_SUFFIXES = (".h5", ".hdf5", ".nc")
+SHADOWED = 0.5  # of the Sun's disc: from there on a pixel counts as shadow
 _UNEVEN = 0.01  # a raw DEM's pixels may differ in true width and height by this share
 
 
@@ -53,6 +54,7 @@ class AlbedoError:
 
     albedo, std : (H, W) datasets; own : () relative standard deviation of a photograph's own error
     cos_incidence, interval : (B, 2) half-widths of the 68 and 95 % intervals, in standard deviations, by cos(incidence) (B,)
+    shadow : (2,) half-widths of both in shadow, where errors are those of the shadow's edge, over sin(Sun's elevation)
     """
 
     albedo: h5py.Dataset
@@ -60,6 +62,7 @@ class AlbedoError:
     own: float
     cos_incidence: NDArray[np.float64]
     interval: NDArray[np.float64]
+    shadow: NDArray[np.float64]
 
     @staticmethod
     def read(file: h5py.File) -> AlbedoError | None:
@@ -69,22 +72,24 @@ class AlbedoError:
         own = math.sqrt(float(np.median((file["albedo_image_std"][...] ** 2).sum(axis=1))))
         names = ("albedo_bin_cos_incidence", "albedo_interval_68", "albedo_interval_95")
         cosines, inner, outer = (file[n][...] for n in names) if names[0] in file else ([1.0], [1.0], [1.96])
-        return AlbedoError(
-            file["albedo"], file["albedo_std"], own, np.asarray(cosines), np.stack([inner, outer], axis=1)
-        )
+        shadow = file["albedo_interval_shadow"][...] if "albedo_interval_shadow" in file else np.zeros(2)
+        interval = np.stack([inner, outer], axis=1)
+        return AlbedoError(file["albedo"], file["albedo_std"], own, np.asarray(cosines), interval, shadow)
 
-    def relative(
-        self, row: int, col: int, height: int, width: int, cos_incidence: NDArray
-    ) -> tuple[Floats32, Floats32]:
-        """Half-widths of the 68 and 95 % intervals of an unseen photograph's I/F over that of the map, (h, w) each.
+    def half_widths(
+        self, row: int, col: int, image: NDArray, cos_incidence: NDArray, shadow: NDArray, sun_sine: float | NDArray
+    ) -> list[Floats32]:
+        """Half-widths of the 68 and 95 % intervals of an unseen photograph's pixels, (h, w) I/F each.
 
-        cos_incidence : (h, w)
+        image : (h, w) I/F of the map; cos_incidence : (h, w); shadow : (h, w) bool; sun_sine : of the Sun's elevation
         """
-        part = np.s_[row : row + height, col : col + width]
-        std = np.hypot(self.std[part] / np.maximum(self.albedo[part], 1e-6), self.own)
-        widths = (np.interp(cos_incidence, self.cos_incidence, self.interval[:, k]) for k in (0, 1))
-        inner, outer = ((w * std).astype(np.float32) for w in widths)
-        return inner, outer
+        part = np.s_[row : row + image.shape[0], col : col + image.shape[1]]
+        std = np.hypot(self.std[part] / np.maximum(self.albedo[part], 1e-6), self.own) * np.abs(image)
+        found = []
+        for level in (0, 1):
+            lit = np.interp(cos_incidence, self.cos_incidence, self.interval[:, level]) * std
+            found.append(np.where(shadow, self.shadow[level] * sun_sine, lit).astype(np.float32))
+        return found
 
 
 @dataclass
@@ -131,6 +136,16 @@ class Surface:
             return self.coefficients[:, *part]
         return np.concatenate([self.coefficients[:, *part], self.albedo[part][None]])
 
+    def read_padded(self, row: int, col: int, height: int, width: int, margin: int) -> Floats32:
+        """(height + 2 margin, width + 2 margin) elevations, m, NaN outside the map."""
+        result = np.full((height + 2 * margin, width + 2 * margin), np.nan, np.float32)
+        top, left = max(0, row - margin), max(0, col - margin)
+        bottom = min(self.grid.height, row + height + margin)
+        right = min(self.grid.width, col + width + margin)
+        inner = np.s_[top - row + margin : bottom - row + margin, left - col + margin : right - col + margin]
+        result[inner] = self.elevation[top:bottom, left:right]
+        return result
+
     def height_range(self) -> tuple[float, float]:
         """Lowest and highest elevation, m, by one pass over the DEM. Raises InputError where there is none."""
         low, high = np.inf, -np.inf
@@ -163,7 +178,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
             if kind == "svbrdf":
                 if model is not None:
                     raise ConfigError(
-                        f"--model: {path.name} holds its own reflectance ({file.attrs['model']}); to render its terrain with another model give --dem {path.name}."
+                        f"`model`: {path.name} holds its own reflectance ({file.attrs['model']}); to render its terrain with another model give `dem` {path.name}."
                     )
                 reflectance = stored_model(path, str(file.attrs["model"]))
                 _check_names(path, reflectance, read_strings(file, "coefficient_name"))
@@ -214,10 +229,10 @@ def stored_model(path: Path, name: str) -> ReflectanceModel:
 
 
 def _named_model(path: Path, model: str | None) -> ReflectanceModel:
-    """Raises ConfigError: which reflectance a picture shows is nobody's to guess."""
+    """The model that was asked for. Raises ConfigError where none was: a terrain has no reflectance of its own."""
     if model is None:
         raise ConfigError(
-            f"{path}: holds a terrain and no reflectance; name one with --dem {path} --model NAME ('lunargr models' lists them), "
+            f"{path}: holds a terrain and no reflectance; name one with `dem` {path} `model` NAME ('lunargr models' lists them), "
             "or render the svbrdf.h5 of 'lunargr infer'."
         )
     return get_model(model)
@@ -240,7 +255,7 @@ def _uniform(model: ReflectanceModel, parameters: Mapping[str, float]) -> NDArra
         bounds = next(p for p in model.parameters if p.name == name)
         if not bounds.lower <= value <= bounds.upper:
             raise ConfigError(
-                f"--parameters: expected {name} of {model.name} in {bounds.lower:g}..{bounds.upper:g}, found {value:g}."
+                f"`parameters`: expected {name} of {model.name} in {bounds.lower:g}..{bounds.upper:g}, found {value:g}."
             )
     return np.array([parameters.get(p.name, p.default) for p in model.parameters], np.float32)
 

@@ -1,0 +1,20 @@
+"""Names of a package that are imported when they are first asked for: the command's help must answer at once."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+
+def imported_later(package: str, *modules: str) -> Callable[[str], Any]:
+    """The package's ``__getattr__``. modules : of the package, in which a name is looked for in this order"""
+
+    def find(name: str) -> Any:
+        for module in modules if not name.startswith("__") else ():
+            loaded = importlib.import_module(f"{package}.{module}")
+            if name in vars(loaded):
+                return vars(loaded)[name]
+        raise AttributeError(f"module '{package}' has no attribute '{name}'")
+
+    return find

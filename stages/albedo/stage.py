@@ -1,0 +1,318 @@
+"""albedo: a factor on the I/F of a map, pixel by pixel, from all photographs that see the pixel: `svbrdf.h5` once more.
+
+Blocks of the map are worked one after the other, each with all its images; what lies around a block and is read with it
+is all that the bands of structure can see, so that blocks leave no seams.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas import SCENE, SVBRDF, ArtefactError, ArtefactWriter, InputError, atomic_path, check_output, open_artefact
+from schemas.files.companions import companions_of
+from schemas.files.outputs import Output
+from schemas.reading import read_strings
+from stages.albedo.calibrate import COSINES, Calibration, calibrate, choose_windows, take_samples
+from stages.albedo.config import Config, Summary, used_frames
+from stages.albedo.posterior import estimate, settle
+from stages.albedo.prior import terrain_variance
+from stages.albedo.pyramid import HALO_PX, LEVELS
+from stages.albedo.references import Box, References
+from stages.albedo.registered import register
+from stages.albedo.writing import Maps, copy_map, kept_attributes
+from stages.common.arrays import Floats32
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.physics.bodies.spheres import find_body
+from stages.physics.horizon.scene import make_overview
+from stages.physics.images.table import Frame, load_frames
+from stages.physics.maps.geotiff import write_geotiff
+from stages.physics.maps.grid import read_grid
+from stages.physics.terrain.surface import Surface, open_surface
+
+BLOCK_PX = 768
+STACK_PX = 64 << 20  # pixels of all images of a block, with what lies around it: 1.3 GB with all that is made of them
+OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A map, the scene's photographs of it, and whether they are in I/F."""
+
+    map: h5py.File
+    references: References
+    units: str
+    surface: Surface
+
+
+@contextlib.contextmanager
+def open_ground(svbrdf: Path, scene: Path, config: Config) -> Iterator[Ground]:
+    """A map without albedo and the photographs that may enter. Raises LunargrError."""
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context(open_artefact(svbrdf, SVBRDF))
+        if "albedo" in file:
+            raise ArtefactError(
+                f"{svbrdf}:/albedo: expected a map without albedo, found one that photographs were applied to already; "
+                "start from the output of 'lunargr infer'."
+            )
+        terrain = stack.enter_context(open_artefact(scene, SCENE))
+        _check_same_grid(svbrdf, file, scene, terrain)
+        frames = load_frames(terrain, scene)
+        used = used_frames(frames, config) if frames else []
+        chosen = [frame for frame, use in zip(frames, used, strict=True) if use]
+        boxes: list[Box] = [
+            tuple(box) for box, use in zip(terrain["frame_window"][...].tolist(), used, strict=True) if use
+        ]
+        if not any(box[2] and box[3] for box in boxes):
+            raise InputError(f"{scene}: expected images that overlap the map {svbrdf}, found none.")
+        units = _units(svbrdf, file, scene, chosen)
+        surface = stack.enter_context(open_surface(svbrdf, None, {}, find_body(str(file.attrs["body_radius_m"]))))
+        elevation = terrain["elevation"]
+        overview = make_overview(elevation, max(1, math.ceil(max(elevation.shape) / OVERVIEW_PX)))
+        cells = overview.cells[np.isfinite(overview.cells)]
+        heights = (float(cells.min()) if cells.size else 0.0), overview.highest
+        heights = heights[0] - 0.5 * max(0.0, heights[1] - heights[0]), heights[1]
+        references = stack.enter_context(
+            References(replace(surface, deviations=None), elevation, overview, heights, chosen, boxes)
+        )
+        yield Ground(file, references, units, surface)
+
+
+def run(
+    svbrdf: Path,
+    scene: Path,
+    output: Output | Path,
+    config: Config,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
+) -> Summary:
+    """Write the map with albedo. Raises LunargrError."""
+    return _run(svbrdf, scene, None, Output.of(output), config, progress)
+
+
+def run_part(svbrdf: Path, scene: Path, calibration: Path, output: Path, config: Config) -> Summary:
+    """:func:`run` for one shard, with the calibration of :func:`calibrate_to` that all shards share."""
+    return _run(svbrdf, scene, calibration, Output(output, overwrite=True), config, show_nothing)
+
+
+def _run(
+    svbrdf: Path, scene: Path, calibration: Path | None, output: Output, config: Config, progress: Progress
+) -> Summary:
+    check_files([svbrdf, scene, *source_files(scene)], output, config)
+    with open_ground(svbrdf, scene, config) as ground:
+        found = Calibration.read(calibration) if calibration else _calibrate(svbrdf, scene, ground, config, progress)
+        ground.references.take_off(found.fields)
+        sizes = {d: ground.map[d].shape[0] for d in ("coefficient", "y", "x")}
+        if "map_name" in ground.map:
+            sizes["map"] = len(ground.map["map_name"])
+        sizes |= {
+            "frame": len(ground.references.frames),
+            "band": LEVELS + 1,
+            "incidence_bin": len(COSINES) - 1,
+            "level": 2,
+        }
+        with contextlib.ExitStack() as stack:
+            writer = stack.enter_context(
+                ArtefactWriter(
+                    output.file,
+                    SVBRDF,
+                    sizes,
+                    config=asdict(config),
+                    inputs=[svbrdf, scene],
+                    attributes=kept_attributes(ground.map),
+                    overwrite=output.overwrite,
+                )
+            )
+            edge = _edge(ground)
+            own = _own_rows(ground, edge, config)
+            if config.shard[1] > 1:
+                writer.file.attrs["shard_rows"] = np.array(own, np.int64)
+            copy_map(ground.map, writer, own)
+            maps = Maps(writer, ground.references.frames, found)
+            for block in _blocks(ground, edge, own, progress):
+                maps.put(block, *work_block(ground, found, block))
+            maps.close()
+            if config.geotiff and config.shard[1] == 1:
+                stack.enter_context(companions_of(output.file))
+                partial = stack.enter_context(atomic_path(output.geotiff_path))
+                write_geotiff(partial, writer.file, read_grid(writer.file, output.file))
+            return _summary(writer.file, config, scene)
+
+
+def check_files(inputs: Sequence[Path], output: Output, config: Config) -> None:
+    """Refuse outputs that cannot be written. A run that is resumed may have got as far as the GeoTIFF. Raises ConfigError."""
+    check_output(output.file, inputs, output.overwrite)
+    if config.geotiff:
+        check_output(output.geotiff_path, [*inputs, output.file], output.overwrite or output.resume)
+
+
+def calibrate_to(path: Path, svbrdf: Path, scene: Path, config: Config) -> None:
+    """Write the calibration that all parts of one map share, as JSON."""
+    with open_ground(svbrdf, scene, config) as ground, atomic_path(path) as partial:
+        _calibrate(svbrdf, scene, ground, config, show_nothing).write(partial)
+
+
+def _calibrate(svbrdf: Path, scene: Path, ground: Ground, config: Config, progress: Progress) -> Calibration:
+    references = ground.references
+    fields = tuple(register(references, config.register, progress)) if config.register else ()
+    references.take_off(fields)
+    windows = choose_windows(ground.map["valid"].shape, references.boxes)
+    samples = take_samples(references, windows, progress, lambda box: terrain_variance(ground.surface, box))
+    if not samples:
+        raise InputError(
+            f"{scene}: expected images that overlap the map {svbrdf}, found none whose sunlit pixels lie on valid ground."
+        )
+    return replace(calibrate(samples, len(references.frames), ground.units), fields=fields)
+
+
+def work_block(ground: Ground, calibration: Calibration, block: Box) -> tuple[Floats32, Floats32, NDArray[np.uint16]]:
+    """(albedo, its standard deviation, number of images) of a block."""
+    row, col, height, width = block
+    rows, cols = ground.map["valid"].shape
+    top, left = max(0, row - HALO_PX), max(0, col - HALO_PX)
+    bottom, right = min(rows, row + height + HALO_PX), min(cols, col + width + HALO_PX)
+    box = top, left, bottom - top, right - left
+    references = ground.references
+    images, ratios, confidences = [], [], []
+    for k in references.overlapping(box):
+        look = references.look(k, box)
+        if look is not None:
+            ratio, confidence = calibration.ratio(k, look)
+            images.append(k)
+            ratios.append(ratio)
+            confidences.append(confidence)
+    inner = np.s_[row - top : row - top + height, col - left : col - left + width]
+    ratio = np.stack(ratios) if images else np.zeros((0, box[2], box[3]), np.float32)
+    confidence = np.stack(confidences) if images else ratio.copy()
+    count = (confidence[:, *inner] > 0).sum(axis=0).astype(np.uint16)
+    spread = calibration.spread.of(images)
+    settle(ratio, confidence, spread)
+    log_albedo, std = estimate(ratio, confidence, spread, terrain_variance(ground.surface, box))
+    albedo = np.exp(log_albedo[inner])
+    albedo_std = albedo * std[inner]
+    unknown = ground.map["valid"][row : row + height, col : col + width] == 0
+    albedo[unknown], albedo_std[unknown], count[unknown] = np.nan, np.nan, 0
+    return albedo, albedo_std, count
+
+
+def source_files(scene: Path) -> list[Path]:
+    """The images and camera models of a scene."""
+    with open_artefact(scene, SCENE) as file:
+        frames = load_frames(file, scene)
+    return [p for f in frames for p in (f.path, f.camera) if p is not None]
+
+
+def count_bands(svbrdf: Path, scene: Path, config: Config) -> int:
+    """Rows of blocks on a map: more shards than these have nothing to do."""
+    with open_ground(svbrdf, scene, config) as ground:
+        return -(-ground.map["valid"].shape[0] // _edge(ground))
+
+
+def summarise(output: Path, scene: Path) -> Summary:
+    """What a finished map holds, for the lines at the end."""
+    from schemas.reading import read_config
+
+    with open_artefact(output, SVBRDF) as file:
+        told = read_config(file)
+        fold = told.get("fold")
+        config = Config(tuple(told.get("leave_out", ())), tuple(fold) if fold else None)
+        return _summary(file, config, scene)
+
+
+def _edge(ground: Ground) -> int:
+    """Edge of a block, px: smaller where so many images overlap that memory would grow with them."""
+    edge, references = BLOCK_PX, ground.references
+    rows, cols = ground.map["valid"].shape
+    while edge > 2 * HALO_PX:
+        side = edge + 2 * HALO_PX
+        starts = [(r, c) for r in range(0, rows, edge) for c in range(0, cols, edge)]
+        most = max(len(references.overlapping((r - HALO_PX, c - HALO_PX, side, side))) for r, c in starts)
+        if most * side * side <= STACK_PX:
+            break
+        edge //= 2
+    return edge
+
+
+def _own_rows(ground: Ground, edge: int, config: Config) -> tuple[int, int]:
+    rows = ground.map["valid"].shape[0]
+    index, count = config.shard
+    bands = -(-rows // edge)
+    first, last = (min(rows, edge * (bands * k // count)) for k in (index, index + 1))
+    return first, last
+
+
+def _blocks(ground: Ground, edge: int, own: tuple[int, int], progress: Progress) -> Iterator[Box]:
+    cols = ground.map["valid"].shape[1]
+    for row in range(own[0], own[1], edge):
+        progress(row - own[0], own[1] - own[0], "rows")
+        for col in range(0, cols, edge):
+            yield row, col, min(edge, own[1] - row), min(edge, cols - col)
+    progress(own[1] - own[0], own[1] - own[0], "rows")
+
+
+def _check_same_grid(svbrdf: Path, file: h5py.File, scene: Path, terrain: h5py.File) -> None:
+    mine, other = read_grid(file, svbrdf), read_grid(terrain, scene)
+    if abs(mine.radius - other.radius) > 1e-6 * other.radius:
+        raise ArtefactError(
+            f"{svbrdf}: expected a map of a body of {other.radius:g} m as {scene}, found one of {mine.radius:g} m; "
+            "infer the map from this scene."
+        )
+    same = np.allclose(mine.transform, other.transform, rtol=0, atol=1e-6 * other.gsd) and mine.crs == other.crs
+    if not same or (mine.height, mine.width) != (other.height, other.width):
+        raise ArtefactError(
+            f"{svbrdf}: expected the grid of {scene} ({other.height} x {other.width} px at {other.gsd:g} m), found another "
+            f"({mine.height} x {mine.width} px at {mine.gsd:g} m); infer the map from this scene."
+        )
+
+
+def _units(svbrdf: Path, file: h5py.File, scene: Path, frames: Sequence[Frame]) -> str:
+    units = {frame.units for frame in frames}
+    if len(units) > 1:
+        raise InputError(f"{scene}: expected one kind of units, found both 'iof' and 'dn'; ingest them apart.")
+    found = units.pop()
+    if found == "iof" and str(file.attrs.get("image_units", "iof")) == "dn":
+        raise InputError(
+            f"{scene}: expected images in DN as those that {svbrdf} was trained on, found I/F; its brightness scale is "
+            "arbitrary. Train on images in I/F."
+        )
+    return found
+
+
+def _summary(file: h5py.File, config: Config, scene: Path) -> Summary:
+    """From at most half a million pixels, in few rows."""
+    height, width = file["albedo"].shape
+    first, last = (int(v) for v in file.attrs.get("shard_rows", (0, height)))
+    rows = range(first, last, max(1, (last - first) // 64))
+    step = max(1, math.ceil(len(rows) * width / 5e5))
+
+    def sample(name: str) -> NDArray:
+        return np.concatenate([file[name][r, ::step] for r in rows]) if len(rows) else np.zeros(0)
+
+    albedo, std, count = sample("albedo"), sample("albedo_std"), sample("albedo_images")
+    known = np.isfinite(albedo)
+    seen = known & (count > 0)
+    moments = (math.nan,) * 4
+    if seen.any():
+        low, high = np.percentile(albedo[seen], [1, 99])
+        moments = float(albedo[seen].mean()), float(albedo[seen].std()), float(low), float(high)
+    with open_artefact(scene, SCENE) as terrain:
+        names = read_strings(terrain, "image_id")
+    used = read_strings(file, "albedo_image_id")
+    own = np.median(np.where(np.isfinite(file["albedo_image_std"][...]), file["albedo_image_std"][...], 0), axis=0)
+    bands = zip(file["albedo_band_px"][...], file["albedo_band_std"][...], own, strict=True)
+    return Summary(
+        tuple(used),
+        tuple(name for name in names if name not in used),
+        float(seen.sum() / max(1, known.sum())),
+        float(count[seen].mean()) if seen.any() else 0.0,
+        moments,  # type: ignore[arg-type]
+        float(np.median(std[seen])) if seen.any() else math.nan,
+        tuple((float(a), float(b), float(c)) for a, b, c in bands),
+    )

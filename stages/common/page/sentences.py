@@ -1,0 +1,45 @@
+"""Sentences that are no stronger than their interval allows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+Sentence = tuple[str, str]  # text, '' | 'good' | 'bad'
+
+
+def verdict(gain: dict[str, Any]) -> str:
+    """What a paired interval says."""
+    low, high = gain.get("gain_percent_low"), gain.get("gain_percent_high")
+    if low is None or high is None:
+        return "unknown"
+    return "better" if low > 0 else "worse" if high < 0 else "no difference"
+
+
+def bounds(gain: dict[str, Any]) -> str:
+    """The interval of a gain, in percent."""
+    low, high = gain.get("gain_percent_low"), gain.get("gain_percent_high")
+    return "no interval" if low is None or high is None else f"95 %: {low:+.1f} .. {high:+.1f}"
+
+
+def listed(names: list[str]) -> str:
+    """'a, b and c', as words."""
+    words = [name.replace("_", " ") for name in names]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else "nothing"
+
+
+def compared(ours: str, other: str, gain: dict[str, Any], on: str) -> Sentence:
+    """What a gain over another model says. on : what it rests on"""
+    value, word = float(gain["gain_percent"]), verdict(gain)
+    tail = f"gain {value:+.1f} % ({bounds(gain)}; {on})"
+    if word == "no difference":
+        return f"{ours} shows no difference from {other}: {tail}.", ""
+    if word == "unknown":
+        return f"{ours} cannot be compared with {other} with any certainty: {tail}.", ""
+    if word == "better":
+        return f"{ours} has a squared error {value:.1f} % lower than {other} ({bounds(gain)}; {on}).", "good"
+    return f"{ours} has a squared error {-value:.1f} % higher than {other}; {tail}.", "bad"
+
+
+def counted(number: int, what: str) -> str:
+    """'1 place', '1,200 places'"""
+    return f"{number:,} {what}{'s' * (number != 1)}"

@@ -1,0 +1,247 @@
+"""infer: coefficient maps for a DEM of any size, the same wherever the windows fall, in bounded memory.
+
+Every window has as much context around it as the network can see, and lies on the lattice of the network's pooling. It is
+then exactly what one pass over the whole map would give: no squares at window borders.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from schemas import (
+    SCENE,
+    SVBRDF,
+    ArtefactError,
+    ArtefactWriter,
+    ConfigError,
+    atomic_path,
+    open_artefact,
+    read_strings,
+)
+from schemas.files.companions import companions_of
+from schemas.files.hdf5 import silence_hdf5
+from schemas.files.outputs import Output, Target, check_apart, check_outputs
+from stages.common.memory import keep_freed_memory, return_freed_memory
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.infer.config import Config, Summary
+from stages.infer.parallel import in_order, side_by_side
+from stages.infer.terrain import TerrainReader, valid_part
+from stages.infer.windows import Box, axis_windows, own_rows, swaths_of, window_and_stride, windows_of
+from stages.infer.writing import Blend, Outputs
+from stages.network.cpu.mapper import Mapper
+from stages.network.precision import check_precision, choose_inference_precision
+from stages.network.predictor import choose_device, load_predictor
+from stages.pairs.holes import fill_holes
+from stages.physics.maps.geotiff import EVEN, MapTiff, band_names, map_tags
+from stages.physics.maps.grid import check_same_body, read_grid
+
+QUANTITY = "radiance factor I/F = pi r, including cos(incidence)"
+GSD_TOLERANCE = 0.05  # relative; beyond it the network would meet terrain at a scale it never saw
+
+
+def run(
+    scene: Path,
+    checkpoint: Path,
+    output: Output | Path,
+    config: Config,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
+) -> Summary:
+    """Write ``svbrdf.h5`` and, if wanted, a cloud-optimised GeoTIFF. Raises ConfigError, ArtefactError."""
+    output = Output.of(output)
+    window_and_stride(config)
+    check_precision(config.precision)
+    check_files([scene, checkpoint], output, config)
+    device = choose_device(config.device)
+    keep_freed_memory()
+    predictor = load_predictor(checkpoint, device)
+    precision = config.precision
+    with open_artefact(scene, SCENE) as file:
+        grid = read_grid(file, scene)
+        if not config.any_gsd and abs(grid.gsd - predictor.gsd) > GSD_TOLERANCE * predictor.gsd:
+            raise ConfigError(
+                f"{scene}: expected a grid near {predictor.gsd:g} m, at which {checkpoint} was trained, found {grid.gsd:g} m; "
+                "ingest the DEM at that `gsd` or add `any_gsd`."
+            )
+        if precision == "auto":
+            precision = choose_inference_precision(predictor, _sample_of(file), device)
+        names = [p.name for p in predictor.model.parameters]
+        maps = list(predictor.maps.maps) if predictor.maps.channels > len(predictor.maps.maps) else []
+        sizes = {"coefficient": len(names), "map": len(maps), "y": grid.height, "x": grid.width}
+        attributes = {
+            "gsd_m": grid.gsd,
+            "body_radius_m": grid.radius,
+            "model": predictor.model.name,
+            "quantity": QUANTITY,
+            "image_units": predictor.image_units,
+            "precision": precision,
+        } | ({"image_noise": predictor.image_noise} if math.isfinite(predictor.image_noise) else {})
+        with contextlib.ExitStack() as stack:
+            writer = stack.enter_context(
+                ArtefactWriter(
+                    output.file,
+                    SVBRDF,
+                    sizes,
+                    config=asdict(config),
+                    inputs=[scene, checkpoint],
+                    attributes=attributes,
+                    overwrite=output.overwrite,
+                )
+            )
+            writer.write_crs(grid.crs_wkt, grid.transform)
+            writer.write("x", file["x"][...])
+            writer.write("y", file["y"][...])
+            writer.write("coefficient_name", names)
+            if maps:
+                writer.write("map_name", maps)
+                writer.dataset("coefficients_std")
+            mapper = Mapper(predictor, device, precision, torch.get_num_threads(), deviations=bool(maps))
+            picture = None
+            # a shard holds some rows only; the GeoTIFF is made of the merged whole
+            if config.geotiff and config.shard[1] == 1:
+                stack.enter_context(companions_of(output.file))
+                partial = stack.enter_context(atomic_path(output.geotiff_path))
+                bands = band_names(names, maps)
+                tags = map_tags(bands, writer.file.attrs)
+                picture = stack.enter_context(MapTiff(partial, grid, bands, tags, ["1"] * len(bands)))
+            windows = _predict(file, writer, picture, mapper, config, progress)
+            share, ranges = _statistics(writer.file, names)
+    return Summary(grid, predictor.model.name, share, windows, ranges)
+
+
+def check_files(inputs: Sequence[Path], output: Output, config: Config) -> None:
+    """Refuse outputs that cannot be written. A run that is resumed may have got as far as the GeoTIFF. Raises ConfigError."""
+    target = Target(output.file)
+    check_outputs([target], inputs, output.overwrite)
+    if config.geotiff:
+        picture = Target(output.geotiff_path, "geotiff", f"the GeoTIFF of {output.file.name}")
+        check_apart([target, picture], inputs)
+        check_outputs([picture], inputs, output.overwrite or output.resume)
+
+
+def count_bands(scene: Path, config: Config) -> int:
+    """Rows of windows on a scene: more shards than these have nothing to do."""
+    window, stride = window_and_stride(config)
+    with open_artefact(scene, SCENE) as file:
+        return len(axis_windows(file["elevation"].shape[0], window, stride, config.offset))
+
+
+def summarise(svbrdf: Path, windows: int = 0) -> Summary:
+    """What a map holds, for the table at the end."""
+    with open_artefact(svbrdf, SVBRDF) as file:
+        share, ranges = _statistics(file, read_strings(file, "coefficient_name"))
+        return Summary(read_grid(file, svbrdf), str(file.attrs["model"]), share, windows, ranges)
+
+
+def _predict(
+    file: h5py.File,
+    writer: ArtefactWriter,
+    picture: MapTiff | None,
+    mapper: Mapper,
+    config: Config,
+    progress: Progress,
+) -> int:
+    """Run the network over all windows of the shard's rows; the number of windows."""
+    elevation, dem_valid = file["elevation"], file["dem_valid"]
+    own = own_rows(elevation.shape[0], config)
+    if config.shard[1] > 1:
+        writer.file.attrs["shard_rows"] = np.array(own, np.int64)
+    window, stride = window_and_stride(config)
+    if mapper.in_strips and config.window is None and config.stride is None:
+        boxes = swaths_of(elevation.shape, config, mapper.together)
+    else:
+        boxes = windows_of(elevation.shape, config)
+
+    def work(box: Box) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
+        part = valid_part(dem_valid, box)
+        if part is not None:
+            for row, values in mapper.strips(TerrainReader(elevation, dem_valid), elevation.shape, part):
+                yield row, part[1], values
+        return_freed_memory()  # or what windows of other sizes leave behind would grow with the map
+
+    # The GeoTIFF takes strips as they come where its overviews can be made of each by itself.
+    at_once = window == stride and all(row % EVEN == 0 and col % EVEN == 0 for row, col, _, _ in boxes)
+    outputs = Outputs(writer, elevation, dem_valid, own, picture if at_once else None)
+    blend = Blend(outputs, window - stride, own) if window > stride else None
+    found = side_by_side(boxes, work, mapper.together)
+    rows, done = sum(box[2] for box in boxes), 0
+    begun = -1
+    for number, strip in in_order(found) if blend else found:
+        if blend and number > begun:
+            begun = number
+            blend.begin(boxes[number])
+        progress(min(done, rows), rows, "rows of windows")
+        if strip is None:
+            continue
+        row, col, values = strip
+        done += values.shape[1]
+        if blend:
+            blend.add(boxes[number], row, col, values)
+        else:
+            outputs.put(row, col, values)
+        outputs.copy_elevation()
+    if blend:
+        blend.flush(own[1])
+    while outputs.copy_elevation():
+        pass
+    if picture and not at_once:
+        picture.put_all(*(f for f in (outputs.coefficients, outputs.deviations) if f is not None))
+    progress(rows, rows, "rows of windows")
+    return len(boxes)
+
+
+def _sample_of(scene: h5py.File, size: int = 256) -> NDArray[np.float32]:
+    """A window of terrain from the middle of a scene, holes filled."""
+    height, width = scene["elevation"].shape
+    r0, c0 = max(0, (height - size) // 2), max(0, (width - size) // 2)
+    part = np.s_[r0 : r0 + size, c0 : c0 + size]
+    return fill_holes(scene["elevation"][part], scene["dem_valid"][part].astype(bool))
+
+
+def _statistics(file: h5py.File, names: list[str]) -> tuple[float, dict[str, tuple[float, float, float, float]]]:
+    """Mean, std and percentiles from at most half a million pixels, in few rows: each touches a chunk every 256 pixels."""
+    height, width = file["valid"].shape
+    rows = range(0, height, max(1, height // 64))
+    step = max(1, math.ceil(len(rows) * width / 5e5))
+    share = float(np.mean([file["valid"][r, :].mean() for r in rows]))
+    ranges = {}
+    for k, name in enumerate(names):
+        sample = np.concatenate([file["coefficients"][k, r, :][::step] for r in rows])
+        sample = sample[np.isfinite(sample)]
+        if sample.size:
+            low, high = np.percentile(sample, [1, 99])
+            ranges[name] = (float(sample.mean()), float(sample.std()), float(low), float(high))
+        else:
+            ranges[name] = (math.nan, math.nan, math.nan, math.nan)
+    return share, ranges
+
+
+def check_body(scene: Path, body: str | None) -> None:
+    """Refuse a body that a scene contradicts. Raises GeometryError."""
+    with open_artefact(scene, SCENE) as file:
+        check_same_body(scene, float(file.attrs["body_radius_m"]), body)
+
+
+def open_terrain(path: Path) -> bool:
+    """Whether ``path`` is one of our HDF5 artefacts (otherwise a raster DEM)."""
+    silence_hdf5()
+    if not path.exists():
+        raise ArtefactError(f"{path}: no such file; expected scene.h5 or a DEM.")
+    return bool(h5py.is_hdf5(path)) and _names_schema(path)
+
+
+def _names_schema(path: Path) -> bool:
+    try:
+        with h5py.File(path, "r") as file:
+            return "lunargr_schema" in file.attrs
+    except OSError:
+        return path.suffix.lower() in (".h5", ".hdf5")  # damaged: let open_artefact or the raster's reader say so

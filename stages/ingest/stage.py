@@ -1,0 +1,241 @@
+"""ingest: a DEM on a metric grid at the working GSD, and where crops of each image may be centred.
+
+Everything streams in blocks: memory does not grow with the DEM.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from schemas import (
+    SCENE,
+    ArtefactWriter,
+    ConfigError,
+    GeometryError,
+    InputError,
+    check_output,
+    open_artefact,
+    read_config,
+)
+from schemas.files.hdf5 import silence_hdf5
+from schemas.files.outputs import Output
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.ingest.config import Config
+from stages.ingest.elevation import take_elevation, write_elevation
+from stages.ingest.plan import plan_grid
+from stages.ingest.validity import check_frames, with_digests, write_validity
+from stages.physics.bodies.spheres import Body, find_body
+from stages.physics.images.table import Frame, load_frames, read_frames, write_frames
+from stages.physics.maps import rasters
+from stages.physics.maps.grid import Grid, check_body, read_grid, require_crs
+
+LARGEST_CROP = 8192  # px: what a network can see at once, and more
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What ingest found, for the table at the end. ``blank``: the images of which no pixel is valid on the DEM."""
+
+    grid: Grid
+    dem_valid_share: float
+    elevation_range: tuple[float, float]
+    frames: tuple[Frame, ...]
+    valid_area_km2: tuple[float, ...]
+    resampled: bool
+    skipped: tuple[str, ...]
+    blank: tuple[Frame, ...] = ()
+
+
+def run(
+    dem: Path,
+    images: Path | None,
+    output: Output | Path,
+    config: Config,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
+) -> Summary:
+    """Write ``scene.h5``. Raises InputError, GeometryError or ConfigError; then nothing is written.
+
+    dem : a raster, or a scene whose grid and elevations are taken as they are. Shards are cut in two steps: of a raster
+    without images, its rows; of a scene with images, the images.
+    """
+    output = Output.of(output)
+    if config.crop < 16 or config.crop % 2 or config.crop > LARGEST_CROP:
+        raise ConfigError(f"`crop`: expected an even number of pixels, 16 .. {LARGEST_CROP}; found {config.crop}.")
+    body = find_body(config.body)
+    frames = read_frames(images, body) if images else []
+    named = [p for f in frames for p in (f.path, f.camera) if p is not None]
+    check_output(output.file, [dem, *([images] if images else []), *named], output.overwrite)
+    index, count = config.shard
+    with _open_terrain(dem, images, config, body, progress) as terrain:
+        if frames and config.crop > min(terrain.grid.height, terrain.grid.width):
+            raise _no_positions(images, config, terrain.grid.gsd)
+        first, last = (len(frames) * k // count for k in (index, index + 1))
+        mine, skipped = check_frames(frames[first:last], terrain.grid, config.skip_outside)
+        if frames and not mine and count == 1:
+            raise InputError(
+                "no image touches the DEM; check that images and DEM show the same place (longitudes, body, CRS)."
+            )
+        sizes = {"frame": len(mine), "y": terrain.grid.height, "x": terrain.grid.width, "window": 4}
+        with ArtefactWriter(
+            output.file,
+            SCENE,
+            sizes,
+            config=terrain.config,
+            inputs=[dem] + ([images] if images else []),
+            attributes=terrain.attributes | {"crop_px": np.int32(config.crop)},
+            overwrite=output.overwrite,
+        ) as writer:
+            _write_grid(writer, terrain.grid)
+            known, low, high = terrain.write(writer, progress)
+            writer.file.attrs["elevation_low_m"], writer.file.attrs["elevation_high_m"] = low, high
+            writer.file.attrs["dem_valid_px"] = known
+            for name in ("valid", "valid_position", "frame_window"):  # also where there is no image at all
+                writer.dataset(name)
+            elevation = terrain.file or writer.file
+            areas = [
+                write_validity(
+                    f, k, terrain.grid, (low, high), elevation, writer, config, _of_all(progress, k, len(mine))
+                )
+                for k, f in enumerate(mine)
+            ]
+            progress(len(mine), len(mine), "image masks")
+            if frames and count == 1 and not any(areas):
+                raise _no_positions(images, config, terrain.grid.gsd)
+            writer.write("valid_area_m2", np.array(areas))
+            write_frames(writer, [with_digests(frame) for frame in mine])
+    return summarise(output.file, tuple(skipped))
+
+
+def _of_all(progress: Progress, index: int, count: int) -> Progress:
+    """Of one image among ``count``: progress over all of them."""
+    return lambda done, total, what: progress(1000 * index + 1000 * done // max(1, total), 1000 * count, what)
+
+
+def summarise(scene: Path, skipped: tuple[str, ...] = ()) -> Summary:
+    """What a scene holds, for the table at the end."""
+    with open_artefact(scene, SCENE) as file:
+        grid = read_grid(file, scene)
+        low, high, known = (file.attrs[k] for k in ("elevation_low_m", "elevation_high_m", "dem_valid_px"))
+        frames = tuple(load_frames(file, scene))
+        return Summary(
+            grid,
+            float(known) / (grid.height * grid.width),
+            (float(low), float(high)),
+            frames,
+            tuple(float(a) / 1e6 for a in file["valid_area_m2"][...]),
+            bool(read_config(file)["resampled"]),
+            skipped,
+            tuple(f for f, window in zip(frames, file["frame_window"][...], strict=True) if not window[2]),
+        )
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """Where the scene's elevations come from. ``write`` gives the number of valid pixels, and the extremes."""
+
+    grid: Grid
+    config: dict[str, Any]
+    attributes: dict[str, Any]
+    write: Callable[[ArtefactWriter, Progress | None], tuple[int, float, float]]
+    file: h5py.File | None = None  # where they can be read at once; views cannot be, while they are written
+
+
+@contextlib.contextmanager
+def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, progress: Progress) -> Iterator[Terrain]:
+    index, count = config.shard
+    if is_artefact(dem):
+        if images is None:
+            raise ConfigError(f"{dem}: a scene already; add `images`, or give a DEM that GDAL reads.")
+        with open_artefact(dem, SCENE, need=()) as file:
+            grid = read_grid(file, dem)
+            if abs(grid.radius - body.radius) > 1e-6 * body.radius:
+                raise ConfigError(f"{dem}: its body has a radius of {grid.radius:g} m; give the same `body`.")
+            if config.gsd is not None and abs(config.gsd - grid.gsd) > 1e-3 * grid.gsd:
+                raise ConfigError(f"{dem}: a grid at {grid.gsd:g} m; leave `gsd` away, or give the DEM itself.")
+            own = ("crop", "skip_outside", "shard", "block")
+            stored = read_config(file) | {k: v for k, v in asdict(config).items() if k in own}
+            names = ("gsd_m", "body_radius_m", "elevation_source")
+            yield Terrain(
+                grid, stored, {k: file.attrs[k] for k in names}, partial(take_elevation, dem, file, count > 1), file
+            )
+        return
+    if images is not None and count > 1:
+        raise ConfigError(
+            "`shard`: the DEM comes first, then its images. Run 'lunargr ingest DEM' with `shard` and without `images`, and merge; "
+            "then give that scene in place of the DEM, with `images` and `shard`."
+        )
+    with rasters.open_raster(dem, "a DEM") as dataset:
+        crs = require_crs(str(dem), dataset.crs, dataset.transform)
+        check_body(str(dem), crs, body)
+        plan = plan_grid(dem, dataset, config.gsd, body.radius, progress)
+        attributes = {"gsd_m": plan.grid.gsd, "body_radius_m": body.radius, "elevation_source": dem.name}
+        if count > 1:
+            bands = math.ceil(plan.grid.height / config.block)
+            rows = [min(plan.grid.height, config.block * (bands * k // count)) for k in (index, index + 1)]
+            attributes["shard_rows"] = np.array(rows, np.int64)
+        stored = asdict(config) | {"resampled": plan.factor is None}
+        yield Terrain(plan.grid, stored, attributes, partial(write_elevation, dem, dataset, plan, config))
+
+
+def count_bands(dem: Path, config: Config) -> int:
+    """Rows of blocks of a raster's grid: more shards than these have nothing to do."""
+    with rasters.open_raster(dem, "a DEM") as dataset:
+        require_crs(str(dem), dataset.crs, dataset.transform)
+        plan = plan_grid(dem, dataset, config.gsd, find_body(config.body).radius)
+    return math.ceil(plan.grid.height / config.block)
+
+
+def image_names(images: Path, config: Config) -> list[str]:
+    """The images of a table."""
+    return [frame.image_id for frame in read_frames(images, find_body(config.body))]
+
+
+def source_files(images: Path, config: Config) -> list[Path]:
+    """The images and camera models that a table names."""
+    return [p for f in read_frames(images, find_body(config.body)) for p in (f.path, f.camera) if p is not None]
+
+
+def check_positions(parts: Sequence[Path], images: Path, config: Config) -> None:
+    """What one run checks at its end, for shards: that any crop fits anywhere. Raises GeometryError."""
+    gsd = math.nan
+    for part in parts:
+        with open_artefact(part, SCENE) as file:
+            if file["valid_area_m2"][...].any():
+                return
+            gsd = float(file.attrs["gsd_m"])
+    raise _no_positions(images, config, gsd)
+
+
+def _no_positions(images: Path | None, config: Config, gsd: float) -> GeometryError:
+    return GeometryError(
+        f"{images}: a crop of {config.crop} px ({config.crop * gsd:g} m) is larger than any valid region of any image; "
+        "choose a smaller `crop` or a finer `gsd`."
+    )
+
+
+def is_artefact(path: Path) -> bool:
+    """Whether a file is one of our own and not a raster."""
+    silence_hdf5()
+    if not (path.is_file() and h5py.is_hdf5(path)):
+        return False
+    try:
+        with h5py.File(path, "r") as file:
+            return "lunargr_schema" in file.attrs
+    except OSError:  # damaged: whoever opens it as a raster says so
+        return False
+
+
+def _write_grid(writer: ArtefactWriter, grid: Grid) -> None:
+    writer.write_crs(grid.crs_wkt, grid.transform)
+    writer.write("x", grid.xy(0, np.arange(grid.width))[0])
+    writer.write("y", grid.xy(np.arange(grid.height), 0)[1])

@@ -1,0 +1,122 @@
+"""From files to files: measured and rendered pictures in, shares of consistent matches and coloured pictures out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from schemas import ConfigError, atomic_path, write_json
+from schemas.files.outputs import Output, Target, check_outputs
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.match.base import Matches, Models, get_matcher
+from stages.match.comparisons import comparisons
+from stages.match.config import Config
+from stages.match.consistency import summarise
+from stages.match.pictures import inside, match_figure, stretch_limits, to_grey
+
+FIGURES = 4  # comparisons that are drawn
+
+
+def run(
+    files: list[Path],
+    output: Output | Path | None,
+    config: Config,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
+) -> dict[str, Any]:
+    """Match every comparison with every matcher; returns what the JSON holds. Raises LunargrError.
+
+    output : the JSON and the folder of pictures, where they are wanted; a bare path is the JSON's
+    """
+    output = Output.of(output)
+    json_file, figures = output.json or output.path, output.figures
+    if config.count < 1:
+        raise ConfigError(f"`count`: expected at least 1, found {config.count}.")
+    targets = [] if json_file is None else [Target(json_file, "json")]
+    if figures is not None:
+        names = (figures / _picture(m, k) for m in config.matchers for k in range(FIGURES))
+        targets += [Target(path, "figures") for path in dict.fromkeys(names)]
+    networks = [path for path in (config.features_model, config.lightglue_model) if path is not None]
+    check_outputs(targets, [*files, *networks], output.overwrite)
+    models = Models(config.features_model, config.lightglue_model)
+    matchers = [get_matcher(name, models) for name in config.matchers]
+    total, source = comparisons(files, config.split, config.count, config.seed, config.device)
+    collected: dict[str, dict[str, list[Matches]]] = {m.name: {} for m in matchers}
+    ground: list[int] = []
+    progress(0, total, "match")
+    for number, comparison in enumerate(source):
+        ground.append(comparison.ground)
+        limits = stretch_limits(comparison.measured)
+        measured, known = to_grey(comparison.measured, limits)
+        pictures = {}
+        for name, image in comparison.rendered.items():
+            pictures[name], also_known = to_grey(image, limits if comparison.common_scale else stretch_limits(image))
+            known = known & also_known
+        for matcher in matchers:
+            found = {name: inside(matcher.match(measured, picture), known) for name, picture in pictures.items()}
+            for name, matches in found.items():
+                collected[matcher.name].setdefault(name, []).append(matches)
+            if figures is not None and number < FIGURES:
+                _save(
+                    match_figure(measured, pictures, found, f"{comparison.label}, {matcher.title}"),
+                    figures / _picture(matcher.name, number),
+                )
+        progress(number + 1, total, "match")
+    result = {
+        "size_px": [512, 384],
+        "crops": total,
+        "tiles": len(set(ground)),
+        "files": [f.name for f in files],
+        "matchers": {
+            m.name: {name: summarise(found, ground) for name, found in collected[m.name].items()} for m in matchers
+        },
+    }
+    if json_file is not None:
+        write_json(json_file, result)
+    return result
+
+
+def _picture(matcher: str, number: int) -> str:
+    return f"match_{matcher}_{number + 1}.png"
+
+
+def _save(figure: Any, path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    with atomic_path(path) as partial:
+        figure.savefig(partial, dpi=110, facecolor="white")
+    plt.close(figure)
+
+
+def _shift(row: dict[str, Any]) -> tuple[float, float]:
+    return row["median_shift_right_px"], row["median_shift_down_px"]
+
+
+def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Columns and cells of the table on the terminal."""
+
+    def share(row: dict[str, Any], threshold: int) -> str:
+        key = f"within_{threshold}_px_percent"
+        if row[key] is None:
+            return "-"
+        low, high = row[f"{key}_low"], row[f"{key}_high"]
+        return f"{row[key]:.1f}" + ("" if low is None else f" ({low:.1f} .. {high:.1f})")
+
+    cells = [
+        [matcher, name, str(row["matches"]), *(share(row, t) for t in (1, 3, 5))]
+        + ["-" if row[k] is None else f"{row[k]:.2f}" for k in ("mean_error_px", "median_error_px")]
+        + ["-" if row["median_shift_right_px"] is None else "{:+.1f}, {:+.1f}".format(*_shift(row))]
+        for matcher, rows in result["matchers"].items()
+        for name, row in rows.items()
+    ]
+    return [
+        "matcher",
+        "rendering",
+        "matches",
+        "< 1 px, %",
+        "< 3 px, %",
+        "< 5 px, %",
+        "mean, px",
+        "median, px",
+        "shift, px",
+    ], cells

@@ -1,0 +1,157 @@
+"""How the variables of the parts become those of the whole: end to end, row by row, as views, or taken once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from schemas import ArtefactWriter, read_strings
+from stages.merge.parts import ROWS, Parts, moved
+
+PATHS = ("path", "camera")
+BUFFER = 1 << 26  # bytes that are copied at a time
+
+
+def join_variable(parts: Parts, name: str, writer: ArtefactWriter, virtual: bool) -> None:
+    """One variable of the whole; ``virtual`` leaves a large one in the parts."""
+    files, first = parts.files, parts.files[0]
+    dims = parts.schema[name].dims
+    by_rows = parts.by_rows and dims[-2:] == ("y", "x")
+    along = dims.index(parts.record) if parts.record and parts.record in dims else None
+    if virtual and (pieces := _view(parts, name, along, by_rows)):
+        writer.link(name, pieces)
+        return
+    unit = first[name].attrs.get("units")
+    target = writer.dataset(
+        name,
+        unit=str(unit) if unit is not None and parts.schema[name].unit_choices else None,
+        decimals=_decimals(files, name),
+    )
+    if along is not None:
+        _concatenate(files, name, target, along)
+    elif by_rows:
+        _overlay(files, name, target)
+    elif dims[-2:] == ("y", "x"):
+        _copy_rows(first[name], target, 0, target.shape[-2])
+    elif name not in PATHS and (target.shape == () or 0 not in target.shape):
+        target[...] = _known(files, name)
+
+
+def join_paths(parts: Parts, merged: h5py.File, output: Path) -> None:
+    """The names of images and cameras, relative to the whole's folder instead of the parts'."""
+    sources = list(zip(parts.paths, parts.files, strict=True))
+    for name in PATHS:
+        if name in merged:
+            found = sources if parts.record == "frame" else sources[:1]
+            names = [moved(v, path, output) for path, file in found for v in read_strings(file, name)]
+            merged[name][...] = np.array(names, dtype=object)
+
+
+def _view(parts: Parts, name: str, along: int | None, by_rows: bool) -> list[Any]:
+    """Where each piece of a view comes from; empty where the variable is copied."""
+    files, source = parts.files, parts.files[0][name]
+    if source.ndim < 2 or source.dtype.kind not in "iufb" or not any(f[name].size for f in files):
+        return []
+    if along is not None:
+        return _end_to_end(files, name, along)
+    if by_rows and all(ROWS in f.attrs for f in files):
+        return _own_rows(files, name)
+    everything = (slice(None),) * source.ndim
+    return [(everything, source, everything)] if source.is_virtual and not parts.by_rows else []
+
+
+def _end_to_end(files: Sequence[h5py.File], name: str, axis: int) -> list[Any]:
+    place, found = 0, []
+    for file in files:
+        source, count = file[name], file[name].shape[axis]
+        before, after = (slice(None),) * axis, (slice(None),) * (source.ndim - axis - 1)
+        if count:
+            found.append(((*before, slice(place, place + count), *after), source, (slice(None),) * source.ndim))
+        place += count
+    return found
+
+
+def _own_rows(files: Sequence[h5py.File], name: str) -> list[Any]:
+    found = []
+    for file in files:
+        first, last = (int(v) for v in file.attrs[ROWS])
+        part = (*(slice(None),) * (file[name].ndim - 2), slice(first, last), slice(None))
+        if last > first:
+            found.append((part, file[name], part))
+    return found
+
+
+def _decimals(files: Sequence[h5py.File], name: str) -> int | None:
+    """Digits after the point that a variable keeps, where all parts keep as many (ArtefactWriter.dataset)."""
+    kept = {file[name].scaleoffset for file in files if file[name].size}
+    return kept.pop() if len(kept) == 1 and files[0][name].dtype.kind == "f" else None
+
+
+def _concatenate(files: Sequence[h5py.File], name: str, target: h5py.Dataset, axis: int) -> None:
+    place = 0
+    for file in files:
+        source = file[name]
+        if not _move_chunks(source, target, axis, place):
+            step = max(1, BUFFER // max(1, source.nbytes // max(1, source.shape[axis])))
+            for k in range(0, source.shape[axis], step):
+                n = min(step, source.shape[axis] - k)
+                key: tuple[Any, ...] = (slice(None),) * axis
+                target[(*key, slice(place + k, place + k + n))] = source[(*key, slice(k, k + n))]
+        place += source.shape[axis]
+
+
+def _move_chunks(source: h5py.Dataset, target: h5py.Dataset, axis: int, place: int) -> bool:
+    """Copy what is stored, as it is stored, where both files cut the variable alike: masks stay sparse and deflated.
+
+    Chunks that nobody wrote stay unwritten. False where it cannot be done.
+    """
+    alike = source.chunks is not None and source.chunks == target.chunks and source.dtype == target.dtype
+    if not alike or source.chunks[axis] != 1 or source.compression != target.compression:
+        return False
+    how = [(d.compression_opts, d.shuffle, d.scaleoffset) for d in (source, target)]
+    if how[0] != how[1]:
+        return False
+    offsets: list[tuple[int, ...]] = []
+    source.id.chunk_iter(lambda info: offsets.append(info.chunk_offset))
+    for offset in offsets:
+        mask, stored = source.id.read_direct_chunk(offset)
+        moved = (*offset[:axis], offset[axis] + place, *offset[axis + 1 :])
+        target.id.write_direct_chunk(moved, stored, mask)
+    return True
+
+
+def _known(files: Sequence[h5py.File], name: str) -> Any:
+    """What the parts have in common; NaN where one part knows nothing (an image that it did not register) gives way."""
+    values = files[0][name][...]
+    for file in files[1:]:
+        if values.dtype.kind == "f" and name in file and file[name].shape == values.shape:
+            values = np.where(np.isnan(values), file[name][...], values)
+    return values
+
+
+def _overlay(files: Sequence[h5py.File], name: str, target: h5py.Dataset, rows: int = 256) -> None:
+    """Each part's own rows; where parts do not say which these are, what any part knows (others hold NaN, or 0)."""
+    if all(ROWS in file.attrs for file in files):
+        for file in files:
+            _copy_rows(file[name], target, *(int(v) for v in file.attrs[ROWS]))
+        return
+    height = target.shape[-2]
+    for first in range(0, height, rows):
+        part = (..., slice(first, min(height, first + rows)), slice(None))
+        joined = files[0][name][part]
+        for file in files[1:]:
+            other = file[name][part]
+            joined = (
+                np.where(np.isnan(joined), other, joined) if joined.dtype.kind == "f" else np.maximum(joined, other)
+            )
+        target[part] = joined
+
+
+def _copy_rows(source: h5py.Dataset, target: h5py.Dataset, first: int, last: int, rows: int = 256) -> None:
+    for row in range(first - first % rows, last, rows):
+        part = (..., slice(max(first, row), min(last, row + rows)), slice(None))
+        target[part] = source[part]

@@ -1,0 +1,83 @@
+"""merge: join the parts that shards of one stage wrote into the artefact that one run would have written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from schemas import ArtefactWriter, Schema, atomic_path, read_config
+from schemas.command_line import whole_command
+from schemas.files.companions import companions_of
+from schemas.files.outputs import Output, Target, check_outputs
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.merge.config import Config
+from stages.merge.joining import join_paths, join_variable
+from stages.merge.parts import MAPS, Parts, open_parts
+from stages.physics.maps.geotiff import write_geotiff
+from stages.physics.maps.grid import read_grid
+
+
+def run(
+    parts: Sequence[Path],
+    output: Output | Path,
+    config: Config = Config(),
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
+) -> Schema:
+    """Join ``parts``, in the order of their shards. Raises ArtefactError where they are not parts of one whole.
+
+    The GeoTIFF of a map is written too, if its parts want one.
+    """
+    output = Output.of(output)
+    with open_parts(parts) as opened:
+        made_with = read_config(opened.files[0]) | {"shard": [0, 1]}
+        as_geotiff = opened.schema.name in MAPS and made_with.get("geotiff", True)
+        _check_output(opened, output, as_geotiff)
+        record, inputs = _provenance(opened, output.file, config)
+        seed = int(opened.files[0].attrs.get("seed", -1))
+        with ArtefactWriter(
+            output.file,
+            opened.schema,
+            opened.sizes(),
+            config=made_with,
+            inputs=inputs,
+            seed=None if seed < 0 else seed,
+            attributes=opened.attributes(output.file) | record,
+            overwrite=output.overwrite,
+        ) as writer:
+            if "crs" in opened.files[0]:
+                opened.files[0].copy("crs", writer.file, "crs")
+            for number, name in enumerate(opened.names):
+                progress(number, len(opened.names), f"merging {name}")
+                join_variable(opened, name, writer, config.virtual)
+            join_paths(opened, writer.file, output.file)
+            if as_geotiff:
+                with companions_of(output.file), atomic_path(output.geotiff_path) as partial:
+                    write_geotiff(partial, writer.file, read_grid(writer.file, output.file))
+            progress(len(opened.names), len(opened.names), "merging")
+        return opened.schema
+
+
+def _check_output(parts: Parts, output: Output, as_geotiff: bool) -> None:
+    """Refuse to replace parts, but for those in a run's own folder beside its output, which go with it. Raises ConfigError."""
+    foreign = [path for path in parts.paths if f"{output.file.name}.parts" not in path.parts]
+    targets = [Target(output.file)]
+    if as_geotiff:
+        targets.append(Target(output.geotiff_path, what=f"the GeoTIFF of {output.file.name}"))
+    check_outputs(targets, foreign, output.overwrite)
+
+
+def _provenance(parts: Parts, output: Path, config: Config) -> tuple[dict[str, Any], list[Path]]:
+    """What the whole says of how it was made: root attributes, and inputs."""
+    if config.inputs is not None:
+        return {}, list(config.inputs)
+    if not parts.of_one_run:
+        return {}, parts.paths
+    # The whole is what that run in one piece would have made, from the same inputs.
+    first = parts.files[0].attrs
+    told = {k: first[k] for k in ("inputs", "provenance", "folder") if k in first}
+    told["command"] = whole_command(str(first.get("command", "")), output)
+    told["parts"] = json.dumps([path.name for path in parts.paths])
+    return told, []

@@ -1,0 +1,136 @@
+"""Standard deviations of coefficient maps, from the residuals of the images.
+
+A residual is taken for the sum of independent errors: of each map, by its effect on the pixel, and of the image itself,
+
+    var(measured - rendered) = sum over maps of (dI/dc sigma_c)^2 + noise^2,
+
+where ln sigma_c is linear in the trained network's last features (Gaussian likelihood, the maps held fixed: a last layer
+fitted afterwards costs maps nothing). What terrain does not show rules these errors, and neighbouring pixels share it: the
+deviations are those of single pixels, means over many are hardly better known. One factor for all is then chosen on
+validation ground, which the maps never saw, such that 95 % of its pixels lie within 1.96 standard deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stages.network.losses import Radiometry
+from stages.network.normalisation import scale_elevation
+from stages.network.pixels import Pixels, sample_pixels
+from stages.network.predictor import Predictor
+from stages.pairs.reader import Batch, PairReader
+from stages.physics.formation.chain import Extension, form
+from stages.physics.photometry import masked_radiance_factor
+
+STEP = 1e-4  # of a parameter's range, for its effect on the image
+RIDGE = 1e-3  # on the features' weights: deviations of ground unlike any other stay near the mean
+WIDTH_95 = 1.959964  # standard deviations within which a Gaussian has 95 %
+ROUNDS = 60
+
+
+def fit_deviations(
+    predictor: Predictor,
+    radiometry: Radiometry,
+    reader: PairReader,
+    train: NDArray[np.int64],
+    validation: NDArray[np.int64],
+    extensions: Sequence[Extension] = (),
+) -> None:
+    """Write the last layer of the deviations, and ``image_noise``, into a trained predictor.
+
+    train, validation : (n,), indices of pairs
+    """
+    predictor.eval()
+    seen = _residuals(predictor, radiometry, reader, train, extensions)
+    residual, effects, features = seen
+    middle, spread = features.mean(dim=0), features.std(dim=0).clamp(min=1e-6)
+    weights, constants, noise = _likelihood(residual, effects, (features - middle) / spread)
+    if len(validation):
+        residual, effects, features = _residuals(predictor, radiometry, reader, validation, extensions)
+    deviation = _deviation(effects, (features - middle) / spread, weights, constants, noise)
+    factor = torch.quantile((residual / deviation).abs(), 0.95) / WIDTH_95
+    maps, head = predictor.maps, predictor.net.head
+    count = len(maps.maps)
+    with torch.no_grad():
+        assert head.bias is not None
+        head.weight[count:, :, 0, 0] = (weights / spread / maps.output_scale).to(head.weight)
+        head.bias[count:] = 0
+        shift = constants - (weights * middle / spread).sum(dim=1) + factor.log()
+        maps.start[count:] = shift.to(maps.start)
+    predictor.image_noise = float(noise.exp() * factor)
+
+
+@torch.no_grad()
+def _residuals(
+    predictor: Predictor,
+    radiometry: Radiometry,
+    reader: PairReader,
+    indices: NDArray[np.int64],
+    extensions: Sequence[Extension],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Of some pixels: residuals (N,), I/F; effects of the maps on them (N, M), I/F per unit; the last features (N, F)."""
+    maps, model = predictor.maps, predictor.model
+    device = maps.start.device
+
+    def more(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        x = scale_elevation(batch.observation.elevation.to(device), predictor.elevation_scale)
+        features = predictor.net.features(x)
+        coefficients = maps.stack(maps.shifted(predictor.net.read_out(features)), dim=1).cpu()
+        return features.float().cpu(), coefficients, form(batch.observation, model, coefficients, extensions)
+
+    pixels = sample_pixels(reader, indices, radiometry, more)
+    features, coefficients, rendered = pixels.more
+    return pixels.image - rendered, _effects(predictor, pixels, coefficients), features
+
+
+def _effects(predictor: Predictor, pixels: Pixels, coefficients: Tensor) -> Tensor:
+    """dI/dc of the maps, (N, M), by central differences within their bounds. coefficients : (N, C)"""
+    model = predictor.model
+    values = model.unpack(coefficients, dim=1)
+    found = []
+    for p in model.parameters:
+        if p.name in predictor.maps.maps:
+            step = STEP * (p.upper - p.lower)
+            above, below = ((values[p.name] + s).clamp(p.lower, p.upper) for s in (step, -step))
+            images = [masked_radiance_factor(model, {**values, p.name: v}, pixels.angles) for v in (above, below)]
+            found.append((images[0] - images[1]) / (above - below) * pixels.light)
+    return torch.stack(found, dim=1)
+
+
+def _variance(effects: Tensor, features: Tensor, weights: Tensor, constants: Tensor, noise: Tensor) -> Tensor:
+    # products and sums instead of BLAS, whose sums hang on where arrays lie in memory
+    logarithm = (features[:, None] * weights).sum(dim=2) + constants
+    return (effects * logarithm.exp()).square().sum(dim=1) + (2 * noise).exp()
+
+
+def _deviation(effects: Tensor, features: Tensor, weights: Tensor, constants: Tensor, noise: Tensor) -> Tensor:
+    return _variance(effects, features, weights, constants, noise).sqrt()
+
+
+def _likelihood(residual: Tensor, effects: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights (M, F), constants (M,) and ln noise () of the largest likelihood."""
+    rms = residual.square().mean().sqrt().clamp(min=1e-9)
+    share = effects.square().mean(dim=0).sqrt().clamp(min=1e-9)
+    weights = torch.zeros(effects.shape[1], features.shape[1], dtype=torch.float64, requires_grad=True)
+    # At first every map explains as much.
+    constants = (rms / share / effects.shape[1] ** 0.5).log().requires_grad_()
+    noise = (0.3 * rms).log().requires_grad_()
+    found = [weights, constants, noise]
+    optimizer = torch.optim.LBFGS(found, max_iter=ROUNDS, line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimizer.zero_grad()
+        variance = _variance(effects, features, *found)
+        value = (variance.log() + residual.square() / variance).mean() / 2
+        value = value + RIDGE * (weights.square().sum() + (constants - start).square().sum() * 0.1)
+        value.backward()
+        return value
+
+    start = constants.detach().clone()
+    optimizer.step(loss)  # type: ignore[arg-type]
+    return weights.detach(), constants.detach(), noise.detach()

@@ -1,0 +1,61 @@
+"""The precision, fp32 or bf16, in which a machine trains and predicts fastest."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from schemas.errors import ConfigError
+from stages.network.cpu.mapper import Mapper
+from stages.network.predictor import Predictor
+
+CLOSE = 0.02  # of a coefficient's spread: what bf16 may cost in inference
+
+
+def check_precision(name: str) -> None:
+    """Raises ConfigError for anything but auto, fp32 and bf16."""
+    if name not in ("auto", "fp32", "bf16"):
+        raise ConfigError(f"`precision`: expected auto, fp32 or bf16, found '{name}'.")
+
+
+def choose_precision(device: torch.device) -> str:
+    """'bf16' for training where the processor multiplies matrices of it, else 'fp32'.
+
+    Nothing is timed: the same machine must choose alike, however busy it is.
+    """
+    if device.type == "cuda":
+        return "bf16" if torch.cuda.is_bf16_supported() else "fp32"
+    return "bf16" if bool(getattr(torch.cpu, "_is_amx_tile_supported", lambda: False)()) else "fp32"
+
+
+def choose_inference_precision(predictor: Predictor, sample: NDArray[np.float32], device: torch.device) -> str:
+    """'bf16' where the processor has instructions for it and the coefficients of a sample keep their meaning.
+
+    Nothing is timed: all parts of a map, on machines of one kind, must choose alike. sample : (H, W) m
+    """
+    if device.type == "cpu":
+        able = any(
+            bool(getattr(torch.cpu, name, lambda: False)())
+            for name in ("_is_amx_tile_supported", "_is_avx512_bf16_supported")
+        )
+    else:
+        able = torch.cuda.is_bf16_supported()
+    if not able:
+        return "fp32"
+    exact, short = (_coefficients(predictor, device, precision, sample) for precision in ("fp32", "bf16"))
+    error = np.sqrt(np.square(short - exact).mean(axis=(1, 2)))
+    spread = exact.std(axis=(1, 2))
+    return "bf16" if bool((error <= CLOSE * spread + 1e-6).all()) else "fp32"
+
+
+def _coefficients(predictor: Predictor, device: torch.device, precision: str, sample: NDArray) -> NDArray[np.float32]:
+    """(C, H, W) of a sample that is taken for a whole map."""
+    rows, columns = (-(-edge // predictor.net.stride) * predictor.net.stride for edge in sample.shape)
+    continued = np.pad(sample, ((2, rows + 2 - sample.shape[0]), (0, columns - sample.shape[1])), mode="edge")
+
+    def terrain(first: int, last: int, left: int, right: int) -> NDArray:
+        return np.ascontiguousarray(continued[first + 2 : last + 2, left:right])
+
+    found = Mapper(predictor, device, precision).strips(terrain, sample.shape, (0, 0, *sample.shape))
+    return np.concatenate([values for _, values in found], axis=1)

@@ -1,0 +1,182 @@
+"""The stage itself: image by image, crop by crop."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas import CROPS, PAIRS, ArtefactWriter, InputError, check_output, open_artefact
+from schemas.files.outputs import Output
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.physics.horizon.scene import horizon_in_scene
+from stages.physics.images.displacement import Field
+from stages.physics.images.source_images import Source, open_source
+from stages.physics.images.table import Frame, load_frames
+from stages.physics.maps.grid import LocalFrames
+from stages.physics.maps.window import Window
+from stages.project.config import Config
+from stages.project.geometry import Geometry, check_directions, crop_geometry
+from stages.project.inputs import Scene, check_places, check_sources, open_scene, scene_of
+from stages.project.register import displacement_at, register, write_registration
+from stages.project.summary import Registered, Summary
+from stages.project.writing import Pair, PairDatasets, Tally, kept_decimals
+
+OF_THE_CROP = ("longitude_deg", "latitude_deg", "row", "col", "image_index", "site", "tile", "split")
+
+
+def run(
+    crops: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
+) -> Summary:
+    """Write ``pairs.h5``. Raises ArtefactError, ConfigError, InputError or GeometryError; then nothing is written."""
+    output = Output.of(output)
+    config.check()
+    check_output(output.file, [crops, scene_of(crops, config)], output.overwrite)
+    with open_artefact(crops, CROPS) as file, open_scene(crops, file, config) as scene:
+        frames = load_frames(file, crops)
+        total, size = file["elevation"].shape[:2]
+        part = slice(*(total * k // config.shard[1] for k in (config.shard[0], config.shard[0] + 1)))
+        check_sources(crops, [frames[k] for k in sorted({int(k) for k in file["image_index"][part]})])
+        check_places(crops, file, scene.elevation.shape)
+        units = _units(crops, file, frames, part)
+        with ArtefactWriter(
+            output.file,
+            PAIRS,
+            {"pair": part.stop - part.start, "y": size, "x": size, "enu": 3, "frame": len(frames)},
+            config=asdict(config),
+            inputs=[crops, scene.path],
+            seed=int(file.attrs["seed"]),
+            attributes={"gsd_m": scene.grid.gsd, "body_radius_m": scene.grid.radius},
+            overwrite=output.overwrite,
+        ) as writer:
+            return _project(writer, Crops(file, part), scene, frames, units, config, progress)
+
+
+@dataclass(frozen=True)
+class Crops:
+    """The crops of one shard. part : its rows of crops.h5; row, col, image_index : (n,)"""
+
+    file: h5py.File
+    part: slice
+
+    def column(self, name: str) -> NDArray:
+        """(n,) values of one variable."""
+        return np.asarray(self.file[name][self.part])
+
+    def elevation(self, k: int) -> NDArray[np.float32]:
+        """(size, size) m. Crop by crop: an image may have more of them than fit into memory."""
+        return np.asarray(self.file["elevation"][self.part.start + k])
+
+    @property
+    def size(self) -> int:
+        """px, of a crop's side"""
+        return int(self.file["elevation"].shape[1])
+
+
+@dataclass(frozen=True)
+class View:
+    """What one image shows of its crops. rows, cols : (m,) of their middles; mean : (m,) m; local : their frames;
+    field : what registration takes off, None without
+    """
+
+    source: Source
+    field: Field | None
+    rows: NDArray
+    cols: NDArray
+    mean: NDArray[np.float64]
+    local: LocalFrames
+    geometry: Geometry
+
+
+def _units(crops: Path, file: h5py.File, frames: list[Frame], part: slice) -> str:
+    units = {frames[int(k)].units for k in np.unique(file["image_index"][part])} or {"iof"}
+    if len(units) > 1:
+        raise InputError(f"{crops}: expected one kind of units, found both 'iof' and 'dn'; ingest them apart.")
+    return units.pop()
+
+
+def _project(
+    writer: ArtefactWriter,
+    crops: Crops,
+    scene: Scene,
+    frames: list[Frame],
+    units: str,
+    config: Config,
+    progress: Progress,
+) -> Summary:
+    decimals = {} if config.exact else kept_decimals(frames, units, scene.grid.gsd)
+    # of the whole table, not of this shard's images: the parts of one whole hold the same variables
+    rays = any(f.camera for f in frames)
+    datasets = PairDatasets(writer, "1" if units == "iof" else "dn", decimals, rays, config.register is not None)
+    tally, registered = Tally(), list[Registered]()
+    image_index, rows, cols = (crops.column(name) for name in ("image_index", "row", "col"))
+    total = len(image_index)
+    for index in np.unique(image_index).tolist():
+        frame, mine = frames[index], np.flatnonzero(image_index == index)
+        # Even crops are centred on the corner shared by their four middle pixels.
+        local = scene.grid.local_frames(rows[mine] - 0.5, cols[mine] - 0.5)
+        mean = np.array([crops.elevation(k).mean(dtype=float) for k in mine.tolist()])
+        radius = scene.grid.radius
+        geometry = crop_geometry(local, mean, radius, frame.sun_position(), frame.camera_position(radius))
+        check_directions(frame, geometry)
+        with open_source(frame, scene.grid, scene.elevation, scene.heights) as source:
+            field = None
+            if config.register:
+                progress(tally.pairs, total, f"registration ({frame.image_id})")
+                registered.append(register(frame, index, source, crops.file, scene, config))
+                field = registered[-1].field
+            view = View(source, field, rows[mine], cols[mine], mean, local, geometry)
+            for place, k in enumerate(mine.tolist()):
+                if tally.pairs % 20 == 0:
+                    progress(tally.pairs, total, f"pairs ({frame.image_id})")
+                pair = _pair(view, place, crops.elevation(k), scene)
+                datasets.put(k, pair)
+                tally.add(pair)
+    progress(total, total, "pairs")
+    for name in OF_THE_CROP:
+        writer.write(name, crops.column(name))
+    writer.write("image_id", [f.image_id for f in frames])
+    writer.write("solar_distance_au", np.array([f.solar_distance_au for f in frames]))
+    if config.register:
+        write_registration(writer, frames, registered)
+    return tally.summary(crops.size, tuple(registered))
+
+
+def _pair(view: View, place: int, heights: NDArray[np.float32], scene: Scene) -> Pair:
+    """The image, the Sun, the camera and the horizon of the crop at ``place`` among those of one image."""
+    grid, size = scene.grid, heights.shape[0]
+    row, col = int(view.rows[place]), int(view.cols[place])
+    corner = row - size // 2, col - size // 2
+    pixels = view.source.read(*corner, size, size, view.field)
+    sun, camera = view.geometry.sun[place], view.geometry.camera[place]
+    if pixels.ortho is not None:
+        # the line-scan camera's own place for this crop, not the one for the middle of its image
+        centre = view.local.up[place] * (grid.radius + view.mean[place])
+        camera = view.local.axes[place] @ (pixels.ortho.camera_position - centre)
+    east, north, _ = sun
+    angle = horizon_in_scene(
+        scene.elevation,
+        scene.overview,
+        Window(*corner, size, size),
+        grid.gsd,
+        math.atan2(east, north) % (2 * math.pi),
+        body_radius=grid.radius,
+    )
+    displacement = (0.0, 0.0)
+    if view.field is not None:
+        displacement = displacement_at(view.source, view.field, row - 0.5, col - 0.5, view.mean[place])
+    return Pair(
+        image=pixels.values,
+        elevation=heights,
+        valid=pixels.valid & np.isfinite(heights),
+        horizon=angle,
+        sun=sun,
+        camera=camera,
+        convergence_deg=float(view.geometry.convergence_deg[place]),
+        displacement=displacement,
+        ortho=pixels.ortho,
+    )

@@ -1,0 +1,15 @@
+"""sample: crops and a geographic split. stage: all of it; places: where crops are; audit: what ground the parts have."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from schemas.later import imported_later
+from stages.sample.config import Config
+
+if TYPE_CHECKING:
+    from stages.sample.audit import Part, audit, read_audit
+    from stages.sample.stage import run
+
+__getattr__ = imported_later(__name__, "stage", "audit")
+__all__ = ["Config", "Part", "audit", "read_audit", "run"]

@@ -1,0 +1,58 @@
+"""What is refused before anything is learned."""
+
+from __future__ import annotations
+
+import math
+
+from schemas import ConfigError, InputError
+from stages.common.progress import Say
+from stages.network.checkpoint_layout import DEEPEST, WIDEST
+from stages.network.precision import check_precision
+from stages.network.predictor import choose_device
+from stages.pairs.reader import PairReader
+from stages.physics.photometry import get_model
+from stages.train.config import Config
+
+
+def check(config: Config) -> None:
+    """Refuse options that cannot be. Raises ConfigError, RegistryError."""
+    if config.epochs < 1 or config.batch < 1:
+        raise ConfigError(f"`epochs` and `batch`: expected at least 1, found {config.epochs} and {config.batch}.")
+    if not (math.isfinite(config.lr) and 0 < config.lr < 1):
+        raise ConfigError(f"`lr`: expected a number between 0 and 1, found {config.lr}.")
+    if config.schedule not in ("constant", "cosine"):
+        raise ConfigError(f"`schedule`: expected 'constant' or 'cosine', found '{config.schedule}'.")
+    check_precision(config.precision)
+    if not 2 <= len(config.widths) <= DEEPEST or not 1 <= min(config.widths) <= max(config.widths) <= WIDEST:
+        raise ConfigError(
+            f"`widths`: expected 2 .. {DEEPEST} stages of 1 .. {WIDEST} channels, found {'-'.join(map(str, config.widths))}."
+        )
+    if not 0 <= config.brightness <= 1:
+        raise ConfigError(f"`brightness`: expected a number from 0 to 1, found {config.brightness}.")
+    if not config.dropout or not all(0 <= share < 1 for share in config.dropout):
+        raise ConfigError(f"`dropout`: expected shares from 0 to below 1, found {config.dropout}.")
+    model = get_model(config.model)
+    model.choose_maps(config.maps)
+    if config.positive and not model.linear:
+        raise ConfigError(f"`positive`: expected a model that is linear in its coefficients, found '{model.name}'.")
+    choose_device(config.device)
+
+
+def check_pairs(reader: PairReader, config: Config, say: Say) -> None:
+    """Refuse pairs that cannot be learned from. Raises InputError, ConfigError."""
+    pairs = reader.path
+    train, validation = reader.indices("train"), reader.indices("validation")
+    if not len(train):
+        raise InputError(
+            f"{pairs}:/split: expected training pairs (split = 0), found none; sample more crops or other tiles."
+        )
+    if not len(validation):
+        say(f"no validation pairs in {pairs}: the epoch with the least training loss is kept")
+    for what, part in (("training", train), ("validation", validation)):
+        if len(part) and not any(reader.valid(part[k : k + 1]).any() for k in range(len(part))):
+            raise InputError(f"{pairs}: no {what} pair has a valid pixel; sample more crops or other tiles.")
+    stride = 2 ** (len(config.widths) - 1)
+    if any(s % stride for s in reader.size):
+        raise ConfigError(
+            f"{pairs}: expected crops of a multiple of {stride} px for {len(config.widths)} widths, found {reader.size[0]} x {reader.size[1]}."
+        )

@@ -1,0 +1,119 @@
+"""One pass over the pairs: learning from them, or looking at them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from schemas import InputError
+from stages.common.progress import Progress, show_nothing
+from stages.network.crop_sums import sum_over_crops
+from stages.network.losses import crop_errors
+from stages.network.processes import mean_over_ranks, sum_gradients, sum_over_ranks
+from stages.network.steps import learning_rate, order_steps, prefetch
+from stages.pairs.reader import Batch
+from stages.physics.formation.chain import form
+from stages.train.config import Config
+from stages.train.training import Training
+
+CHECK_EVERY = 16  # batches: looking at the loss makes a GPU wait
+BACKWARD = 3  # work of learning from a batch over that of looking at it: what progress counts
+
+
+def learn_epoch(
+    training: Training, train: NDArray[np.int64], config: Config, epoch: int, progress: Progress = show_nothing
+) -> float:
+    """One pass over the training pairs; the mean squared error on the way. Raises InputError where it is not finite."""
+    rank, ranks, device = training.rank, training.ranks, training.device
+    # All randomness of an epoch hangs on (seed, epoch): a resumed run draws what an uninterrupted one would.
+    rng = np.random.default_rng([config.seed, epoch])
+    torch.manual_seed(hash((config.seed, epoch)) % 2**31)
+    training.predictor.train()
+    sums = torch.zeros(2, dtype=torch.float64, device=device)  # squared errors and pixels of this process
+    steps, keys = order_steps(train, config.batch, config.augment, rng, rank, ranks)
+    for number, batch in enumerate(prefetch(training.reader, steps, device)):
+        for group in training.optimizer.param_groups:
+            group["lr"] = learning_rate(
+                config.lr, config.schedule, epoch * len(steps) + number, config.epochs * len(steps)
+            )
+        objective, error = _errors(training, batch, config.brightness, keys[number].to(device))
+        pixels = batch.valid.sum().double()
+        sums += torch.stack([error.detach().double(), pixels])
+        if number % CHECK_EVERY == 0 and not torch.isfinite(sums[0]):
+            break
+        # The mean over the valid pixels of the whole batch; this process has its share of the sum.
+        loss = objective / sum_over_ranks(pixels, ranks).clamp(min=1).float()
+        training.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        if ranks > 1:
+            sum_gradients(training.learned)
+        training.optimizer.step()
+        if rank == 0:
+            progress(number + 1, len(steps), f"epoch {epoch + 1}/{config.epochs}")
+    error_sum, pixel_sum = sums.tolist()
+    if not math.isfinite(error_sum):
+        raise InputError(
+            f"{training.reader.path}: the loss is not finite in epoch {epoch + 1}; lower `lr` or check the images' units."
+        )
+    return mean_over_ranks(error_sum, pixel_sum, ranks, device)
+
+
+def _errors(training: Training, batch: Batch, brightness: float, keys: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Sums over a batch: what is to be minimised, and the squared errors."""
+    predictor, radiometry = training.predictor, training.radiometry
+    maps = predictor.maps
+    with torch.autocast(
+        training.device.type, torch.bfloat16, enabled=training.precision == "bf16" and keys is not None
+    ):
+        shifted = predictor.shifted(batch.observation.elevation, keys)
+    crops = len(shifted)
+    rest = [value.expand(crops, 1, 1) for value in maps.everywhere().values()]
+    frame = batch.observation.frame
+    assert frame is not None
+
+    def objective(first: int, last: int, shifted: Tensor, gain: Tensor, offset: Tensor, *rest: Tensor):
+        coefficients = maps.combine(shifted, rest)
+        rendered = form(batch.observation.part(first, last), maps.model, coefficients, training.extensions)
+        measured = batch.image[first:last] / radiometry.scale
+        predicted = rendered if radiometry.calibrated else gain * rendered + offset
+        return crop_errors(predicted, measured, batch.valid[first:last], brightness)
+
+    return sum_over_crops(objective, shifted, *radiometry.of_crops(frame), *rest)
+
+
+@torch.no_grad()
+def evaluate_loss(
+    training: Training,
+    indices: NDArray[np.int64],
+    batch_size: int,
+    brightness: float = 1.0,
+    progress: Progress = show_nothing,
+) -> tuple[float, float]:
+    """Mean squared error and mean of what is minimised over the valid pixels of some pairs, in evaluation mode.
+
+    NaN where there are no pairs.
+    """
+    training.predictor.eval()
+    totals, pixels = [0.0, 0.0], 0.0
+    mine = indices[training.rank :: training.ranks]
+    steps = [(mine[k : k + batch_size], None) for k in range(0, len(mine), batch_size)]
+    for number, batch in enumerate(prefetch(training.reader, steps, training.device)):
+        objective, error = _errors(training, batch, brightness)
+        totals[0] += float(error)
+        totals[1] += float(objective)
+        pixels += float(batch.valid.sum())
+        if training.rank == 0:
+            progress(number + 1, len(steps), "validation")
+    means = [mean_over_ranks(total, pixels, training.ranks, training.device) for total in totals]
+    return means[0], means[1]
+
+
+def of_all(progress: Progress, epoch: int, epochs: int, work: tuple[int, int], before: int = 0) -> Progress:
+    """Report work on the whole training. work : of training and of validation in an epoch; before : done in this one"""
+    first, total = epoch * sum(work) + before, epochs * sum(work)
+    each = 1 if before else BACKWARD
+    return lambda done, _, what: progress(first + each * done, total, what)

@@ -1,0 +1,141 @@
+"""train: a U-Net that predicts reflectance from terrain, learned through the differentiable formation chain.
+
+Read from top to bottom: set up, one loop over epochs; `epoch.py` has the loop over batches. Several processes (``torchrun``)
+share every batch; the first one writes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from schemas.files.outputs import Output, Target, check_apart, check_outputs
+from schemas.provenance import sha256
+from stages.common.memory import keep_freed_memory
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.threads import one_thread_each
+from stages.network.deviations import fit_deviations
+from stages.network.predictor import choose_device
+from stages.network.processes import join_group
+from stages.network.resume import History, restore, save, snapshot
+from stages.pairs.reader import PairReader
+from stages.physics.formation.chain import Extension
+from stages.train.checkpoint import write_checkpoint
+from stages.train.checks import check, check_pairs
+from stages.train.config import Config
+from stages.train.epoch import BACKWARD, evaluate_loss, learn_epoch, of_all
+from stages.train.training import go_back, introduction, set_up
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What training reached."""
+
+    history: History
+    pairs_per_second: float
+    precision: str
+    start: dict[str, float]
+
+
+def run(
+    pairs: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
+) -> Summary:
+    """Write ``checkpoint.h5``: the weights of the best validation epoch. Raises ConfigError, InputError, ArtefactError.
+
+    After every epoch the whole state goes to a file beside the output, from which ``resume`` goes on to the same result.
+    """
+    output = Output.of(output)
+    check(config)
+    sidecar = output.file.with_name(f"{output.file.stem}.resume.h5")
+    inputs = [pairs, *([Path(config.extend)] if config.extend else [])]
+    check_outputs([Target(output.file)], inputs, output.overwrite)
+    check_apart([Target(output.file), Target(sidecar, what=f"the state of the unfinished {output.file.name}")], inputs)
+    rank, ranks = join_group()
+    device = choose_device(config.device)
+    if device.type == "cuda" and ranks > 1:
+        device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0)))
+    keep_freed_memory()
+    extensions = _load_extensions(config.extend, pairs, say)
+    if extensions and config.augment:
+        # an effect may belong to a direction on the ground, which turning crops would lose
+        say("crops are not turned or mirrored: the extended model may hold effects bound to an azimuth")
+        config = replace(config, augment=False)
+    with one_thread_each(), PairReader(pairs, detector=bool(extensions)) as reader:
+        check_pairs(reader, config, say)
+        training = set_up(reader, config, extensions, device, rank, ranks)
+        history, best = History(), dict[str, Tensor]()
+        # A constant rate may go on for longer; what a cosine did in its first epochs hangs on how many there are.
+        epochs = config.epochs if config.schedule == "cosine" else None
+        identity = json.dumps(
+            asdict(config) | {"device": None, "epochs": epochs, "pairs": sha256(pairs), "ranks": ranks}, sort_keys=True
+        )
+        if output.resume and sidecar.exists():
+            training.precision = restore(
+                sidecar,
+                identity,
+                training.predictor,
+                training.radiometry,
+                training.optimizer,
+                history,
+                best,
+                device,
+            )
+            say(f"resumed after epoch {len(history.train_loss)}/{config.epochs}")
+        if rank == 0:
+            say(introduction(training))
+        speed = math.nan
+        train, validation = reader.indices("train"), reader.indices("validation")
+        work = BACKWARD * math.ceil(len(train) / config.batch), math.ceil(len(validation[rank::ranks]) / config.batch)
+        for epoch in range(len(history.train_loss), config.epochs):
+            began = time.monotonic()
+            train_loss = learn_epoch(training, train, config, epoch, of_all(progress, epoch, config.epochs, work))
+            training_seconds = time.monotonic() - began
+            shown = of_all(progress, epoch, config.epochs, work, work[0])
+            validation_loss, objective = evaluate_loss(training, validation, config.batch, config.brightness, shown)
+            history.train_loss.append(train_loss)
+            history.validation_loss.append(validation_loss)
+            # chosen by what is minimised: the level of a few crops of validation ground would choose by chance
+            history.objective.append(objective if math.isfinite(objective) else train_loss)
+            history.epoch_seconds.append(time.monotonic() - began)
+            if history.objective[-1] <= min(history.objective):
+                history.best_epoch = epoch
+                best = snapshot(training.predictor, training.radiometry)
+            if rank == 0:
+                predictor, radiometry, optimizer = training.predictor, training.radiometry, training.optimizer
+                save(sidecar, identity, predictor, radiometry, optimizer, history, best, training.precision)
+                speed = len(train) / training_seconds
+                left = (config.epochs - epoch - 1) * history.epoch_seconds[-1]
+                say(
+                    f"epoch {epoch + 1:3d}/{config.epochs}  train {train_loss:.4e}  validation {validation_loss:.4e}"
+                    f"{' *' if history.best_epoch == epoch else '  '} {speed:6.1f} pairs/s  {left / 60:5.1f} min left"
+                )
+        if rank == 0:
+            go_back(training, best)
+            fit_deviations(
+                training.predictor, training.radiometry, reader, train, validation, extensions=training.extensions
+            )
+            write_checkpoint(output, config, training, history)
+            sidecar.unlink(missing_ok=True)
+    if ranks > 1:
+        dist.barrier()
+        dist.destroy_process_group()
+    return Summary(history, speed, training.precision, training.start)
+
+
+def _load_extensions(path: str | None, pairs: Path, say: Say) -> list[Extension]:
+    if path is None:
+        return []
+    from stages.effects import load_extension
+    from stages.effects.extension import check_ground
+
+    for note in check_ground(Path(path), pairs):
+        say(f"note: {note}")
+    return list(load_extension(Path(path)))

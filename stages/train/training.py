@@ -1,0 +1,85 @@
+"""What every step of training works with: the network at the best uniform surface, and how it goes on from there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from stages.network.coefficient_maps import CoefficientMaps
+from stages.network.losses import Radiometry
+from stages.network.precision import choose_precision
+from stages.network.predictor import Predictor
+from stages.network.unet import UNet
+from stages.network.uniform import elevation_scale, fit_start
+from stages.pairs.reader import PairReader
+from stages.physics.formation.chain import Extension
+from stages.physics.photometry import get_model
+from stages.train.config import Config
+
+
+@dataclass
+class Training:
+    """What every step works with and changes. rank, ranks : this process among those that share every batch."""
+
+    reader: PairReader
+    predictor: Predictor
+    radiometry: Radiometry
+    optimizer: torch.optim.Optimizer
+    extensions: list[Extension]
+    device: torch.device
+    precision: str
+    start: dict[str, float]
+    rank: int = 0
+    ranks: int = 1
+
+    @property
+    def learned(self) -> list[Tensor]:
+        """All tensors that the optimizer changes."""
+        return [p for group in self.optimizer.param_groups for p in group["params"]]
+
+
+def set_up(
+    reader: PairReader, config: Config, extensions: list[Extension], device: torch.device, rank: int, ranks: int
+) -> Training:
+    """The network at the best uniform surface of the training pairs, and all that goes with it."""
+    torch.manual_seed(config.seed)
+    model = get_model(config.model)
+    train = reader.indices("train")
+    start, radiometry = fit_start(reader, train, model, config.positive)
+    # Linear: about the coefficients' own size, whatever their bounds are. Else: a third of a unit of the sigmoid.
+    span = [1.0 if config.positive else p.upper - p.lower for p in model.parameters]
+    output_scale = float((start.abs() / torch.tensor(span)).mean()) * 4 if model.linear else 0.3
+    maps = CoefficientMaps(model, config.maps, start, output_scale, config.positive, deviations=True)
+    net = UNet(maps.channels, config.widths, config.dropout)
+    predictor = Predictor(net, maps, elevation_scale(reader, train))
+    predictor.gsd, predictor.image_units = reader.gsd, reader.units
+    predictor.to(device)
+    predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    radiometry.to(device)
+    learned = [p for p in (*predictor.parameters(), *radiometry.parameters()) if p.requires_grad]
+    optimizer = torch.optim.Adam(learned, lr=config.lr, fused=True)
+    precision = choose_precision(device) if config.precision == "auto" else config.precision
+    named = dict(zip((p.name for p in model.parameters), start.tolist(), strict=True))
+    return Training(reader, predictor, radiometry, optimizer, extensions, device, precision, named, rank, ranks)
+
+
+def go_back(training: Training, state: dict[str, Tensor]) -> None:
+    """Go back to a snapshot."""
+    for name, module in (("predictor", training.predictor), ("radiometry", training.radiometry)):
+        module.load_state_dict({k.split("/", 1)[1]: v for k, v in state.items() if k.startswith(f"{name}/")})
+
+
+def introduction(training: Training) -> str:
+    """What is about to be learned, in a line."""
+    predictor, reader = training.predictor, training.reader
+    maps = predictor.maps
+    where = f"maps of {', '.join(maps.maps)}" + (f", global {', '.join(maps.rest)}" if maps.rest else "")
+    weights = sum(p.numel() for p in predictor.net.parameters())
+    train, validation = (len(reader.indices(part)) for part in ("train", "validation"))
+    processes = f", {training.ranks} processes" if training.ranks > 1 else ""
+    return (
+        f"model {predictor.model.name}: {where}; {weights:,} weights, {train} training and {validation} validation pairs, "
+        f"{training.device}, {training.precision}{processes}"
+    )
