@@ -113,7 +113,7 @@ def _as_good(found: Found, best: Found) -> bool:
 
 
 def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
-    """Whether an effect of the reflectance law stands for another form of it, which has more to add for sure, or a fair share more."""
+    """Whether an effect of the reflectance law stands for another form of it, which has more to add for sure."""
     if not get_effect(found.effect).of_law:
         return False
     if not len(whole.form_places()):
@@ -123,7 +123,7 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
         )
         return True
     added = whole.law_adds(found)
-    if interval(added)[0] <= 0 and added.sum() <= (1 - SIMPLER) * found.gain:
+    if interval(added)[0] <= 0:
         return False
     why = f"the nominal law has another form, which gains {added.sum():.0f} nats more beside it; the effect stands for a part of that"
     out.rejected[found.effect] = (found.gain, why)
