@@ -47,8 +47,10 @@ lint: $(STAMP) ## ruff, formatting and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(STAMP) ## speed and memory, each beside a named peer in the same run
-	for script in tests/benchmarks/bench_*.py; do echo "== $$script"; $(BIN)/python $$script; done
+bench: $(STAMP) ## speed and memory, each beside a named peer in the same run; on a quiet machine, then make figures; ONLY=word for some
+	mkdir -p results/bench
+	for script in tests/benchmarks/bench_*$(ONLY)*.py; do echo "== $$script"; \
+	  $(BIN)/python $$script | tee results/bench/$$(basename $$script .py).txt; done
 
 campaign: $(STAMP) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
 	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign
@@ -153,8 +155,10 @@ $(D)/checkpoint_m2.h5: $(D)/pairs.h5
 $(D)/m2.h5: $(D)/pairs.h5 $(D)/checkpoint_m2.h5
 	$(LUNARGR) evaluate $^ --only learned --only learned_gain_offset -o $@ --overwrite
 
-figures: ## write every figure of README.md and docs/ from what demo, reproduce-apollo15 and reproduce-models left
+figures: ## write every figure of README.md and docs/, and the notebook, from what demo, reproduce-* and bench left
 	$(BIN)/python examples/figures.py
+	@# the notebook trains its own network for two passes, and keeps it
+	if [ -f $(D)/pairs.h5 ]; then cd $(D) && ../$(BIN)/python ../examples/notebook_page.py; fi
 
 # --- real photographs: Apollo 15 metric camera frames over the GLD100 elevation model ------------------------------
 

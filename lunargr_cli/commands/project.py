@@ -26,6 +26,7 @@ class CLASS(typer.core.TyperCommand):
     """``--register`` alone means ``--register constant``: typer knows no option whose value may be left out."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Write out what ``--register`` alone means."""
         full = []
         for k, word in enumerate(args):
             full.append(word)

@@ -35,6 +35,7 @@ class Spread:
     prior: Floats
 
     def of(self, images: list[int]) -> Spread:
+        """The same for some of the images."""
         return Spread(self.shared, self.own[images], self.shared_px, self.own_px[images], self.prior)
 
 

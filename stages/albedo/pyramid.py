@@ -38,8 +38,10 @@ def collapse(levels: list[Floats32]) -> Floats32:
 
 
 def reduce(values: Floats32) -> Floats32:
+    """(H, W) -> half as many rows and columns, Gaussian-smoothed."""
     return np.asarray(cv2.pyrDown(values), np.float32)
 
 
 def enlarge(values: Floats32, shape: tuple[int, ...]) -> Floats32:
+    """(h, w) -> ``shape``, twice as many rows and columns."""
     return np.asarray(cv2.pyrUp(values, dstsize=(shape[1], shape[0])), np.float32)

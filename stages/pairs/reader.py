@@ -35,6 +35,7 @@ class Batch:
     valid: Tensor
 
     def to(self, device: torch.device) -> Batch:
+        """The same on another device; the observation is moved in place."""
         o = self.observation
         for name in (
             "elevation",
@@ -97,6 +98,7 @@ class PairReader:
         self._check_any_valid()
 
     def close(self) -> None:
+        """Close the file."""
         self._stack.close()
 
     def __enter__(self) -> PairReader:

@@ -73,6 +73,7 @@ class Crops:
 
     @property
     def size(self) -> int:
+        """px, of a crop's side"""
         return int(self.file["elevation"].shape[1])
 
 

@@ -90,6 +90,7 @@ class Tally:
     emission: list[float] = field(default_factory=list)
 
     def add(self, pair: Pair) -> None:
+        """Count one pair."""
         up = pair.sun[2]
         self.pairs += 1
         self.valid += int(pair.valid.sum())

@@ -36,6 +36,7 @@ class Training:
 
     @property
     def learned(self) -> list[Tensor]:
+        """All tensors that the optimizer changes."""
         return [p for group in self.optimizer.param_groups for p in group["params"]]
 
 
