@@ -164,6 +164,8 @@ figures: ## write every figure of README.md and docs/, and the notebook, from wh
 
 A := results/apollo15
 A_DATA := $(SHARED)/data/apollo15
+A_RUNS := $(foreach seed,0 1 2,$(A)/checkpoint_$(seed).h5)
+A_FOLDS := $(foreach fold,1 2 3 4 5,$(A)/fold_$(fold).h5)
 
 reproduce-apollo15: $(A)/report.html ## the same stages on five real Apollo 15 frames (needs the reference data)
 	@echo; echo "Open $(abspath $(A)/report.html)"
@@ -179,19 +181,26 @@ $(A)/crops.h5: $(A)/scene.h5
 $(A)/pairs.h5: $(A)/crops.h5
 	$(LUNARGR) project $< --register field -o $@ --overwrite
 
-$(A)/checkpoint.h5: $(A)/pairs.h5
-	$(LUNARGR) train $< --model kernels --epochs 6 --precision fp32 -o $@ --overwrite --resume
+$(A_RUNS): $(A)/checkpoint_%.h5: $(A)/pairs.h5
+	$(LUNARGR) train $< --model kernels --epochs 6 --precision fp32 --seed $* -o $@ --overwrite --resume
 
-$(A)/svbrdf.h5: $(A)/scene.h5 $(A)/checkpoint.h5
+$(A)/svbrdf.h5: $(A)/scene.h5 $(A)/checkpoint_0.h5
 	$(LUNARGR) infer $^ -o $@ --overwrite
 
 $(A)/render.exr: $(A)/svbrdf.h5
 	$(LUNARGR) render $< --subsolar-longitude 79 --subsolar-latitude 0.243 -o $@ --overwrite
 
-$(A)/evaluation.h5: $(A)/pairs.h5 $(A)/checkpoint.h5
+# the map with albedo from all frames but one, for each of the five
+$(A_FOLDS): $(A)/fold_%.h5: $(A)/svbrdf.h5 $(A)/scene.h5
+	$(LUNARGR) albedo $^ --fold $*/5 --register field --no-geotiff -o $@ --overwrite
+
+$(A)/held_out.h5: $(A)/pairs.h5 $(A_FOLDS)
+	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite
+
+$(A)/evaluation.h5: $(A)/pairs.h5 $(A_RUNS)
 	$(LUNARGR) evaluate $^ -o $@ --figures $(A)/figures --overwrite
 
-$(A)/match.json: $(A)/pairs.h5 $(A)/checkpoint.h5
+$(A)/match.json: $(A)/pairs.h5 $(A)/checkpoint_0.h5
 	$(LUNARGR) match $^ --count 12 --json $@ --figures $(A)/figures --overwrite
 
 $(A)/diagnosis.h5: $(A)/scene.h5
@@ -199,16 +208,16 @@ $(A)/diagnosis.h5: $(A)/scene.h5
 	$(LUNARGR) project $(A)/stack_crops.h5 -o $(A)/stack.h5 --overwrite
 	$(LUNARGR) diagnose $(A)/stack.h5 --model hapke -o $@ --json $(A)/diagnosis.json --report $(A)/diagnosis.html --overwrite
 
-$(A)/report.html: $(A)/evaluation.h5 $(A)/match.json $(A)/render.exr $(A)/diagnosis.h5
-	$(LUNARGR) report $(A)/scene.h5 $(A)/crops.h5 $(A)/pairs.h5 $(A)/checkpoint.h5 $(A)/svbrdf.h5 $(A)/evaluation.h5 $(A)/match.json \
-	    $(A)/diagnosis.json $(A)/render.png -o $@ --title "Apollo 15 metric camera over GLD100" --overwrite
+$(A)/report.html: $(A)/evaluation.h5 $(A)/held_out.h5 $(A)/match.json $(A)/render.exr $(A)/diagnosis.h5
+	$(LUNARGR) report $(A)/scene.h5 $(A)/crops.h5 $(A)/pairs.h5 $(A)/checkpoint_0.h5 $(A)/svbrdf.h5 $(A)/evaluation.h5 $(A)/held_out.h5 \
+	    $(A)/match.json $(A)/diagnosis.json $(A)/render.png -o $@ --title "Apollo 15 metric camera over GLD100" --overwrite
 
 # --- the paper's model comparison ----------------------------------------------------------------------------------
 
 MODELS_PAIRS ?= $(D)/pairs.h5
 
 reproduce-models: $(MODELS_PAIRS) ## train M1..M6, kernels and Hapke from three seeds on the same pairs; the paper's table with spreads
-	$(LUNARGR) compare $< -o results/models --seeds 3 --epochs 8 --precision fp32 --json results/models.json --resume
+	$(LUNARGR) compare $< -o results/models --seeds 3 --epochs 4 --batch 8 --precision fp32 --json results/models.json --resume
 
 clean: ## remove what the targets made, except .venv
 	rm -rf demo results build *.egg-info .pytest_cache .ruff_cache .mypy_cache

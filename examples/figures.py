@@ -141,7 +141,8 @@ def held_out(root: Path, folder: str, command: str) -> list[str]:
          "-" if row.get("ssim") is None else f"{row['ssim']:.3f}"]
         for name, row in result["models"].items()
     ]  # fmt: skip
-    lines = [f"Claim: {result['claim']}; {conclusions.basis(result)}, {len(result['images'])} images."]
+    unit = "" if result.get("image_units") == "iof" else " MSE in DN squared."
+    lines = [f"Claim: {result['claim']}; {conclusions.basis(result)}, {len(result['images'])} images.{unit}"]
     lines += table(["map", "MSE", "SSIM"], rows) + said(conclusions.held_out_images(result))
     return lines + covered(result)
 
@@ -295,6 +296,7 @@ BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "demo-match": lambda root: matched(root, "demo", DEMO),
     "demo-diagnosis": lambda root: diagnosed(root, "demo", DEMO),
     "apollo15": apollo15,
+    "apollo15-held-out": lambda root: held_out(root, "results/apollo15", APOLLO),
     "apollo15-match": lambda root: matched(root, "results/apollo15", APOLLO),
     "apollo15-diagnosis": lambda root: diagnosed(root, "results/apollo15", APOLLO),
     "models": models,

@@ -14,7 +14,7 @@ import sys
 import time
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from lunargr_cli import raise_again
@@ -184,6 +184,3 @@ def own_streams(verbose: bool = False) -> None:
     os.close(nowhere)
     # For good: C libraries go on talking while Python ends.
     sys.stderr = os.fdopen(own, "w", buffering=1, errors="backslashreplace")
-
-
-Progress = Callable[[int, int, str], None]

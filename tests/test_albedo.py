@@ -10,10 +10,12 @@ import pytest
 import rasterio
 from albedo_scene import NOISE, SIZE, SUNS, photograph, photographs, plant, texture
 from evaluation_scene import run_command
+from scipy.ndimage import shift
 
 from schemas import ArtefactError, ConfigError, InputError
 from schemas.files.outputs import Output
 from stages import albedo, merge
+from stages.albedo import stage as running
 from stages.albedo.posterior import Spread, estimate, settle
 from stages.albedo.pyramid import LEVELS
 
@@ -346,3 +348,32 @@ def test_noisy_images_weigh_less():
     spread = Spread(np.full(LEVELS + 1, 1e6), own, 1e6, own[:, 0], np.full(LEVELS + 1, 1e6))
     mean, _ = estimate(ratio, np.ones_like(ratio), spread)
     np.testing.assert_allclose(mean, (0.1 / 0.01 - 0.1 / 0.04) / (1 / 0.01 + 1 / 0.04), rtol=1e-3)
+
+
+def test_what_registration_finds_is_taken_off_by_all_shards(rng, tmp_path, monkeypatch):
+    """Images three pixels aside: where that is told, the albedo is as sharp as if they were not, whoever reads them."""
+    from stages.albedo.calibrate import Calibration
+    from stages.physics.images.displacement import Basis, Field
+
+    truth = np.exp(texture(rng))
+    images = [shift(image, (0, 3), mode="nearest") for image in photographs(rng, truth)]
+    scene = plant(tmp_path, truth, images)
+    aside = Field(Basis("constant", (0.0, 0.0)), np.array([[3.0], [0.0]]), 16, 16, 0.1, 0.1, 0.9)
+    monkeypatch.setattr(running, "register", lambda references, form, progress: [aside] * len(references.frames))
+    config = replace(QUIET, register="constant")
+    inner = np.s_[8:-8, 8:-8]
+    moved, stayed = (np.log(made(scene, c)[0] / truth)[inner] for c in (config, QUIET))
+    assert rms(moved - moved.mean()) < 0.25 * rms(stayed - stayed.mean())
+    path, again, part = (tmp_path / name for name in ("calibration.json", "again.json", "part.h5"))
+    albedo.calibrate_to(path, scene.map, scene.scene, config)
+    Calibration.read(path).write(again)
+    assert again.read_bytes() == path.read_bytes()
+    whole = made(scene, config)[0]
+    running.run_part(scene.map, scene.scene, path, part, config)
+    np.testing.assert_array_equal(read(part, "albedo")[0], whole)
+
+
+def test_an_unknown_form_of_registration_is_refused(planted, tmp_path):
+    with pytest.raises(ConfigError, match=r"--register: expected one of constant, affine, field, found 'rubber'"):
+        made(planted, replace(QUIET, register="rubber"), "no.h5")
+    assert not (planted.folder / "no.h5").exists()

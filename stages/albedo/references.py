@@ -13,18 +13,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.physics.horizon.scene import Overview, horizon_in_scene
+from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import ASTRONOMICAL_UNIT, Frame
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import Grid
-from stages.physics.maps.window import Window
+from stages.physics.maps.window import Box, Window
 from stages.physics.terrain.shading import Light, shade_block
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.surface import SHADOWED, Surface
-
-Floats32 = NDArray[np.float32]
-Box = tuple[int, int, int, int]  # row, col, height, width
 
 OPEN_IMAGES = 64  # files that stay open between windows
 SHADOW_MARGIN_PX = 2  # a shadow's edge lies so well where the DEM and the registration say
@@ -34,7 +33,8 @@ TURN = 30e3  # m over which the Sun's azimuth turns by 1 deg on the Moon
 @dataclass(frozen=True)
 class Look:
     """One photograph on a window. measured : (h, w) as in the file, NaN where it shows no known ground; predicted : (h, w)
-    I/F, 0 in shadow; usable : (h, w) bool, lit and away from shadows; shadow : (h, w) bool; sun_sine : of the Sun's elevation"""
+    I/F, 0 in shadow; usable : (h, w) bool, lit and away from shadows; shadow : (h, w) bool; sun_sine : of the Sun's elevation
+    """
 
     measured: Floats32
     predicted: Floats32
@@ -80,11 +80,17 @@ class References(contextlib.AbstractContextManager):
     ) -> None:
         self.surface, self.elevation, self.overview, self.heights = surface, elevation, overview, heights
         self.frames, self.boxes = frames, boxes
+        self._fields: Sequence[Field | None] = [None] * len(frames)
         self._open: OrderedDict[int, tuple[Source, contextlib.ExitStack]] = OrderedDict()
 
     def __exit__(self, *error: object) -> None:
         while self._open:
             self._open.popitem()[1][1].close()
+
+    def take_off(self, fields: Sequence[Field | None]) -> None:
+        """Read each image from now on without the displacement that registration found; none where empty."""
+        if fields:
+            self._fields = fields
 
     def overlapping(self, box: Box) -> list[int]:
         """Images that may show something of a window."""
@@ -93,7 +99,7 @@ class References(contextlib.AbstractContextManager):
     def look(self, k: int, box: Box) -> Look | None:
         """Image ``k`` on a window, None where it shows nothing that counts."""
         row, col, height, width = box
-        pixels = self._source(k).read(row, col, height, width)
+        pixels = self.source(k).read(row, col, height, width, self._fields[k])
         if not pixels.valid.any():
             return None
         frame, surface = self.frames[k], self.surface
@@ -117,7 +123,8 @@ class References(contextlib.AbstractContextManager):
         shadow = block["shadow"] > SHADOWED
         return Look(measured, block["image"], cosine, usable, shadow, math.sin(max(0.0, elevation)))
 
-    def _source(self, k: int) -> Source:
+    def source(self, k: int) -> Source:
+        """The open image ``k``."""
         if k in self._open:
             self._open.move_to_end(k)
             return self._open[k][0]

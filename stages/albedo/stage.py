@@ -26,7 +26,9 @@ from stages.albedo.posterior import estimate, settle
 from stages.albedo.prior import terrain_variance
 from stages.albedo.pyramid import HALO_PX, LEVELS
 from stages.albedo.references import Box, References
+from stages.albedo.registered import register
 from stages.albedo.writing import Maps, copy_map, kept_attributes
+from stages.common.arrays import Floats32
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import find_body
 from stages.physics.horizon.scene import make_overview
@@ -34,8 +36,6 @@ from stages.physics.images.table import Frame, load_frames
 from stages.physics.maps.geotiff import write_geotiff
 from stages.physics.maps.grid import read_grid
 from stages.physics.terrain.surface import Surface, open_surface
-
-Floats32 = NDArray[np.float32]
 
 BLOCK_PX = 768
 STACK_PX = 64 << 20  # pixels of all images of a block, with what lies around it: 1.3 GB with all that is made of them
@@ -107,7 +107,8 @@ def _run(
 ) -> Summary:
     check_files([svbrdf, scene, *source_files(scene)], output, config)
     with open_ground(svbrdf, scene, config) as ground:
-        found = Calibration.read(calibration) if calibration else _calibrate(svbrdf, scene, ground, progress)
+        found = Calibration.read(calibration) if calibration else _calibrate(svbrdf, scene, ground, config, progress)
+        ground.references.take_off(found.fields)
         sizes = {d: ground.map[d].shape[0] for d in ("coefficient", "y", "x")}
         if "map_name" in ground.map:
             sizes["map"] = len(ground.map["map_name"])
@@ -155,18 +156,20 @@ def check_files(inputs: Sequence[Path], output: Output, config: Config) -> None:
 def calibrate_to(path: Path, svbrdf: Path, scene: Path, config: Config) -> None:
     """Write the calibration that all parts of one map share, as JSON."""
     with open_ground(svbrdf, scene, config) as ground, atomic_path(path) as partial:
-        _calibrate(svbrdf, scene, ground, show_nothing).write(partial)
+        _calibrate(svbrdf, scene, ground, config, show_nothing).write(partial)
 
 
-def _calibrate(svbrdf: Path, scene: Path, ground: Ground, progress: Progress) -> Calibration:
+def _calibrate(svbrdf: Path, scene: Path, ground: Ground, config: Config, progress: Progress) -> Calibration:
     references = ground.references
+    fields = tuple(register(references, config.register, progress)) if config.register else ()
+    references.take_off(fields)
     windows = choose_windows(ground.map["valid"].shape, references.boxes)
     samples = take_samples(references, windows, progress)
     if not samples:
         raise InputError(
             f"{scene}: expected images that overlap the map {svbrdf}, found none whose sunlit pixels lie on valid ground."
         )
-    return calibrate(samples, len(references.frames), ground.units)
+    return replace(calibrate(samples, len(references.frames), ground.units), fields=fields)
 
 
 def work_block(ground: Ground, calibration: Calibration, block: Box) -> tuple[Floats32, Floats32, NDArray[np.uint16]]:

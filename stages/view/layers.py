@@ -10,15 +10,14 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 from rasterio.transform import Affine
 
 from schemas import SVBRDF, ArtefactError, InputError, RegistryError, open_artefact, read_strings
+from stages.common.arrays import Floats32
 from stages.physics.maps.grid import Grid, read_grid
 from stages.physics.photometry import ReflectanceModel, get_model, model_names
 from stages.physics.photometry.albedo_factor import FACTOR, AlbedoFactor
 
-Floats32 = NDArray[np.float32]
 READ_ROWS = 512
 _OWN = ("x", "y", "coefficients", "coefficient_name", "albedo", "elevation", "valid", "crs")
 
