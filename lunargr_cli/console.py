@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 
 from lunargr_cli import raise_again
 from lunargr_cli.progress import Pace, bar_line, progress_words
+from lunargr_cli.spelling import spell
 from schemas.errors import InputError
 
 _BEGAN = time.monotonic()
@@ -99,7 +100,7 @@ class Console:
         """A line for the person at the terminal."""
         if not self.quiet:
             self._wipe_bar()
-            print(harmless(message), file=sys.stderr, flush=True)
+            print(harmless(spell(message)), file=sys.stderr, flush=True)
 
     def progress(self, done: int, total: int, what: str = "") -> None:
         """Show how far a long loop is and how long it still takes."""

@@ -22,6 +22,7 @@ from lunargr_cli import INTERRUPTED, commands, quiet_interruptions, signals, sto
 from lunargr_cli.console import flush_out, own_streams, say_effort, say_error, write_out
 from lunargr_cli.options import check_numbers
 from lunargr_cli.paths import guarded
+from lunargr_cli.spelling import running, spell
 from schemas.command_line import said
 from schemas.errors import EXIT_CODE, InputError, LunargrError
 from schemas.files.locks import claim
@@ -43,12 +44,18 @@ def _command_line() -> str:
 
 
 def _checked(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, which no number that is not finite reaches."""
+    """The command, which no number that is not finite reaches, and whose errors name its options."""
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
-        check_numbers(command, inspect.signature(command).bind(*arguments, **options).arguments)
-        command(*arguments, **options)
+        before = running.set(command)
+        try:
+            check_numbers(command, inspect.signature(command).bind(*arguments, **options).arguments)
+            command(*arguments, **options)
+        except LunargrError as error:
+            raise type(error)(spell(str(error))) from None
+        finally:
+            running.reset(before)
 
     return run
 

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
 from lunargr_cli.paths import Writes
+from lunargr_cli.spelling import option_of
 from schemas.errors import ConfigError
+
+if TYPE_CHECKING:
+    from schemas.files.outputs import Output
 
 Number = TypeVar("Number", int, float)
 
@@ -30,6 +35,15 @@ def check_scheduler(text: str | None) -> str | None:
             f"--scheduler: expected an address, or local:N with 1 <= N <= {MOST_WORKERS} workers, found '{text}'."
         )
     return text
+
+
+Config = TypeVar("Config")
+
+
+def configure(config: type[Config], options: Mapping[str, Any], **more: Any) -> Config:
+    """A stage's Config from the options of a command that bear its fields' names. more : what is made of other options"""
+    names = {field.name for field in dataclasses.fields(config)}  # type: ignore[arg-type]
+    return config(**{name: value for name, value in options.items() if name in names} | more)
 
 
 OutputFile = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True), Writes.FILE]
@@ -76,6 +90,25 @@ BodyOption = Annotated[
 Json = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Also write the result as JSON."), Writes.FILE
 ]
+GeoTiff = Annotated[
+    Path | None,
+    typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif)."),
+    Writes.FILE,
+]
+NoGeoTiff = Annotated[
+    bool, typer.Option("--no-geotiff", help="Write the HDF5 map only: on large maps a quarter of the time less.")
+]
+# Of `train` and `compare`
+Epochs = Annotated[int, typer.Option("--epochs", min=1, max=100_000, help="Passes over the training pairs.")]
+Batch = Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Pairs per step, over all processes.")]
+LearningRate = Annotated[float, typer.Option("--lr", help="Adam's learning rate.")]
+Schedule = Annotated[str, typer.Option("--schedule", help="Learning rate over the steps: constant or cosine.")]
+Widths = Annotated[
+    str, typer.Option("--widths", help="Channels of each stage of the U-Net; Lunar-G2R: 16-32-64-128-256.")
+]
+TrainingPrecision = Annotated[
+    str, typer.Option("--precision", help="fp32, bf16, or auto: bf16 where the processor is made for it.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
 
 
@@ -83,9 +116,7 @@ def check_numbers(command: Callable[..., None], options: Mapping[str, Any]) -> N
     """No option of any command takes NaN or infinity. Raises ConfigError."""
     for name, value in options.items():
         if isinstance(value, float) and not math.isfinite(value):
-            declared = get_type_hints(command, include_extras=True)[name].__metadata__[0].param_decls or ()
-            option = next((d for d in declared if d.startswith("--")), f"--{name.replace('_', '-')}")
-            raise ConfigError(f"{option}: expected a finite number, found {value}.")
+            raise ConfigError(f"{option_of(command, name)}: expected a finite number, found {value}.")
 
 
 def parse_shard(text: str | None) -> tuple[int, int]:
@@ -106,9 +137,23 @@ def read_numbers(option: str, text: str, kind: type[Number]) -> tuple[Number, ..
         raise ConfigError(f"{option}: expected numbers like 8-16-32, found '{text}'.") from None
 
 
+def dashed(numbers: Iterable[float]) -> str:
+    """(16, 32, 64) -> '16-32-64', as :func:`read_numbers` reads it."""
+    return "-".join(f"{number:g}" for number in numbers)
+
+
 def read_names(text: str | None) -> tuple[str, ...]:
     """'w, b' -> ('w', 'b'); None -> ()"""
     return tuple(name.strip() for name in (text or "").split(",") if name.strip())
+
+
+def to_map(output: Path, overwrite: bool, geotiff: Path | None, no_geotiff: bool) -> Output:
+    """Where a map and its GeoTIFF go. Raises ConfigError."""
+    from schemas.files.outputs import Output
+
+    if geotiff and no_geotiff:
+        raise ConfigError(f"--geotiff {geotiff} and --no-geotiff: expected one of them, found both.")
+    return Output(output, overwrite, geotiff=geotiff)
 
 
 def in_parts(scheduler: str | None, resume: bool, parts: int | None, shard: str | None) -> bool:

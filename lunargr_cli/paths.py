@@ -28,7 +28,7 @@ class Writes(enum.Enum):
 
 @dataclass
 class Files:
-    """The files of one call. ``written`` holds (option, path, kind)."""
+    """The files of one call. ``written`` holds (parameter, path, kind)."""
 
     read: list[Path] = field(default_factory=list)
     written: list[tuple[str, Path, Writes]] = field(default_factory=list)
@@ -44,17 +44,8 @@ def files_of(command: Callable[..., None], arguments: Mapping[str, Any]) -> File
         if kind is None:
             files.read += paths
         else:
-            files.written += [(_option(name, marks), path, kind) for path in paths]
+            files.written += [(name, path, kind) for path in paths]
     return files
-
-
-def _option(name: str, marks: tuple[Any, ...]) -> str:
-    """How the option is spelled; within Annotated typer keeps the first spelling as the default."""
-    for mark in marks:
-        for spelled in (getattr(mark, "default", None), *(getattr(mark, "param_decls", None) or ())):
-            if isinstance(spelled, str) and spelled.startswith("--"):
-                return spelled
-    return f"--{name.replace('_', '-')}"
 
 
 @contextlib.contextmanager
@@ -75,7 +66,7 @@ def guarded(command: Callable[..., None], *arguments: Any, **options: Any) -> It
         _check_name(path)
     replace = bool(bound.arguments.get("overwrite") or bound.arguments.get("resume"))  # what is resumed, stages say
     with protect(files.read):
-        targets = [Target(path, option) for option, path, _ in files.written]
+        targets = [Target(path, name) for name, path, _ in files.written]
         check_apart(targets)
         kinds = [kind for _, _, kind in files.written]
         check_outputs([t for t, k in zip(targets, kinds, strict=True) if k is Writes.FILE], overwrite=replace)

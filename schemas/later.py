@@ -1,4 +1,4 @@
-"""Names of a package that are imported when they are first asked for: `lunargr --help` must answer at once."""
+"""Names of a package that are imported when they are first asked for: the command's help must answer at once."""
 
 from __future__ import annotations
 

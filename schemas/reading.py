@@ -160,7 +160,7 @@ def _check_views(path: Path, file: h5py.File) -> None:
                 if not (path if source == "." else path.resolve().parent / source).is_file():
                     raise ArtefactError(
                         f"{path}:{data.name}: expected the file '{source}' that it is a view of, found none; "
-                        "bring it back, or merge the parts again without --virtual."
+                        "bring it back, or merge the parts again without `virtual`."
                     )
 
 

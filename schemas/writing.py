@@ -67,7 +67,7 @@ class ArtefactWriter:
             except OSError as error:
                 if is_full_disk(error):
                     raise
-                raise ConfigError(f"{self.path}: cannot be written ({error}); choose another --output.") from None
+                raise ConfigError(f"{self.path}: cannot be written ({error}); choose another `output`.") from None
             for key, value in self._root_attributes.items():
                 self.file.attrs[key] = value
             for order, (name, size) in enumerate(self.sizes.items()):

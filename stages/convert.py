@@ -94,7 +94,7 @@ def band_indices(data: DatasetReader, convention: Convention, names: Sequence[st
     if not any(found):
         raise InputError(
             f"{data.name}: expected band descriptions {wanted} for {convention.name}, found none; "
-            f"name the bands in their order in the file, as in --bands {wanted}."
+            f"name the bands in their order in the file, as in `bands` {wanted}."
         )
     indices = {}
     for name in convention.names:
@@ -103,7 +103,7 @@ def band_indices(data: DatasetReader, convention: Convention, names: Sequence[st
         if len(bands) != 1:
             raise InputError(
                 f"{data.name}: expected one band '{name}' for {convention.name}, found {len(bands)} among "
-                f"'{', '.join(found)}'; name the bands in their order in the file with --bands."
+                f"'{', '.join(found)}'; name the bands in their order in the file with `bands`."
             )
         indices[name] = bands[0]
     return indices
@@ -114,7 +114,7 @@ def _named(data: DatasetReader, names: Sequence[str]) -> list[str]:
     if not any("=" in name for name in names):
         if len(names) != data.count:
             raise ConfigError(
-                f"--bands: expected {data.count} names for the {data.count} bands of {data.name}, found {len(names)}; "
+                f"`bands`: expected {data.count} names for the {data.count} bands of {data.name}, found {len(names)}; "
                 "give only those that are wanted as NAME=INDEX."
             )
         return list(names)
@@ -122,7 +122,7 @@ def _named(data: DatasetReader, names: Sequence[str]) -> list[str]:
     for item in names:
         name, _, index = item.partition("=")
         if not index.strip().isdigit() or not 1 <= int(index) <= data.count:
-            raise ConfigError(f"--bands: expected NAME=INDEX with an index from 1 to {data.count}, found '{item}'.")
+            raise ConfigError(f"`bands`: expected NAME=INDEX with an index from 1 to {data.count}, found '{item}'.")
         found[int(index) - 1] = name.strip()
     return found
 

@@ -162,7 +162,7 @@ PHYSICS = (
         "stages/physics/formation/facets.py",
         "q = (above[j] - below[j]) * step - bend",
         "q = (below[j] - above[j]) * step - bend",
-        ("tests/test_evaluate.py::test_the_true_coefficients_leave_only_the_noise",),
+        ("tests/test_formation.py::test_one_pass_gives_what_the_chain_gives",),
         "rows run north in the fused geometry",
     ),
     Mutant(
@@ -209,10 +209,10 @@ PHYSICS = (
     ),
     Mutant(
         "stages/physics/horizon/sweeps.py",
-        "        position = shear * np.arange(rows)\n",
-        "        position = shear * (np.arange(rows) + 1)\n",
+        "            1 / max(abs(east), abs(north)),\n",
+        "            1.0,\n",
         ("tests/test_horizon.py::test_dome",),
-        "lines of the horizon are off by one row",
+        "a step along an oblique ray is as long as one along a row",
     ),
     Mutant(
         "stages/physics/horizon/scene.py",
@@ -299,7 +299,7 @@ STAGES = (
         "stages/physics/maps/ground_tiles.py",
         "r0, r1 = (row - half) // self.edge, (row + half - 1) // self.edge",
         "r0, r1 = (row - half) // self.edge, (row + half - 2) // self.edge",
-        ("tests/test_sample.py::test_parts_share_no_pixel_of_ground",),
+        ("tests/test_sample.py::test_a_footprint_ends_where_its_tile_does",),
         "crops reach one row into the next tile's ground",
     ),
     Mutant(
@@ -332,9 +332,9 @@ STAGES = (
     ),
     Mutant(
         "stages/physics/horizon/scene.py",
-        "    window = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
+        "    strip = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
         "    top, bottom, left, right = row, row + height, col, col + width\n"
-        "    window = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
+        "    strip = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)\n",
         ("tests/test_project.py::test_terrain_outside_the_crop_casts_its_shadow",),
         "only the crop's own terrain casts near shadows",
     ),
@@ -354,8 +354,8 @@ STAGES = (
     ),
     Mutant(
         "stages/train/epoch.py",
-        "    training.predictor.eval()\n    total, pixels",
-        "    training.predictor.train()\n    total, pixels",
+        "    training.predictor.eval()\n    totals, pixels",
+        "    training.predictor.train()\n    totals, pixels",
         (f"{LEAKS}::test_validation_runs_without_dropout_and_leaves_the_network_as_it_is",),
         "validation runs in training mode",
     ),
@@ -419,7 +419,7 @@ STAGES = (
         "stages/infer/stage.py",
         "writer.write_crs(grid.crs_wkt, grid.transform)",
         "writer.write_crs(grid.crs_wkt, grid.window(0, 1, 1, 1).transform)",
-        ("tests/test_infer.py::test_gdal_places_the_netcdf_variable",),
+        ("tests/test_infer.py::test_the_georeference_is_that_of_the_coordinates",),
         "the map lies one pixel to the east",
     ),
     Mutant(
@@ -520,7 +520,7 @@ STAGES = (
         "stages/albedo/posterior.py",
         "                    confidence[k, r, c] *= weights[i]\n",
         "",
-        ("tests/test_albedo.py::test_a_shadow_or_a_cosmic_ray_in_one_image_leaves_no_mark",),
+        ("tests/test_albedo.py::test_what_one_image_shows_alone_loses_its_weight",),
         "outliers keep their full weight in the albedo",
     ),
     Mutant(

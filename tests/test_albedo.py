@@ -92,6 +92,19 @@ def test_a_shadow_or_a_cosmic_ray_in_one_image_leaves_no_mark(rng, tmp_path):
     assert np.nanmax(np.abs(np.log(marked / clean))) < 0.1
 
 
+def test_what_one_image_shows_alone_loses_its_weight(rng):
+    """A pixel 20 sigma from what five other images agree on counts a hundredth; its neighbours keep theirs."""
+    ratio = rng.normal(0, 0.01, (6, 32, 32)).astype(np.float32)
+    ratio[2, 16, 16] += 0.2
+    confidence = np.ones_like(ratio)
+    spread = Spread(
+        np.full(LEVELS + 1, 0.04), np.full((6, LEVELS + 1), 1e-4), 0.04, np.full(6, 1e-4), np.zeros(LEVELS + 1)
+    )
+    location = settle(ratio, confidence, spread)
+    assert confidence[2, 16, 16] < 0.03 * np.median(confidence[2])
+    assert np.median(confidence) > 0.5 and abs(location[16, 16]) < 0.02
+
+
 def test_shifted_images_count_less(rng, tmp_path):
     truth = np.exp(texture(rng))
     images = photographs(rng, truth)
@@ -197,7 +210,7 @@ def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
     from lunargr_cli.fanout.stages import run_albedo
 
     # blocks so small that the map has four rows of them
-    monkeypatch.setattr(running, "BLOCK_PX", 64)
+    monkeypatch.setattr("stages.albedo.stage.BLOCK_PX", 64)
     config = replace(QUIET, geotiff=True)
     names = ("albedo", "albedo_std", "albedo_images", "coefficients", "elevation", "albedo_gain", "albedo_image_std")
     whole = tmp_path / "whole.h5"
@@ -228,7 +241,7 @@ def interrupt(*arguments, **options):
 
 
 def test_blocks_leave_no_seams(planted, found, monkeypatch):
-    monkeypatch.setattr(running, "BLOCK_PX", 64)
+    monkeypatch.setattr("stages.albedo.stage.BLOCK_PX", 64)
     blocks = made(planted, name="blocks.h5")[0]
     assert np.nanmax(np.abs(np.log(blocks / found[0]))) < 0.1 * np.nanmedian(found[1])
 

@@ -9,6 +9,7 @@ import pytest
 
 from schemas.errors import GeometryError
 from stages.physics.horizon import horizon, horizon_in_scene, make_overview
+from stages.physics.maps.window import Window
 
 GSD = 5.0
 
@@ -46,7 +47,7 @@ def test_crops_see_the_whole_scene(scene, azimuth_deg, body_radius):
     rng = np.random.default_rng(azimuth_deg)
     error, alone = [], []
     for row, col in rng.integers(0, 1800 - 96, (6, 2)):
-        found = horizon_in_scene(counting, overview, row, col, 96, 96, GSD, azimuth, body_radius=body_radius)
+        found = horizon_in_scene(counting, overview, Window(row, col, 96, 96), GSD, azimuth, body_radius=body_radius)
         expected = whole[row : row + 96, col : col + 96]
         assert found.shape == (96, 96)
         assert found.dtype == np.float32
@@ -67,10 +68,10 @@ def test_a_distant_wall_is_found_through_the_overview():
     z[100:140] = 200.0
     overview = make_overview(z, 4)
     row = 1500
-    found = horizon_in_scene(z, overview, row, 100, 64, 64, GSD, 0.0)
+    found = horizon_in_scene(z, overview, Window(row, 100, 64, 64), GSD, 0.0)
     distance = (row + np.arange(64) - 139)[:, None] * GSD
     np.testing.assert_allclose(found, np.broadcast_to(np.arctan(200.0 / distance), (64, 64)), rtol=0.012)
-    curved = horizon_in_scene(z, overview, row, 100, 64, 64, GSD, 0.0, body_radius=400_000.0)
+    curved = horizon_in_scene(z, overview, Window(row, 100, 64, 64), GSD, 0.0, body_radius=400_000.0)
     expected = np.arctan(200.0 / distance - distance / 8e5)
     np.testing.assert_allclose(curved, np.broadcast_to(expected, (64, 64)), rtol=0.015)
 
@@ -78,8 +79,8 @@ def test_a_distant_wall_is_found_through_the_overview():
 def test_a_high_sun_spares_the_search_and_keeps_the_shadow(scene):
     overview = make_overview(scene, 4)
     azimuth, sun = math.radians(70), math.radians(12)
-    full = horizon_in_scene(scene, overview, 800, 700, 64, 64, GSD, azimuth)
-    quick = horizon_in_scene(scene, overview, 800, 700, 64, 64, GSD, azimuth, sun_elevation=sun)
+    full = horizon_in_scene(scene, overview, Window(800, 700, 64, 64), GSD, azimuth)
+    quick = horizon_in_scene(scene, overview, Window(800, 700, 64, 64), GSD, azimuth, sun_elevation=sun)
     near_sun = full > sun - math.radians(0.9)
     np.testing.assert_allclose(quick[near_sun], full[near_sun], atol=math.radians(0.2))
     assert ((quick > sun) == (full > sun)).mean() > 0.999
@@ -90,7 +91,7 @@ def test_missing_ground(scene):
     z[300:340, 500:620] = np.nan
     z[900:1000] = np.nan
     overview = make_overview(z, 4)
-    found = horizon_in_scene(z, overview, 310, 480, 64, 64, GSD, 2.0)
+    found = horizon_in_scene(z, overview, Window(310, 480, 64, 64), GSD, 2.0)
     assert np.array_equal(np.isnan(found), np.isnan(z[310:374, 480:544]))
 
 
@@ -100,4 +101,4 @@ def test_missing_ground(scene):
 def test_bad_input_is_named(row, shape, message):
     overview = make_overview(np.zeros((200, 200), np.float32), 4)
     with pytest.raises(GeometryError, match=message):
-        horizon_in_scene(np.zeros(shape, np.float32), overview, row, 0, 64, 64, GSD, 0.0)
+        horizon_in_scene(np.zeros(shape, np.float32), overview, Window(row, 0, 64, 64), GSD, 0.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import h5py
 import numpy as np
 import pytest
@@ -148,6 +150,15 @@ def test_gdal_places_the_netcdf_variable(small_artefacts, checkpoint, tmp_path):
         np.testing.assert_allclose(data.xy(0, 0), (scene["x"][0], scene["y"][0]), atol=1e-6)
 
 
+def test_the_georeference_is_that_of_the_coordinates(small_artefacts, checkpoint, tmp_path):
+    infer.run(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", infer.Config(geotiff=False, **FULL))
+    with h5py.File(tmp_path / "map.h5") as file:
+        left, width, _, top, _, height = map(float, file["crs"].attrs["GeoTransform"].split())
+        x, y = file["x"][...], file["y"][...]
+    np.testing.assert_allclose(x, left + width * (np.arange(len(x)) + 0.5), atol=1e-6)
+    np.testing.assert_allclose(y, top + height * (np.arange(len(y)) + 0.5), atol=1e-6)
+
+
 def test_shards_make_the_same_map(small_artefacts, checkpoint, reference, tmp_path):
     parts = []
     for k in range(3):
@@ -164,6 +175,12 @@ def test_shards_make_the_same_map(small_artefacts, checkpoint, reference, tmp_pa
         np.testing.assert_array_equal(file["valid"][...].astype(bool), reference[1])
     with pytest.raises(ArtefactError, match="every shard"):
         merge.run(parts[:2], tmp_path / "two.h5")
+    with h5py.File(parts[1], "r+") as file:  # a shard of another checkpoint of the same name
+        inputs = json.loads(file.attrs["inputs"])
+        inputs[0]["sha256"] = "0" * 64
+        file.attrs["inputs"] = json.dumps(inputs)
+    with pytest.raises(ArtefactError, match=r"part1.*made from, found others"):
+        merge.run(parts, tmp_path / "mixed.h5")
 
 
 def test_windows_cover_every_pixel_once_blended():
@@ -178,11 +195,11 @@ def test_windows_cover_every_pixel_once_blended():
 def test_wrong_inputs_are_refused(small_files, small_artefacts, checkpoint, tmp_path):
     coarse = tmp_path / "coarse.h5"
     ingest.run(small_files.dem, None, coarse, ingest.Config(gsd=60))
-    with pytest.raises(ConfigError, match="--any-gsd"):
+    with pytest.raises(ConfigError, match="`any_gsd`"):
         infer.run(coarse, checkpoint, tmp_path / "m.h5", infer.Config(**FULL))
     with pytest.raises(ArtefactError, match="expected a 'checkpoint'"):
         infer.run(small_artefacts["scene"], small_artefacts["pairs"], tmp_path / "m.h5", infer.Config(**FULL))
-    with pytest.raises(ConfigError, match="--stride"):
+    with pytest.raises(ConfigError, match="`stride`"):
         infer.run(small_artefacts["scene"], checkpoint, tmp_path / "m.h5", infer.Config(window=64, stride=65, **FULL))
     assert not (tmp_path / "m.h5").exists()
 

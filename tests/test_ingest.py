@@ -156,7 +156,7 @@ def test_bad_dems_get_one_clear_line(tmp_path):
     axis = (np.arange(128) - 63.5) * 20
     terrain = small_scene.height(axis[None, :], -axis[:, None]).astype(np.float32)
     cases = [
-        ({"crs": mars}, GeometryError, "--body"),
+        ({"crs": mars}, GeometryError, "`body`"),
         ({"z": np.full((128, 128), np.nan, np.float32)}, InputError, "only nodata"),
         ({"z": np.full((128, 128), -1, np.float32), "nodata": -1}, InputError, "only nodata"),
         ({"z": terrain / 1000}, InputError, "kilometres"),

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import inspect
+import re
 import subprocess
 import sys
 
+import pytest
 from conftest import ROOT
 
 LAYERS = [
@@ -58,3 +62,72 @@ def test_help_needs_no_heavy_import():
     code = "import sys; import lunargr_cli.main; print(sorted({'torch','cv2','h5py','numba','rasterio','matplotlib'} & set(sys.modules)))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip() == "[]"
+
+
+CORE = sorted(path for top in ("stages", "schemas") for path in (ROOT / top).rglob("*.py"))
+
+
+def test_the_core_does_not_speak_of_command_line_options():
+    """Stages name settings as their fields; the command line alone knows how they are spelled."""
+    wrong = []
+    for path in CORE:
+        if path.name == "command_line.py":  # which takes recorded command lines apart
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found = re.search(r"(?<![\w-])--[a-z][\w-]*", node.value)
+                wrong += [f"{path.relative_to(ROOT)}:{node.lineno}: {found[0]}"] if found else []
+    assert not wrong, wrong
+
+
+LONGEST, MOST_PARAMETERS = 80, 8
+LOOPS = {"stages/train/stage.py run"}  # the training loop reads best in one piece
+# What hands a kernel its arrays one by one; and what is still to be cut.
+WAITING = ("stages/physics/horizon/", "stages/simulate/stage.py: _signal")
+
+
+def _parameters(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    return len(arguments) - (bool(arguments) and arguments[0].arg in ("self", "cls"))
+
+
+def _is_kernel(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    return any(
+        "jit" in ast.dump(decorator) or "intrinsic" in ast.dump(decorator) for decorator in function.decorator_list
+    )
+
+
+def test_functions_are_short_and_take_few_parameters():
+    """But numba kernels, which take arrays one by one, and commands, whose parameters are their options."""
+    wrong = []
+    for path in [*CORE, *sorted((ROOT / "lunargr_cli").rglob("*.py"))]:
+        place = str(path.relative_to(ROOT))
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) or _is_kernel(node):
+                continue
+            command = node.name == "command" and "commands/" in place
+            # of a command only what it does counts, not the list of its options
+            first = node.body[0].lineno if command else node.lineno
+            if node.end_lineno - first >= LONGEST and f"{place} {node.name}" not in LOOPS:
+                wrong.append(f"{place}: {node.name} has {node.end_lineno - first + 1} lines")
+            if _parameters(node) > MOST_PARAMETERS and not command:
+                wrong.append(f"{place}: {node.name} has {_parameters(node)} parameters")
+    assert not [line for line in wrong if not line.startswith(WAITING)], wrong
+
+
+STAGES_RUN = (
+    "simulate", "ingest", "sample", "project", "train", "infer", "albedo", "render", "view", "export", "evaluate", "match",
+    "diagnose", "compare", "report", "merge", "convert",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STAGES_RUN)
+def test_every_stage_is_run_alike(name):
+    """run(inputs ..., output, config, say, progress); say and progress may be left away."""
+    from stages.common.progress import say_nothing, show_nothing
+
+    parameters = inspect.signature(importlib.import_module(f"stages.{name}").run).parameters
+    assert list(parameters)[-4:] == ["output", "config", "say", "progress"]
+    assert parameters["output"].annotation in ("Output | Path", "Output | Path | None")
+    assert parameters["say"].default is say_nothing and parameters["progress"].default is show_nothing
+    assert all(p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters.values())

@@ -66,7 +66,7 @@ def test_unknown_maps_list_the_choices(small_artefacts, tmp_path):
         train.run(small_artefacts["pairs"], out, train.Config(model="hapke", maps=("w", "x")))
     code, message = run_command("train", small_artefacts["pairs"], "--maps", "w,x", "-o", out)
     assert code == 3 and "\n" not in message and "choose one of" in message
-    with pytest.raises(ConfigError, match="--positive"):
+    with pytest.raises(ConfigError, match="`positive`"):
         train.run(small_artefacts["pairs"], out, train.Config(model="hapke", positive=True))
     assert not out.exists()
 

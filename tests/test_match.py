@@ -134,7 +134,7 @@ def test_unknown_matcher_lists_the_choices():
 
 @pytest.mark.parametrize("name", ["aliked", "disk"])
 def test_learned_matchers_say_what_they_miss(name, tmp_path):
-    with pytest.raises(ConfigError, match="--features-model"):
+    with pytest.raises(ConfigError, match="`features_model`"):
         get_matcher(name)
     with pytest.raises(InputError, match="no such file"):
         get_matcher(name, Models(tmp_path / "absent.onnx"))

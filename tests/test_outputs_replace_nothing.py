@@ -17,6 +17,7 @@ from typer.main import get_command
 from lunargr_cli import commands
 from lunargr_cli import main as cli
 from lunargr_cli.paths import Writes, files_of
+from lunargr_cli.spelling import option_of
 
 SUN = ["--sun-azimuth", "100", "--sun-elevation", "35"]
 # What each command reads, and the words that have it read that. Every command that writes must be here.
@@ -48,7 +49,7 @@ def written_options(module) -> list[tuple[str, Writes]]:
     """The options of a command that name what it writes."""
     command = get_command(cli.app).commands[module.NAME]
     some = {p.name: Path("x") for p in command.params}
-    return [(option, kind) for option, _, kind in files_of(module.command, some).written]
+    return [(option_of(module.command, name), kind) for name, _, kind in files_of(module.command, some).written]
 
 
 @pytest.fixture(scope="session")
@@ -186,9 +187,9 @@ def test_an_output_that_nobody_marked_cannot_replace_anything(tmp_path):
     def command(source: Path, result: Path, output: cli.Path) -> None:
         write_json(result, 1)
 
-    from lunargr_cli.options import Output
+    from lunargr_cli.options import OutputFile
 
-    command.__annotations__ = {"source": Path, "result": Path, "output": Output}
+    command.__annotations__ = {"source": Path, "result": Path, "output": OutputFile}
     result = tmp_path / "result.json"
     result.write_text("kept")
     arguments = {"source": tmp_path / "source", "result": result, "output": tmp_path / "o"}

@@ -89,7 +89,7 @@ def test_reference_implementation_stores_cos_phase_first():
 
 def test_what_the_target_cannot_hold_is_refused_by_name():
     values = {"w": 0.4, "b": 0.23, "c": 0.4, "Bs0": 1.7, "hs": 0.05, "Bc0": 0.5, "hc": 1.0, "theta": 0.4, "phi": 0.0}
-    with pytest.raises(ConfigError, match=r"Bc0 = 0\.5 becomes 0; theta = 0\.4 becomes 0; give --approximate"):
+    with pytest.raises(ConfigError, match=r"Bc0 = 0\.5 becomes 0; theta = 0\.4 becomes 0; give `approximate`"):
         convert_maps(values, "lunargr:hapke_h1981", "asp:Hapke")
     asp, lost = convert_maps(values, "lunargr:hapke_h1981", "asp:Hapke", approximate=True)
     assert len(lost) == 2
@@ -186,7 +186,7 @@ def test_bands_are_found_by_name_only(tmp_path, rng):
     maps = sample(get_convention("asp:Hapke"), rng)
     unnamed = write_maps(tmp_path / "unnamed.tif", maps, descriptions=False)
     config = convert.Config("asp:Hapke", "lunargr:hapke_h1981")
-    with pytest.raises(InputError, match=r"expected band descriptions omega,b,c,B0,h .* --bands omega,b,c,B0,h"):
+    with pytest.raises(InputError, match=r"expected band descriptions omega,b,c,B0,h .* `bands` omega,b,c,B0,h"):
         convert.run(unnamed, tmp_path / "out.tif", config)
     named = convert.Config("asp:Hapke", "lunargr:hapke_h1981", bands=["omega", "b", "c", "B0", "h"])
     convert.run(unnamed, tmp_path / "out.tif", named)
@@ -196,9 +196,9 @@ def test_bands_are_found_by_name_only(tmp_path, rng):
     convert.run(unnamed, tmp_path / "swap.tif", convert.Config("asp:Hapke", "lunargr:hapke_h1981", bands=swapped))
     with rasterio.open(tmp_path / "swap.tif") as data:
         assert data.read(1) == pytest.approx(maps["b"], rel=1e-6)
-    with pytest.raises(ConfigError, match="--bands: expected NAME=INDEX with an index from 1 to 5, found 'omega=6'"):
+    with pytest.raises(ConfigError, match="`bands`: expected NAME=INDEX with an index from 1 to 5, found 'omega=6'"):
         convert.run(unnamed, tmp_path / "x.tif", convert.Config("asp:Hapke", "lunargr:hapke_h1981", bands=["omega=6"]))
-    with pytest.raises(ConfigError, match="--bands: expected 5 names"):
+    with pytest.raises(ConfigError, match="`bands`: expected 5 names"):
         convert.run(unnamed, tmp_path / "x.tif", convert.Config("asp:Hapke", "lunargr:hapke_h1981", bands=["omega"]))
     partial = write_maps(tmp_path / "partial.tif", {k: maps[k] for k in ("omega", "b", "c", "B0")})
     with pytest.raises(InputError, match="expected one band 'h' for asp:Hapke, found 0 among 'omega, b, c, B0'"):

@@ -120,7 +120,7 @@ def test_unknown_pixels_do_not_spoil_the_rounded_ones(small_artefacts, tmp_path,
 
 
 def test_moved_scene_changed_scene_and_mixed_units(small_artefacts, small_files, tmp_path):
-    with pytest.raises(ArtefactError, match="--scene"):
+    with pytest.raises(ArtefactError, match="`scene`"):
         elsewhere = tmp_path / "crops.h5"
         elsewhere.write_bytes(small_artefacts["crops"].read_bytes())
         project.run(elsewhere, tmp_path / "p.h5", project.Config())

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from rasterio.transform import Affine
 from relief import body_point, hills
+from scipy.ndimage import gaussian_filter
 
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import Grid, local_metric_crs, unit_vectors
 from stages.physics.photometry import get_model
+from stages.physics.terrain.further_light import Bounce
 from stages.physics.terrain.shading import Light
 from stages.physics.terrain.sun import Sun, sun_from_angles
 from stages.physics.terrain.sun_visibility import SunHorizon
@@ -71,8 +73,8 @@ class Peer:
         }
         return mi.load_dict({"type": "scene", "terrain": self.mesh, "sun": light})
 
-    def image(self, sun: Sun, camera, samples: int) -> np.ndarray:
-        """I/F: radiance under an irradiance of pi."""
+    def image(self, sun: Sun, camera, samples: int, bounces: int = 0) -> np.ndarray:
+        """I/F: radiance under an irradiance of pi, after at most so many bounces between facets."""
         eye = (camera.centre - self.centre) / self.unit
         forward, down = camera.rotation[:, 2], camera.rotation[:, 1]
         sensor = mi.load_dict(
@@ -93,7 +95,8 @@ class Peer:
                 "sampler": {"type": "stratified", "sample_count": samples},
             }
         )
-        integrator = mi.load_dict({"type": "direct", "hide_emitters": True})
+        path = {"type": "path", "max_depth": 2 + bounces, "rr_depth": 100, "hide_emitters": True}
+        integrator = mi.load_dict(path if bounces else {"type": "direct", "hide_emitters": True})
         return np.array(mi.render(self.scene(sun), sensor=sensor, integrator=integrator, seed=1))[..., 0]
 
     def depth(self, sun: Sun, camera) -> np.ndarray:
@@ -169,3 +172,31 @@ def test_views_agree_with_mitsuba(scenes, tmp_path, name, sun_elevation_deg):
         assert (theirs[dark] < 0.01 * theirs[lit].mean()).mean() > 0.99
     miss = np.abs(ours["depth"] - depth)[uniform]
     assert np.percentile(miss, 99) < 0.1 * grid.gsd, np.percentile(miss, [50, 90, 99, 100])
+
+
+@pytest.mark.parametrize("name", ["nadir", "oblique"])
+def test_one_bounce_agrees_with_mitsuba(scenes, tmp_path, name):
+    """What a low Sun's light adds after one bounce, in shadows and beside them, through a camera."""
+    scene_name, (row, col, altitude_px), target = VIEWS[name]
+    grid, z, peer = scenes[scene_name]
+    position = body_point(grid, row, col, altitude_px * grid.gsd)
+    camera = pinhole_view(position, look_at(position, body_point(grid, *target, 0.0)), FOV, (WIDTH, HEIGHT), RADIUS)
+    sun = sun_from_angles(120.0, 18.0, grid)
+    sun = Sun(sun.position, 1e-3 * SUN_RADIUS)
+    surface = lambert_surface(tmp_path, grid, z)
+    relief = (float(z.min()), float(z.max()))
+    horizon = SunHorizon(surface.elevation, grid, sun, relief[1] - relief[0])
+    images = []
+    for bounce in (None, Bounce(surface, sun, horizon)):
+        light = Light(sun, horizon, None, bounce=bounce)
+        bands = render_view(surface, camera, light, make_scene(surface, camera, light, relief, 2))
+        images.append(np.concatenate([b["image"] for b in bands]))
+    ours = images[1] - images[0]
+    theirs = peer.image(sun, camera, 256, bounces=1) - peer.image(sun, camera, 256)
+    inner = np.zeros(ours.shape, bool)
+    inner[8:-8, 8:-8] = True
+    inner &= np.isfinite(ours)
+    assert theirs[inner].mean() > 0.002 * images[0][inner].mean()  # it is there to be seen
+    assert ours[inner].mean() == pytest.approx(theirs[inner].mean(), rel=0.05)
+    smooth = [gaussian_filter(np.where(inner, v, 0), 3)[inner] for v in (ours, theirs)]
+    assert np.corrcoef(*smooth)[0, 1] > 0.95

@@ -19,7 +19,7 @@ from schemas import DIAGNOSIS, SCENE, SVBRDF, ArtefactWriter
 from schemas.files.outputs import Output
 from stages import evaluate, match, report, train
 from stages.report import conclusions
-from stages.report.maps import round_length
+from stages.report.maps import _longest, round_length
 
 WKT = "LOCAL_CS[moon]"
 VOID = {"meta", "img", "br", "link", "hr"}
@@ -175,7 +175,7 @@ def test_numbers_are_those_of_the_files(page, folder):
     assert f"{gain:+.1f}" in text
     matching = json.loads((folder / "match.json").read_text())["matchers"]["sift"]["learned"]
     assert f"{matching['within_3_px_percent']:.1f}" in text
-    assert "sun elevation" in text and "1.25 +- 0.1 degree" in text and "earthshine" in text
+    assert "sun elevation" in text and "1.25\u00a0+-\u00a00.1\u00a0degree" in text and "earthshine" in text
 
 
 def test_text_of_the_user_is_escaped(page):
@@ -366,3 +366,13 @@ def test_bad_input_is_one_line_and_leaves_nothing(folder, tmp_path, case):
     code, message = run_command("report", files[case], "-o", output)
     assert code == 3 and message and "\n" not in message
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_more_maps_are_shown_smaller(tmp_path):
+    """The page stays light: many maps have together the pixels of a few."""
+    pixels = []
+    for count in (3, 12, 40):
+        with h5py.File(tmp_path / f"{count}.h5", "w") as file:
+            file["coefficients"] = file["coefficients_std"] = np.zeros((count, 1, 1))
+            pixels.append(2 * count * _longest(file) ** 2)
+    assert pixels[0] == 6 * 800**2 and pixels[1:] == pytest.approx([10 * 800**2] * 2, rel=0.01)

@@ -11,6 +11,7 @@ from geographiclib.geodesic import Geodesic
 
 from schemas import ConfigError, GeometryError
 from stages import sample
+from stages.physics.maps.ground_tiles import Tiles
 
 
 def crops(small_artefacts, tmp_path, **options):
@@ -132,9 +133,9 @@ def test_impossible_requests_are_refused(small_artefacts, tmp_path):
         ({"tile_m": 100.0}, ConfigError, "at least one crop"),
         ({"crop": 40}, ConfigError, "multiple of 16"),
         ({"count": 5, "density": 1.0}, ConfigError, "one of the two"),
-        ({"count": 0}, ConfigError, "--count: expected 1"),
+        ({"count": 0}, ConfigError, "`count`: expected 1"),
         ({"crop": 0}, ConfigError, "multiple of 16"),
-        ({"tile_m": float("nan")}, ConfigError, "--tile-m"),
+        ({"tile_m": float("nan")}, ConfigError, "`tile_m`"),
         ({"crop": 320, "tile_m": 6400.0}, GeometryError, "no crop"),
     ]:
         with pytest.raises(kind, match=words):
@@ -186,5 +187,16 @@ def test_a_scene_with_room_has_twenty_test_tiles(small_artefacts, tmp_path):
 
 
 def test_a_crop_larger_than_the_scene_s_tiles_asks_for_larger_tiles(small_artefacts, tmp_path):
-    with pytest.raises(ConfigError, match="--tile-m"):
+    with pytest.raises(ConfigError, match="`tile_m`"):
         sample.run(small_artefacts["scene"], tmp_path / "c.h5", sample.Config(crop=256, count=5))
+
+
+def test_a_footprint_ends_where_its_tile_does():
+    """Rows 10 to 19 are for testing: crops of 4 px are centred from row 12 to row 18 there, and the ones beside end at row 9."""
+    tiles = Tiles(10, np.array([[0], [2], [0]], np.int8))
+    row = np.arange(2, 28)
+    part = tiles.allowed(row[:, None], np.array([5]), 4)[:, 0]
+    assert row[part == 2].tolist() == list(range(12, 19))
+    assert row[part == 0].tolist() == [*range(2, 9), *range(22, 28)]
+    across = Tiles(10, np.array([[0, 1, 0]], np.int8)).allowed(np.array([[5]]), row, 4)[0]
+    assert row[across == 1].tolist() == list(range(12, 19))

@@ -135,7 +135,7 @@ def test_a_full_disk_is_one_clear_line_and_leaves_nothing(tmp_path):
 
 def test_an_output_never_replaces_an_input_nor_an_existing_file(tmp_path):
     path = write_pairs(tmp_path / "pairs.h5")
-    with pytest.raises(ConfigError, match="--overwrite"):
+    with pytest.raises(ConfigError, match="`overwrite`"):
         write_pairs(path)
     before = path.read_bytes()
     with pytest.raises(ConfigError, match="replace the input"):

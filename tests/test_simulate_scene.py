@@ -282,7 +282,7 @@ def test_bad_files_and_existing_outputs(scene, tmp_path):
     with pytest.raises(InputError, match="JSON"):
         read_recipe(tmp_path / "bad.json")
     before = (folder / "dem.tif").stat().st_mtime_ns
-    with pytest.raises(ConfigError, match="--overwrite"):
+    with pytest.raises(ConfigError, match="`overwrite`"):
         run(folder, config)
     assert (folder / "dem.tif").stat().st_mtime_ns == before
     with pytest.raises(RegistryError, match="reflectance model"):

@@ -217,11 +217,11 @@ def test_bad_requests_are_refused_and_leave_nothing(small_artefacts, tmp_path):
     pairs = small_artefacts["pairs"]
     for options, kind, words in [
         ({"model": "M9"}, RegistryError, "choose one of"),
-        ({"lr": -1.0}, ConfigError, "--lr"),
-        ({"epochs": 0}, ConfigError, "--epochs"),
+        ({"lr": -1.0}, ConfigError, "`lr`"),
+        ({"epochs": 0}, ConfigError, "`epochs`"),
         ({"widths": (4, 4, 4, 4, 4, 4, 4)}, ConfigError, "multiple of 64"),
-        ({"schedule": "steps"}, ConfigError, "--schedule"),
-        ({"device": "abacus"}, ConfigError, "--device"),
+        ({"schedule": "steps"}, ConfigError, "`schedule`"),
+        ({"device": "abacus"}, ConfigError, "`device`"),
     ]:
         with pytest.raises(kind, match=words):
             train.run(pairs, out, config(**options))

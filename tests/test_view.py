@@ -126,9 +126,9 @@ def test_a_model_without_a_formula_for_the_page_is_refused_with_those_that_have_
     ("config", "output", "message"),
     [
         (view.Config(), "o.png", r"ends in \.html"),
-        (view.Config(max_px=3), "o.html", "--max-px"),
-        (view.Config(sun_elevation_deg=0.0), "o.html", "--sun-elevation"),
-        (view.Config(photographs=0), "o.html", "--photographs"),
+        (view.Config(max_px=3), "o.html", "`max_px`"),
+        (view.Config(sun_elevation_deg=0.0), "o.html", "`sun_elevation_deg`"),
+        (view.Config(photographs=0), "o.html", "`photographs`"),
     ],
 )
 def test_options_that_make_no_page(hilly_map, tmp_path, config, output, message):

@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.options import (
+    GeoTiff,
+    NoGeoTiff,
     OutputFile,
     Overwrite,
     Parts,
@@ -17,8 +19,11 @@ from lunargr_cli.options import (
     Shard,
     in_parts,
     parse_shard,
+    read_names,
+    to_map,
 )
-from lunargr_cli.paths import Writes
+from schemas.errors import ConfigError
+from stages.albedo import Config
 
 NAME, ORDER = "albedo", 61
 
@@ -42,12 +47,8 @@ def command(
             help="Take off how far each image lies from its rendering: constant, affine or field, as 'lunargr project'.",
         ),
     ] = None,
-    geotiff: Annotated[
-        Path | None,
-        typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif)."),
-        Writes.FILE,
-    ] = None,
-    no_geotiff: Annotated[bool, typer.Option("--no-geotiff", help="Write the HDF5 map only.")] = False,
+    geotiff: GeoTiff = None,
+    no_geotiff: NoGeoTiff = False,
     shard: Shard = None,
     output: OutputFile = Path("svbrdf_albedo.h5"),
     scheduler: Scheduler = None,
@@ -61,22 +62,11 @@ def command(
     The albedo multiplies the I/F of the map. Where photographs agree it is theirs; where they do not, and where there are
     none, it is 1 and the map stays as the terrain gave it. Rendering, evaluation and GeoTIFF take it into account.
     """
+    config = Config(read_names(leave_out), _fold(fold), register, parse_shard(shard), geotiff=not no_geotiff)
     from lunargr_cli.console import Console
-    from schemas import ConfigError
-    from schemas.files.outputs import Output
     from stages import albedo
 
-    if geotiff and no_geotiff:
-        raise ConfigError(f"--geotiff {geotiff} and --no-geotiff: expected one of them, found both.")
-    console = Console(quiet)
-    to = Output(output, overwrite, geotiff=geotiff)
-    config = albedo.Config(
-        leave_out=tuple(name.strip() for name in leave_out.split(",") if name.strip()) if leave_out else (),
-        fold=_fold(fold),
-        register=register,
-        shard=parse_shard(shard),
-        geotiff=not no_geotiff,
-    )
+    console, to = Console(quiet), to_map(output, overwrite, geotiff, no_geotiff)
     if in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_albedo
@@ -103,8 +93,6 @@ def command(
 
 def _fold(text: str | None) -> tuple[int, int] | None:
     """'2/4' -> (1, 4). Raises ConfigError."""
-    from schemas import ConfigError
-
     if text is None:
         return None
     first, _, last = text.partition("/")

@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Resume
+from lunargr_cli.options import (
+    Batch,
+    Device,
+    Epochs,
+    Json,
+    LearningRate,
+    Overwrite,
+    Quiet,
+    Resume,
+    Schedule,
+    TrainingPrecision,
+    Widths,
+    configure,
+    dashed,
+    read_names,
+    read_numbers,
+)
 from lunargr_cli.paths import Writes
+from stages.train import Config
+
+if TYPE_CHECKING:
+    from lunargr_cli.console import Console
 
 NAME, ORDER = "compare", 72
-ENDS = ("checkpoint.h5", "checkpoint.resume.h5")  # and the evaluation's
 
 
 def command(
@@ -27,20 +47,16 @@ def command(
     seeds: Annotated[
         int, typer.Option("--seeds", min=1, max=1000, help="Training runs of every model, from seeds 0, 1, ...")
     ] = 3,
-    epochs: Annotated[int, typer.Option("--epochs", min=1, max=100_000, help="Passes over the training pairs.")] = 20,
-    batch: Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Pairs per training step.")] = 32,
-    lr: Annotated[float, typer.Option("--lr", help="Adam's learning rate.")] = 3e-3,
-    schedule: Annotated[
-        str, typer.Option("--schedule", help="Learning rate over the steps: constant or cosine.")
-    ] = "cosine",
-    widths: Annotated[str, typer.Option("--widths", help="Channels of each stage of the U-Net.")] = "8-16-32",
-    precision: Annotated[
-        str, typer.Option("--precision", help="fp32, bf16, or auto: bf16 where a probe finds it faster.")
-    ] = "auto",
+    epochs: Epochs = Config.epochs,
+    batch: Batch = Config.batch,
+    lr: LearningRate = Config.lr,
+    schedule: Schedule = Config.schedule,
+    widths: Widths = dashed(Config.widths),
+    precision: TrainingPrecision = Config.precision,
     split: Annotated[
         str, typer.Option("--split", help="Where models are compared: validation (as in the paper) or test.")
     ] = "validation",
-    device: Device = "auto",
+    device: Device = Config.device,
     json_file: Json = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
@@ -50,48 +66,79 @@ def command(
 
     With --resume, runs that the folder already holds are kept and an interrupted one goes on where it stopped.
     """
+    common = configure(Config, locals(), widths=read_numbers("--widths", widths, int))
     from lunargr_cli.console import Console
-    from lunargr_cli.options import read_numbers
     from schemas import SPLITS, ConfigError
     from schemas.files.outputs import Output, Target, check_outputs
-    from stages import compare, evaluate, train
-    from stages.physics.photometry import get_model
+    from stages import compare, train
 
     console = Console(quiet)
-    names = list(dict.fromkeys(get_model(name.strip()).name for name in models.split(",") if name.strip()))
-    if len(names) < 2:
-        raise ConfigError(f"--models: expected at least two models, found '{models}'.")
-    channels = read_numbers("--widths", widths, int)
-    settings: dict[str, Any] = {"epochs": epochs, "batch": batch, "lr": lr, "schedule": schedule, "widths": channels}
-    settings["precision"] = precision
-    train.check(train.Config(device=device, **settings))
+    names = _models(models)
+    train.check(common)
     if split not in dict(SPLITS):
         raise ConfigError(f"--split: expected one of {', '.join(dict(SPLITS))}, found '{split}'.")
+    runs = [_Runs(output, name, seeds, split) for name in names]
     table, curves = output / compare.TABLE, output / compare.CURVES
-    check_outputs([Target(table), Target(curves)], [pairs], overwrite or resume)
-    made = [output / f"{name}_seed{k}.{end}" for name in names for k in range(seeds) for end in ENDS]
-    made += [output / f"{name}.{split}.{end}" for name in names for end in ("h5", "json")]
-    check_outputs(map(Target, made), [pairs], overwrite or resume)
-    files: list[tuple[Path, list[Path]]] = []
-    for number, name in enumerate(names):
-        evaluation = output / f"{name}.{split}.h5"
-        checkpoints = [output / f"{name}_seed{seed}.checkpoint.h5" for seed in range(seeds)]
-        for seed, checkpoint in enumerate(checkpoints):
-            config = train.Config(model=name, seed=seed, device=device, **settings)
+    made = [path for run in runs for path in run.files]
+    check_outputs([Target(path) for path in (table, curves, *made)], [pairs], overwrite or resume)
+    for number, run in enumerate(runs):
+        for seed, checkpoint in enumerate(run.checkpoints):
+            config = replace(common, model=run.model, seed=seed)
             if not (resume and checkpoint.exists() and _same(checkpoint, config, pairs)):
-                console.say(f"training {name}, seed {seed} ({number * seeds + seed + 1} of {seeds * len(names)})")
-                train.run(pairs, Output(checkpoint, overwrite or resume, resume), config, console.say, console.progress)
-        if not (resume and evaluation.exists() and _made_from(evaluation, [pairs, *checkpoints])):
-            scoring = evaluate.Config(split=split, renderings=False, device=device, only=("learned",))
-            evaluate.run(pairs, checkpoints, Output(evaluation, overwrite=True), scoring, console.say, console.progress)
-        files.append((evaluation, checkpoints))
-    result = compare.run(files, Output(output, overwrite=True, json=json_file))
+                console.say(f"training {run.model}, seed {seed} ({number * seeds + seed + 1} of {seeds * len(names)})")
+                to = Output(checkpoint, overwrite or resume, resume)
+                train.run(pairs, to, config, console.say, console.progress)
+        if not (resume and run.evaluation.exists() and _made_from(run.evaluation, [pairs, *run.checkpoints])):
+            _evaluate(pairs, run, device, console)
+    result = compare.run([(run.evaluation, run.checkpoints) for run in runs], Output(output, json=json_file))
     console.table(
         f"{len(names)} models x {seeds} seeds on {result['crops']} {split} crops, {result['tiles']} ground tiles",
         *compare.result_lines(result),
     )
     console.table("which differences are larger than their noise", *compare.difference_lines(result))
     console.say(f"written: {table}, {curves}")
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """The files of one model's training runs. folder : of the comparison"""
+
+    folder: Path
+    model: str
+    seeds: int
+    split: str
+
+    @property
+    def checkpoints(self) -> list[Path]:
+        return [self.folder / f"{self.model}_seed{seed}.checkpoint.h5" for seed in range(self.seeds)]
+
+    @property
+    def evaluation(self) -> Path:
+        return self.folder / f"{self.model}.{self.split}.h5"
+
+    @property
+    def files(self) -> list[Path]:
+        """All that is written, with what an unfinished training leaves."""
+        unfinished = [path.with_suffix(".resume.h5") for path in self.checkpoints]
+        return [*self.checkpoints, *unfinished, self.evaluation, self.evaluation.with_suffix(".json")]
+
+
+def _models(text: str) -> list[str]:
+    from schemas import ConfigError
+    from stages.physics.photometry import get_model
+
+    names = list(dict.fromkeys(get_model(name).name for name in read_names(text)))
+    if len(names) < 2:
+        raise ConfigError(f"--models: expected at least two models, found '{text}'.")
+    return names
+
+
+def _evaluate(pairs: Path, run: _Runs, device: str, console: Console) -> None:
+    from schemas.files.outputs import Output
+    from stages import evaluate
+
+    config = evaluate.Config(split=run.split, renderings=False, device=device, only=("learned",))
+    evaluate.run(pairs, run.checkpoints, Output(run.evaluation, overwrite=True), config, console.say, console.progress)
 
 
 def _same(checkpoint: Path, config: Any, pairs: Path) -> bool:

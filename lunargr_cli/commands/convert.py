@@ -37,12 +37,12 @@ def command(
 ) -> None:
     """Write coefficient maps in another program's convention; 'lunargr models --conventions' lists them."""
     from lunargr_cli.console import Console
+    from lunargr_cli.options import read_names
     from schemas.files.outputs import Output
     from stages import convert
 
     console = Console(quiet)
-    names = None if bands is None else [name.strip() for name in bands.split(",")]
-    config = convert.Config(start, end, names, approximate)
+    config = convert.Config(start, end, None if bands is None else read_names(bands), approximate)
     report = convert.run(source, Output(output, overwrite), config, console.say, console.progress)
     for loss in report.losses:
         console.say(f"lost: {loss}")

@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.console import Console, write_out
-from lunargr_cli.options import MOST, Json, Overwrite, Quiet, Scheduler, Seed
+from lunargr_cli.options import MOST, Json, Overwrite, Quiet, Scheduler, Seed, configure, read_names
 from lunargr_cli.paths import Writes
+from stages.diagnose import Config
 
 NAME, ORDER = "diagnose", 80
 
@@ -25,7 +26,7 @@ def command(
             "--model",
             help="Reflectance model to fit where there is no checkpoint; M2 or hapke, whichever explains more alone, may take its place.",
         ),
-    ] = "M2",
+    ] = Config.model,
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="diagnosis.h5: the extended model for train, render, evaluate."),
@@ -39,11 +40,15 @@ def command(
     free: Annotated[
         str,
         typer.Option("--free", help="Coefficients of --model that are fitted, by commas; the others stay published."),
-    ] = "",
+    ] = ",".join(Config.free),
     list_effects: Annotated[bool, typer.Option("--list", help="Explain every effect and stop.")] = False,
-    most_causes: Annotated[int, typer.Option("--causes", min=1, max=100, help="Most causes to name.")] = 4,
-    most_pairs: Annotated[int, typer.Option("--pairs", min=1, max=MOST, help="Most pairs that the search uses.")] = 384,
-    seed: Seed = 0,
+    most_causes: Annotated[
+        int, typer.Option("--causes", min=1, max=100, help="Most causes to name.")
+    ] = Config.most_causes,
+    most_pairs: Annotated[
+        int, typer.Option("--pairs", min=1, max=MOST, help="Most pairs that the search uses.")
+    ] = Config.most_pairs,
+    seed: Seed = Config.seed,
     json_file: Json = None,
     scheduler: Scheduler = None,
     overwrite: Overwrite = False,
@@ -63,8 +68,7 @@ def command(
     from stages import diagnose
     from stages.diagnose.result.answer import describe
 
-    chosen = tuple(name.strip() for name in free.split(",") if name.strip())
-    config = diagnose.Config(model, chosen, most_causes, most_pairs=most_pairs, seed=seed)
+    config = configure(Config, locals(), free=read_names(free))
     if scheduler:
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_diagnose

@@ -7,8 +7,20 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import MOST, Device, Json, OutputFile, Overwrite, Quiet, ResumeParts, Scheduler, Seed
+from lunargr_cli.options import (
+    MOST,
+    Device,
+    Json,
+    OutputFile,
+    Overwrite,
+    Quiet,
+    ResumeParts,
+    Scheduler,
+    Seed,
+    configure,
+)
 from lunargr_cli.paths import Writes
+from stages.evaluate import Config
 
 NAME, ORDER = "evaluate", 70
 
@@ -27,7 +39,7 @@ def command(
         bool,
         typer.Option("--held-out-images", help="Score seen ground under images that did not make the map's albedo."),
     ] = False,
-    split: Annotated[str, typer.Option("--split", help="train, validation or test.")] = "test",
+    split: Annotated[str, typer.Option("--split", help="train, validation or test.")] = Config.split,
     extend: Annotated[
         Path | None,
         typer.Option("--extend", metavar="FILE", help="Also score the extended model of 'lunargr diagnose'."),
@@ -40,7 +52,7 @@ def command(
     fit_pairs: Annotated[
         int,
         typer.Option("--fit-pairs", min=0, max=MOST, help="Most train pairs that baselines are fitted on (0: all)."),
-    ] = 4096,
+    ] = Config.fit_pairs,
     renderings: Annotated[
         bool | None,
         typer.Option(
@@ -51,9 +63,9 @@ def command(
         list[str] | None,
         typer.Option("--only", metavar="ROW", help="Score only this row of the table; may be repeated."),
     ] = None,
-    batch: Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Crops in memory at a time.")] = 16,
-    seed: Seed = 0,
-    device: Device = "auto",
+    batch: Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Crops in memory at a time.")] = Config.batch,
+    seed: Seed = Config.seed,
+    device: Device = Config.device,
     json_file: Json = None,
     scheduler: Scheduler = None,
     resume: ResumeParts = False,
@@ -66,6 +78,7 @@ def command(
     the train split in the same way for every model; their errors are shares of the full DN range. Checkpoints of one
     model from several seeds make the learned rows means over training runs, whose spread is part of the intervals.
     """
+    config = configure(Config, locals(), only=tuple(only or ()), extend=str(extend) if extend else None)
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output
     from stages import evaluate
@@ -79,8 +92,6 @@ def command(
 
         show_held_out_images(console, pairs, checkpoints, to, split, seed)
         return
-    extension = str(extend) if extend else None
-    config = evaluate.Config(split, batch, fit_pairs, renderings, seed, device, tuple(only or ()), extension)
     if scheduler is not None or resume:
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_evaluate

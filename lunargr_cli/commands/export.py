@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.options import OutputFile, Overwrite, Quiet
+from stages.export import Config
 
 NAME, ORDER = "export", 62
 
@@ -15,7 +16,7 @@ NAME, ORDER = "export", 62
 def command(
     checkpoint: Annotated[Path, typer.Argument(help="checkpoint.h5 from 'lunargr train'.")],
     output: OutputFile = Path("model.onnx"),
-    opset: Annotated[int, typer.Option("--opset", help="ONNX operator set.")] = 17,
+    opset: Annotated[int, typer.Option("--opset", help="ONNX operator set.")] = Config.opset,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -24,7 +25,7 @@ def command(
     from schemas.files.outputs import Output
     from stages import export
 
-    made = export.run(checkpoint, Output(output, overwrite), export.Config(opset))
+    made = export.run(checkpoint, Output(output, overwrite), Config(opset))
     Console(quiet).say(
         f"{output}: {made.model}, coefficients {', '.join(made.coefficients)}, sizes in multiples of {made.stride} px, "
         f"{made.size / 1e6:.1f} MB; {made.card} says what it is"

@@ -11,6 +11,8 @@ from lunargr_cli.options import (
     MOST,
     BodyOption,
     Device,
+    GeoTiff,
+    NoGeoTiff,
     OutputFile,
     Overwrite,
     Parts,
@@ -18,10 +20,12 @@ from lunargr_cli.options import (
     ResumeParts,
     Scheduler,
     Shard,
+    configure,
     in_parts,
     parse_shard,
+    to_map,
 )
-from lunargr_cli.paths import Writes
+from stages.infer import Config
 
 NAME, ORDER = "infer", 60
 
@@ -38,24 +42,20 @@ def command(
     stride: Annotated[
         int | None, typer.Option("--stride", min=1, max=MOST, help="Step between windows, px (default: a window).")
     ] = None,
-    window_offset: Annotated[
+    offset: Annotated[
         int, typer.Option("--window-offset", min=-MOST, max=MOST, metavar="PX", help="Shift the grid of windows.")
-    ] = 0,
+    ] = Config.offset,
     precision: Annotated[
         str,
         typer.Option("--precision", help="fp32, bf16, or auto: bf16 where the processor has it and it does no harm."),
-    ] = "auto",
-    any_gsd: Annotated[bool, typer.Option("--any-gsd", help="Allow a DEM at another GSD than the training's.")] = False,
-    geotiff: Annotated[
-        Path | None,
-        typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif)."),
-        Writes.FILE,
-    ] = None,
-    no_geotiff: Annotated[
-        bool, typer.Option("--no-geotiff", help="Write svbrdf.h5 only: on large maps a quarter of the time less.")
-    ] = False,
+    ] = Config.precision,
+    any_gsd: Annotated[
+        bool, typer.Option("--any-gsd", help="Allow a DEM at another GSD than the training's.")
+    ] = Config.any_gsd,
+    geotiff: GeoTiff = None,
+    no_geotiff: NoGeoTiff = False,
     body: BodyOption = None,
-    device: Device = "auto",
+    device: Device = Config.device,
     shard: Shard = None,
     output: OutputFile = Path("svbrdf.h5"),
     scheduler: Scheduler = None,
@@ -65,31 +65,15 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Predict georeferenced maps of reflectance coefficients for a DEM of any size."""
+    config = configure(Config, locals(), shard=parse_shard(shard), geotiff=not no_geotiff)
     import contextlib
     from dataclasses import replace
 
     from lunargr_cli.console import Console
-    from schemas import ConfigError
     from schemas.files.locks import scratch_path
-    from schemas.files.outputs import Output
     from stages import infer
 
-    if precision not in ("auto", "fp32", "bf16"):
-        raise ConfigError(f"--precision: expected auto, fp32 or bf16, found '{precision}'.")
-    if geotiff and no_geotiff:
-        raise ConfigError(f"--geotiff {geotiff} and --no-geotiff: expected one of them, found both.")
-    console = Console(quiet)
-    to = Output(output, overwrite, geotiff=geotiff)
-    config = infer.Config(
-        window=window,
-        stride=stride,
-        offset=window_offset,
-        device=device,
-        precision=precision,
-        any_gsd=any_gsd,
-        shard=parse_shard(shard),
-        geotiff=not no_geotiff,
-    )
+    console, to = Console(quiet), to_map(output, overwrite, geotiff, no_geotiff)
     interrupted = scheduler is not None or resume  # may have got as far as the GeoTIFF: its parts tell
     infer.check_files([terrain, checkpoint], replace(to, resume=interrupted), config)
     gridding = None
@@ -99,9 +83,8 @@ def command(
         from stages import ingest
         from stages.network.predictor import load_predictor
 
-        gridding = ingest.Config(
-            gsd=None if any_gsd else load_predictor(checkpoint).gsd, body="moon" if body is None else body
-        )
+        gsd = None if any_gsd else load_predictor(checkpoint).gsd
+        gridding = ingest.Config(gsd=gsd, body=body or ingest.Config.body)
     if in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_infer

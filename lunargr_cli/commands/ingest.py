@@ -17,9 +17,11 @@ from lunargr_cli.options import (
     ResumeParts,
     Scheduler,
     Shard,
+    configure,
     in_parts,
     parse_shard,
 )
+from stages.ingest import Config
 
 NAME, ORDER = "ingest", 20
 
@@ -39,12 +41,12 @@ def command(
     ] = None,
     crop: Annotated[
         int, typer.Option("--crop", min=1, max=MOST, help="Crop size in pixels that valid positions are made for.")
-    ] = 128,
+    ] = Config.crop,
     output: OutputFile = Path("scene.h5"),
-    body: BodyOption = None,
+    body: BodyOption = Config.body,
     skip_outside: Annotated[
         bool, typer.Option("--skip-outside", help="Leave out images that do not touch the DEM.")
-    ] = False,
+    ] = Config.skip_outside,
     shard: Shard = None,
     scheduler: Scheduler = None,
     resume: ResumeParts = False,
@@ -53,15 +55,12 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Bring a DEM to a metric grid and find where crops of each image may be centred."""
+    config = configure(Config, locals(), shard=parse_shard(shard))
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output
     from stages import ingest
 
-    console = Console(quiet)
-    to = Output(output, overwrite)
-    config = ingest.Config(
-        gsd=gsd, crop=crop, body="moon" if body is None else body, skip_outside=skip_outside, shard=parse_shard(shard)
-    )
+    console, to = Console(quiet), Output(output, overwrite)
     if in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_ingest

@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Seed
+from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Seed, configure
 from lunargr_cli.paths import Writes
+from stages.match import Config
 
 NAME, ORDER = "match", 71
 
@@ -21,12 +22,14 @@ def command(
             help="PAIRS CHECKPOINT; or an EVALUATION with renderings; or a measured image and rendered ones.",
         ),
     ],
-    matcher: Annotated[
+    matchers: Annotated[
         list[str] | None,
         typer.Option("--matcher", help="daisy, sift, aliked or disk; may be repeated (default: daisy and sift)."),
     ] = None,
-    split: Annotated[str, typer.Option("--split", help="train, validation or test (for pairs).")] = "test",
-    count: Annotated[int, typer.Option("--count", min=1, max=MOST, help="Crops to match, drawn at random.")] = 24,
+    split: Annotated[str, typer.Option("--split", help="train, validation or test (for pairs).")] = Config.split,
+    count: Annotated[
+        int, typer.Option("--count", min=1, max=MOST, help="Crops to match, drawn at random.")
+    ] = Config.count,
     features_model: Annotated[
         Path | None, typer.Option("--features-model", metavar="ONNX", help="Network of aliked or disk.")
     ] = None,
@@ -38,8 +41,8 @@ def command(
         typer.Option("--figures", metavar="DIR", help="Write match pictures, coloured by error, as PNG."),
         Writes.FOLDER,
     ] = None,
-    seed: Seed = 0,
-    device: Device = "auto",
+    seed: Seed = Config.seed,
+    device: Device = Config.device,
     json_file: Json = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -49,15 +52,13 @@ def command(
     Both show the same ground, pixel for pixel, so every match should end where it began: the learned reflectance
     beside Hapke matched to each crop's range, as in the Lunar-G2R paper.
     """
+    config = configure(Config, locals(), matchers=tuple(matchers or Config.matchers))
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output
     from stages import match
     from stages.match.stage import result_lines
 
     console = Console(quiet)
-    config = match.Config(
-        tuple(matcher or ("daisy", "sift")), split, count, features_model, lightglue_model, seed, device
-    )
     to = Output(overwrite=overwrite, json=json_file, figures=figures)
     result = match.run(files, to, config, console.say, console.progress)
     columns, cells = result_lines(result)

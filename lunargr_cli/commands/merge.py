@@ -9,6 +9,7 @@ import typer
 
 from lunargr_cli.options import Overwrite, Quiet
 from lunargr_cli.paths import Writes
+from stages.merge import Config
 
 NAME, ORDER = "merge", 89
 
@@ -20,7 +21,7 @@ def command(
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write."), Writes.FILE],
     virtual: Annotated[
         bool, typer.Option("--virtual", help="Do not copy: the output is a view of its parts, which must stay.")
-    ] = False,
+    ] = Config.virtual,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -30,5 +31,5 @@ def command(
     from stages import merge
 
     console = Console(quiet)
-    schema = merge.run(parts, Output(output, overwrite), merge.Config(virtual), console.say, console.progress)
+    schema = merge.run(parts, Output(output, overwrite), Config(virtual), console.say, console.progress)
     console.say(f"{output}: {len(parts)} parts of '{schema.name}' merged")

@@ -18,19 +18,19 @@ from lunargr_cli.options import (
     ResumeParts,
     Scheduler,
     Shard,
+    configure,
     in_parts,
     parse_shard,
 )
 from lunargr_cli.paths import Writes
+from schemas.errors import ConfigError
+from stages.project import Config
 
 if TYPE_CHECKING:
     from lunargr_cli.console import Console
     from stages.project import Registered
 
 NAME, ORDER = "project", 40
-
-
-FORMS = ("constant", "affine", "field")  # as in stages.physics.images.displacement, which is slow to import
 
 
 class CLASS(typer.core.TyperCommand):
@@ -41,7 +41,7 @@ class CLASS(typer.core.TyperCommand):
         for k, word in enumerate(args):
             full.append(word)
             if word == "--register" and not _is_value(args[k + 1 : k + 2]):
-                full.append(FORMS[0])
+                full.append("constant")
         return super().parse_args(ctx, full)
 
 
@@ -66,7 +66,7 @@ def command(
     ] = None,
     max_shift: Annotated[
         float, typer.Option("--max-shift", help="How far to search when registering, px of the scene's grid.")
-    ] = 8.0,
+    ] = Config.max_shift,
     blocks_csv: Annotated[
         Path | None,
         typer.Option("--shifts", metavar="CSV", help="Also write each block's own shift to a table."),
@@ -74,7 +74,7 @@ def command(
     ] = None,
     exact: Annotated[
         bool, typer.Option("--exact", help="Keep all digits of float32, not those that matter: three times the size.")
-    ] = False,
+    ] = Config.exact,
     shard: Shard = None,
     output: OutputFile = Path("pairs.h5"),
     scheduler: Scheduler = None,
@@ -84,24 +84,16 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Orthorectify the images onto the crops; add the Sun, the camera and the terrain's horizon."""
+    config = configure(Config, locals(), scene=str(scene) if scene else None, shard=parse_shard(shard))
     from lunargr_cli.console import Console
-    from schemas import ConfigError
     from schemas.files.outputs import Output, Target, check_outputs
     from stages import project
 
-    console = Console(quiet)
-    to = Output(output, overwrite)
+    console, to = Console(quiet), Output(output, overwrite)
     if blocks_csv is not None:
         if register is None:
             raise typer.BadParameter("needs --register", param_hint="--shifts")
-        check_outputs([Target(output), Target(blocks_csv, "--shifts")], [crops], overwrite)
-    config = project.Config(
-        scene=str(scene) if scene else None,
-        shard=parse_shard(shard),
-        register=register,
-        max_shift=max_shift,
-        exact=exact,
-    )
+        check_outputs([Target(output), Target(blocks_csv, "blocks_csv")], [crops], overwrite)
     if in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_project

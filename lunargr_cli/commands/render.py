@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lunargr_cli.options import BodyOption, Json, Overwrite, Quiet, Resume, Seed, Shard, parse_shard
+from lunargr_cli.options import BodyOption, Json, Overwrite, Quiet, Resume, Seed, Shard, configure, parse_shard
 from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
+from stages.render import Config, StereoConfig
+
+if TYPE_CHECKING:
+    from lunargr_cli.console import Console
+    from schemas.files.outputs import Output
+    from stages.render import Summary
 
 NAME, ORDER = "render", 60
+CONVERGENCE = ",".join(f"{edge:g}" for edge in StereoConfig.convergence_deg)
 SHARED_OUTPUT = True  # the shards of a trajectory share a folder; each file in it has its own lock
 
 
@@ -48,17 +55,24 @@ def command(
     ] = None,
     view: Annotated[
         str, typer.Option("--view", metavar="ortho|pinhole", help="The map's own grid, or a camera.")
-    ] = "ortho",
-    sun_azimuth: Annotated[
-        float | None, typer.Option(metavar="DEG", help="Sun over the map's middle: clockwise from north ...")
+    ] = Config.view,
+    sun_azimuth_deg: Annotated[
+        float | None,
+        typer.Option("--sun-azimuth", metavar="DEG", help="Sun over the map's middle: clockwise from north ..."),
     ] = None,
-    sun_elevation: Annotated[float | None, typer.Option(metavar="DEG", help="... and above the horizon.")] = None,
-    subsolar_longitude: Annotated[
-        float | None, typer.Option(metavar="DEG", help="Or the sub-solar point: east longitude ...")
+    sun_elevation_deg: Annotated[
+        float | None, typer.Option("--sun-elevation", metavar="DEG", help="... and above the horizon.")
     ] = None,
-    subsolar_latitude: Annotated[float | None, typer.Option(metavar="DEG", help="... and latitude.")] = None,
-    solar_distance: Annotated[
-        float | None, typer.Option(metavar="AU", help="Distance of the Sun (widens the penumbra; default 1).")
+    subsolar_longitude_deg: Annotated[
+        float | None,
+        typer.Option("--subsolar-longitude", metavar="DEG", help="Or the sub-solar point: east longitude ..."),
+    ] = None,
+    subsolar_latitude_deg: Annotated[
+        float | None, typer.Option("--subsolar-latitude", metavar="DEG", help="... and latitude.")
+    ] = None,
+    solar_distance_au: Annotated[
+        float | None,
+        typer.Option("--solar-distance", metavar="AU", help="Distance of the Sun (widens the penumbra; default 1)."),
     ] = None,
     time: Annotated[
         str | None, typer.Option("--time", metavar="UTC", help="Or the time, such as 2010-11-09T13:06:40.")
@@ -79,11 +93,15 @@ def command(
     quaternion: Annotated[
         str | None, typer.Option(metavar="W,X,Y,Z", help="Instead: camera axes (right, down, forward) to body-fixed.")
     ] = None,
-    roll: Annotated[
-        float, typer.Option(metavar="DEG", help="Turn the camera clockwise about its line of sight.")
-    ] = 0.0,
-    fov: Annotated[float, typer.Option(metavar="DEG", help="Field of view across the image's width.")] = 20.0,
-    size: Annotated[str, typer.Option(metavar="W,H", help="Image size in pixels.")] = "1024,1024",
+    roll_deg: Annotated[
+        float, typer.Option("--roll", metavar="DEG", help="Turn the camera clockwise about its line of sight.")
+    ] = Config.roll_deg,
+    fov_deg: Annotated[
+        float, typer.Option("--fov", metavar="DEG", help="Field of view across the image's width.")
+    ] = Config.fov_deg,
+    size_px: Annotated[str, typer.Option("--size", metavar="W,H", help="Image size in pixels.")] = ",".join(
+        map(str, Config.size_px)
+    ),
     camera: Annotated[
         Path | None,
         typer.Option(
@@ -112,16 +130,34 @@ def command(
     ] = None,
     convergence: Annotated[
         str, typer.Option(metavar="LOW,HIGH", help="With --stereo: degrees between both lines of sight.")
-    ] = "4,30",
-    seed: Seed = 0,
-    extend: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="diagnosis.h5: add the effects that 'lunargr diagnose' found.")
+    ] = CONVERGENCE,
+    seed: Seed = StereoConfig.seed,
+    extension: Annotated[
+        Path | None,
+        typer.Option("--extend", metavar="FILE", help="diagnosis.h5: add the effects that 'lunargr diagnose' found."),
     ] = None,
-    shadows: Annotated[bool, typer.Option("--shadows/--no-shadows", help="Cast shadows, with the Sun's disc.")] = True,
-    backplanes: Annotated[
+    shadows: Annotated[
+        bool, typer.Option("--shadows/--no-shadows", help="Cast shadows, with the Sun's disc.")
+    ] = Config.shadows,
+    bounce: Annotated[
+        bool, typer.Option("--bounce", help="Light that sunlit slopes throw on other terrain, into shadows too.")
+    ] = Config.bounce,
+    earthshine: Annotated[
+        bool, typer.Option("--earthshine", help="The Earth's light, from where it stands at --time or ...")
+    ] = Config.earthshine,
+    earth_azimuth_deg: Annotated[
+        float | None,
+        typer.Option("--earth-azimuth", metavar="DEG", help="... over the map's middle: clockwise from north ..."),
+    ] = None,
+    earth_elevation_deg: Annotated[
+        float | None, typer.Option("--earth-elevation", metavar="DEG", help="... and above the horizon.")
+    ] = None,
+    backplanes_in_tif: Annotated[
         bool, typer.Option("--backplanes", help="Ortho: put the backplanes into the GeoTIFF, too.")
-    ] = False,
-    png_only: Annotated[bool, typer.Option("--png-only", help="With --trajectory: write no EXR files.")] = False,
+    ] = Config.backplanes_in_tif,
+    png_only: Annotated[
+        bool, typer.Option("--png-only", help="With --trajectory: write no EXR files.")
+    ] = Config.png_only,
     body: BodyOption = None,
     shard: Shard = None,
     resume: Resume = False,
@@ -138,67 +174,53 @@ def command(
     lunargr render --dem dem.tif --model hapke --parameters w=0.25 --sun-azimuth 90 --sun-elevation 30 -o hapke.exr
     lunargr render svbrdf.h5 --trajectory descent.csv --sun-azimuth 90 --sun-elevation 30 -o views/
     """
-    if source is not None and dem is None:
-        path = source
-    elif dem is not None and source is None:
-        path = dem
-    else:
+    path = source or dem
+    if path is None or (source and dem):
         raise ConfigError("render: expected a reflectance map (svbrdf.h5) or --dem DEM, one of the two.")
     if parameters and dem is None:
         raise ConfigError("--parameters: expected together with --dem; an svbrdf.h5 holds its own coefficients.")
+    told = {
+        "view": "pinhole" if camera or trajectory else view,
+        "position": _numbers(position, "--position", (3,)),
+        "look_at": _numbers(look_at, "--look-at", (2, 3)),
+        "quaternion": _numbers(quaternion, "--quaternion", (4,)),
+        "size_px": _size(size_px),
+        "camera": str(camera) if camera else None,
+        "parameters": _parameters(parameters or []),
+        "terrain_only": dem is not None,
+        "extension": str(extension) if extension else None,
+        "shard": parse_shard(shard),
+    }
+    config = configure(Config, locals(), **told)
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output
     from stages import render
 
-    given = _parameters(parameters or [])
-    config = render.Config(
-        view="pinhole" if camera or trajectory else view,
-        sun_azimuth_deg=sun_azimuth,
-        sun_elevation_deg=sun_elevation,
-        subsolar_longitude_deg=subsolar_longitude,
-        subsolar_latitude_deg=subsolar_latitude,
-        solar_distance_au=solar_distance,
-        time=time,
-        position=_numbers(position, "--position", (3,)),
-        look_at=_numbers(look_at, "--look-at", (2, 3)),
-        quaternion=_numbers(quaternion, "--quaternion", (4,)),
-        roll_deg=roll,
-        fov_deg=fov,
-        size_px=_size(size),
-        camera=str(camera) if camera else None,
-        samples=samples,
-        shadows=shadows,
-        model=model,
-        parameters=given,
-        terrain_only=dem is not None,
-        extension=str(extend) if extend else None,
-        body=body,
-        backplanes_in_tif=backplanes,
-        export=export,
-        png_only=png_only,
-        shard=parse_shard(shard),
-    )
-    console, to = Console(quiet), Output(output, overwrite, resume)
+    console, to = Console(quiet), Output(output, overwrite, resume, json=json_file)
     if stereo is not None:
         if trajectory is not None or camera or position or shard or resume:
             raise ConfigError(
                 "--stereo: expected without a camera, --trajectory, --shard and --resume; it draws its own."
             )
-        low, high = _numbers(convergence, "--convergence", (2,)) or (4.0, 30.0)
-        drawn = render.StereoConfig(stereo, altitude, (low, high), seed=seed)
+        low, high = _numbers(convergence, "--convergence", (2,)) or StereoConfig.convergence_deg
+        drawn = StereoConfig(stereo, altitude, (low, high), seed=seed)
         manifest = render.run_stereo(path, to, config, drawn, console.say, console.progress)
         console.say(f"{manifest}: {stereo} stereo pairs")
         return
     if trajectory is not None:
-        results = render.run_trajectory(path, trajectory, to, config, console.say, console.progress)
-    else:
-        if shard is not None or resume:
-            raise ConfigError(
-                "--shard and --resume: expected together with --trajectory; a single view is one piece of work."
-            )
-        results = [render.run(path, to, config, console.say, console.progress)]
-    if json_file is not None:
-        _write_json(json_file, results)
+        _show(render.run_trajectory(path, trajectory, to, config, console.say, console.progress), to, console)
+        return
+    if shard is not None or resume:
+        raise ConfigError(
+            "--shard and --resume: expected together with --trajectory; a single view is one piece of work."
+        )
+    _show([render.run(path, to, config, console.say, console.progress)], to, console)
+
+
+def _show(results: list[Summary], to: Output, console: Console) -> None:
+    """The table of what was rendered, and the JSON."""
+    if to.json is not None:
+        _write_json(to.json, results)
     console.table(
         "rendered",
         ("view", "pixels", "known", "mean I/F", "shadow", "incidence", "rays/px", "files"),
@@ -212,7 +234,7 @@ def command(
             )
 
 
-def _row(result: Any) -> tuple[str, ...]:
+def _row(result: Summary) -> tuple[str, ...]:
     size = f"{result.size_px[0]} x {result.size_px[1]}"
     files = " ".join(p.name for p in result.files)
     if result.skipped:
@@ -230,7 +252,7 @@ def _row(result: Any) -> tuple[str, ...]:
     )
 
 
-def _write_json(path: Path, results: list[Any]) -> None:
+def _write_json(path: Path, results: list[Summary]) -> None:
     from schemas import write_json
 
     def finite(value: float) -> float | None:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.options import OutputFile, Overwrite, Quiet
+from stages.report import Config
 
 NAME, ORDER = "report", 85
 
@@ -22,9 +23,7 @@ def command(
         ),
     ],
     output: OutputFile = Path("report.html"),
-    title: Annotated[
-        str, typer.Option("--title", help="Title of the page.")
-    ] = "Lunar reflectance learned from terrain",
+    title: Annotated[str, typer.Option("--title", help="Title of the page.")] = Config.title,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
@@ -34,5 +33,5 @@ def command(
     from stages import report
 
     console = Console(quiet)
-    titles = report.run(files, Output(output, overwrite), report.Config(title), console.say, console.progress)
+    titles = report.run(files, Output(output, overwrite), Config(title), console.say, console.progress)
     console.say(f"{output}: {', '.join(titles)}")

@@ -7,9 +7,24 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import MOST, OutputFile, Overwrite, Parts, Quiet, Scheduler, Seed, Shard, in_parts, parse_shard
+from lunargr_cli.options import (
+    MOST,
+    OutputFile,
+    Overwrite,
+    Parts,
+    Quiet,
+    Scheduler,
+    Seed,
+    Shard,
+    configure,
+    in_parts,
+    parse_shard,
+)
+from schemas.errors import ConfigError
+from stages.sample import Config
 
 NAME, ORDER = "sample", 30
+DEFAULT_SPLIT = "/".join(f"{100 * share:g}" for share in Config.split)
 
 
 def command(
@@ -29,12 +44,12 @@ def command(
     ] = None,
     stack: Annotated[
         bool, typer.Option("--stack", help="Crop every image that covers a chosen place: pairs share a 'site'.")
-    ] = False,
+    ] = Config.stack,
     tile_m: Annotated[
         float | None, typer.Option("--tile-m", help="Edge of a ground tile of the split, m (default: up to 4 crops).")
     ] = None,
-    split: Annotated[str, typer.Option("--split", help="Shares of train/validation/test.")] = "80/10/10",
-    seed: Seed = 0,
+    split: Annotated[str, typer.Option("--split", help="Shares of train/validation/test.")] = DEFAULT_SPLIT,
+    seed: Seed = Config.seed,
     shard: Shard = None,
     output: OutputFile = Path("crops.h5"),
     scheduler: Scheduler = None,
@@ -43,29 +58,12 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Choose crop centres per image and split them by ground tile, with no ground shared between the parts."""
+    config = configure(Config, locals(), split=_shares(split), shard=parse_shard(shard))
     from lunargr_cli.console import Console
-    from schemas import ConfigError
     from schemas.files.outputs import Output
     from stages import sample
 
-    try:
-        shares = [float(v) for v in split.split("/")]
-        total = sum(shares)
-        first, second, third = (v / total for v in shares)
-    except (ValueError, ZeroDivisionError):
-        raise ConfigError(f"--split: expected three shares like 80/10/10, found '{split}'.") from None
-    console = Console(quiet)
-    to = Output(output, overwrite)
-    config = sample.Config(
-        crop=crop,
-        count=count,
-        density=density,
-        stack=stack,
-        tile_m=tile_m,
-        split=(first, second, third),
-        seed=seed,
-        shard=parse_shard(shard),
-    )
+    console, to = Console(quiet), Output(output, overwrite)
     if in_parts(scheduler, False, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_sample
@@ -75,3 +73,14 @@ def command(
         audit = sample.run(scene, to, config, console.say, console.progress)
     rows = [(p.name, p.pairs, p.images, p.tiles, f"{p.ground_km2:.2f}", f"{p.shared_km2:.2f}") for p in audit]
     console.table("split by ground tile", ("part", "pairs", "images", "tiles", "ground km2", "shared km2"), rows)
+
+
+def _shares(text: str) -> tuple[float, float, float]:
+    """'80/10/10' -> (0.8, 0.1, 0.1). Raises ConfigError."""
+    try:
+        shares = [float(v) for v in text.split("/")]
+        total = sum(shares)
+        first, second, third = (v / total for v in shares)
+    except (ValueError, ZeroDivisionError):
+        raise ConfigError(f"--split: expected three shares like 80/10/10, found '{text}'.") from None
+    return first, second, third

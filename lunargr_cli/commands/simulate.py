@@ -10,6 +10,9 @@ import typer
 from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json, Overwrite, Quiet
 from lunargr_cli.paths import Writes
+from schemas.errors import ConfigError
+from stages import simulate
+from stages.simulate import Config
 
 NAME, ORDER = "simulate", 10
 
@@ -28,7 +31,7 @@ def command(
     recipe: Annotated[Path | None, typer.Option("--recipe", help="JSON recipe; the options below override it.")] = None,
     print_recipe: Annotated[bool, typer.Option("--print-recipe", help="Print the full recipe and stop.")] = False,
     size_px: Annotated[
-        int | None, typer.Option("--size-px", help="Edge of the scene in pixels at --gsd. [default: 1536]")
+        int | None, typer.Option("--size-px", help=f"Edge of the scene in pixels at --gsd. [default: {Config.size_px}]")
     ] = None,
     extent_m: Annotated[
         float | None, typer.Option("--extent-m", help="Edge of the scene in metres, instead of --size-px.")
@@ -36,16 +39,21 @@ def command(
     gsd: Annotated[
         float | None,
         typer.Option(
-            "--gsd", help="GSD in metres that the pipeline will work at; the DEM is twice as fine. [default: 5]"
+            "--gsd",
+            help=f"GSD in metres that the pipeline will work at; the DEM is twice as fine. [default: {Config.gsd:g}]",
         ),
     ] = None,
-    images: Annotated[int | None, typer.Option("--images", help="Number of images. [default: 16]")] = None,
+    images: Annotated[
+        int | None, typer.Option("--images", help=f"Number of images. [default: {Config.images}]")
+    ] = None,
     units: Annotated[
-        str | None, typer.Option("--units", help="iof, or dn: an unknown gain and offset per image. [default: iof]")
+        str | None,
+        typer.Option("--units", help=f"iof, or dn: an unknown gain and offset per image. [default: {Config.units}]"),
     ] = None,
     hidden: Annotated[str | None, typer.Option("--hidden", help=_HIDDEN_HELP)] = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of every random choice. [default: 1]")
+        int | None,
+        typer.Option("--seed", min=0, max=2**63 - 1, help=f"Seed of every random choice. [default: {Config.seed}]"),
     ] = None,
     overwrite: Overwrite = False,
     json_file: Json = None,
@@ -55,20 +63,16 @@ def command(
 
     Everything downstream treats it as real data. What the pipeline must find out is in truth.h5 alone.
     """
-    from stages.simulate.recipe import make_config, read_recipe, recipe_json
-
-    values: dict[str, Any] = read_recipe(recipe) if recipe else {}
-    where = str(recipe) if recipe else "options"
-    config = make_config(_override(values, size_px, extent_m, gsd, images, units, hidden, seed), where)
+    changes = {"size_px": size_px, "images": images, "units": units, "seed": seed}
+    config = _configure(recipe, changes, gsd, extent_m, hidden)
     if print_recipe:
-        write_out(recipe_json(config))
+        write_out(simulate.recipe_json(config))
         return
     from schemas import write_json
     from schemas.files.outputs import Output
-    from stages.simulate.stage import run
 
     console = Console(quiet)
-    summary = run(Output(output, overwrite), config, console.say, console.progress)
+    summary = simulate.run(Output(output, overwrite), config, console.say, console.progress)
     rows = [
         (
             i.shot.image_id,
@@ -106,31 +110,20 @@ def command(
     console.say(f"next: lunargr ingest {output / 'dem.tif'} --images {output / 'images.csv'} --gsd {config.gsd:g}")
 
 
-def _override(
-    values: dict[str, Any],
-    size_px: int | None,
-    extent_m: float | None,
-    gsd: float | None,
-    images: int | None,
-    units: str | None,
-    hidden: str | None,
-    seed: int | None,
-) -> dict[str, Any]:
-    from schemas.errors import ConfigError
+def _configure(
+    recipe: Path | None, changes: dict[str, Any], gsd: float | None, extent_m: float | None, hidden: str | None
+) -> Config:
+    """The recipe with what the options say in its place. Raises ConfigError, InputError."""
     from stages.simulate.hidden import hidden_from_option
-    from stages.simulate.recipe import Config
 
-    values = dict(values)
-    if size_px is not None and extent_m is not None:
+    values = simulate.read_recipe(recipe) if recipe else {}
+    if changes["size_px"] is not None and extent_m is not None:
         raise ConfigError("--size-px and --extent-m both set the size; give one of them.")
-    if gsd is not None and gsd <= 0:
-        raise ConfigError(f"--gsd: expected a number of metres above 0, found {gsd:g}.")
     if gsd is not None:
-        values["gsd"] = gsd
-        values["dem_gsd"] = gsd / 2
-    for key, value in (("size_px", size_px), ("images", images), ("units", units), ("seed", seed)):
-        if value is not None:
-            values[key] = value
+        if gsd <= 0:
+            raise ConfigError(f"--gsd: expected a number of metres above 0, found {gsd:g}.")
+        changes |= {"gsd": gsd, "dem_gsd": gsd / 2}
+    values |= {name: value for name, value in changes.items() if value is not None}
     if extent_m is not None:
         step = values.get("gsd", Config.gsd)
         if not (isinstance(step, int | float) and step > 0 and 0 < extent_m < 1e9):
@@ -138,4 +131,4 @@ def _override(
         values["size_px"] = round(min(extent_m / step, 2.0**31))
     if hidden is not None:
         values["hidden"] = hidden_from_option(hidden)
-    return values
+    return simulate.make_config(values, str(recipe) if recipe else "options")

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import OutputFile, Overwrite, Quiet
+from lunargr_cli.options import OutputFile, Overwrite, Quiet, configure
+from stages.view import Config
 
 NAME, ORDER = "view", 61
 
@@ -18,14 +19,18 @@ def command(
     pairs: Annotated[
         Path | None, typer.Option("--pairs", metavar="PAIRS.h5", help="Show measured photographs beside the map.")
     ] = None,
-    photographs: Annotated[int, typer.Option(metavar="N", help="With --pairs: how many of its crops.")] = 12,
+    photographs: Annotated[
+        int, typer.Option(metavar="N", help="With --pairs: how many of its crops.")
+    ] = Config.photographs,
     max_px: Annotated[
         int, typer.Option("--max-px", metavar="PX", help="Larger maps are shown as means over blocks of pixels.")
-    ] = 2048,
-    sun_azimuth: Annotated[
-        float, typer.Option(metavar="DEG", help="The first picture's Sun, clockwise from north ...")
-    ] = 270.0,
-    sun_elevation: Annotated[float, typer.Option(metavar="DEG", help="... and above the horizon.")] = 25.0,
+    ] = Config.max_px,
+    sun_azimuth_deg: Annotated[
+        float, typer.Option("--sun-azimuth", metavar="DEG", help="The first picture's Sun, clockwise from north ...")
+    ] = Config.sun_azimuth_deg,
+    sun_elevation_deg: Annotated[
+        float, typer.Option("--sun-elevation", metavar="DEG", help="... and above the horizon.")
+    ] = Config.sun_elevation_deg,
     title: Annotated[str | None, typer.Option("--title", help="Title of the page (default: the map's name).")] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -36,12 +41,12 @@ def command(
     lunargr view svbrdf.h5 -o view.html
     lunargr view svbrdf.h5 --pairs pairs.h5 -o view.html
     """
+    config = configure(Config, locals())
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output
     from stages import view
 
     console = Console(quiet)
-    config = view.Config(max_px, photographs, sun_azimuth, sun_elevation, title)
     made = view.run(source, pairs, Output(output, overwrite), config, console.say, console.progress)
     smaller = f", means of {made.factor} x {made.factor} px" if made.factor > 1 else ""
     console.say(

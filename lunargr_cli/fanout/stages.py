@@ -178,7 +178,7 @@ def run_diagnose(pairs: Path, checkpoint: Path | None, output: Output, config: A
         raise ConfigError("diagnose: expected --output with --scheduler (the part lies beside it), found none.")
     pairs, checkpoint = pairs.resolve(), checkpoint and checkpoint.resolve()
     inputs = [pairs, *([checkpoint] if checkpoint else [])]
-    named = ((output.path, "--output"), (output.json, "--json"), (output.report, "--report"))
+    named = ((output.path, "output"), (output.json, "json"), (output.report, "report"))
     check_outputs([Target(path, option) for path, option in named if path is not None], inputs, output.overwrite)
     with _job(output, "diagnose", config, inputs, (), work) as job:
         arguments = {"pairs": pairs, "checkpoint": checkpoint, "config": config}

@@ -96,7 +96,7 @@ def _folder(folder: Path) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{folder}: cannot be made a folder ({error.strerror}); choose another --output.") from None
+        raise ConfigError(f"{folder}: cannot be made a folder ({error.strerror}); choose another `output`.") from None
     try:
         yield
     finally:
@@ -144,7 +144,7 @@ def _acquire(lock: Path, output: Path) -> str:
             noted = seen
             continue
         except OSError as error:
-            raise ConfigError(f"{output}: cannot be written ({error.strerror}); choose another --output.") from None
+            raise ConfigError(f"{output}: cannot be written ({error.strerror}); choose another `output`.") from None
         own = {
             "host": host(),
             "pid": os.getpid(),
@@ -166,7 +166,7 @@ def _acquire(lock: Path, output: Path) -> str:
 def _refusal(output: Path, lock: Path, owner: dict[str, Any]) -> str:
     who = f"process {owner['pid']} on {owner['host']}, since {owner['since']}" if owner else "just started"
     return (
-        f"{output}: another run is writing this output ({who}); wait for it or choose another --output "
+        f"{output}: another run is writing this output ({who}); wait for it or choose another `output` "
         f"(if it cannot be alive any more, remove {lock})."
     )
 

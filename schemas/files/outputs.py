@@ -29,11 +29,11 @@ _protected: ContextVar[Inputs | None] = ContextVar("protected", default=None)
 class Target:
     """A file, or a folder of files, that a run will write.
 
-    option : with which the user chooses another place; what : how a message calls it
+    setting : with which the user chooses another place; what : how a message calls it
     """
 
     path: Path
-    option: str = "--output"
+    setting: str = "output"
     what: str = "the output"
 
 
@@ -102,7 +102,7 @@ def check_apart(targets: Iterable[Target], inputs: Sequence[Path] = ()) -> None:
     for target in targets:
         if (twin := others.find(target.path)) is not None:
             raise ConfigError(
-                f"{target.path}: {target.what} would replace {twin}, which this run also writes; choose another {target.option}."
+                f"{target.path}: {target.what} would replace {twin}, which this run also writes; choose another `{target.setting}`."
             )
         others.note(target.path)
 
@@ -112,23 +112,23 @@ def refuse_inputs(target: Target, known: Iterable[Inputs]) -> None:
     for inputs in known:
         if (source := inputs.clash(target.path)) is not None:
             same = "the input of the same name" if str(source) == str(target.path) else f"the input {source}"
-            raise ConfigError(f"{target.path}: {target.what} would replace {same}; choose another {target.option}.")
+            raise ConfigError(f"{target.path}: {target.what} would replace {same}; choose another `{target.setting}`.")
 
 
 def check_output(path: Path, inputs: Sequence[Path] = (), overwrite: bool = False) -> None:
-    """:func:`check_outputs` for the one file of ``--output``."""
+    """:func:`check_outputs` for the one file of a stage that writes no other."""
     check_outputs([Target(Path(path))], inputs, overwrite)
 
 
 def check_folder(target: Target) -> None:
     """Refuse a folder that cannot be one. Raises ConfigError."""
     if target.path.exists() and not target.path.is_dir():
-        raise ConfigError(f"{target.path}: expected a folder, found a file; choose another {target.option}.")
+        raise ConfigError(f"{target.path}: expected a folder, found a file; choose another `{target.setting}`.")
     _check_writable(target.path, target)
 
 
 def _check_place(target: Target, overwrite: bool) -> None:
-    path, another = target.path, f"choose another {target.option}"
+    path, another = target.path, f"choose another `{target.setting}`"
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -136,11 +136,11 @@ def _check_place(target: Target, overwrite: bool) -> None:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror}); {another}.") from None
     if stat.S_ISDIR(mode):
-        raise ConfigError(f"{path}: expected a file name, found a folder; name the file in {target.option}.")
+        raise ConfigError(f"{path}: expected a file name, found a folder; name the file in `{target.setting}`.")
     if mode and not stat.S_ISREG(mode):
         raise ConfigError(f"{path}: expected a file name, found a device, pipe or socket; {another}.")
     if mode and not overwrite:
-        raise ConfigError(f"{path}: exists already; add --overwrite to replace it or {another}.")
+        raise ConfigError(f"{path}: exists already; add `overwrite` to replace it or {another}.")
     _check_writable(path.parent, target)
 
 
@@ -153,7 +153,7 @@ def _check_writable(folder: Path, target: Target) -> None:
         return
     why = "no permission, or a read-only file system" if there.is_dir() else f"{there} is a file"
     what = f"{folder}: cannot be made a folder" if there != folder.absolute() else f"{target.path}: cannot be written"
-    raise ConfigError(f"{what} ({why}); choose another {target.option}.")
+    raise ConfigError(f"{what} ({why}); choose another `{target.setting}`.")
 
 
 def is_full_disk(error: BaseException | None) -> bool:

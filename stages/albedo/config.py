@@ -48,11 +48,11 @@ def used_frames(frames: Sequence[Frame], config: Config) -> list[bool]:
     names = [f.image_id for f in frames]
     for name in config.leave_out:
         if name not in names:
-            raise ConfigError(f"--leave-out: expected an image of the scene ({', '.join(names)}), found '{name}'.")
+            raise ConfigError(f"`leave_out`: expected an image of the scene ({', '.join(names)}), found '{name}'.")
     used = [name not in config.leave_out for name in names]
     if config.fold is not None:
         fold, count = config.fold
         used = [u and k % count != fold for k, u in enumerate(used)]
     if not any(used):
-        raise ConfigError("--leave-out, --fold: expected to leave at least one image, found none; leave out fewer.")
+        raise ConfigError("`leave_out`, `fold`: expected to leave at least one image, found none; leave out fewer.")
     return used

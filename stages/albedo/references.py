@@ -19,6 +19,7 @@ from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import ASTRONOMICAL_UNIT, Frame
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import Grid
+from stages.physics.maps.window import Window
 from stages.physics.terrain.shading import Light, shade_block
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.surface import SHADOWED, Surface
@@ -60,7 +61,7 @@ class SceneHorizon:
                 h, w = min(edge, row + height - r), min(edge, col + width - c)
                 azimuth, elevation = self._sun.over(grid, r + (h - 1) / 2, c + (w - 1) / 2)
                 result[r - row : r - row + h, c - col : c - col + w] = horizon_in_scene(
-                    self._elevation, self._overview, r, c, h, w, grid.gsd, azimuth,
+                    self._elevation, self._overview, Window(r, c, h, w), grid.gsd, azimuth,
                     sun_elevation=elevation, body_radius=grid.radius,
                 )  # fmt: skip
         return result

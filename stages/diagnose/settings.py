@@ -19,6 +19,8 @@ CLEAR = math.radians(
     15.0
 )  # rad of the Sun above facet and horizon: lower, a slope error of a degree is 7 % of brightness and more
 RUGGED = 1.35  # ... and on rugged ground so many times its rms slope, since facets that seem to face the Sun are chosen by the DEM's errors
+SEEN = 3  # pieces of ground that an image shows at least: of fewer, its own variance is not known, and its rows outweigh all others
+SHADOWED = 30  # pixels of deep shadow in a piece of an image, below which their mean is not used
 FEWEST_PIXELS = 400  # of an image in a crop: fewer do not give a spectrum
 
 # --- registration ---
@@ -34,6 +36,7 @@ ROUNDS = 16  # of expectation-maximisation: further ones change a variance by le
 UNITS = 12  # pieces of ground at least, over which a jackknife has the degrees of freedom for a 95 % interval
 PATCH = 32  # px: crops are not cut into smaller pieces than this
 SHAMS = 99  # sham residuals: p values go down to 1 %
+FEW_GROUNDS = 5  # pieces of test ground: of fewer, Student's interval is several times the gain
 DISCOVERY = 0.05  # false discovery rate
 SURE = 4.0  # standard errors: an effect found at this size is never called invisible
 CORRELATED = 16.0  # px^2 per independent sample of a residual: what is left of albedo and relief is some 4 px wide

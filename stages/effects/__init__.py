@@ -1,7 +1,7 @@
 """Candidate effects behind one registry: what the forward model may lack, one file each.
 
 An effect is a parametric extension of the chain in ``stages/physics/formation``; its slot fixes where it acts, so the
-order in which effects are listed never matters within the physics. `lunargr diagnose --list` prints this folder.
+order in which effects are listed never matters within the physics. The list of `lunargr diagnose` is this folder.
 """
 
 from __future__ import annotations

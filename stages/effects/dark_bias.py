@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 from stages.effects.base import Effect, Survey, Trial, register
@@ -23,6 +24,11 @@ class DarkBias(Effect):
     parameters = (Parameter("iof", "1", -0.1, 0.1, 0.0, "added I/F, truth minus given"),)
     strong: ClassVar = {"iof": 0.004}
     tolerance: ClassVar = {"iof": 5e-5}  # half a step of 12 bits
+
+    @classmethod
+    def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
+        """No detector is clipped below nothing by a tenth of the signal, nor lit up by half of it."""
+        return -0.1 * survey.brightness < values["iof"] < 0.5 * survey.brightness
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:

@@ -88,7 +88,7 @@ def check_ground(diagnosis: Path, pairs: Path) -> list[str]:
                 raise ArtefactError(
                     f"{diagnosis}: expected a diagnosis that learned from ground split as in {pairs.name} ({mine['split_id']}), "
                     f"found split {other['split_id']}: it may have learned from the test ground; sample both with the same "
-                    "--tile-m, --split and --seed."
+                    "`tile_m`, `split` and `seed`."
                 )
     return []
 

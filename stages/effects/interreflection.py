@@ -6,12 +6,14 @@ import math
 import threading
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from stages.effects.base import Effect, register
-from stages.physics.formation.chain import State, geometry
+from stages.physics.formation.chain import State
+from stages.physics.light.sky import form_factors
 from stages.physics.photometry import Parameter
 
 CELLS = 64  # the crop is cut into at most this many cells a side: exchange of light is a smooth field
@@ -75,22 +77,25 @@ def received(elevation: Tensor, radiance: Tensor, gsd: float) -> Tensor:
 
 def gather(height: Tensor, leaving: Tensor, cell: float) -> Tensor:
     """Irradiance over pi times the solar flux from all visible terrain; height (H, W), leaving (n, H, W) I/F -> (n, H, W)."""
-    factors = form_factors(height, cell).to(leaving)
+    factors = kept_factors(height, cell).to(leaving)
     return torch.sparse.mm(factors, leaving.flatten(1).T).T.reshape(leaving.shape)
 
 
-def form_factors(height: Tensor, cell: float) -> Tensor:
+def kept_factors(height: Tensor, cell: float) -> Tensor:
     """Share of its whole sky that each facet sees filled by each other one, times the cosine; sparse, (H W, H W).
 
-    Each azimuth is walked outwards from the facet's own plane: what rises above all before it is seen, and lights the
-    facet by the solid angle that it adds times the cosine of its incidence. The last few pieces of ground are kept, since
-    the same one is lit again and again.
+    The last few pieces of ground are kept, since the same one is lit again and again. height : (H, W), m; cell : m
     """
     key = (tuple(height.shape), cell, height.cpu().numpy().tobytes())
     with _lock:
         factors = _kept.get(key)
     if factors is None:
-        factors = _walk(height, cell)
+        starts, places, shares = form_factors(height.cpu().numpy(), cell, AZIMUTHS, np.array(STEPS))
+        rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        entries = torch.from_numpy(np.stack([rows, places]))
+        size = (height.numel(), height.numel())
+        factors = torch.sparse_coo_tensor(entries, torch.from_numpy(shares), size, check_invariants=False).coalesce()
+        factors = factors.to(height.device)
         with _lock:
             while len(_kept) >= KEEP:
                 _kept.pop(next(iter(_kept)))
@@ -100,37 +105,3 @@ def form_factors(height: Tensor, cell: float) -> Tensor:
 
 _kept: dict[tuple, Tensor] = {}
 _lock = threading.Lock()  # sites are worked on side by side
-
-
-def _walk(height: Tensor, cell: float) -> Tensor:
-    rows, columns = height.shape
-    east, north = geometry.slopes(height, cell)
-    up = torch.rsqrt(1 + east**2 + north**2)
-    row, column = torch.arange(rows, device=height.device), torch.arange(columns, device=height.device)
-    here = (row[:, None] * columns + column).flatten()
-    places, shares = [], []
-    for k in range(AZIMUTHS):
-        azimuth = 2 * math.pi * (k + 0.5) / AZIMUTHS
-        to_east, to_north = math.sin(azimuth), math.cos(azimuth)
-        level = -(east * to_east + north * to_north) * up  # the normal along the azimuth
-        highest = torch.atan2(-level, up)
-        for step in STEPS:
-            right, down = round(step * to_east), round(-step * to_north)
-            there = _mirrored(row + down, rows)[:, None] * columns + _mirrored(column + right, columns)
-            angle = torch.atan((height.flatten()[there] - height) / (math.hypot(right, down) * cell))
-            top = torch.maximum(angle, highest)
-            # the integral of cos(incidence) cos(h) over h from the highest so far to the top
-            share = 0.5 * level * ((top - highest) + torch.sin(top - highest) * torch.cos(top + highest))
-            share = share + 0.5 * up * (torch.sin(top) ** 2 - torch.sin(highest) ** 2)
-            seen = share.flatten() > 0
-            places.append(torch.stack([here, there.flatten()])[:, seen])
-            shares.append(share.flatten()[seen])
-            highest = top
-    size, weights = (rows * columns, rows * columns), torch.cat(shares) * (2 / AZIMUTHS)
-    return torch.sparse_coo_tensor(torch.cat(places, 1), weights, size, check_invariants=False).coalesce()
-
-
-def _mirrored(index: Tensor, count: int) -> Tensor:
-    """Indices beyond either end folded back, the end itself repeated."""
-    index = index % (2 * count)
-    return torch.minimum(index, 2 * count - 1 - index)

@@ -16,6 +16,9 @@ from stages.physics.photometry import Parameter
 class SunElevation(Effect):
     name = "sun_elevation"
     slot = "illumination"
+    of_law = (
+        True  # on lit ground it goes with incidence as the law does; shadow edges, which would tell, are not judged
+    )
     title = "elevation of the Sun"
     mechanism = (
         "A wrong time, a wrong latitude or a local frame that is not level raises or lowers the Sun in every image alike: "

@@ -18,10 +18,10 @@ from stages.pairs.reader import PairReader
 def check(config: Config) -> None:
     """Refuse options that cannot be. Raises ConfigError, RegistryError."""
     if config.split not in dict(SPLITS):
-        raise ConfigError(f"--split: expected one of {', '.join(dict(SPLITS))}, found '{config.split}'.")
+        raise ConfigError(f"`split`: expected one of {', '.join(dict(SPLITS))}, found '{config.split}'.")
     if config.batch < 1 or config.fit_pairs < 0:
         raise ConfigError(
-            f"--batch, --fit-pairs: expected at least 1 and 0, found {config.batch} and {config.fit_pairs}."
+            f"`batch`, `fit_pairs`: expected at least 1 and 0, found {config.batch} and {config.fit_pairs}."
         )
     known = [name for name, _, _ in layout(bool(config.extend))]
     for name in config.only:
@@ -47,7 +47,7 @@ def check_runs(checkpoints: Sequence[Path], predictors: Sequence[Predictor], rea
         if seed in seeds:
             raise ConfigError(
                 f"{path}: expected a training run from another seed than {seeds[seed].name}, found seed {seed} again; "
-                "train it with another --seed."
+                "train it with another `seed`."
             )
         seeds[seed] = path
 
@@ -77,9 +77,7 @@ def notes(checkpoint: Path, predictor: Predictor, reader: PairReader, config: Co
     with open_artefact(checkpoint, CHECKPOINT) as file:
         trained_with = read_config(file).get("extend")
     if trained_with and not config.extend:
-        found.append(f"the checkpoint was trained with the effects of '{Path(trained_with).name}': add --extend")
+        found.append(f"the checkpoint was trained with the effects of '{Path(trained_with).name}': add `extend`")
     if read_config(reader.file).get("register"):
-        found.append(
-            "the images were registered on ground of every part of the split, the scored one included (project --register)"
-        )
+        found.append("the images were registered on ground of every part of the split, the scored one included")
     return found + (check_ground(Path(config.extend), reader.path) if config.extend else [])

@@ -118,7 +118,7 @@ def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> Map:
     file = stack.enter_context(open_artefact(path, SVBRDF))
     if "albedo" not in file:
         raise ArtefactError(
-            f"{path}:/albedo: expected a map with albedo, found none; run 'lunargr albedo' with --fold."
+            f"{path}:/albedo: expected a map with albedo, found none; run 'lunargr albedo' with `fold`."
         )
     suns = unit_vectors(file["albedo_subsolar_longitude_deg"][...], file["albedo_subsolar_latitude_deg"][...])
     error = AlbedoError.read(file)
@@ -155,7 +155,7 @@ def _choose(reader: PairReader, maps: Sequence[Map], split: str) -> list[tuple[i
     if not chosen:
         raise ArtefactError(
             f"{maps[0].path}: expected pairs of split '{split}' whose image did not make the albedo, found none; "
-            "run 'lunargr albedo' with --fold or --leave-out."
+            "run 'lunargr albedo' with `fold` or `leave_out`."
         )
     return chosen
 

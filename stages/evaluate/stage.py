@@ -102,9 +102,9 @@ def _run(
 def _check_outputs(files: Files) -> None:
     output, (beside, *others) = files.output, files.reports
     targets = [Target(output.file), Target(beside, what=f"the JSON beside {output.file.name}")]
-    targets += [Target(report, "--json") for report in others]
+    targets += [Target(report, "json") for report in others]
     if output.figures is not None:
-        targets += [Target(output.figures / name, "--figures") for name in FIGURES]
+        targets += [Target(output.figures / name, "figures") for name in FIGURES]
     check_outputs(targets, files.inputs, output.overwrite)
 
 

@@ -63,9 +63,9 @@ def run(
     output = Output.of(output)
     path = output.file
     if path.suffix.lower() != ".onnx":
-        raise ConfigError(f"{path}: expected a name that ends in .onnx; choose another --output.")
+        raise ConfigError(f"{path}: expected a name that ends in .onnx; choose another `output`.")
     if not 13 <= config.opset <= 20:
-        raise ConfigError(f"--opset: expected 13..20, found {config.opset}.")
+        raise ConfigError(f"`opset`: expected 13..20, found {config.opset}.")
     card = path.with_suffix(".md")
     for made in (path, card):
         check_output(made, [checkpoint], output.overwrite)

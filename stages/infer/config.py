@@ -20,7 +20,7 @@ class Config:
     stride: int | None = None
     offset: int = 0
     device: str = "auto"
-    precision: str = "fp32"
+    precision: str = "auto"
     any_gsd: bool = False
     shard: tuple[int, int] = (0, 1)
     geotiff: bool = True

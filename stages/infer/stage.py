@@ -39,7 +39,7 @@ from stages.infer.windows import Box, axis_windows, own_rows, swaths_of, window_
 from stages.infer.writing import Blend, Outputs
 from stages.network.cpu.mapper import Mapper
 from stages.network.predictor import choose_device, load_predictor
-from stages.network.runtime import choose_inference_precision
+from stages.network.runtime import check_precision, choose_inference_precision
 from stages.pairs.holes import fill_holes
 from stages.physics.maps.geotiff import EVEN, MapTiff, band_names, map_tags
 from stages.physics.maps.grid import check_same_body, read_grid
@@ -59,6 +59,7 @@ def run(
     """Write ``svbrdf.h5`` and, if wanted, a cloud-optimised GeoTIFF. Raises ConfigError, ArtefactError."""
     output = Output.of(output)
     window_and_stride(config)
+    check_precision(config.precision)
     check_files([scene, checkpoint], output, config)
     device = choose_device(config.device)
     keep_freed_memory()
@@ -69,7 +70,7 @@ def run(
         if not config.any_gsd and abs(grid.gsd - predictor.gsd) > GSD_TOLERANCE * predictor.gsd:
             raise ConfigError(
                 f"{scene}: expected a grid near {predictor.gsd:g} m, at which {checkpoint} was trained, found {grid.gsd:g} m; "
-                "ingest the DEM at that --gsd or add --any-gsd."
+                "ingest the DEM at that `gsd` or add `any_gsd`."
             )
         if precision == "auto":
             precision = choose_inference_precision(predictor, _sample_of(file), device)
@@ -122,7 +123,7 @@ def check_files(inputs: Sequence[Path], output: Output, config: Config) -> None:
     target = Target(output.file)
     check_outputs([target], inputs, output.overwrite)
     if config.geotiff:
-        picture = Target(output.geotiff_path, "--geotiff (or --no-geotiff)", f"the GeoTIFF of {output.file.name}")
+        picture = Target(output.geotiff_path, "geotiff", f"the GeoTIFF of {output.file.name}")
         check_apart([target, picture], inputs)
         check_outputs([picture], inputs, output.overwrite or output.resume)
 
@@ -225,7 +226,7 @@ def _statistics(file: h5py.File, names: list[str]) -> tuple[float, dict[str, tup
 
 
 def check_body(scene: Path, body: str | None) -> None:
-    """Refuse a --body that a scene contradicts. Raises GeometryError."""
+    """Refuse a body that a scene contradicts. Raises GeometryError."""
     with open_artefact(scene, SCENE) as file:
         check_same_body(scene, float(file.attrs["body_radius_m"]), body)
 

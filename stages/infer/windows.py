@@ -25,7 +25,7 @@ def window_and_stride(config: Config) -> tuple[int, int]:
     stride = window if config.stride is None else config.stride  # windows carry their context: they need no overlap
     if window < 16 or not 1 <= stride <= window:
         raise ConfigError(
-            f"--window and --stride: expected 1 <= stride <= window and window >= 16, found {stride} and {window}."
+            f"`window` and `stride`: expected 1 <= stride <= window and window >= 16, found {stride} and {window}."
         )
     return window, stride
 

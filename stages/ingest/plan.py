@@ -47,13 +47,13 @@ def plan_grid(
     east, north = rasters.pixel_size_at(dataset, radius, dataset.height / 2, dataset.width / 2)
     native = max(east, north)
     if gsd is not None and not (math.isfinite(gsd) and gsd > 0):
-        raise ConfigError(f"--gsd: expected a positive number of metres, found {gsd}.")
+        raise ConfigError(f"`gsd`: expected a positive number of metres, found {gsd}.")
     if not (math.isfinite(native) and native > 0):
         raise GeometryError(f"{dem}: its georeference puts the DEM off the body; check its CRS and transform.")
     wanted = native if gsd is None else gsd
     if wanted < 0.5 * native:
         raise ConfigError(
-            f"--gsd: expected at least half the DEM's own {native:g} m, found {wanted:g}; detail cannot be invented."
+            f"`gsd`: expected at least half the DEM's own {native:g} m, found {wanted:g}; detail cannot be invented."
         )
     holds_radii = _holds_radii(dem, dataset, radius, progress)
     t = dataset.transform
@@ -74,7 +74,7 @@ def plan_grid(
         if true_square and true_scale and fits:
             height, width = dataset.height // factor, dataset.width // factor
             if min(height, width) < 1:
-                raise ConfigError(f"--gsd: {wanted:g} m is coarser than the whole DEM; choose a finer one.")
+                raise ConfigError(f"`gsd`: {wanted:g} m is coarser than the whole DEM; choose a finer one.")
             transform = t @ Affine.scale(factor)
             return Plan(
                 Grid(dataset.crs.to_wkt(), transform, height, width, radius), factor, Resampling.average, holds_radii
@@ -127,7 +127,7 @@ def _holds_radii(dem: Path, dataset: DatasetReader, radius: float, progress: Pro
     if abs(middle) > 0.5 * radius:
         if abs(middle - radius) > 0.05 * radius:
             raise InputError(
-                f"{dem}: expected metres above the sphere or radii near {radius:g} m, found values near {middle:g}; check units and --body."
+                f"{dem}: expected metres above the sphere or radii near {radius:g} m, found values near {middle:g}; check units and `body`."
             )
         return True
     kilometres_radius = (

@@ -70,7 +70,7 @@ def run(
     """
     output = Output.of(output)
     if config.crop < 16 or config.crop % 2 or config.crop > LARGEST_CROP:
-        raise ConfigError(f"--crop: expected an even number of pixels, 16 .. {LARGEST_CROP}; found {config.crop}.")
+        raise ConfigError(f"`crop`: expected an even number of pixels, 16 .. {LARGEST_CROP}; found {config.crop}.")
     body = find_body(config.body)
     frames = read_frames(images, body) if images else []
     named = [p for f in frames for p in (f.path, f.camera) if p is not None]
@@ -101,25 +101,24 @@ def run(
             writer.file.attrs["dem_valid_px"] = known
             for name in ("valid", "valid_position", "frame_window"):  # also where there is no image at all
                 writer.dataset(name)
+            elevation = terrain.file or writer.file
             areas = [
                 write_validity(
-                    frame,
-                    k,
-                    len(mine),
-                    terrain.grid,
-                    (low, high),
-                    terrain.file or writer.file,
-                    writer,
-                    config,
-                    progress,
+                    f, k, terrain.grid, (low, high), elevation, writer, config, _of_all(progress, k, len(mine))
                 )
-                for k, frame in enumerate(mine)
+                for k, f in enumerate(mine)
             ]
+            progress(len(mine), len(mine), "image masks")
             if frames and count == 1 and not any(areas):
                 raise _no_positions(images, config, terrain.grid.gsd)
             writer.write("valid_area_m2", np.array(areas))
             write_frames(writer, [with_digests(frame) for frame in mine])
     return summarise(output.file, tuple(skipped))
+
+
+def _of_all(progress: Progress, index: int, count: int) -> Progress:
+    """Of one image among ``count``: progress over all of them."""
+    return lambda done, total, what: progress(1000 * index + 1000 * done // max(1, total), 1000 * count, what)
 
 
 def summarise(scene: Path, skipped: tuple[str, ...] = ()) -> Summary:
@@ -156,13 +155,13 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, pr
     index, count = config.shard
     if is_artefact(dem):
         if images is None:
-            raise ConfigError(f"{dem}: a scene already; add --images, or give a DEM that GDAL reads.")
+            raise ConfigError(f"{dem}: a scene already; add `images`, or give a DEM that GDAL reads.")
         with open_artefact(dem, SCENE, need=()) as file:
             grid = read_grid(file, dem)
             if abs(grid.radius - body.radius) > 1e-6 * body.radius:
-                raise ConfigError(f"{dem}: its body has a radius of {grid.radius:g} m; give the same --body.")
+                raise ConfigError(f"{dem}: its body has a radius of {grid.radius:g} m; give the same `body`.")
             if config.gsd is not None and abs(config.gsd - grid.gsd) > 1e-3 * grid.gsd:
-                raise ConfigError(f"{dem}: a grid at {grid.gsd:g} m; leave --gsd away, or give the DEM itself.")
+                raise ConfigError(f"{dem}: a grid at {grid.gsd:g} m; leave `gsd` away, or give the DEM itself.")
             own = ("crop", "skip_outside", "shard", "block")
             stored = read_config(file) | {k: v for k, v in asdict(config).items() if k in own}
             names = ("gsd_m", "body_radius_m", "elevation_source")
@@ -172,8 +171,8 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, pr
         return
     if images is not None and count > 1:
         raise ConfigError(
-            "--shard: the DEM comes first, then its images. Run 'lunargr ingest DEM --shard I/N' without --images and merge; "
-            "then give that scene in place of the DEM, with --images and --shard."
+            "`shard`: the DEM comes first, then its images. Run 'lunargr ingest DEM' with `shard` and without `images`, and merge; "
+            "then give that scene in place of the DEM, with `images` and `shard`."
         )
     with rasters.open_raster(dem, "a DEM") as dataset:
         crs = require_crs(str(dem), dataset.crs, dataset.transform)
@@ -220,7 +219,7 @@ def check_positions(parts: Sequence[Path], images: Path, config: Config) -> None
 def _no_positions(images: Path | None, config: Config, gsd: float) -> GeometryError:
     return GeometryError(
         f"{images}: a crop of {config.crop} px ({config.crop * gsd:g} m) is larger than any valid region of any image; "
-        "choose a smaller --crop or a finer --gsd."
+        "choose a smaller `crop` or a finer `gsd`."
     )
 
 

@@ -34,7 +34,7 @@ def check_frames(frames: Sequence[Frame], grid: Grid, skip_outside: bool) -> tup
             if source.box() is None:
                 if not skip_outside:
                     raise InputError(
-                        f"{frame.path}: image '{frame.image_id}' does not touch the DEM; remove it from the table or add --skip-outside."
+                        f"{frame.path}: image '{frame.image_id}' does not touch the DEM; remove it from the table or add `skip_outside`."
                     )
                 skipped.append(frame.image_id)
                 continue
@@ -45,7 +45,6 @@ def check_frames(frames: Sequence[Frame], grid: Grid, skip_outside: bool) -> tup
 def write_validity(
     frame: Frame,
     index: int,
-    count: int,
     grid: Grid,
     heights: tuple[float, float],
     dem: h5py.File,
@@ -53,7 +52,7 @@ def write_validity(
     config: Config,
     progress: Progress,
 ) -> float:
-    """Write one image's masks; returns the ground area of its valid positions, m2."""
+    """Write the masks of the image with this index; returns the ground area of its valid positions, m2."""
     valid, position = writer.dataset("valid"), writer.dataset("valid_position")
     dem_valid = dem["dem_valid"]
     used: tuple[int, int, int, int] | None = None
@@ -61,7 +60,7 @@ def write_validity(
         row0, col0, height, width = source.box() or (0, 0, 0, 0)
         todo = list(blocks(height, width, config.block))
         for number, (r, c, h, w) in enumerate(todo):
-            progress(index * 1000 + 1000 * number // max(1, len(todo)), count * 1000, f"image masks ({frame.image_id})")
+            progress(number, len(todo), f"image masks ({frame.image_id})")
             r, c = row0 + r, col0 + c
             seen = source.read(r, c, h, w).valid & dem_valid[r : r + h, c : c + w].astype(bool)
             if seen.any():
@@ -82,8 +81,6 @@ def write_validity(
             pixel = grid.local_frames(r + h / 2, c + w / 2).pixel_size[0]
             area += float(eroded.sum()) * float(pixel[0] * pixel[1])
     _check_sun(frame, grid, (r0 + r1) / 2, (c0 + c1) / 2)
-    if index == count - 1:
-        progress(count * 1000, count * 1000, "image masks")
     return area
 
 

@@ -45,7 +45,7 @@ class Matcher(ABC):
 
     def __init__(self, models: Models) -> None:
         if models.features is not None and not self.needs_models:
-            raise ConfigError(f"--features-model: the matcher '{self.name}' takes no network; choose aliked or disk.")
+            raise ConfigError(f"`features_model`: the matcher '{self.name}' takes no network; choose aliked or disk.")
 
     @abstractmethod
     def match(self, measured: np.ndarray, rendered: np.ndarray) -> Matches:

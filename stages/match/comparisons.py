@@ -95,7 +95,7 @@ def from_evaluation(path: Path, count: int, seed: int) -> tuple[int, Iterator[Co
     with open_artefact(path, EVALUATION) as file:
         if "rendered" not in file:
             raise ArtefactError(
-                f"{path}:/rendered: expected rendered crops, found none; run 'lunargr evaluate --renderings', "
+                f"{path}:/rendered: expected rendered crops, found none; run 'lunargr evaluate' with `renderings`, "
                 "or 'lunargr match PAIRS CHECKPOINT'."
             )
         pixels = file["valid_pixels"][...] / np.prod(file["measured"].shape[1:])
@@ -118,7 +118,7 @@ def from_pairs(
 ) -> tuple[int, Iterator[Comparison]]:
     """Crops of a split, rendered with the learned reflectance and with Hapke matched as in the paper."""
     if split not in dict(SPLITS):
-        raise ConfigError(f"--split: expected one of {', '.join(dict(SPLITS))}, found '{split}'.")
+        raise ConfigError(f"`split`: expected one of {', '.join(dict(SPLITS))}, found '{split}'.")
     predictor = load_predictor(checkpoint, choose_device(device))
     where = next(predictor.parameters()).device
     with PairReader(pairs) as reader:

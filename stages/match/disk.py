@@ -23,7 +23,7 @@ class Disk(NetworkMatcher):
         # LightGlue's network for DISK has other inputs and outputs than ALIKED's; OpenCV 5.0 drives only the latter.
         if not hasattr(cv2, "LG_DISK"):
             raise ConfigError(
-                f"--lightglue-model: OpenCV {cv2.__version__} drives LightGlue for ALIKED only; leave it out "
-                "(DISK then matches by reciprocal nearest neighbours) or choose --matcher aliked."
+                f"`lightglue_model`: OpenCV {cv2.__version__} drives LightGlue for ALIKED only; leave it out "
+                "(DISK then matches by reciprocal nearest neighbours) or choose `matchers` aliked."
             )
         return load_network("LightGlueMatcher_create", path, 0.0, 0, 0, cv2.LG_DISK)

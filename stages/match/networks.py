@@ -41,7 +41,9 @@ class NetworkMatcher(Matcher):
     def __init__(self, models: Models) -> None:
         super().__init__(models)
         if models.features is None:
-            raise ConfigError(f"--matcher {self.name}: expected --features-model FILE.onnx, found none; give its path.")
+            raise ConfigError(
+                f"`matchers` {self.name}: expected `features_model` FILE.onnx, found none; give its path."
+            )
         self.files = models
         self.detector = load_network(self.factory, models.features)
         self.lightglue = self._load_lightglue(models.lightglue) if models.lightglue is not None else None

@@ -31,11 +31,11 @@ def run(
     output = Output.of(output)
     json_file, figures = output.json or output.path, output.figures
     if config.count < 1:
-        raise ConfigError(f"--count: expected at least 1, found {config.count}.")
-    targets = [] if json_file is None else [Target(json_file, "--json")]
+        raise ConfigError(f"`count`: expected at least 1, found {config.count}.")
+    targets = [] if json_file is None else [Target(json_file, "json")]
     if figures is not None:
         names = (figures / _picture(m, k) for m in config.matchers for k in range(FIGURES))
-        targets += [Target(path, "--figures") for path in dict.fromkeys(names)]
+        targets += [Target(path, "figures") for path in dict.fromkeys(names)]
     networks = [path for path in (config.features_model, config.lightglue_model) if path is not None]
     check_outputs(targets, [*files, *networks], output.overwrite)
     models = Models(config.features_model, config.lightglue_model)

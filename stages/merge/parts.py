@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 
 from schemas import ArtefactError, Schema, open_artefact, read_config, read_kind
+from schemas.checks import parse_json
 from stages.physics.images.table import relative_path
 
 # The dimension along which the shards of a stage are laid end to end; maps are joined by rows instead, and so are scenes
@@ -132,3 +133,17 @@ def _check_alike(parts: Parts) -> None:
             raise ArtefactError(
                 f"{path}: expected the options that {name} was made with, found others; run the shard again."
             )
+        if parts.of_one_run and _hashes(file, path) != _hashes(first, name):
+            raise ArtefactError(
+                f"{path}: expected a shard of the files that {name} was made from, found others; run it again."
+            )
+
+
+def _hashes(file: h5py.File, path: Path) -> list[str]:
+    """SHA-256 of what a part was made from."""
+    inputs = parse_json(str(file.attrs.get("inputs", "[]")), f"{path}: root attribute 'inputs'")
+    if not isinstance(inputs, list) or not all(isinstance(i, dict) for i in inputs):
+        raise ArtefactError(
+            f"{path}: expected a list of files in the root attribute 'inputs', found {inputs!r:.40}; run the shard again."
+        )
+    return sorted(str(i.get("sha256")) for i in inputs)

@@ -85,12 +85,12 @@ def choose_device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if not re.fullmatch(r"cpu|cuda(:\d{1,3})?", name, re.ASCII):
-        raise ConfigError(f"--device: expected cpu, cuda, cuda:N or auto, found '{name}'.")
+        raise ConfigError(f"`device`: expected cpu, cuda, cuda:N or auto, found '{name}'.")
     device = torch.device(name)
     count = torch.cuda.device_count()
     if device.type == "cuda" and (device.index or 0) >= count:
         raise ConfigError(
-            f"--device: expected one of {count} CUDA devices, found '{name}'; use --device cpu or another."
+            f"`device`: expected one of {count} CUDA devices, found '{name}'; use `device` cpu or another."
         )
     return device
 
@@ -120,7 +120,7 @@ def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | 
         name = str(file.attrs["model"])
         if model is not None and model.lower() != name.lower():
             raise ArtefactError(
-                f"{path}: expected a checkpoint for model '{model}', found one for '{name}'; train again or drop --model."
+                f"{path}: expected a checkpoint for model '{model}', found one for '{name}'; train again or drop `model`."
             )
         try:
             reflectance = get_model(name)

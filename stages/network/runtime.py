@@ -6,10 +6,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from schemas.errors import ConfigError
 from stages.network.cpu.mapper import Mapper
 from stages.network.predictor import Predictor
 
 CLOSE = 0.02  # of a coefficient's spread: what bf16 may cost in inference
+
+
+def check_precision(name: str) -> None:
+    """Raises ConfigError for anything but auto, fp32 and bf16."""
+    if name not in ("auto", "fp32", "bf16"):
+        raise ConfigError(f"`precision`: expected auto, fp32 or bf16, found '{name}'.")
 
 
 def choose_precision(device: torch.device) -> str:

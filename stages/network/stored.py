@@ -65,5 +65,5 @@ def check_finite(path: Path, state: dict[str, torch.Tensor]) -> None:
     for name, value in state.items():
         if not math.isfinite(float(value.double().sum())):
             raise ArtefactError(
-                f"{path}:/weights/{name}: expected finite weights, found NaN or infinity; train again, with a lower --lr."
+                f"{path}:/weights/{name}: expected finite weights, found NaN or infinity; train again, with a lower `lr`."
             )

@@ -27,6 +27,6 @@ class Config:
         from stages.physics.images.displacement import FORMS
 
         if self.register not in (None, *FORMS):
-            raise ConfigError(f"--register: expected 'constant', 'affine' or 'field', found '{self.register}'.")
+            raise ConfigError(f"`register`: expected 'constant', 'affine' or 'field', found '{self.register}'.")
         if not 1.0 <= self.max_shift <= 32.0:
-            raise ConfigError(f"--max-shift: expected 1 to 32 px, found {self.max_shift:g}.")
+            raise ConfigError(f"`max_shift`: expected 1 to 32 px, found {self.max_shift:g}.")

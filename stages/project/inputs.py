@@ -81,7 +81,7 @@ def find_scene(crops: Path, file: h5py.File, config: Config) -> Path:
     """The scene that an open crops.h5 was sampled from. Raises ArtefactError where it is gone."""
     scene = Path(config.scene) if config.scene else crops.resolve().parent / str(file.attrs["scene"])
     if not scene.exists():
-        raise ArtefactError(f"{scene}: no such file; {crops} was sampled from it. Name its new place with --scene.")
+        raise ArtefactError(f"{scene}: no such file; {crops} was sampled from it. Name its new place with `scene`.")
     return scene
 
 

@@ -18,6 +18,7 @@ from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import Frame, load_frames
 from stages.physics.maps.grid import LocalFrames
+from stages.physics.maps.window import Window
 from stages.project.config import Config
 from stages.project.geometry import Geometry, check_directions, crop_geometry
 from stages.project.inputs import Scene, check_places, check_sources, open_scene, scene_of
@@ -162,9 +163,7 @@ def _pair(view: View, place: int, heights: NDArray[np.float32], scene: Scene) ->
     angle = horizon_in_scene(
         scene.elevation,
         scene.overview,
-        *corner,
-        size,
-        size,
+        Window(*corner, size, size),
         grid.gsd,
         math.atan2(east, north) % (2 * math.pi),
         body_radius=grid.radius,

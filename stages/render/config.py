@@ -1,4 +1,4 @@
-"""What to render, what came out, and the files behind one --output."""
+"""What to render, what came out, and the files behind one `output`."""
 
 from __future__ import annotations
 
@@ -34,6 +34,8 @@ class Config:
     samples : rays per pixel and axis (None: as many as the pixel's footprint asks for)
     model, parameters : a reflectance that is the same everywhere, where the source holds none
     export : with a trajectory: also a data set of its views, colmap or nerfstudio; png_only : no EXR; shard : every n-th view
+    bounce : light that sunlit terrain throws on other terrain, once, between diffuse facets
+    earthshine : the Earth's light, from its place at ``time``, or at an azimuth and elevation over the map's middle
     terrain_only : of svbrdf.h5 use the terrain, with ``model``
     """
 
@@ -53,6 +55,10 @@ class Config:
     camera: str | None = None
     samples: int | None = None
     shadows: bool = True
+    bounce: bool = False
+    earthshine: bool = False
+    earth_azimuth_deg: float | None = None
+    earth_elevation_deg: float | None = None
     model: str | None = None
     parameters: Mapping[str, float] = field(default_factory=dict)
     terrain_only: bool = False
@@ -104,7 +110,7 @@ def inputs(source: Path, config: Config) -> list[Path]:
 
 
 def output_files(output: Path, view: str) -> list[Path]:
-    """The files behind one --output. Raises ConfigError."""
+    """The files behind one `output`. Raises ConfigError."""
     suffix = output.suffix.lower()
     png, tif = output.with_suffix(".png"), output.with_suffix(".tif")
     if suffix in (".exr", ""):
@@ -116,32 +122,35 @@ def output_files(output: Path, view: str) -> list[Path]:
         return [output, png]
     if suffix == ".png":
         return [output]
-    raise ConfigError(f"{output}: expected a name that ends in .exr, .tif or .png; choose another --output.")
+    raise ConfigError(f"{output}: expected a name that ends in .exr, .tif or .png; choose another `output`.")
 
 
 def check(config: Config, trajectory: bool = False) -> None:
     """Refuse options that cannot go together. Raises ConfigError."""
     if config.view not in VIEWS:
-        raise ConfigError(f"--view: expected one of {', '.join(VIEWS)}; found '{config.view}'.")
+        raise ConfigError(f"`view`: expected one of {', '.join(VIEWS)}; found '{config.view}'.")
     if config.samples is not None and not 1 <= config.samples <= 32:
-        raise ConfigError(f"--samples: expected rays per pixel and axis in 1..32, found {config.samples}.")
+        raise ConfigError(f"`samples`: expected rays per pixel and axis in 1..32, found {config.samples}.")
     if not 0 < config.fov_deg < 180:
-        raise ConfigError(f"--fov: expected degrees between 0 and 180, found {config.fov_deg:g}.")
+        raise ConfigError(f"`fov_deg`: expected degrees between 0 and 180, found {config.fov_deg:g}.")
     if config.solar_distance_au is not None and not 0.05 <= config.solar_distance_au <= 100:
-        raise ConfigError(f"--solar-distance: expected 0.05 .. 100 au, found {config.solar_distance_au:g}.")
+        raise ConfigError(f"`solar_distance_au`: expected 0.05 .. 100 au, found {config.solar_distance_au:g}.")
     if config.quaternion is not None and abs(math.hypot(*config.quaternion) - 1) > 0.01:
-        raise ConfigError(f"--quaternion: expected one of unit length, found {math.hypot(*config.quaternion):g}.")
+        raise ConfigError(f"`quaternion`: expected one of unit length, found {math.hypot(*config.quaternion):g}.")
     if not 0 < config.size_px[0] * config.size_px[1] <= LARGEST_VIEW:
         raise ConfigError(
-            f"--size: expected a view of at most {LARGEST_VIEW:,} pixels, found {config.size_px[0]} x {config.size_px[1]}."
+            f"`size_px`: expected a view of at most {LARGEST_VIEW:,} pixels, found {config.size_px[0]} x {config.size_px[1]}."
         )
+    angles = (config.earth_azimuth_deg, config.earth_elevation_deg)
+    if any(v is not None for v in angles) and (None in angles or not config.earthshine):
+        raise ConfigError("the Earth: expected `earthshine` with both `earth_azimuth_deg` and `earth_elevation_deg`.")
     if config.export is not None and not trajectory:
-        raise ConfigError("--export: expected together with --trajectory; a single view makes no data set.")
+        raise ConfigError("`export`: expected together with `trajectory`; a single view makes no data set.")
     if config.export not in (None, *EXPORTS):
-        raise ConfigError(f"--export: expected one of {', '.join(EXPORTS)}; found '{config.export}'.")
+        raise ConfigError(f"`export`: expected one of {', '.join(EXPORTS)}; found '{config.export}'.")
     if config.view == "ortho" or config.camera or trajectory:
         return
     if config.position is None:
-        raise ConfigError("--view pinhole: expected --position LON,LAT,ALT or --camera FILE; found neither.")
+        raise ConfigError("`view` pinhole: expected `position` LON,LAT,ALT or `camera` FILE; found neither.")
     if config.look_at is not None and config.quaternion is not None:
-        raise ConfigError("--view pinhole: expected --look-at or --quaternion, found both.")
+        raise ConfigError("`view` pinhole: expected `look_at` or `quaternion`, found both.")

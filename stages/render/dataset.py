@@ -61,7 +61,7 @@ def export_views(views: Sequence[View], grid: Grid, folder: Path, kind: str) -> 
     missing = [view.exr.name for view in views if not view.exr.exists()]
     if missing:
         raise InputError(
-            f"{folder}: expected every view's EXR, found {missing[0]} missing (of {len(missing)}); render all views first, without --png-only."
+            f"{folder}: expected every view's EXR, found {missing[0]} missing (of {len(missing)}); render all views first, without `png_only`."
         )
     target, world = folder / kind, make_world(grid)
     (target / "images").mkdir(parents=True, exist_ok=True)

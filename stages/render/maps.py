@@ -23,7 +23,7 @@ from stages.render.tally import Tally
 BAND_ROWS = 256
 BAND_PX = 1 << 20  # of a wide map fewer rows at a time: memory does not follow its width
 BAND_COLUMNS = 1024
-UNITS = {"image": "1", "image_std": "1", "shadow": "1", "depth": "m", "elevation": "m"}
+UNITS = {"image": "1", "image_std": "1", "shadow": "1", "sky_view": "1", "depth": "m", "elevation": "m"}
 
 
 def render_map(
@@ -37,7 +37,7 @@ def render_map(
     """The whole map, streamed to its files band by band."""
     grid = surface.grid
     images = ["image", "image_std"] if surface.knows_errors else ["image"]
-    channels = [*images, *BACKPLANES, "elevation"]
+    channels = [*images, *BACKPLANES, "elevation", *(["sky_view"] if light.bounce is not None else [])]
     bands = channels if config.backplanes_in_tif else ["image"]
     named = {path.suffix.lower(): path for path in files}
     wanted = channels if ".exr" in named else list(dict.fromkeys([*bands, "shadow", "incidence_deg"]))

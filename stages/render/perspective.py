@@ -18,8 +18,9 @@ from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.formation.chain import Observation, State
 from stages.physics.formation.geometry import Angles
 from stages.physics.maps.grid import CSM_CENTRE, Grid
+from stages.physics.maps.window import Window
 from stages.physics.photometry import masked_radiance_factor
-from stages.physics.terrain.shading import BACKPLANES, Light, form_window
+from stages.physics.terrain.shading import BACKPLANES, HALO_PX, Light, form_window, further_radiance
 from stages.physics.terrain.sun_visibility import visible_share
 from stages.physics.terrain.surface import Surface
 from stages.render.ray_points import HitAngles, hit_angles, hit_points, sample_maps
@@ -31,6 +32,7 @@ Floats32 = NDArray[np.float32]
 
 MOST_SAMPLES = 8  # rays per pixel and axis; beyond, the terrain itself is averaged first
 RAYS_AT_ONCE = 1 << 19
+BLOCK_PX = 512  # of further light at once
 LATTICE = 33  # rays per axis of the first look
 
 
@@ -41,6 +43,7 @@ class Scene:
     grid : of that part; row, col : its first pixel on the surface's grid; factor : px of the surface per px here
     maps : (C, h, w) coefficients or (C, 1, 1); horizon : (h, w), rad, or None
     lit : (2, h, w) I/F where extensions have shaded the ground beforehand, and where it was clipped at 0; or None
+    added : (h, w) I/F that the Earth and the terrain around add, or None
     """
 
     grid: Grid
@@ -48,13 +51,14 @@ class Scene:
     maps: Floats32
     horizon: Floats32 | None
     lit: Floats32 | None
+    added: Floats32 | None
     samples: int
     distance: float
 
 
 def look(
     surface: Surface, camera: Camera, relief: tuple[float, float], samples: int | None
-) -> tuple[tuple[int, int, int, int], int, int, float]:
+) -> tuple[Window, int, int, float]:
     """Which window of the map a camera can see, samples per pixel and axis, coarsening factor, distance to the ground.
 
     relief : lowest and highest elevation, m. Raises GeometryError where the view misses the map or starts under it.
@@ -73,7 +77,9 @@ def look(
     )
     known = np.isfinite(distances)
     if not known.any():
-        raise GeometryError("the camera does not see the body; check its place, --look-at (or --quaternion) and --fov.")
+        raise GeometryError(
+            "the camera does not see the body; check its place, `look_at` (or `quaternion`) and `fov_deg`."
+        )
     points, distances = points[known], distances[known]
     lon = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
     lat = np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1)))
@@ -95,7 +101,7 @@ def look(
     footprint = pixel_footprint(camera, distance) / grid.gsd
     wanted = samples or min(MOST_SAMPLES, max(2, math.ceil(footprint)))
     factor = max(1, int(footprint / wanted))
-    return (top, left, bottom - top, right - left), wanted, factor, distance
+    return Window(top, left, bottom - top, right - left), wanted, factor, distance
 
 
 def shell_crossing(origins: Floats, directions: Floats, inner: float, outer: float) -> tuple[Floats, Floats]:
@@ -118,7 +124,7 @@ def _misses(surface: Surface) -> str:
     lon, lat = grid.lonlat((grid.height - 1) / 2, (grid.width - 1) / 2)
     return (
         f"the view misses {surface.path.name}, whose middle is at longitude {float(lon):.4f}, latitude {float(lat):.4f} deg; "
-        "check the camera's place, --look-at (or --quaternion) and --fov."
+        "check the camera's place, `look_at` (or `quaternion`) and `fov_deg`."
     )
 
 
@@ -141,7 +147,7 @@ def _check_above_ground(surface: Surface, origins: Floats, relief: tuple[float, 
                 ground = float(np.array([1 - v, v]) @ corner @ np.array([1 - u, u]))
         if altitude <= ground:
             raise GeometryError(
-                f"the camera is under the ground: it stands {altitude:.1f} m above the sphere, the ground there at {ground:.1f} m; raise the altitude in --position."
+                f"the camera is under the ground: it stands {altitude:.1f} m above the sphere, the ground there at {ground:.1f} m; raise the altitude in `position`."
             )
 
 
@@ -149,27 +155,42 @@ def make_scene(
     surface: Surface, camera: Camera, light: Light, relief: tuple[float, float], samples: int | None
 ) -> Scene:
     """Read and prepare what a camera sees. Raises GeometryError."""
-    (row, col, height, width), samples, factor, distance = look(surface, camera, relief, samples)
-    grid = surface.grid.window(row, col, height, width)
-    elevation = surface.elevation[row : row + height, col : col + width]
-    horizon = None if light.horizon is None else light.horizon.window(row, col, height, width)
-    lit = None
+    window, samples, factor, distance = look(surface, camera, relief, samples)
+    grid = surface.grid.window(*window)
+    elevation = surface.elevation[window.part]
+    horizon = None if light.horizon is None else light.horizon.window(*window)
+    around = window.padded(HALO_PX, surface.elevation.shape) if light.extensions else window
+    lit, added = None, _added(surface, light, around)
     if light.extensions:
         # the sensor comes last: its effects act on the camera's image, not on the ground
         ground = replace(light, extensions=[e for e in light.extensions if e.slot != "sensor"])
-        lit = np.stack(form_window(surface, ground, row, col, height, width))
+        lit, added = np.stack(form_window(surface, ground, window, added)), None
         maps = np.zeros((0, 1, 1), np.float32)
     else:
-        maps = surface.read_coefficients(row, col, height, width)
+        maps = surface.read_coefficients(*window)
     if factor > 1:
         elevation = coarsen(elevation, factor)
         horizon = None if horizon is None else coarsen(horizon, factor)
         lit = None if lit is None else np.stack([coarsen(m, factor) for m in lit])
+        added = None if added is None else coarsen(added, factor)
         if maps.shape[1] > 1:
             maps = np.stack([coarsen(m, factor) for m in maps])
         coarse = grid.transform @ Affine.scale(factor)
         grid = Grid(grid.crs_wkt, coarse, elevation.shape[0], elevation.shape[1], grid.radius)
-    return Scene(grid, build_height_field(elevation, grid), maps, horizon, lit, samples, distance)
+    return Scene(grid, build_height_field(elevation, grid), maps, horizon, lit, added, samples, distance)
+
+
+def _added(surface: Surface, light: Light, window: Window) -> Floats32 | None:
+    """(h, w) I/F that further light adds, block by block; None without such light."""
+    if light.earthshine is None and light.bounce is None:
+        return None
+    result = np.empty((window.height, window.width), np.float32)
+    for r in range(0, window.height, BLOCK_PX):
+        for c in range(0, window.width, BLOCK_PX):
+            height, width = min(BLOCK_PX, window.height - r), min(BLOCK_PX, window.width - c)
+            block = Window(window.row + r, window.col + c, height, width)
+            result[block.within(window).part] = further_radiance(surface, light, block)[0]
+    return result
 
 
 def coarsen(values: Floats32, factor: int) -> Floats32:
@@ -261,6 +282,8 @@ def _radiance(surface: Surface, light: Light, scene: Scene, rays: _Rays) -> tupl
         image = masked_radiance_factor(surface.model, parameters, angles).numpy()
         clipped = (image < 0).astype(np.float32)
         image = np.maximum(image, 0) * visible
+        if scene.added is not None:
+            image += sample_maps(scene.added[None], rays.hits)[0]
         image[(rays.hits.status != HIT) | ~np.isfinite(coefficients).all(axis=0)] = np.nan
     image[_in_space(scene, rays)] = 0.0
     return image, np.where(np.isfinite(image), clipped, 0)

@@ -30,7 +30,7 @@ def _failed(path: Path, message: str) -> OSError | InputError:
         if stat.f_bavail * stat.f_frsize < 1 << 20:
             return OSError(28, "No space left on device")
     return InputError(
-        f"{path}: cannot be written ({' '.join(message.split())}); free some space or choose another --output."
+        f"{path}: cannot be written ({' '.join(message.split())}); free some space or choose another `output`."
     )
 
 

@@ -11,16 +11,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.errors import ConfigError
+from schemas.errors import ConfigError, GeometryError
 from schemas.provenance import raster_record
 from stages.physics.bodies.spheres import Body
 from stages.physics.cameras import Camera
 from stages.physics.images.frame_geometry import open_camera_for
 from stages.physics.images.table import ASTRONOMICAL_UNIT
+from stages.physics.light.earth import EARTH_DISTANCE
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import check_same_body
+from stages.physics.terrain.further_light import Bounce, Earthshine, Hidden, Horizon
 from stages.physics.terrain.shading import Light
-from stages.physics.terrain.sun import Sun, check_sun_is_up, find_sun
+from stages.physics.terrain.sun import Sun, check_sun_is_up, elevation_range, find_sun, place_over
 from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface, open_surface, open_terrain
 from stages.render.config import LARGEST_VIEW, SUN, Config, inputs
@@ -46,8 +48,14 @@ def make_light(
     else:
         sun = _named_sun(surface, config, body)
     span = relief[1] - relief[0]
-    check_sun_is_up(sun, surface.grid, span)
-    horizon = SunHorizon(surface.elevation, surface.grid, sun, span) if config.shadows else None
+    earthshine = _earthshine(surface, config, body, sun, span) if config.earthshine else None
+    horizon: Horizon | None = None
+    if earthshine is not None and elevation_range(sun, surface.grid)[1] < 0:
+        horizon = Hidden()  # by night the Earth shines alone
+    else:
+        check_sun_is_up(sun, surface.grid, span)
+        horizon = SunHorizon(surface.elevation, surface.grid, sun, span) if config.shadows else None
+    bounce = Bounce(surface, sun, horizon) if config.bounce else None
     extensions: list = []
     if config.extension:
         from stages.effects import load_extension
@@ -56,14 +64,38 @@ def make_light(
         extensions = load_extension(Path(config.extension), ["rendered"])
     position = None
     if config.position is not None:
-        position = place(*_three(config.position, "--position"), surface.grid.radius)
-    return Light(sun, horizon, position, extensions)
+        position = place(*_three(config.position, "`position`"), surface.grid.radius)
+    return Light(sun, horizon, position, extensions, earthshine, bounce)
+
+
+def _earthshine(surface: Surface, config: Config, body: Body, sun: Sun, relief: float) -> Earthshine:
+    """The Earth's light over a surface of the Moon. Raises LunargrError."""
+    if body.name != "moon":
+        raise ConfigError(f"`earthshine`: expected the Moon, which alone the Earth lights, found `body` {body.name}.")
+    grid = surface.grid
+    if config.earth_azimuth_deg is not None and config.earth_elevation_deg is not None:
+        if not -90.0 <= config.earth_elevation_deg <= 90.0:
+            raise GeometryError(
+                f"`earth_elevation_deg`: expected degrees in -90..90, found {config.earth_elevation_deg:g}."
+            )
+        position = place_over(grid, config.earth_azimuth_deg, config.earth_elevation_deg, EARTH_DISTANCE)
+    elif config.time is not None:
+        from stages.physics.bodies.ephemeris import earth_position
+
+        position = earth_position(config.time)
+    else:
+        raise ConfigError(
+            "`earthshine`: expected `time`, or `earth_azimuth_deg` and `earth_elevation_deg`; found neither."
+        )
+    found = Earthshine.over(surface, sun, position, relief, config.shadows)
+    check_sun_is_up(found.disc, grid, relief, "Earth")
+    return found
 
 
 def _named_sun(surface: Surface, config: Config, body: Body) -> Sun:
     if config.time is not None and config.body is None and abs(body.radius - surface.grid.radius) > 0.005 * body.radius:
         raise ConfigError(
-            f"--time: expected --body beside it, since {surface.path} (radius {surface.grid.radius:g} m) does not show the Moon."
+            f"`time`: expected `body` beside it, since {surface.path} (radius {surface.grid.radius:g} m) does not show the Moon."
         )
     return find_sun(
         surface.grid,
@@ -90,7 +122,7 @@ def find_camera(surface: Surface, config: Config) -> Camera:
     camera = _camera(surface, config)
     if camera.lines * camera.samples > LARGEST_VIEW:
         raise ConfigError(
-            f"{config.camera or '--size'}: expected a view of at most {LARGEST_VIEW:,} pixels, found "
+            f"{config.camera or '`size_px`'}: expected a view of at most {LARGEST_VIEW:,} pixels, found "
             f"{camera.samples} x {camera.lines}; render it in smaller pieces."
         )
     return camera
@@ -100,14 +132,14 @@ def _camera(surface: Surface, config: Config) -> Camera:
     if config.camera:
         return open_camera_for(Path(config.camera), surface.grid.radius)
     grid = surface.grid
-    lon, lat, altitude = _three(config.position or (), "--position")
+    lon, lat, altitude = _three(config.position or (), "`position`")
     position = place(lon, lat, altitude, grid.radius)
     if config.quaternion is not None:
         rotation = rotation_from_quaternion(config.quaternion)
     else:
         target = config.look_at if config.look_at is not None else (lon, lat)
         if len(target) not in (2, 3):
-            raise ConfigError(f"--look-at: expected LON,LAT or LON,LAT,ALT, found {len(target)} numbers.")
+            raise ConfigError(f"`look_at`: expected LON,LAT or LON,LAT,ALT, found {len(target)} numbers.")
         height = target[2] if len(target) == 3 and math.isfinite(target[2]) else _ground_height(surface, *target[:2])
         rotation = look_at(position, place(target[0], target[1], height, grid.radius), config.roll_deg)
     return pinhole_view(position, rotation, config.fov_deg, config.size_px, grid.radius)

@@ -82,14 +82,14 @@ def run_stereo(
 
 def _check(config: Config, stereo: StereoConfig) -> None:
     if stereo.count < 1:
-        raise ConfigError(f"--stereo: expected at least 1 pair, found {stereo.count}.")
+        raise ConfigError(f"`stereo`: expected at least 1 pair, found {stereo.count}.")
     low, high = stereo.convergence_deg
     if not 0 < low <= high <= 90:
-        raise ConfigError(f"--convergence: expected LOW,HIGH degrees in 0..90, found {low:g},{high:g}.")
+        raise ConfigError(f"`convergence`: expected LOW,HIGH degrees in 0..90, found {low:g},{high:g}.")
     if stereo.altitude is not None and not stereo.altitude > 0:
-        raise ConfigError(f"--altitude: expected metres above 0, found {stereo.altitude:g}.")
+        raise ConfigError(f"`altitude`: expected metres above 0, found {stereo.altitude:g}.")
     if any(getattr(config, name) is not None for name in SUN):
-        raise ConfigError("--stereo: expected no Sun; each picture gets one of its own.")
+        raise ConfigError("`stereo`: expected no Sun; each picture gets one of its own.")
 
 
 class _Places:
@@ -106,7 +106,7 @@ class _Places:
         rows, cols = (int(n * grid.gsd / self.tile) for n in (grid.height, grid.width))
         if rows * cols < len(SPLITS):
             raise ConfigError(
-                f"--stereo: expected ground for {len(SPLITS)} tiles of {self.tile:.4g} m, one per split, found {rows} x {cols}; lower --altitude or --fov."
+                f"`stereo`: expected ground for {len(SPLITS)} tiles of {self.tile:.4g} m, one per split, found {rows} x {cols}; lower `altitude` or `fov_deg`."
             )
         self.corners = [(r, c) for r in range(rows) for c in range(cols)]
         self.splits = _split_tiles(len(self.corners), rng)

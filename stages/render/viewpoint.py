@@ -36,7 +36,7 @@ def look_at(position: Floats, target: Floats, roll_deg: float = 0.0) -> Floats:
     forward = target - position
     distance = float(np.linalg.norm(forward))
     if distance < 1e-6:
-        raise GeometryError("--look-at: expected a place other than the camera's, found the same.")
+        raise GeometryError("`look_at`: expected a place other than the camera's, found the same.")
     forward = forward / distance
     up = position / np.linalg.norm(position)
     if math.acos(min(1.0, abs(float(forward @ up)))) < NEAR_NADIR:
@@ -56,7 +56,7 @@ def rotation_from_quaternion(quaternion: Sequence[float]) -> Floats:
     norm = float(np.linalg.norm(q)) if q.shape == (4,) else math.nan
     if not abs(norm - 1.0) < 0.01:
         raise GeometryError(
-            f"--quaternion: expected four numbers w,x,y,z of unit length, found {', '.join(f'{v:g}' for v in np.ravel(q))}."
+            f"`quaternion`: expected four numbers w,x,y,z of unit length, found {', '.join(f'{v:g}' for v in np.ravel(q))}."
         )
     return quaternion_matrix(q / norm)
 
@@ -67,11 +67,11 @@ def pinhole_view(
     """A distortion-free camera; ``fov_deg`` spans the image's width. Raises GeometryError."""
     if not 0.0 < fov_deg < 170.0:
         raise GeometryError(
-            f"--fov: expected degrees across the image's width between 0 and 170, found {fov_deg:g}; correct it."
+            f"`fov_deg`: expected degrees across the image's width between 0 and 170, found {fov_deg:g}; correct it."
         )
     width, height = size_px
     if not (1 <= width <= 65536 and 1 <= height <= 65536):
-        raise GeometryError(f"--size: expected W,H between 1 and 65536 px, found {width},{height}.")
+        raise GeometryError(f"`size_px`: expected W,H between 1 and 65536 px, found {width},{height}.")
     focal = 0.5 * width / math.tan(math.radians(0.5 * fov_deg))
     return Pinhole(
         lines=height,

@@ -46,15 +46,15 @@ def run_trajectory(
     output = Output.of(output)
     folder, (index, count) = output.file, config.shard
     if config.camera:
-        raise ConfigError("--trajectory: expected no --camera; each row places its own pinhole camera.")
+        raise ConfigError("`trajectory`: expected no `camera`; each row places its own pinhole camera.")
     config = replace(config, view="pinhole")
     check(config, trajectory=True)
     if config.export is not None and count > 1:
         raise ConfigError(
-            "--export: expected without --shard; render the shards, then export with --resume and no --shard."
+            "`export`: expected without `shard`; render the shards, then export with `resume` and no `shard`."
         )
     if config.export is not None and config.png_only:
-        raise ConfigError("--export: expected EXR files, which hold the depths; drop --png-only.")
+        raise ConfigError("`export`: expected EXR files, which hold the depths; drop `png_only`.")
     body = find_body("moon" if config.body is None else config.body)
     views = read_trajectory(table)[index::count]
     suffix = ".png" if config.png_only else ".exr"
@@ -142,7 +142,7 @@ def render_camera(
             progress(done, camera.lines, "lines")
         if not ground:
             raise GeometryError(
-                f"the view misses {surface.path.name}: no pixel sees valid ground; check the camera's place, --look-at (or --quaternion) and --fov."
+                f"the view misses {surface.path.name}: no pixel sees valid ground; check the camera's place, `look_at` (or `quaternion`) and `fov_deg`."
             )
         write_png(named[".png"], preview.image())
     return tally.summary(view_id, files, (camera.samples, camera.lines), scene.samples)

@@ -13,7 +13,12 @@ from stages.common import page
 from stages.common.page import pictures
 from stages.physics.photometry import get_model
 
-LONGEST = 800  # px of a map on the page: many maps must stay a light page
+LONGEST, MANY = 800, 10  # px of a map on the page, where there are no more maps than so many
+ALBEDO = {
+    "albedo": ("Albedo: factor on the I/F of the coefficients", "gray"),
+    "albedo_std": ("Standard deviation of the albedo", "viridis"),
+    "albedo_images": ("Images that made a pixel's albedo", "cividis"),
+}
 
 
 def svbrdf(file: h5py.File) -> page.Section:
@@ -22,10 +27,11 @@ def svbrdf(file: h5py.File) -> page.Section:
     model = get_model(str(file.attrs["model"]))
     units = {p.name: p.unit for p in model.parameters}
     names = read_strings(file, "coefficient_name")
-    known = pictures.read_thinned(file["valid"], longest=LONGEST)[0] > 0
+    longest = _longest(file)
+    known = pictures.read_thinned(file["valid"], longest=longest)[0] > 0
     figures, constant = [], []
     for k, name in enumerate(names):
-        values = np.where(known, pictures.read_thinned(file["coefficients"], k, longest=LONGEST)[0], np.nan)
+        values = np.where(known, pictures.read_thinned(file["coefficients"], k, longest=longest)[0], np.nan)
         present = values[np.isfinite(values)]
         if len(present) and np.ptp(present) <= 1e-6 * max(1e-12, abs(float(present.mean()))):
             constant.append([name, _unit(units.get(name, "1")) or "-", f"{float(present.mean()):.4g}"])
@@ -50,10 +56,17 @@ def svbrdf(file: h5py.File) -> page.Section:
     return section
 
 
+def _longest(file: h5py.File) -> int:
+    """px of a map: together they stay a light page, however many coefficients a model has."""
+    count = len(file["coefficients"]) + sum(name in file for name in ALBEDO)
+    count += len(file["coefficients_std"]) if "coefficients_std" in file else 0
+    return round(LONGEST * min(1.0, math.sqrt(MANY / count)))
+
+
 def _deviations(file: h5py.File, known: np.ndarray, units: dict[str, str]) -> list[Markup]:
     figures = []
     for k, name in enumerate(read_strings(file, "map_name")):
-        values = pictures.read_thinned(file["coefficients_std"], k, longest=LONGEST)[0]
+        values = pictures.read_thinned(file["coefficients_std"], k, longest=_longest(file))[0]
         title = f"Standard deviation of {name}"
         figures.append(_map(file, np.where(known, values, np.nan), title, units.get(name, "1"), "viridis"))
     return figures
@@ -62,13 +75,9 @@ def _deviations(file: h5py.File, known: np.ndarray, units: dict[str, str]) -> li
 def _albedo(file: h5py.File, known: np.ndarray) -> list[Markup]:
     """Albedo, its standard deviation, and how many images made it."""
     shown = []
-    for name, title, colours in (
-        ("albedo", "Albedo: factor on the I/F of the coefficients", "gray"),
-        ("albedo_std", "Standard deviation of the albedo", "viridis"),
-        ("albedo_images", "Images that made a pixel's albedo", "cividis"),
-    ):
+    for name, (title, colours) in ALBEDO.items():
         if name in file:
-            values = pictures.read_thinned(file[name], longest=LONGEST)[0].astype(float)
+            values = pictures.read_thinned(file[name], longest=_longest(file))[0].astype(float)
             shown.append(_map(file, np.where(known, values, np.nan), title, "1", colours))
     count = len(read_strings(file, "albedo_image_id"))
     text = (

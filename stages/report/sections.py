@@ -123,7 +123,8 @@ def _where(file: h5py.File, split: np.ndarray) -> str:
     for name, value in SPLITS:
         mine = np.flatnonzero(split == value)
         mine = mine[:: max(1, len(mine) // 1500)]
-        axes.plot(longitude[mine], latitude[mine], ".", color=SPLIT_COLOURS[name], markersize=3, label=name, alpha=0.8)
+        look = {"color": SPLIT_COLOURS[name], "markersize": 3, "label": name, "alpha": 0.8}
+        axes.plot(longitude[mine], latitude[mine], ".", rasterized=True, **look)  # as shapes, a third of the page
     axes.set(xlabel="east longitude, deg", ylabel="latitude, deg")
     axes.set_aspect(1 / max(0.05, np.cos(np.radians(np.mean(latitude)))), adjustable="datalim")
     axes.legend(frameon=False, markerscale=3, fontsize=8)

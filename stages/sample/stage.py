@@ -64,7 +64,7 @@ def run(
         chosen = choose(positions, tiles, len(opened.frames), grid, config, rng, progress)
         if not len(chosen):
             raise GeometryError(
-                f"{scene}: no crop of {crop} px fits into a tile of {edge * grid.gsd:g} m and valid data; choose a smaller --crop or other --tile-m."
+                f"{scene}: no crop of {crop} px fits into a tile of {edge * grid.gsd:g} m and valid data; choose a smaller `crop` or other `tile_m`."
             )
         parts = audit(chosen, tiles, grid, crop)
         _write(opened, output, chosen, tiles, parts, config, progress)
@@ -73,14 +73,14 @@ def run(
 
 def _check(config: Config) -> None:
     if config.count is not None and config.density is not None:
-        raise ConfigError("--count and --density: give one of the two.")
+        raise ConfigError("`count` and `density`: give one of the two.")
     if config.count is not None and not 1 <= config.count <= MOST_CROPS:
-        raise ConfigError(f"--count: expected 1 .. {MOST_CROPS} crops, found {config.count}.")
-    for option, value in (("--density", config.density), ("--tile-m", config.tile_m)):
+        raise ConfigError(f"`count`: expected 1 .. {MOST_CROPS} crops, found {config.count}.")
+    for option, value in (("`density`", config.density), ("`tile_m`", config.tile_m)):
         if value is not None and not 0 < value <= LARGEST:
             raise ConfigError(f"{option}: expected a number above 0, up to {LARGEST:g}, found {value:g}.")
     if len(config.split) != 3 or min(config.split) < 0 or not math.isclose(sum(config.split), 1, abs_tol=1e-6):
-        raise ConfigError(f"--split: expected three shares that sum to 1, found {config.split}.")
+        raise ConfigError(f"`split`: expected three shares that sum to 1, found {config.split}.")
 
 
 def _read(path: Path, file: h5py.File, config: Config) -> Scene:
@@ -88,13 +88,13 @@ def _read(path: Path, file: h5py.File, config: Config) -> Scene:
     grid, frames = read_grid(file, path), load_frames(file, path)
     crop = int(file.attrs["crop_px"]) if config.crop is None else config.crop
     if crop % 16 or crop < 16:
-        raise ConfigError(f"--crop: expected a multiple of 16 px (the network halves it four times), found {crop}.")
+        raise ConfigError(f"`crop`: expected a multiple of 16 px (the network halves it four times), found {crop}.")
     if crop > min(grid.height, grid.width):
         raise ConfigError(
-            f"--crop: expected at most {min(grid.height, grid.width)} px, the edge of {path}, found {crop}."
+            f"`crop`: expected at most {min(grid.height, grid.width)} px, the edge of {path}, found {crop}."
         )
     if not frames:
-        raise ConfigError(f"{path}: expected images, found none; run 'lunargr ingest' with --images.")
+        raise ConfigError(f"{path}: expected images, found none; run 'lunargr ingest' with `images`.")
     return Scene(path, file, grid, frames, crop)
 
 

@@ -83,10 +83,10 @@ def parse_hidden(items: Iterable[Mapping[str, Any]]) -> list[Hidden]:
             except (TypeError, ValueError):
                 number = math.nan
             if not low <= number <= high:
-                raise ConfigError(f"--hidden {effect}: expected {name} in {low:g}..{high:g}, found {value}.")
+                raise ConfigError(f"`hidden` {effect}: expected {name} in {low:g}..{high:g}, found {value}.")
             parameters[name] = number
         if any(h.effect == effect for h in result):
-            raise ConfigError(f"--hidden: expected each effect once, found '{effect}' twice.")
+            raise ConfigError(f"`hidden`: expected each effect once, found '{effect}' twice.")
         result.append(Hidden(effect, parameters))
     return result
 
@@ -102,7 +102,7 @@ def hidden_from_option(text: str) -> list[dict[str, Any]]:
         for pair in filter(None, rest.split(SEPARATOR)):
             key, equals, value = pair.partition("=")
             if not equals:
-                raise ConfigError(f"--hidden: expected EFFECT:NAME=VALUE{SEPARATOR}..., found '{part}'.")
+                raise ConfigError(f"`hidden`: expected EFFECT:NAME=VALUE{SEPARATOR}..., found '{part}'.")
             entry[key.strip()] = value
         entries.append(entry)
     parse_hidden(entries)

@@ -225,7 +225,7 @@ def read_recipe(path: Path) -> dict[str, Any]:
     """The keys of a recipe file. Raises InputError."""
     from schemas.files.user_files import read_json
 
-    values = read_json(path, "a recipe in JSON ('lunargr simulate --print-recipe' writes one)")
+    values = read_json(path, "a recipe in JSON ('lunargr simulate' with `print_recipe` writes one)")
     if not isinstance(values, dict):
         raise InputError(f"{path}: expected a JSON object of recipe keys, found {type(values).__name__}; mend it.")
     return values

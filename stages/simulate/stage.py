@@ -178,6 +178,22 @@ def _dem_inside(config: Config, x: NDArray, y: NDArray, phases: NDArray) -> NDAr
     return (x < edge(y, phases[0])) & (-x < edge(y, phases[1])) & (y < edge(x, phases[2])) & (-y < edge(x, phases[3]))
 
 
+@dataclass(frozen=True)
+class Exposure:
+    """What makes one image of the ground's light.
+
+    kernel : (n,) float32, point spread on the DEM's grid; reach : DEM px around a place that its signal comes from
+    """
+
+    config: Config
+    scene: Scene
+    view: View
+    kernel: NDArray[np.float32]
+    reach: int
+    detector: sensor.Detector
+    hidden: list[Hidden]
+
+
 def _make_image(
     path: Path, config: Config, scene: Scene, shot: Pass, number: int, hidden: list[Hidden]
 ) -> tuple[ImageTruth, float]:
@@ -196,6 +212,7 @@ def _make_image(
     detector = sensor.make_detector(config, shot, hidden, expected, rng)
     echo = find(hidden, "echo")
     reach = len(kernel) // 2 + 4 + (int(echo["lag_px"] * shot.gsd / step) + 2 if echo else 0)
+    exposure = Exposure(config, scene, view, kernel, reach, detector, hidden)
     band = int(max(64, min(image.height, WINDOW_PIXELS * (step / shot.gsd) ** 2 / image.width)))
     total, count = 0.0, 0
     with atomic_path(path) as partial:
@@ -207,7 +224,7 @@ def _make_image(
                 inside = sensor.footprint(config, shot, lattice.x, lattice.y, number)
                 signal = np.zeros(inside.shape, np.float32)
                 if inside.any():
-                    signal = _signal(config, scene, view, lattice, inside, kernel, detector, hidden, reach)
+                    signal = _signal(exposure, lattice, inside)
                     total += float(signal[inside].sum(dtype=np.float64))
                     count += int(inside.sum())
                 # drawn for every pixel: the noise is then the same however the image is cut into bands
@@ -218,26 +235,17 @@ def _make_image(
     return ImageTruth(shot, detector, mean, float(noise)), count * shot.gsd**2 / config.extent**2
 
 
-def _signal(
-    config: Config,
-    scene: Scene,
-    view: View,
-    lattice: sensor.Lattice,
-    inside: NDArray[np.bool_],
-    kernel: NDArray[np.float32],
-    detector: sensor.Detector,
-    hidden: list[Hidden],
-    reach: int,
-) -> NDArray[np.float32]:
-    """The noise-free signal, I/F, of a band of an image."""
-    size = config.dem_size
-    row, col = sensor.move(config, view.shot, detector, lattice, scene.grid.gsd)
+def _signal(exposure: Exposure, lattice: sensor.Lattice, inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The noise-free signal, I/F, of a band of an image; lattice and inside : (rows, columns) of the band."""
+    scene, view, detector, hidden = exposure.scene, exposure.view, exposure.detector, exposure.hidden
+    size, reach = exposure.config.dem_size, exposure.reach
+    row, col = sensor.move(exposure.config, view.shot, detector, lattice, scene.grid.gsd)
     r0, r1 = int(row[inside].min()) - reach, int(row[inside].max()) + reach + 1
     c0, c1 = int(col[inside].min()) - reach, int(col[inside].max()) + reach + 1
     r0, c0, r1, c1 = max(0, r0), max(0, c0), min(size, r1), min(size, c1)
     window = (r0, c0, r1 - r0, c1 - c0)
     wanted = _wanted(row[inside], col[inside], window, reach)
-    light = blur(radiance(scene, view, window, wanted, hidden), kernel)
+    light = blur(radiance(scene, view, window, wanted, hidden), exposure.kernel)
     signal = sensor.resample(light, row, col, window)
     late = None
     if echo := find(hidden, "echo"):

@@ -7,6 +7,7 @@ import math
 from schemas import ConfigError, InputError
 from stages.common.progress import Say
 from stages.network.predictor import choose_device
+from stages.network.runtime import check_precision
 from stages.network.stored import DEEPEST, WIDEST
 from stages.pairs.reader import PairReader
 from stages.physics.photometry import get_model
@@ -16,25 +17,24 @@ from stages.train.config import Config
 def check(config: Config) -> None:
     """Refuse options that cannot be. Raises ConfigError, RegistryError."""
     if config.epochs < 1 or config.batch < 1:
-        raise ConfigError(f"--epochs and --batch: expected at least 1, found {config.epochs} and {config.batch}.")
+        raise ConfigError(f"`epochs` and `batch`: expected at least 1, found {config.epochs} and {config.batch}.")
     if not (math.isfinite(config.lr) and 0 < config.lr < 1):
-        raise ConfigError(f"--lr: expected a number between 0 and 1, found {config.lr}.")
+        raise ConfigError(f"`lr`: expected a number between 0 and 1, found {config.lr}.")
     if config.schedule not in ("constant", "cosine"):
-        raise ConfigError(f"--schedule: expected 'constant' or 'cosine', found '{config.schedule}'.")
-    if config.precision not in ("auto", "fp32", "bf16"):
-        raise ConfigError(f"--precision: expected auto, fp32 or bf16, found '{config.precision}'.")
+        raise ConfigError(f"`schedule`: expected 'constant' or 'cosine', found '{config.schedule}'.")
+    check_precision(config.precision)
     if not 2 <= len(config.widths) <= DEEPEST or not 1 <= min(config.widths) <= max(config.widths) <= WIDEST:
         raise ConfigError(
-            f"--widths: expected 2 .. {DEEPEST} stages of 1 .. {WIDEST} channels, found {'-'.join(map(str, config.widths))}."
+            f"`widths`: expected 2 .. {DEEPEST} stages of 1 .. {WIDEST} channels, found {'-'.join(map(str, config.widths))}."
         )
     if not 0 <= config.brightness <= 1:
-        raise ConfigError(f"--brightness: expected a number from 0 to 1, found {config.brightness}.")
+        raise ConfigError(f"`brightness`: expected a number from 0 to 1, found {config.brightness}.")
     if not config.dropout or not all(0 <= share < 1 for share in config.dropout):
-        raise ConfigError(f"--dropout: expected shares from 0 to below 1, found {config.dropout}.")
+        raise ConfigError(f"`dropout`: expected shares from 0 to below 1, found {config.dropout}.")
     model = get_model(config.model)
     model.choose_maps(config.maps)
     if config.positive and not model.linear:
-        raise ConfigError(f"--positive: expected a model that is linear in its coefficients, found '{model.name}'.")
+        raise ConfigError(f"`positive`: expected a model that is linear in its coefficients, found '{model.name}'.")
     choose_device(config.device)
 
 

@@ -57,7 +57,7 @@ def learn_epoch(
     error_sum, pixel_sum = sums.tolist()
     if not math.isfinite(error_sum):
         raise InputError(
-            f"{training.reader.path}: the loss is not finite in epoch {epoch + 1}; lower --lr or check the images' units."
+            f"{training.reader.path}: the loss is not finite in epoch {epoch + 1}; lower `lr` or check the images' units."
         )
     return mean_over_ranks(error_sum, pixel_sum, ranks, device)
 
@@ -93,10 +93,8 @@ def evaluate_loss(
     brightness: float = 1.0,
     progress: Progress = show_nothing,
 ) -> tuple[float, float]:
-    """Mean squared error and mean of what is minimised over the valid pixels of some pairs, in evaluation mode.
-
-    NaN where there are no pairs.
-    """
+    """Mean squared error and mean of what is minimised over the valid pixels of some pairs, in evaluation mode; NaN where
+    there are none."""
     training.predictor.eval()
     totals, pixels = [0.0, 0.0], 0.0
     mine = indices[training.rank :: training.ranks]

@@ -55,7 +55,7 @@ def read_content(path: Path, max_px: int) -> Content:
         if model.glsl is None:
             able = [name for name in model_names() if get_model(name).glsl is not None]
             raise RegistryError(
-                f"{path}: its model {model.name} has no formula for a page (`glsl` in its file); models that have one: {', '.join(able)}."
+                f"{path}: its model {model.name} has no formula for a page (glsl in its file); models that have one: {', '.join(able)}."
             )
         names, expected = read_strings(file, "coefficient_name"), [p.name for p in model.parameters]
         if names != expected:

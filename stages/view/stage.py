@@ -72,10 +72,10 @@ def run(
 
 def _check(config: Config, page: Path) -> None:
     if page.suffix.lower() not in (".html", ".htm"):
-        raise ConfigError(f"{page}: expected a name that ends in .html; choose another --output.")
+        raise ConfigError(f"{page}: expected a name that ends in .html; choose another `output`.")
     if not 16 <= config.max_px <= 8192:
-        raise ConfigError(f"--max-px: expected pixels in 16..8192, found {config.max_px}.")
+        raise ConfigError(f"`max_px`: expected pixels in 16..8192, found {config.max_px}.")
     if not 0 < config.sun_elevation_deg <= 90:
-        raise ConfigError(f"--sun-elevation: expected degrees in 0..90, found {config.sun_elevation_deg:g}.")
+        raise ConfigError(f"`sun_elevation_deg`: expected degrees in 0..90, found {config.sun_elevation_deg:g}.")
     if config.photographs < 1:
-        raise ConfigError(f"--photographs: expected at least 1, found {config.photographs}.")
+        raise ConfigError(f"`photographs`: expected at least 1, found {config.photographs}.")

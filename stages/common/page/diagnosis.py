@@ -25,8 +25,8 @@ VERDICTS = {
     "cannot_tell": "These data cannot tell whether something is missing from the simulation.",
 }
 SAME = (
-    "Before and after are taken with the same nominal coefficients, gains, offsets and registration: only the cause "
-    "itself is left out. The gain is that on ground that it was not fitted to, with its 95 % interval."
+    "The residual before and after is that without and with the cause, all else that is fitted, the nominal coefficients among it, "
+    "fitted along in both. The gain is that on ground that the cause was not fitted to, with its 95 % interval."
 )
 
 
@@ -122,7 +122,8 @@ def _cause(cause: dict[str, Any]) -> list[str]:
     values = []
     for name, v in cause.get("parameters", {}).items():
         unit = "" if v.get("unit", "1") == "1" else f" {v['unit']}"
-        values.append(f"{name} = {number(v['value'], '.3g')} +- {number(v['error'], '.1g')}{unit}")
+        value = f"{name} = {number(v['value'], '.3g')} +- {number(v['error'], '.1g')}{unit}"
+        values.append(value.replace(" ", "\u00a0"))
     before, after = (number(cause.get(f"residual_rms_{k}"), ".4f") for k in ("before", "after"))
     others = [words(name) for name in cause.get("group", []) if name != cause["effect"]]
     gain = [cause.get(k) for k in ("held_out_gain_percent", "held_out_low", "held_out_high")]

@@ -32,6 +32,7 @@ class Covariance:
     mean_albedo: float
     mean_relief: float
     mean_own: float
+    dark: float = 1.0  # of a piece's mean in deep shadow
     size: dict[int, float] = field(default_factory=dict)  # of a patch (by its number), times the above
     mean_size: dict[int, float] = field(default_factory=dict)
     radius: list[float] = field(default_factory=list)  # (A,) cycles/px
@@ -124,6 +125,13 @@ def estimate(patches: Sequence[Patch], rows: Sequence[tuple[Tensor, Tensor]], gr
     return model
 
 
+def shadow_variance(patches: Sequence[Patch], residuals: Sequence[Tensor]) -> float:
+    """Variance of the means in deep shadow about what they have in common; residuals : (n,) of every patch."""
+    seen = [r[p.dark.sum((-2, -1)) > 0] for p, r in zip(patches, residuals, strict=True)]
+    values = torch.cat(seen).double()
+    return max(float(values.var()), 1e-10) if len(values) > 1 else 1.0
+
+
 def _unit_mean(sizes: dict[int, float]) -> dict[int, float]:
     """Sizes over their geometric mean."""
     middle = math.exp(sum(math.log(v) for v in sizes.values()) / len(sizes))
@@ -193,4 +201,4 @@ def _bend(chain: Chain, mask: Tensor) -> Tensor:
     return torch.stack(parts).mean()
 
 
-__all__ = ["Covariance", "estimate", "texture"]
+__all__ = ["Covariance", "estimate", "shadow_variance", "texture"]

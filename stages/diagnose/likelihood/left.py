@@ -39,7 +39,7 @@ def peak(rows: list[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[
     power = torch.zeros(frames, len(grid.keep), dtype=torch.float64)
     count = torch.zeros(frames, dtype=torch.float64)
     for row in rows:
-        z, _ = whitened_residual(row, model, grid)
+        z, _, _ = whitened_residual(row, model, grid)
         size = (row.patch.weight.square().mean((-2, -1)) * model.size.get(row.patch.number, 1.0)).clamp(min=1e-6)
         share = (z.real.square() + z.imag.square()).double() / size[:, None]
         power.index_add_(0, row.patch.frames, share)

@@ -16,13 +16,20 @@ from stages.diagnose.rows.patches import Grid, Patch
 
 @dataclass
 class Rows:
-    """Coefficients and means of one patch: shared (1 + m, n, K) with the residual first, per frame (k, n, K)."""
+    """Coefficients, means and means in deep shadow of one patch: shared (1 + m, n, K) with the residual first, per frame (k, n, K)."""
 
     patch: Patch
     shared: Tensor
     shared_mean: Tensor
     own: Tensor
     own_mean: Tensor
+    shared_dark: Tensor
+    own_dark: Tensor
+
+
+Residual = tuple[
+    Tensor, Tensor, Tensor
+]  # coefficients (n, K), means (n,), means in deep shadow (n,); or (R, ...) of each
 
 
 @dataclass
@@ -37,16 +44,17 @@ class Products:
     sham: NDArray[np.float64]
     sham_squares: NDArray[np.float64]
     ground: int
+    site: int
 
 
-def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> tuple[Tensor, Tensor]:
-    """Residual (n, K) and its means (n,) with unit covariance, for shams."""
+def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> Residual:
+    """The residual with unit covariance, for shams."""
     factor = _factor(model, rows.patch, grid)
     white = torch.einsum("kij,jk->ik", factor[grid.bins], rows.shared[0])
     mean = torch.linalg.solve_triangular(
         torch.linalg.cholesky(model.mean_matrix(rows.patch)), rows.shared_mean[0].double()[:, None], upper=False
     )
-    return white, mean[:, 0]
+    return white, mean[:, 0], rows.shared_dark[0] / model.dark**0.5
 
 
 def weighed_squares(z: Tensor, mean: Tensor, patch: Patch, model: Covariance, grid: Grid) -> float:
@@ -70,8 +78,8 @@ def _factor(model: Covariance, patch: Patch, grid: Grid) -> Tensor:
     return torch.linalg.inv(lower).to(torch.complex64)
 
 
-def products(rows: Rows, model: Covariance, grid: Grid, frames: int, shams: tuple[Tensor, Tensor] | None) -> Products:
-    """shams : (R, n, K) and (R, n), whitened sham residuals."""
+def products(rows: Rows, model: Covariance, grid: Grid, frames: int, shams: Residual | None) -> Products:
+    """shams : whitened sham residuals."""
     patch = rows.patch
     n = len(patch.frames)
     factor = _factor(model, patch, grid)
@@ -106,13 +114,18 @@ def products(rows: Rows, model: Covariance, grid: Grid, frames: int, shams: tupl
         if k:
             cross += torch.einsum("mi,in,an->man", rows.shared_mean.double(), inverse, rows.own_mean.double())
             own += torch.einsum("ai,ij,bj->aibj", rows.own_mean.double(), inverse, rows.own_mean.double())
+    shadow, own_shadow = (x.double() / model.dark**0.5 for x in (rows.shared_dark, rows.own_dark))
+    dense += shadow @ shadow.T
+    if k:
+        cross += shadow[:, None] * own_shadow
+        own += torch.diag_embed(own_shadow[:, None] * own_shadow).permute(0, 2, 1, 3)
     top = torch.cat([dense, cross.flatten(1)], 1)
     low = torch.cat([cross.flatten(1).T, own.reshape(k * n, k * n)], 1)
     place = np.concatenate([np.arange(m), (m + np.arange(k)[:, None] * frames + patch.frames.numpy()[None]).flatten()])
     sham, squares = np.zeros((len(place), 0)), np.zeros(0)
     if shams is not None:
-        z, mean = shams
-        with_shared = (flat @ _real(z).T).double()
+        z, mean, dark = shams
+        with_shared = (flat @ _real(z).T).double() + shadow @ dark.double().T
         squares = (z.real.square() + z.imag.square()).sum((1, 2)).double().numpy()
         parts = [with_shared]
         if k:
@@ -124,7 +137,8 @@ def products(rows: Rows, model: Covariance, grid: Grid, frames: int, shams: tupl
                 if count:
                     spread[:, :, at] = factor[b].mH @ z[:, :, at]
             a_, b_ = (torch.view_as_real(t).flatten(2).transpose(0, 1) for t in (rows.own, spread))
-            parts.append((a_ @ b_.transpose(1, 2)).double().transpose(0, 1).flatten(0, 1))
+            by_frame = (a_ @ b_.transpose(1, 2)).double().transpose(0, 1)
+            parts.append((by_frame + own_shadow[..., None] * dark.double().T).flatten(0, 1))
         if not patch.free:
             parts[0] = parts[0] + a.T @ mean.double().T
             squares = squares + mean.double().square().sum(1).numpy()
@@ -132,21 +146,22 @@ def products(rows: Rows, model: Covariance, grid: Grid, frames: int, shams: tupl
                 upper = torch.linalg.solve_triangular(lower.T, mean.double().T, upper=True)  # (n, R)
                 parts[1] = parts[1] + torch.einsum("an,nr->anr", rows.own_mean.double(), upper).flatten(0, 1)
         sham = torch.cat(parts).numpy()
-    return Products(torch.cat([top, low]).numpy(), place, sham, squares, patch.ground)
+    return Products(torch.cat([top, low]).numpy(), place, sham, squares, patch.ground, patch.site)
 
 
-def make_shams(
-    white: Sequence[tuple[Tensor, Tensor]], grid: Grid, count: int, seed: int
-) -> list[tuple[Tensor, Tensor]]:
+def make_shams(white: Sequence[Residual], grid: Grid, count: int, seed: int) -> list[Residual]:
     """Sham residuals for every patch: the whitened residual of another one, its images shuffled, mirrored, of either sign."""
     rng = np.random.default_rng(seed)
     mirror = _mirror(grid)
-    out = [(torch.empty(count, *z.shape, dtype=z.dtype), torch.empty(count, len(m))) for z, m in white]
+    out = [
+        (torch.empty(count, *z.shape, dtype=z.dtype), torch.empty(count, len(m)), torch.empty(count, len(m)))
+        for z, m, _ in white
+    ]
     pieces = len(white)
     for r in range(count):
         shift = int(rng.integers(1, pieces)) if pieces > 1 else 0
         for p in range(pieces):
-            z, mean = white[(p + shift) % pieces]
+            z, mean, dark = white[(p + shift) % pieces]
             n = len(out[p][0][0])
             images = torch.from_numpy(np.concatenate([rng.permutation(len(z)) for _ in range(-(-n // len(z)))])[:n])
             w = z[images]
@@ -155,7 +170,8 @@ def make_shams(
             if rng.random() < 0.5:
                 w = w.conj()
             sign = float(rng.choice([-1.0, 1.0]))
-            out[p][0][r], out[p][1][r] = sign * w, (sign * mean[images]).float()
+            for into, sham in zip(out[p], (w, mean[images], dark[images]), strict=True):
+                into[r] = sign * sham
     return out
 
 

@@ -15,7 +15,7 @@ from scipy.special import gammaincc, gammaln
 from stages.diagnose.likelihood.jackknife import FRACTION, jackknife_error, student
 from stages.diagnose.likelihood.products import Products
 from stages.diagnose.rows.columns import Guise, Plan
-from stages.diagnose.settings import DRIFTING, FOLDS, LEVELS
+from stages.diagnose.settings import DRIFTING, FOLDS, LEVELS, UNITS
 from stages.effects import get_effect
 
 Array = NDArray[np.float64]
@@ -80,11 +80,13 @@ class Whole:
         self.folds = [f for f in self.folds if len(f)]
 
     def _labels(self) -> list[int]:
-        """Which units are left out together: all that lie on one ground, where there are enough grounds."""
+        """Which units are left out together: all on one ground; pieces of a crop that overlaps no other, where grounds are few."""
         grounds = sorted({u.ground for u in self.units})
-        if len(grounds) >= 4:
-            return [grounds.index(u.ground) for u in self.units]
-        return list(range(len(self.units)))
+        alone = {g for g in grounds if len({u.site for u in self.units if u.ground == g}) == 1}
+        few = len(grounds) < UNITS
+        keys = [(u.ground, k if few and u.ground in alone else -1) for k, u in enumerate(self.units)]
+        numbers = {key: n for n, key in enumerate(dict.fromkeys(keys))}
+        return [numbers[key] for key in keys]
 
     def _let_coefficients_drift(self) -> None:
         """Take out of every unit what the nominal coefficients may be there beside the rest: reflectance varies over the ground.
@@ -156,24 +158,23 @@ class Whole:
         """Inverse prior variances."""
         return np.array([self.precision.get(int(k), 1.0) for k in places])
 
-    def let_gains_scatter(self, name_columns: Sequence[int]) -> float:
-        """Estimate the scatter of nuisance per frame by expectation-maximisation and set its prior; returns it."""
-        places = self.frame_places(name_columns)
+    def let_scatter(self, places: NDArray[np.int64]) -> None:
+        """Estimate the scatter of nuisance about nothing by expectation-maximisation and make it their prior."""
         if not len(places):
-            return 0.0
+            return
+        places = np.sort(places)
         spread = 0.3
         for _ in range(8):
             for p in places:
                 self.precision[int(p)] = spread**-2
             n = self.nuisance()
             at = np.searchsorted(n, places)
-            a = self.gram[np.ix_(n, n)] + np.diag(self.weight(n))
-            inverse = np.linalg.inv(_scaled(a)[0]) * np.outer(*(2 * [_scaled(a)[1]]))
+            scaled, scale = _scaled(self.gram[np.ix_(n, n)] + np.diag(self.weight(n)))
+            inverse = np.linalg.inv(scaled) * np.outer(scale, scale)
             mean = inverse @ self.gram[n, 0]
             spread = math.sqrt(max(float((mean[at] ** 2 + inverse.diagonal()[at]).mean()), 1e-10))
         for p in places:
             self.precision[int(p)] = max(spread, 1e-4) ** -2
-        return spread
 
     def set_scatter(self, spread: float) -> None:
         for p in self.scattered:
@@ -295,36 +296,30 @@ class Whole:
                 out[self.labels[k]] += 0.5 * (_left(u, b0) - _left(u, b1))
         return out
 
-    def without_one(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> Array:
-        """(labels, J) amounts with one piece of ground left out each."""
+    def without_one(
+        self, places: NDArray[np.int64], exclude: Sequence[int] = (), spread: float = 0.0, now: Array | None = None
+    ) -> Array:
+        """(labels, J) amounts with one piece of ground left out each; ``spread`` draws them, beside ``now``, to nothing."""
         n = self.nuisance([*places, *exclude])
         every = np.concatenate([n, places])
-        more = np.diag(np.concatenate([self.weight(n), np.zeros(len(places))]))
+        pull = spread**-2 if spread else 0.0
+        more = np.diag(np.concatenate([self.weight(n), np.full(len(places), pull)]))
+        pulled = np.concatenate([np.zeros(len(n)), pull * now if now is not None else np.zeros(len(places))])
         out = []
         for label in sorted(set(self.labels)):
             rest = self.gram.copy()
             for u, own in zip(self.units, self.labels, strict=True):
                 if own == label:
                     rest[np.ix_(u.place, u.place)] -= u.gram
-            out.append(_solve(rest[np.ix_(every, every)] + more, rest[every, 0])[len(n) :])
+            out.append(_solve(rest[np.ix_(every, every)] + more, rest[every, 0] - pulled)[len(n) :])
         return np.array(out)
 
-    def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array, Array]:
-        """Amounts, their standard errors (the larger of the likelihood's and the jackknife's), and how far they hang on what is fitted along.
-
-        The last is by how much an amount moves if all ordinary imperfections, or another form of the law alone, are taken for absent.
-        """
+    def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array]:
+        """Amounts and their standard errors: the larger of the likelihood's and the jackknife's."""
         information, score, _, _ = self.reduce(places, exclude)
         inverse = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
         scatter = jackknife_error(self.without_one(places, exclude))
-        amount = inverse @ score
-        free = {1 + k for k, sd in self.plan.prior.items() if math.isinf(sd)}
-        moved = np.zeros(len(places))
-        for gone in (list(self.form_places()), [k for k in self.precision if k not in free]):
-            information, score, _, _ = self.reduce(places, [*exclude, *gone])
-            other = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ score
-            moved = np.maximum(moved, np.abs(other - amount))
-        return amount, np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter), moved
+        return inverse @ score, np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter)
 
     def law_adds(self, found: Found) -> Array:
         """(labels,) nats that another form of the reflectance gains on held-out ground beside an effect of the law."""

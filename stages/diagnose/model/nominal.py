@@ -71,7 +71,7 @@ def load_nominal(checkpoint: Path | None, model: str, units: str, free: Sequence
     if predictor.image_units != units:
         raise ArtefactError(
             f"{checkpoint}: expected a checkpoint for images in '{units}', found one for '{predictor.image_units}'; "
-            "train on the pairs that are to be diagnosed, or use --model."
+            "train on the pairs that are to be diagnosed, or use `model`."
         )
     count = len(predictor.model.parameters)
     return Nominal(predictor.model, torch.ones(count), torch.zeros(count, dtype=torch.bool), predictor)

@@ -26,6 +26,7 @@ class Site:
     gain, offset : (n,), measured = gain x I/F + offset; 1 and 0 for calibrated images
     texture : (H, W), relative albedo of the ground beyond the nominal model
     displacement : where each image looks for its pixels, (columns east, rows south), px, broadcastable to it
+    left_out : of the images, those too seldom seen for a covariance of their own
     ground : number that sites share whose crops overlap: what is learned on one is known on the other
     """
 
@@ -41,6 +42,7 @@ class Site:
     offset: Tensor
     texture: Tensor
     displacement: tuple[Tensor, Tensor] | None = None
+    left_out: frozenset[int] = frozenset()
     ground: int = 0
 
     @property

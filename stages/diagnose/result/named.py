@@ -29,10 +29,9 @@ def by_search(state: State) -> list[Named]:
         units = {p.name: p.unit for p in cls.parameters}
         if cls.scope == "scene":
             values = {k: float(v) for k, v in cause.effect.values.items()}
-            whole = {k: math.hypot(e, cause.hangs.get(k, 0.0)) for k, e in cause.errors.items()}
-            found = cls.report(values, whole)
+            found = cls.report(values, cause.errors)
         else:
-            found = {cls.parameters[0].name: (cls.size(cause.effect.values), cause.errors.get("rms", 0.0))}
+            found = {cls.parameters[0].name: (cause.rms, cause.errors.get("rms", math.inf))}
         low, high = interval(cause.found.gains)
         out.append(
             Named(

@@ -92,7 +92,7 @@ def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
         if name not in seen or found is None:
             out.append(name)
             continue
-        if found.alone >= SURE:
+        if found.alone >= SURE and name not in outcome.hidden:
             continue
         whole = outcome.view.whole if outcome.view else None
         assert whole is not None
@@ -112,7 +112,7 @@ def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
                 size = abs(at - cls.null()[coordinate])
                 worth = cls.strong.get(coordinate, 0.0) or size
                 error = min(error, size / worth / math.sqrt(max(float(information[k, k]), 1e-30)))
-        if SURE * error > 1:
+        if SURE * error > 1 or name in outcome.hidden:
             out.append(name)
     return out
 

@@ -10,7 +10,18 @@ from torch import Tensor
 
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import lit_mask
-from stages.diagnose.settings import CLEAR, DARKEST, FEWEST_PIXELS, LIT_MARGIN, PATCH, RUGGED, SECTORS, TAPER, UNITS
+from stages.diagnose.settings import (
+    CLEAR,
+    DARKEST,
+    FEWEST_PIXELS,
+    LIT_MARGIN,
+    PATCH,
+    RUGGED,
+    SECTORS,
+    SHADOWED,
+    TAPER,
+    UNITS,
+)
 
 
 @dataclass(frozen=True)
@@ -71,6 +82,7 @@ def make_grid(height: int, width: int) -> Grid:
 class Patch:
     """One piece of one site. weight : (n, h, w) window on judged pixels; scale : (n, h, w), I/F that residuals are relative to
 
+    dark : (n, h, w) 1 in deep shadow, 0 elsewhere and in images that show too little of it
     images : (n,) which of the site's images; slopes : (n, 2) relative brightness per slope to the east and north
     """
 
@@ -85,12 +97,17 @@ class Patch:
     slopes: Tensor
     level: Tensor
     frames: Tensor
+    dark: Tensor
     free: bool  # gain and offset of every image
 
     def relative(self, fields: Tensor) -> Tensor:
         """Fields (m, N, H, W) of the site as relative ones of the patch, free of each image's mean (gain and offset), windowed."""
         x = fields[:, self.images, self.rows, self.columns] / self.scale
         return x
+
+    def shadow(self, fields: Tensor) -> Tensor:
+        """Mean of relative fields (m, N, H, W) in deep shadow, (m, n); 0 where there is none."""
+        return (self.relative(fields) * self.dark).sum((-2, -1)) / self.dark.sum((-2, -1)).clamp(min=1)
 
     def transform(self, fields: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
         """Fields (m, N, H, W) -> coefficients (m, n, K) complex and means (m, n)."""
@@ -112,8 +129,8 @@ class Patch:
         return z, mean
 
 
-def judged(chain: Chain) -> Tensor:
-    """(n, H, W) bool: ground with the Sun well above its own slopes and the horizon, and ground in deep shadow a pixel away from its edge.
+def judged(chain: Chain) -> tuple[Tensor, Tensor]:
+    """Two (n, H, W) bool: ground with the Sun well above its own slopes and the horizon; ground in deep shadow a pixel away from its edge.
 
     Elsewhere relief below the DEM's resolution decides what is lit.
     """
@@ -121,14 +138,13 @@ def judged(chain: Chain) -> Tensor:
     above = chain.height_above_horizon()
     east, north = chain.state.slopes
     rugged = math.atan(float((east.square() + north.square()).mean().sqrt()))
-    clear = own > max(CLEAR, RUGGED * rugged)
-    lit = lit_mask(chain) & clear
+    clear = max(CLEAR, RUGGED * rugged)
+    lit = lit_mask(chain) & (own > clear)
     if above is None:
-        return lit
-    lit &= above > max(CLEAR, RUGGED * rugged)
+        return lit, torch.zeros_like(lit)
     deep = (above < -LIT_MARGIN).float()
-    deep = -torch.nn.functional.max_pool2d(-deep[:, None], 3, 1, 1)[:, 0] > 0
-    return lit | (deep & chain.site.valid)
+    deep = -torch.nn.functional.max_pool2d(-deep[:, None], 3, 1, 1)[:, 0]
+    return lit & (above > clear), (deep > 0) & chain.site.valid
 
 
 def window(height: int, width: int) -> Tensor:
@@ -150,12 +166,15 @@ def cuts(size: int, sites: int) -> int:
 
 def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Patch]:
     """The pieces of one site that show enough pixels."""
-    use = judged(chain)
+    use, deep = judged(chain)
     image = chain.predict()
     _, height, width = image.shape
     lit = lit_mask(chain)
+    kept = torch.tensor([k not in chain.site.left_out for k in range(len(image))])
     level = (image * lit).sum((-2, -1)) / lit.sum((-2, -1)).clamp(min=1)
     scale = torch.maximum(image, DARKEST * level[:, None, None]).clamp(min=1e-6)
+    # what is bright all the same is lit ground that the DEM does not know of
+    deep &= chain.site.image < DARKEST * level[:, None, None]
     east, north = chain.slope_tangents()
     h, w = height // pieces, width // pieces
     out = []
@@ -164,7 +183,7 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
             rows, columns = slice(i * h, (i + 1) * h), slice(j * w, (j + 1) * w)
             here = use[:, rows, columns]
             seen = (here & lit[:, rows, columns]).sum((-2, -1))
-            images = torch.nonzero((seen >= min(FEWEST_PIXELS, 0.3 * h * w)) & (level > 0))[:, 0]
+            images = torch.nonzero((seen >= min(FEWEST_PIXELS, 0.3 * h * w)) & (level > 0) & kept)[:, 0]
             if not len(images):
                 continue
             weight = here[images].float() * window(h, w)
@@ -176,6 +195,8 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
             bright = 1 / s
             bright = bright - ((bright * weight).sum((-2, -1)) / total)[:, None, None]
             frames = torch.from_numpy(chain.site.frames)[images]
+            dark = deep[images, rows, columns].float()
+            dark *= (dark.sum((-2, -1)) >= SHADOWED)[:, None, None] & (not free)
             out.append(
                 Patch(
                     (number * pieces + i) * pieces + j,
@@ -189,6 +210,7 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
                     slopes,
                     bright,
                     frames,
+                    dark,
                     free,
                 )
             )

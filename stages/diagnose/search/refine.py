@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.weigh import Whole
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import SETTLED, STEPS
@@ -38,11 +41,11 @@ def as_effect(found, data: Survey, frames: int, whole):
 def refine(state: State) -> View:
     """Fit the nominal model and all causes' values together; sets values and errors; returns the last look."""
     view = None
-    for step in range(STEPS):
+    for _ in range(STEPS):
         state.fit()
         along = [n for n in state.open_names() if _ordinary(n) or get_effect(n).always]
         view = state.look(along, 0)
-        largest = _step(state, view, last=step == STEPS - 1)
+        largest = _step(state, view)
         if largest < SETTLED:
             break
     state.fit()
@@ -55,7 +58,7 @@ def _ordinary(name: str) -> bool:
     return cls.scope == "scene" and bool(cls.tolerance)
 
 
-def _step(state: State, view: View, last: bool) -> float:
+def _step(state: State, view: View) -> float:
     """Move all values; returns the largest move in standard errors."""
     whole, plan = view.whole, view.plan
     scene = [(k, step) for k, step in enumerate(plan.steps)]
@@ -66,12 +69,12 @@ def _step(state: State, view: View, last: bool) -> float:
         seen = whole.seen[places]
         for p in places:
             whole.precision.pop(int(p), None)
-        amounts, errors, hangs = _amounts(state, whole, places[seen], [scene[k][1][0] for k in np.flatnonzero(seen)])
+        amounts, errors = _amounts(state, whole, places[seen], [scene[k][1][0] for k in np.flatnonzero(seen)])
         for p in places:
             whole.precision[int(p)] = 1e-10 * whole.gram[p, p]
         alone = {c.effect.name: 0 for c in state.causes}
-        for (_, (place, name, _)), amount, error, hang in zip(
-            [s for s, ok in zip(scene, seen, strict=True) if ok], amounts, errors, hangs, strict=True
+        for (_, (place, name, _)), amount, error in zip(
+            [s for s, ok in zip(scene, seen, strict=True) if ok], amounts, errors, strict=True
         ):
             cause = state.causes[place]
             cls = type(cause.effect)
@@ -84,7 +87,6 @@ def _step(state: State, view: View, last: bool) -> float:
             effect.held = cause.effect.held
             cause.effect = effect
             cause.errors[name] = float(error)
-            cause.hangs[name] = float(hang)
             alone[cls.name] += 1
     for cause in state.causes:
         if cause.found.guise.per_frame:
@@ -93,7 +95,7 @@ def _step(state: State, view: View, last: bool) -> float:
 
 
 def _amounts(state: State, whole: Whole, places, owners: list[int]) -> list[NDArray[np.float64]]:
-    """Moves of all coordinates, their errors and how far they hang on the nuisance; beside what is of the law no other form of it stands."""
+    """Moves of all coordinates and their errors; beside what is of the law no other form of it stands."""
     out = list(whole.errors(places))
     law = np.array([type(state.causes[k].effect).of_law for k in owners], dtype=bool)
     if law.any():
@@ -116,15 +118,23 @@ def _step_frames(state: State, view: View, cause: Cause) -> float:
     column, frame = index // whole.frames - min(guise.columns), index % whole.frames
     table = np.stack([np.broadcast_to(np.asarray(cause.effect.values[n], float), (whole.frames,)) for n in names])
     now = table[column, frame] / sizes[column]
-    information, score, _, _ = whole.reduce(places)
     prior = cause.found.spread**-2
+    information, score, _, _ = whole.reduce(places)
     inverse = np.linalg.inv(information + prior * np.eye(len(places)))
     move = inverse @ (score - prior * now)
     out = table.copy()
     out[column, frame] = (now + move) * sizes[column]
     cause.effect = cls({n: torch.from_numpy(out[k].copy()).float() for k, n in enumerate(names)}, state.data)
+    # the mean square of values is that of their estimates, which are drawn to nothing, and their variances
     variance = inverse.diagonal() * sizes[column] ** 2
-    cause.errors["rms"] = float(np.sqrt(variance.mean() / max(len(variance), 1)))
+    frames = max(len(set(frame.tolist())), 1)
+
+    def rms(values: NDArray[np.float64]) -> float:
+        return math.sqrt(float(((values * sizes[column]) ** 2 + variance).sum()) / frames)
+
+    without = [rms(now + m) for m in whole.without_one(places, spread=cause.found.spread, now=now)]
+    cause.rms = rms(now + move)
+    cause.errors["rms"] = float(jackknife_error(np.array(without)))
     return float(np.sqrt((move**2).mean() / max(inverse.diagonal().mean(), 1e-12)))
 
 

@@ -15,9 +15,10 @@ from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
 from stages.diagnose.search.refine import as_effect, refine
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.search.tested import hidden_gains
-from stages.diagnose.settings import DISCOVERY, NOTABLE, SIMPLER, SURE, TRIED, TRIES
+from stages.diagnose.settings import DISCOVERY, FEW_GROUNDS, NOTABLE, SIMPLER, SURE, TRIED, TRIES
 from stages.effects import get_effect
 
+TOO_FEW = "it takes more images"
 ODD = "nothing real has the values that fit best"
 
 
@@ -28,6 +29,7 @@ class Outcome:
     view: View | None = None
     best: dict[str, Found] = field(default_factory=dict)
     rejected: dict[str, tuple[float, str]] = field(default_factory=dict)
+    hidden: set[str] = field(default_factory=set)  # what a law may imitate at will: too few images to tell
     sure: bool = False  # whether something stands out that no plausible effect explains
 
 
@@ -73,6 +75,8 @@ def search(state: State, most: int) -> Outcome:
                 sure = [f for f in sure if f is not chosen]
                 refused.add(chosen.effect)
                 out.rejected[chosen.effect] = (chosen.gain, why)
+                if why.startswith(TOO_FEW):
+                    out.hidden.add(chosen.effect)
                 out.sure |= why.startswith(ODD) and chosen.gain > NOTABLE * float(view.whole.gram[0, 0])
                 state.say(f"{chosen.effect} is not taken: {why}")
             else:
@@ -110,7 +114,7 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
     """Whether an effect of the reflectance law stands for another form of it, which has more to add for sure, or a fair share more."""
     if not get_effect(found.effect).of_law:
         return False
-    if not len(whole.form_places()):
+    if whole.plan.free_form:
         out.rejected[found.effect] = (
             found.gain,
             "the nominal law is a sum of kernels, and what is left of it has no form of its own",
@@ -127,12 +131,18 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
 def take(state: State, view: View, found: Found, group: list[str]) -> str:
     """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
     cls = get_effect(found.effect)
-    law = max(len(view.plan.form), sum(n.startswith("coefficient") for n in view.plan.shared) // 2)
+    law = max(
+        0 if view.plan.free_form else len(view.plan.form),
+        sum(n.startswith("coefficient") for n in view.plan.shared) // 2,
+    )
     if cls.scatters and not cls.displaces and state.frames <= law:
-        return f"a law of {law} coefficients can give {state.frames} images any brightness: more images than that would tell"
+        return f"{TOO_FEW}: a law of {law} coefficients can give {state.frames} any brightness"
+    first = as_effect(found, state.data, state.frames, view.whole)
+    if cls.scope == "scene" and not cls.plausible({k: float(v) for k, v in first.values.items()}, state.data):
+        return ODD
     vector, causes = state.nominal.vector, list(state.causes)
     saved = [(c, c.effect, dict(c.errors)) for c in causes]
-    cause = Cause(as_effect(found, state.data, state.frames, view.whole), found, group=group)
+    cause = Cause(first, found, group=group)
     state.causes.append(cause)
     look = refine(state)
     why = doubt(state, cause) or next(
@@ -146,10 +156,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         if low <= 0:
             why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
     if not why:
-        tested = hidden_gains(state, cause, look)
-        low, high = interval(tested)
-        if high < 0:
-            why = f"the test pairs contradict it: it gains {tested.sum():.0f} nats there ({low:.0f} .. {high:.0f})"
+        why = contradicted(hidden_gains(state, cause, look))
     if why:
         state.causes[:] = causes
         for c, effect, errors in saved:
@@ -159,11 +166,25 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     return why
 
 
+def contradicted(parts: list[tuple[np.ndarray, str]]) -> str:
+    """Why test pairs that gain so much on each piece of ground take a name back, or ''.
+
+    Too few grounds for an interval speak by their sum, where weighted squares and plain ones agree.
+    """
+    for gains, unit in parts:
+        low, high = interval(gains)
+        if high < 0:
+            return f"the test pairs contradict it: it gains {gains.sum():.3g} {unit} there ({low:.3g} .. {high:.3g})"
+    if parts and all(len(g) < FEW_GROUNDS and g.sum() < 0 for g, _ in parts):
+        return "the test pairs contradict it: it gains " + " and ".join(f"{g.sum():.3g} {unit}" for g, unit in parts)
+    return ""
+
+
 def doubt(state: State, cause: Cause) -> str:
     """Why the fitted values cannot be a cause, or ''."""
     cls = type(cause.effect)
     if cls.scope == "image":
-        size, error = cls.size(cause.effect.values), cause.errors.get("rms", 0.0)
+        size, error = cause.rms, cause.errors.get("rms", math.inf)
         least = max(cls.tolerance.values(), default=0.0)
         return f"it is {size:.2g}, and less than {least:.2g} is ordinary" if size - 2 * error < least else ""
     values = {k: float(v) for k, v in cause.effect.values.items()}
@@ -200,7 +221,9 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
                 z, mean = row.patch.transform(brought, look.grid)
                 shared, means = torch.cat([row.shared, z]), torch.cat([row.shared_mean, mean])
                 shared[0], means[0] = shared[0] + z[0], means[0] + mean[0]
-                more = dataclasses.replace(row, shared=shared, shared_mean=means)
+                dark = torch.cat([row.shared_dark, row.patch.shadow(brought)])
+                dark[0] = dark[0] + dark[-1]
+                more = dataclasses.replace(row, shared=shared, shared_mean=means, shared_dark=dark)
                 added.append(products(more, look.model, look.grid, state.frames, None))
                 few = 1 + sum(n.startswith("coefficient") for n in look.plan.shared)
                 less = dataclasses.replace(
@@ -209,6 +232,8 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
                     shared_mean=torch.cat([means[:few], means[-1:]]),
                     own=row.own[:0],
                     own_mean=row.own_mean[:0],
+                    shared_dark=0 * torch.cat([dark[:few], dark[-1:]]),
+                    own_dark=row.own_dark[:0],
                 )
                 plain.append(products(less, flat, look.grid, state.frames, None).gram)
     plan = dataclasses.replace(look.plan, shared=[*look.plan.shared, "secant"])
@@ -217,6 +242,8 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
         whole.precision.pop(1 + k, None)
     first = look.whole.first
     whole.precision |= {k + 1: v for k, v in look.whole.precision.items() if k >= first}  # one shared column more
+    scattered = look.whole.known_places([1 + k for group in look.plan.scattered for k in group])
+    whole.precision |= {int(p): look.whole.precision[int(p)] for p in scattered}
     cause.rms_before, cause.rms_after = _rms(np.sum(plain, 0), look)
     if type(cause.effect).scope == "image" or len(cause.found.guise.columns) > 1:
         return cause.found.gains, float(whole.gram[0, 0])

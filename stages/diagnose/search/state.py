@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from stages.diagnose.likelihood.covariance import Covariance, estimate, texture
-from stages.diagnose.likelihood.products import Products, Rows, make_shams, products, whitened_residual
+from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_variance, texture
+from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
 from stages.diagnose.likelihood.weigh import Found, Whole
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import Nominal, fit
@@ -19,7 +19,7 @@ from stages.diagnose.registration.explain import Registration
 from stages.diagnose.registration.forms import aligned
 from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, shared_columns
 from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patches
-from stages.diagnose.settings import SHAMS
+from stages.diagnose.settings import SEEN, SHAMS
 from stages.effects import Effect, Survey, get_effect
 
 
@@ -30,9 +30,7 @@ class Cause:
     effect: Effect
     found: Found
     errors: dict[str, float] = field(default_factory=dict)
-    hangs: dict[str, float] = field(
-        default_factory=dict
-    )  # how far values hang on the ordinary imperfections fitted along
+    rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)
     gain_percent: float = float("nan")
     gain_low: float = float("nan")
@@ -92,6 +90,15 @@ class State:
         for site, known in zip(self.sites, kept, strict=True):
             site.texture = known
 
+    def leave_out_rare_images(self) -> None:
+        """Images that show too few pieces of ground, unless that is all there are."""
+        _, pieces = self.grid()
+        patches = [p for k, chain in enumerate(self.chains()) for p in make_patches(k, chain, pieces, self.free_gains)]
+        seen = torch.bincount(torch.cat([p.frames for p in patches]), minlength=self.frames) if patches else None
+        if seen is not None and int(seen.max()) >= SEEN:
+            for site in self.sites:
+                site.left_out = frozenset(k for k, f in enumerate(site.frames) if seen[f] < SEEN)
+
     def learn_texture(self) -> None:
         """Estimate the covariance from the bare residual, and with it the ground's albedo, which effects go with."""
         chains = self.chains()
@@ -132,29 +139,27 @@ class State:
             for patch in patches:
                 z, mean = patch.transform(shared, grid)
                 z_own, mean_own = patch.transform(own, grid)
-                out.append(Rows(patch, z, mean, z_own, mean_own))
+                out.append(Rows(patch, z, mean, z_own, mean_own, patch.shadow(shared), patch.shadow(own)))
             return out
 
         rows = [r for part in per_site(of, range(len(chains))) for r in part]
         model = estimate([r.patch for r in rows], [(r.shared[0], r.shared_mean[0]) for r in rows], grid, self.frames)
+        model.dark = shadow_variance([r.patch for r in rows], [r.shared_dark[0] for r in rows])
         self.covariance = model
-        tricks: list[tuple[Tensor, Tensor] | None] = [None] * len(rows)
+        tricks: list[Residual | None] = [None] * len(rows)
         if shams:
             tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
         units = per_site(lambda k: products(rows[k], model, grid, self.frames, tricks[k]), range(len(rows)))
         whole = Whole(units, plan, self.frames)
+        for group in plan.scattered:
+            whole.let_scatter(whole.known_places([1 + k for k in group]))
         for name in dict.fromkeys(plan.per_frame):
             if get_effect(name).scatters:
-                columns = [k for k, n in enumerate(plan.per_frame) if n == name]
-                whole.let_gains_scatter(columns)
+                places = whole.frame_places([k for k, n in enumerate(plan.per_frame) if n == name])
+                whole.let_scatter(places)
                 if not get_effect(name).displaces:
-                    whole.scattered = whole.frame_places(columns)
+                    whole.scattered = places
         return View(whole, plan, rows, grid, model)
-
-    def plain(self, view: View) -> list[Products]:
-        """Products of the same rows without weights: what a squared residual is."""
-        flat = Covariance.white(view.grid.annuli, self.frames)
-        return per_site(lambda r: products(r, flat, view.grid, self.frames, None), view.rows)
 
 
 @dataclass

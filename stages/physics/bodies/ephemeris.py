@@ -116,16 +116,28 @@ def subsolar_point(time_utc: str | datetime, body: str | Body = "moon") -> Subso
     Raises InputError for a time that cannot be read, GeometryError for a body that neither the built-in ephemeris nor
     the kernels of ``LUNARGR_SPICE_KERNELS`` know.
     """
-    return _subsolar_point(str(time_utc), body_name(body), os.environ.get(KERNELS_VARIABLE, ""))
-
-
-@lru_cache(maxsize=4096)
-def _subsolar_point(time_utc: str, body: str, kernels: str) -> SubsolarPoint:
-    sun = _sun_from_kernels(time_utc, body, kernels) if kernels else _sun_from_astropy(time_utc, body)
+    sun = _apparent_place("sun", str(time_utc), body_name(body), os.environ.get(KERNELS_VARIABLE, ""))
     distance = float(np.linalg.norm(sun))
     longitude = math.degrees(math.atan2(sun[1], sun[0]))
     latitude = math.degrees(math.asin(sun[2] / distance))
     return SubsolarPoint(longitude, latitude, distance / AU)
+
+
+def earth_position(time_utc: str | datetime, body: str | Body = "moon") -> Floats:
+    """(3,) the Earth's apparent place over ``body`` at that UTC time, body-fixed, m.
+
+    Raises as :func:`subsolar_point` does. Over the Moon the direction is good to 0.01 deg.
+    """
+    return np.array(
+        _apparent_place("earth", str(time_utc), body_name(body), os.environ.get(KERNELS_VARIABLE, "")), float
+    )
+
+
+@lru_cache(maxsize=4096)
+def _apparent_place(target: str, time_utc: str, body: str, kernels: str) -> Floats:
+    """(3,) of the Sun or the Earth, with light time and aberration, body-fixed, m."""
+    find = _place_from_kernels if kernels else _place_from_astropy
+    return find(target, time_utc, body, kernels)
 
 
 # Satellites turn one face to their planet: where that face looks is where the planet is. Mean distances, m (NASA fact
@@ -154,19 +166,18 @@ PLUTO = (
 )
 
 
-def _sun_from_astropy(time_utc: str, body: str) -> Floats:
-    """The Sun's apparent place, body-fixed, m."""
+def _place_from_astropy(target: str, time_utc: str, body: str, _kernels: str) -> Floats:
     if body not in ORIENTATIONS:
         raise _unknown(body)
     from astropy.time import TimeDelta
 
     time = parse_utc(time_utc).tdb
     place, velocity = _state(body, time)
-    sun = _builtin("sun", time)[0] - place
-    light_time = np.linalg.norm(sun) / SPEED_OF_LIGHT
-    sun = _builtin("sun", time - TimeDelta(light_time, format="sec"))[0] - place
-    distance = np.linalg.norm(sun)
-    apparent = sun / distance + velocity / SPEED_OF_LIGHT  # aberration to first order: 20 arcsec at most here
+    towards = _builtin(target, time)[0] - place
+    light_time = np.linalg.norm(towards) / SPEED_OF_LIGHT
+    towards = _builtin(target, time - TimeDelta(light_time, format="sec"))[0] - place
+    distance = np.linalg.norm(towards)
+    apparent = towards / distance + velocity / SPEED_OF_LIGHT  # aberration to first order: 20 arcsec at most here
     apparent *= distance / np.linalg.norm(apparent)
     return ORIENTATIONS[body].rotation(_days(time)) @ apparent
 
@@ -216,8 +227,8 @@ def _days(time: Time) -> float:
     return float((time.jd1 - J2000) + time.jd2)
 
 
-def _sun_from_kernels(time_utc: str, body: str, kernels: str) -> Floats:
-    """As above, from the user's SPICE kernels; the mean-Earth frame of the Moon where they define it."""
+def _place_from_kernels(target: str, time_utc: str, body: str, kernels: str) -> Floats:
+    """From the user's SPICE kernels; the mean-Earth frame of the Moon where they define it."""
     try:
         import spiceypy
     except ImportError:
@@ -228,11 +239,11 @@ def _sun_from_kernels(time_utc: str, body: str, kernels: str) -> Floats:
     try:
         _furnish(kernels)
         frame = next((f for f in frames if spiceypy.namfrm(f) != 0 and _frame_has_data(f)), frames[-1])
-        position, _ = spiceypy.spkpos("SUN", utc_to_et(time_utc), frame, "LT+S", body.upper())
+        position, _ = spiceypy.spkpos(target.upper(), utc_to_et(time_utc), frame, "LT+S", body.upper())
     except spiceypy.exceptions.SpiceyError as error:
         reason = " ".join(str(getattr(error, "long", "") or getattr(error, "short", "") or error).split())
         raise InputError(
-            f"{KERNELS_VARIABLE}: no place of the Sun seen from '{body}' at {time_utc}: {reason}"
+            f"{KERNELS_VARIABLE}: no place of the {target.title()} seen from '{body}' at {time_utc}: {reason}"
         ) from None
     return np.asarray(position) * 1000.0
 

@@ -54,10 +54,10 @@ def find_body(text: str) -> Body:
         radius = float(name)
     except ValueError:
         raise GeometryError(
-            f"--body: expected a radius in metres or one of {', '.join(RADII)}; found '{text}'."
+            f"`body`: expected a radius in metres or one of {', '.join(RADII)}; found '{text}'."
         ) from None
     if not 100.0 <= radius <= 1e8:
         raise GeometryError(
-            f"--body: expected a radius in metres between 100 and 1e8, found {radius:g}; is it in kilometres?"
+            f"`body`: expected a radius in metres between 100 and 1e8, found {radius:g}; is it in kilometres?"
         )
     return Body(f"sphere of {radius:g} m", radius)

@@ -97,7 +97,7 @@ class Camera(ABC):
             at = np.broadcast_arrays(np.asarray(line, float), np.asarray(sample, float))
             raise GeometryError(
                 f"{self.kind} camera: {int((~hit).sum())} of {hit.size} pixels look past the body, the first at line "
-                f"{at[0][tuple(first)]:g}, sample {at[1][tuple(first)]:g}; check its pointing and --body."
+                f"{at[0][tuple(first)]:g}, sample {at[1][tuple(first)]:g}; check its pointing and `body`."
             )
         if missing != "nearest":
             points = np.where(hit[..., None], points, np.nan)

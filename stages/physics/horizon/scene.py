@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import GeometryError
 from stages.physics.horizon.hulls import sweep_horizon
+from stages.physics.maps.window import Window
 
 CELLS_PER_DISTANCE = 64  # a ridge with slopes of +-0.3 is then rounded by less than 0.1 deg
 NODE = 4  # the far horizon is searched from every fourth pixel
@@ -94,10 +95,7 @@ def _block_mean(block, factor, out):
 def horizon_in_scene(
     elevation: Any,
     overview: Overview,
-    row: int,
-    col: int,
-    height: int,
-    width: int,
+    window: Window,
     gsd: float,
     azimuth: float,
     sun_elevation: float | None = None,
@@ -107,12 +105,12 @@ def horizon_in_scene(
 
     elevation : (rows, columns) of the scene, anything that slices [r0:r1, c0:c1], m; NaN = nothing there
     overview : from :func:`make_overview`, of the same scene
-    row, col : first pixel of the crop; height, width : its size, px
-    gsd : m; azimuth : rad, clockwise from the grid's north
+    window : the crop's pixels on the scene's grid; gsd : m; azimuth : rad, clockwise from the grid's north
     sun_elevation : rad; terrain that is certain to stay 1 deg below it is not searched for (None: search everything)
     body_radius : m; terrain at distance d sinks by d^2 / 2R (None: flat)
     returns (height, width) float32, rad, as :func:`stages.physics.horizon.horizon`
     """
+    row, col, height, width = window
     rows, columns = overview.shape
     if tuple(int(n) for n in elevation.shape) != overview.shape:
         raise GeometryError(
@@ -130,10 +128,10 @@ def horizon_in_scene(
     bottom = min(rows, row + height + reach_north) if north < 0 else row + height
     left = max(0, col - reach_east) if east < 0 else col
     right = min(columns, col + width + reach_east) if east > 0 else col + width
-    window = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)
-    slope = np.tan(sweep_horizon(window, gsd, azimuth, body_radius, (row - top, col - left, height, width)))
+    strip = np.ascontiguousarray(elevation[top:bottom, left:right], dtype=np.float32)
+    slope = np.tan(sweep_horizon(strip, gsd, azimuth, body_radius, (row - top, col - left, height, width)))
     slope[np.abs(slope) > 1e6] = -np.inf  # nothing there: float32's -pi/2 lies beyond the pole, its tangent is +2e7
-    crop = window[row - top : row - top + height, col - left : col - left + width]
+    crop = strip[row - top : row - top + height, col - left : col - left + width]
     enough = -math.inf if sun_elevation is None else math.tan(max(sun_elevation - math.radians(1), -1.5))
     bend = 0.0 if body_radius is None else 0.5 / body_radius
     nodes = np.empty((-(-(height - 1) // NODE) + 1, -(-(width - 1) // NODE) + 1, 2), dtype=np.float32)

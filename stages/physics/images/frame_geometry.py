@@ -24,7 +24,7 @@ def open_camera_for(path: Path, body_radius: float) -> Camera:
     if abs(camera.semi_axes[0] - body_radius) > 0.005 * body_radius:
         raise GeometryError(
             f"{path}: expected a camera at a body of {body_radius:g} m radius, found {camera.semi_axes[0]:g} m; name the body "
-            "with --body, or with the key 'body' in a pinhole camera's JSON."
+            "with `body`, or with the key 'body' in a pinhole camera's JSON."
         )
     return camera
 

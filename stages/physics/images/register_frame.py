@@ -22,6 +22,7 @@ from stages.physics.images.registration import BLOCK_PX, Box, Shift, block_shift
 from stages.physics.images.source_images import Source
 from stages.physics.images.table import Frame
 from stages.physics.maps.grid import Grid
+from stages.physics.maps.window import Window
 from stages.physics.photometry import get_model
 
 STEP_PX = 64  # from block to block
@@ -199,10 +200,7 @@ def render_region(
     horizon = horizon_in_scene(
         elevation,
         overview,
-        row,
-        col,
-        height,
-        width,
+        Window(row, col, height, width),
         grid.gsd,
         math.atan2(east, north) % (2 * math.pi),
         sun_elevation=math.asin(max(-1.0, min(1.0, float(up)))) - math.radians(5),

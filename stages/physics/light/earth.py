@@ -1,4 +1,4 @@
-"""The Earth as a light source for the Moon: how bright, and where it stands."""
+"""The Earth as a light source for the Moon: how bright it is."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def earth_irradiance(
     """The Earth's irradiance on a facet that faces it, over the Sun's: the I/F of a white diffuse facet there.
 
     earth_phase : rad, angle Sun-Earth-Moon; 0 = full Earth, which is new Moon (pi minus the Moon's own phase angle)
-    distance : m
+    distance : m, to the facet
 
     p (R / d)^2 Phi(phase), with the phase function of a diffuse sphere (sin a + (pi - a) cos a) / pi. Clouds make the
     true Earth a few tens of per cent brighter or darker from day to day.
@@ -28,27 +28,8 @@ def earth_irradiance(
     return geometric_albedo * (EARTH_RADIUS / distance) ** 2 * sphere
 
 
-def earth_direction_enu(
-    longitude: ArrayLike,
-    latitude: ArrayLike,
-    sub_earth_longitude: float = 0.0,
-    sub_earth_latitude: float = 0.0,
-    distance: float = EARTH_DISTANCE,
-    body_radius: float = 1737400.0,
-) -> NDArray[np.float64]:
-    """(..., 3) unit vectors towards the Earth in east-north-up frames at places on the Moon.
-
-    longitude, latitude : rad, east and planetocentric; sub_earth_... : rad, the optical libration (up to 8 and 7 deg)
-    """
-    longitude, latitude = np.broadcast_arrays(np.asarray(longitude, float), np.asarray(latitude, float))
-    towards = distance * _unit(np.asarray(sub_earth_longitude), np.asarray(sub_earth_latitude))
-    offset = towards - body_radius * _unit(longitude, latitude)
-    offset /= np.linalg.norm(offset, axis=-1, keepdims=True)
-    east = np.stack([-np.sin(longitude), np.cos(longitude), 0 * longitude], -1)
-    up = _unit(longitude, latitude)
-    north = np.cross(up, east)
-    return np.stack([(offset * axis).sum(-1) for axis in (east, north, up)], -1)
-
-
-def _unit(longitude: NDArray, latitude: NDArray) -> NDArray[np.float64]:
-    return np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)], -1)
+def earth_phase(sun: NDArray[np.float64], earth: NDArray[np.float64], place: NDArray[np.float64]) -> float:
+    """rad, the angle at the Earth between the Sun and a place on the Moon; (3,) each, m, in the same axes."""
+    to_sun, to_place = sun - earth, place - earth
+    cosine = to_sun @ to_place / (np.linalg.norm(to_sun) * np.linalg.norm(to_place))
+    return math.acos(max(-1.0, min(1.0, float(cosine))))

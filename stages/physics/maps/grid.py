@@ -236,15 +236,15 @@ def check_body(where: str, crs: CRS, body: Body) -> None:
     found = crs_radius(crs)
     if found is not None and abs(found - body.radius) > BODY_TOLERANCE * body.radius:
         raise GeometryError(
-            f"{where}: expected a CRS on a sphere of {body.radius:g} m ({body.name}), found radius {found:g} m; name the body with --body."
+            f"{where}: expected a CRS on a sphere of {body.radius:g} m ({body.name}), found radius {found:g} m; name the body with `body`."
         )
 
 
 def check_same_body(where: object, radius: float, body: str | None) -> None:
-    """Refuse a --body that contradicts what a file says. Raises GeometryError."""
+    """Refuse a `body` that contradicts what a file says. Raises GeometryError."""
     if body is not None and abs(find_body(body).radius - radius) > BODY_TOLERANCE * radius:
         raise GeometryError(
-            f"{where}: lies on a body of {radius:g} m radius, found --body {body} ({find_body(body).radius:g} m); leave --body away."
+            f"{where}: lies on a body of {radius:g} m radius, found `body` {body} ({find_body(body).radius:g} m); leave `body` away."
         )
 
 

@@ -1,6 +1,6 @@
 """The one geographic split of a scene: square ground tiles, dealt to training, validation and test by a hash.
 
-It hangs on the scene, --tile-m, --split and --seed only, not on what is sampled: see `stages/sample.py`.
+It hangs on the scene, `tile_m`, `split` and `seed` only, not on what is sampled: see `stages/sample.py`.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class _Layer:
 def tile_edge(grid: Grid, positions: PositionMasks, shares: tuple[float, float, float], tile_m: float | None) -> int:
     """Edge of a ground tile in pixels; metres are measured along the body with a geodesic at the scene's centre.
 
-    Without --tile-m it follows from the scene and the shares alone, not from the crops that are asked for.
+    Without `tile_m` it follows from the scene and the shares alone, not from the crops that are asked for.
     """
     crop = positions.crop
     if tile_m is not None:
@@ -110,13 +110,13 @@ def tile_edge(grid: Grid, positions: PositionMasks, shares: tuple[float, float, 
         metres = Geodesic(grid.radius, 0).Inverse(lat[0], lon[0], lat[1], lon[1])["s12"] / 100
         edge = min(round(tile_m / metres), 4 * max(grid.height, grid.width))
         if edge < crop:
-            raise ConfigError(f"--tile-m: expected at least one crop ({crop * metres:g} m), found {tile_m:g} m.")
+            raise ConfigError(f"`tile_m`: expected at least one crop ({crop * metres:g} m), found {tile_m:g} m.")
         return edge
     edge = _scene_edge(positions, shares)
     if edge < crop:
         raise ConfigError(
-            f"--crop: expected at most {edge} px, the ground tiles of this scene's split, found {crop}; "
-            "name larger tiles with --tile-m here and wherever else this scene is sampled."
+            f"`crop`: expected at most {edge} px, the ground tiles of this scene's split, found {crop}; "
+            "name larger tiles with `tile_m` here and wherever else this scene is sampled."
         )
     return edge
 

@@ -79,7 +79,7 @@ def _check_numbers(path: Path, what: str, dataset: DatasetReader) -> None:
     if "complex" in dataset.dtypes[0] or dataset.dtypes[0] == "cint16":
         raise InputError(
             f"{path}: expected {what} of real numbers, found {dataset.dtypes[0]}; take one part "
-            "(gdal_calc.py --calc='numpy.real(A)')."
+            "(gdal_calc.py, 'numpy.real(A)')."
         )
     scale, offset = dataset.scales[0], dataset.offsets[0]
     if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
@@ -114,9 +114,7 @@ def check_metres(path: Path, dataset: DatasetReader) -> None:
     known = {"km": 1000.0, "kilometre": 1000.0, "kilometer": 1000.0, "kilometers": 1000.0, "kilometres": 1000.0}
     known |= {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 12 / 39.37, "us-ft": 12 / 39.37}
     metres = factor if factor != 1.0 else known.get(unit)
-    advice = (
-        f"convert them (gdal_calc.py --calc='A*{metres:g}')" if metres else "convert them, or set the unit that is true"
-    )
+    advice = f"convert them (gdal_calc.py, 'A*{metres:g}')" if metres else "convert them, or set the unit that is true"
     raise InputError(
         f"{path}: expected elevations in metres, found the unit '{unit}'; {advice} and say so (gdal_edit.py -units m)."
     )

@@ -288,7 +288,7 @@ def convert_maps(
         if losses and not approximate:
             raise ConfigError(
                 f"{start.name} -> {end.name}: the target cannot hold all of the source: {'; '.join(losses.values())}; "
-                "give --approximate to convert all the same."
+                "give `approximate` to convert all the same."
             )
         result = end.from_ours(ours)
     return {name: result[name] for name in end.names}, losses

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from stages.physics.formation.chain import Extension, Observation, State, form
 from stages.physics.formation.geometry import Angles
+from stages.physics.maps.window import Window
 from stages.physics.photometry import masked_radiance_factor
 from stages.physics.photometry.deviation import radiance_deviation
+from stages.physics.terrain.further_light import Bounce, Earthshine, Horizon
 from stages.physics.terrain.ground import BlockGeometry, block_geometry
 from stages.physics.terrain.sun import Sun
-from stages.physics.terrain.sun_visibility import SunHorizon, visible_share
+from stages.physics.terrain.sun_visibility import visible_share
 from stages.physics.terrain.surface import SHADOWED, Surface
 
 Floats32 = NDArray[np.float32]
@@ -35,12 +37,19 @@ STRAIGHT_ABOVE = 1e8  # m: from here every pixel of a tile is seen from straight
 
 @dataclass(frozen=True)
 class Light:
-    """Sun, its horizon over the map (None: nothing casts shadows) and the camera (None: straight above every pixel)."""
+    """What lights a map, and where its light goes.
+
+    horizon : of the Sun, over the map (None: nothing casts shadows)
+    camera_position : (3,), body-fixed, m (None: straight above every pixel)
+    earthshine, bounce : light besides the Sun's own
+    """
 
     sun: Sun
-    horizon: SunHorizon | None
+    horizon: Horizon | None
     camera_position: NDArray[np.float64] | None
     extensions: Sequence[Extension] = ()
+    earthshine: Earthshine | None = None
+    bounce: Bounce | None = None
 
 
 class Floor:
@@ -59,47 +68,54 @@ class Floor:
         state.reflectance = state.reflectance.clamp(min=0)
 
 
+class Added:
+    """I/F that further light adds to the chain's radiance, (h, w)."""
+
+    slot = "illumination"
+
+    def __init__(self, radiance: Floats32) -> None:
+        self._radiance = torch.from_numpy(np.nan_to_num(radiance))[None]
+
+    def apply(self, state: State) -> None:
+        state.further_light.append(self._add)
+
+    def _add(self, state: State) -> None:
+        state.radiance = state.radiance + self._radiance
+
+
 def shade_block(surface: Surface, light: Light, row: int, col: int, height: int, width: int) -> dict[str, Floats32]:
     """``image`` (I/F) and the backplanes of a window, each (height, width), NaN where the map is unknown.
 
     ``clipped`` is 1 where the model gave I/F below 0, which is drawn as 0.
     ``image_std`` is among them where the map knows its errors: of a photograph of the same view, pixel by pixel.
+    ``sky_view`` is among them where terrain lights terrain.
     """
-    elevation = read_padded(surface, row, col, height, width, 1)
-    geometry = block_geometry(surface.grid, row, col, elevation, light.sun.position, light.camera_position)
-    visible = np.ones((height, width), np.float32)
-    if light.horizon is not None:
-        sun_elevation = np.arcsin(np.clip(geometry.sun[2], -1.0, 1.0))
-        visible = visible_share(sun_elevation, light.horizon.window(row, col, height, width), light.sun.radius)
+    window, grid = Window(row, col, height, width), surface.grid
+    elevation = surface.read_padded(*window, 1)
+    geometry = block_geometry(grid, row, col, elevation, light.sun.position, light.camera_position)
+    visible = _visible(light.horizon, light.sun, geometry, window)
+    around = window.padded(HALO_PX, (grid.height, grid.width)) if light.extensions else window
+    added, sky = further_radiance(surface, light, around)
     if light.extensions:
-        image, clipped = form_window(surface, light, row, col, height, width)
+        image, clipped = form_window(surface, light, window, added)
     else:
-        coefficients = torch.from_numpy(np.ascontiguousarray(surface.read_coefficients(row, col, height, width)))
-        parameters = surface.model.unpack(coefficients, dim=0)
-        cosines = (geometry.cos_incidence, geometry.cos_emission, geometry.cos_phase)
-        angles = Angles(*(torch.from_numpy(v) for v in cosines))
-        image = masked_radiance_factor(surface.model, parameters, angles).numpy()
-        clipped = (image < 0).astype(np.float32)
-        image = np.maximum(image, 0) * visible
-        unknown = np.isnan(geometry.cos_incidence) | ~np.isfinite(coefficients.numpy()).all(axis=0)
-        image[unknown] = np.nan
-        clipped[unknown] = 0
+        image, clipped = _reflected(surface, geometry, visible, window)
+        image = image if added is None else image + added
+    planes = {"image": image, "clipped": clipped}
+    if sky is not None:
+        planes["sky_view"] = sky[window.within(around).part]
     shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
     shadow[np.isnan(geometry.cos_incidence)] = np.nan
-    deviation = {}
     if surface.albedo_error is not None:
         # photographs have corrected the coefficients' errors: those of the albedo stand in their place
         inner, _ = surface.albedo_error.half_widths(
             row, col, image, geometry.cos_incidence, shadow > SHADOWED, np.clip(geometry.sun[2], 0.0, 1.0)
         )
         inner[np.isnan(image)] = np.nan
-        deviation = {"image_std": inner}
+        planes["image_std"] = inner
     elif surface.deviations is not None:
-        deviation = _image_deviation(surface, geometry, visible, row, col)
-    return {
-        "image": image,
-        "clipped": clipped,
-        **deviation,
+        planes["image_std"] = _image_deviation(surface, geometry, visible, window)
+    return planes | {
         "incidence_deg": _degrees(geometry.cos_incidence),
         "emission_deg": _degrees(geometry.cos_emission),
         "phase_deg": _degrees(geometry.cos_phase),
@@ -111,54 +127,86 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
     }
 
 
-def _image_deviation(
-    surface: Surface, geometry: BlockGeometry, visible: Floats32, row: int, col: int
-) -> dict[str, Floats32]:
-    """``image_std``, (h, w) I/F: errors of the coefficients, through the model, and the images' own."""
-    height, width = visible.shape
-    known = torch.from_numpy(np.ascontiguousarray(surface.read_coefficients(row, col, height, width)))
+def _visible(horizon: Horizon | None, source: Sun, geometry: BlockGeometry, window: Window) -> Floats32:
+    """(h, w) share of the source's disc that stands above the terrain."""
+    if horizon is None:
+        return np.ones((window.height, window.width), np.float32)
+    elevation = np.arcsin(np.clip(geometry.sun[2], -1.0, 1.0))
+    return visible_share(elevation, horizon.window(*window), source.radius)
+
+
+def _reflected(
+    surface: Surface, geometry: BlockGeometry, visible: Floats32, window: Window
+) -> tuple[Floats32, Floats32]:
+    """(h, w) I/F of facets in a source's light, NaN where unknown, and 1 where the model's was below 0."""
+    coefficients = torch.from_numpy(np.ascontiguousarray(surface.read_coefficients(*window)))
+    parameters = surface.model.unpack(coefficients, dim=0)
+    image = masked_radiance_factor(surface.model, parameters, _angles(geometry)).numpy()
+    clipped = (image < 0).astype(np.float32)
+    image = np.maximum(image, 0) * visible
+    unknown = np.isnan(geometry.cos_incidence) | ~np.isfinite(coefficients.numpy()).all(axis=0)
+    image[unknown] = np.nan
+    clipped[unknown] = 0
+    return image, clipped
+
+
+def _angles(geometry: BlockGeometry) -> Angles:
+    cosines = (geometry.cos_incidence, geometry.cos_emission, geometry.cos_phase)
+    return Angles(*(torch.from_numpy(v) for v in cosines))
+
+
+def further_radiance(surface: Surface, light: Light, window: Window) -> tuple[Floats32 | None, Floats32 | None]:
+    """I/F that the Earth and the terrain around add, and the sky view, (h, w) each; None without such light."""
+    added = sky = None
+    if light.earthshine is not None:
+        earth, position = light.earthshine, light.camera_position
+        heights = surface.read_padded(*window, 1)
+        geometry = block_geometry(surface.grid, window.row, window.col, heights, earth.disc.position, position)
+        visible = _visible(earth.horizon, earth.disc, geometry, window)
+        added = np.float32(earth.irradiance) * _reflected(surface, geometry, visible, window)[0]
+    if light.bounce is not None:
+        scattered, sky = light.bounce.window(*window)
+        added = scattered if added is None else added + scattered
+    return added, sky
+
+
+def _image_deviation(surface: Surface, geometry: BlockGeometry, visible: Floats32, window: Window) -> Floats32:
+    """(h, w) I/F: errors of the coefficients, through the model, and the images' own."""
+    known = torch.from_numpy(np.ascontiguousarray(surface.read_coefficients(*window)))
     values = surface.model.unpack(known, dim=0)
-    deviations = {k: torch.from_numpy(v) for k, v in surface.read_deviations(row, col, height, width).items()}
-    angles = Angles(*(torch.from_numpy(v) for v in (geometry.cos_incidence, geometry.cos_emission, geometry.cos_phase)))
-    found = radiance_deviation(surface.model, values, deviations, angles).numpy() * visible
+    deviations = {k: torch.from_numpy(v) for k, v in surface.read_deviations(*window).items()}
+    found = radiance_deviation(surface.model, values, deviations, _angles(geometry)).numpy() * visible
     found[np.isnan(geometry.cos_incidence) | ~np.isfinite(known.numpy()).all(axis=0)] = np.nan
-    return {"image_std": np.hypot(found, np.float32(surface.image_noise))}
-
-
-def read_padded(surface: Surface, row: int, col: int, height: int, width: int, margin: int) -> Floats32:
-    """(height + 2 margin, width + 2 margin) elevations, NaN outside the map."""
-    result = np.full((height + 2 * margin, width + 2 * margin), np.nan, np.float32)
-    top, left = max(0, row - margin), max(0, col - margin)
-    bottom = min(surface.grid.height, row + height + margin)
-    right = min(surface.grid.width, col + width + margin)
-    result[top - row + margin : bottom - row + margin, left - col + margin : right - col + margin] = surface.elevation[
-        top:bottom, left:right
-    ]
-    return result
+    return np.hypot(found, np.float32(surface.image_noise))
 
 
 def form_window(
-    surface: Surface, light: Light, row: int, col: int, height: int, width: int
+    surface: Surface, light: Light, window: Window, added: Floats32 | None = None
 ) -> tuple[Floats32, Floats32]:
-    """I/F of a window through the whole formation chain with its extensions, tile by tile with a margin; where it was clipped."""
-    result = np.full((2, height, width), np.nan, np.float32)
-    for r in range(0, height, TILE_PX):
-        for c in range(0, width, TILE_PX):
-            h, w = min(TILE_PX, height - r), min(TILE_PX, width - c)
-            top, left = max(0, row + r - HALO_PX), max(0, col + c - HALO_PX)
-            bottom = min(surface.grid.height, row + r + h + HALO_PX)
-            right = min(surface.grid.width, col + c + w + HALO_PX)
-            tile = _form_tile(surface, light, top, left, bottom - top, right - left)
-            inner = tile[:, row + r - top : row + r - top + h, col + c - left : col + c - left + w]
-            result[:, r : r + h, c : c + w] = inner
+    """I/F of a window through the whole formation chain with its extensions, tile by tile with a margin; where it was clipped.
+
+    added : I/F that further light adds, on the window padded by HALO_PX
+    """
+    shape = (surface.grid.height, surface.grid.width)
+    around = window.padded(HALO_PX, shape)
+    result = np.full((2, window.height, window.width), np.nan, np.float32)
+    for r in range(0, window.height, TILE_PX):
+        for c in range(0, window.width, TILE_PX):
+            tile = Window(
+                window.row + r, window.col + c, min(TILE_PX, window.height - r), min(TILE_PX, window.width - c)
+            )
+            wide = tile.padded(HALO_PX, shape)
+            more = [] if added is None else [Added(added[wide.within(around).part])]
+            formed = _form_tile(surface, light, wide, [*light.extensions, *more])
+            result[:, *tile.within(window).part] = formed[:, *tile.within(wide).part]
     return result[0], result[1]
 
 
-def _form_tile(surface: Surface, light: Light, row: int, col: int, height: int, width: int) -> Floats32:
-    """(2, height, width): I/F, and 1 where the model's was clipped."""
-    grid = surface.grid
-    elevation = surface.elevation[row : row + height, col : col + width]
-    coefficients = surface.read_coefficients(row, col, height, width)
+def _form_tile(surface: Surface, light: Light, tile: Window, extensions: Sequence[Extension]) -> Floats32:
+    """(2, h, w): I/F, and 1 where the model's was clipped."""
+    grid, (row, col, height, width) = surface.grid, tile
+    elevation = surface.elevation[tile.part]
+    coefficients = surface.read_coefficients(*tile)
     known = np.isfinite(elevation) & np.isfinite(coefficients).all(axis=0)
     if not known.any():
         return np.stack([np.full((height, width), np.nan, np.float32), np.zeros((height, width), np.float32)])
@@ -174,7 +222,7 @@ def _form_tile(surface: Surface, light: Light, row: int, col: int, height: int, 
     horizon = None
     if light.horizon is not None:
         # nodata neither shades nor is shaded
-        horizon = torch.from_numpy(np.nan_to_num(light.horizon.window(row, col, height, width), nan=-1.5))[None]
+        horizon = torch.from_numpy(np.nan_to_num(light.horizon.window(*tile), nan=-1.5))[None]
     observation = Observation(
         elevation=torch.from_numpy(np.where(np.isfinite(elevation), elevation, level).astype(np.float32))[None],
         sun_direction=torch.from_numpy(sun)[None],
@@ -188,7 +236,7 @@ def _form_tile(surface: Surface, light: Light, row: int, col: int, height: int, 
     floor = Floor()
     with torch.no_grad():
         whole = filled.expand(1, -1, height, width)
-        image = form(observation, surface.model, whole, [floor, *light.extensions])[0].numpy()
+        image = form(observation, surface.model, whole, [floor, *extensions])[0].numpy()
     assert floor.below is not None
     below = np.broadcast_to(floor.below[0].numpy(), image.shape)
     return np.stack([np.where(known, image, np.nan), below & known]).astype(np.float32)

@@ -40,10 +40,15 @@ def sun_from_angles(azimuth_deg: float, elevation_deg: float, grid: Grid, distan
     """The Sun at an azimuth (clockwise from true north) and elevation over the middle of a map. Raises GeometryError."""
     if not 0.0 < elevation_deg <= 90.0:
         raise GeometryError(
-            f"--sun-elevation: expected degrees above the horizon (0..90), found {elevation_deg:g}; the Sun is below the horizon."
+            f"`sun_elevation_deg`: expected degrees above the horizon (0..90), found {elevation_deg:g}; the Sun is below the horizon."
             if elevation_deg <= 0
-            else f"--sun-elevation: expected degrees in 0..90, found {elevation_deg:g}."
+            else f"`sun_elevation_deg`: expected degrees in 0..90, found {elevation_deg:g}."
         )
+    return Sun(place_over(grid, azimuth_deg, elevation_deg, distance_au * ASTRONOMICAL_UNIT), SUN_RADIUS / distance_au)
+
+
+def place_over(grid: Grid, azimuth_deg: float, elevation_deg: float, distance: float) -> Floats:
+    """(3,) body-fixed, m: what stands at an azimuth (from true north) and elevation over the middle of a map, ``distance`` m off."""
     frame = grid.local_frames((grid.height - 1) / 2, (grid.width - 1) / 2)
     # azimuth from true north -> from the grid's rows
     azimuth = math.radians(azimuth_deg + float(frame.convergence_deg[0]))
@@ -52,13 +57,13 @@ def sun_from_angles(azimuth_deg: float, elevation_deg: float, grid: Grid, distan
         [math.sin(azimuth) * math.cos(elevation), math.cos(azimuth) * math.cos(elevation), math.sin(elevation)]
     )
     axes = frame.axes[0]
-    return Sun(axes[2] * grid.radius + local @ axes * distance_au * ASTRONOMICAL_UNIT, SUN_RADIUS / distance_au)
+    return axes[2] * grid.radius + local @ axes * distance
 
 
 def sun_from_subsolar(longitude_deg: float, latitude_deg: float, distance_au: float = 1.0) -> Sun:
     """The Sun over its sub-solar point. Raises GeometryError."""
     if not -90.0 <= latitude_deg <= 90.0:
-        raise GeometryError(f"--subsolar-latitude: expected degrees in -90..90, found {latitude_deg:g}.")
+        raise GeometryError(f"`subsolar_latitude_deg`: expected degrees in -90..90, found {latitude_deg:g}.")
     return Sun(unit_vectors(longitude_deg, latitude_deg) * distance_au * ASTRONOMICAL_UNIT, SUN_RADIUS / distance_au)
 
 
@@ -78,8 +83,8 @@ def find_sun(
     subsolar = subsolar_longitude_deg is not None or subsolar_latitude_deg is not None
     if angles + subsolar + (time is not None) != 1:
         raise ConfigError(
-            "the Sun: expected one of --sun-azimuth with --sun-elevation, --subsolar-longitude with --subsolar-latitude, "
-            f"or --time; found {'none' if not (angles or subsolar or time) else 'more than one'}."
+            "the Sun: expected one of `sun_azimuth_deg` with `sun_elevation_deg`, `subsolar_longitude_deg` with `subsolar_latitude_deg`, "
+            f"or `time`; found {'none' if not (angles or subsolar or time) else 'more than one'}."
         )
     if time is not None:
         from stages.physics.bodies.ephemeris import subsolar_point
@@ -89,27 +94,32 @@ def find_sun(
     if subsolar:
         if subsolar_longitude_deg is None or subsolar_latitude_deg is None:
             raise ConfigError(
-                "the Sun: expected both --subsolar-longitude and --subsolar-latitude, found one; give both."
+                "the Sun: expected both `subsolar_longitude_deg` and `subsolar_latitude_deg`, found one; give both."
             )
         return sun_from_subsolar(subsolar_longitude_deg, subsolar_latitude_deg, distance_au or 1.0)
     if azimuth_deg is None or elevation_deg is None:
-        raise ConfigError("the Sun: expected both --sun-azimuth and --sun-elevation, found one; give both.")
+        raise ConfigError("the Sun: expected both `sun_azimuth_deg` and `sun_elevation_deg`, found one; give both.")
     return sun_from_angles(azimuth_deg, elevation_deg, grid, distance_au or 1.0)
 
 
-def check_sun_is_up(sun: Sun, grid: Grid, relief: float) -> None:
-    """Refuse a Sun that no point of the map can see. Raises GeometryError.
+def check_sun_is_up(sun: Sun, grid: Grid, relief: float, name: str = "Sun") -> None:
+    """Refuse a source of light that no point of the map can see. Raises GeometryError.
 
     relief : m between the lowest and highest point: a summit looks this far over the edge of the sphere
     """
-    dip = math.sqrt(2.0 * max(relief, 0.0) / grid.radius)
+    low, high = elevation_range(sun, grid)
+    if high < -(sun.radius + math.sqrt(2.0 * max(relief, 0.0) / grid.radius)):
+        raise GeometryError(
+            f"the {name} is below the horizon everywhere on the map: its elevation is {math.degrees(low):.1f} to "
+            f"{math.degrees(high):.1f} deg; choose another time or {name} direction."
+        )
+
+
+def elevation_range(sun: Sun, grid: Grid) -> tuple[float, float]:
+    """Lowest and highest elevation of a source of light over a map, rad."""
     rows = np.linspace(0, grid.height - 1, 9)
     cols = np.linspace(0, grid.width - 1, 9)
     row, col = (v.ravel() for v in np.meshgrid(rows, cols))
     up = grid.local_frames(row, col).up
     elevation = np.arcsin(np.clip((up * sun.directions(up * grid.radius)).sum(1), -1.0, 1.0))
-    if elevation.max() < -(sun.radius + dip):
-        raise GeometryError(
-            f"the Sun is below the horizon everywhere on the map: its elevation is {math.degrees(elevation.min()):.1f} to "
-            f"{math.degrees(elevation.max()):.1f} deg; choose another time or Sun direction."
-        )
+    return float(elevation.min()), float(elevation.max())

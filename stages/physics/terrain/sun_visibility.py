@@ -14,6 +14,7 @@ from stages.physics.horizon import horizon
 from stages.physics.horizon.scene import Overview, horizon_in_scene, make_overview
 from stages.physics.light.sun_disc import sun_visibility
 from stages.physics.maps.grid import Grid
+from stages.physics.maps.window import Window
 from stages.physics.terrain.sun import Sun
 
 WHOLE_PX = 32 << 20  # up to this many pixels one sweep over everything is cheaper than blocks
@@ -92,7 +93,7 @@ class SunHorizon:
             while len(self._blocks) >= 2 * (self._grid.width // BLOCK_PX + 1):
                 self._blocks.popitem(last=False)
             self._blocks[row, col] = horizon_in_scene(
-                self._elevation, overview, row, col, height, width, self._grid.gsd, azimuth,
+                self._elevation, overview, Window(row, col, height, width), self._grid.gsd, azimuth,
                 sun_elevation=elevation, body_radius=self._grid.radius,
             )  # fmt: skip
         return self._blocks[row, col]

@@ -136,6 +136,16 @@ class Surface:
             return self.coefficients[:, *part]
         return np.concatenate([self.coefficients[:, *part], self.albedo[part][None]])
 
+    def read_padded(self, row: int, col: int, height: int, width: int, margin: int) -> Floats32:
+        """(height + 2 margin, width + 2 margin) elevations, m, NaN outside the map."""
+        result = np.full((height + 2 * margin, width + 2 * margin), np.nan, np.float32)
+        top, left = max(0, row - margin), max(0, col - margin)
+        bottom = min(self.grid.height, row + height + margin)
+        right = min(self.grid.width, col + width + margin)
+        inner = np.s_[top - row + margin : bottom - row + margin, left - col + margin : right - col + margin]
+        result[inner] = self.elevation[top:bottom, left:right]
+        return result
+
     def height_range(self) -> tuple[float, float]:
         """Lowest and highest elevation, m, by one pass over the DEM. Raises InputError where there is none."""
         low, high = np.inf, -np.inf
@@ -168,7 +178,7 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
             if kind == "svbrdf":
                 if model is not None:
                     raise ConfigError(
-                        f"--model: {path.name} holds its own reflectance ({file.attrs['model']}); to render its terrain with another model give --dem {path.name}."
+                        f"`model`: {path.name} holds its own reflectance ({file.attrs['model']}); to render its terrain with another model give `dem` {path.name}."
                     )
                 reflectance = stored_model(path, str(file.attrs["model"]))
                 _check_names(path, reflectance, read_strings(file, "coefficient_name"))
@@ -222,7 +232,7 @@ def _named_model(path: Path, model: str | None) -> ReflectanceModel:
     """Raises ConfigError: which reflectance a picture shows is nobody's to guess."""
     if model is None:
         raise ConfigError(
-            f"{path}: holds a terrain and no reflectance; name one with --dem {path} --model NAME ('lunargr models' lists them), "
+            f"{path}: holds a terrain and no reflectance; name one with `dem` {path} `model` NAME ('lunargr models' lists them), "
             "or render the svbrdf.h5 of 'lunargr infer'."
         )
     return get_model(model)
@@ -245,7 +255,7 @@ def _uniform(model: ReflectanceModel, parameters: Mapping[str, float]) -> NDArra
         bounds = next(p for p in model.parameters if p.name == name)
         if not bounds.lower <= value <= bounds.upper:
             raise ConfigError(
-                f"--parameters: expected {name} of {model.name} in {bounds.lower:g}..{bounds.upper:g}, found {value:g}."
+                f"`parameters`: expected {name} of {model.name} in {bounds.lower:g}..{bounds.upper:g}, found {value:g}."
             )
     return np.array([parameters.get(p.name, p.default) for p in model.parameters], np.float32)
 

@@ -1,0 +1,18 @@
+"""What diagnose is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Config:
+    """model : fitted where there is no checkpoint, in its coefficients ``free`` (() for all); most_pairs, most_sites : used for the search."""
+
+    model: str = "M2"
+    free: tuple[str, ...] = ()
+    most_causes: int = 4
+    most_images: int = 16
+    most_pairs: int = 384
+    most_sites: int = 128
+    seed: int = 0

@@ -1,0 +1,207 @@
+"""The stage: the whole decision, in the order in which the package's own text tells it."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from schemas import ArtefactError, ConfigError, write_json
+from schemas.files.companions import companions_of
+from schemas.files.outputs import Output, Target, check_outputs
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.diagnose.config import Config
+from stages.diagnose.likelihood.left import budget, peak
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.form import better_form, relative_misfit
+from stages.diagnose.model.nominal import fit, lit_mask, load_nominal
+from stages.diagnose.model.sites import Site, group_pairs, load_site, number_grounds, survey
+from stages.diagnose.registration.explain import explain
+from stages.diagnose.result.answer import Answer
+from stages.diagnose.result.files import write_diagnosis
+from stages.diagnose.result.named import by_histogram, by_registration, by_search
+from stages.diagnose.result.score import blind_effects, displacements, score
+from stages.diagnose.search.select import Outcome, search
+from stages.diagnose.search.state import State
+from stages.diagnose.settings import LINE, MISFIT
+from stages.effects import effect_names
+from stages.pairs.reader import PairReader
+
+
+@dataclass
+class Result:
+    answer: Answer
+    state: State | None
+    outcome: Outcome | None
+
+
+@torch.no_grad()
+def run(
+    pairs: Path,
+    checkpoint: Path | None = None,
+    output: Output | Path | None = None,
+    config: Config = Config(),
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
+) -> Result:
+    """Diagnose the pairs; write what is asked for. Raises ArtefactError, ConfigError, RegistryError."""
+    output = Output.of(output)
+    if config.most_causes < 1 or config.most_pairs < 1 or config.most_images < 1:
+        raise ConfigError("diagnose: expected counts of at least 1 for causes, images and pairs.")
+    inputs = [p for p in (pairs, checkpoint) if p is not None]
+    named = ((output.path, "output"), (output.json, "json"), (output.report, "report"))
+    check_outputs([Target(path, option) for path, option in named if path is not None], inputs, output.overwrite)
+    with PairReader(pairs) as reader:
+        result = diagnose(reader, checkpoint, config, say, progress)
+        image_ids = reader.image_ids
+    with companions_of(output.path):
+        if output.json is not None:
+            write_json(output.json, result.answer.to_json())
+        if output.report is not None:
+            from stages.diagnose.result.page import write_page
+
+            write_page(output.report, result.answer, result.state, image_ids)
+    if output.path is not None:  # last: where it is, the others are
+        write_diagnosis(output.path, result.answer, image_ids, inputs, output.overwrite)
+    return result
+
+
+def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, progress) -> Result:
+    """The whole decision on an open file."""
+    if "sun_horizon_deg" not in reader.file:
+        raise ArtefactError(
+            f"{reader.path}:/sun_horizon_deg: expected the terrain horizon (without it shadows cannot be told from dark ground), "
+            "found none; write the pairs again with 'lunargr project'."
+        )
+    nominal = load_nominal(checkpoint, config.model, reader.units, config.free)
+    train, test = split(reader)
+    sites = _load(reader, train, config)
+    hidden = _load(reader, test, dataclasses.replace(config, most_sites=64))
+    number_grounds(sites)
+    number_grounds(hidden)
+    answer = Answer("cannot_tell", config={**dataclasses.asdict(config), "checkpoint": str(checkpoint or "")})
+    answer.pairs, answer.sites = sum(s.count for s in sites), len(sites)
+    answer.images = len({int(f) for s in sites for f in s.frames})
+    if not sites:
+        answer.note, answer.blind = "too few pixels of the pairs show lit ground", effect_names()
+        return Result(answer, None, None)
+    frames, units = len(reader.image_ids), reader.units
+    cut = by_histogram(sites, units)
+    fit(nominal, sites, [], units, [s.read for s in sites], start=True)
+    if not config.free and (other := better_form(nominal, sites, units)):
+        answer.form, nominal = other.model.name, other
+        say(f"{config.model} has the wrong form: {answer.form} is fitted in its place")
+        fit(nominal, sites, [], units, [s.read for s in sites])
+    data = survey(sites, frames, units)
+    state = State(
+        nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, hidden, say=say, progress=progress
+    )
+    state.reference = copy.copy(nominal)
+    state.leave_out_rare_images()
+    before = _residual(state)
+    if not before > 0:
+        answer.note, answer.blind = "too few pixels of the pairs show fully lit ground", effect_names()
+        return Result(answer, state, None)
+    progress(1, 5, "registration")
+    state.registration = explain(sites, nominal, [], frames, data.elevation[0])
+    if state.registration.form.name != "none":
+        for site, known in zip(sites, state.registration.known, strict=True):
+            site.displacement = known
+        for site, found in zip(hidden, displacements(state, [])[1], strict=True):
+            site.displacement = found
+    state.fit()
+    misfit = relative_misfit(nominal, sites, varied=units == "dn", whole=True) * (0.5 if units == "dn" else 1.0)
+    if not misfit < MISFIT:
+        answer.verdict, answer.unexplained_fraction = "unexplained", 1.0
+        answer.note = (
+            f"the nominal model does not fit at all: its residual has {100 * misfit:.0f} % of the images' own signal; "
+            "check units, Sun direction and registration before any cause is sought"
+        )
+        return Result(answer, state, None)
+    progress(2, 5, "search")
+    outcome = search(state, config.most_causes)
+    placed, refused = by_registration(state)
+    answer.causes = placed + by_search(state) + [c for c in [cut(data, state) if cut else None] if c]
+    answer.rejected = refused | outcome.rejected
+    if state.registration is not None:
+        answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}
+    view = outcome.view
+    assert view is not None
+    after = _residual(state)
+    answer.budget = budget(view.rows, view.model, view.grid, before, after)
+    line, share = peak(view.rows, view.model, view.grid, frames)
+    answer.blind = blind_effects(state, outcome, {c.effect.name for c in answer.causes})
+    structure = line > LINE
+    answer.unexplained_fraction = share if structure else 0.0
+    if answer.causes:
+        answer.verdict = "named"
+    elif structure or outcome.sure:
+        answer.verdict = "unexplained"
+        answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)
+    else:
+        answer.verdict = "cannot_tell" if answer.blind else "nothing_significant"
+    answer.held_out = score(state, answer)
+    return Result(answer, state, outcome)
+
+
+def _load(reader: PairReader, pairs: np.ndarray, config: Config) -> list[Site]:
+    sites: list[Site] = []
+    used = 0
+    for members in group_pairs(reader, pairs, config.most_images):
+        if used and (used + len(members) > config.most_pairs or len(sites) >= config.most_sites):
+            break
+        site = load_site(reader, members)
+        if site is not None:
+            sites.append(site)
+            used += site.count
+    return sites
+
+
+def _residual(state: State) -> float:
+    """Mean square of the relative residual in the windows."""
+    from stages.diagnose.rows.patches import make_patches
+
+    grid, pieces = state.grid()
+    total, count = 0.0, 0.0
+    for k, chain in enumerate(state.chains()):
+        residual = (chain.site.image - chain.predict())[None]
+        if (
+            state.free_gains
+        ):  # relative to the image as it was read: a gain that is fitted too low would blow residuals up
+            residual = residual * _as_read(chain)
+        for patch in make_patches(k, chain, pieces, state.free_gains):
+            z, mean = patch.transform(residual, grid)
+            total += float((z.real.square() + z.imag.square()).sum())
+            area = patch.weight.square().sum((-2, -1))
+            if not patch.free:
+                total += float((mean.square() * area).sum())
+            count += float(area.sum())
+    return total / count if count else math.nan
+
+
+def _as_read(chain: Chain) -> torch.Tensor:
+    """(n, 1, 1) by which a residual over the prediction's mean gets one over the read image's mean."""
+    site = chain.site
+    lit = lit_mask(chain).float()
+    count = lit.sum((-2, -1)).clamp(min=1)
+    ratio = (chain.predict() * lit).sum((-2, -1)) / count * site.gain.abs()
+    return (ratio / ((site.read * lit).sum((-2, -1)) / count).clamp(min=1e-9))[:, None, None]
+
+
+def split(reader: PairReader) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs to learn from and pairs to score: the test split, or the last of at least three sites."""
+    test = np.flatnonzero(reader.split == 2)
+    train = np.flatnonzero(reader.split != 2)
+    if len(train) and len(test):
+        return train, test
+    everything = np.arange(reader.count)
+    numbers = np.unique(reader.site)
+    if len(numbers) >= 3:
+        last = reader.site == numbers[-1]
+        return everything[~last], everything[last]
+    return everything, everything[:0]

@@ -1,0 +1,95 @@
+"""Each default stands once: what a command offers is what its stage's Config says, and messages name the command's options."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import pkgutil
+from typing import get_type_hints
+
+import pytest
+
+from lunargr_cli import commands, spelling
+from lunargr_cli.options import dashed, parse_shard, read_names
+
+MODULES = {
+    m.name: importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)
+}
+# Commands whose options are a stage's settings, and where these are.
+CONFIGS = {
+    "albedo": "albedo", "compare": "train", "convert": "convert", "diagnose": "diagnose", "evaluate": "evaluate",
+    "export": "export", "infer": "infer", "ingest": "ingest", "match": "match", "merge": "merge", "project": "project",
+    "render": "render", "report": "report", "sample": "sample", "train": "train", "view": "view",
+}  # fmt: skip
+# How commands write what a Config holds as a tuple.
+WRITTEN = {
+    "widths": dashed, "dropout": dashed, "shard": lambda shard: None if shard == parse_shard(None) else shard,
+    "maps": lambda names: None if names == read_names(None) else names, "only": lambda rows: None if rows == () else rows,
+    "leave_out": lambda names: None if names == () else names, "free": ",".join,
+    "size_px": lambda size: ",".join(map(str, size)), "parameters": lambda values: values or None,
+}  # fmt: skip
+# Of the same name, but not the setting: where the GeoTIFF goes, not whether; left away for the stage's own choice.
+OTHERS = {("infer", "geotiff"), ("albedo", "geotiff"), ("match", "matchers")}
+# What commands have beside settings.
+BESIDE = {
+    "output", "overwrite", "resume", "quiet", "json_file", "figures", "report", "scheduler", "parts", "no_geotiff", "models",
+    "seeds", "held_out_images", "list_effects", "blocks_csv", "dem", "trajectory", "stereo", "altitude", "convergence", "pairs",
+    "images", "seed", "checkpoint", "source", "split", "body",
+}  # fmt: skip
+
+
+def options(command):
+    for name, parameter in inspect.signature(command).parameters.items():
+        if parameter.default is not inspect.Parameter.empty:
+            yield name, parameter.default
+
+
+def defaults(config) -> dict:
+    fields = dataclasses.fields(config)
+    return {f.name: f.default_factory() if f.default_factory is not dataclasses.MISSING else f.default for f in fields}
+
+
+@pytest.mark.parametrize("name", sorted(CONFIGS))
+def test_a_command_s_defaults_are_those_of_its_config(name):
+    known = defaults(importlib.import_module(f"stages.{CONFIGS[name]}").Config)
+    seen = 0
+    for option, default in options(MODULES[name].command):
+        if option not in known:
+            assert option in BESIDE, f"{name}: {option} is no field of {CONFIGS[name]}.Config"
+        elif (name, option) not in OTHERS:
+            split = lambda shares: "/".join(f"{100 * share:g}" for share in shares)  # noqa: E731
+            written = WRITTEN.get(option, split if (name, option) == ("sample", "split") else lambda value: value)
+            assert default == written(known[option]), f"{name}: {option}"
+            seen += 1
+    assert seen
+
+
+@pytest.mark.parametrize("name", sorted(CONFIGS))
+def test_defaults_are_not_written_down_a_second_time(name):
+    """A number, word or True as a default stands in the Config alone."""
+    source = inspect.getsource(MODULES[name].command)
+    known = defaults(importlib.import_module(f"stages.{CONFIGS[name]}").Config)
+    for option, default in options(MODULES[name].command):
+        if option in known and default not in (None, False):
+            assert f"= {default!r},\n" not in source.replace("'", '"').replace('"', "'"), f"{name}: {option}"
+
+
+def test_simulate_shows_the_defaults_of_its_recipe():
+    from stages.simulate import Config
+
+    hints = get_type_hints(MODULES["simulate"].command, include_extras=True)
+    for name in ("size_px", "images", "units", "seed"):
+        assert f"[default: {getattr(Config, name)}]" in hints[name].__metadata__[0].help
+
+
+def test_settings_are_spelled_as_the_options_of_the_command_that_runs():
+    before = spelling.running.set(MODULES["infer"].command)
+    try:
+        assert (
+            spelling.spell("`offset`: too far; lower `any_gsd`, see `a b`")
+            == "--window-offset: too far; lower --any-gsd, see `a b`"
+        )
+        assert spelling.spell("run 'lunargr albedo' with `leave_out`") == "run 'lunargr albedo' with --leave-out"
+    finally:
+        spelling.running.reset(before)
