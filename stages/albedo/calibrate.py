@@ -10,7 +10,7 @@ agree it is 0 and the map stays as it is. (Moment estimates of variance componen
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -90,8 +90,9 @@ class Calibration:
 
 @dataclass
 class Sample:
-    """One window with all images that see it."""
+    """One window with all images that see it. prior : (h, w) variance of what the map may be wrong by, None where unknown"""
 
+    prior: Floats32 | None = None
     images: list[int] = field(default_factory=list)
     looks: list[Look] = field(default_factory=list)
 
@@ -119,12 +120,17 @@ def choose_windows(shape: tuple[int, int], boxes: Sequence[Box]) -> list[Box]:
     return chosen
 
 
-def take_samples(references: References, windows: Sequence[Box], progress: Progress = show_nothing) -> list[Sample]:
-    """What the images show of some windows, one sample each."""
+def take_samples(
+    references: References,
+    windows: Sequence[Box],
+    progress: Progress = show_nothing,
+    prior: Callable[[Box], Floats32 | None] = lambda box: None,
+) -> list[Sample]:
+    """What the images show of some windows, one sample each. prior : (h, w) of a window's, as :func:`posterior.estimate` takes it"""
     samples = []
     for number, box in enumerate(windows):
         progress(number, len(windows), "calibration windows")
-        sample = Sample()
+        sample = Sample(prior(box))
         for k in references.overlapping(box):
             look = references.look(k, box)
             if look is not None:
@@ -167,7 +173,8 @@ def _unseen(calibration: Calibration, sample: Sample, units: str) -> Stack:
         look.measured if units == "iof" else (look.measured - calibration.offset[k]) / calibration.gain[k]
         for k, look in zip(sample.images, sample.looks, strict=True)
     ]
-    return Stack(*_stack(calibration, sample), sample.images, sample.looks, [v.astype(np.float32) for v in scaled])
+    measured = [v.astype(np.float32) for v in scaled]
+    return Stack(*_stack(calibration, sample), sample.images, sample.looks, measured, sample.prior)
 
 
 def _stack(calibration: Calibration, sample: Sample) -> tuple[Floats32, Floats32]:

@@ -31,13 +31,16 @@ LEAST_IMAGES = 3  # the same
 
 @dataclass(frozen=True)
 class Stack:
-    """A window: log ratios and confidence (n, H, W) of ``images``, their looks, and what each is in I/F (NaN unknown)."""
+    """A window: log ratios and confidence (n, H, W) of ``images``, their looks, what each is in I/F (NaN unknown), and the
+    prior of ``posterior.estimate``.
+    """
 
     ratio: Floats32
     confidence: Floats32
     images: list[int]
     looks: Sequence[Look]
     measured: Sequence[Floats32]
+    prior: Floats32 | None
 
 
 def unseen_intervals(stacks: Sequence[Stack], spread: Spread, edges: Floats) -> tuple[Floats, Floats]:
@@ -81,7 +84,7 @@ def _residuals(
             rest, trust = stack.ratio[others], stack.confidence[others]
             part = spread.of([stack.images[k] for k in others])
             settle(rest, trust, part)
-            location, std = estimate(rest, trust, part)
+            location, std = estimate(rest, trust, part, stack.prior)
             look, seen = stack.looks[out], (stack.confidence[others] > 0).any(axis=0)
             known = np.isfinite(stack.measured[out]) & (look.shadow | (seen & (look.predicted > 0)))
             use = np.flatnonzero(known)[::THINNED]

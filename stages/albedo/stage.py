@@ -164,7 +164,7 @@ def _calibrate(svbrdf: Path, scene: Path, ground: Ground, config: Config, progre
     fields = tuple(register(references, config.register, progress)) if config.register else ()
     references.take_off(fields)
     windows = choose_windows(ground.map["valid"].shape, references.boxes)
-    samples = take_samples(references, windows, progress)
+    samples = take_samples(references, windows, progress, lambda box: terrain_variance(ground.surface, box))
     if not samples:
         raise InputError(
             f"{scene}: expected images that overlap the map {svbrdf}, found none whose sunlit pixels lie on valid ground."
