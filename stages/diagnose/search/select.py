@@ -113,17 +113,17 @@ def _as_good(found: Found, best: Found) -> bool:
 
 
 def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
-    """Whether an effect of the reflectance law stands for another form of it, which has more to add for sure, or a fair share more."""
+    """Whether an effect of the reflectance law stands for another form of it, which has more to add for sure."""
     if not get_effect(found.effect).of_law:
         return False
-    if whole.plan.free_form:
+    if not len(whole.form_places()):
         out.rejected[found.effect] = (
             found.gain,
             "the nominal law is a sum of kernels, and what is left of it has no form of its own",
         )
         return True
     added = whole.law_adds(found)
-    if interval(added)[0] <= 0 and added.sum() <= (1 - SIMPLER) * found.gain:
+    if interval(added)[0] <= 0:
         return False
     why = f"the nominal law has another form, which gains {added.sum():.0f} nats more beside it; the effect stands for a part of that"
     out.rejected[found.effect] = (found.gain, why)
@@ -133,10 +133,7 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
 def take(state: State, view: View, found: Found, group: list[str]) -> str:
     """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
     cls = get_effect(found.effect)
-    law = max(
-        0 if view.plan.free_form else len(view.plan.form),
-        sum(n.startswith("coefficient") for n in view.plan.shared) // 2,
-    )
+    law = max(len(view.plan.form), sum(n.startswith("coefficient") for n in view.plan.shared) // 2)
     if cls.scatters and not cls.displaces and state.frames <= law:
         return f"{TOO_FEW}: a law of {law} coefficients can give {state.frames} any brightness"
     first = as_effect(found, state.data, state.frames, view.whole)
@@ -230,8 +227,6 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
         whole.precision.pop(1 + k, None)
     first = look.whole.first
     whole.precision |= {k + 1: v for k, v in look.whole.precision.items() if k >= first}  # one shared column more
-    scattered = look.whole.known_places([1 + k for group in look.plan.scattered for k in group])
-    whole.precision |= {int(p): look.whole.precision[int(p)] for p in scattered}
     cause.rms_before, cause.rms_after = _rms(np.sum(plain, 0), look)
     total = float(whole.gram[0, 0])
     if type(cause.effect).scope == "image" or len(cause.found.guise.columns) > 1:

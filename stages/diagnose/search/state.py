@@ -157,8 +157,6 @@ class State:
             tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
         units = per_site(lambda k: products(rows[k], model, grid, self.frames, tricks[k]), range(len(rows)))
         whole = Whole(units, plan, self.frames)
-        for group in plan.scattered:
-            whole.let_scatter(whole.known_places([1 + k for k in group]))
         for name in dict.fromkeys(plan.per_frame):
             if get_effect(name).scatters:
                 places = whole.frame_places([k for k, n in enumerate(plan.per_frame) if n == name])
