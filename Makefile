@@ -11,7 +11,7 @@ LUNARGR := $(BIN)/lunargr
 STAMP := $(VENV)/.installed
 SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 
-.PHONY: help install demo demo-paper figures test test-slow mutants fuzz endurance lint bench campaign campaign-real docs vendor-js reproduce-apollo15 reproduce-models clean
+.PHONY: help install demo demo-paper figures test test-slow mutants fuzz endurance lint bench campaign campaign-real docs wheel vendor-js reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -47,8 +47,10 @@ lint: $(STAMP) ## ruff, formatting and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(STAMP) ## speed and memory, each beside a named peer in the same run
-	for script in tests/benchmarks/bench_*.py; do echo "== $$script"; $(BIN)/python $$script; done
+bench: $(STAMP) ## speed and memory, each beside a named peer in the same run; on a quiet machine, then make figures; ONLY=word for some
+	mkdir -p results/bench
+	for script in tests/benchmarks/bench_*$(ONLY)*.py; do echo "== $$script"; \
+	  $(BIN)/python $$script | tee results/bench/$$(basename $$script .py).txt; done
 
 campaign: $(STAMP) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
 	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign
@@ -64,6 +66,9 @@ docs: $(STAMP) ## write the generated parts of docs/ again, and build the site i
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "Open $(abspath build/site/index.html)"
+
+wheel: $(STAMP) ## build/dist/*.whl; URL=https://... of the repository puts its pictures and links on the package's page
+	LUNARGR_URL=$(URL) $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir build/dist .
 
 VENDOR := stages/view/assets/vendor
 
@@ -150,8 +155,10 @@ $(D)/checkpoint_m2.h5: $(D)/pairs.h5
 $(D)/m2.h5: $(D)/pairs.h5 $(D)/checkpoint_m2.h5
 	$(LUNARGR) evaluate $^ --only learned --only learned_gain_offset -o $@ --overwrite
 
-figures: ## write every figure of README.md and docs/ from what demo, reproduce-apollo15 and reproduce-models left
+figures: ## write every figure of README.md and docs/, and the notebook, from what demo, reproduce-* and bench left
 	$(BIN)/python examples/figures.py
+	@# the notebook trains its own network for two passes, and keeps it
+	if [ -f $(D)/pairs.h5 ]; then cd $(D) && ../$(BIN)/python ../examples/notebook_page.py; fi
 
 # --- real photographs: Apollo 15 metric camera frames over the GLD100 elevation model ------------------------------
 

@@ -195,6 +195,99 @@ def commands(_: Path) -> list[str]:
     return [f"    {re.sub(r'^ +', '    ', line)}" for line in lines.splitlines()]
 
 
+def benchmark(root: Path, name: str) -> list[str]:
+    """What a benchmark printed, word for word."""
+    try:
+        said = (root / f"results/bench/{name}.txt").read_text().rstrip()
+    except FileNotFoundError:
+        raise Absent(f"results/bench/{name}.txt", f"make bench ONLY={name.removeprefix('bench_')}") from None
+    return ["```text", *said.splitlines(), "```"]
+
+
+SIZES = (
+    ("scene.h5", "Mpx of the working grid", "scene.h5:elevation"),
+    ("crops.h5", "pair", "crops.h5:elevation"),
+    ("pairs.h5", "pair", "pairs.h5:elevation"),
+    ("checkpoint_0.h5", "", ""),
+    ("svbrdf.h5", "Mpx", "svbrdf.h5:elevation"),
+    ("svbrdf.tif", "Mpx", "svbrdf.h5:elevation"),
+    ("svbrdf_albedo.h5", "Mpx", "svbrdf_albedo.h5:elevation"),
+    ("evaluation.h5", "crop", "evaluation.h5:measured"),
+    ("render.exr", "Mpx", "svbrdf.h5:elevation"),
+    ("view.html", "Mpx", "svbrdf.h5:elevation"),
+)
+
+
+def sizes(root: Path) -> list[str]:
+    """Bytes of the demo's files, and of each unit in them."""
+    import h5py
+
+    rows = []
+    for name, unit, counted in SIZES:
+        try:
+            size = (root / "demo" / name).stat().st_size
+            per = "-"
+            if counted:
+                file, variable = counted.split(":")
+                with h5py.File(root / "demo" / file) as opened:
+                    shape = opened[variable].shape
+                number = shape[0] if len(shape) == 3 else shape[0] * shape[1] / 1e6
+                per = (
+                    f"{size / number / 1e3:,.0f} kB a {unit}"
+                    if len(shape) == 3
+                    else f"{size / number / 1e6:.1f} MB a {unit}"
+                )
+        except FileNotFoundError:
+            raise Absent(f"demo/{name}", DEMO) from None
+        rows.append([f"`{name}`", f"{size / 1e6:.1f} MB", per])
+    return table(["file of the demo", "size", "each"], rows)
+
+
+# Tycho: a DEM of 95 x 90 km at 1 m worked on at 5 m, 667 images of 5,000 x 50,000 px and the Lunar-G2R paper's pairs.
+# Global: the Moon at 100 m and a tenth of overlap, in local maps. (stage, work at Tycho, at global scale, in the table's unit)
+CAMPAIGNS = (
+    ("ingest", 8550.0, 4180.0),
+    ("ingest --images", 667 * 250.0, None),
+    ("sample", 83.614, None),
+    ("project", 83.614, None),
+    ("infer", 342.0, 4180.0),
+    ("render", 342.0, 4180.0),
+    ("evaluate", 8.337, None),
+)
+
+
+def campaigns(root: Path) -> list[str]:
+    """Processor time of large work, from the rates that bench_scaling measured and wrote into the page."""
+    try:
+        text = (root / "docs" / "scaling.md").read_text()
+    except FileNotFoundError:
+        raise Absent("docs/scaling.md", "python tests/benchmarks/bench_scaling.py --docs docs/scaling.md") from None
+    rates = {m[1]: (m[2], float(m[3]), m[4]) for m in RATE.finditer(text)}
+    rows = []
+    for stage, *works in CAMPAIGNS:
+        if stage not in rates:
+            raise Absent(f"the rate of {stage}", "python tests/benchmarks/bench_scaling.py --docs docs/scaling.md")
+        peaks, rate, unit = rates[stage]
+        memory = max(float(p.replace(",", "")) for p in peaks.split(", ")) / 1e3
+        times = ["" if work is None else duration(rate * work) for work in works]
+        rows.append(
+            [
+                f"`{stage}`",
+                f"{works[0]:,.3g} {unit}" if works[0] < 1e3 else f"{works[0]:,.0f} {unit}",
+                *times,
+                f"{memory:.1f} GB",
+            ]
+        )
+    return table(["stage", "work at Tycho", "Tycho", "global 100 m map", "memory"], rows)
+
+
+RATE = re.compile(r"^\| `([a-z -]+)` \| [^|]*\| ([^|]*?) \|.*\| ([0-9.]+) s per ([^|]*?) \|$", re.M)
+
+
+def duration(seconds: float) -> str:
+    return f"{seconds / 60:.1f} min" if seconds < 3600 else f"{seconds / 3600:.1f} h"
+
+
 BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "demo-commands": commands,
     "demo": demo,
@@ -207,6 +300,12 @@ BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "apollo15-match": lambda root: matched(root, "results/apollo15", APOLLO),
     "apollo15-diagnosis": lambda root: diagnosed(root, "results/apollo15", APOLLO),
     "models": models,
+    "demo-sizes": sizes,
+    "campaigns": campaigns,
+    "bench-training": lambda root: benchmark(root, "bench_training"),
+    "bench-layer": lambda root: benchmark(root, "bench_layer"),
+    "bench-inference": lambda root: benchmark(root, "bench_inference"),
+    "bench-view": lambda root: benchmark(root, "bench_view"),
 }
 
 

@@ -14,7 +14,7 @@ import sys
 import time
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from lunargr_cli import raise_again
@@ -93,7 +93,7 @@ class Console:
 
     quiet: bool = False
     _pace: Pace = field(default_factory=Pace)
-    _shown: float = field(default=-math.inf)
+    _shown: float | None = field(default=None)
     _bar: bool = field(default=False)
 
     def say(self, message: str) -> None:
@@ -107,6 +107,8 @@ class Console:
         raise_again()
         times = self._pace.report(done, total)
         terminal, now = sys.stderr.isatty(), time.monotonic()
+        if self._shown is None:  # a short loop leaves one line in a log
+            self._shown = -math.inf if terminal else now
         if self.quiet or (done < total and now - self._shown < (0.1 if terminal else 10.0)):
             return
         self._shown = now
@@ -182,6 +184,3 @@ def own_streams(verbose: bool = False) -> None:
     os.close(nowhere)
     # For good: C libraries go on talking while Python ends.
     sys.stderr = os.fdopen(own, "w", buffering=1, errors="backslashreplace")
-
-
-Progress = Callable[[int, int, str], None]

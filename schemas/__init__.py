@@ -18,25 +18,13 @@ from schemas.errors import (
 from schemas.later import imported_later
 from schemas.truth import TRUTH
 
-# Where those are who need h5py: `lunargr --help` must answer at once.
-_LATER = {
-    "ArtefactWriter": "writing",
-    "atomic_path": "files.outputs",
-    "check_output": "files.outputs",
-    "open_artefact": "reading",
-    "read_config": "reading",
-    "read_kind": "reading",
-    "read_strings": "reading",
-    "write_json": "files.outputs",
-}
-
 if TYPE_CHECKING:
     from schemas.files.outputs import atomic_path, check_output, write_json
     from schemas.reading import open_artefact, read_config, read_kind, read_strings
     from schemas.writing import ArtefactWriter
 
 
-__getattr__ = imported_later(__name__, _LATER)
+__getattr__ = imported_later(__name__, "files.outputs", "reading", "writing")
 
 __all__ = [
     "CHECKPOINT",

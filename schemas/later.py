@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 
-def imported_later(package: str, where: Mapping[str, str]) -> Callable[[str], Any]:
-    """The package's ``__getattr__``. where : name -> the module of the package that holds it"""
+def imported_later(package: str, *modules: str) -> Callable[[str], Any]:
+    """The package's ``__getattr__``. modules : of the package, in which a name is looked for in this order"""
 
     def find(name: str) -> Any:
-        if name not in where:
-            raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        return getattr(importlib.import_module(f"{package}.{where[name]}"), name)
+        for module in modules if not name.startswith("__") else ():
+            loaded = importlib.import_module(f"{package}.{module}")
+            if name in vars(loaded):
+                return vars(loaded)[name]
+        raise AttributeError(f"module '{package}' has no attribute '{name}'")
 
     return find

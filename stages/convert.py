@@ -51,11 +51,7 @@ class Report:
 
 
 def run(
-    source: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
+    source: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Report:
     """Convert the coefficient maps of ``source`` into ``output``, a float32 GeoTIFF on the same grid, NaN as nodata.
 

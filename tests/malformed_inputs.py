@@ -142,11 +142,12 @@ def table_cases() -> Iterator[Case]:
 
 def write_camera(path: Path) -> None:
     """A pinhole camera over the small scene, and the table once more as JSON beside it."""
-    from stages.physics.cameras.pinhole import Pinhole
+    from camera_rays import looking_at
+
     from stages.physics.maps.grid import unit_vectors
 
     up = unit_vectors(small_scene.LON, small_scene.LAT)
-    camera = Pinhole.looking_at(
+    camera = looking_at(
         position=up * (small_scene.RADIUS + 9000.0), target=up * small_scene.RADIUS, field_of_view=0.2, size=(24, 24), radius=small_scene.RADIUS
     )  # fmt: skip
     path.write_text(json.dumps(camera.to_document()))

@@ -19,8 +19,29 @@ class Mutant:
 LEAKS = "tests/test_leaks.py"
 ALL = "np.arange(reader.count)"
 
-# What outside checks planted and the tests of that time did not notice. (Those in stages/diagnose are still to come.)
+# What outside checks planted and the tests of that time did not notice.
 KNOWN = (
+    Mutant(
+        "stages/diagnose/stage.py",
+        "test = np.flatnonzero(reader.split == 2)",
+        "test = np.flatnonzero(reader.split != 2)",
+        ("tests/test_diagnose_leaks.py::test_the_score_is_of_the_test_pairs",),
+        "the diagnosis is scored on the pairs that it learned from",
+    ),
+    Mutant(
+        "stages/diagnose/stage.py",
+        "train = np.flatnonzero(reader.split != 2)",
+        "train = np.arange(reader.count)",
+        ("tests/test_diagnose_leaks.py::test_causes_are_learned_without_the_test_pairs",),
+        "the diagnosis learns from the test pairs, too",
+    ),
+    Mutant(
+        "stages/diagnose/likelihood/weigh.py",
+        "found.p = (1 + float((largest >= found.surprise).sum())) / (1 + len(largest))",
+        "found.p = 0.0",
+        ("tests/test_diagnose_leaks.py::test_p_tells_what_was_planted_from_what_was_not",),
+        "every p of the diagnosis is 0",
+    ),
     Mutant(
         "stages/train/stage.py",
         "history.objective.append(objective if math.isfinite(objective) else train_loss)",

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import OpenImageIO as oiio
 import small_scene
+from camera_rays import image_to_terrain, looking_at
 from small_scene import LAT, LON, RADIUS, local_xy
 
 from schemas.files.outputs import Output
@@ -26,7 +27,7 @@ def overhead_camera(east: float = 0.0, north: float = 0.0) -> Pinhole:
     to_east = np.cross([0, 0, 1.0], up)
     to_east /= np.linalg.norm(to_east)
     shift = east * to_east + north * np.cross(up, to_east)
-    return Pinhole.looking_at(up * (RADIUS + ALTITUDE) + shift, up * RADIUS + shift, math.radians(3.4), (400, 380))
+    return looking_at(up * (RADIUS + ALTITUDE) + shift, up * RADIUS + shift, math.radians(3.4), (400, 380))
 
 
 def photograph(view: Pinhole, height=small_scene.height, reflect=small_scene.radiance_factor) -> np.ndarray:
@@ -36,7 +37,7 @@ def photograph(view: Pinhole, height=small_scene.height, reflect=small_scene.rad
         return height(*local_xy(longitude, latitude))
 
     line, sample_ = np.meshgrid(np.arange(view.lines) + 0.5, np.arange(view.samples) + 0.5, indexing="ij")
-    points = view.image_to_terrain(line, sample_, height_at, tolerance=0.05)
+    points = image_to_terrain(view, line, sample_, height_at, tolerance=0.05)
     radius = np.linalg.norm(points, axis=-1)
     x, y = local_xy(
         np.degrees(np.arctan2(points[..., 1], points[..., 0])), np.degrees(np.arcsin(points[..., 2] / radius))

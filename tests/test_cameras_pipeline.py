@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import small_scene
+from camera_rays import looking_at
 from raw_frames import ALTITUDE, overhead_camera, photograph, residual, run_all, write_frame
 from small_scene import LAT, LON, RADIUS
 
@@ -16,7 +17,6 @@ from stages import ingest
 from stages.physics.bodies.ephemeris import subsolar_point, utc_to_et
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras import open_camera
-from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.images.frame_geometry import complete_row
 from stages.physics.images.labels import label_time, product_time
 from stages.physics.images.table import read_frames
@@ -139,7 +139,7 @@ SPACECRAFT = {"spacecraft_longitude_deg": LON, "spacecraft_latitude_deg": LAT, "
 def test_bad_camera_images_get_one_clear_line(small_files, raw, tmp_path):
     images = write_frame(tmp_path, overhead_camera(), raw[:-1])
     cases = {"expected 380 lines x 400 samples as its camera model has, found 379 x 400": images}
-    away = Pinhole.looking_at(overhead_camera().centre, overhead_camera().centre * 2, 0.05, (400, 380))
+    away = looking_at(overhead_camera().centre, overhead_camera().centre * 2, 0.05, (400, 380))
     (tmp_path / "b").mkdir()
     cases["does not touch the DEM"] = write_frame(tmp_path / "b", away, raw, **SPACECRAFT)
     (tmp_path / "c").mkdir()

@@ -11,8 +11,15 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from conftest import ROOT
+from rasterio.transform import Affine
+
+from stages import simulate
+from stages.physics.bodies.spheres import RADII, find_body
+from stages.physics.maps.grid import Grid, local_metric_crs
+from stages.physics.terrain.sun import find_sun
 
 PYTHON = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.S)
 TUTORIAL = re.findall(r"```bash\n(.*?)```", (ROOT / "docs" / "tutorial.md").read_text(), re.S)
@@ -26,8 +33,45 @@ def test_the_list_of_commands_is_up_to_date():
 
 @pytest.mark.parametrize("code", PYTHON)
 def test_python_examples_run(code, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(tmp_path)  # they write files
     exec(compile(code, "docs/python.md", "exec"), {})
+
+
+def printed_commands():
+    """(page, words) of every command that README and docs print, those with gaps for the reader to fill left out."""
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        text = page.read_text().replace("\\\n", " ")
+        fenced = "\n".join(re.findall(r"^```(?:bash|sh)?\n(.*?)^```", text, re.M | re.S))
+        for line in re.findall(r"^ {4}(lunargr .*)$", text, re.M) + re.findall(r"^(lunargr .*)$", fenced, re.M):
+            for command in re.split(r";|>|\s#|\s{3,}", line):
+                words = shlex.split(command)
+                if words[:1] == ["lunargr"] and not re.search(r"\.\.\.|[|<]|\b[A-Z]{4,}\b|\[", command):
+                    yield page.name, words[1:]
+
+
+def test_the_commands_that_the_pages_print_have_such_options():
+    from typer.main import get_command
+
+    from lunargr_cli.main import app
+
+    known = get_command(app).commands
+    found = list(printed_commands())
+    assert len(found) > 60
+    for page, (name, *options) in found:
+        try:
+            known[name].make_context(name, list(options))
+        except Exception as error:  # typer has its own copy of click's
+            pytest.fail(f"{page}: lunargr {shlex.join([name, *options])}: {error}")
+
+
+def test_the_example_time_has_the_sun_up_over_the_embedded_scene():
+    [time] = set(re.findall(r"--time (\S+)", (ROOT / "docs" / "render.md").read_text()))
+    config = simulate.make_config({})
+    grid = Grid(local_metric_crs(config.longitude_deg, config.latitude_deg, RADII["moon"]).to_wkt(),
+                Affine(5, 0, -100, 0, -5, 100), 40, 40, RADII["moon"])  # fmt: skip
+    sun = find_sun(grid, find_body("moon"), time=time)
+    up = grid.local_frames(20, 20).axes[0, 2]
+    assert np.degrees(np.arcsin(up @ sun.position / np.linalg.norm(sun.position))) > 15
 
 
 @pytest.fixture

@@ -7,6 +7,8 @@ import re
 import runpy
 import shutil
 
+import h5py
+import numpy as np
 import pytest
 from conftest import ROOT
 
@@ -89,7 +91,7 @@ def test_unseen_images_are_a_claim_of_their_own(tmp_path):
 @pytest.mark.parametrize("name", [n for n in figures["BLOCKS"] if n != "demo-commands"])
 def test_without_a_file_the_block_names_the_command_and_no_figure(name, tmp_path):
     text = figures["rewrite"](PAGE.replace("NAME", name), tmp_path)
-    assert "9.99e-5" not in text and re.search(r"`make (demo|reproduce-\w+)` makes `(demo|results)/", text)
+    assert "9.99e-5" not in text and re.search(r"`(make|python) [^`]+` makes `(demo|results|docs)/", text)
     assert not NUMBER.search(text)
 
 
@@ -121,3 +123,37 @@ def test_the_printed_commands_are_those_that_make_runs():
     if shutil.which("make") is None:
         pytest.skip("no make on this machine")
     assert figures["block"]("demo-commands", ROOT) in PAGES[0].read_text()
+
+
+def test_campaigns_follow_from_the_rates_of_the_scaling_table(tmp_path):
+    row = "| `{}` | map, edge in px: 10, 20 | {} | 1.0 | 2, 3 | +5 % | {} s per {} |"
+    rows = [row.format(stage, "1,165, 1,401", 0.5, unit) for stage, unit in (
+        ("ingest", "Mpx"), ("ingest --images", "Mpx"), ("sample", "thousand crops"), ("project", "thousand pairs"),
+        ("infer", "Mpx"), ("render", "Mpx"), ("evaluate", "thousand pairs"))]  # fmt: skip
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "scaling.md").write_text("\n".join(rows))
+    text = figures["rewrite"](PAGE.replace("NAME", "campaigns"), tmp_path)
+    assert "| `infer` | 342 Mpx | 2.9 min | 34.8 min | 1.4 GB |" in text
+    assert "| `project` | 83.6 thousand pairs | 0.7 min |  | 1.4 GB |" in text
+    (tmp_path / "docs" / "scaling.md").write_text("\n".join(rows[:-1]))
+    assert "No figures yet" in figures["rewrite"](PAGE.replace("NAME", "campaigns"), tmp_path)
+
+
+def test_a_benchmark_stands_as_it_was_printed(tmp_path):
+    assert "make bench ONLY=view" in figures["rewrite"](PAGE.replace("NAME", "bench-view"), tmp_path)
+    (tmp_path / "results" / "bench").mkdir(parents=True)
+    (tmp_path / "results" / "bench" / "bench_view.txt").write_text("12 frames/s\n")
+    assert "```text\n12 frames/s\n```" in figures["rewrite"](PAGE.replace("NAME", "bench-view"), tmp_path)
+
+
+def test_sizes_are_those_of_the_files(tmp_path):
+    (tmp_path / "demo").mkdir()
+    for name, _, _ in figures["SIZES"]:
+        (tmp_path / "demo" / name).write_bytes(b"x" * 2000)
+    for name, shape in (("scene", (1000, 2000)), ("svbrdf", (1000, 2000)), ("svbrdf_albedo", (1000, 2000)),
+                        ("crops", (4, 8, 8)), ("pairs", (4, 8, 8)), ("evaluation", (4, 8, 8))):  # fmt: skip
+        with h5py.File(tmp_path / "demo" / f"{name}.h5", "w") as file:
+            file["measured" if name == "evaluation" else "elevation"] = np.zeros(shape, np.float32)
+    text = figures["rewrite"](PAGE.replace("NAME", "demo-sizes"), tmp_path)
+    assert "| `scene.h5` | 8.0 MB | 4.0 MB a Mpx of the working grid |" in text
+    assert "| `checkpoint_0.h5` | 0.0 MB | - |" in text and "kB a pair" in text

@@ -73,7 +73,7 @@ def test_one_pass_gives_what_the_chain_gives(name, shadows):
 
 def test_one_pass_is_exact_in_the_half_shadow():
     observation = crops()
-    _, light = facets.look(
+    _, light = facets.angles_and_light(
         observation.elevation, observation.sun_direction, observation.camera_position, observation.sun_horizon, 5.0, 1737400.0
     )  # fmt: skip
     expected = sun_visibility(torch.asin(observation.sun_direction[:, 2])[:, None, None], observation.sun_horizon)

@@ -113,7 +113,7 @@ def test_extended_models_get_the_same_further_light(crater, tmp_path, monkeypatc
     more = {"bounce": True, "earthshine": True, "earth_azimuth_deg": 0.0, "earth_elevation_deg": 60.0}
     light, _ = added(dem, tmp_path, more, **view)
     monkeypatch.setattr("stages.effects.load_extension", lambda *_: [Half()])
-    halved, _ = added(dem, tmp_path, more, **view, extension=str(dem))
+    halved, _ = added(dem, tmp_path, more, **view, extend=str(dem))
     known = np.isfinite(light) & np.isfinite(halved)
     assert known.mean() > 0.9
     assert halved[known].mean() == pytest.approx(0.5 * light[known].mean(), rel=0.02)

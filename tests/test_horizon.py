@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from schemas.errors import GeometryError
-from stages.physics.horizon import cast_shadow, cast_shadow_bands, horizon, hulls, shadow
+from stages.physics.horizon import cast_shadow, horizon, hulls, shadow
 
 GSD = 5.0
 AZIMUTHS_DEG = (0, 13, 45, 71, 90, 118, 135, 164, 180, 205, 225, 251, 270, 298, 315, 349)
@@ -221,16 +221,3 @@ def test_bad_input_is_named(change):
     arguments = {"elevation": np.zeros((4, 4)), "gsd": 1.0, "azimuth": 0.0, "sun_elevation": 0.1} | change
     with pytest.raises(GeometryError, match=next(iter(change))):
         cast_shadow(**arguments)
-
-
-@pytest.mark.parametrize("azimuth_deg", (0, 25, 77, 150, 190, 260, 300))
-@pytest.mark.parametrize("band", (1, 7, 64, 1000))
-def test_bands_are_the_whole(rng, azimuth_deg, band):
-    z = np.cumsum(np.cumsum(rng.normal(size=(150, 170)), 0), 1).astype(np.float32) * 0.03
-    z[70:80, 20:40] = np.nan
-    seen, joined = np.zeros(z.shape, int), np.zeros(z.shape, bool)
-    for rows, columns, dark in cast_shadow_bands(z, GSD, math.radians(azimuth_deg), 0.15, 50_000.0, band):
-        seen[rows, columns] += 1
-        joined[rows, columns] = dark
-    assert (seen == 1).all()
-    assert (joined != cast_shadow(z, GSD, math.radians(azimuth_deg), 0.15, 50_000.0)).mean() < 1e-4  # rounding

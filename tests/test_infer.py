@@ -16,7 +16,7 @@ from schemas import ArtefactError, ConfigError
 from stages import infer, ingest, merge, train
 from stages.network.predictor import load_predictor
 
-FULL = {"device": "cpu"}
+FULL = {"device": "cpu", "precision": "fp32"}
 
 
 @pytest.fixture(scope="module")

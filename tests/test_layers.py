@@ -131,3 +131,10 @@ def test_every_stage_is_run_alike(name):
     assert parameters["output"].annotation in ("Output | Path", "Output | Path | None")
     assert parameters["say"].default is say_nothing and parameters["progress"].default is show_nothing
     assert all(p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters.values())
+
+
+def test_shared_types_are_defined_once():
+    """One name for arrays of float64, for progress and for messages, in stages/common."""
+    shared = re.compile(r"^(\w+) = (NDArray\[np\.float(64|32)\]|Callable\[\[(int, int, )?str\], None\])(  #.*)?$", re.M)
+    found = [m[1] for path in CORE for m in shared.finditer(path.read_text())]
+    assert len(found) == len(set(found)) and {"Floats", "Floats32", "Progress", "Say"} <= set(found), found

@@ -16,12 +16,12 @@ from schemas import ConfigError, RegistryError, read_strings
 from schemas.files.outputs import Output
 from stages import infer, train
 from stages.common.threads import one_thread_each, share_out
+from stages.network.coefficient_maps import CoefficientMaps
+from stages.network.crop_sums import PIECE, convolution, sum_over_crops
+from stages.network.deviations import _likelihood
 from stages.network.losses import crop_errors, squared_error
-from stages.network.maps import CoefficientMaps
-from stages.network.pieces import PIECE, convolution, sum_over_crops
 from stages.network.pixels import Pixels, fit_pixels
 from stages.network.predictor import load_predictor
-from stages.network.spread import _likelihood
 from stages.pairs.holes import fill_holes
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import get_model, masked_radiance_factor, model_names
@@ -78,7 +78,12 @@ def test_globals_are_learned_and_constant_in_the_map(small_artefacts, trained, t
         (k,) = json.loads(file.attrs["globals"]).values()
         start = json.loads(file.attrs["start"])
     assert 0 < k < 2 and k != start["k"]
-    infer.run(small_artefacts["scene"], trained, tmp_path / "map.h5", infer.Config(device="cpu", geotiff=False))
+    infer.run(
+        small_artefacts["scene"],
+        trained,
+        tmp_path / "map.h5",
+        infer.Config(device="cpu", precision="fp32", geotiff=False),
+    )
     with h5py.File(tmp_path / "map.h5") as file:
         valid = file["valid"][...].astype(bool)
         albedo, constant = (plane[valid] for plane in file["coefficients"][...])
@@ -241,7 +246,7 @@ def test_the_image_deviation_is_that_of_drawn_parameters(rng):
 
 def test_the_map_carries_its_deviations(small_artefacts, trained, tmp_path):
     """In strips and from a whole window alike, positive, by name; the GeoTIFF has them as bands."""
-    infer.run(small_artefacts["scene"], trained, tmp_path / "map.h5", infer.Config(device="cpu"))
+    infer.run(small_artefacts["scene"], trained, tmp_path / "map.h5", infer.Config(device="cpu", precision="fp32"))
     predictor = load_predictor(trained)
     assert predictor.image_noise > 0
     with h5py.File(small_artefacts["scene"]) as file:

@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from stages.network.losses import Radiometry, masked_mse, squared_error
-from stages.network.maps import CoefficientMaps
+from stages.network.coefficient_maps import CoefficientMaps
+from stages.network.losses import Radiometry, squared_error
 from stages.network.normalisation import scale_elevation
+from stages.network.precision import choose_inference_precision
 from stages.network.predictor import Predictor
-from stages.network.runtime import choose_inference_precision
 from stages.network.unet import UNet
 from stages.pairs.holes import FILL_REACH, fill_holes
 from stages.pairs.reader import PairReader
@@ -169,8 +169,8 @@ def test_holes_are_filled_alike_in_every_window(rng):
 def test_loss_counts_valid_pixels_only():
     predicted, measured = torch.zeros(1, 2, 2), torch.tensor([[[1.0, 2.0], [1e9, 3.0]]])
     valid = torch.tensor([[[True, True], [False, False]]])
-    assert masked_mse(predicted, measured, valid).item() == pytest.approx(2.5)
-    assert masked_mse(predicted, measured, torch.zeros_like(valid)).item() == 0
+    assert squared_error(predicted, measured, valid).item() == pytest.approx(2.5 * valid.sum().item())
+    assert squared_error(predicted, measured, torch.zeros_like(valid)).item() == 0
 
 
 def test_the_gradient_of_the_loss_is_that_of_its_value(rng):

@@ -7,10 +7,16 @@ import pytest
 
 from schemas.errors import GeometryError
 from stages.physics.images.fit_displacement import fit_field
-from stages.physics.images.registration import Shift, estimate_shift
+from stages.physics.images.registration import Shift, block_shift, prepare
 
 FINE = 4  # the scene is made this much finer than its images, so that a shift of 1/4 px needs no interpolation
 SIZE = 128
+
+
+def estimate_shift(image, rendering, valid=None, max_shift=8.0):
+    """The one shift of the whole picture."""
+    pictures = prepare(image, rendering, valid)
+    return block_shift(pictures, (0, 0, *pictures.image.shape), max_shift)
 
 
 def fractal(rng, n, beta):

@@ -12,7 +12,7 @@ from rasterio.transform import Affine
 from render_scene import LAT, LON, SUN, lunargr_render, write_dem
 
 from stages import render
-from stages.render import maps
+from stages.render import ortho
 
 BAD = [
     ((*SUN[:2], "--sun-elevation", "-5"), "below the horizon"),
@@ -93,9 +93,9 @@ def test_an_interrupted_render_leaves_nothing(hilly_map, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return original(*arguments)
 
-    original = maps.shade_block
-    monkeypatch.setattr(maps, "shade_block", stop)
-    monkeypatch.setattr(maps, "BAND_ROWS", 40)
+    original = ortho.shade_block
+    monkeypatch.setattr(ortho, "shade_block", stop)
+    monkeypatch.setattr(ortho, "BAND_ROWS", 40)
     with pytest.raises(KeyboardInterrupt):
         render.run(path, tmp_path / "o.exr", render.Config(sun_azimuth_deg=1.0, sun_elevation_deg=40.0))
     assert [p.name for p in tmp_path.iterdir()] == ["svbrdf.h5"]

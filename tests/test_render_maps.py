@@ -19,7 +19,7 @@ from stages import render
 from stages.physics.maps.grid import Grid, unit_vectors
 from stages.physics.photometry import evaluate
 from stages.physics.terrain import sun_visibility as light
-from stages.render import maps
+from stages.render import ortho
 from stages.render.pictures import read_exr, stretch
 
 
@@ -96,8 +96,8 @@ def test_blocks_make_no_difference(hilly_map, tmp_path, monkeypatch):
     path, *_ = hilly_map
     config = render.Config(sun_azimuth_deg=100.0, sun_elevation_deg=20.0)
     render.run(path, tmp_path / "whole.exr", config)
-    monkeypatch.setattr(maps, "BAND_ROWS", 33)
-    monkeypatch.setattr(maps, "BAND_COLUMNS", 71)
+    monkeypatch.setattr(ortho, "BAND_ROWS", 33)
+    monkeypatch.setattr(ortho, "BAND_COLUMNS", 71)
     render.run(path, tmp_path / "blocks.exr", config)
     whole, blocks = read_exr(tmp_path / "whole.exr"), read_exr(tmp_path / "blocks.exr")
     for name in whole:
@@ -151,7 +151,7 @@ def test_extensions_reach_both_kinds_of_view(hilly_map, tmp_path):
     for name, changes in (("map", {}), ("view", view)):
         base, more = tmp_path / f"{name}.exr", tmp_path / f"{name}_more.exr"
         render.run(path, base, render.Config(**sun, **changes))
-        render.run(path, more, render.Config(**sun, **changes, extension=str(tmp_path / "diagnosis.h5")))
+        render.run(path, more, render.Config(**sun, **changes, extend=str(tmp_path / "diagnosis.h5")))
         difference = read_exr(more)["image"] - read_exr(base)["image"]
         known = np.isfinite(difference)
         assert known.mean() > 0.9
@@ -179,7 +179,7 @@ def test_what_a_model_gives_below_0_is_drawn_as_0_and_counted(rng, tmp_path, mon
 
         monkeypatch.setattr("stages.effects.load_extension", lambda *_: [Nothing()])
     config = render.Config(
-        sun_azimuth_deg=100.0, sun_elevation_deg=29.0, shadows=False, extension=str(path) if extended else None
+        sun_azimuth_deg=100.0, sun_elevation_deg=29.0, shadows=False, extend=str(path) if extended else None
     )
     summary = render.run(path, tmp_path / "o.exr", config)
     exr = read_exr(tmp_path / "o.exr")

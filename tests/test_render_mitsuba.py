@@ -197,6 +197,6 @@ def test_one_bounce_agrees_with_mitsuba(scenes, tmp_path, name):
     inner[8:-8, 8:-8] = True
     inner &= np.isfinite(ours)
     assert theirs[inner].mean() > 0.002 * images[0][inner].mean()  # it is there to be seen
-    assert ours[inner].mean() == pytest.approx(theirs[inner].mean(), rel=0.05)
+    assert ours[inner].mean() == pytest.approx(theirs[inner].mean(), rel=0.03)
     smooth = [gaussian_filter(np.where(inner, v, 0), 3)[inner] for v in (ours, theirs)]
-    assert np.corrcoef(*smooth)[0, 1] > 0.95
+    assert np.corrcoef(*smooth)[0, 1] > 0.98

@@ -15,7 +15,7 @@ from rasterio.warp import Resampling, reproject
 from schemas import ConfigError, InputError, RegistryError, open_artefact
 from schemas.truth import TRUTH
 from stages.simulate import make_config, read_recipe, recipe_json, run, stage
-from stages.simulate import render as render_module
+from stages.simulate import radiance as render_module
 
 R = 1737400.0
 SMALL = {"size_px": 288, "images": 10, "crater_largest": 260.0, "hidden": [], "seed": 3}

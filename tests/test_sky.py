@@ -13,7 +13,7 @@ from schemas.errors import GeometryError
 from stages.physics.formation.chain import Observation, form
 from stages.physics.horizon import horizon
 from stages.physics.light.earth import earth_irradiance
-from stages.physics.light.sky import sky_view, terrain_light
+from stages.physics.light.sky import terrain_light
 from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
 from stages.physics.photometry import get_model
 
@@ -29,10 +29,14 @@ def _bowl(n=161, radius=420.0, rim=300.0):
     return z, away, (radius - level) / (2 * radius)
 
 
+def sky_view(z, azimuths=32):
+    return terrain_light(z, np.zeros_like(z), GSD, azimuths=azimuths)[1]
+
+
 def test_sky_view_of_a_spherical_bowl_is_the_same_everywhere():
     """Any two patches of a sphere see each other alike, so the cap hides h / 2 R of the light from all its facets."""
     z, away, share = _bowl()
-    view = sky_view(z, GSD, azimuths=32)
+    view = sky_view(z)
     inside = away < 270
     assert np.abs(view[inside] - (1 - share)).max() < 0.02
     assert view[inside].mean() == pytest.approx(1 - share, abs=0.003)
@@ -42,13 +46,13 @@ def test_sky_view_of_a_spherical_bowl_is_the_same_everywhere():
 def test_sky_view_of_a_plane_is_whole():
     row, col = np.mgrid[:60, :70]
     z = ((0.3 * col - 0.2 * row) * GSD).astype(np.float32)
-    np.testing.assert_allclose(sky_view(z, GSD)[3:-3, 3:-3], 1.0, atol=1e-4)
+    np.testing.assert_allclose(sky_view(z)[3:-3, 3:-3], 1.0, atol=1e-4)
 
 
 def test_sky_view_keeps_what_is_missing():
     z, _, _ = _bowl(81)
     z[10:20, 30:40] = np.nan
-    view = sky_view(z, GSD, 8)
+    view = sky_view(z, 8)
     assert np.isnan(view[11:19, 31:39]).all()
     assert np.isfinite(view[30:60, 30:60]).all()
 
@@ -227,7 +231,7 @@ class _WideSun:
         state.sun_radius = math.radians(2)
 
 
-@pytest.mark.parametrize("call", [lambda z: sky_view(z, GSD, 2), lambda z: terrain_light(z, z[1:], GSD)])
+@pytest.mark.parametrize("call", [lambda z: sky_view(z, 2), lambda z: terrain_light(z, z[1:], GSD)])
 def test_bad_input_is_named(call):
     with pytest.raises(GeometryError, match="expected"):
         call(np.zeros((5, 5), np.float32))

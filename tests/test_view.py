@@ -61,13 +61,20 @@ def test_content_has_every_map_of_the_file(hilly_map):
         deviation.attrs["units"] = "1"
         albedo = file.create_dataset("albedo", data=np.full(elevation.shape, 1.1, np.float32))
         albedo.attrs["long_name"] = "relative to what the terrain predicts"
+        counts = file.create_dataset("albedo_images", data=np.full(elevation.shape, 3, np.uint8))
+        counts.attrs["long_name"] = "how many made it"
+        file["coefficients_std"] = np.abs(coefficients[1:2]).astype(np.float32)  # of those that vary by place
+        file["map_name"] = np.array(["b"], h5py.string_dtype())
         file["samples"] = np.arange(7)  # not a map
     content = read_content(path, 2048)
     assert content.factor == 1 and content.grid.transform == grid.transform
     np.testing.assert_array_equal(content.elevation, elevation.astype(np.float32))
-    assert [layer.name for layer in content.coefficients] == ["a", "b", "c"]
-    assert [layer.name for layer in content.others] == [*(f"coefficient_std_{k}" for k in "abc"), "albedo"]
-    assert content.others[3].title == "albedo: relative to what the terrain predicts"
+    assert [layer.name for layer in content.coefficients] == ["a", "b", "c", "albedo"]  # albedo is in the picture
+    expected = ["albedo_images", *(f"coefficient_std_{k}" for k in "abc"), "coefficients_std_b"]
+    assert sorted(layer.name for layer in content.others) == expected
+    titles = {layer.name: layer.title for layer in content.others}
+    assert titles["albedo_images"] == "albedo images: how many made it"
+    assert content.model.formula.startswith("albedo_factor (")
 
 
 def test_a_large_map_is_shown_as_means_at_the_same_place(hilly_map):

@@ -58,6 +58,23 @@ def test_the_page_shows_what_render_gives(tmp_path, model):
     assert np.nanmin(expected) < 0.9 * np.nanmax(expected)
 
 
+@pytest.mark.parametrize("model", ["hapke", "kernels"])
+def test_albedo_from_photographs_is_in_the_picture(tmp_path, model):
+    """As `lunargr render` has it: a factor on the I/F of the coefficients, place by place."""
+    path, page = make_map(tmp_path, model), tmp_path / "v.html"
+    albedo = 1 + 0.5 * np.sin(np.arange(96)[:, None] / 9) * np.cos(np.arange(128) / 7)
+    with h5py.File(path, "r+") as file:
+        file["albedo"] = albedo.astype(np.float32)
+    view.run(path, None, page, view.Config())
+    calls = "return [lunargr.pixels({azimuth: 270, elevation: 35}), lunargr.head.fields.map((l) => l.name)]"
+    found, layers = run_in_page(page, calls)
+    expected = rendered(path, tmp_path, sun_azimuth_deg=270.0, sun_elevation_deg=35.0)
+    found = found.reshape(expected.shape)
+    assert np.nanmean(found) == pytest.approx(np.nanmean(expected), rel=0.01)
+    assert np.nanquantile(np.abs(found - expected), 0.9) < 0.005 * np.nanmean(expected)
+    assert layers.count("albedo") == 1
+
+
 def test_light_that_goes_to_a_camera(tmp_path):
     path, page = make_map(tmp_path, "hapke"), tmp_path / "v.html"
     view.run(path, None, page, view.Config())

@@ -7,21 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import (
-    GeoTiff,
-    NoGeoTiff,
-    OutputFile,
-    Overwrite,
-    Parts,
-    Quiet,
-    ResumeParts,
-    Scheduler,
-    Shard,
-    in_parts,
-    parse_shard,
-    read_names,
-    to_map,
-)
+from lunargr_cli import options
 from schemas.errors import ConfigError
 from stages.albedo import Config
 
@@ -46,28 +32,29 @@ def command(
             metavar="FORM",
             help="Take off how far each image lies from its rendering: constant, affine or field, as 'lunargr project'.",
         ),
-    ] = None,
-    geotiff: GeoTiff = None,
-    no_geotiff: NoGeoTiff = False,
-    shard: Shard = None,
-    output: OutputFile = Path("svbrdf_albedo.h5"),
-    scheduler: Scheduler = None,
-    resume: ResumeParts = False,
-    parts: Parts = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    ] = Config.register,
+    geotiff: options.GeoTiff = None,
+    no_geotiff: options.NoGeoTiff = False,
+    shard: options.Shard = None,
+    output: options.OutputFile = Path("svbrdf_albedo.h5"),
+    scheduler: options.Scheduler = None,
+    resume: options.ResumeParts = False,
+    parts: options.Parts = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Add per-pixel albedo to a reflectance map, from all photographs of the scene.
 
     The albedo multiplies the I/F of the map. Where photographs agree it is theirs; where they do not, and where there are
     none, it is 1 and the map stays as the terrain gave it. Rendering, evaluation and GeoTIFF take it into account.
     """
-    config = Config(read_names(leave_out), _fold(fold), register, parse_shard(shard), geotiff=not no_geotiff)
+    made = {"leave_out": options.read_names(leave_out), "fold": _fold(fold), "geotiff": not no_geotiff}
+    config = options.configure(Config, locals(), **made, shard=options.parse_shard(shard))
     from lunargr_cli.console import Console
     from stages import albedo
 
-    console, to = Console(quiet), to_map(output, overwrite, geotiff, no_geotiff)
-    if in_parts(scheduler, resume, parts, shard):
+    console, to = Console(quiet), options.to_map(output, overwrite, geotiff, no_geotiff)
+    if options.in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_albedo
 

@@ -8,23 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lunargr_cli.options import (
-    Batch,
-    Device,
-    Epochs,
-    Json,
-    LearningRate,
-    Overwrite,
-    Quiet,
-    Resume,
-    Schedule,
-    TrainingPrecision,
-    Widths,
-    configure,
-    dashed,
-    read_names,
-    read_numbers,
-)
+from lunargr_cli import options
 from lunargr_cli.paths import Writes
 from stages.train import Config
 
@@ -47,26 +31,26 @@ def command(
     seeds: Annotated[
         int, typer.Option("--seeds", min=1, max=1000, help="Training runs of every model, from seeds 0, 1, ...")
     ] = 3,
-    epochs: Epochs = Config.epochs,
-    batch: Batch = Config.batch,
-    lr: LearningRate = Config.lr,
-    schedule: Schedule = Config.schedule,
-    widths: Widths = dashed(Config.widths),
-    precision: TrainingPrecision = Config.precision,
+    epochs: options.Epochs = Config.epochs,
+    batch: options.Batch = Config.batch,
+    lr: options.LearningRate = Config.lr,
+    schedule: options.Schedule = Config.schedule,
+    widths: options.Widths = options.dashed(Config.widths),
+    precision: options.TrainingPrecision = Config.precision,
     split: Annotated[
         str, typer.Option("--split", help="Where models are compared: validation (as in the paper) or test.")
     ] = "validation",
-    device: Device = Config.device,
-    json_file: Json = None,
-    resume: Resume = False,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    device: options.Device = Config.device,
+    json_file: options.Json = None,
+    resume: options.Resume = False,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Train every model from several seeds on the same pairs and compare them, with the noise of seeds and ground.
 
     With --resume, runs that the folder already holds are kept and an interrupted one goes on where it stopped.
     """
-    common = configure(Config, locals(), widths=read_numbers("--widths", widths, int))
+    common = options.configure(Config, locals(), widths=options.read_numbers("--widths", widths, int))
     from lunargr_cli.console import Console
     from schemas import SPLITS, ConfigError
     from schemas.files.outputs import Output, Target, check_outputs
@@ -127,7 +111,7 @@ def _models(text: str) -> list[str]:
     from schemas import ConfigError
     from stages.physics.photometry import get_model
 
-    names = list(dict.fromkeys(get_model(name).name for name in read_names(text)))
+    names = list(dict.fromkeys(get_model(name).name for name in options.read_names(text)))
     if len(names) < 2:
         raise ConfigError(f"--models: expected at least two models, found '{text}'.")
     return names

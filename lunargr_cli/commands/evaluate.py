@@ -7,18 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import (
-    MOST,
-    Device,
-    Json,
-    OutputFile,
-    Overwrite,
-    Quiet,
-    ResumeParts,
-    Scheduler,
-    Seed,
-    configure,
-)
+from lunargr_cli import options
 from lunargr_cli.paths import Writes
 from stages.evaluate import Config
 
@@ -34,7 +23,7 @@ def command(
             help="From 'lunargr train', several being training runs of one model; with --held-out-images maps from 'lunargr albedo'.",
         ),
     ],
-    output: OutputFile = Path("evaluation.h5"),
+    output: options.OutputFile = Path("evaluation.h5"),
     held_out_images: Annotated[
         bool,
         typer.Option("--held-out-images", help="Score seen ground under images that did not make the map's albedo."),
@@ -51,7 +40,9 @@ def command(
     ] = None,
     fit_pairs: Annotated[
         int,
-        typer.Option("--fit-pairs", min=0, max=MOST, help="Most train pairs that baselines are fitted on (0: all)."),
+        typer.Option(
+            "--fit-pairs", min=0, max=options.MOST, help="Most train pairs that baselines are fitted on (0: all)."
+        ),
     ] = Config.fit_pairs,
     renderings: Annotated[
         bool | None,
@@ -63,14 +54,16 @@ def command(
         list[str] | None,
         typer.Option("--only", metavar="ROW", help="Score only this row of the table; may be repeated."),
     ] = None,
-    batch: Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Crops in memory at a time.")] = Config.batch,
-    seed: Seed = Config.seed,
-    device: Device = Config.device,
-    json_file: Json = None,
-    scheduler: Scheduler = None,
-    resume: ResumeParts = False,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    batch: Annotated[
+        int, typer.Option("--batch", min=1, max=options.MOST, help="Crops in memory at a time.")
+    ] = Config.batch,
+    seed: options.Seed = Config.seed,
+    device: options.Device = Config.device,
+    json_file: options.Json = None,
+    scheduler: options.Scheduler = None,
+    resume: options.ResumeParts = False,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Score the learned model and its baselines on one split: MSE, PSNR, SSIM, LPIPS, with 95 % intervals.
 
@@ -78,7 +71,7 @@ def command(
     the train split in the same way for every model; their errors are shares of the full DN range. Checkpoints of one
     model from several seeds make the learned rows means over training runs, whose spread is part of the intervals.
     """
-    config = configure(Config, locals(), only=tuple(only or ()), extend=str(extend) if extend else None)
+    config = options.configure(Config, locals(), only=tuple(only or ()), extend=str(extend) if extend else None)
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output
     from stages import evaluate

@@ -7,24 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import (
-    MOST,
-    BodyOption,
-    Device,
-    GeoTiff,
-    NoGeoTiff,
-    OutputFile,
-    Overwrite,
-    Parts,
-    Quiet,
-    ResumeParts,
-    Scheduler,
-    Shard,
-    configure,
-    in_parts,
-    parse_shard,
-    to_map,
-)
+from lunargr_cli import options
 from stages.infer import Config
 
 NAME, ORDER = "infer", 60
@@ -36,14 +19,21 @@ def command(
     window: Annotated[
         int | None,
         typer.Option(
-            "--window", min=16, max=MOST, help="Window size, px; context around it is added (default: what is fast)."
+            "--window",
+            min=16,
+            max=options.MOST,
+            help="Window size, px; context around it is added (default: what is fast).",
         ),
     ] = None,
     stride: Annotated[
-        int | None, typer.Option("--stride", min=1, max=MOST, help="Step between windows, px (default: a window).")
+        int | None,
+        typer.Option("--stride", min=1, max=options.MOST, help="Step between windows, px (default: a window)."),
     ] = None,
     offset: Annotated[
-        int, typer.Option("--window-offset", min=-MOST, max=MOST, metavar="PX", help="Shift the grid of windows.")
+        int,
+        typer.Option(
+            "--window-offset", min=-options.MOST, max=options.MOST, metavar="PX", help="Shift the grid of windows."
+        ),
     ] = Config.offset,
     precision: Annotated[
         str,
@@ -52,20 +42,20 @@ def command(
     any_gsd: Annotated[
         bool, typer.Option("--any-gsd", help="Allow a DEM at another GSD than the training's.")
     ] = Config.any_gsd,
-    geotiff: GeoTiff = None,
-    no_geotiff: NoGeoTiff = False,
-    body: BodyOption = None,
-    device: Device = Config.device,
-    shard: Shard = None,
-    output: OutputFile = Path("svbrdf.h5"),
-    scheduler: Scheduler = None,
-    resume: ResumeParts = False,
-    parts: Parts = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    geotiff: options.GeoTiff = None,
+    no_geotiff: options.NoGeoTiff = False,
+    body: options.BodyOption = None,
+    device: options.Device = Config.device,
+    shard: options.Shard = None,
+    output: options.OutputFile = Path("svbrdf.h5"),
+    scheduler: options.Scheduler = None,
+    resume: options.ResumeParts = False,
+    parts: options.Parts = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Predict georeferenced maps of reflectance coefficients for a DEM of any size."""
-    config = configure(Config, locals(), shard=parse_shard(shard), geotiff=not no_geotiff)
+    config = options.configure(Config, locals(), shard=options.parse_shard(shard), geotiff=not no_geotiff)
     import contextlib
     from dataclasses import replace
 
@@ -73,7 +63,7 @@ def command(
     from schemas.files.locks import scratch_path
     from stages import infer
 
-    console, to = Console(quiet), to_map(output, overwrite, geotiff, no_geotiff)
+    console, to = Console(quiet), options.to_map(output, overwrite, geotiff, no_geotiff)
     interrupted = scheduler is not None or resume  # may have got as far as the GeoTIFF: its parts tell
     infer.check_files([terrain, checkpoint], replace(to, resume=interrupted), config)
     gridding = None
@@ -85,7 +75,7 @@ def command(
 
         gsd = None if any_gsd else load_predictor(checkpoint).gsd
         gridding = ingest.Config(gsd=gsd, body=body or ingest.Config.body)
-    if in_parts(scheduler, resume, parts, shard):
+    if options.in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_infer
 

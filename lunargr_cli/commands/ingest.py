@@ -7,20 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import (
-    MOST,
-    BodyOption,
-    OutputFile,
-    Overwrite,
-    Parts,
-    Quiet,
-    ResumeParts,
-    Scheduler,
-    Shard,
-    configure,
-    in_parts,
-    parse_shard,
-)
+from lunargr_cli import options
 from stages.ingest import Config
 
 NAME, ORDER = "ingest", 20
@@ -40,28 +27,29 @@ def command(
         float | None, typer.Option("--gsd", help="Working ground sample distance, m (default: the DEM's own).")
     ] = None,
     crop: Annotated[
-        int, typer.Option("--crop", min=1, max=MOST, help="Crop size in pixels that valid positions are made for.")
+        int,
+        typer.Option("--crop", min=1, max=options.MOST, help="Crop size in pixels that valid positions are made for."),
     ] = Config.crop,
-    output: OutputFile = Path("scene.h5"),
-    body: BodyOption = Config.body,
+    output: options.OutputFile = Path("scene.h5"),
+    body: options.BodyOption = Config.body,
     skip_outside: Annotated[
         bool, typer.Option("--skip-outside", help="Leave out images that do not touch the DEM.")
     ] = Config.skip_outside,
-    shard: Shard = None,
-    scheduler: Scheduler = None,
-    resume: ResumeParts = False,
-    parts: Parts = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    shard: options.Shard = None,
+    scheduler: options.Scheduler = None,
+    resume: options.ResumeParts = False,
+    parts: options.Parts = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Bring a DEM to a metric grid and find where crops of each image may be centred."""
-    config = configure(Config, locals(), shard=parse_shard(shard))
+    config = options.configure(Config, locals(), shard=options.parse_shard(shard))
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output
     from stages import ingest
 
     console, to = Console(quiet), Output(output, overwrite)
-    if in_parts(scheduler, resume, parts, shard):
+    if options.in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_ingest
 

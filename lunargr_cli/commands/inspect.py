@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from schemas.provenance import Step
 
 NAME, ORDER = "inspect", 90
+SHOWN = 16  # digits of a SHA-256 on the terminal; --json has all
 
 
 def command(
@@ -95,6 +96,6 @@ def _of_raster(file: Path) -> Found:
 def _row(step: Step) -> tuple[object, ...]:
     record = step.record
     if record is None:
-        return step.name, "(given)", "", "", step.sha256
+        return step.name, "(given)", "", "", step.sha256[:SHOWN]
     how = record["command"] or f"(Python) {record['schema']} {json.dumps(record['config'], sort_keys=True)}"
-    return step.name, how, record["version"], "" if record["seed"] < 0 else record["seed"], step.sha256
+    return step.name, how, record["version"], "" if record["seed"] < 0 else record["seed"], step.sha256[:SHOWN]

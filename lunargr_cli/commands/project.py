@@ -10,18 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import typer.core
 
-from lunargr_cli.options import (
-    OutputFile,
-    Overwrite,
-    Parts,
-    Quiet,
-    ResumeParts,
-    Scheduler,
-    Shard,
-    configure,
-    in_parts,
-    parse_shard,
-)
+from lunargr_cli import options
 from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
 from stages.project import Config
@@ -37,6 +26,7 @@ class CLASS(typer.core.TyperCommand):
     """``--register`` alone means ``--register constant``: typer knows no option whose value may be left out."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Write out what ``--register`` alone means."""
         full = []
         for k, word in enumerate(args):
             full.append(word)
@@ -75,16 +65,16 @@ def command(
     exact: Annotated[
         bool, typer.Option("--exact", help="Keep all digits of float32, not those that matter: three times the size.")
     ] = Config.exact,
-    shard: Shard = None,
-    output: OutputFile = Path("pairs.h5"),
-    scheduler: Scheduler = None,
-    resume: ResumeParts = False,
-    parts: Parts = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    shard: options.Shard = None,
+    output: options.OutputFile = Path("pairs.h5"),
+    scheduler: options.Scheduler = None,
+    resume: options.ResumeParts = False,
+    parts: options.Parts = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Orthorectify the images onto the crops; add the Sun, the camera and the terrain's horizon."""
-    config = configure(Config, locals(), scene=str(scene) if scene else None, shard=parse_shard(shard))
+    config = options.configure(Config, locals(), scene=str(scene) if scene else None, shard=options.parse_shard(shard))
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output, Target, check_outputs
     from stages import project
@@ -94,7 +84,7 @@ def command(
         if register is None:
             raise typer.BadParameter("needs --register", param_hint="--shifts")
         check_outputs([Target(output), Target(blocks_csv, "blocks_csv")], [crops], overwrite)
-    if in_parts(scheduler, resume, parts, shard):
+    if options.in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_project
 

@@ -132,7 +132,7 @@ def command(
         str, typer.Option(metavar="LOW,HIGH", help="With --stereo: degrees between both lines of sight.")
     ] = CONVERGENCE,
     seed: Seed = StereoConfig.seed,
-    extension: Annotated[
+    extend: Annotated[
         Path | None,
         typer.Option("--extend", metavar="FILE", help="diagnosis.h5: add the effects that 'lunargr diagnose' found."),
     ] = None,
@@ -188,7 +188,7 @@ def command(
         "camera": str(camera) if camera else None,
         "parameters": _parameters(parameters or []),
         "terrain_only": dem is not None,
-        "extension": str(extension) if extension else None,
+        "extend": str(extend) if extend else None,
         "shard": parse_shard(shard),
     }
     config = configure(Config, locals(), **told)

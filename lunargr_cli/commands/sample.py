@@ -7,19 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import (
-    MOST,
-    OutputFile,
-    Overwrite,
-    Parts,
-    Quiet,
-    Scheduler,
-    Seed,
-    Shard,
-    configure,
-    in_parts,
-    parse_shard,
-)
+from lunargr_cli import options
 from schemas.errors import ConfigError
 from stages.sample import Config
 
@@ -31,12 +19,17 @@ def command(
     scene: Annotated[Path, typer.Argument(help="scene.h5 from 'lunargr ingest'.")],
     crop: Annotated[
         int | None,
-        typer.Option("--crop", min=1, max=MOST, help="Crop size in pixels, a multiple of 16 (default: the scene's)."),
+        typer.Option(
+            "--crop", min=1, max=options.MOST, help="Crop size in pixels, a multiple of 16 (default: the scene's)."
+        ),
     ] = None,
     count: Annotated[
         int | None,
         typer.Option(
-            "--count", min=1, max=MOST, help="Crops in all; with --stack, places in all (default: 100 per image)."
+            "--count",
+            min=1,
+            max=options.MOST,
+            help="Crops in all; with --stack, places in all (default: 100 per image).",
         ),
     ] = None,
     density: Annotated[
@@ -49,22 +42,22 @@ def command(
         float | None, typer.Option("--tile-m", help="Edge of a ground tile of the split, m (default: up to 4 crops).")
     ] = None,
     split: Annotated[str, typer.Option("--split", help="Shares of train/validation/test.")] = DEFAULT_SPLIT,
-    seed: Seed = Config.seed,
-    shard: Shard = None,
-    output: OutputFile = Path("crops.h5"),
-    scheduler: Scheduler = None,
-    parts: Parts = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
+    seed: options.Seed = Config.seed,
+    shard: options.Shard = None,
+    output: options.OutputFile = Path("crops.h5"),
+    scheduler: options.Scheduler = None,
+    parts: options.Parts = None,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Choose crop centres per image and split them by ground tile, with no ground shared between the parts."""
-    config = configure(Config, locals(), split=_shares(split), shard=parse_shard(shard))
+    config = options.configure(Config, locals(), split=_shares(split), shard=options.parse_shard(shard))
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output
     from stages import sample
 
     console, to = Console(quiet), Output(output, overwrite)
-    if in_parts(scheduler, False, parts, shard):
+    if options.in_parts(scheduler, False, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_sample
 

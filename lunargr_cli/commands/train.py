@@ -7,24 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import (
-    Batch,
-    Device,
-    Epochs,
-    LearningRate,
-    OutputFile,
-    Overwrite,
-    Quiet,
-    Resume,
-    Schedule,
-    Seed,
-    TrainingPrecision,
-    Widths,
-    configure,
-    dashed,
-    read_names,
-    read_numbers,
-)
+from lunargr_cli import options
 from stages.train import Config
 
 NAME, ORDER = "train", 50
@@ -46,14 +29,14 @@ def command(
     positive: Annotated[
         bool, typer.Option("--positive", help="Keep coefficients nearly positive (LeakyReLU), as Lunar-G2R does.")
     ] = Config.positive,
-    epochs: Epochs = Config.epochs,
-    batch: Batch = Config.batch,
-    lr: LearningRate = Config.lr,
-    schedule: Schedule = Config.schedule,
-    widths: Widths = dashed(Config.widths),
+    epochs: options.Epochs = Config.epochs,
+    batch: options.Batch = Config.batch,
+    lr: options.LearningRate = Config.lr,
+    schedule: options.Schedule = Config.schedule,
+    widths: options.Widths = options.dashed(Config.widths),
     dropout: Annotated[
         str, typer.Option("--dropout", help="Dropout of each stage, or one for all; Lunar-G2R: 0.1-0.1-0.2-0.2-0.3.")
-    ] = dashed(Config.dropout),
+    ] = options.dashed(Config.dropout),
     brightness: Annotated[
         float,
         typer.Option(
@@ -63,21 +46,24 @@ def command(
     augment: Annotated[
         bool, typer.Option("--augment/--no-augment", help="Turn and mirror crops, Sun and camera along.")
     ] = Config.augment,
-    precision: TrainingPrecision = Config.precision,
+    precision: options.TrainingPrecision = Config.precision,
     extend: Annotated[
         Path | None, typer.Option("--extend", metavar="FILE", help="diagnosis.h5: train through the extended model.")
     ] = None,
-    seed: Seed = Config.seed,
-    device: Device = Config.device,
-    output: OutputFile = Path("checkpoint.h5"),
-    overwrite: Overwrite = False,
-    resume: Resume = False,
-    quiet: Quiet = False,
+    seed: options.Seed = Config.seed,
+    device: options.Device = Config.device,
+    output: options.OutputFile = Path("checkpoint.h5"),
+    overwrite: options.Overwrite = False,
+    resume: options.Resume = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Learn reflectance from terrain through the differentiable renderer. Several processes: run under torchrun."""
-    texts = {"maps": read_names(maps), "extend": str(extend) if extend else None}
-    numbers = {"widths": read_numbers("--widths", widths, int), "dropout": read_numbers("--dropout", dropout, float)}
-    config = configure(Config, locals(), **texts, **numbers)
+    texts = {"maps": options.read_names(maps), "extend": str(extend) if extend else None}
+    numbers = {
+        "widths": options.read_numbers("--widths", widths, int),
+        "dropout": options.read_numbers("--dropout", dropout, float),
+    }
+    config = options.configure(Config, locals(), **texts, **numbers)
     from lunargr_cli.console import Console
     from schemas.files.outputs import Output
     from stages import train

@@ -31,6 +31,8 @@ class Task:
 
 
 class Engine(Protocol):
+    """Where the parts of a stage are worked on."""
+
     def work(self, tasks: Sequence[Task]) -> Iterator[Path]:
         """Do all tasks; a part's path as it is finished."""
 
@@ -39,6 +41,7 @@ class Here:
     """One after the other, in this process."""
 
     def work(self, tasks: Sequence[Task]) -> Iterator[Path]:
+        """Do all tasks one after the other; a part's path as it is finished."""
         from schemas.files.locks import unlocked
 
         for task in tasks:

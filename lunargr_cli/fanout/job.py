@@ -69,7 +69,8 @@ class Work:
 @dataclass(frozen=True)
 class Identity:
     """What decides a result. inputs : known by their contents; sources : files too many to read for that, known by size
-    and time of change"""
+    and time of change
+    """
 
     stage: str
     options: Mapping[str, Any]

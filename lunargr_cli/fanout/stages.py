@@ -51,6 +51,7 @@ def run_ingest(dem: Path, images: Path | None, output: Output, config: Any, work
 
 
 def ingest_part(path: Path, dem: Path, images: Path | None, config: Any) -> None:
+    """Write one shard of scene.h5."""
     from stages import ingest
 
     ingest.run(dem, images, Output(path, overwrite=True), config)
@@ -69,12 +70,14 @@ def run_sample(scene: Path, output: Output, config: Any, work: Work) -> Any:
 
 
 def sample_part(path: Path, scene: Path, config: Any) -> None:
+    """Write one shard of crops.h5."""
     from stages import sample
 
     sample.run(scene, Output(path, overwrite=True), config)
 
 
 def run_project(crops: Path, output: Output, config: Any, work: Work) -> Any:
+    """pairs.h5 from shards that run side by side."""
     from stages import merge, project
 
     crops = crops.resolve()
@@ -90,6 +93,7 @@ def run_project(crops: Path, output: Output, config: Any, work: Work) -> Any:
 
 
 def project_part(path: Path, crops: Path, config: Any) -> None:
+    """Write one shard of pairs.h5."""
     from stages import project
 
     project.run(crops, Output(path, overwrite=True), config)
@@ -125,6 +129,7 @@ def _merge_map(pieces: list[Path], output: Output, config: Any, inputs: list[Pat
 
 
 def infer_part(path: Path, scene: Path, checkpoint: Path, config: Any) -> None:
+    """Write one shard of svbrdf.h5; the whole map gets its GeoTIFF when they are merged."""
     from stages import infer
 
     infer.run(scene, checkpoint, Output(path, overwrite=True), config)
@@ -151,12 +156,14 @@ def run_albedo(svbrdf: Path, scene: Path, output: Output, config: Any, work: Wor
 
 
 def calibration_part(path: Path, svbrdf: Path, scene: Path, config: Any) -> None:
+    """Fit the images' gains and offsets, which all shards share."""
     from stages import albedo
 
     albedo.calibrate_to(path, svbrdf, scene, config)
 
 
 def albedo_part(path: Path, svbrdf: Path, scene: Path, config: Any, calibration: Path) -> None:
+    """Write one shard of a map with albedo."""
     from stages import albedo
 
     albedo.run_part(svbrdf, scene, calibration, path, config)
@@ -164,6 +171,7 @@ def albedo_part(path: Path, svbrdf: Path, scene: Path, config: Any, calibration:
 
 
 def run_evaluate(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Any, work: Work) -> Any:
+    """evaluation.h5 from shards that run side by side."""
     from stages import evaluate
 
     pairs, checkpoints = pairs.resolve(), [c.resolve() for c in checkpoints]
@@ -191,6 +199,7 @@ def run_diagnose(pairs: Path, checkpoint: Path | None, output: Output, config: A
 
 
 def diagnose_part(path: Path, pairs: Path, checkpoint: Path | None, config: Any) -> None:
+    """Diagnose where one engine runs a whole stage."""
     from stages import diagnose
 
     json_file, report = path.with_suffix(".json"), path.with_suffix(".html")

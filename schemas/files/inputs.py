@@ -34,6 +34,7 @@ class Inputs:
         self.add(paths)
 
     def add(self, paths: Iterable[Path]) -> None:
+        """Take in files, and what they link to or name as their own inputs."""
         waiting = [Path(p) for p in paths]
         while waiting:
             path = waiting.pop()

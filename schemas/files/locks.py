@@ -61,6 +61,7 @@ def is_beside(output: str, name: str) -> bool:
 
 
 def host() -> str:
+    """This machine's name, as a lock names its holder."""
     return socket.gethostname().split(".")[0]
 
 

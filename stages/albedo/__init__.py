@@ -1,5 +1,6 @@
 """Stage albedo. stage: from files to files; references: photographs against the map; calibrate: gains and errors; pyramid: scales;
-posterior: the estimate; prior: what the network says of its own errors; intervals: how far unseen images lie; writing: the new map."""
+posterior: the estimate; prior: what the network says of its own errors; intervals: how far unseen images lie; writing: the new map.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +13,7 @@ if TYPE_CHECKING:
     from stages.albedo.calibrate import Calibration
     from stages.albedo.stage import calibrate_to, check_files, count_bands, run, run_part, source_files, summarise
 
-__getattr__ = imported_later(
-    __name__,
-    {
-        "Calibration": "calibrate",
-        "calibrate_to": "stage",
-        "check_files": "stage",
-        "count_bands": "stage",
-        "run": "stage",
-        "run_part": "stage",
-        "source_files": "stage",
-        "summarise": "stage",
-    },
-)
+__getattr__ = imported_later(__name__, "stage", "calibrate")
 __all__ = [
     "Calibration",
     "Config",

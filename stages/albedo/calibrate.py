@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from stages.albedo.intervals import GAUSSIAN, Stack, unseen_intervals
@@ -24,11 +23,9 @@ from stages.albedo.posterior import Spread, settle
 from stages.albedo.pyramid import LEVELS, bands
 from stages.albedo.references import Box, Look, References, overlap
 from stages.albedo.registered import as_text, from_text
+from stages.common.arrays import Floats, Floats32
 from stages.common.progress import Progress, show_nothing
 from stages.physics.images.displacement import Field
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 WINDOW_PX = 128
 WINDOWS_PER_IMAGE = 16
@@ -46,7 +43,8 @@ class Calibration:
     """gain, offset : (n,), measured = gain x I/F x albedo + offset; spread : variances of log ratios;
     error : relative variance of an image's error at the cosines of incidence ``COSINES``; interval : (2, bins), half-widths
     of the 68 and 95 % intervals of an unseen image, in standard deviations, by the same bins; shadow : (2,) the same in
-    shadow, I/F over the sine of the Sun's elevation; fields : what registration takes off each image, empty without it"""
+    shadow, I/F over the sine of the Sun's elevation; fields : what registration takes off each image, empty without it
+    """
 
     gain: Floats
     offset: Floats
@@ -67,6 +65,7 @@ class Calibration:
         return ratio, np.where(known, confidence, 0).astype(np.float32)
 
     def write(self, path: Path) -> None:
+        """Write it as JSON."""
         values = {"gain": self.gain, "offset": self.offset, "error": self.error}
         values |= {"interval": self.interval, "shadow": self.shadow}
         values |= {
@@ -81,6 +80,7 @@ class Calibration:
 
     @staticmethod
     def read(path: Path) -> Calibration:
+        """Read what :meth:`write` wrote."""
         text = json.loads(path.read_text())
         shared_px, fields = float(text.pop("shared_px")), tuple(from_text(text.pop("fields")))
         v = {k: np.array(values, float) for k, values in text.items()}
@@ -126,6 +126,7 @@ def take_samples(
     progress: Progress = show_nothing,
     prior: Callable[[Box], Floats32 | None] = lambda box: None,
 ) -> list[Sample]:
+    """What the images show of some windows, one sample each. prior : (h, w) of a window's, as :func:`posterior.estimate` takes it"""
     samples = []
     for number, box in enumerate(windows):
         progress(number, len(windows), "calibration windows")
@@ -242,7 +243,8 @@ def _line(expected: Floats, measured: Floats, with_offset: bool) -> tuple[float,
 
 def _variances(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], count: int) -> Spread:
     """Variance components by moments of pairs of images: products for what is shared; for the rest what a square has
-    beyond that, or what differences say where this is more (errors that neighbours share would hide in differences)."""
+    beyond that, or what differences say where this is more (errors that neighbours share would hide in differences).
+    """
     levels = LEVELS + 2  # the last are whole pixels
     product, weight, difference, reach = (np.zeros((levels, count, count)) for _ in range(4))
     square, sums, pixels = (np.zeros((levels, count)) for _ in range(3))

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 class Config:
     """leave_out : image ids that must not enter; fold : (k, n) leaves out every n-th image from the k-th on (0-based), None:
     all enter; register : None, or the freest form of displacement that is taken off each image before ('constant', 'affine',
-    'field'), as in project; geotiff : whether the map is written as a GeoTIFF as well."""
+    'field'), as in project; geotiff : whether the map is written as a GeoTIFF as well.
+    """
 
     leave_out: tuple[str, ...] = ()
     fold: tuple[int, int] | None = None
@@ -28,7 +29,8 @@ class Config:
 @dataclass(frozen=True)
 class Summary:
     """For the lines at the end. covered_share : of the map's valid pixels, those that an image saw; shared_std, prior_std :
-    relative spread of the albedo that images share, and of its error where images enter, medians"""
+    relative spread of the albedo that images share, and of its error where images enter, medians
+    """
 
     images: tuple[str, ...]
     left_out: tuple[str, ...]
@@ -44,7 +46,7 @@ def used_frames(frames: Sequence[Frame], config: Config) -> list[bool]:
     from stages.physics.images.displacement import FORMS
 
     if config.register not in (None, *FORMS):
-        raise ConfigError(f"--register: expected one of {', '.join(FORMS)}, found '{config.register}'.")
+        raise ConfigError(f"`register`: expected one of {', '.join(FORMS)}, found '{config.register}'.")
     names = [f.image_id for f in frames]
     for name in config.leave_out:
         if name not in names:

@@ -19,9 +19,7 @@ from scipy.special import ndtri, stdtrit
 
 from stages.albedo.posterior import Spread, estimate, settle
 from stages.albedo.references import Look
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
+from stages.common.arrays import Floats, Floats32
 
 SHARES = (0.6827, 0.95)
 GAUSSIAN = (1.0, 1.96)  # where nothing can be left out
@@ -34,7 +32,8 @@ LEAST_IMAGES = 3  # the same
 @dataclass(frozen=True)
 class Stack:
     """A window: log ratios and confidence (n, H, W) of ``images``, their looks, what each is in I/F (NaN unknown), and the
-    prior of ``posterior.estimate``."""
+    prior of ``posterior.estimate``.
+    """
 
     ratio: Floats32
     confidence: Floats32
@@ -46,7 +45,8 @@ class Stack:
 
 def unseen_intervals(stacks: Sequence[Stack], spread: Spread, edges: Floats) -> tuple[Floats, Floats]:
     """(2, bins) half-widths over hypot(std of the albedo, median image's own), by bins of cos(incidence) ``edges``; (2,)
-    in shadow, over the sine of the Sun's elevation."""
+    in shadow, over the sine of the Sun's elevation.
+    """
     bins = len(edges) - 1
     residuals, places, images = _residuals(stacks, spread, edges)
     result, shadow = np.tile(np.array(GAUSSIAN)[:, None], bins), np.zeros(2)

@@ -13,12 +13,9 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from stages.albedo.pyramid import LEVELS, bands, collapse, enlarge, reduce
-
-Floats32 = NDArray[np.float32]
-Floats = NDArray[np.float64]
+from stages.common.arrays import Floats, Floats32
 
 FREEDOM = 4.0  # degrees of freedom of Student's distribution, as Lange et al. recommend
 ITERATIONS = 8
@@ -28,7 +25,8 @@ ITERATIONS = 8
 class Spread:
     """Variances of log ratios. shared : (LEVELS + 1,) of the albedo that all images show, by band; own : (n, LEVELS + 1)
     of each image's error; shared_px, own_px : (), (n,) of whole pixels; prior : (LEVELS + 1,) of what the map may be wrong
-    by where no image says more"""
+    by where no image says more
+    """
 
     shared: Floats
     own: Floats
@@ -37,6 +35,7 @@ class Spread:
     prior: Floats
 
     def of(self, images: list[int]) -> Spread:
+        """The same for some of the images."""
         return Spread(self.shared, self.own[images], self.shared_px, self.own_px[images], self.prior)
 
 

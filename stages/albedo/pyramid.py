@@ -1,13 +1,13 @@
 """Structure by size: Laplacian pyramids of images with gaps (Burt & Adelson 1983, IEEE Trans. Commun. 31:532), each
-level smoothed by normalised convolution (Knutsson & Westin 1993, CVPR:515) so that unknown pixels say nothing."""
+level smoothed by normalised convolution (Knutsson & Westin 1993, CVPR:515) so that unknown pixels say nothing.
+"""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Floats32 = NDArray[np.float32]
+from stages.common.arrays import Floats32
 
 LEVELS = 5  # bands of 1, 2, 4, 8 and 16 px; everything larger is one band more
 CELL_PX = 1 << LEVELS
@@ -38,8 +38,10 @@ def collapse(levels: list[Floats32]) -> Floats32:
 
 
 def reduce(values: Floats32) -> Floats32:
+    """(H, W) -> half as many rows and columns, Gaussian-smoothed."""
     return np.asarray(cv2.pyrDown(values), np.float32)
 
 
 def enlarge(values: Floats32, shape: tuple[int, ...]) -> Floats32:
+    """(h, w) -> ``shape``, twice as many rows and columns."""
     return np.asarray(cv2.pyrUp(values, dstsize=(shape[1], shape[0])), np.float32)

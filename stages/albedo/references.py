@@ -13,19 +13,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.physics.horizon.scene import Overview, horizon_in_scene
 from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import ASTRONOMICAL_UNIT, Frame
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import Grid
-from stages.physics.maps.window import Window
+from stages.physics.maps.window import Box, Window
 from stages.physics.terrain.shading import Light, shade_block
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.surface import SHADOWED, Surface
-
-Floats32 = NDArray[np.float32]
-Box = tuple[int, int, int, int]  # row, col, height, width
 
 OPEN_IMAGES = 64  # files that stay open between windows
 SHADOW_MARGIN_PX = 2  # a shadow's edge lies so well where the DEM and the registration say
@@ -35,7 +33,8 @@ TURN = 30e3  # m over which the Sun's azimuth turns by 1 deg on the Moon
 @dataclass(frozen=True)
 class Look:
     """One photograph on a window. measured : (h, w) as in the file, NaN where it shows no known ground; predicted : (h, w)
-    I/F, 0 in shadow; usable : (h, w) bool, lit and away from shadows; shadow : (h, w) bool; sun_sine : of the Sun's elevation"""
+    I/F, 0 in shadow; usable : (h, w) bool, lit and away from shadows; shadow : (h, w) bool; sun_sine : of the Sun's elevation
+    """
 
     measured: Floats32
     predicted: Floats32

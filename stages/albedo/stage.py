@@ -28,6 +28,7 @@ from stages.albedo.pyramid import HALO_PX, LEVELS
 from stages.albedo.references import Box, References
 from stages.albedo.registered import register
 from stages.albedo.writing import Maps, copy_map, kept_attributes
+from stages.common.arrays import Floats32
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import find_body
 from stages.physics.horizon.scene import make_overview
@@ -35,8 +36,6 @@ from stages.physics.images.table import Frame, load_frames
 from stages.physics.maps.geotiff import write_geotiff
 from stages.physics.maps.grid import read_grid
 from stages.physics.terrain.surface import Surface, open_surface
-
-Floats32 = NDArray[np.float32]
 
 BLOCK_PX = 768
 STACK_PX = 64 << 20  # pixels of all images of a block, with what lies around it: 1.3 GB with all that is made of them

@@ -55,6 +55,7 @@ class Maps:
         self._writer, self._frames, self._calibration = writer, frames, calibration
 
     def put(self, block: Box, *values: NDArray) -> None:
+        """Write one block of every map, each (height, width)."""
         row, col, height, width = block
         for target, part in zip(self._maps, values, strict=True):
             target[row : row + height, col : col + width] = part

@@ -32,7 +32,5 @@ if TYPE_CHECKING:
     from stages.diagnose.result.answer import Answer
     from stages.diagnose.stage import Result, diagnose, run
 
-__getattr__ = imported_later(
-    __name__, {"Answer": "result.answer", "Result": "stage", "diagnose": "stage", "run": "stage"}
-)
+__getattr__ = imported_later(__name__, "stage", "result.answer")
 __all__ = ["Answer", "Config", "Result", "diagnose", "run"]

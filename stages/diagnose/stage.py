@@ -35,6 +35,8 @@ from stages.pairs.reader import PairReader
 
 @dataclass
 class Result:
+    """What a run gives; ``state`` and ``outcome`` are None where nothing was searched."""
+
     answer: Answer
     state: State | None
     outcome: Outcome | None

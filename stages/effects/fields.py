@@ -20,7 +20,10 @@ def slope(elevation: Tensor, gsd: float) -> Tensor:
 
 
 def curvature(elevation: Tensor, gsd: float) -> Tensor:
-    """Laplacian of the height after a blur of 2 px, 1/m."""
+    """Laplacian of the height after a blur of 2 px, 1/m.
+
+    elevation : (B, H, W), m; returns (B, H, W)
+    """
     level = elevation - elevation.mean(dim=(-2, -1), keepdim=True)
     return laplacian(gaussian(level, CURVATURE_SIGMA2), gsd)
 

@@ -10,9 +10,5 @@ from stages.evaluate.config import Config
 if TYPE_CHECKING:
     from stages.evaluate.stage import run, run_in_parts
 
-__getattr__ = imported_later(__name__, {"run": "stage", "run_in_parts": "stage"})
-__all__ = [
-    "Config",
-    "run",
-    "run_in_parts",
-]
+__getattr__ = imported_later(__name__, "stage")
+__all__ = ["Config", "run", "run_in_parts"]

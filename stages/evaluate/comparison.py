@@ -41,6 +41,7 @@ class Task:
 
     @property
     def calibrated(self) -> bool:
+        """Whether the images are in I/F."""
         return self.units == "iof"
 
     def rows(self) -> list[Row]:

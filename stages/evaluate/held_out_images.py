@@ -23,6 +23,7 @@ from schemas import EVALUATION, SVBRDF, ArtefactError, ArtefactWriter, check_out
 from schemas.files.companions import companions_of
 from schemas.files.outputs import Output
 from schemas.reading import read_strings
+from stages.common.arrays import Floats
 from stages.common.intervals import ERROR, choose_units, gain_interval, ratio_interval
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.evaluate.coverage import BANDS_DEG, count_within, shares
@@ -33,8 +34,6 @@ from stages.physics.formation.radiometry import crop_range, match_crops
 from stages.physics.maps.grid import unit_vectors
 from stages.physics.photometry import get_model
 from stages.physics.terrain.surface import SHADOWED, AlbedoError
-
-Floats = NDArray[np.float64]
 
 CLAIM = "seen ground, unseen images"
 ROWS = ("terrain", "albedo", "terrain_gain_offset", "albedo_gain_offset")
@@ -164,7 +163,8 @@ def _score(
     reader: PairReader, maps: Sequence[Map], chosen: Sequence[tuple[int, int]], writer: ArtefactWriter, progress: Any
 ) -> dict[str, NDArray]:
     """Sums of squares (rows, pairs), pixels, ssim, nearest Suns (rad); ``within`` (3, bands, pairs): pixels
-    by incidence, and of those the ones within the 68 and the 95 % intervals."""
+    by incidence, and of those the ones within the 68 and the 95 % intervals.
+    """
     count = len(chosen)
     found: dict[str, NDArray] = {
         "squares": np.zeros((len(ROWS), count)),

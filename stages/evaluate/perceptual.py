@@ -31,6 +31,7 @@ class Perceptual:
 
     @property
     def available(self) -> bool:
+        """Whether LPIPS can be had here."""
         return self.metric is not None
 
     @torch.no_grad()

@@ -26,9 +26,14 @@ class Reader(Protocol):
     site: np.ndarray
     frame: np.ndarray
 
-    def observation(self, indices: np.ndarray) -> Observation: ...
-    def image(self, indices: np.ndarray) -> Tensor: ...
-    def valid(self, indices: np.ndarray) -> Tensor: ...
+    def observation(self, indices: np.ndarray) -> Observation:
+        """Everything about these pairs but their images."""
+
+    def image(self, indices: np.ndarray) -> Tensor:
+        """(B, H, W) measured."""
+
+    def valid(self, indices: np.ndarray) -> Tensor:
+        """(B, H, W) bool."""
 
 
 class Predictor(Protocol):
@@ -36,9 +41,14 @@ class Predictor(Protocol):
 
     model: ReflectanceModel
 
-    def coefficients(self, elevation: Tensor) -> Tensor: ...
-    def coefficients_and_deviations(self, elevation: Tensor) -> tuple[Tensor, dict[str, Tensor]]: ...
-    def parameters(self) -> Iterator[Tensor]: ...
+    def coefficients(self, elevation: Tensor) -> Tensor:
+        """(B, H, W) m -> (B, C, H, W)."""
+
+    def coefficients_and_deviations(self, elevation: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """(B, H, W) m -> (B, C, H, W), and standard deviations (B, H, W) by name."""
+
+    def parameters(self) -> Iterator[Tensor]:
+        """Its weights; they tell the device."""
 
 
 @dataclass
@@ -69,6 +79,7 @@ def read_batch(reader: Reader, indices: np.ndarray, scale: float) -> Batch:
 
 
 def batches(indices: np.ndarray, size: int) -> Iterator[np.ndarray]:
+    """The indices (n,) in parts of at most ``size``."""
     for start in range(0, len(indices), size):
         yield indices[start : start + size]
 
@@ -155,6 +166,7 @@ class Constant:
     values: np.ndarray
 
     def __call__(self, batch: Batch) -> Tensor:
+        """The values, for every pixel alike."""
         return torch.as_tensor(self.values, dtype=torch.float32)[None, :, None, None]
 
 

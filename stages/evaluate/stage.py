@@ -39,6 +39,7 @@ class Files:
 
     @property
     def inputs(self) -> list[Path]:
+        """What no output may replace."""
         return [self.pairs, *self.checkpoints, *([Path(self.extend)] if self.extend else [])]
 
     @property

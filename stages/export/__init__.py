@@ -10,9 +10,5 @@ from stages.export.config import Config
 if TYPE_CHECKING:
     from stages.export.onnx_file import Summary, run
 
-__getattr__ = imported_later(__name__, {"Summary": "onnx_file", "run": "onnx_file"})
-__all__ = [
-    "Config",
-    "Summary",
-    "run",
-]
+__getattr__ = imported_later(__name__, "onnx_file")
+__all__ = ["Config", "Summary", "run"]

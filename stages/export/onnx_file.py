@@ -18,7 +18,7 @@ from schemas.files.outputs import Output
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.export.card import model_card
 from stages.export.config import Config
-from stages.network.maps import CoefficientMaps
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.normalisation import scale_elevation
 from stages.network.predictor import Predictor, load_predictor
 from stages.network.unet import UNet
@@ -53,11 +53,7 @@ class _Exported(torch.nn.Module):
 
 
 def run(
-    checkpoint: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
+    checkpoint: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Summary:
     """Write ``output`` (.onnx) and its card beside it (.md). Raises LunargrError."""
     output = Output.of(output)

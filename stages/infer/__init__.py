@@ -11,19 +11,7 @@ if TYPE_CHECKING:
     from stages.infer.stage import check_body, check_files, count_bands, open_terrain, run, summarise
     from stages.infer.windows import axis_windows, blend_weights
 
-__getattr__ = imported_later(
-    __name__,
-    {
-        "check_body": "stage",
-        "check_files": "stage",
-        "count_bands": "stage",
-        "open_terrain": "stage",
-        "run": "stage",
-        "summarise": "stage",
-        "axis_windows": "windows",
-        "blend_weights": "windows",
-    },
-)
+__getattr__ = imported_later(__name__, "stage", "windows")
 __all__ = [
     "Config",
     "Summary",

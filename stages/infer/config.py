@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class Config:
     """window, stride : px; windows overlap by their difference and are blended; None: as large as the machine likes best;
-    offset : px, shifts their grid; precision : fp32, bf16, or auto (see ``stages.network.runtime``); geotiff : whether the
+    offset : px, shifts their grid; precision : fp32, bf16, or auto (see ``stages.network.precision``); geotiff : whether the
     map is written as a GeoTIFF as well.
     """
 

@@ -38,8 +38,8 @@ from stages.infer.terrain import TerrainReader, valid_part
 from stages.infer.windows import Box, axis_windows, own_rows, swaths_of, window_and_stride, windows_of
 from stages.infer.writing import Blend, Outputs
 from stages.network.cpu.mapper import Mapper
+from stages.network.precision import check_precision, choose_inference_precision
 from stages.network.predictor import choose_device, load_predictor
-from stages.network.runtime import check_precision, choose_inference_precision
 from stages.pairs.holes import fill_holes
 from stages.physics.maps.geotiff import EVEN, MapTiff, band_names, map_tags
 from stages.physics.maps.grid import check_same_body, read_grid

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from schemas import ConfigError
 from stages.infer.config import Config
-
-Box = tuple[int, int, int, int]  # row, col, height, width
+from stages.physics.maps.window import Box
 
 BAND = 1024  # rows, by which shards share a map out; the window where the network cannot run strip by strip
 # Context costs a wide window little, and one that runs from north to south nothing but at its ends. Memory follows the width.

@@ -19,19 +19,7 @@ if TYPE_CHECKING:
         summarise,
     )
 
-__getattr__ = imported_later(
-    __name__,
-    {
-        "Summary": "stage",
-        "check_positions": "stage",
-        "count_bands": "stage",
-        "image_names": "stage",
-        "is_artefact": "stage",
-        "run": "stage",
-        "source_files": "stage",
-        "summarise": "stage",
-    },
-)
+__getattr__ = imported_later(__name__, "stage")
 __all__ = [
     "Config",
     "Summary",

@@ -48,6 +48,7 @@ def area_mean(fine: NDArray, factor: int) -> NDArray[np.float32]:
 def write_elevation(
     dem: Path, dataset: DatasetReader, plan: Plan, config: Config, writer: ArtefactWriter, progress: Progress
 ) -> tuple[int, float, float]:
+    """Resample the DEM onto the grid, piece by piece; valid pixels, lowest and highest elevation, m."""
     grid = plan.grid
     elevation, dem_valid = writer.dataset("elevation"), writer.dataset("dem_valid")
     first, last = writer.file.attrs.get("shard_rows", (0, grid.height))

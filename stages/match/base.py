@@ -69,6 +69,7 @@ def _load_all() -> None:
 
 
 def matcher_names() -> list[str]:
+    """The registered matchers, sorted."""
     _load_all()
     return sorted(_MATCHERS)
 

@@ -37,6 +37,7 @@ class Comparison:
 
 
 def is_artefact(path: Path) -> bool:
+    """Whether a file's name is that of an artefact, not of a picture."""
     return path.suffix.lower() in (".h5", ".hdf5", ".nc")
 
 

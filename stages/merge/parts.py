@@ -45,6 +45,7 @@ class Parts:
 
     @property
     def by_rows(self) -> bool:
+        """Whether parts are rows of a map, not records."""
         return self.record is None
 
     @property

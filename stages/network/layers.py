@@ -25,6 +25,7 @@ class BatchNorm(nn.BatchNorm2d):
     """
 
     def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) normalised by the statistics of the batch over all processes."""
         if not (self.training and shared()):
             return super().forward(x)
         y, mean, variance, count = _SharedNorm.apply(x, self.weight, self.bias, self.eps)
@@ -33,7 +34,10 @@ class BatchNorm(nn.BatchNorm2d):
 
     @torch.no_grad()
     def note(self, mean: Tensor, variance: Tensor, count: Tensor) -> None:
-        """Let a batch's statistics (float64) into the running ones."""
+        """Update the running statistics with those of a batch (float64).
+
+        mean, variance : (C,); count : (), values per channel
+        """
         assert self.running_mean is not None and self.running_var is not None and self.momentum is not None
         assert self.num_batches_tracked is not None
         self.num_batches_tracked += 1
@@ -83,7 +87,7 @@ class _SharedNorm(torch.autograd.Function):
 
 
 class Dropout(nn.Module):
-    """Dropout whose pattern hangs on a key of each crop and on the layer, and on nothing else.
+    """Dropout whose pattern depends on a key of each crop and on the layer, and on nothing else.
 
     A crop loses the same values whichever process works on it, and beside whichever other crops.
     """
@@ -93,6 +97,7 @@ class Dropout(nn.Module):
         self.p, self.layer = p, layer
 
     def forward(self, x: Tensor, keys: Tensor) -> Tensor:
+        """x : (B, C, H, W); keys : (B,) int64."""
         if not self.training or self.p == 0:
             return x
         kept, scale = kept_values(keys, self.layer, self.p, x.shape[1:])
@@ -111,7 +116,10 @@ def dropout_threshold(p: float) -> tuple[int, float]:
 
 
 def layer_keys(keys: Tensor, layer: int) -> tuple[Tensor, Tensor]:
-    """Two 32-bit numbers per crop for one layer: the finaliser of splitmix64 (Steele et al. 2014) on its key."""
+    """Two 32-bit numbers per crop for one layer: the finaliser of splitmix64 (Steele et al. 2014) on its key.
+
+    keys : (B,) int64; returns (B,) each
+    """
     step = (layer + 1) * 0x9E3779B97F4A7C15 % 2**64
     z = keys + (step - 2**64 if step >= 2**63 else step)
     z = (z ^ (z >> 30 & 0x3FFFFFFFF)) * -4658895280553007687

@@ -9,12 +9,15 @@ from torch import Tensor, nn
 
 
 def squared_error(predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
-    """Sum of squared errors over valid pixels; its gradient is that in ``predicted`` only."""
+    """Sum of squared errors over valid pixels; its gradient is that in ``predicted`` only.
+
+    predicted, measured, valid : (B, H, W), in the same unit
+    """
     return _SquaredError.apply(predicted, measured, valid)
 
 
 class _SquaredError(torch.autograd.Function):
-    """One pass back, where autograd takes four: the residual, 0 where invalid, is its own gradient."""
+    """The residual, 0 where invalid, is kept as the gradient: one pass over memory, where autograd takes four."""
 
     @staticmethod
     def forward(ctx: Any, predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
@@ -26,11 +29,6 @@ class _SquaredError(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
         (residual,) = ctx.saved_tensors
         return residual * (2 * gradients[0]), None, None
-
-
-def masked_mse(predicted: Tensor, measured: Tensor, valid: Tensor) -> Tensor:
-    """Mean squared error over valid pixels; 0 where there are none."""
-    return squared_error(predicted, measured, valid) / valid.sum().clamp(min=1)
 
 
 def crop_errors(predicted: Tensor, measured: Tensor, valid: Tensor, brightness: float) -> tuple[Tensor, Tensor]:
@@ -65,9 +63,11 @@ class Radiometry(nn.Module):
         self.shift = nn.Parameter(offset / scale, requires_grad=not calibrated)
 
     def gain(self) -> Tensor:
+        """(F,) of each image."""
         return self.scale * (self.log_gain - self.log_gain.mean()).exp()
 
     def offset(self) -> Tensor:
+        """(F,) of each image."""
         return self.scale * self.shift
 
     def of_crops(self, frame: Tensor) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,10 @@ MAXIMUM_PIXELS = 30_000
 
 
 def batches_of(reader: PairReader, indices: NDArray[np.int64], size: int = 32) -> Iterator[Batch]:
-    """At most about MAXIMUM_PAIRS of some pairs."""
+    """Batches of evenly chosen pairs, at most about MAXIMUM_PAIRS of them.
+
+    indices : (n,), of pairs
+    """
     step = max(1, len(indices) // MAXIMUM_PAIRS)
     chosen = indices[::step]
     for first in range(0, len(chosen), size):
@@ -59,7 +62,9 @@ def sample_pixels(
     found: list[list[Tensor]] = []
     for batch in batches_of(reader, indices):
         o = batch.observation
-        seen = facets.look(o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius)
+        seen = facets.angles_and_light(
+            o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius
+        )
         assert seen is not None and o.frame is not None  # on the CPU, without gradients
         angles, light = seen
         image = (batch.image - offset[o.frame, None, None]) / gain[o.frame, None, None]

@@ -16,9 +16,9 @@ from torch import Tensor
 from schemas.artefacts import CHECKPOINT
 from schemas.errors import ArtefactError, ConfigError, RegistryError
 from schemas.reading import open_artefact, read_config, read_strings
-from stages.network.maps import CoefficientMaps
+from stages.network.checkpoint_layout import check_finite, check_weights, read_layout
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.normalisation import scale_elevation
-from stages.network.stored import check_finite, check_weights, read_layout
 from stages.network.unet import UNet
 from stages.physics.photometry import get_model
 
@@ -96,7 +96,10 @@ def choose_device(name: str) -> torch.device:
 
 
 def write_state(group: h5py.Group, state: Mapping[str, Tensor]) -> None:
-    """A state dict as plain HDF5 arrays, no pickle."""
+    """A state dict as plain HDF5 arrays, no pickle.
+
+    state : by name, tensors of any shape
+    """
     for name, tensor in state.items():
         group.create_dataset(name, data=tensor.detach().cpu().numpy(), track_order=True)
 

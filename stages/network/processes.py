@@ -22,7 +22,10 @@ def join_group() -> tuple[int, int]:
 
 
 def sum_gradients(parameters: Sequence[Tensor]) -> None:
-    """Each process has the gradient of its share of the loss: add them up."""
+    """Each process has the gradient of its share of the loss: add them up.
+
+    parameters : tensors of any shape
+    """
     flat = torch.cat([(p.grad if p.grad is not None else torch.zeros_like(p)).reshape(-1) for p in parameters])
     dist.all_reduce(flat)
     offset = 0
@@ -32,12 +35,14 @@ def sum_gradients(parameters: Sequence[Tensor]) -> None:
 
 
 def sum_over_ranks(values: Tensor, ranks: int) -> Tensor:
+    """The sum over all processes, in place; values : any shape."""
     if ranks > 1:
         dist.all_reduce(values)
     return values
 
 
 def mean_over_ranks(total: float, weight: float, ranks: int, device: torch.device) -> float:
+    """Weighted mean over all processes; NaN without weight."""
     sums = torch.tensor([total, weight], dtype=torch.float64, device=device)
     if ranks > 1:
         dist.all_reduce(sums)

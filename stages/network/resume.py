@@ -30,6 +30,7 @@ class History:
 
 
 def snapshot(predictor: Predictor, radiometry: Radiometry) -> dict[str, Tensor]:
+    """A copy of all weights, by name."""
     state = {f"predictor/{k}": v.detach().clone() for k, v in predictor.state_dict().items()}
     return state | {f"radiometry/{k}": v.detach().clone() for k, v in radiometry.state_dict().items()}
 
@@ -44,6 +45,7 @@ def save(
     best: dict[str, Tensor],
     precision: str,
 ) -> None:
+    """Write the state of an unfinished run, whole or not at all; best : weights of the best epoch, tensors of any shape."""
     state = optimizer.state_dict()
     with atomic_path(sidecar) as partial, h5py.File(partial, "w", track_order=True) as file:
         file.attrs["identity"] = identity
@@ -75,7 +77,10 @@ def restore(
     best: dict[str, Tensor],
     device: torch.device,
 ) -> str:
-    """Load the state of an interrupted run; returns its precision. Raises ArtefactError where it was another run's."""
+    """Load the state of an interrupted run; returns its precision. Raises ArtefactError where it was another run's.
+
+    best : the weights of the best epoch so far, tensors of any shape, changed in place
+    """
     silence_hdf5()
     try:
         with h5py.File(sidecar, "r") as file:

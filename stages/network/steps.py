@@ -31,6 +31,8 @@ def order_steps(
     """The batches of one epoch for this process: (pair indices, symmetries), and the crops' keys for dropout.
 
     Every process gets as many batches; what a crop meets does not depend on the process that works on it.
+
+    train : (n,), indices of pairs
     """
     order = rng.permutation(train)
     turns = rng.integers(0, symmetries.COUNT, len(order)) if augment else None
@@ -48,7 +50,10 @@ def order_steps(
 def prefetch(
     reader: PairReader, steps: Sequence[tuple[NDArray, NDArray | None]], device: torch.device
 ) -> Iterator[Batch]:
-    """Batches in order, the next one read while the current one is worked on."""
+    """Batches in order, the next one read while the current one is worked on.
+
+    steps : pair indices (b,) and symmetries (b,), or None, of each batch
+    """
     with ThreadPoolExecutor(1) as pool:
         waiting = None
         for indices, turns in steps:

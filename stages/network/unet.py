@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from stages.network.cpu.fused_layers import join, norm_act, pool, quarter_weights
+from stages.network.crop_sums import convolution
 from stages.network.layers import SLOPE, BatchNorm, Dropout, draw_keys
-from stages.network.pieces import convolution
 
 WIDTHS = (16, 32, 64, 128, 256)
 DROPOUT = (0.1, 0.1, 0.2, 0.2, 0.3)
@@ -29,13 +29,17 @@ class HeightConv(nn.Conv2d):
             self.weight *= 16
 
     def differences(self, x: Tensor) -> Tensor:
-        """The convolution without its bias."""
+        """The convolution without its bias.
+
+        x : (B, 1, H, W); returns (B, C, H, W)
+        """
         # bfloat16 keeps three digits of a height, which would leave little of a slope: float32, whatever the rest is in.
         with torch.autocast(x.device.type, enabled=False):
             weight = self.weight - self.weight.mean(dim=(2, 3), keepdim=True)
             return convolution(functional.pad(x.float(), (1, 1, 1, 1), mode="replicate"), weight)
 
     def forward(self, x: Tensor) -> Tensor:
+        """x : (B, 1, H, W), scaled heights; returns (B, C, H, W)."""
         assert self.bias is not None
         y = self.differences(x) + self.bias[:, None, None]
         kind = x.device.type
@@ -62,12 +66,16 @@ class Block(nn.Sequential):
         )
 
     def forward(self, x: Tensor, keys: Tensor) -> Tensor:  # type: ignore[override]
+        """x : (B, C, H, W); keys : (B,); returns (B, D, H, W)."""
         for step in self:
             x = step(x, keys) if isinstance(step, Dropout) else step(x)
         return x
 
     def fused(self, x: Tensor, keys: Tensor, pad: int) -> Tensor:
-        """The same in fewer passes on the CPU. x has its edges continued by a pixel already (heights do not)."""
+        """The same in fewer passes on the CPU. x has its edges continued by a pixel already (heights do not).
+
+        x : (B, C, H + 2, W + 2), or (B, 1, H, W) of heights; keys : (B,); returns (B, D, H + 2 pad, W + 2 pad)
+        """
         entry, first, _, drop, second, last, _ = self
         assert isinstance(entry, nn.Conv2d) and isinstance(first, BatchNorm) and isinstance(drop, Dropout)
         assert isinstance(second, nn.Conv2d) and isinstance(last, BatchNorm) and entry.bias is not None
@@ -134,7 +142,10 @@ class UNet(nn.Module):
         return self.plain_features(x, keys)
 
     def plain_features(self, x: Tensor, keys: Tensor) -> Tensor:
-        """The same as one writes a network down."""
+        """The features by plain PyTorch operations: what GPUs run and the fused form is tested against.
+
+        x : (B, 1, H, W), scaled heights; keys : (B,); returns (B, F, H, W)
+        """
         kept = []
         for block in self.down[:-1]:
             x = block(x, keys)

@@ -43,6 +43,8 @@ def fit_radiometry(
     """Gain and offset of each image against a uniform surface (default: the reference), by least squares over ``indices``.
 
     Images without pairs there take the mean gain and offset; calibrated images keep 1 and 0.
+
+    indices : (n,), of pairs; uniform : (C,) coefficients of ``model``
     """
     frames = len(reader.image_ids)
     if reader.units == "iof":
@@ -119,7 +121,10 @@ def _solve_positive(gram: Tensor, right: Tensor) -> Tensor:
 
 
 def elevation_scale(reader: PairReader, indices: NDArray[np.int64]) -> float:
-    """Std of the crop-centred elevations over ``indices``, m."""
+    """Std of the crop-centred elevations over ``indices``, m.
+
+    indices : (n,), of pairs
+    """
     total, count = 0.0, 0
     for first in range(0, len(indices), 256):
         z = reader.elevation(indices[first : first + 256]).double()

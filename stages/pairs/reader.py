@@ -35,13 +35,13 @@ class Batch:
     valid: Tensor
 
     def to(self, device: torch.device) -> Batch:
+        """The same on another device; the observation is moved in place."""
         o = self.observation
         for name in (
             "elevation",
             "sun_direction",
             "camera_position",
             "sun_horizon",
-            "sky_view",
             "detector_sample",
             "detector_line",
             "frame",
@@ -51,7 +51,7 @@ class Batch:
         return Batch(o, self.image.to(device, non_blocking=True), self.valid.to(device, non_blocking=True))
 
 
-FIELDS = ("elevation", "image", "valid", "sun_horizon_deg", "sky_view")
+FIELDS = ("elevation", "image", "valid", "sun_horizon_deg")
 DETECTOR = ("detector_sample", "detector_line")
 
 
@@ -98,6 +98,7 @@ class PairReader:
         self._check_any_valid()
 
     def close(self) -> None:
+        """Close the file."""
         self._stack.close()
 
     def __enter__(self) -> PairReader:
@@ -168,7 +169,6 @@ class PairReader:
             gsd=self.gsd,
             body_radius=self.body_radius,
             sun_horizon=optional("sun_horizon_deg"),
-            sky_view=optional("sky_view"),
             detector_sample=optional("detector_sample"),
             detector_line=optional("detector_line"),
             frame=torch.from_numpy(self.frame[rows]),
@@ -223,7 +223,7 @@ def _without_holes(elevation: NDArray[np.float32]) -> NDArray[np.float32]:
 def _turn(batch: Batch, symmetries: NDArray) -> None:
     o = batch.observation
     fields = [batch.image, batch.valid, o.elevation]
-    fields += [f for f in (o.sun_horizon, o.sky_view, o.detector_sample, o.detector_line) if f is not None]
+    fields += [f for f in (o.sun_horizon, o.detector_sample, o.detector_line) if f is not None]
     for k, symmetry in enumerate(symmetries):
         if symmetry:
             for field in fields:

@@ -49,6 +49,7 @@ class Mapping:
             self._map.madvise(mmap.MADV_DONTNEED)
 
     def close(self) -> None:
+        """Let go of the file."""
         self.bytes = np.empty(0, np.uint8)
         os.close(self._fd)
         with contextlib.suppress(BufferError):  # somebody still looks at it: it is closed with the last of them

@@ -13,20 +13,7 @@ if TYPE_CHECKING:
     from stages.project.stage import run
     from stages.project.summary import Registered, Summary, summarise
 
-__getattr__ = imported_later(
-    __name__,
-    {
-        "Geometry": "geometry",
-        "crop_geometry": "geometry",
-        "count_pairs": "inputs",
-        "scene_of": "inputs",
-        "source_files": "inputs",
-        "run": "stage",
-        "Registered": "summary",
-        "Summary": "summary",
-        "summarise": "summary",
-    },
-)
+__getattr__ = imported_later(__name__, "stage", "geometry", "inputs", "summary")
 __all__ = [
     "Config",
     "Geometry",

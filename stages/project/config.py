@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from schemas.errors import ConfigError
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
 class Config:
     """scene : overrides the scene that crops.h5 names; register : None, or the freest form of displacement that may be taken
     off ('constant', 'affine', 'field'); max_shift : px searched; exact : keep float32 as it is instead of the digits that
-    matter."""
+    matter.
+    """
 
     scene: str | None = None
     shard: tuple[int, int] = (0, 1)

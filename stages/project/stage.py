@@ -30,11 +30,7 @@ OF_THE_CROP = ("longitude_deg", "latitude_deg", "row", "col", "image_index", "si
 
 
 def run(
-    crops: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
+    crops: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Summary:
     """Write ``pairs.h5``. Raises ArtefactError, ConfigError, InputError or GeometryError; then nothing is written."""
     output = Output.of(output)
@@ -77,13 +73,15 @@ class Crops:
 
     @property
     def size(self) -> int:
+        """px, of a crop's side"""
         return int(self.file["elevation"].shape[1])
 
 
 @dataclass(frozen=True)
 class View:
     """What one image shows of its crops. rows, cols : (m,) of their middles; mean : (m,) m; local : their frames;
-    field : what registration takes off, None without"""
+    field : what registration takes off, None without
+    """
 
     source: Source
     field: Field | None

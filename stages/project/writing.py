@@ -27,7 +27,8 @@ DISPLACEMENT = ("displacement_col_px", "displacement_row_px")
 @dataclass(frozen=True)
 class Pair:
     """One crop of one image. image, elevation, valid, horizon (rad) : (h, w); sun, camera : (3,);
-    displacement : (dx, dy) px at its middle, taken off; ortho : the camera's side, None for map-projected images"""
+    displacement : (dx, dy) px at its middle, taken off; ortho : the camera's side, None for map-projected images
+    """
 
     image: NDArray[np.float32]
     elevation: NDArray[np.float32]
@@ -89,6 +90,7 @@ class Tally:
     emission: list[float] = field(default_factory=list)
 
     def add(self, pair: Pair) -> None:
+        """Count one pair."""
         up = pair.sun[2]
         self.pairs += 1
         self.valid += int(pair.valid.sum())

@@ -12,12 +12,5 @@ if TYPE_CHECKING:
     from stages.render.stereo import run_stereo
     from stages.render.views import run_trajectory
 
-__getattr__ = imported_later(__name__, {"run": "stage", "run_stereo": "stereo", "run_trajectory": "views"})
-__all__ = [
-    "Config",
-    "StereoConfig",
-    "Summary",
-    "run",
-    "run_stereo",
-    "run_trajectory",
-]
+__getattr__ = imported_later(__name__, "stage", "stereo", "views")
+__all__ = ["Config", "StereoConfig", "Summary", "run", "run_stereo", "run_trajectory"]

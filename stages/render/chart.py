@@ -11,12 +11,10 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats
 from stages.physics.maps.grid import Grid, unit_vectors
-
-Floats = NDArray[np.float64]
 
 TOLERANCE = 0.005  # px, of the fitted polynomial against the projection itself
 _DEGREES = (1, 2, 3, 4, 5, 7, 9)
@@ -30,7 +28,6 @@ class Chart:
     forward : (2, n + 1, n + 1), coefficients of x^i y^j of (col, row), x and y in units of ``scale``
     scale : gnomonic coordinate that the polynomials count as 1
     reach : gnomonic coordinates beyond this are off the chart
-    error_px : largest miss against the projection on points that were not fitted
     """
 
     axes: Floats
@@ -38,15 +35,10 @@ class Chart:
     scale: float
     reach: float
     radius: float
-    error_px: float
 
     def to_local(self, points: Floats) -> Floats:
         """Body-fixed (..., 3) -> local frame, origin still at the body's centre."""
         return points @ self.axes.T
-
-    def to_body(self, points: Floats) -> Floats:
-        """Local frame (..., 3) -> body-fixed."""
-        return points @ self.axes
 
 
 def fit_chart(grid: Grid) -> Chart:
@@ -67,7 +59,7 @@ def fit_chart(grid: Grid) -> Chart:
         miss = _terms(check[2] / scale, check[3] / scale, degree) @ solution - np.stack([check[1], check[0]], axis=1)
         error = float(np.abs(miss).max())
         if error < TOLERANCE:
-            return Chart(axes, _square(np.asarray(solution, float), degree), scale, 1.02 * scale, grid.radius, error)
+            return Chart(axes, _square(np.asarray(solution, float), degree), scale, 1.02 * scale, grid.radius)
     raise GeometryError(
         f"the scene spans {height} x {width} px of {grid.gsd:g} m, too much of the body for one perspective view; "
         "crop it (gdal_translate -projwin) to what the camera can see."

@@ -62,7 +62,7 @@ class Config:
     model: str | None = None
     parameters: Mapping[str, float] = field(default_factory=dict)
     terrain_only: bool = False
-    extension: str | None = None
+    extend: str | None = None
     body: str | None = None
     backplanes_in_tif: bool = False
     export: str | None = None
@@ -106,7 +106,7 @@ class Summary:
 
 def inputs(source: Path, config: Config) -> list[Path]:
     """The files that no output may replace."""
-    return [source, *(Path(p) for p in (config.camera, config.extension) if p)]
+    return [source, *(Path(p) for p in (config.camera, config.extend) if p)]
 
 
 def output_files(output: Path, view: str) -> list[Path]:

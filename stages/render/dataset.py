@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from schemas.errors import InputError
 from schemas.files.outputs import atomic_path
+from stages.common.arrays import Floats
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
 from stages.render.pictures import DISPLAY_GAMMA, read_exr
 
-Floats = NDArray[np.float64]
 POINTS_PER_SIDE = 24  # of each view, on which the sparse points are picked
 SAME_PLACE = 2e-3  # of the distance: a point that another view sees this near is the same
 GL_AXES = np.diag([1.0, -1.0, -1.0])  # nerfstudio's cameras look along -z, with y up
@@ -111,7 +111,7 @@ def _write_image(path: Path, image: NDArray[np.float32], white: float) -> Path:
 def _write_world(path: Path, world: World, grid: Grid) -> Path:
     row, col = (grid.height - 1) / 2, (grid.width - 1) / 2
     lon, lat = (float(v) for v in grid.lonlat(row, col))
-    told = {
+    document = {
         "origin_mcmf": world.origin.tolist(),
         "axes_mcmf": dict(zip(("east", "north", "up"), world.axes.tolist(), strict=True)),
         "origin": {"longitude_deg": lon, "latitude_deg": lat, "height": 0.0},
@@ -119,7 +119,7 @@ def _write_world(path: Path, world: World, grid: Grid) -> Path:
         "unit": "m",
     }
     with atomic_path(path) as partial:
-        partial.write_text(json.dumps(told, indent=1))
+        partial.write_text(json.dumps(document, indent=1))
     return path
 
 
@@ -180,8 +180,8 @@ def _write_colmap(views: Sequence[View], world: World, target: Path) -> list[Pat
     cameras, images = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"], ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"]
     for k, view in enumerate(views):
         c = view.camera
-        numbers = (*c.focal_px, *c.principal_point_px)
-        cameras.append(f"{k + 1} PINHOLE {c.samples} {c.lines} {' '.join(f'{v:.9g}' for v in numbers)}")
+        intrinsics = (*c.focal_px, *c.principal_point_px)
+        cameras.append(f"{k + 1} PINHOLE {c.samples} {c.lines} {' '.join(f'{v:.9g}' for v in intrinsics)}")
         rotation, place = world.pose(c)
         pose = (*quaternion(rotation.T), *(-rotation.T @ place))
         images.append(f"{k + 1} {' '.join(f'{v:.12g}' for v in pose)} {k + 1} {view.view_id}.png")

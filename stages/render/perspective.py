@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rasterio.transform import Affine
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats, Floats32
 from stages.physics.cameras.base import Camera
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.formation.chain import Observation, State
@@ -26,9 +27,6 @@ from stages.physics.terrain.surface import Surface
 from stages.render.ray_points import HitAngles, hit_angles, hit_points, sample_maps
 from stages.render.raycast import HIT, MISS, HeightField, Hits, build_height_field, cast
 from stages.render.viewpoint import pixel_footprint
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 MOST_SAMPLES = 8  # rays per pixel and axis; beyond, the terrain itself is averaged first
 RAYS_AT_ONCE = 1 << 19
@@ -56,7 +54,7 @@ class Scene:
     distance: float
 
 
-def look(
+def seen_window(
     surface: Surface, camera: Camera, relief: tuple[float, float], samples: int | None
 ) -> tuple[Window, int, int, float]:
     """Which window of the map a camera can see, samples per pixel and axis, coarsening factor, distance to the ground.
@@ -105,7 +103,10 @@ def look(
 
 
 def shell_crossing(origins: Floats, directions: Floats, inner: float, outer: float) -> tuple[Floats, Floats]:
-    """Distances along rays at which they enter and leave the shell between two spheres; NaN where they miss it."""
+    """Distances along rays at which they enter and leave the shell between two spheres; NaN where they miss it.
+
+    origins, directions : (n, 3), m and unit; inner, outer : radii, m; returns (n,) each, m
+    """
     along = (origins * directions).sum(-1)
     closest2 = (origins * origins).sum(-1) - along**2
     with np.errstate(invalid="ignore"):
@@ -155,7 +156,7 @@ def make_scene(
     surface: Surface, camera: Camera, light: Light, relief: tuple[float, float], samples: int | None
 ) -> Scene:
     """Read and prepare what a camera sees. Raises GeometryError."""
-    window, samples, factor, distance = look(surface, camera, relief, samples)
+    window, samples, factor, distance = seen_window(surface, camera, relief, samples)
     grid = surface.grid.window(*window)
     elevation = surface.elevation[window.part]
     horizon = None if light.horizon is None else light.horizon.window(*window)
@@ -194,7 +195,10 @@ def _added(surface: Surface, light: Light, window: Window) -> Floats32 | None:
 
 
 def coarsen(values: Floats32, factor: int) -> Floats32:
-    """Means of whole factor x factor blocks, over what is known (NaN where nothing is)."""
+    """Means of whole factor x factor blocks, over what is known (NaN where nothing is).
+
+    values : (H, W); returns (H // factor, W // factor)
+    """
     height, width = (n // factor for n in values.shape)
     blocks = values[: height * factor, : width * factor].reshape(height, factor, width, factor)
     known = np.isfinite(blocks)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from schemas.errors import InputError
 from schemas.files.outputs import atomic_path
+from stages.common.arrays import Floats32
 
-Floats32 = NDArray[np.float32]
 DISPLAY_GAMMA = 2.2
 
 
@@ -153,7 +153,10 @@ def stretch(
 
 
 def write_png(path: Path, image: Floats32, limits: tuple[float, float] | None = None) -> tuple[float, float]:
-    """A stretched 8-bit preview, transparent (and black beneath) where ``image`` is NaN; returns the limits used."""
+    """A stretched 8-bit preview, transparent (and black beneath) where ``image`` is NaN; returns the limits used.
+
+    image : (H, W), I/F
+    """
     grey, limits = stretch(image, limits)
     alpha = np.isfinite(image).astype(np.uint8)
     pixels = np.stack([grey * alpha, alpha * np.uint8(255)], axis=-1)

@@ -9,11 +9,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats
 from stages.physics.terrain.ground import slope_difference
 from stages.render.chart import chart_gradient
 from stages.render.raycast import HeightField, Hits, turn
-
-Floats = NDArray[np.float64]
 
 
 def hit_points(hits: Hits, origins: Floats, directions: Floats) -> Floats:
@@ -46,15 +45,6 @@ def hit_angles(field: HeightField, origins: Floats, directions: Floats, hits: Hi
     return HitAngles(*out)
 
 
-def surface_normals(field: HeightField, points: Floats, hits: Hits) -> Floats:
-    """(N, 3) body-fixed unit normals at body-fixed points (N, 3) from :func:`hit_points`."""
-    chart = field.chart
-    local = np.ascontiguousarray(chart.to_local(points))
-    normals = np.empty_like(local)
-    _normals(field.elevation, chart.forward, chart.scale, local, hits.row, hits.col, normals)
-    return chart.to_body(normals)
-
-
 @numba.njit(cache=True)
 def _normal(z, forward, scale, x, y, w, row, col):
     """Unit normal at the local point (x, y, w) over (row, col)."""
@@ -85,17 +75,6 @@ def _normal(z, forward, scale, x, y, w, row, col):
     nw = w * inverse + (hx * gx + hy * gy) / w
     norm = 1.0 / math.sqrt(nx * nx + ny * ny + nw * nw)
     return nx * norm, ny * norm, nw * norm
-
-
-@numba.njit(cache=True, parallel=True)
-def _normals(z, forward, scale, points, row, col, normals):
-    for n in numba.prange(points.shape[0]):
-        if row[n] == row[n]:
-            normals[n, 0], normals[n, 1], normals[n, 2] = _normal(
-                z, forward, scale, points[n, 0], points[n, 1], points[n, 2], row[n], col[n]
-            )
-        else:
-            normals[n, 0], normals[n, 1], normals[n, 2] = np.nan, np.nan, np.nan
 
 
 @numba.njit(cache=True, parallel=True)

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats
 from stages.physics.maps.grid import Grid
 from stages.render.chart import Chart, chart_position, fit_chart, step_length
-
-Floats = NDArray[np.float64]
 
 MISS, HIT, BELOW = 0, 1, 2  # a ray left the scene, met the surface, or came in under it (a hole or the scene's edge)
 
@@ -58,7 +57,10 @@ class Hits:
 
 
 def build_height_field(elevation: NDArray[np.float32], grid: Grid) -> HeightField:
-    """Prepare a DEM for rays: one pass over it. Raises GeometryError where it holds no cell of four known heights."""
+    """Prepare a DEM for rays: one pass over it. Raises GeometryError where it holds no cell of four known heights.
+
+    elevation : (H, W), m, NaN = unknown
+    """
     elevation = np.ascontiguousarray(elevation, np.float32)
     height, width = elevation.shape
     if height < 2 or width < 2:

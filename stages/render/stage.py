@@ -1,4 +1,4 @@
-"""The stage: one view."""
+"""One view of a terrain, as a map or through a camera."""
 
 from __future__ import annotations
 
@@ -9,17 +9,13 @@ from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import find_body
 from stages.render.config import Config, Summary, check, inputs, output_files
-from stages.render.maps import render_map
-from stages.render.setting import find_camera, make_light, open_source
+from stages.render.ortho import render_map
+from stages.render.setup import find_camera, make_light, open_source
 from stages.render.views import render_camera
 
 
 def run(
-    source: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
+    source: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Summary:
     """Render one view of ``source`` (svbrdf.h5, scene.h5 or a DEM). Raises LunargrError.
 

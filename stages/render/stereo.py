@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
 from schemas.files.outputs import Output, atomic_path, check_output
+from stages.common.arrays import Floats
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.cameras.pinhole import Pinhole
@@ -24,11 +25,9 @@ from stages.physics.terrain.surface import Surface
 from stages.render.config import SUN, Config, StereoConfig, check, output_files
 from stages.render.dataset import World, make_world, project, ray_directions
 from stages.render.pictures import read_exr, write_exr
-from stages.render.setting import make_light, open_source
+from stages.render.setup import make_light, open_source
 from stages.render.viewpoint import look_at, pinhole_view
 from stages.render.views import render_camera
-
-Floats = NDArray[np.float64]
 
 SPLITS = (("train", 0.8), ("validation", 0.1), ("test", 0.1))
 TILE_FOOTPRINTS = 2.0  # edge of a tile in footprints seen from straight above
@@ -65,7 +64,7 @@ def run_stereo(
         for number in range(stereo.count):
             progress(number, stereo.count, "pairs")
             pairs.append(_render_pair(f"pair_{number:05d}", surface, places, own, body, relief, world, folder))
-    told = {
+    document = {
         "source": source.name,
         "pixel_centre": 0.5,
         "unit": "m",
@@ -75,7 +74,7 @@ def run_stereo(
         "pairs": pairs,
     }
     with atomic_path(manifest) as partial:
-        partial.write_text(json.dumps(told, indent=1))
+        partial.write_text(json.dumps(document, indent=1))
     progress(stereo.count, stereo.count, "pairs")
     return manifest
 
@@ -130,8 +129,8 @@ class _Places:
 
 def _split_tiles(count: int, rng: np.random.Generator) -> list[str]:
     """A split per tile: shares as in SPLITS, at least one tile of each."""
-    numbers = [max(1, round(share * count)) for _, share in SPLITS[1:]]
-    names = [name for (name, _), n in zip(SPLITS[1:], numbers, strict=True) for _ in range(n)]
+    counts = [max(1, round(share * count)) for _, share in SPLITS[1:]]
+    names = [name for (name, _), n in zip(SPLITS[1:], counts, strict=True) for _ in range(n)]
     names = ["train"] * (count - len(names)) + names
     return [names[k] for k in rng.permutation(count)]
 

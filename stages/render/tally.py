@@ -7,11 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.render.config import Summary
-
-Floats32 = NDArray[np.float32]
 
 
 def skipped(view_id: str, files: Sequence[Path], size: tuple[int, int]) -> Summary:
@@ -29,6 +27,7 @@ class Tally:
         self.low, self.high = math.inf, -math.inf
 
     def add(self, band: Mapping[str, Floats32]) -> None:
+        """Count one band: ``image``, ``shadow``, ``incidence_deg`` and ``clipped``, (h, w) each."""
         image, known = band["image"], np.isfinite(band["image"])
         self.pixels += image.size
         self.known += int(known.sum())
@@ -40,6 +39,7 @@ class Tally:
             self.low, self.high = min(self.low, float(incidence.min())), max(self.high, float(incidence.max()))
 
     def summary(self, view_id: str, files: Sequence[Path], size: tuple[int, int], samples: int) -> Summary:
+        """The counts as a summary; size : samples and lines."""
         n = max(self.known, 1)
         return Summary(
             view_id,

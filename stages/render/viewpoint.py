@@ -6,15 +6,14 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats
 from stages.physics.cameras.base import Camera
 from stages.physics.cameras.document import quaternion_matrix
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import unit_vectors
 
-Floats = NDArray[np.float64]
 NEAR_NADIR = math.radians(1.0)  # closer to straight down than this, "up in the image" means north
 
 
@@ -64,7 +63,10 @@ def rotation_from_quaternion(quaternion: Sequence[float]) -> Floats:
 def pinhole_view(
     position: Floats, rotation: Floats, fov_deg: float, size_px: tuple[int, int], radius: float
 ) -> Pinhole:
-    """A distortion-free camera; ``fov_deg`` spans the image's width. Raises GeometryError."""
+    """A distortion-free camera; ``fov_deg`` spans the image's width. Raises GeometryError.
+
+    position : (3,) body-fixed, m; rotation : (3, 3) camera axes to body-fixed; radius : m
+    """
     if not 0.0 < fov_deg < 170.0:
         raise GeometryError(
             f"`fov_deg`: expected degrees across the image's width between 0 and 170, found {fov_deg:g}; correct it."

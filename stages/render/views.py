@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError, LunargrError
 from schemas.files.outputs import Output, Target, check_outputs
+from stages.common.arrays import Floats32
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras.base import Camera
@@ -24,11 +24,9 @@ from stages.render.config import SUN, Config, Summary, check, inputs, output_fil
 from stages.render.dataset import View, export_views
 from stages.render.perspective import apply_sensor, make_scene, render_view
 from stages.render.pictures import Preview, write_exr, write_png
-from stages.render.setting import camera_place, find_camera, make_light, metadata, open_source
+from stages.render.setup import camera_place, find_camera, make_light, metadata, open_source
 from stages.render.tally import Tally, skipped
 from stages.render.trajectory import ViewRow, read_trajectory
-
-Floats32 = NDArray[np.float32]
 
 
 def run_trajectory(
@@ -94,7 +92,7 @@ def run_trajectory(
 
 
 def _with_row(config: Config, view: ViewRow) -> Config:
-    """The command's options with what a row of the table says in their place; a row's Sun replaces the whole Sun."""
+    """The configuration of one row: what the row leaves empty stays as it is; a row's Sun replaces the whole Sun."""
     own = replace(
         config,
         position=view.position,
@@ -130,8 +128,8 @@ def render_camera(
     with contextlib.ExitStack() as stack:
         exr = None
         if ".exr" in named:
-            told = metadata(surface, config, light)
-            exr = stack.enter_context(write_exr(named[".exr"], camera.lines, camera.samples, channels, told))
+            facts = metadata(surface, config, light)
+            exr = stack.enter_context(write_exr(named[".exr"], camera.lines, camera.samples, channels, facts))
         for band in bands:
             if exr:
                 exr.write(band)

@@ -10,8 +10,5 @@ from stages.report.config import Config
 if TYPE_CHECKING:
     from stages.report.stage import run
 
-__getattr__ = imported_later(__name__, {"run": "stage"})
-__all__ = [
-    "Config",
-    "run",
-]
+__getattr__ = imported_later(__name__, "stage")
+__all__ = ["Config", "run"]

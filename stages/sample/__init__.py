@@ -11,11 +11,5 @@ if TYPE_CHECKING:
     from stages.sample.audit import Part, audit, read_audit
     from stages.sample.stage import run
 
-__getattr__ = imported_later(__name__, {"Part": "audit", "audit": "audit", "read_audit": "audit", "run": "stage"})
-__all__ = [
-    "Config",
-    "Part",
-    "audit",
-    "read_audit",
-    "run",
-]
+__getattr__ = imported_later(__name__, "stage", "audit")
+__all__ = ["Config", "Part", "audit", "read_audit", "run"]

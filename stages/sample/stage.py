@@ -44,11 +44,7 @@ class Scene:
 
 
 def run(
-    scene: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
+    scene: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> list[Part]:
     """Write ``crops.h5`` and return the audit of the split. Raises ConfigError or GeometryError."""
     output = Output.of(output)

@@ -18,12 +18,5 @@ from stages.simulate.recipe import Config, make_config, read_recipe, recipe_json
 if TYPE_CHECKING:
     from stages.simulate.stage import Summary, run
 
-__getattr__ = imported_later(__name__, {"Summary": "stage", "run": "stage"})
-__all__ = [
-    "Config",
-    "Summary",
-    "make_config",
-    "read_recipe",
-    "recipe_json",
-    "run",
-]
+__getattr__ = imported_later(__name__, "stage")
+__all__ = ["Config", "Summary", "make_config", "read_recipe", "recipe_json", "run"]

@@ -17,9 +17,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.simulate.noise import gradient_noise
-
-Array = NDArray[np.float32]
 
 EQUILIBRIUM_PER_KM2 = 10**-1.1  # craters > 1 km per km2, cumulative slope -2
 PRODUCTION_SLOPE, EQUILIBRIUM_SLOPE = 3.0, 2.0
@@ -50,13 +49,17 @@ class Craters:
         return len(self.x)
 
     def select(self, keep: NDArray) -> Craters:
+        """Those that ``keep``, (n,) bool or indices, names."""
         return Craters(
             *(a[keep] for a in (self.x, self.y, self.diameter, self.age, self.depth_factor, self.seed)),
         )
 
 
 def cumulative_density(diameter: NDArray | float, density: float, transition: float) -> NDArray:
-    """Craters larger than ``diameter`` (m) per m2: equilibrium below ``transition`` (m), production above."""
+    """Craters larger than ``diameter`` (m) per m2: equilibrium below ``transition`` (m), production above.
+
+    diameter : (n,) or a number
+    """
     d = np.asarray(diameter, float)
     at_transition = density * EQUILIBRIUM_PER_KM2 * (transition / 1000.0) ** -EQUILIBRIUM_SLOPE * 1e-6
     slope = np.where(d < transition, EQUILIBRIUM_SLOPE, PRODUCTION_SLOPE)
@@ -143,7 +146,10 @@ def _bury(x, y, diameter, time, luck, order, start, rows, columns, cell, x0, y0)
 
 
 def fresh_profile(r: NDArray) -> NDArray:
-    """Height over diameter of a fresh simple crater at r radii from its centre."""
+    """Height over diameter of a fresh simple crater at r radii from its centre.
+
+    r : (n,); returns (n,). Rim and depth after Pike (1977), ejecta after McGetchin et al. (1973)
+    """
     r = np.asarray(r, float)
     # flat floor, parabolic foot, straight wall at the angle of repose (tan = 2 DEPTH WALL = 0.67)
     foot = FLOOR + 2 * (1 - FLOOR - 1 / WALL)
@@ -158,7 +164,7 @@ def fresh_profile(r: NDArray) -> NDArray:
 
 
 @lru_cache(maxsize=1)
-def profile_table(states: int = 40, samples: int = 320) -> tuple[Array, float]:
+def profile_table(states: int = 40, samples: int = 320) -> tuple[Floats32, float]:
     """Profiles worn by diffusion: (states, samples) heights over diameter, and the spacing in radii.
 
     State k has K = kappa t / R^2 = WORN_OUT (k / (states - 1))^2, plus a little that even fresh rims have. The
@@ -266,7 +272,9 @@ def _stamp(
                             ejecta[r, c] += np.float32(fresh * fade * streak)
 
 
-def stamp(craters: Craters, x0: float, y0: float, step: float, shape: tuple[int, int]) -> tuple[Array, Array, Array]:
+def stamp(
+    craters: Craters, x0: float, y0: float, step: float, shape: tuple[int, int]
+) -> tuple[Floats32, Floats32, Floats32]:
     """Heights (m), freshness of walls and near ejecta (0..1) and rays of ejecta (0..) of a block.
 
     (x0, y0) is the centre of the first pixel; rows run south. Largest first, so that the result is the same however

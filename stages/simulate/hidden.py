@@ -110,4 +110,5 @@ def hidden_from_option(text: str) -> list[dict[str, Any]]:
 
 
 def find(effects: Iterable[Hidden], name: str) -> Hidden | None:
+    """The hidden effect of that name, None where it is not hidden."""
     return next((h for h in effects if h.effect == name), None)

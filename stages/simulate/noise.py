@@ -10,9 +10,8 @@ import math
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
+from stages.common.arrays import Floats32
 
 LACUNARITY = 1.87  # not 2: octaves must not share lattice lines
 TURN = 0.655  # rad between octaves
@@ -95,7 +94,7 @@ def fractal(
     shortest: float,
     hurst: float,
     seed: int,
-) -> Array:
+) -> Floats32:
     """Fractal noise at the pixel centres of a block whose first centre is (x0, y0), m; rows run south.
 
     The octave of wavelength ``longest`` has standard deviation 1, others (wavelength / longest)^hurst: a surface with

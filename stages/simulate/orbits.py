@@ -29,7 +29,10 @@ class Strip:
     length: float
 
     def along_across(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Metres along the track and across it (to the right) from the strip's centre."""
+        """Metres along the track and across it (to the right) from the strip's centre.
+
+        x, y : (H, W), m on the map
+        """
         s, c = math.sin(math.radians(self.heading_deg)), math.cos(math.radians(self.heading_deg))
         dx, dy = x - self.x, y - self.y
         return dx * s + dy * c, dx * c - dy * s

@@ -70,6 +70,7 @@ class Config:
     hidden: list[dict[str, Any]] = field(default_factory=lambda: [{"effect": "dark_bias"}])
 
     def hidden_effects(self) -> list[Hidden]:
+        """The hidden effects with their parameters."""
         return parse_hidden(self.hidden)
 
     @property
@@ -79,10 +80,12 @@ class Config:
 
     @property
     def extent(self) -> float:
+        """m, of the scene's side"""
         return self.size_px * self.gsd
 
     @property
     def dem_size(self) -> int:
+        """px, of the DEM's side"""
         return self.size_px * self.factor
 
 
@@ -232,4 +235,5 @@ def read_recipe(path: Path) -> dict[str, Any]:
 
 
 def recipe_json(config: Config) -> str:
+    """The content of a recipe file."""
     return json.dumps(dataclasses.asdict(config), indent=1)

@@ -11,15 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
 from schemas.errors import RegistryError
+from stages.common.arrays import Floats32
 from stages.physics.photometry import ReflectanceModel, get_model
 from stages.simulate.noise import fractal, gradient_noise
 from stages.simulate.recipe import Config
 from stages.simulate.terrain import Ground
-
-Array = NDArray[np.float32]
 
 MARGIN = 6  # DEM pixels around a block that slopes need
 ALBEDO_PARAMETERS = ("w", "albedo", "single_scattering_albedo", "A", "normal_albedo")
@@ -33,8 +31,8 @@ FAR_CRATERS = ((2.3, 2.1), (3.1, 5.3))
 class Albedo:
     """Natural logarithms of the albedo's factors, (H, W): what follows the ground and what does not."""
 
-    geometry: Array
-    free: Array
+    geometry: Floats32
+    free: Floats32
 
 
 @njit(parallel=True, fastmath=True, cache=True)
@@ -53,14 +51,14 @@ def _far_rays(out, x0, y0, step, sx, sy, edge, seed):
 
 
 def albedo(config: Config, ground: Ground, row: int, col: int) -> Albedo:
-    """Of a block that carries MARGIN pixels around it; ``row``, ``col`` are of its first inner pixel."""
+    """The albedo of a block that carries MARGIN pixels around it; ``row``, ``col`` are of its first inner pixel."""
     step = config.dem_gsd
     inner = (slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
     elevation = ground.elevation
     k = max(1, min(MARGIN - 1, round(5.0 / step)))
     centre = elevation[inner]
 
-    def shifted(dr: int, dc: int) -> Array:
+    def shifted(dr: int, dc: int) -> Floats32:
         return elevation[MARGIN + dr : elevation.shape[0] - MARGIN + dr, MARGIN + dc : elevation.shape[1] - MARGIN + dc]
 
     east = (shifted(0, k) - shifted(0, -k)) / (2 * k * step)
@@ -110,14 +108,17 @@ class Truth:
         """Names of the parameters that vary by place."""
         return [self.albedo_name, *filter(None, [self.lobe_name])]
 
-    def maps(self, geometry: Array, free: Array) -> dict[str, Array]:
-        """The parameters that vary by place, from the logarithms of the albedo's factors."""
+    def maps(self, geometry: Floats32, free: Floats32) -> dict[str, Floats32]:
+        """The parameters that vary by place, from the logarithms of the albedo's factors.
+
+        geometry, free : (H, W); returns (H, W) by name
+        """
         maps = {self.albedo_name: self._bounded(self.albedo_name, np.exp(geometry + free))}
         if self.lobe_name:
             maps[self.lobe_name] = self._bounded(self.lobe_name, 1 - 0.22 * np.tanh(geometry / 0.4))
         return maps
 
-    def _bounded(self, name: str, factor: Array) -> Array:
+    def _bounded(self, name: str, factor: Floats32) -> Floats32:
         low, high = self._known[name].lower, self._known[name].upper
         margin = 1e-3 * (high - low)
         return np.clip(np.float32(self.constants[name]) * factor, low + margin, high - margin).astype(np.float32)

@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 
+from stages.common.arrays import Floats, Floats32
 from stages.physics.maps.grid import Grid
 from stages.simulate.hidden import Hidden, find
 from stages.simulate.orbits import Pass, Strip
 from stages.simulate.recipe import Config
-
-Array = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -42,6 +40,7 @@ class Detector:
 def make_detector(
     config: Config, shot: Pass, hidden: list[Hidden], mean_iof: float, rng: np.random.Generator
 ) -> Detector:
+    """Draw the detector of one image; mean_iof : I/F of level ground, which auto-exposure aims at."""
     shift_rms, jitter, response = config.registration_error, 0.0, 1.0
     if effect := find(hidden, "misregistration"):
         shift_rms = math.hypot(shift_rms, effect["rms_px"] * shot.gsd / math.sqrt(2))
@@ -102,7 +101,8 @@ class Lattice:
     y: Floats
 
     @classmethod
-    def of(cls, image: Grid, first: int, height: int, scene: Grid) -> Lattice:
+    def fit(cls, image: Grid, first: int, height: int, scene: Grid) -> Lattice:
+        """The lattice of ``height`` lines of an image from line ``first`` on, by a cubic fit to the projection."""
         rows = np.linspace(first, first + height - 1, 9)
         cols = np.linspace(0, image.width - 1, 9)
         rr, cc = np.meshgrid(rows, cols, indexing="ij")
@@ -126,7 +126,10 @@ def _scaled(values: NDArray, first: float, count: int) -> Floats:
 
 
 def footprint(config: Config, shot: Pass, x: Floats, y: Floats, number: int) -> NDArray[np.bool_]:
-    """Where the image has data: a strip with ragged edges, lost lines and holes, inside the scene."""
+    """Where the image has data: a strip with ragged edges, lost lines and holes, inside the scene.
+
+    x, y : (H, W), m from the scene's centre
+    """
     strip, half = shot.strip, config.extent / 2
     along, across = strip.along_across(x, y)
     rng = np.random.default_rng([config.seed, 5, number])
@@ -154,8 +157,11 @@ def footprint(config: Config, shot: Pass, x: Floats, y: Floats, number: int) -> 
     return inside
 
 
-def resample(radiance: Array, row: Floats, col: Floats, window: tuple[int, int, int, int]) -> Array:
-    """Cubic interpolation of a window of the blurred radiance at DEM pixel coordinates."""
+def resample(radiance: Floats32, row: Floats, col: Floats, window: tuple[int, int, int, int]) -> Floats32:
+    """Cubic interpolation of a window of the blurred radiance at DEM pixel coordinates.
+
+    radiance : (h, w) I/F of the window (row, col, height, width); row, col : (H, W) px; returns (H, W)
+    """
     u, v = (col - window[1]).astype(np.float32), (row - window[0]).astype(np.float32)
     return np.asarray(cv2.remap(radiance, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
@@ -174,14 +180,17 @@ def move(config: Config, shot: Pass, detector: Detector, lattice: Lattice, step:
 
 
 def respond(
-    image: Array,
-    echo: Array | None,
+    image: Floats32,
+    echo: Floats32 | None,
     lattice: Lattice,
     shot: Pass,
     detector: Detector,
     hidden: list[Hidden],
-) -> Array:
-    """The hidden detector effects, in the order of the hardware: echo, dark signal, columns, gain, response, clipping."""
+) -> Floats32:
+    """The hidden detector effects, in the order of the hardware: echo, dark signal, columns, gain, response, clipping.
+
+    image, echo : (H, W), I/F
+    """
     if (effect := find(hidden, "echo")) and echo is not None:
         image = image + np.float32(effect["fraction"]) * echo
     if effect := find(hidden, "dark_bias"):
@@ -200,8 +209,11 @@ def respond(
     return image
 
 
-def add_noise(image: Array, config: Config, detector: Detector, rng: np.random.Generator) -> Array:
-    """Shot and read noise, in electrons."""
+def add_noise(image: Floats32, config: Config, detector: Detector, rng: np.random.Generator) -> Floats32:
+    """Shot and read noise, in electrons.
+
+    image : (H, W), I/F
+    """
     electrons = image * np.float32(detector.electrons)
     sigma = np.sqrt(np.maximum(electrons, 0) + np.float32(config.read_noise**2))
     noise = rng.standard_normal(image.shape, dtype=np.float32)

@@ -21,9 +21,9 @@ from stages.physics.maps.grid import Grid, local_metric_crs, unit_vectors
 from stages.simulate import sensor
 from stages.simulate.hidden import Hidden, find
 from stages.simulate.orbits import RADIUS, Pass, plan_passes
+from stages.simulate.radiance import Scene, View, blur, point_spread, radiance
 from stages.simulate.recipe import Config
 from stages.simulate.reflectance import MARGIN, Truth, albedo
-from stages.simulate.render import Scene, View, blur, point_spread, radiance
 from stages.simulate.terrain import Terrain
 from stages.simulate.write import NODATA_FLOAT, ImageFile, ImageTruth, geotiff, table_row, write_table, write_truth
 
@@ -69,23 +69,23 @@ def _make_scene(
     names: Sequence[str],
     hidden: list[Hidden],
     truth: Truth,
-    say: Progress,
+    progress: Progress,
 ) -> Summary:
     """Every file of the scene, in ``folder``."""
     terrain = Terrain(config)
     grid = scene_grid(config, config.dem_gsd, config.dem_size)
     with _truth_arrays(folder, config.dem_size) as (elevation, log_geometry, log_free):
         scene = Scene(grid, elevation, log_geometry, log_free, truth)
-        _make_ground(config, terrain, scene, say)
+        _make_ground(config, terrain, scene, progress)
         dem_valid = _write_dem(folder / "dem.tif", config, scene, hidden)
         images, covered, rows = [], [], []
         for k, (shot, name) in enumerate(zip(shots, names, strict=True)):
-            say(k, len(shots), "images")
+            progress(k, len(shots), "images")
             image, share = _make_image(folder / name, config, scene, shot, k, hidden)
             images.append(image)
             covered.append(share)
             rows.append(table_row(config, shot, name, hidden))
-        say(len(shots), len(shots), "images")
+        progress(len(shots), len(shots), "images")
         working = scene_grid(config, config.gsd, config.size_px)
         write_truth(folder / "truth.h5", config, scene, working, terrain.craters, images, hidden)
     write_table(folder / "images.csv", rows)
@@ -113,10 +113,10 @@ def _truth_arrays(folder: Path, size: int) -> Iterator[list[NDArray[np.float32]]
         yield [np.memmap(Path(scratch) / f"{k}.f4", np.float32, "w+", shape=shape) for k in range(3)]
 
 
-def _make_ground(config: Config, terrain: Terrain, scene: Scene, say: Progress) -> None:
+def _make_ground(config: Config, terrain: Terrain, scene: Scene, progress: Progress) -> None:
     size = config.dem_size
     for first in range(0, size, GROUND_ROWS):
-        say(first, size, "terrain rows")
+        progress(first, size, "terrain rows")
         count = min(GROUND_ROWS, size - first)
         ground = terrain.block(first - MARGIN, -MARGIN, count + 2 * MARGIN, size + 2 * MARGIN)
         logs = albedo(config, ground, first, 0)
@@ -124,7 +124,7 @@ def _make_ground(config: Config, terrain: Terrain, scene: Scene, say: Progress) 
         scene.elevation[rows] = ground.elevation[MARGIN:-MARGIN, MARGIN:-MARGIN]
         scene.log_geometry[rows] = logs.geometry
         scene.log_free[rows] = logs.free
-    say(size, size, "terrain rows")
+    progress(size, size, "terrain rows")
 
 
 def _write_dem(path: Path, config: Config, scene: Scene, hidden: list[Hidden]) -> float:
@@ -220,7 +220,7 @@ def _make_image(
         with out.file:
             for first in range(0, image.height, band):
                 rows = min(band, image.height - first)
-                lattice = sensor.Lattice.of(image, first, rows, scene.grid)
+                lattice = sensor.Lattice.fit(image, first, rows, scene.grid)
                 inside = sensor.footprint(config, shot, lattice.x, lattice.y, number)
                 signal = np.zeros(inside.shape, np.float32)
                 if inside.any():

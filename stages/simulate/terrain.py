@@ -8,11 +8,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.simulate.craters import Craters, populate, stamp
 from stages.simulate.noise import fractal
 from stages.simulate.recipe import Config
-
-Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -28,9 +27,9 @@ class Boulders:
 class Ground:
     """A block of the ground: elevation (m above the sphere), freshness and rays, each (H, W) float32."""
 
-    elevation: Array
-    freshness: Array
-    rays: Array
+    elevation: Floats32
+    freshness: Floats32
+    rays: Floats32
 
 
 class Terrain:

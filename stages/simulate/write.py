@@ -17,16 +17,16 @@ from rasterio.windows import Window
 from schemas import TRUTH, ArtefactWriter, atomic_path
 from schemas.provenance import pack_record
 from schemas.rasters import TIFF_TAG
+from stages.common.arrays import Floats32
 from stages.physics.formation.geometry import Angles
 from stages.physics.maps.geotiff import MapTiff
 from stages.physics.maps.grid import Grid
 from stages.simulate.hidden import CHOICES, Hidden, find
 from stages.simulate.orbits import Pass, direction, sub_point
+from stages.simulate.radiance import Scene
 from stages.simulate.recipe import Config
-from stages.simulate.render import Scene
 from stages.simulate.sensor import Detector
 
-Array = NDArray[np.float32]
 NODATA_FLOAT = -3.4028226550889045e38  # the NULL of 32-bit ISIS cubes, as LROC's products carry it
 NODATA_INT16 = -32768
 NODATA_DN = 0
@@ -86,7 +86,8 @@ class ImageFile:
         self.file.set_band_description(1, "DN" if units == "dn" else "radiance factor I/F")
         self.file.update_tags(IMAGE_ID=shot.image_id, START_TIME=shot.start_time)
 
-    def write(self, first: int, image: Array, inside: NDArray[np.bool_], detector: Detector) -> None:
+    def write(self, first: int, image: Floats32, inside: NDArray[np.bool_], detector: Detector) -> None:
+        """Write lines from ``first`` on; image : (h, W) I/F; inside : (h, W), where there is data."""
         window = Window(0, first, self.grid.width, len(image))
         if self.units == "dn":
             counts = np.clip(np.rint(detector.gain * image + detector.offset), 1, 4095)
@@ -123,6 +124,7 @@ def table_row(config: Config, shot: Pass, path: str, hidden: list[Hidden]) -> di
 
 
 def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write images.csv, whole or not at all."""
     with atomic_path(path) as partial, open(partial, "w", newline="", encoding="utf-8") as stream:
         table = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
         table.writeheader()
@@ -223,8 +225,11 @@ def _write_truth_rows(out: ArtefactWriter, tif: MapTiff, config: Config, scene: 
     out.dataset("log_albedo_free")[here] = area_mean(free, factor)
 
 
-def standard_iof(scene: Scene, maps: dict[str, Array]) -> Array:
-    """I/F of level ground at incidence 30, emission 0, phase 30 deg."""
+def standard_iof(scene: Scene, maps: dict[str, Floats32]) -> Floats32:
+    """I/F of level ground at incidence 30, emission 0, phase 30 deg.
+
+    maps : (H, W) by name; returns (H, W)
+    """
     import torch
 
     angles = [torch.deg2rad(torch.tensor(v)) for v in (30.0, 0.0, 30.0)]
@@ -258,7 +263,8 @@ def _write_images(out: ArtefactWriter, images: Sequence[ImageTruth]) -> None:
         out.write(name, np.array(values, float))
 
 
-def area_mean(values: Array, factor: int) -> Array:
+def area_mean(values: Floats32, factor: int) -> Floats32:
+    """(H, W) -> (H / factor, W / factor) means over whole blocks."""
     height, width = values.shape
     blocks = values.reshape(height // factor, factor, width // factor, factor)
     return blocks.mean(axis=(1, 3), dtype=np.float64).astype(np.float32)

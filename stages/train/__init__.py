@@ -11,10 +11,5 @@ if TYPE_CHECKING:
     from stages.train.checks import check
     from stages.train.stage import Summary, run
 
-__getattr__ = imported_later(__name__, {"check": "checks", "Summary": "stage", "run": "stage"})
-__all__ = [
-    "Config",
-    "Summary",
-    "check",
-    "run",
-]
+__getattr__ = imported_later(__name__, "stage", "checks")
+__all__ = ["Config", "Summary", "check", "run"]

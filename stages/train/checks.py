@@ -6,9 +6,9 @@ import math
 
 from schemas import ConfigError, InputError
 from stages.common.progress import Say
+from stages.network.checkpoint_layout import DEEPEST, WIDEST
+from stages.network.precision import check_precision
 from stages.network.predictor import choose_device
-from stages.network.runtime import check_precision
-from stages.network.stored import DEEPEST, WIDEST
 from stages.pairs.reader import PairReader
 from stages.physics.photometry import get_model
 from stages.train.config import Config

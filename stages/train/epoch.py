@@ -11,8 +11,8 @@ from torch import Tensor
 
 from schemas import InputError
 from stages.common.progress import Progress, show_nothing
+from stages.network.crop_sums import sum_over_crops
 from stages.network.losses import crop_errors
-from stages.network.pieces import sum_over_crops
 from stages.network.processes import mean_over_ranks, sum_gradients, sum_over_ranks
 from stages.network.steps import learning_rate, order_steps, prefetch
 from stages.pairs.reader import Batch
@@ -93,8 +93,10 @@ def evaluate_loss(
     brightness: float = 1.0,
     progress: Progress = show_nothing,
 ) -> tuple[float, float]:
-    """Mean squared error and mean of what is minimised over the valid pixels of some pairs, in evaluation mode; NaN where
-    there are none."""
+    """Mean squared error and mean of what is minimised over the valid pixels of some pairs, in evaluation mode.
+
+    NaN where there are no pairs.
+    """
     training.predictor.eval()
     totals, pixels = [0.0, 0.0], 0.0
     mine = indices[training.rank :: training.ranks]

@@ -22,10 +22,10 @@ from schemas.provenance import sha256
 from stages.common.memory import keep_freed_memory
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.common.threads import one_thread_each
+from stages.network.deviations import fit_deviations
 from stages.network.predictor import choose_device
 from stages.network.processes import join_group
 from stages.network.resume import History, restore, save, snapshot
-from stages.network.spread import fit_deviations
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import Extension
 from stages.train.checkpoint import write_checkpoint
@@ -46,11 +46,7 @@ class Summary:
 
 
 def run(
-    pairs: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
+    pairs: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Summary:
     """Write ``checkpoint.h5``: the weights of the best validation epoch. Raises ConfigError, InputError, ArtefactError.
 

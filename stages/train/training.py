@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.losses import Radiometry
-from stages.network.maps import CoefficientMaps
+from stages.network.precision import choose_precision
 from stages.network.predictor import Predictor
-from stages.network.runtime import choose_precision
 from stages.network.unet import UNet
 from stages.network.uniform import elevation_scale, fit_start
 from stages.pairs.reader import PairReader
@@ -36,6 +36,7 @@ class Training:
 
     @property
     def learned(self) -> list[Tensor]:
+        """All tensors that the optimizer changes."""
         return [p for group in self.optimizer.param_groups for p in group["params"]]
 
 

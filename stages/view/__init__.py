@@ -10,9 +10,5 @@ from stages.view.config import Config
 if TYPE_CHECKING:
     from stages.view.stage import Summary, run
 
-__getattr__ = imported_later(__name__, {"Summary": "stage", "run": "stage"})
-__all__ = [
-    "Config",
-    "Summary",
-    "run",
-]
+__getattr__ = imported_later(__name__, "stage")
+__all__ = ["Config", "Summary", "run"]

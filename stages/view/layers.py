@@ -10,16 +10,16 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 from rasterio.transform import Affine
 
 from schemas import SVBRDF, ArtefactError, InputError, RegistryError, open_artefact, read_strings
+from stages.common.arrays import Floats32
 from stages.physics.maps.grid import Grid, read_grid
 from stages.physics.photometry import ReflectanceModel, get_model, model_names
+from stages.physics.photometry.albedo_factor import FACTOR, AlbedoFactor
 
-Floats32 = NDArray[np.float32]
 READ_ROWS = 512
-_OWN = ("x", "y", "coefficients", "coefficient_name", "elevation", "valid", "crs")
+_OWN = ("x", "y", "coefficients", "coefficient_name", "albedo", "elevation", "valid", "crs")
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,9 @@ def read_content(path: Path, max_px: int) -> Content:
             Layer(p.name, p.description, p.unit, _shrunk(file["coefficients"], (k,), factor))
             for k, p in enumerate(model.parameters)
         ]
+        if "albedo" in file:  # what `lunargr render` multiplies by, too
+            model = AlbedoFactor(model)
+            coefficients.append(Layer("albedo", FACTOR.description, FACTOR.unit, _shrunk(file["albedo"], (), factor)))
         others = _others(file, full, names, factor)
     known = np.isfinite(elevation)
     for layer in coefficients:
@@ -86,14 +89,20 @@ def _coarse_grid(full: Grid, factor: int, shape: tuple[int, ...]) -> Grid:
 
 def _others(file: h5py.File, grid: Grid, names: list[str], factor: int) -> list[Layer]:
     """Every further map on the grid, whoever wrote it: uncertainties, albedo, counts."""
+    mapped = read_strings(file, "map_name") if "map_name" in file else names
     found = []
     for name, variable in file.items():
         if name in _OWN or not isinstance(variable, h5py.Dataset) or variable.dtype.kind not in "fiu":
             continue
         if variable.shape == (grid.height, grid.width):
             found.append(_layer(variable, name, name, (), factor))
-        elif variable.shape == (len(names), grid.height, grid.width):
-            found += [_layer(variable, f"{name}_{of}", f"{name} of {of}", (k,), factor) for k, of in enumerate(names)]
+        elif variable.ndim == 3 and variable.shape[1:] == (grid.height, grid.width):
+            # of every coefficient, or of those that vary by place
+            which = mapped if name == "coefficients_std" else names
+            if len(which) == len(variable):
+                found += [
+                    _layer(variable, f"{name}_{of}", f"{name} of {of}", (k,), factor) for k, of in enumerate(which)
+                ]
     return [layer for layer in found if np.isfinite(layer.values).any()]
 
 

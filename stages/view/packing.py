@@ -73,6 +73,7 @@ class Blob:
         self.size = 0
 
     def add(self, data: bytes) -> list[int]:
+        """Append bytes; their place as [first, count]."""
         place = [self.size, len(data)]
         self._parts.append(data)
         self.size += len(data)
@@ -90,4 +91,5 @@ class Blob:
         }
 
     def text(self) -> str:
+        """All of it in base64."""
         return base64.b64encode(b"".join(self._parts)).decode("ascii")

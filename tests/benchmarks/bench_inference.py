@@ -28,8 +28,8 @@ from torch.nn import functional
 from schemas import CHECKPOINT, ArtefactWriter
 from stages.common.memory import keep_freed_memory
 from stages.infer.terrain import TerrainReader
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.cpu.mapper import Mapper
-from stages.network.maps import CoefficientMaps
 from stages.network.predictor import Predictor, write_state
 from stages.network.unet import DROPOUT, WIDTHS, UNet
 from stages.physics.photometry import get_model

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 
 from stages.common.memory import keep_freed_memory
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.losses import squared_error
-from stages.network.maps import CoefficientMaps
+from stages.network.precision import choose_precision
 from stages.network.predictor import Predictor
-from stages.network.runtime import choose_precision
 from stages.network.unet import UNet
 from stages.physics.formation.chain import Observation, form
 from stages.physics.photometry import get_model

@@ -1,17 +1,14 @@
 """Cast shadow and horizon: megapixels per second beside Embree (through Mitsuba), and memory on a 20,000 x 20,000 map.
 
 python tests/benchmarks/bench_light.py                speed and disagreement
-python tests/benchmarks/bench_light.py --large        shade and shadow 20,000 x 20,000 in bands; prints peak memory
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-import resource
 import statistics
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -103,70 +100,13 @@ def speed(size: int, peer_size: int, sun_elevation: float) -> None:
     print(f"; Embree {statistics.median(theirs):.1f} Mpx/s after {peer[0]:.1f} s of building" if peer else "")
 
 
-def large(size: int, azimuth_deg: float, folder: Path) -> None:
-    """Shade (Lommel-Seeliger, nadir) and shadow one map from disk to disk."""
-    import h5py
-    import torch
-
-    from stages.physics.formation import geometry
-    from stages.physics.horizon import cast_shadow_bands
-    from stages.physics.photometry import get_model, masked_radiance_factor
-
-    torch.set_num_threads(2)
-    model = get_model("lommel_seeliger")
-    path = folder / "dem.h5"
-    tile = terrain(2000, tile=2000)
-    with h5py.File(path, "w") as file:
-        data = file.create_dataset("elevation", (size, size), np.float32, chunks=(256, 256))
-        for row in range(0, size, 2000):
-            data[row : row + 2000] = np.tile(tile, (1, -(-size // 2000)))[: min(2000, size - row), :size]
-    base = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    azimuth, sun_elevation = math.radians(azimuth_deg), math.radians(10)
-    sun = torch.tensor(
-        [
-            [
-                math.sin(azimuth) * math.cos(sun_elevation),
-                math.cos(azimuth) * math.cos(sun_elevation),
-                math.sin(sun_elevation),
-            ]
-        ]
-    )
-    start = time.perf_counter()
-    with h5py.File(path) as file, h5py.File(folder / "image.h5", "w") as result:
-        data = file["elevation"]
-        image = result.create_dataset("image", (size, size), np.float32, chunks=(256, 256))
-        for rows, columns, dark in cast_shadow_bands(data, GSD, azimuth, sun_elevation, 1737400.0, 256):
-            top, left = max(rows.start - 1, 0), max(columns.start - 1, 0)
-            z = torch.from_numpy(data[top : rows.stop + 1, left : columns.stop + 1])[None]
-            east, north = geometry.slopes(z, GSD)
-            a, b = rows.start - top, columns.start - left
-            window = (slice(None), slice(a, a + dark.shape[0]), slice(b, b + dark.shape[1]))
-            east, north = east[window], north[window]
-            up = torch.ones_like(east)
-            angles = geometry.photometric_angles(east, north, sun, (0 * up, 0 * up, up))
-            shade = masked_radiance_factor(model, {"albedo": torch.tensor(0.1)}, angles)
-            image[rows, columns] = shade[0].numpy() * ~dark
-    took = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    print(
-        f"{size} x {size}, azimuth {azimuth_deg:g} deg: read, shadowed, shaded and written in {took:.1f} s "
-        f"({size * size / 1e6 / took:.0f} Mpx/s); peak memory {peak / 2**20:.2f} GiB ({base / 2**20:.2f} before)"
-    )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=8192)
     parser.add_argument("--peer-size", type=int, default=2048)
-    parser.add_argument("--large", action="store_true")
-    parser.add_argument("--large-size", type=int, default=20000)
     parser.add_argument("--azimuth", type=float, default=130.0)
     options = parser.parse_args()
-    if options.large:
-        with tempfile.TemporaryDirectory() as folder:
-            large(options.large_size, options.azimuth, Path(folder))
-    else:
-        speed(options.size, options.peer_size, math.radians(8))
+    speed(options.size, options.peer_size, math.radians(8))
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ from torch.nn import functional
 from schemas import PAIRS, ArtefactWriter
 from stages import train
 from stages.common.memory import keep_freed_memory
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.losses import squared_error
-from stages.network.maps import CoefficientMaps
 from stages.network.predictor import Predictor
 from stages.network.unet import DROPOUT, WIDTHS, UNet
 from stages.pairs.reader import PairReader

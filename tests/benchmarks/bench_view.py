@@ -1,10 +1,11 @@
-"""Frames per second and weight of the page of `lunargr view`, in headless Chromium with software rendering (SwiftShader).
+"""The page of `lunargr view` in headless Chromium: its weight, its I/F against `lunargr render`, its frames per second.
 
-    python tests/benchmarks/bench_view.py [--edge 2048] [--frames 20] [--model M2]
+    python tests/benchmarks/bench_view.py                     # a rough map of 2048 x 2048 px, M2
+    python tests/benchmarks/bench_view.py --map demo/svbrdf_albedo.h5 --pairs demo/pairs.h5
 
-No graphics card takes part: the processor draws, on as many cores as there are. A laptop's GPU is some tens of times faster.
-A frame ends when a pixel of it has been read back. "Sun": every frame has another Sun, so that shadows and light are worked
-out for every pixel of the map; "camera": the light stays, the view from space turns.
+Chromium draws in software (SwiftShader): no graphics card takes part, the processor draws on as many cores as there are. A frame ends
+when a pixel of it has been read back. "Another Sun": shadows and light are worked out for every pixel of the map; "camera": the
+light stays, the view from space is drawn again.
 """
 
 from __future__ import annotations
@@ -24,52 +25,79 @@ from browser import run_in_page
 from relief import hills
 from render_scene import make_grid, smooth_maps, write_svbrdf
 
-from stages import view
+from stages import render, view
 from stages.physics.photometry import get_model
+from stages.render.pictures import read_exr
 
-SCRIPT = """
+EDGE, MODEL = 2048, "M2"
+SUNS = ((270.0, 25.0), (45.0, 45.0), (330.0, 70.0), (200.0, 10.0), (90.0, 5.0), (123.0, 2.0))
+FRAMES = """
 const gl = document.querySelector("canvas").getContext("webgl2"), pixel = new Uint8Array(4);
 const draw = (parts) => { lunargr.set(parts); gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); };
 const time = (change) => {
   draw(change(0));
   const seconds = [];
-  for (let k = 1; k <= FRAMES; k++) { const start = performance.now(); draw(change(k)); seconds.push((performance.now() - start) / 1000); }
-  return seconds.sort((a, b) => a - b)[Math.floor(FRAMES / 2)];
+  for (let k = 1; k <= COUNT; k++) { const start = performance.now(); draw(change(k)); seconds.push((performance.now() - start) / 1000); }
+  return seconds.sort((a, b) => a - b)[Math.floor(COUNT / 2)];
 };
 const sun = time((k) => ({ azimuth: (7 * k) % 360, elevation: 20 }));
 const flat = time((k) => ({ azimuth: (7 * k) % 360, elevation: 20, shadows: false }));
 lunargr.set({ view: "space" });
-const still = time(() => ({}));
-return { sun, flat, still };
+return { sun, flat, camera: time(() => ({})) };
 """
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--edge", type=int, default=2048)
-    parser.add_argument("--frames", type=int, default=20)
-    parser.add_argument("--model", default="M2")
-    options = parser.parse_args()
-    edge, rng = options.edge, np.random.default_rng(1)
-    grid = make_grid(edge, edge, 5.0)
-    defaults = np.array(list(get_model(options.model).defaults().values()))
-    rough = smooth_maps(rng, (edge, edge), len(defaults)) - 0.05 + 0.001 * rng.standard_normal((1, edge, edge))
-    with tempfile.TemporaryDirectory() as folder:
-        source, page = Path(folder) / "svbrdf.h5", Path(folder) / "view.html"
-        write_svbrdf(source, grid, hills(rng, edge, 5.0), defaults[:, None, None] * (1 + 4 * rough), options.model)
-        start = time.perf_counter()
-        view.run(source, None, page, view.Config())
-        print(
-            f"{edge} x {edge} px, {options.model}: page of {page.stat().st_size / 1e6:.1f} MB in {time.perf_counter() - start:.1f} s"
+def rough_map(path: Path) -> Path:
+    """A worst case for packing: coefficients with noise in every pixel."""
+    rng, grid = np.random.default_rng(1), make_grid(EDGE, EDGE, 5.0)
+    defaults = np.array(list(get_model(MODEL).defaults().values()))
+    rough = smooth_maps(rng, (EDGE, EDGE), len(defaults)) - 0.05 + 0.001 * rng.standard_normal((1, EDGE, EDGE))
+    return write_svbrdf(path, grid, hills(rng, EDGE, 5.0), defaults[:, None, None] * (1 + 4 * rough), MODEL)
+
+
+def against_render(source: Path, page: Path, folder: Path) -> None:
+    """The page's I/F beside the command's for some Suns."""
+    print(
+        "Sun (azimuth, elevation)   mean I/F of the page over render's, less 1   pixels off by more than 1 % of the mean"
+    )
+    for number, (azimuth, elevation) in enumerate(SUNS):
+        found = run_in_page(
+            page, f"return lunargr.pixels({{azimuth: {azimuth}, elevation: {elevation}}})", timeout=1800
         )
-        found = run_in_page(page, SCRIPT.replace("FRAMES", str(options.frames)), timeout=1800)
-    print(f"SwiftShader on {os.cpu_count()} cores, median of {options.frames} frames:")
-    for name, what in (
+        config = render.Config(sun_azimuth_deg=azimuth, sun_elevation_deg=elevation)
+        render.run(source, folder / f"{number}.exr", config)
+        image = read_exr(folder / f"{number}.exr")["image"]
+        expected = np.where(np.isfinite(image), np.maximum(image, 0), np.nan)
+        mean, off = np.nanmean(expected), np.abs(found.reshape(expected.shape) - expected)
+        share = 100 * float((off > 0.01 * mean).sum() / np.isfinite(expected).sum())
+        difference = 100 * (np.nanmean(found) / mean - 1)
+        print(f"{azimuth:12.0f}, {elevation:4.0f} deg {difference:+38.4f} % {share:42.1f} %", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--map", type=Path, help="svbrdf.h5 (default: a rough map made for this)")
+    parser.add_argument("--pairs", type=Path, help="photographs for the page")
+    parser.add_argument("--frames", type=int, default=11)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        source, page = options.map or rough_map(folder / "svbrdf.h5"), folder / "view.html"
+        start = time.perf_counter()
+        made = view.run(source, options.pairs, page, view.Config())
+        size = f"page of {made.size / 1e6:.1f} MB in {time.perf_counter() - start:.1f} s"
+        print(f"{made.width:,} x {made.height:,} px, {made.model}, {made.photographs} photographs: {size}", flush=True)
+        against_render(source, page, folder)
+        seconds = run_in_page(page, FRAMES.replace("COUNT", str(options.frames)), timeout=1800)
+    print(
+        f"software rendering (SwiftShader) on {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, median of {options.frames} frames:"
+    )
+    for key, words in (
         ("sun", "another Sun, cast shadows"),
         ("flat", "another Sun, no shadows"),
-        ("still", "view from space"),
+        ("camera", "camera alone"),
     ):
-        print(f"  {what:26s} {1 / found[name]:7.2f} frames/s ({1000 * found[name]:.0f} ms)")
+        print(f"  {words:26s} {1 / seconds[key]:6.2f} frames/s")
 
 
 if __name__ == "__main__":

@@ -36,14 +36,17 @@ class Section:
     body: list[Markup] = field(default_factory=list)
 
     def add(self, *parts: Markup) -> None:
+        """Put parts at its end."""
         self.body.extend(parts)
 
 
 def paragraph(text: str, kind: str = "") -> Markup:
+    """A paragraph; ``kind`` is its CSS class."""
     return _part("paragraph", text, kind)
 
 
 def heading(text: str) -> Markup:
+    """A heading within a section."""
     return _part("heading", text)
 
 
@@ -74,6 +77,7 @@ def named_bars(bars: Iterable[tuple[Markup, str]]) -> Markup:
 
 
 def chart(svg: str, caption: str) -> Markup:
+    """An SVG drawing with a caption."""
     return _part("chart", Markup(svg), caption)
 
 
@@ -99,6 +103,7 @@ def budget(shares: Iterable[tuple[str, float]]) -> Markup:
 
 
 def grid(figures: Iterable[Markup]) -> Markup:
+    """Figures side by side, as many as fit."""
     return _part("grid", list(figures))
 
 

@@ -179,6 +179,7 @@ def words(name: str) -> str:
 
 
 def number(value: float | None, form: str) -> str:
+    """A number as text, "-" where there is none."""
     return "-" if value is None else format(value, form)
 
 

@@ -39,6 +39,7 @@ def photo_uri(picture: np.ndarray, quality: int = 85) -> str:
 
 
 def uri_of(content: bytes, kind: str) -> str:
+    """A file's content as a data: URI."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 

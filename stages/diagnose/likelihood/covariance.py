@@ -53,6 +53,7 @@ class Covariance:
         return out.flatten(0, 1) * self.size.get(patch.number, 1.0)
 
     def mean_matrix(self, patch: Patch) -> Tensor:
+        """(n, n) covariance of the patch's mean among the n images of a site."""
         g = patch.slopes.double()
         own = torch.eye(len(g), dtype=torch.float64) * self.mean_own
         return (self.mean_albedo + self.mean_relief * (g @ g.T) + own) * self.mean_size.get(patch.number, 1.0)

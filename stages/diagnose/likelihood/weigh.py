@@ -42,6 +42,7 @@ class Found:
 
     @property
     def gain(self) -> float:
+        """Held-out gain over all pieces of ground, nats."""
         return float(self.gains.sum())
 
     def gain_interval(self) -> tuple[float, float]:
@@ -50,6 +51,7 @@ class Found:
 
 
 def interval(gains: Array) -> tuple[float, float]:
+    """95 % interval of a sum of gains over independent pieces of ground, by Student's t."""
     units = len(gains)
     if units < 3:
         return -math.inf, math.inf
@@ -134,6 +136,7 @@ class Whole:
         return out[self.seen[out]]
 
     def places(self, guise: Guise) -> NDArray[np.int64]:
+        """Where the columns of a candidate stand among all."""
         if guise.per_frame:
             return self.frame_places(guise.columns)
         return np.array([1 + k for k in guise.columns])
@@ -177,6 +180,7 @@ class Whole:
             self.precision[int(p)] = max(spread, 1e-4) ** -2
 
     def set_scatter(self, spread: float) -> None:
+        """Set the prior precision of what scatters from image to image."""
         for p in self.scattered:
             self.precision[int(p)] = max(spread, 1e-4) ** -2
 

@@ -35,6 +35,7 @@ class SharpSlopes:
         self.made: object = None
 
     def apply(self, state: State) -> None:
+        """Put the slopes that the images resolve in place of the central differences."""
         if state.slopes is self.made:  # taken over from the state that they were made for
             return
         z = state.elevation

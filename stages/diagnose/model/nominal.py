@@ -47,6 +47,7 @@ class Nominal:
         return self.maps[site.number] * vector
 
     def chain(self, site: Site, base: Sequence[Effect], moved: Sequence[Effect] = ()) -> Chain:
+        """The formation chain of one site with these effects."""
         free = self.free if self.predictor is None else None  # maps may still drift
         return Chain(site, self.model, self.coefficients(site), base, moved, free)
 

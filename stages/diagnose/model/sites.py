@@ -47,10 +47,12 @@ class Site:
 
     @property
     def count(self) -> int:
+        """Pairs that show it."""
         return len(self.pairs)
 
     @property
     def frames(self) -> NDArray[np.int64]:
+        """(B,) source image of each pair."""
         assert self.observation.frame is not None
         return self.observation.frame.numpy()
 

@@ -24,6 +24,7 @@ class Named:
     group: list[str]
 
     def to_json(self) -> dict[str, Any]:
+        """As it stands in the report."""
         return {
             "effect": self.effect.name,
             "parameters": {
@@ -55,9 +56,11 @@ class HeldOut:
 
     @property
     def gain(self) -> float:
+        """Share of the squared error that is gone, per cent."""
         return 100 * (1 - self.extended / self.nominal) if self.nominal > 0 else math.nan
 
     def to_json(self) -> dict[str, Any]:
+        """As it stands in the report."""
         return {
             "pairs": self.pairs,
             "sites": self.sites,
@@ -89,6 +92,7 @@ class Answer:
     config: dict[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
+        """As it stands in the report."""
         return {
             "verdict": self.verdict,
             "causes": [c.to_json() for c in self.causes],
@@ -141,6 +145,7 @@ def describe(found: dict[str, dict[str, Any]]) -> str:
 
 
 def number(value: float) -> float | None:
+    """A number for JSON: None where it is not finite."""
     return float(value) if math.isfinite(value) else None
 
 

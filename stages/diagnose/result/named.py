@@ -23,6 +23,7 @@ from stages.effects.filters import gaussian
 
 
 def by_search(state: State) -> list[Named]:
+    """The causes that the search found, with errors and units."""
     out = []
     for cause in state.causes:
         cls = type(cause.effect)

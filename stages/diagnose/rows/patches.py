@@ -43,10 +43,12 @@ class Grid:
 
     @property
     def annuli(self) -> int:
+        """Rings of equal spatial frequency."""
         return len(self.radius)
 
     @property
     def bins(self) -> Tensor:
+        """(H, W) number of the ring and sector that each frequency belongs to."""
         return self.annulus * SECTORS + self.sector
 
 

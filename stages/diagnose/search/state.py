@@ -41,6 +41,8 @@ class Cause:
 
 @dataclass
 class State:
+    """What the search knows so far."""
+
     nominal: Nominal
     sites: list[Site]
     data: Survey
@@ -58,17 +60,21 @@ class State:
 
     @property
     def base(self) -> list[Effect]:
+        """The effects found so far."""
         return [c.effect for c in self.causes]
 
     @property
     def free_gains(self) -> bool:
+        """Whether every image has an unknown gain and offset."""
         return self.units == "dn"
 
     def chains(self) -> list[Chain]:
+        """The formation chain of every site with the effects found so far."""
         base = self.base
         return per_site(lambda site: self.nominal.chain(site, base), self.sites)
 
     def grid(self) -> tuple[Grid, int]:
+        """The patches' frequencies, and into how many pieces a side a crop is cut."""
         height, width = self.sites[0].image.shape[-2:]
         pieces = cuts(min(height, width), len(self.sites))
         return make_grid(height // pieces, width // pieces), pieces

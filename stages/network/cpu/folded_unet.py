@@ -60,7 +60,7 @@ class Conv:
 
 
 class FirstConv:
-    """The network's first layer: see :func:`row_kernels.heights`. ``scale`` : m, by which heights are divided."""
+    """The network's first layer: see :func:`inference_kernels.heights`. ``scale`` : m, by which heights are divided."""
 
     def __init__(self, conv: HeightConv, norm: BatchNorm, scale: float, dtype: torch.dtype) -> None:
         centred = conv.weight - conv.weight.mean(dim=(2, 3), keepdim=True)

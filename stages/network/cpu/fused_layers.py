@@ -1,4 +1,4 @@
-"""The network's steps between convolutions as single operations on the CPU, differentiable: see ``kernels``."""
+"""The network's steps between convolutions as single operations on the CPU, differentiable: see ``training_kernels``."""
 
 from __future__ import annotations
 
@@ -34,6 +34,8 @@ def norm_act(
 
     Takes over what ``norm`` does in training, running statistics included; in evaluation mode it has no gradient. A bias
     before a normalisation changes nothing but the running mean: it has no gradient either.
+
+    x : (B, C, H, W); bias : (C,); keys : (B,) int64; returns (B, C, H + 2 pad, W + 2 pad)
     """
     pattern, threshold, factor = _NO_KEYS, 0, 1.0
     if norm.training and drop is not None and drop.p > 0:
@@ -129,7 +131,10 @@ class _Pool(torch.autograd.Function):
 
 
 def pool(x: Tensor) -> Tensor:
-    """Largest of 2 x 2, edges continued by a pixel."""
+    """Largest of 2 x 2, edges continued by a pixel.
+
+    x : (B, C, H, W); returns (B, C, H / 2 + 2, W / 2 + 2)
+    """
     return _Pool.apply(x)
 
 
@@ -152,7 +157,10 @@ class _Join(torch.autograd.Function):
 
 
 def join(quarters: Tensor, kept: Tensor) -> Tensor:
-    """Upsampled values (from :func:`quarter_weights`) beside kept ones, edges continued by a pixel."""
+    """Upsampled values (from :func:`quarter_weights`) beside kept ones, edges continued by a pixel.
+
+    quarters : (B, 4 C, H / 2, W / 2); kept : (B, D, H, W); returns (B, C + D, H + 2, W + 2)
+    """
     return _Join.apply(channels_last(quarters), channels_last(kept))
 
 

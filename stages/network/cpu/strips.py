@@ -32,6 +32,7 @@ class Rows:
         self._pieces: deque[tuple[int, Tensor]] = deque()
 
     def add(self, piece: Tensor) -> None:
+        """Put the rows that follow, (1, C, h, W), at the end."""
         self._pieces.append((self.end, piece))
         self.end += piece.shape[2]
 
@@ -43,6 +44,7 @@ class Rows:
                 yield a, piece[:, :, a - row : b - row]
 
     def forget(self, before: int) -> None:
+        """Let go of pieces that end before a row."""
         while self._pieces and self._pieces[0][0] + self._pieces[0][1].shape[2] <= before:
             self._pieces.popleft()
 

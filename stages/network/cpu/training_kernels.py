@@ -33,6 +33,7 @@ def pixels_of(x: Tensor) -> NDArray:
 
 
 def channels_last(x: Tensor) -> Tensor:
+    """(B, C, H, W), laid out pixel by pixel."""
     return x.contiguous(memory_format=torch.channels_last)
 
 

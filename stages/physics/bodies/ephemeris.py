@@ -20,9 +20,9 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError, InputError
+from stages.common.arrays import Floats
 from stages.physics.bodies.orientations import CENTURY, ORIENTATIONS
 from stages.physics.bodies.small_bodies import ELEMENTS, GAUSS, Elements, small_body_state
 from stages.physics.bodies.spheres import Body
@@ -30,7 +30,6 @@ from stages.physics.bodies.spheres import Body
 if TYPE_CHECKING:
     from astropy.time import Time
 
-Floats = NDArray[np.float64]
 KERNELS_VARIABLE = "LUNARGR_SPICE_KERNELS"
 AU = 149597870700.0  # m, IAU 2012 definition
 SPEED_OF_LIGHT = 299792458.0  # m/s
@@ -95,15 +94,8 @@ def et_to_utc(ephemeris_time: float) -> str:
 
 
 def body_name(body: str | Body) -> str:
+    """The name in lower case."""
     return (body.name if isinstance(body, Body) else str(body)).strip().lower()
-
-
-def body_rotation(time_utc: str | datetime, body: str | Body = "moon") -> Floats:
-    """(3, 3), takes ICRF vectors to body-fixed ones at that time. Raises GeometryError for a body without a model."""
-    name = body_name(body)
-    if name not in ORIENTATIONS:
-        raise _unknown(name)
-    return ORIENTATIONS[name].rotation(_days(parse_utc(time_utc).tdb))
 
 
 # --- the Sun --------------------------------------------------------------------------------------------------------

@@ -13,11 +13,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import InputError
+from stages.common.arrays import Floats
 
-Floats = NDArray[np.float64]
 GAUSS = 0.01720209895  # au^1.5 / day: the Gaussian gravitational constant
 OBLIQUITY = math.radians(84381.448 / 3600)  # of the ecliptic of J2000 that orbital elements refer to (IAU 1976)
 J2000 = 2451545.0

@@ -7,7 +7,7 @@ Image coordinates here are CSM's: (line, sample), the first pixel's centre at (0
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError, InputError, RegistryError
 from schemas.files.user_files import read_json
-
-Floats = NDArray[np.float64]
+from stages.common.arrays import Floats
 
 
 class Camera(ABC):
@@ -52,7 +51,10 @@ class Camera(ABC):
         return None
 
     def ephemeris_time(self, line: ArrayLike) -> Floats | None:
-        """Seconds of TDB since J2000 of each line; None where the model holds no time."""
+        """Seconds of TDB since J2000 of each line; None where the model holds no time.
+
+        line : (...,) px; returns the same shape
+        """
         return None
 
     def position(self, line: ArrayLike, sample: ArrayLike | None = None) -> Floats:
@@ -64,12 +66,15 @@ class Camera(ABC):
         """Which exposure took each line, where the image is pieced together of several that overlap on the ground.
 
         None for an image in one piece, over which places move steadily as they do over the ground.
+
+        line : (...,) px; returns the same shape
         """
         return None
 
     def ground_to_piece(self, points: ArrayLike, piece: ArrayLike) -> tuple[Floats, Floats]:
         """As :meth:`ground_to_image`, in a given exposure (indices that broadcast with the points); lines are held
-        where that exposure's own pixels are, so that its neighbours in the image do not mix in."""
+        where that exposure's own pixels are, so that its neighbours in the image do not mix in.
+        """
         return self.ground_to_image(points)
 
     def edge_lines(self, count: int) -> Floats:
@@ -77,7 +82,10 @@ class Camera(ABC):
         return np.linspace(0.0, self.lines, count)
 
     def inside(self, line: ArrayLike, sample: ArrayLike) -> NDArray[np.bool_]:
-        """Whether image coordinates lie on the detector."""
+        """Whether image coordinates lie on the detector.
+
+        line, sample : (...,) px, broadcast against each other
+        """
         line, sample = np.asarray(line, float), np.asarray(sample, float)
         return (line >= 0) & (line <= self.lines) & (sample >= 0) & (sample <= self.samples)
 
@@ -101,51 +109,6 @@ class Camera(ABC):
             )
         if missing != "nearest":
             points = np.where(hit[..., None], points, np.nan)
-        return points
-
-    def image_to_terrain(
-        self,
-        line: ArrayLike,
-        sample: ArrayLike,
-        height_at: Callable[[Floats, Floats], Floats],
-        tolerance: float = 1e-3,
-        iterations: int = 50,
-    ) -> Floats:
-        """(..., 3) body-fixed points where the rays meet a terrain; NaN where they do not, or leave it.
-
-        height_at : (longitude, latitude in degrees) -> metres above the sphere of the equatorial radius, NaN outside
-        tolerance : m, between the ray and the terrain
-        Each step raises the sphere to the terrain under the last answer, with the secant's slope where two steps
-        give one; over terrain steeper than the ray the answer may be the second surface that it crosses.
-        """
-        origin, direction = self.rays(line, sample)
-        radius = self.semi_axes[0]
-        height = np.zeros(origin.shape[:-1])
-        previous_height: Floats | None = None
-        previous_gap: Floats | None = None
-        points = np.full_like(origin, np.nan)
-        done = np.zeros(height.shape, bool)
-        for _ in range(iterations):
-            trial, hit = meet_ellipsoid(origin, direction, radius + height, radius + height)
-            r = np.linalg.norm(trial, axis=-1)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                longitude = np.degrees(np.arctan2(trial[..., 1], trial[..., 0]))
-                latitude = np.degrees(np.arcsin(np.clip(trial[..., 2] / r, -1, 1)))
-                terrain = np.asarray(height_at(longitude, latitude), float)
-                gap = np.where(hit, terrain, np.nan) - height
-                found = np.abs(gap) < tolerance
-                points = np.where((found & ~done)[..., None], trial, points)
-                done |= found
-                if (done | ~np.isfinite(gap)).all():
-                    break
-                step = gap
-                if previous_gap is not None and previous_height is not None:
-                    slope = (gap - previous_gap) / (height - previous_height)
-                    secant = -gap / slope
-                    usable = np.isfinite(secant) & (slope < -0.2) & (np.abs(secant) < 10 * np.abs(gap) + 1)
-                    step = np.where(usable, secant, 0.5 * gap)
-            previous_height, previous_gap = height, gap
-            height = np.where(done | ~np.isfinite(step), height, height + step)
         return points
 
 
@@ -184,6 +147,7 @@ def register(cls: type[Camera]) -> type[Camera]:
 
 
 def camera_kinds() -> list[str]:
+    """The registered kinds of cameras, sorted."""
     return sorted({cls.kind for cls in _CAMERAS.values()})
 
 

@@ -154,12 +154,18 @@ def _each(model, k, x, y, forward, out_x, out_y):
 
 
 def undistort_arrays(model: int, k: NDArray, dx: NDArray, dy: NDArray) -> tuple[NDArray, NDArray]:
-    """:func:`undistort` for arrays of one shape."""
+    """:func:`undistort` for arrays.
+
+    dx, dy : (n,) mm or px, as the model counts; k : (m,) its coefficients; returns (n,) each
+    """
     return _arrays(model, k, dx, dy, False)
 
 
 def distort_arrays(model: int, k: NDArray, ux: NDArray, uy: NDArray) -> tuple[NDArray, NDArray]:
-    """:func:`distort` for arrays of one shape."""
+    """:func:`distort` for arrays.
+
+    ux, uy : (n,) mm or px, as the model counts; k : (m,) its coefficients; returns (n,) each
+    """
     return _arrays(model, k, ux, uy, True)
 
 

@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import GeometryError, InputError
+from stages.common.arrays import Floats
 from stages.physics.bodies.spheres import find_body
 
-Floats = NDArray[np.float64]
 LARGEST_IMAGE = 100_000_000  # lines, samples: longer than any strip from orbit
 ROTATION_TOLERANCE = 1e-6
 LOWEST_CAMERA, FARTHEST_CAMERA = 0.5, 1e13  # of the radius (bodies are far from round), m
@@ -30,6 +29,7 @@ def value(document: Mapping[str, Any], key: str, where: str) -> Any:
 
 
 def number(document: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:
+    """A finite number. Raises InputError."""
     if default is not None and not has(document, key):
         return default
     found = value(document, key, where)
@@ -67,6 +67,7 @@ def array(document: Mapping[str, Any], key: str, where: str, shape: tuple[int, .
 
 
 def has(document: Mapping[str, Any], key: str) -> bool:
+    """Whether a dotted key is there."""
     here: Any = document
     for part in key.split("."):
         if not isinstance(here, Mapping) or part not in here:
@@ -76,6 +77,7 @@ def has(document: Mapping[str, Any], key: str) -> bool:
 
 
 def size(document: Mapping[str, Any], key: str, where: str) -> int:
+    """A number of lines or samples. Raises InputError."""
     result = number(document, key, where)
     if not 1 <= result <= LARGEST_IMAGE or result != int(result):
         raise InputError(

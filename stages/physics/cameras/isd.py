@@ -12,15 +12,14 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats
 from stages.physics.cameras import document as read
 from stages.physics.cameras.base import meet_ellipsoid
 from stages.physics.cameras.distortion import distort, distort_arrays, read_distortion, undistort_arrays
 from stages.physics.cameras.tables import Rotations, States, read_rotations, read_states
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

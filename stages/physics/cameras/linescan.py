@@ -81,11 +81,14 @@ class LineScan(Camera):
             check_times(where, key, times, float(ends.min()), float(ends.max()))
         origin, axis = camera.rays(camera.lines / 2, camera.samples / 2)
         object.__setattr__(camera, "detector", detector.facing(origin, axis, camera.semi_axes[0]))
-        object.__setattr__(camera, "_search", _Search.of(camera, where))
+        object.__setattr__(camera, "_search", _Search.for_camera(camera, where))
         return camera
 
     def times(self, line: ArrayLike) -> Floats:
-        """Seconds from ``centre_time`` of image lines."""
+        """Seconds from ``centre_time`` of image lines.
+
+        line : (...,) px; returns the same shape
+        """
         line = np.asarray(line, float)
         k = np.clip(np.searchsorted(self.line_starts, line, side="right") - 1, 0, None)
         return self.line_times[k] + self.line_rates[k] * (line - self.line_starts[k])
@@ -162,7 +165,7 @@ class _Search:
     slope: float
 
     @classmethod
-    def of(cls, camera: LineScan, where: str) -> _Search:
+    def for_camera(cls, camera: LineScan, where: str) -> _Search:
         margin = max(2.0, 0.01 * camera.lines)
         ends = camera.times(np.array([-margin, camera.lines + margin]))
         wanted = 4 * max(len(camera.positions.values), len(camera.pointing.values))

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from schemas.errors import GeometryError
 from stages.physics.cameras import document as read
 from stages.physics.cameras.base import Camera, Floats, register
 
@@ -42,49 +41,6 @@ class Pinhole(Camera):
     def from_document(cls, document: Mapping[str, Any], where: str) -> Pinhole:
         focal = read.one_or_two(document, "focal_px", where, "focal lengths above 0 px")
         return cls(focal_px=focal, **read.own_camera(document, where))
-
-    @classmethod
-    def looking_at(
-        cls,
-        position: ArrayLike,
-        target: ArrayLike,
-        field_of_view: float,
-        size: tuple[int, int],
-        up: ArrayLike | None = None,
-        radius: float = 1737400.0,
-    ) -> Pinhole:
-        """A camera at ``position`` with ``target`` in the middle of its image.
-
-        position, target : (3,), body-fixed, m; field_of_view : rad, across the samples
-        size : (samples, lines); up : (3,) what the top of the image points to (the body's north by default)
-        """
-        position, target = np.asarray(position, float), np.asarray(target, float)
-        forward = target - position
-        distance = np.linalg.norm(forward)
-        if not distance > 0 or not 0 < field_of_view < np.pi:
-            raise GeometryError(
-                f"pinhole camera: expected two different places and a field of view in (0, 180) deg, found distance "
-                f"{distance:g} m and {np.degrees(field_of_view):g} deg."
-            )
-        forward = forward / distance
-        above = np.array([0.0, 0.0, 1.0]) if up is None else np.asarray(up, float)
-        right = np.cross(forward, above)
-        if np.linalg.norm(right) < 1e-9 * np.linalg.norm(above):  # straight along "up": any other axis will do
-            right = np.cross(forward, np.array([1.0, 0.0, 0.0]))
-            if np.linalg.norm(right) < 1e-9:
-                right = np.cross(forward, np.array([0.0, 1.0, 0.0]))
-        right = right / np.linalg.norm(right)
-        down = np.cross(forward, right)
-        focal = size[0] / 2 / np.tan(field_of_view / 2)
-        return cls(
-            lines=size[1],
-            samples=size[0],
-            focal_px=(focal, focal),
-            principal_point_px=(size[0] / 2, size[1] / 2),
-            centre=position,
-            rotation=np.stack([right, down, forward], axis=1),
-            semi_axes=(radius, radius),
-        )
 
     def to_document(self) -> dict[str, Any]:
         """The JSON document that :meth:`from_document` reads."""

@@ -139,7 +139,10 @@ class PushFrame(Camera):
         return self.times[self.piece(line)]
 
     def ground_to_image(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """As of every camera; NaN too where a place falls between two framelets, more than half a line from both."""
+        """As of every camera; NaN too where a place falls between two framelets, more than half a line from both.
+
+        points : (..., 3) body-fixed, m; returns line and sample, (...,) px each
+        """
         points = np.asarray(points, float)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         line, sample = np.empty(len(flat)), np.empty(len(flat))
@@ -211,7 +214,7 @@ def _flag(document: Mapping[str, Any], key: str, where: str) -> bool:
 
 
 @numba.njit(cache=True)
-def _look(
+def _place_on_framelet(
     point, k, centres, rotations, focal, sense, to_line, to_sample, line_offset, sample_offset, summing, sample_summing,
     model, coefficients,
 ):  # fmt: skip
@@ -253,14 +256,14 @@ def _find(
                 continue
             row, column = math.nan, math.nan
             if k >= 0:
-                row, column = _look(
+                row, column = _place_on_framelet(
                     p, k, centres, rotations, focal, sense, to_line, to_sample, line_offset, sample_offset, summing,
                     sample_summing, model, coefficients,
                 )  # fmt: skip
             if not math.isfinite(row):
                 k, slope = -1, first_slope
                 for j in range(0, framelets, stride):
-                    r, c = _look(
+                    r, c = _place_on_framelet(
                         p, j, centres, rotations, focal, sense, to_line, to_sample, line_offset, sample_offset,
                         summing, sample_summing, model, coefficients,
                     )  # fmt: skip
@@ -275,7 +278,7 @@ def _find(
                 j = int(min(max(k + step, 0.0), framelets - 1.0))
                 if j == k:
                     break
-                r, c = _look(
+                r, c = _place_on_framelet(
                     p, j, centres, rotations, focal, sense, to_line, to_sample, line_offset, sample_offset, summing,
                     sample_summing, model, coefficients,
                 )  # fmt: skip
@@ -290,7 +293,7 @@ def _find(
                 moving = False
                 for j in (k - 1, k + 1):
                     if 0 <= j < framelets:
-                        r, c = _look(
+                        r, c = _place_on_framelet(
                             p, j, centres, rotations, focal, sense, to_line, to_sample, line_offset, sample_offset,
                             summing, sample_summing, model, coefficients,
                         )  # fmt: skip

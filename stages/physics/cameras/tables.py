@@ -12,12 +12,12 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from schemas.errors import InputError
+from stages.common.arrays import Floats
 from stages.physics.cameras import document as read
 
-Floats = NDArray[np.float64]
 LEAST_NODES = 25  # of the even position table
 _UNITS = {"m": 1.0, "km": 1000.0}
 
@@ -51,7 +51,8 @@ class States:
 @dataclass(frozen=True)
 class Rotations:
     """Rotations over time. times : (n,), s; quaternions : (n, 4), scalar first, neighbours on the same side;
-    constant : (3, 3), applied after them."""
+    constant : (3, 3), applied after them.
+    """
 
     times: Floats
     quaternions: Floats
@@ -128,13 +129,19 @@ def _times(document: Mapping[str, Any], key: str, where: str) -> Floats:
 
 
 def one_side(quaternions: Floats) -> Floats:
-    """The same rotations with signs such that neighbours are close: interpolation must not cross from q to -q."""
+    """The same rotations with signs such that neighbours are close: interpolation must not cross from q to -q.
+
+    quaternions : (n, 4), scalar first
+    """
     flip = np.cumprod(np.where((quaternions[1:] * quaternions[:-1]).sum(-1) < 0, -1.0, 1.0))
     return np.concatenate([quaternions[:1], quaternions[1:] * flip[:, None]])
 
 
 def slerp(times: Floats, quaternions: Floats, at: Floats) -> Floats:
-    """Unit quaternions at times ``at``, great circles between the entries and continued beyond the ends."""
+    """Unit quaternions at times ``at``, great circles between the entries and continued beyond the ends.
+
+    times : (n,) s, rising; quaternions : (n, 4) there; at : (k,) s; returns (k, 4)
+    """
     i = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
     t = (at - times[i]) / (times[i + 1] - times[i])
     a, b = quaternions[i], quaternions[i + 1]
@@ -167,7 +174,10 @@ def matrix_quaternions(rotations: Floats) -> Floats:
 
 
 def even_positions(states: States, times: Floats, body: Rotations) -> EvenTable:
-    """Body-fixed positions, m, on the even grid that the entries ``times`` span."""
+    """Body-fixed positions, m, on the even grid that the entries ``times`` span.
+
+    times : (n,) s
+    """
     if len(times) == 1:
         return EvenTable(float(times[0]), 1.0, (body.at(times) @ states.at(times)[..., None])[..., 0])
     grid = np.linspace(times[0], times[-1], max(LEAST_NODES, len(times)))
@@ -192,6 +202,8 @@ def check_times(where: str, key: str, times: Floats, first: float, last: float) 
     """Refuse image times outside a table, beyond what tables that were cut at the exposure leave out.
 
     Allowed is one step of the table, and at most a tenth of its span. Raises InputError.
+
+    times : (n,) s, of the table; first, last : s, of the image
     """
     if len(times) == 1:
         return

@@ -29,7 +29,6 @@ class Observation:
     sun_direction : (B, 3), unit, ENU along the crop's axes
     camera_position : (B, 3), m from the crop's centre
     sun_horizon : (B, H, W), rad, or None where nothing casts shadows
-    sky_view : (B, H, W), 1, or None
     detector_sample, detector_line : (B, H, W), px, or None
     frame : (B,) int64, index of the source image, or None
     site : (B,) int64, number of the ground site, or None
@@ -41,7 +40,6 @@ class Observation:
     gsd: float
     body_radius: float
     sun_horizon: Tensor | None = None
-    sky_view: Tensor | None = None
     detector_sample: Tensor | None = None
     detector_line: Tensor | None = None
     frame: Tensor | None = None
@@ -92,9 +90,11 @@ class Extension(Protocol):
     """A physical effect that extends the chain (``stages/effects``)."""
 
     @property
-    def slot(self) -> str: ...
+    def slot(self) -> str:
+        """One of SLOTS."""
 
-    def apply(self, state: State) -> None: ...
+    def apply(self, state: State) -> None:
+        """Change what the slot may change."""
 
 
 def form(
@@ -111,7 +111,9 @@ def form(
     """
     if not extensions:
         o = observation
-        known = facets.look(o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius)
+        known = facets.angles_and_light(
+            o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius
+        )
         if known is not None:
             return model.lit(coefficients, *known)
     state = illuminate(observation, extensions)

@@ -1,6 +1,6 @@
 """Angles and sunlight of every facet of a batch of crops, in one pass over its elevations.
 
-The same as ``geometry`` and ``penumbra`` give, to rounding, for training and prediction on the CPU, where only coefficients
+The same as ``geometry`` and ``light.sun_disc`` give, to rounding, for training and prediction on the CPU, where only coefficients
 have gradients: every operation of theirs is a pass over memory, and all of them cost more than a model and its gradient.
 """
 
@@ -22,7 +22,7 @@ FLOOR = np.float32(horizon_cosine(torch.float32))
 RADII_PER_RAD = np.float32(1 / SUN_RADIUS)
 
 
-def look(
+def angles_and_light(
     elevation: Tensor,
     sun_direction: Tensor,
     camera_position: Tensor,
@@ -53,13 +53,13 @@ def look(
     axes = [v.astype(np.float32) for v in (east, north, east / body_radius, north / body_radius)]
     out = [torch.empty_like(z) for _ in range(4)]
     inputs = z.numpy(), edge.numpy(), sun_horizon is not None, places.numpy(), *axes, np.float32(1 / gsd)
-    share_out(_look, crops, *inputs, *(t.numpy() for t in out))
+    share_out(_angles_and_light, crops, *inputs, *(t.numpy() for t in out))
     *cosines, light = out
     return Angles(*cosines), light
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _look(
+def _angles_and_light(
     first, last, z, edge, shaded, places, east, north, bend_east, bend_north, per_pixel, mu0, mu, cos_phase, light
 ):
     height, width = z.shape[1:]

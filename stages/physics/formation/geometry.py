@@ -28,7 +28,10 @@ class Angles:
 
     @classmethod
     def from_angles(cls, incidence: Tensor, emission: Tensor, phase: Tensor) -> Angles:
-        """From angles in radians, kept as given so that nothing is lost near phase 0."""
+        """From angles in radians, kept as given so that nothing is lost near phase 0.
+
+        incidence, emission, phase : (...,) each, broadcastable
+        """
         return cls(incidence.cos(), emission.cos(), phase.cos(), incidence, emission, phase)
 
     @cached_property
@@ -48,7 +51,10 @@ class Angles:
 
 
 def safe_acos(cosine: Tensor) -> Tensor:
-    """acos with finite gradients at +-1: the argument keeps 1e-7 (float32) or 1e-14 (float64) away from them."""
+    """acos with finite gradients at +-1: the argument keeps 1e-7 (float32) or 1e-14 (float64) away from them.
+
+    cosine : (...,); returns the same shape, rad
+    """
     margin = 1e-14 if cosine.dtype == torch.float64 else 1e-7
     return torch.acos(cosine.clamp(-1 + margin, 1 - margin))
 
@@ -83,6 +89,8 @@ def curvature_slopes(slope_east: Tensor, slope_north: Tensor, gsd: float, body_r
     """Tilt slopes on the sphere into the tangent plane at the crop's centre, where the Sun's direction is given.
 
     The surface falls away from that plane as d^2 / 2R, so its slope gains -d / R (1 deg per 30 km on the Moon).
+
+    slope_east, slope_north : (..., H, W); gsd, body_radius : m
     """
     height, width = slope_east.shape[-2:]
     east, north = crop_axes(height, width, gsd, slope_east.device)

@@ -9,8 +9,6 @@ height, are interpolated.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from schemas.errors import GeometryError
 from stages.physics.horizon.hulls import sweep_horizon
 from stages.physics.horizon.scene import Overview, horizon_in_scene, make_overview
-from stages.physics.horizon.shadow import sweep_shadow, sweep_shadow_bands
+from stages.physics.horizon.shadow import sweep_shadow
 from stages.physics.horizon.sweeps import PixelSize
 
-__all__ = ["Overview", "cast_shadow", "cast_shadow_bands", "horizon", "horizon_in_scene", "make_overview"]
+__all__ = ["Overview", "cast_shadow", "horizon", "horizon_in_scene", "make_overview"]
 
 
 def _check(
@@ -71,23 +69,3 @@ def cast_shadow(
     grid = np.ascontiguousarray(elevation, dtype=np.float32)
     _check(grid.shape, gsd, body_radius, azimuth, sun_elevation)
     return sweep_shadow(grid, gsd, azimuth, sun_elevation, body_radius)
-
-
-def cast_shadow_bands(
-    elevation: Any,
-    gsd: PixelSize,
-    azimuth: float,
-    sun_elevation: float,
-    body_radius: float | None = None,
-    band: int = 512,
-) -> Iterator[tuple[slice, slice, NDArray[np.bool_]]]:
-    """:func:`cast_shadow` of a grid that does not fit into memory, in bands of rows or columns from the Sun's side.
-
-    elevation : (H, W), anything that slices [r0:r1, c0:c1] (array, h5py dataset), m
-    band : rows (columns where the Sun stands nearer to east or west) that are in memory at a time
-    yields (rows, columns, shadow): slices of the grid and the bool array that belongs there; together the whole grid
-    """
-    _check(tuple(elevation.shape), gsd, body_radius, azimuth, sun_elevation)
-    if band < 1:
-        raise GeometryError(f"band: expected at least 1 row, found {band}.")
-    return sweep_shadow_bands(elevation, gsd, azimuth, sun_elevation, body_radius, band)

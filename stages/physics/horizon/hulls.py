@@ -303,7 +303,9 @@ def sweep_horizon(
 ) -> NDArray[np.float32]:
     """Elevation angle of the terrain horizon; see ``horizon.horizon``.
 
+    grid : (H, W), m; gsd : m; azimuth : rad
     target : row, column, height, width of the part of the grid whose horizon is wanted (None: all of it)
+    returns (height, width) float32, rad
     """
     sweep = Sweep.towards(azimuth, gsd, grid.shape)
     taps = Taps.near(sweep.shear, NEAR, NEAR_COLUMNS)

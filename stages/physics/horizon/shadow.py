@@ -9,7 +9,6 @@ the lines carry only what lies beyond.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numba
@@ -262,7 +261,10 @@ def _state(sweep: Sweep, parallel: bool) -> NDArray[np.float32]:
 def sweep_shadow(
     grid: NDArray[np.float32], gsd: PixelSize, azimuth: float, sun_elevation: float, body_radius: float | None
 ) -> NDArray[np.bool_]:
-    """True where terrain hides a Sun at this azimuth and elevation (rad); see ``horizon.cast_shadow``."""
+    """True where terrain hides a Sun at this azimuth and elevation (rad); see ``horizon.cast_shadow``.
+
+    grid : (H, W), m; returns (H, W)
+    """
     sweep, tables = _tables(grid.shape, gsd, azimuth, sun_elevation, body_radius)
     out = np.empty(grid.shape, dtype=np.bool_)
     parallel = grid.size > SMALL
@@ -274,27 +276,3 @@ def sweep_shadow(
         *tables,
     )  # fmt: skip
     return out
-
-
-def sweep_shadow_bands(
-    elevation: Any, gsd: PixelSize, azimuth: float, sun_elevation: float, body_radius: float | None, band: int
-) -> Iterator[tuple[slice, slice, NDArray[np.bool_]]]:
-    """The same, band by band from the Sun's side; only the rays' heights go from one band to the next."""
-    shape = (int(elevation.shape[0]), int(elevation.shape[1]))
-    sweep, tables = _tables(shape, gsd, azimuth, sun_elevation, body_radius)
-    state = _state(sweep, True)
-    for start in range(0, sweep.rows, band):
-        stop = min(start + band, sweep.rows)
-        before = max(0, start - NEAR - 1)  # the nearest rows are looked at again
-        low, high, inner = before, stop, slice(start, stop)
-        if sweep.reverse:
-            low, high, inner = sweep.rows - stop, sweep.rows - before, slice(sweep.rows - stop, sweep.rows - start)
-        z = elevation[:, low:high] if sweep.by_columns else elevation[low:high, :]
-        z = np.ascontiguousarray(z, dtype=np.float32)
-        out = np.empty((shape[0], stop - start) if sweep.by_columns else (stop - start, shape[1]), dtype=np.bool_)
-        z_row, out_row, step = (stop - 1, stop - 1, -1) if sweep.reverse else (-before, -start, 1)
-        _KERNELS[sweep.by_columns, z.size > SMALL](
-            z, z_row, step, out.view(np.uint8) if sweep.by_columns else out, out_row, step, start, stop, sweep.columns, sweep.first_line, sweep.line_count, state,
-            *tables,
-        )  # fmt: skip
-        yield (slice(0, shape[0]), inner, out) if sweep.by_columns else (inner, slice(0, shape[1]), out)

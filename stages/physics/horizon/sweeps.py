@@ -84,6 +84,7 @@ class Sweep:
 
     @property
     def first_line(self) -> int:
+        """Number of the leftmost line."""
         return int(self.whole.min(initial=0))
 
     @property

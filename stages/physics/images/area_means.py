@@ -9,9 +9,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats
 from stages.physics.maps.grid import CSM_CENTRE
 
-Floats = NDArray[np.float64]
 ReadWindow = Callable[[int, int, int, int], NDArray[np.float32]]
 
 MAX_SAMPLES = 64  # per side of a ground pixel

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from stages.common.arrays import Floats, Mask
 
 # sigma of the mean that is taken off: albedo is strongest over long distances, shading over short ones
 HIGH_PASS_PX = 4.0
@@ -39,7 +38,8 @@ def _masked_mean(filled: Floats, mask: Floats, sigma: float) -> Floats:
 def masked_correlation(image: Floats, good_image: Mask, templates: Sequence[Floats], good: Mask, reach: int) -> Floats:
     """(n, 2 reach + 1, 2 reach + 1) correlation coefficients of image[r + dy, c + dx] with each template[r, c].
 
-    Rows are dy. -1 where too few known pixels overlap.
+    image, good_image, good : (H, W), and so is each of the n templates. Rows of the answer are dy, columns dx.
+    -1 where too few known pixels overlap.
     """
     shape = tuple(cv2.getOptimalDFTSize(n + reach) for n in image.shape)
     index = np.arange(-reach, reach + 1)
@@ -73,6 +73,8 @@ def combined_correlation(scores: Floats, among: Floats) -> Floats:
     """Multiple correlation of the image with several templates, from its correlation with each and theirs among them.
 
     The sign is the first one's: a negative of the rendering is no match.
+
+    scores : (n, R, C), of each template over the shifts; among : (n, n)
     """
     if len(scores) == 1:
         return scores[0]

@@ -11,12 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
+from stages.common.arrays import Floats
 from stages.physics.maps.grid import Grid, unit_vectors
 
-Floats = NDArray[np.float64]
 FORMS = ("constant", "affine", "field")  # from the plainest on
 # (row, col, height m) -> (dx, dy) px that all of the relief displacement makes there
 Relief = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
@@ -24,7 +24,7 @@ Relief = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
 
 @dataclass(frozen=True)
 class Basis:
-    """What a displacement is a mixture of.
+    """Basis functions over the ground whose weighted sum is a displacement: a constant, a plane, or cubic B-splines.
 
     form : one of FORMS; origin : (row, col), the middle for 'affine', the first knot for 'field'
     step : px, what the places are divided by, the distance of the knots; cells : (rows, cols) between the knots of a field
@@ -37,6 +37,7 @@ class Basis:
 
     @property
     def size(self) -> int:
+        """Parts that it is made of."""
         return {"constant": 1, "affine": 3}.get(self.form, (self.cells[0] + 3) * (self.cells[1] + 3))
 
     def matrix(self, row: Floats, col: Floats) -> Floats:
@@ -119,6 +120,7 @@ class Field:
 
     @property
     def accepted(self) -> bool:
+        """Whether the evidence was enough."""
         return not self.refused
 
     @property

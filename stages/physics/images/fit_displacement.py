@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats, Mask
 from stages.physics.images.displacement import FORMS, Basis, Field
 from stages.physics.images.registration import Shift
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 LEAST_BLOCKS = {"constant": 4, "affine": 8, "field": 12}
 WORST_FIELD_SIGMA_PX = 0.25
@@ -51,7 +49,8 @@ class _Blocks:
 class _Solution:
     """theta : (2 size [+ 1],), dx's and dy's coefficients and the relief's share; covariance of it; off : (n, 2) px, what it
     leaves; keep : (n,) bool, blocks that count; scatter : px; freedom : parameters per axis
-    design : (n, 2, p); rows, values : (2 n, p) and (2 n,) the weighted equations; held : (p, p) what holds theta besides them"""
+    design : (n, 2, p); rows, values : (2 n, p) and (2 n,) the weighted equations; held : (p, p) what holds theta besides them
+    """
 
     theta: Floats
     covariance: Floats

@@ -34,6 +34,7 @@ class Block(dict[str, Any]):
         return None
 
     def walk(self) -> Iterator[Block]:
+        """Itself and all blocks within."""
         yield self
         for block in self.blocks:
             yield from block.walk()

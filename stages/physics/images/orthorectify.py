@@ -16,11 +16,11 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats
 from stages.physics.cameras import Camera
 from stages.physics.images.area_means import ReadWindow, area_means
 from stages.physics.maps.grid import CSM_CENTRE, Grid, unit_vectors
 
-Floats = NDArray[np.float64]
 # (row, col) arrays -> (dx, dy) px along columns and rows, as registration finds them
 Displacement = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]
 
@@ -161,7 +161,10 @@ def _ground(terrain: Terrain, row: NDArray, col: NDArray, displacement: Displace
 
 
 def bilinear(values: NDArray, row: NDArray, col: NDArray) -> Floats:
-    """Between pixel centres, continued evenly beyond the outermost; whole indices need no neighbour."""
+    """Bilinear samples between pixel centres, extrapolated beyond the outermost.
+
+    values : (H, W); row, col : (...,) px; returns (...,)
+    """
     row, col = np.asarray(row, float), np.asarray(col, float)
     r = np.clip(np.floor(row).astype(int), 0, max(0, values.shape[0] - 2))
     c = np.clip(np.floor(col).astype(int), 0, max(0, values.shape[1] - 2))

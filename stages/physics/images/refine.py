@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import correlate1d
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from stages.common.arrays import Floats, Mask
 
 ITERATIONS = 30
 LEAST_PIXELS = 200  # that must stay usable while the image is moved under the template
@@ -28,7 +27,8 @@ MEMORY_PX = 16  # residuals further apart than this are taken as independent
 @dataclass(frozen=True)
 class Refined:
     """place : (dx, dy) px; share : of ``relief`` within the region, 0 without; covariance : (3, 3) of the three, inf for a
-    share that was not asked for; correlation : between image and rendering there. None of it finite where it did not settle."""
+    share that was not asked for; correlation : between image and rendering there. None of it finite where it did not settle.
+    """
 
     place: tuple[float, float]
     share: float
@@ -62,7 +62,7 @@ def refine(
             use = whole & _seen(solid, cell)
             if use.sum() < LEAST_PIXELS:
                 return NOWHERE
-            region = _Region.of(cell, use, templates, weight)
+            region = _Region.around(cell, use, templates, weight)
         fit = _linear_fit(moved, region, None)
         if fit is None:
             return NOWHERE
@@ -101,7 +101,7 @@ class _Region:
     projector: Floats
 
     @classmethod
-    def of(cls, cell: tuple[int, int, int, int], use: Mask, templates: Sequence[Floats], weight: Floats) -> _Region:
+    def around(cls, cell: tuple[int, int, int, int], use: Mask, templates: Sequence[Floats], weight: Floats) -> _Region:
         flat = np.flatnonzero(use)
         columns = [*templates, np.ones(use.shape)]
         design, east, south = (
@@ -129,7 +129,8 @@ def _slope(values: Floats, axis: int) -> Floats:
 @dataclass(frozen=True)
 class _Linear:
     """One linearised fit: change (p,) of the displacement; ``columns`` (n, p) with all nuisances projected out and weighted;
-    inverse (p, p) of their normal matrix; residual (n,)."""
+    inverse (p, p) of their normal matrix; residual (n,).
+    """
 
     change: Floats
     columns: Floats
@@ -205,6 +206,8 @@ def moved_image(spline: Floats, dx: float, dy: float) -> Floats:
     """The image at (row + dy, col + dx) from the coefficients of its quintic spline.
 
     A cubic convolution's phase depends on the fraction of a pixel: it drew shifts by up to 0.05 px.
+
+    spline : (H, W); dx, dy : px; returns (H, W)
     """
     for axis, shift in ((0, dy), (1, dx)):
         whole = math.floor(shift)
@@ -221,7 +224,10 @@ def _quintic(x: float) -> float:
 
 
 def displaced(values: NDArray, columns: int, rows: int) -> NDArray:
-    """values[row + rows, col + columns], zeros from outside."""
+    """values[row + rows, col + columns], zeros from outside.
+
+    values : (H, W); returns (H, W)
+    """
     out = np.zeros_like(values)
     height, width = values.shape
     r0, r1, c0, c1 = max(0, -rows), min(height, height - rows), max(0, -columns), min(width, width - columns)
@@ -240,6 +246,9 @@ def _seen(solid: Mask, cell: tuple[int, int, int, int]) -> Mask:
 
 
 def eroded(mask: Mask, size: int) -> Mask:
-    """The pixels of a mask whose ``size`` x ``size`` surroundings are in it."""
+    """The pixels of a mask whose ``size`` x ``size`` surroundings are in it.
+
+    mask : (H, W); returns (H, W)
+    """
     kernel = np.ones((size, size), np.uint8)
     return cv2.erode(mask.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0

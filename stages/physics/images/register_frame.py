@@ -175,7 +175,8 @@ def _added(field: Field, row: float, col: float, left: Shift) -> Shift:
 
 def albedo_patterns(z: NDArray[np.float32], rendering: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """What albedo may follow, as it shows under the light of ``rendering``: height, curvature at three scales and its
-    size at two (rims and floors alike), steepness at two and its square; (H, W) each, NaN taken as level."""
+    size at two (rims and floors alike), steepness at two and its square; (H, W) each, NaN taken as level.
+    """
     filled = np.where(np.isfinite(z), z, np.nanmean(z) if np.isfinite(z).any() else 0.0).astype(float)
     curvature = [cv2.Laplacian(cv2.GaussianBlur(filled, (0, 0), sigma), cv2.CV_64F) for sigma in (0.5, 1.0, 3.0)]
     steepness = [np.hypot(*np.gradient(blurred)) for blurred in (filled, cv2.GaussianBlur(filled, (0, 0), 3.0))]
@@ -187,8 +188,12 @@ def albedo_patterns(z: NDArray[np.float32], rendering: NDArray[np.float64]) -> l
 def render_region(
     frame: Frame, z: NDArray[np.float32], elevation: Any, overview: Overview, grid: Grid, row: int, col: int
 ) -> tuple[NDArray[np.float64], ...]:
-    """I/F of a uniform surface by each of MODELS, shadows cast by the whole scene, and whether the Sun shines; NaN without
-    terrain."""
+    """I/F of a uniform surface by each of MODELS, with shadows, and whether the Sun shines; NaN without terrain.
+
+    z : (h, w) heights of the region, m; row, col : its first pixel on the grid; elevation : (H, W) of the scene, which casts
+    the shadows
+    returns (h, w) for each model, and (h, w) 1 where the Sun shines
+    """
     height, width = z.shape
     known = np.isfinite(z)
     mean = float(z[known].mean()) if known.any() else 0.0

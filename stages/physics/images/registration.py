@@ -14,16 +14,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import spline_filter
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats, Mask
 from stages.physics.images.correlation import combined_correlation, masked_correlation, small_structure
 from stages.physics.images.refine import refine
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Box = tuple[int, int, int, int]  # row, col, height, width
+from stages.physics.maps.window import Box
 
 BLOCK_PX = 64
 LEAST_PIXELS = 400
@@ -36,7 +34,7 @@ WORST_SIGMA_PX = 0.5
 
 @dataclass(frozen=True)
 class Shift:
-    """One block's answer.
+    """The shift of one block, how sure it is, and why it is refused where it is.
 
     dx, dy : px along columns and rows; sigma : px, standard error of the worse axis
     correlation : between image and rendering at that shift, small structure only; lead : over the next best place
@@ -57,6 +55,7 @@ class Shift:
 
     @property
     def accepted(self) -> bool:
+        """Whether the evidence was enough."""
         return not self.refused
 
     @property
@@ -120,23 +119,6 @@ def capture_shifts(
     return Shifts(shifts, errors, np.array([[s.quality for s in line] for line in found]))
 
 
-def estimate_shift(
-    image: ArrayLike,
-    rendering: ArrayLike,
-    valid: ArrayLike | None = None,
-    weights: ArrayLike | None = None,
-    max_shift: float = 8.0,
-    patterns: Sequence[ArrayLike] = (),
-) -> Shift:
-    """The one shift of a whole ``image`` against its ``rendering``: see :func:`capture_shifts`.
-
-    weights : (H, W) >= 0, for example less in shadow. Never raises for poor evidence: see ``Shift.refused``.
-    Raises GeometryError for shapes that differ.
-    """
-    pictures = prepare(image, rendering, valid, weights, patterns)
-    return block_shift(pictures, (0, 0, *pictures.image.shape), max_shift)
-
-
 def prepare(
     image: ArrayLike,
     rendering: ArrayLike,
@@ -145,7 +127,11 @@ def prepare(
     patterns: Sequence[ArrayLike] = (),
     relief: Floats | None = None,
 ) -> Pictures:
-    """Band-pass all of it once. Raises GeometryError for shapes that differ."""
+    """Band-pass an image, its rendering and what else it may show, once for all blocks. Raises GeometryError for shapes that differ.
+
+    image, rendering, valid, weights, relief : (H, W), and so is each of the ``patterns``; NaN = unknown
+    weights : 0 or more, for example less in shadow; relief : displacement of the ground by height
+    """
     image, rendering = np.asarray(image, float), np.asarray(rendering, float)
     if image.ndim != 2 or image.shape != rendering.shape:
         raise GeometryError(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
+from stages.common.arrays import Floats
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras import Camera
 from stages.physics.images.area_means import area_means
@@ -32,15 +33,14 @@ from stages.physics.images.orthorectify import (
 from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, check_body, require_crs
-
-Floats = NDArray[np.float64]
-Box = tuple[int, int, int, int]
+from stages.physics.maps.window import Box
 
 
 @dataclass(frozen=True)
 class Pixels:
     """A window of the scene's grid. values : (h, w) float32, NaN where not seen; valid : (h, w) bool;
-    ortho : the camera's side of it, None for map-projected images."""
+    ortho : the camera's side of it, None for map-projected images.
+    """
 
     values: NDArray[np.float32]
     valid: NDArray[np.bool_]
@@ -48,6 +48,8 @@ class Pixels:
 
 
 class Source(Protocol):
+    """An image whose pixels can be read onto the grid of a scene."""
+
     def box(self) -> Box | None:
         """(row, col, height, width) on the grid that holds all that the image shows, None where it lies elsewhere."""
 
@@ -90,6 +92,7 @@ class MapSource:
     camera_position: Floats
 
     def box(self) -> Box | None:
+        """See :meth:`Source.box`."""
         if rasters.source_window(self.dataset, self.grid, margin=0) is None:
             return None
         image = self.dataset
@@ -106,12 +109,14 @@ class MapSource:
         return r0, c0, max(0, r1 - r0), max(0, c1 - c0)
 
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
+        """See :meth:`Source.read`; resampled from one map to the other."""
         if field is None or field.refused:
             part = self.grid.window(row, col, height, width)
             return Pixels(*rasters.warp(self.dataset, part, rasters.choose_resampling(self.dataset, part)[0]), None)
         return Pixels(*self._read_moved(row, col, height, width, field), None)
 
     def relief(self, reference: float) -> Relief | None:
+        """See :meth:`Source.relief`."""
         return relief_displacement(self.grid, self.camera_position, reference)
 
     def _read_moved(
@@ -159,12 +164,15 @@ class CameraSource:
     sun_position: Floats
 
     def box(self) -> Box | None:
+        """See :meth:`Source.box`."""
         return footprint(self.camera, self.grid, self.heights)
 
     def relief(self, reference: float) -> Relief | None:
+        """None: orthorectification has taken it off."""
         return None
 
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
+        """See :meth:`Source.read`; orthorectified with the scene's elevations."""
         r0, c0, r1, c1 = self._surroundings(row, col, height, width)
         piece = np.asarray(self.elevation[r0:r1, c0:c1], dtype=float)
         terrain = Terrain(piece, self.grid.window(r0, c0, r1 - r0, c1 - c0))

@@ -22,6 +22,8 @@ def earth_irradiance(
 
     p (R / d)^2 Phi(phase), with the phase function of a diffuse sphere (sin a + (pi - a) cos a) / pi. Clouds make the
     true Earth a few tens of per cent brighter or darker from day to day.
+
+    returns the shape of ``earth_phase``, (...,)
     """
     phase = np.asarray(earth_phase, dtype=float)
     sphere = (np.sin(phase) + (math.pi - phase) * np.cos(phase)) / math.pi

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError
+from stages.common.arrays import Floats32
 from stages.physics.horizon.scene import Overview
 from stages.physics.maps.window import Window
 
-Floats32 = NDArray[np.float32]
 CELLS_PER_DISTANCE = 32  # steps and cells grow with distance: a cell is seen under 1/32 rad
 
 
@@ -88,17 +88,6 @@ def terrain_light(
         *_directions(azimuths), distances, level, light, sky,
     )  # fmt: skip
     return light, sky
-
-
-def sky_view(elevation: ArrayLike, gsd: float, azimuths: int = 32, body_radius: float | None = None) -> Floats32:
-    """Share of a diffuse sky's light that reaches every facet, 0..1; 1 on a plain.
-
-    elevation : (H, W), m, NaN = nothing there; gsd : m; azimuths : directions looked in
-    body_radius : m, terrain at distance d sinks by d^2 / 2R (None: flat)
-    returns (H, W) float32; NaN where the elevation or a slope is. Beyond the grid the ground is taken as level.
-    """
-    z = np.asarray(elevation, dtype=np.float32)
-    return terrain_light(z, np.zeros_like(z), gsd, azimuths=azimuths, body_radius=body_radius)[1]
 
 
 def form_factors(

@@ -129,10 +129,10 @@ def _head_and_length(levels: Sequence[_Level], big: bool) -> tuple[bytes, int]:
 
 
 def _head(levels: Sequence[_Level], offsets: Sequence[NDArray[np.int64]], big: bool) -> bytes:
-    told = f"GDAL_STRUCTURAL_METADATA_SIZE={len(STRUCTURE):06d} bytes\n{STRUCTURE}".encode()
-    first = _aligned((16 if big else 8) + len(told))
+    ghost = f"GDAL_STRUCTURAL_METADATA_SIZE={len(STRUCTURE):06d} bytes\n{STRUCTURE}".encode()
+    first = _aligned((16 if big else 8) + len(ghost))
     head = bytearray(struct.pack("<2sHHHQ", b"II", 43, 8, 0, first) if big else struct.pack("<2sHI", b"II", 42, first))
-    head += told
+    head += ghost
     for k, (level, own) in enumerate(zip(levels, offsets, strict=True)):
         head += bytes(_aligned(len(head)) - len(head))
         kind = LONG8 if big else LONG

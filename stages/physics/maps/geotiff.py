@@ -40,13 +40,20 @@ class Placed(Protocol):
     """Where a raster lies: a grid, or another raster that is open."""
 
     @property
-    def crs(self) -> CRS | None: ...
+    def crs(self) -> CRS | None:
+        """None where unknown."""
+
     @property
-    def transform(self) -> Affine: ...
+    def transform(self) -> Affine:
+        """GDAL's, pixel corners to map coordinates."""
+
     @property
-    def height(self) -> int: ...
+    def height(self) -> int:
+        """px"""
+
     @property
-    def width(self) -> int: ...
+    def width(self) -> int:
+        """px"""
 
 
 class MapTiff:
@@ -139,7 +146,7 @@ def _told() -> Iterator[None]:
 
 
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
-    """The map that an open artefact holds, as a cloud-optimised GeoTIFF; standard deviations and albedo are bands more."""
+    """The map that an open artefact holds, as a cloud-optimised GeoTIFF; with standard deviations and albedo as further bands."""
     fields = [file[name] for name in ("coefficients", "coefficients_std") if name in file]
     maps = read_strings(file, "map_name") if len(fields) > 1 else []
     further = [name for name in ALBEDO_BANDS if name in file]

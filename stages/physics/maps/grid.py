@@ -15,12 +15,13 @@ import h5py
 import numpy as np
 import rasterio
 import rasterio.warp
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from rasterio.crs import CRS
 from rasterio.errors import CRSError
 from rasterio.transform import Affine
 
 from schemas.errors import ArtefactError, GeometryError, InputError
+from stages.common.arrays import Floats
 from stages.physics.bodies.spheres import RADII, Body, find_body
 
 GDAL_CENTRE = 0.5  # GDAL's coordinate of the centre of the first pixel
@@ -28,8 +29,6 @@ CSM_CENTRE = 0.5
 ISIS_CENTRE = 1.0
 BODY_TOLERANCE = 0.005  # of the radius: mean, equatorial and reference spheres of one body
 _ELLIPSOID = re.compile(r"(?:SPHEROID|ELLIPSOID)\[\"[^\"]*\",\s*([0-9.eE+]+),\s*([0-9.eE+]+)")
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,7 @@ class Grid:
 
     @cached_property
     def crs(self) -> CRS:
+        """Its CRS, parsed."""
         return _parsed(self.crs_wkt)
 
     @property
@@ -82,11 +82,17 @@ class Grid:
         return row, col
 
     def lonlat(self, row: ArrayLike, col: ArrayLike) -> tuple[Floats, Floats]:
-        """East longitude and planetocentric latitude, degrees."""
+        """East longitude and planetocentric latitude, degrees.
+
+        row, col : (...,) px, broadcastable; returns (...,) each
+        """
         return self.map_lonlat(*self.xy(row, col))
 
     def map_lonlat(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
-        """East longitude and planetocentric latitude, degrees, of map coordinates."""
+        """East longitude and planetocentric latitude, degrees, of map coordinates.
+
+        x, y : (...,) m, broadcastable; returns (...,) each
+        """
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         lon, lat = rasterio.warp.transform(self.crs, self._geographic, x.ravel(), y.ravel())
         lat = _scaled_tangent(np.asarray(lat), self.squash)
@@ -97,7 +103,10 @@ class Grid:
         return self.rowcol(*self.map_xy(longitude_deg, latitude_deg))
 
     def map_xy(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
-        """Map coordinates of places given in degrees."""
+        """Map coordinates of places given in degrees.
+
+        longitude_deg, latitude_deg : (...,), broadcastable; returns x and y, (...,) m each
+        """
         lon, lat = np.broadcast_arrays(np.asarray(longitude_deg, float), np.asarray(latitude_deg, float))
         lat_own = _scaled_tangent(lat.ravel(), 1 / self.squash)
         x, y = rasterio.warp.transform(self._geographic, self.crs, lon.ravel(), lat_own)
@@ -119,6 +128,8 @@ class Grid:
 
         The Sun's and the camera's directions must follow the crop's own rows and columns, which turn against true
         north by the meridian convergence (a full circle around the pole of a polar stereographic map).
+
+        row, col : px, n places in any shape, broadcastable to (n,)
         """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         n = row.size
@@ -155,6 +166,7 @@ class LocalFrames:
 
     @property
     def up(self) -> Floats:
+        """(n, 3) unit vectors, body-fixed."""
         return self.axes[:, 2]
 
 

@@ -1,6 +1,6 @@
 """The one geographic split of a scene: square ground tiles, dealt to training, validation and test by a hash.
 
-It hangs on the scene, `tile_m`, `split` and `seed` only, not on what is sampled: see `stages/sample.py`.
+It hangs on the scene, `tile_m`, `split` and `seed` only, not on what is sampled: see `stages/sample`.
 """
 
 from __future__ import annotations
@@ -81,6 +81,7 @@ class PositionMasks:
         return [int(k) for k in np.flatnonzero(meets)]
 
     def mask(self, frame: int, block: tuple[int, int, int, int]) -> NDArray[np.bool_]:
+        """(height, width) bool: where a crop of an image may be centred; block : row, column, height, width."""
         row, col, h, w = block
         if self.stored:
             return self.file["valid_position"][frame, row : row + h, col : col + w].astype(bool)

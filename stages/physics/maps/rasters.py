@@ -26,6 +26,7 @@ from rasterio.windows import Window
 from schemas.errors import InputError
 from schemas.files.hdf5 import silence_hdf5
 from schemas.files.user_files import check_file
+from stages.common.arrays import Mask
 from stages.common.memory import return_freed_memory
 from stages.physics.maps.grid import Grid, ellipsoid_of, latitude_squash
 
@@ -37,8 +38,6 @@ _SPECIAL_UINT16 = (0, 1, 2, 65534, 65535)
 _SPECIAL_UINT8 = (0, 255)
 
 LARGEST_WINDOW = 1 << 22  # source pixels that are warped at a time: 0.2 GB with all that is made of them
-
-Mask = NDArray[np.bool_]
 
 
 @contextlib.contextmanager
@@ -89,7 +88,7 @@ def _check_numbers(path: Path, what: str, dataset: DatasetReader) -> None:
 
 
 def check_single_band(path: Path, dataset: DatasetReader, what: str) -> None:
-    """Refuse rasters of several bands: which of them is meant, nobody said. Masks (alpha) are none. Raises InputError."""
+    """Refuse rasters of several bands; masks (alpha) do not count. Raises InputError."""
     bands = sum(kind != ColorInterp.alpha for kind in dataset.colorinterp)
     if bands > 1:
         raise InputError(
@@ -173,6 +172,8 @@ def transform_points(grid: Grid, dataset: DatasetReader, x: NDArray, y: NDArray)
     """Map coordinates of a grid -> those of a raster on the same body.
 
     A geographic raster may count longitudes 0..360 or -180..180: the points follow the raster's own domain.
+
+    x, y : (n,) in the units of either CRS; returns (n,) each
     """
     if grid.squash == latitude_squash(dataset.crs):
         tx, ty = rasterio.warp.transform(grid.crs, dataset.crs, x, y)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+Box = tuple[int, int, int, int]  # row, col, height, width: a Window, or any tuple like it
+
 
 class Window(NamedTuple):
     """First row and column on the grid, and the number of rows and columns."""

@@ -13,6 +13,11 @@ from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel
 
 FACTOR = Parameter("albedo_factor", "1", 0.0, 100.0, 1.0, "I/F relative to that of the other parameters")
+GLSL = """
+float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
+  return p[COUNT - 1] * without_albedo(p, mu0, mu, cos_g);
+}
+"""
 
 
 class AlbedoFactor(ReflectanceModel):
@@ -24,6 +29,8 @@ class AlbedoFactor(ReflectanceModel):
             setattr(self, key, getattr(model, key))
         self.formula = f"{FACTOR.name} ({model.formula})"  # type: ignore[misc]
         self.parameters = (*model.parameters, FACTOR)  # type: ignore[misc]
+        if model.glsl is not None:
+            self.glsl = model.glsl.replace("float radiance_factor(", "float without_albedo(") + GLSL  # type: ignore[misc]
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         return self.model.radiance_factor(parameters, angles) * parameters[FACTOR.name]

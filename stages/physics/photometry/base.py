@@ -60,12 +60,16 @@ class ReflectanceModel(ABC):
         """Network outputs -> parameters within their bounds (sigmoid between lower and upper).
 
         names : the parameters along ``dim``; all of them where None
+        raw : (..., C, ...) with the parameters along ``dim``
         """
         low, high = self._bounds(raw, dim, names)
         return low + (high - low) * torch.sigmoid(raw)
 
     def unconstrain(self, value: Tensor, dim: int, names: Sequence[str] | None = None) -> Tensor:
-        """Inverse of :meth:`constrain`, for starting a network at known coefficients."""
+        """Inverse of :meth:`constrain`, for starting a network at known coefficients.
+
+        value : (..., C, ...) with the parameters along ``dim``
+        """
         low, high = self._bounds(value, dim, names)
         return torch.logit(((value - low) / (high - low)).clamp(1e-6, 1 - 1e-6))
 
@@ -91,7 +95,10 @@ class ReflectanceModel(ABC):
         return tuple(name for name in names if name in chosen)
 
     def unpack(self, coefficients: Tensor | Mapping[str, Tensor], dim: int) -> dict[str, Tensor]:
-        """A stack of coefficients -> parameters by name; the order is that of ``parameters``. Named ones stay as they are."""
+        """A stack of coefficients -> parameters by name; the order is that of ``parameters``. Named ones stay as they are.
+
+        coefficients : (..., C, ...) with the parameters along ``dim``; returns each without that axis
+        """
         if not isinstance(coefficients, Tensor):
             return dict(coefficients)
         # unbind and not select: its backward is one stack, where select writes a full stack of zeros per parameter
@@ -115,7 +122,10 @@ def horizon_cosine(dtype: torch.dtype) -> float:
 
 
 def masked_radiance_factor(model: ReflectanceModel, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
-    """I/F, exactly 0 (with zero gradient, never NaN) where the Sun or the camera is behind the surface."""
+    """I/F, exactly 0 (with zero gradient, never NaN) where the Sun or the camera is behind the surface.
+
+    parameters : by name, each broadcasting with the angles (...,)
+    """
     mu0, mu = angles.cos_incidence, angles.cos_emission
     floor = horizon_cosine(mu0.dtype)
     lit = (mu0 > floor) & (mu > floor)
@@ -145,4 +155,5 @@ def get_model(name: str) -> ReflectanceModel:
 
 
 def model_names() -> list[str]:
+    """The registered models, in the order of their modules."""
     return [m.name for m in _MODELS.values()]

@@ -11,7 +11,6 @@ Systems: ``lunargr`` (this package), ``isis`` (USGS ISIS photometric models), ``
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -19,6 +18,7 @@ import numpy as np
 
 from schemas.errors import ConfigError, RegistryError
 from stages.physics.photometry.base import get_model, model_names
+from stages.physics.photometry.quantities import from_bidirectional_reflectance, to_bidirectional_reflectance
 
 Maps = Mapping[str, np.ndarray]
 Converter = Callable[[Maps], dict[str, np.ndarray]]
@@ -100,14 +100,14 @@ def _texture(channels: Mapping[str, str], zero: tuple[str, ...] = ()) -> tuple[C
 
     def to_ours(theirs: Maps) -> dict[str, np.ndarray]:
         active = {
-            ours: math.pi * np.where(theirs[name] >= 0, theirs[name], SLOPE * theirs[name])
+            ours: from_bidirectional_reflectance(np.where(theirs[name] >= 0, theirs[name], SLOPE * theirs[name]))
             for name, ours in channels.items()
         }
         like = next(iter(active.values()))
         return {**active, **{name: np.zeros_like(like) for name in zero}}
 
     def from_ours(ours: Maps) -> dict[str, np.ndarray]:
-        raw = {name: ours[key] / math.pi for name, key in channels.items()}
+        raw = {name: to_bidirectional_reflectance(ours[key]) for name, key in channels.items()}
         return {name: np.where(value >= 0, value, value / SLOPE) for name, value in raw.items()}
 
     return to_ours, from_ours

@@ -18,7 +18,10 @@ Powers = tuple[tuple[int, int], ...]  # (p, q) of every coefficient
 
 
 def fits(coefficients: Tensor, cos_incidence: Tensor, cos_phase: Tensor, light: Tensor) -> bool:
-    """Whether :func:`cosine_sum` can do it: float32 on the CPU, and no gradients but the coefficients'."""
+    """Whether :func:`cosine_sum` can do it: float32 on the CPU, and no gradients but the coefficients'.
+
+    coefficients : (B, C, H, W); cos_incidence, cos_phase, light : (B, H, W)
+    """
     geometry = cos_incidence, cos_phase, light
     if any(t.dtype != torch.float32 or t.device.type != "cpu" for t in (coefficients, *geometry)):
         return False

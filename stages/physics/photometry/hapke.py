@@ -87,7 +87,10 @@ float multiple_scattering(float x, float w) {
 
 
 def henyey_greenstein(cos_phase: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Double Henyey-Greenstein phase function: (1 + c)/2 in the backward lobe (about g = 0), (1 - c)/2 forward."""
+    """Double Henyey-Greenstein phase function: (1 + c)/2 in the backward lobe (about g = 0), (1 - c)/2 forward.
+
+    cos_phase : (...,); b, c : broadcastable with it
+    """
     b2 = b * b
     backward = (1 - 2 * b * cos_phase + b2).clamp(min=1e-12) ** -1.5
     forward = (1 + 2 * b * cos_phase + b2).clamp(min=1e-12) ** -1.5
@@ -95,12 +98,18 @@ def henyey_greenstein(cos_phase: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 
 def shadow_hiding(tan_half_phase: Tensor, hs: Tensor) -> Tensor:
-    """Bs(g) = 1 / (1 + tan(g/2) / hs)."""
+    """Bs(g) = 1 / (1 + tan(g/2) / hs).
+
+    tan_half_phase : (...,); hs : 1, broadcastable with it
+    """
     return hs / (hs + tan_half_phase).clamp(min=1e-12)
 
 
 def coherent_backscatter(tan_half_phase: Tensor, hc: Tensor) -> Tensor:
-    """Bc(g) = [1 + (1 - exp(-x)) / x] / [2 (1 + x)^2], x = tan(g/2) / hc; 1 at g = 0."""
+    """Bc(g) = [1 + (1 - exp(-x)) / x] / [2 (1 + x)^2], x = tan(g/2) / hc; 1 at g = 0.
+
+    tan_half_phase : (...,); hc : 1, broadcastable with it
+    """
     x = tan_half_phase / hc.clamp(min=1e-9)
     small = x < 1e-2
     safe = torch.where(small, torch.ones_like(x), x)
@@ -110,19 +119,28 @@ def coherent_backscatter(tan_half_phase: Tensor, hc: Tensor) -> Tensor:
 
 
 def porosity(phi: Tensor) -> Tensor:
-    """K of the filling factor; 1 at phi = 0, where its one-sided slope is infinite and 0 is returned for it."""
+    """K of the filling factor; 1 at phi = 0, where its one-sided slope is infinite and 0 is returned for it.
+
+    phi : (...,), 0..1
+    """
     y = 1.209 * phi.clamp(min=1e-20, max=0.75) ** (2 / 3)
     return -torch.log1p(-y) / y
 
 
 def h_1981(x: Tensor, w: Tensor) -> Tensor:
-    """H(x) = (1 + 2 x) / (1 + 2 x sqrt(1 - w)) (Hapke 1981)."""
+    """H(x) = (1 + 2 x) / (1 + 2 x sqrt(1 - w)) (Hapke 1981).
+
+    x : (...,), a cosine; w : single-scattering albedo, broadcastable with it
+    """
     gamma = (1 - w).clamp(min=1e-12).sqrt()
     return (1 + 2 * x) / (1 + 2 * x * gamma)
 
 
 def h_2002(x: Tensor, w: Tensor) -> Tensor:
-    """H(x) = 1 / (1 - w x [r0 + (1 - 2 r0 x)/2 ln((1 + x)/x)]), r0 = (1 - sqrt(1-w)) / (1 + sqrt(1-w)) (Hapke 2002)."""
+    """H(x) = 1 / (1 - w x [r0 + (1 - 2 r0 x)/2 ln((1 + x)/x)]), r0 = (1 - sqrt(1-w)) / (1 + sqrt(1-w)) (Hapke 2002).
+
+    x : (...,), a cosine; w : single-scattering albedo, broadcastable with it
+    """
     gamma = (1 - w).clamp(min=1e-12).sqrt()
     r0 = (1 - gamma) / (1 + gamma)
     x = x.clamp(min=1e-12)
@@ -146,7 +164,10 @@ class HapkeBase(ReflectanceModel):
 
     @abstractmethod
     def phase_function(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
-        """p(g) of single scattering, 1 on average over the sphere."""
+        """p(g) of single scattering, 1 on average over the sphere.
+
+        parameters : by name, each broadcasting with the angles (...,)
+        """
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         w = parameters["w"]

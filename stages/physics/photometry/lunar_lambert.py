@@ -31,7 +31,7 @@ float mixture(float share, float mu0, float mu) { return mu0 * (1.0 + share * (2
 def lunar_share(phase: Tensor, coefficients: tuple = MCEWEN) -> Tensor:
     """L(g) = O + A g + B g^2 + C g^3, the weight of the Lommel-Seeliger term.
 
-    phase : rad
+    phase : (...,) rad
     coefficients : O, A, B, C for g in degrees, numbers or tensors
     """
     g = torch.rad2deg(phase)
@@ -40,7 +40,10 @@ def lunar_share(phase: Tensor, coefficients: tuple = MCEWEN) -> Tensor:
 
 
 def mixture(share: Tensor, angles: Angles) -> Tensor:
-    """2 L cos(i) / (cos(i) + cos(e)) + (1 - L) cos(i)."""
+    """2 L cos(i) / (cos(i) + cos(e)) + (1 - L) cos(i).
+
+    share : L, (...,) as the angles
+    """
     mu0 = angles.cos_incidence
     return mu0 * (1 + share * (2 / (mu0 + angles.cos_emission) - 1))
 

@@ -8,21 +8,20 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from stages.common.arrays import Floats, Floats32
 from stages.physics.formation.geometry import Angles
 from stages.physics.horizon.scene import make_overview
 from stages.physics.light.earth import EARTH_RADIUS, earth_irradiance, earth_phase
 from stages.physics.light.sky import Surroundings, terrain_light
 from stages.physics.maps.window import Window
 from stages.physics.photometry import masked_radiance_factor
+from stages.physics.photometry.quantities import to_reflectance_factor
 from stages.physics.terrain.ground import block_geometry
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.sun_visibility import SunHorizon, visible_share
 from stages.physics.terrain.surface import Surface
 
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 STANDARD = math.radians(30)  # incidence and phase of the standard geometry (30, 0, 30) of maps and laboratories
 FINEST = 2  # px per cell of the map's means around a window
 OVERVIEW_PX = 2048
@@ -32,7 +31,8 @@ BLOCK_PX = 1024
 class Horizon(Protocol):
     """Elevation of the terrain horizon towards a source of light, rad, for any window of a map."""
 
-    def window(self, row: int, col: int, height: int, width: int) -> Floats32: ...
+    def window(self, row: int, col: int, height: int, width: int) -> Floats32:
+        """(height, width) rad; NaN where the elevation is."""
 
 
 class Hidden:
@@ -53,7 +53,10 @@ class Earthshine:
 
     @staticmethod
     def over(surface: Surface, sun: Sun, earth_position: Floats, relief: float, shadows: bool) -> Earthshine:
-        """The Earth at a place, body-fixed, m, lit by the Sun as it stands. relief : m, lowest to highest point."""
+        """The Earth at a place, body-fixed, m, lit by the Sun as it stands. relief : m, lowest to highest point.
+
+        earth_position : (3,)
+        """
         grid = surface.grid
         middle = grid.local_frames((grid.height - 1) / 2, (grid.width - 1) / 2).up[0] * grid.radius
         distance = float(np.linalg.norm(earth_position - middle))
@@ -73,7 +76,7 @@ def diffuse_albedo(surface: Surface, window: Window) -> Floats32:
     incidence, emission = torch.full(shape, STANDARD), torch.zeros(shape)
     angles = Angles.from_angles(incidence, emission, incidence)
     value = masked_radiance_factor(surface.model, surface.model.unpack(coefficients, dim=0), angles).numpy()
-    value = np.maximum(value, 0) / np.float32(math.cos(STANDARD))
+    value = to_reflectance_factor(np.maximum(value, 0), np.full_like(value, math.cos(STANDARD)))
     value[~np.isfinite(coefficients.numpy()).all(axis=0)] = np.nan
     return value
 

@@ -10,12 +10,10 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from stages.common.arrays import Floats, Floats32
 from stages.physics.maps.grid import Grid
 
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 NODE_PX = 64
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.physics.formation.chain import Extension, Observation, State, form
 from stages.physics.formation.geometry import Angles
 from stages.physics.maps.window import Window
@@ -20,7 +21,6 @@ from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.sun_visibility import visible_share
 from stages.physics.terrain.surface import SHADOWED, Surface
 
-Floats32 = NDArray[np.float32]
 BACKPLANES = (
     "incidence_deg",
     "emission_deg",
@@ -53,9 +53,9 @@ class Light:
 
 
 class Floor:
-    """Formulas that are fitted, such as a polynomial's, fall below 0 near the terminator; no ground does.
+    """Clips the I/F of lit facets at 0, as the first step of the chain's reflectance; ``below`` (B, H, W) says where.
 
-    Clips the I/F of lit facets at 0, as the first step of the chain's reflectance; ``below`` (B, H, W) says where.
+    Fitted formulas, such as a polynomial's, fall below 0 near the terminator.
     """
 
     slot = "reflectance"
@@ -64,6 +64,7 @@ class Floor:
         self.below: torch.Tensor | None = None
 
     def apply(self, state: State) -> None:
+        """Clip the reflectance."""
         self.below = state.reflectance < 0
         state.reflectance = state.reflectance.clamp(min=0)
 
@@ -77,6 +78,7 @@ class Added:
         self._radiance = torch.from_numpy(np.nan_to_num(radiance))[None]
 
     def apply(self, state: State) -> None:
+        """Have it added once the Sun's own light is known."""
         state.further_light.append(self._add)
 
     def _add(self, state: State) -> None:
@@ -183,9 +185,10 @@ def _image_deviation(surface: Surface, geometry: BlockGeometry, visible: Floats3
 def form_window(
     surface: Surface, light: Light, window: Window, added: Floats32 | None = None
 ) -> tuple[Floats32, Floats32]:
-    """I/F of a window through the whole formation chain with its extensions, tile by tile with a margin; where it was clipped.
+    """I/F of a window through the formation chain with its extensions, tile by tile, and 1 where the model's was below 0.
 
     added : I/F that further light adds, on the window padded by HALO_PX
+    returns (h, w) float32 each
     """
     shape = (surface.grid.height, surface.grid.width)
     around = window.padded(HALO_PX, shape)

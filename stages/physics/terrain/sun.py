@@ -6,15 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
+from stages.common.arrays import Floats
 from stages.physics.bodies.spheres import Body
 from stages.physics.images.table import ASTRONOMICAL_UNIT
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import Grid, unit_vectors
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,13 @@ from rasterio.windows import Window
 from schemas.artefacts import SCENE, SVBRDF
 from schemas.errors import ArtefactError, ConfigError, InputError, RegistryError
 from schemas.reading import open_artefact, read_kind, read_strings
+from stages.common.arrays import Floats32
 from stages.physics.bodies.spheres import Body
 from stages.physics.maps.grid import Grid, check_body, read_grid, require_crs
 from stages.physics.maps.rasters import check_metres, check_single_band, open_raster, pixel_size_at, read_window
 from stages.physics.photometry import ReflectanceModel, get_model
 from stages.physics.photometry.albedo_factor import AlbedoFactor
 
-Floats32 = NDArray[np.float32]
 _HDF5_SUFFIXES = (".h5", ".hdf5", ".nc")
 SHADOWED = 0.5  # of the Sun's disc: from there on a pixel counts as shadow
 _UNEVEN = 0.01  # a raw DEM's pixels may differ in true width and height by this share
@@ -229,7 +229,7 @@ def stored_model(path: Path, name: str) -> ReflectanceModel:
 
 
 def _named_model(path: Path, model: str | None) -> ReflectanceModel:
-    """Raises ConfigError: which reflectance a picture shows is nobody's to guess."""
+    """The model that was asked for. Raises ConfigError where none was: a terrain has no reflectance of its own."""
     if model is None:
         raise ConfigError(
             f"{path}: holds a terrain and no reflectance; name one with `dem` {path} `model` NAME ('lunargr models' lists them), "

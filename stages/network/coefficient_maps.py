@@ -1,4 +1,4 @@
-"""From what the network gives to the parameters of a reflectance model: some by place, the others the same everywhere."""
+"""The parameters of a reflectance model from a network's output: some as maps, the others the same everywhere."""
 
 from __future__ import annotations
 
@@ -64,14 +64,17 @@ class CoefficientMaps(nn.Module):
         return output.float() * self.output_scale + self.start[:, None, None]
 
     def combine(self, shifted: Tensor, everywhere: Sequence[Tensor]) -> Tensor | dict[str, Tensor]:
-        """Maps (B, channels, H, W) and the values of the others, each broadcasting to (B, H, W) -> what ``formation.form`` takes."""
+        """Maps (B, channels, H, W) and the values of the others, each broadcasting to (B, H, W) -> what ``formation.chain.form`` takes."""
         bounded = self._bounded(shifted.narrow(1, 0, len(self.maps)), 1, self.maps)
         if not self.rest:
             return bounded
         return dict(zip((*self.maps, *self.rest), (*bounded.unbind(1), *everywhere), strict=True))
 
     def stack(self, shifted: Tensor, dim: int) -> Tensor:
-        """All parameters along ``dim``, in the model's order."""
+        """All parameters along ``dim``, in the model's order.
+
+        shifted : (B, channels, H, W) with dim 1, or alike; returns (B, C, H, W)
+        """
         bounded = self._bounded(shifted.narrow(dim, 0, len(self.maps)), dim, self.maps)
         if not self.rest:
             return bounded
@@ -81,7 +84,10 @@ class CoefficientMaps(nn.Module):
         return torch.stack([found[name] for name in self.names], dim=dim)
 
     def deviations(self, shifted: Tensor, dim: int) -> Tensor:
-        """Standard deviations of the maps along ``dim``, in the maps' order; at most half of a parameter's range."""
+        """Standard deviations of the maps along ``dim``, in the maps' order; at most half of a parameter's range.
+
+        shifted : (B, channels, H, W) with dim 1, or alike; returns (B, M, H, W)
+        """
         count = len(self.maps)
         half = [(p.upper - p.lower) / 2 for p in self.model.parameters if p.name in self.maps]
         shape = [1] * shifted.ndim

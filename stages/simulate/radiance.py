@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats32
 from stages.physics.formation import chain as formation
 from stages.physics.horizon import horizon
 from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
@@ -19,8 +20,6 @@ from stages.physics.photometry import masked_radiance_factor
 from stages.simulate.hidden import Hidden, find
 from stages.simulate.orbits import Pass
 from stages.simulate.reflectance import Truth
-
-Array = NDArray[np.float32]
 
 BLOCK = 256  # DEM pixels; the Sun's and the camera's directions are exact at each block's centre
 SHADOW_REACH = 20e3  # m; terrain farther off casts no shadow here
@@ -49,7 +48,7 @@ class View:
 
 def radiance(
     scene: Scene, view: View, window: tuple[int, int, int, int], wanted: NDArray, hidden: list[Hidden]
-) -> Array:
+) -> Floats32:
     """I/F (H, W) of the window (row, col, height, width), 0 in shadow; blocks without a ``wanted`` pixel stay 0.
 
     wanted : (H, W) bool
@@ -86,7 +85,7 @@ def radiance(
     return out
 
 
-def _horizon(scene: Scene, window: tuple[int, int, int, int], azimuth: float, sun_elevation: float) -> Array:
+def _horizon(scene: Scene, window: tuple[int, int, int, int], azimuth: float, sun_elevation: float) -> Floats32:
     """Elevation of the terrain's horizon over a window, from the whole scene or as far as shadows reach."""
     row, col, height, width = window
     total_height, total_width = scene.elevation.shape
@@ -104,8 +103,8 @@ def _horizon(scene: Scene, window: tuple[int, int, int, int], azimuth: float, su
 
 
 def _block(
-    scene: Scene, view: View, row: int, col: int, skyline: Array, sun_radius: float, hidden: list[Hidden]
-) -> Array:
+    scene: Scene, view: View, row: int, col: int, skyline: Floats32, sun_radius: float, hidden: list[Hidden]
+) -> Floats32:
     """The chain on one block; one pixel around it keeps slopes central."""
     height, width = skyline.shape
     total_height, total_width = scene.elevation.shape
@@ -159,7 +158,7 @@ def _earthshine(state: formation.State, shine: Hidden) -> torch.Tensor:
     return shine["irradiance"] * facing.clamp(min=0) / torch.sqrt(1 + slope_east**2 + slope_north**2)
 
 
-def point_spread(step: float, image_gsd: float, sigma_px: float, extra_sigma2_px2: float = 0.0) -> Array:
+def point_spread(step: float, image_gsd: float, sigma_px: float, extra_sigma2_px2: float = 0.0) -> Floats32:
     """Separable kernel on the DEM grid: the image pixel's area (a box) and the optics (a Gaussian), 1 in sum."""
     sigma = math.sqrt(sigma_px**2 + extra_sigma2_px2) * image_gsd / step
     half = 0.5 * image_gsd / step
@@ -176,5 +175,6 @@ def point_spread(step: float, image_gsd: float, sigma_px: float, extra_sigma2_px
     return (taps / taps.sum()).astype(np.float32)
 
 
-def blur(image: Array, kernel: Array) -> Array:
+def blur(image: Floats32, kernel: Floats32) -> Floats32:
+    """image : (H, W); kernel : (n,), applied along rows and columns; edges repeated."""
     return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE), np.float32)

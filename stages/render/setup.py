@@ -1,4 +1,4 @@
-"""From options to a terrain, a light and a camera."""
+"""The terrain, the light and the camera that a configuration asks for."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ def make_light(
         horizon = SunHorizon(surface.elevation, surface.grid, sun, span) if config.shadows else None
     bounce = Bounce(surface, sun, horizon) if config.bounce else None
     extensions: list = []
-    if config.extension:
+    if config.extend:
         from stages.effects import load_extension
 
         # the diagnosed images are not this one: their own values must not be taken for it
-        extensions = load_extension(Path(config.extension), ["rendered"])
+        extensions = load_extension(Path(config.extend), ["rendered"])
     position = None
     if config.position is not None:
         position = place(*_three(config.position, "`position`"), surface.grid.radius)
@@ -162,12 +162,12 @@ def camera_place(camera: Camera) -> NDArray[np.float64]:
 
 def metadata(surface: Surface, config: Config, light: Light) -> dict[str, object]:
     """What a file must say about how it came to be."""
-    told = {k: v for k, v in asdict(config).items() if v not in (None, {}, False) and k != "shard"}
+    facts = {k: v for k, v in asdict(config).items() if v not in (None, {}, False) and k != "shard"}
     return {
         "source": surface.path.name,
         "model": surface.model.name,
         "quantity": "radiance factor I/F = pi r, including cos(incidence)",
         "sun_position_mcmf": " ".join(f"{v:.6e}" for v in light.sun.position),
-        "config": " ".join(f"{k}={v}" for k, v in sorted(told.items())),
-        "record": raster_record("render", told, inputs(surface.path, config)),
+        "config": " ".join(f"{k}={v}" for k, v in sorted(facts.items())),
+        "record": raster_record("render", facts, inputs(surface.path, config)),
     }

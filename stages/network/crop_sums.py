@@ -1,4 +1,4 @@
-"""Batches in pieces of a fixed number of crops, each worked on by one thread: the sums do not hang on how many there are.
+"""Sums over the crops of a batch that do not depend on the number of threads: pieces of a fixed number of crops, a thread each.
 
 Only inside ``stages.common.threads.one_thread_each``, on the CPU; elsewhere these are PyTorch's own operators.
 """

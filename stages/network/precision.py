@@ -1,4 +1,4 @@
-"""Which precision a machine runs fastest in: bf16 only where the processor is made for it, or a probe finds it faster."""
+"""The precision, fp32 or bf16, in which a machine trains and predicts fastest."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a checkpoint must hold for its network to be built: checked by its shapes, before anything of their size is made."""
+"""Names and shapes that a checkpoint must hold for its network, checked before any memory of their size is taken."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import h5py
 import torch
 
 from schemas.errors import ArtefactError
-from stages.network.maps import CoefficientMaps
+from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.unet import UNet
 
 WIDEST, DEEPEST = 65536, 12  # channels of a stage, stages: beyond any network, and short of any machine's memory
@@ -61,7 +61,10 @@ def check_weights(
 
 
 def check_finite(path: Path, state: dict[str, torch.Tensor]) -> None:
-    """Raises ArtefactError for weights that are not finite: every map made with them would be empty."""
+    """Raises ArtefactError for weights that are not finite: every map made with them would be empty.
+
+    state : by name, tensors of any shape
+    """
     for name, value in state.items():
         if not math.isfinite(float(value.double().sum())):
             raise ArtefactError(

@@ -17,7 +17,7 @@ from stages.physics.terrain.shading import BACKPLANES, Light, shade_block
 from stages.physics.terrain.surface import Surface
 from stages.render.config import Config, Summary
 from stages.render.pictures import Preview, write_exr, write_png
-from stages.render.setting import metadata
+from stages.render.setup import metadata
 from stages.render.tally import Tally
 
 BAND_ROWS = 256
@@ -43,15 +43,15 @@ def render_map(
     wanted = channels if ".exr" in named else list(dict.fromkeys([*bands, "shadow", "incidence_deg"]))
     wanted = [*wanted, "clipped"]
     preview, tally = Preview(grid.height, grid.width), Tally()
-    told = metadata(surface, config, light)
+    facts = metadata(surface, config, light)
     with contextlib.ExitStack() as stack:
         exr = tif = None
         if ".exr" in named:
-            exr = stack.enter_context(write_exr(named[".exr"], grid.height, grid.width, channels, told))
+            exr = stack.enter_context(write_exr(named[".exr"], grid.height, grid.width, channels, facts))
         for suffix in (".tif", ".tiff"):
             if suffix in named:
                 units = [UNITS.get(b, "degree") for b in bands]
-                tags = {TIFF_TAG if k == "record" else k: v for k, v in told.items()}
+                tags = {TIFF_TAG if k == "record" else k: v for k, v in facts.items()}
                 partial = stack.enter_context(atomic_path(named[suffix]))
                 tif = stack.enter_context(MapTiff(partial, grid, bands, tags, units))
         rows = max(

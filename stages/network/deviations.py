@@ -1,4 +1,4 @@
-"""How far coefficient maps are from the truth: a standard deviation for each, from the residuals of the images.
+"""Standard deviations of coefficient maps, from the residuals of the images.
 
 A residual is taken for the sum of independent errors: of each map, by its effect on the pixel, and of the image itself,
 
@@ -41,14 +41,17 @@ def fit_deviations(
     validation: NDArray[np.int64],
     extensions: Sequence[Extension] = (),
 ) -> None:
-    """Write the last layer of the deviations, and ``image_noise``, into a trained predictor."""
+    """Write the last layer of the deviations, and ``image_noise``, into a trained predictor.
+
+    train, validation : (n,), indices of pairs
+    """
     predictor.eval()
-    seen = _look(predictor, radiometry, reader, train, extensions)
+    seen = _residuals(predictor, radiometry, reader, train, extensions)
     residual, effects, features = seen
     middle, spread = features.mean(dim=0), features.std(dim=0).clamp(min=1e-6)
     weights, constants, noise = _likelihood(residual, effects, (features - middle) / spread)
     if len(validation):
-        residual, effects, features = _look(predictor, radiometry, reader, validation, extensions)
+        residual, effects, features = _residuals(predictor, radiometry, reader, validation, extensions)
     deviation = _deviation(effects, (features - middle) / spread, weights, constants, noise)
     factor = torch.quantile((residual / deviation).abs(), 0.95) / WIDTH_95
     maps, head = predictor.maps, predictor.net.head
@@ -63,7 +66,7 @@ def fit_deviations(
 
 
 @torch.no_grad()
-def _look(
+def _residuals(
     predictor: Predictor,
     radiometry: Radiometry,
     reader: PairReader,

@@ -1,0 +1,14 @@
+"""The artefacts of the pipeline, a file each. `lunargr schema NAME`, the writers, the checks and the docs all read these."""
+
+from __future__ import annotations
+
+# isort: off
+# in the order of the pipeline, which is the order that they are listed in
+from schemas.artefacts.common import SPLITS, UNITS
+from schemas.artefacts.scene import CROPS, SCENE
+from schemas.artefacts.pairs import PAIRS
+from schemas.artefacts.checkpoint import CHECKPOINT
+from schemas.artefacts.svbrdf import SVBRDF
+from schemas.artefacts.results import DIAGNOSIS, EVALUATION
+
+__all__ = ["CHECKPOINT", "CROPS", "DIAGNOSIS", "EVALUATION", "PAIRS", "SCENE", "SPLITS", "SVBRDF", "UNITS"]

@@ -1,0 +1,121 @@
+"""evaluation.h5 and diagnosis.h5: what was found."""
+
+from __future__ import annotations
+
+from schemas.declaration import STRING, Attribute, Schema, Variable, declare
+
+EVALUATION = declare(
+    Schema(
+        name="evaluation",
+        version=1,
+        stage="evaluate",
+        title="Measured against rendered crops of one split, for every compared model",
+        dims={
+            "model": "compared models",
+            "run": "training runs of the learned model",
+            "pair": "crops of the split",
+            "y": "crop rows",
+            "x": "crop columns",
+        },
+        variables=(
+            Variable("model_name", ("model",), STRING, "", "names of the compared models"),
+            Variable("pair_index", ("pair",), "i4", "1", "index of the crop in pairs.h5", minimum=0),
+            Variable("tile", ("pair",), "i4", "1", "ground tile, the independent unit of the intervals"),
+            Variable("valid_pixels", ("pair",), "i4", "1", "pixels that count", minimum=0),
+            Variable("mse", ("model", "pair"), "f8", "1", "mean squared error of the crop, mean over training runs"),
+            Variable(
+                "ssim", ("model", "pair"), "f8", "1", "structural similarity of the crop, mean over training runs"
+            ),
+            Variable("run_seed", ("run",), "i8", "1", "seed of each training run", required=False),
+            Variable(
+                "run_mse",
+                ("run", "pair"),
+                "f8",
+                "1",
+                "mean squared error of the crop under the learned model of each training run",
+                required=False,
+            ),
+            Variable("measured", ("pair", "y", "x"), "f4", "1", "measured crop"),
+            Variable(
+                "rendered",
+                ("model", "pair", "y", "x"),
+                "f4",
+                "1",
+                "rendered crop, of the first training run",
+                required=False,
+            ),
+        ),
+        attributes=(
+            Attribute("split", "which split was evaluated"),
+            Attribute("metrics", "the table as JSON", kind="json"),
+        ),
+    )
+)
+
+DIAGNOSIS = declare(
+    Schema(
+        name="diagnosis",
+        version=1,
+        stage="diagnose",
+        title="Named causes of the residual and the extended model that contains them",
+        dims={
+            "frame": "source images",
+            "axis": "east, south",
+            "mode": "cosines of line jitter",
+            "field_term": "cosines of a frame's response over a crop",
+            "column": "detector samples, evenly spaced from the first to the last",
+            "site": "sites of the pairs, by their number there",
+            "term": "cosines of an albedo pattern, down and across a crop, in the order of the effect's coordinates",
+        },
+        variables=(
+            Variable("image_id", ("frame",), STRING, "", "name of the source image"),
+            Variable(
+                "image_shift_px",
+                ("frame", "axis"),
+                "f4",
+                "px",
+                "misregistration: columns and rows by which the image shows ground further east and south",
+                required=False,
+            ),
+            Variable(
+                "line_jitter_px",
+                ("frame", "mode"),
+                "f4",
+                "px",
+                "line_jitter: amplitudes of cosines 1..3 over the lines, east, then south",
+                required=False,
+            ),
+            Variable(
+                "frame_field",
+                ("frame", "field_term"),
+                "f4",
+                "1",
+                "frame_field: amplitudes of low cosines over a crop, relative to the response",
+                required=False,
+            ),
+            Variable("image_gain", ("frame",), "f4", "1", "image_gain: relative gain of the image", required=False),
+            Variable(
+                "column_response",
+                ("column",),
+                "f4",
+                "1",
+                "column_pattern: response over the detector samples first..last, relative to 1",
+                required=False,
+            ),
+            Variable(
+                "site_albedo",
+                ("site", "term"),
+                "f4",
+                "1",
+                "albedo_map: amplitudes of the cosines at each site, relative to its albedo; 0 for sites not looked at",
+                required=False,
+            ),
+        ),
+        attributes=(
+            Attribute("report", "the diagnosis as JSON (docs: the output of diagnose)", kind="json"),
+            Attribute(
+                "extension", "JSON list of the effects of the extended model with their parameters", kind="json list"
+            ),
+        ),
+    )
+)

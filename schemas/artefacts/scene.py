@@ -1,0 +1,87 @@
+"""scene.h5 and crops.h5: the ground, its images, and where crops lie."""
+
+from __future__ import annotations
+
+from schemas.artefacts.common import (
+    FRAME_TABLE,
+    GRID,
+    HEIGHTS,
+    LARGEST_COUNT,
+    PAIR_PLACE,
+    PLACE,
+    SMALLEST_GSD,
+    VALIDITY,
+    grid_map,
+)
+from schemas.declaration import Attribute, Schema, Variable, declare
+
+SCENE = declare(
+    Schema(
+        name="scene",
+        version=1,
+        stage="ingest",
+        title="A DEM on a metric grid, its images and where crops may be centred",
+        dims={
+            "frame": "source images",
+            "y": "grid rows, north to south",
+            "x": "grid columns, west to east",
+            "window": "row, column, height, width",
+        },
+        variables=GRID
+        + (
+            grid_map("elevation", "f4", "m", "height above the reference sphere"),
+            grid_map("dem_valid", "u1", "1", "1 = the DEM is valid", flags=VALIDITY, compress=True),
+            grid_map("valid", "u1", "1", "1 = both DEM and image are valid", flags=VALIDITY, compress=True, of="frame"),
+            grid_map(
+                "valid_position",
+                "u1",
+                "1",
+                "1 = a crop centred here lies wholly in valid data",
+                flags=VALIDITY,
+                compress=True,
+                of="frame",
+            ),
+            Variable(
+                "frame_window",
+                ("frame", "window"),
+                "i4",
+                "1",
+                "row, column, height, width of the box that holds the image's valid pixels",
+                minimum=0,
+            ),
+            Variable(
+                "valid_area_m2", ("frame",), "f8", "m2", "ground covered by valid positions", minimum=0.0, finite=True
+            ),
+        )
+        + FRAME_TABLE,
+        attributes=PLACE
+        + (
+            Attribute("crop_px", "crop size that valid_position was eroded for", True, "integer", 2, LARGEST_COUNT),
+            Attribute("elevation_source", "name of the DEM file"),
+            Attribute("elevation_low_m", "least elevation, m", False, "number", *HEIGHTS),
+            Attribute("elevation_high_m", "largest elevation, m", False, "number", *HEIGHTS),
+            Attribute("dem_valid_px", "valid pixels of the DEM", False, "integer", 0),
+        ),
+        sizes=(("window", 4),),
+    )
+)
+
+CROPS = declare(
+    Schema(
+        name="crops",
+        version=1,
+        stage="sample",
+        title="Crop centres and DEM crops with a geographic split",
+        dims={"pair": "one crop of one image", "y": "crop rows", "x": "crop columns", "frame": "source images"},
+        variables=(Variable("elevation", ("pair", "y", "x"), "f4", "m", "height above the reference sphere"),)
+        + PAIR_PLACE
+        + FRAME_TABLE,
+        attributes=PLACE
+        + (
+            Attribute("scene", "the scene artefact, relative to this file"),
+            Attribute("scene_sha256", "its SHA-256"),
+            Attribute("tile_m", "edge of a ground tile, m", True, "number", SMALLEST_GSD, LARGEST_COUNT),
+            Attribute("split_audit", "pairs, images, tiles and ground of each part, as JSON", False, "json list"),
+        ),
+    )
+)
