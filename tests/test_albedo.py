@@ -374,6 +374,6 @@ def test_what_registration_finds_is_taken_off_by_all_shards(rng, tmp_path, monke
 
 
 def test_an_unknown_form_of_registration_is_refused(planted, tmp_path):
-    with pytest.raises(ConfigError, match=r"--register: expected one of constant, affine, field, found 'rubber'"):
+    with pytest.raises(ConfigError, match=r"register`: expected one of constant, affine, field, found 'rubber'"):
         made(planted, replace(QUIET, register="rubber"), "no.h5")
     assert not (planted.folder / "no.h5").exists()
