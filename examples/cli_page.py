@@ -56,6 +56,10 @@ def page() -> str:
         "",
         "Written by `examples/cli_page.py` from the program itself. All options: `lunargr COMMAND --help`.",
         "",
+        "| every command | |",
+        "|---|---|",
+        *(f"| {', '.join(f'`{o}`' for o in p.opts)} | {cell(getattr(p, 'help', '') or '')} |" for p in group.params),
+        "",
     ]
     for name, command in group.commands.items():
         lines += section(name, command)

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Callable
 from typing import Any
 
 
 def imported_later(package: str, *modules: str) -> Callable[[str], Any]:
-    """The package's ``__getattr__``. modules : of the package, in which a name is looked for in this order"""
+    """The package's ``__getattr__``, for what its ``__all__`` lists.
+
+    modules : of the package, in which a name is looked for in this order
+    """
 
     def find(name: str) -> Any:
-        for module in modules if not name.startswith("__") else ():
+        # Others may be modules of the package, which Python then imports itself.
+        for module in modules if name in sys.modules[package].__all__ else ():
             loaded = importlib.import_module(f"{package}.{module}")
             if name in vars(loaded):
                 return vars(loaded)[name]

@@ -186,3 +186,21 @@ def test_albedo_that_follows_curvature_is_high_in_hollows_where_its_strength_is_
         ratio = (followed / form(scene, M2, COEFFICIENTS))[:, level, level]
         expected = 1 + 0.1 * (2 * bend - 0.001) / 0.005
         torch.testing.assert_close(ratio, torch.full_like(ratio, expected), rtol=2e-3, atol=0)
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_a_ramp_is_displaced_by_what_is_asked_for(alike):
+    """The cubic of torch's grid_sample moves it by 0.14 px where 0.1 is asked for."""
+    ramp = torch.arange(24.0).expand(2, 16, 24) + 3 * torch.arange(16.0)[:, None]
+    east, south = torch.full((2, 1, 1), 0.1), torch.full((2, 1, 1), -0.3)
+    moved = displace(ramp, east if alike else east.expand_as(ramp), south)
+    assert torch.allclose((moved - ramp)[:, 4:-4, 4:-4], torch.tensor(0.1 - 0.9), atol=1e-4)
+
+
+def test_gradients_of_a_wave_that_is_hardly_resolved():
+    from stages.effects.filters import gradients
+
+    x = torch.arange(64.0)
+    east, south = gradients(torch.sin(0.9 * x).expand(1, 32, 64))
+    assert torch.allclose(east[0, 10, 8:-8], 0.9 * torch.cos(0.9 * x)[8:-8], atol=0.03)
+    assert float(south.abs().max()) == 0.0

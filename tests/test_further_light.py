@@ -16,6 +16,10 @@ from stages.physics.horizon import make_overview
 from stages.physics.light.earth import EARTH_DISTANCE, earth_irradiance
 from stages.physics.light.sky import Surroundings, terrain_light
 from stages.physics.maps.window import Window
+from stages.physics.photometry import get_model
+from stages.physics.terrain.further_light import Bounce
+from stages.physics.terrain.sun import sun_from_angles
+from stages.physics.terrain.surface import Surface
 from stages.render.pictures import read_exr
 
 GSD, ALBEDO = 5.0, 0.3
@@ -97,6 +101,31 @@ def test_far_terrain_as_means_gives_the_light_of_every_pixel(rng):
     assert found.mean() == pytest.approx(whole.mean(), rel=0.01)
     assert np.sqrt(((found - whole) ** 2).mean()) < 0.05 * whole.mean()
     assert np.abs(free - sky).max() < 0.01
+
+
+class Counting:
+    """An elevation that notes the largest window read of it."""
+
+    def __init__(self, z: np.ndarray) -> None:
+        self.z, self.shape, self.ndim, self.dtype, self.largest = z, z.shape, 2, z.dtype, 0
+
+    def __getitem__(self, key):
+        part = self.z[key]
+        self.largest = max(self.largest, part.size)
+        return part
+
+
+def test_a_bounce_reads_windows_of_the_map_and_never_all_of_it(rng, tmp_path):
+    z = Counting(hills(rng, 640, GSD))
+    grid = metric_grid(640, 640, GSD, LON, LAT)
+    surface = Surface(tmp_path, grid, z, get_model("lambert"), None, np.array([ALBEDO], np.float32))  # type: ignore[arg-type]
+    bounce = Bounce(surface, sun_from_angles(90.0, 20.0, grid), None)
+    assert z.largest <= 258 * 640  # one band of rows at a time for the means
+    z.largest = 0
+    light, sky = bounce.window(300, 280, 40, 50)
+    assert light.shape == sky.shape == (40, 50) and (light > 0).any()
+    margin = 2 * 32 + 1  # of cells of two pixels, and one more for slopes
+    assert z.largest <= (40 + 2 * margin) * (50 + 2 * margin)
 
 
 @pytest.mark.parametrize("view", [{}, OVERHEAD])

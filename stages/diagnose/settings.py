@@ -36,7 +36,6 @@ ROUNDS = 16  # of expectation-maximisation: further ones change a variance by le
 UNITS = 12  # pieces of ground at least, over which a jackknife has the degrees of freedom for a 95 % interval
 PATCH = 32  # px: crops are not cut into smaller pieces than this
 SHAMS = 99  # sham residuals: p values go down to 1 %
-FEW_GROUNDS = 5  # pieces of test ground: of fewer, Student's interval is several times the gain
 DISCOVERY = 0.05  # false discovery rate
 SURE = 4.0  # standard errors: an effect found at this size is never called invisible
 CORRELATED = 16.0  # px^2 per independent sample of a residual: what is left of albedo and relief is some 4 px wide

@@ -57,16 +57,6 @@ def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> Residual:
     return white, mean[:, 0], rows.shared_dark[0] / model.dark**0.5
 
 
-def weighed_squares(z: Tensor, mean: Tensor, patch: Patch, model: Covariance, grid: Grid) -> float:
-    """A residual's square under the inverse covariance; z : (n, K), mean : (n,)."""
-    white = torch.einsum("kij,jk->ik", _factor(model, patch, grid)[grid.bins], z)
-    squares = float((white.real.square() + white.imag.square()).sum())
-    if patch.free:
-        return squares
-    lower = torch.linalg.cholesky(model.mean_matrix(patch))
-    return squares + float(torch.linalg.solve_triangular(lower, mean.double()[:, None], upper=False).square().sum())
-
-
 def _real(z: Tensor) -> Tensor:
     """(m, n, K) complex as (m, 2 n K) real ones."""
     return torch.view_as_real(z.contiguous()).flatten(1)
@@ -185,4 +175,4 @@ def _mirror(grid: Grid) -> Tensor:
     return back[flipped]
 
 
-__all__ = ["Products", "Rows", "make_shams", "products", "weighed_squares", "whitened_residual"]
+__all__ = ["Products", "Rows", "make_shams", "products", "whitened_residual"]

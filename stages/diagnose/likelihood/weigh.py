@@ -65,6 +65,7 @@ class Whole:
     def __init__(self, units: Sequence[Products], plan: Plan, frames: int) -> None:
         self.units, self.plan, self.frames = list(units), plan, frames
         self.first = 1 + len(plan.shared)
+        self.drift: tuple[NDArray[np.int64], Array, Array] | None = None  # places, main directions, their scatter
         self._let_coefficients_drift()
         self.size = self.first + len(plan.per_frame) * frames
         self.gram = np.zeros((self.size, self.size))
@@ -108,7 +109,6 @@ class Whole:
         main = (scale[:, None] * axes[:, -DRIFTING:]) * math.sqrt(
             len(self.units)
         )  # a unit's column has about unit information
-        reduced = [main.T @ u.gram[places] for u in self.units]
         spread = np.full(main.shape[1], 1.0)
         squares = [main.T @ u.gram[np.ix_(places, places)] @ main for u in self.units]
         score = np.array([main.T @ u.gram[places, 0] for u in self.units])
@@ -122,12 +122,28 @@ class Whole:
             own = np.array([c @ (s - g @ mean) for c, g, s in zip(posterior, squares, score, strict=True)])
             variance = own**2 + np.array([c.diagonal() for c in posterior])
             spread = np.sqrt(np.maximum(variance.mean(0), 1e-8))
-        out = []
-        for u, g, r in zip(self.units, squares, reduced, strict=True):
-            inner = np.linalg.inv(g + np.diag(spread**-2))
-            sham = main.T @ u.sham[places]
-            out.append(dataclasses.replace(u, gram=u.gram - r.T @ inner @ r, sham=u.sham - r.T @ inner @ sham))
-        self.units = out
+        self.drift = places, main, spread
+        self.units = [self._without_drift(u) for u in self.units]
+
+    def _without_drift(self, u: Products) -> Products:
+        """The unit with its own amounts of the coefficients integrated out."""
+        if self.drift is None:
+            return u
+        places, main, spread = self.drift
+        r, sham = main.T @ u.gram[places], main.T @ u.sham[places]
+        inner = np.linalg.inv(main.T @ u.gram[np.ix_(places, places)] @ main + np.diag(spread**-2))
+        return dataclasses.replace(u, gram=u.gram - r.T @ inner @ r, sham=u.sham - r.T @ inner @ sham)
+
+    def gains_on(self, units: Sequence[Products], places: NDArray[np.int64], exclude: Sequence[int] = ()) -> Array:
+        """(len(units),) nats that the columns gain on other ground, all that is fitted here taken over."""
+        n = self.nuisance([*places, *exclude])
+        every = np.concatenate([n, places])
+        more = np.concatenate([self.weight(n), np.zeros(len(places))])
+        b1, b0 = np.zeros(self.size), np.zeros(self.size)
+        b1[every] = _solve(self.gram[np.ix_(every, every)] + np.diag(more), self.gram[every, 0])
+        b0[n] = _solve(self.gram[np.ix_(n, n)] + np.diag(self.weight(n)), self.gram[n, 0])
+        held = [self._without_drift(u) for u in units]
+        return np.array([0.5 * (_left(u, b0) - _left(u, b1)) for u in held])
 
     def frame_places(self, columns: Sequence[int]) -> NDArray[np.int64]:
         """Places of columns per frame in the whole, frame by frame within a column."""

@@ -157,49 +157,21 @@ class Chain:
         """Whether the nominal model is the sum of kernels itself."""
         return self.model.name == RICH
 
-    def form_tangents(self) -> tuple[list[Tensor], list[Tensor]]:
-        """What another form of the law may add, (n, H, W) each: what is surely of no form of the nominal one, and what hardly is.
-
-        The first are a sum of kernels, or beside a nominal one what has no kernel (cosines alone); the second its kernels times
-        cosines, each as bright as the image.
-        """
-        rich = get_model(RICH)
-        surfaces, bent = [], []
+    def form_tangents(self) -> list[Tensor]:
+        """d image / d coefficient of a sum of kernels that stands beside the nominal model, (n, H, W) each."""
         if self.free_form:
-            angles = self._state.angles
-            surfaces = [torch.ones_like(angles.cos_incidence), angles.cos_incidence, angles.cos_phase]
-            cosines = [c - c.mean() for c in (angles.cos_incidence, angles.cos_emission)]
-            bent = [self.as_bright(t * c) for t in self.surface_tangents() for c in cosines]
-        for k in range(0 if self.free_form else len(rich.parameters)):
-            c = torch.zeros(1, len(rich.parameters), 1, 1)
-            c[:, k] = 1.0
-            surfaces.append(masked_radiance_factor(rich, rich.unpack(c, dim=1), self._state.angles))
-        free = []
-        for surface in surfaces:
-            step = 0.02 * self._state.reflectance.mean() / surface.mean().abs().clamp(min=1e-9)
-            more = self._expose(self._state, self._state.reflectance + step * surface * self.lit(), self.base)
-            free.append(more - self.textured)
-        return free, bent
-
-    def albedo_tangents(self) -> list[Tensor]:
-        """How the law goes with albedo, (n, H, W) each: nothing in the mean over a place's images, in one image as bright as that.
-
-        What all images share is albedo itself, which is part of the covariance; what effects do to all of them would vanish in it.
-        """
-        bright = self.site.texture - self.site.texture.mean()
-        image, lit = self.textured.clamp(min=1e-6), self.lit() & (self.textured > 1e-6)
-        count = lit.sum(0).clamp(min=1)
+            return []
+        rich = get_model(RICH)
+        zero = torch.zeros(1, len(rich.parameters), 1, 1)
         out = []
-        for t in self.surface_tangents():
-            share = torch.where(lit, t / image, 0.0)
-            out.append(self.as_bright((share - share.sum(0) / count) * lit * image * bright))
+        for k in range(len(rich.parameters)):
+            c = zero.clone()
+            c[:, k] = 1.0
+            surface = masked_radiance_factor(rich, rich.unpack(c, dim=1), self._state.angles)
+            step = 0.02 * self._state.reflectance.mean() / surface.mean().abs().clamp(min=1e-9)
+            more = self._expose(self._state, self._state.reflectance + step * surface, self.base)
+            out.append(more - self.textured)
         return out
-
-    def as_bright(self, x: Tensor) -> Tensor:
-        """A column with the image's rms on lit ground."""
-        lit = self.lit()
-        size = (self.textured * lit).square().mean().sqrt()
-        return x * (size / (x * lit).square().mean().sqrt().clamp(min=1e-9 * float(size) + 1e-30))
 
     def slope_tangents(self) -> tuple[Tensor, Tensor]:
         """d image / d slope to the east and to the north: how an error of the DEM shows in every image."""

@@ -38,8 +38,6 @@ class Plan:
     form: list[int] = field(
         default_factory=list
     )  # of another form of the reflectance: a nuisance of all but effects of the law
-    scattered: list[list[int]] = field(default_factory=list)  # groups of nuisance whose scatter the data give
-    free_form: bool = False  # the nominal law is a sum of kernels itself
     guises: list[Guise] = field(default_factory=list)
     steps: list[tuple[int, str, float]] = field(default_factory=list)  # base effect, coordinate, step: tangents
 
@@ -57,12 +55,11 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey) -> Plan:
     free = range(chain.coefficients.shape[1]) if chain.free is None else torch.nonzero(chain.free)[:, 0].tolist()
     for k in free:
         shared(f"coefficient {k}", float("inf"))
-    plan.scattered.append([shared(f"coefficient {k} with albedo", 1.0) for k in free])
-    others, bent = chain.form_tangents()
-    plan.form = [shared(f"form {k}", float("inf")) for k in range(len(others))]
-    plan.scattered.append([shared(f"bend {k}", 1.0) for k in range(len(bent))])
-    plan.form += plan.scattered[-1]
-    plan.free_form = chain.free_form
+    for k in free:
+        shared(f"coefficient {k} with albedo", float("inf"))
+    if not chain.free_form:
+        for k in range(len(chain.form_tangents())):
+            plan.form.append(shared(f"form {k}", float("inf")))
     shared("slopes within a pixel", 1.0)
     for place, effect in enumerate(chain.base):
         if effect.scope == "scene":
@@ -100,13 +97,12 @@ def shared_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
     The residual is that of the bare prediction, albedo being part of its covariance; what effects add goes with the albedo.
     """
     tangents = chain.surface_tangents()
-    free, bent = chain.form_tangents()
+    bright = chain.site.texture - chain.site.texture.mean()
     out = [
         chain.site.image - chain.predict(),
         *tangents,
-        *chain.albedo_tangents(),
-        *free,
-        *bent,
+        *(t * bright for t in tangents),
+        *chain.form_tangents(),
         chain.unresolved_slopes(),
     ]
     for place, coordinate, step in plan.steps:

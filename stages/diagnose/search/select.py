@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 
 from stages.diagnose.likelihood.covariance import Covariance
-from stages.diagnose.likelihood.products import products
+from stages.diagnose.likelihood.products import Rows, products
 from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
+from stages.diagnose.model.chain import Chain
 from stages.diagnose.search.refine import as_effect, refine
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.search.tested import hidden_gains
-from stages.diagnose.settings import DISCOVERY, FEW_GROUNDS, NOTABLE, SIMPLER, SURE, TRIED, TRIES
-from stages.effects import get_effect
+from stages.diagnose.search.tested import hidden_rows
+from stages.diagnose.settings import DISCOVERY, NOTABLE, SIMPLER, SURE, TRIED, TRIES
+from stages.effects import Effect, get_effect
 
 TOO_FEW = "it takes more images"
 ODD = "nothing real has the values that fit best"
@@ -111,17 +113,17 @@ def _as_good(found: Found, best: Found) -> bool:
 
 
 def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
-    """Whether an effect of the reflectance law stands for another form of it, which has more to add for sure, or a fair share more."""
+    """Whether an effect of the reflectance law stands for another form of it, which has more to add for sure."""
     if not get_effect(found.effect).of_law:
         return False
-    if whole.plan.free_form:
+    if not len(whole.form_places()):
         out.rejected[found.effect] = (
             found.gain,
             "the nominal law is a sum of kernels, and what is left of it has no form of its own",
         )
         return True
     added = whole.law_adds(found)
-    if interval(added)[0] <= 0 and added.sum() <= (1 - SIMPLER) * found.gain:
+    if interval(added)[0] <= 0:
         return False
     why = f"the nominal law has another form, which gains {added.sum():.0f} nats more beside it; the effect stands for a part of that"
     out.rejected[found.effect] = (found.gain, why)
@@ -131,10 +133,7 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
 def take(state: State, view: View, found: Found, group: list[str]) -> str:
     """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
     cls = get_effect(found.effect)
-    law = max(
-        0 if view.plan.free_form else len(view.plan.form),
-        sum(n.startswith("coefficient") for n in view.plan.shared) // 2,
-    )
+    law = max(len(view.plan.form), sum(n.startswith("coefficient") for n in view.plan.shared) // 2)
     if cls.scatters and not cls.displaces and state.frames <= law:
         return f"{TOO_FEW}: a law of {law} coefficients can give {state.frames} any brightness"
     first = as_effect(found, state.data, state.frames, view.whole)
@@ -149,14 +148,13 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         (f"beside it {c.effect.name} is no cause any more: {w}" for c in causes if (w := doubt(state, c))), ""
     )
     if not why:
-        gains, total = secant_gains(state, cause, look)
+        gains, total, tested = secant_gains(state, cause, look)
         low, high = interval(gains)
         cause.gain_percent, cause.gain_low, cause.gain_high = (200 * x / total for x in (float(gains.sum()), low, high))
         cause.found = dataclasses.replace(cause.found, gains=gains)
         if low <= 0:
             why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
-    if not why:
-        why = contradicted(hidden_gains(state, cause, look))
+        why = why or contradicted(tested)
     if why:
         state.causes[:] = causes
         for c, effect, errors in saved:
@@ -166,17 +164,11 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     return why
 
 
-def contradicted(parts: list[tuple[np.ndarray, str]]) -> str:
-    """Why test pairs that gain so much on each piece of ground take a name back, or ''.
-
-    Too few grounds for an interval speak by their sum, where weighted squares and plain ones agree.
-    """
-    for gains, unit in parts:
-        low, high = interval(gains)
-        if high < 0:
-            return f"the test pairs contradict it: it gains {gains.sum():.3g} {unit} there ({low:.3g} .. {high:.3g})"
-    if parts and all(len(g) < FEW_GROUNDS and g.sum() < 0 for g, _ in parts):
-        return "the test pairs contradict it: it gains " + " and ".join(f"{g.sum():.3g} {unit}" for g, unit in parts)
+def contradicted(gains: np.ndarray) -> str:
+    """Why test pairs that gain so many nats on each piece of ground take a name back, or ''."""
+    low, high = interval(gains)
+    if high < 0:
+        return f"the test pairs contradict it: it gains {gains.sum():.3g} nats there ({low:.3g} .. {high:.3g})"
     return ""
 
 
@@ -206,49 +198,65 @@ def doubt(state: State, cause: Cause) -> str:
     return ""
 
 
-def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, float]:
-    """Held-out gain (labels,) in nats of the cause as it was rendered, everything else fitted along, and the squares without it.
+def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, float, np.ndarray]:
+    """Held-out gain (labels,) in nats of the cause as it was rendered, everything else fitted along; the squares without it; its gain on the test pairs.
 
     Effects with many values keep the gain that their columns had on held-out ground: one amount for all would not be held out.
     """
     others = [c.effect for c in state.causes if c is not cause]
-    added, plain = [], []
+    few = 1 + sum(n.startswith("coefficient") for n in look.plan.shared)
     flat = Covariance.white(look.grid.annuli, state.frames)
-    for number, chain in enumerate(state.chains()):
-        brought = (chain.render() - state.nominal.chain(chain.site, others).render())[None]
-        for row in look.rows:
-            if row.patch.site == number:
-                z, mean = row.patch.transform(brought, look.grid)
-                shared, means = torch.cat([row.shared, z]), torch.cat([row.shared_mean, mean])
-                shared[0], means[0] = shared[0] + z[0], means[0] + mean[0]
-                dark = torch.cat([row.shared_dark, row.patch.shadow(brought)])
-                dark[0] = dark[0] + dark[-1]
-                more = dataclasses.replace(row, shared=shared, shared_mean=means, shared_dark=dark)
-                added.append(products(more, look.model, look.grid, state.frames, None))
-                few = 1 + sum(n.startswith("coefficient") for n in look.plan.shared)
-                less = dataclasses.replace(
-                    row,
-                    shared=torch.cat([shared[:few], shared[-1:]]),
-                    shared_mean=torch.cat([means[:few], means[-1:]]),
-                    own=row.own[:0],
-                    own_mean=row.own_mean[:0],
-                    shared_dark=0 * torch.cat([dark[:few], dark[-1:]]),
-                    own_dark=row.own_dark[:0],
-                )
-                plain.append(products(less, flat, look.grid, state.frames, None).gram)
+    sites = [(chain, [r for r in look.rows if r.patch.site == k]) for k, chain in enumerate(state.chains())]
+    added, plain = [], []
+    for chain, rows in sites:
+        for more in _with_cause(state, chain, others, rows, look):
+            added.append(products(more, look.model, look.grid, state.frames, None))
+            less = dataclasses.replace(
+                more,
+                shared=torch.cat([more.shared[:few], more.shared[-1:]]),
+                shared_mean=torch.cat([more.shared_mean[:few], more.shared_mean[-1:]]),
+                shared_dark=0 * torch.cat([more.shared_dark[:few], more.shared_dark[-1:]]),
+                own=more.own[:0],
+                own_mean=more.own_mean[:0],
+                own_dark=more.own_dark[:0],
+            )
+            plain.append(products(less, flat, look.grid, state.frames, None).gram)
     plan = dataclasses.replace(look.plan, shared=[*look.plan.shared, "secant"])
     whole = Whole(added, plan, state.frames)
     for k in [k for k, n in enumerate(look.plan.shared) if n.startswith(cause.effect.name + ".")]:
         whole.precision.pop(1 + k, None)
     first = look.whole.first
     whole.precision |= {k + 1: v for k, v in look.whole.precision.items() if k >= first}  # one shared column more
-    scattered = look.whole.known_places([1 + k for group in look.plan.scattered for k in group])
-    whole.precision |= {int(p): look.whole.precision[int(p)] for p in scattered}
     cause.rms_before, cause.rms_after = _rms(np.sum(plain, 0), look)
+    total = float(whole.gram[0, 0])
     if type(cause.effect).scope == "image" or len(cause.found.guise.columns) > 1:
-        return cause.found.gains, float(whole.gram[0, 0])
+        return cause.found.gains, total, np.zeros(0)
     form = list(whole.form_places()) if type(cause.effect).of_law else []
-    return whole.held_out(np.array([whole.first - 1]), form), float(whole.gram[0, 0])
+    place = np.array([whole.first - 1])
+    tested = [
+        products(more, look.model, look.grid, state.frames, None)
+        for chain, rows in hidden_rows(state, look.plan)
+        for more in _with_cause(state, chain, others, rows, look)
+    ]
+    gains = whole.gains_on(tested, place, form)
+    grounds = [u.ground for u in tested]
+    if len(set(grounds)) >= 3:  # else pieces of ground, where there are too few grounds for an interval
+        gains = np.bincount(grounds, weights=gains).astype(np.float64)
+    return whole.held_out(place, form), total, gains
+
+
+def _with_cause(state: State, chain: Chain, others: Sequence[Effect], rows: Sequence[Rows], look: View) -> list[Rows]:
+    """Rows as they are without the cause, what it brought as the last column."""
+    brought = (chain.render() - state.nominal.chain(chain.site, others).render())[None]
+    out = []
+    for row in rows:
+        z, mean = row.patch.transform(brought, look.grid)
+        shared, means = torch.cat([row.shared, z]), torch.cat([row.shared_mean, mean])
+        dark = torch.cat([row.shared_dark, row.patch.shadow(brought)])
+        for x in (shared, means, dark):
+            x[0] = x[0] + x[-1]
+        out.append(dataclasses.replace(row, shared=shared, shared_mean=means, shared_dark=dark))
+    return out
 
 
 def _rms(gram: np.ndarray, look: View) -> tuple[float, float]:

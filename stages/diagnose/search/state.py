@@ -131,24 +131,24 @@ class State:
         every = [n for n in effect_names() if n not in named]
         return [n for n in every if get_effect(n).visible(self.data, self.has)]
 
+    def rows(self, number: int, chain: Chain, plan: Plan) -> list[Rows]:
+        """Of one site, piece by piece."""
+        grid, pieces = self.grid()
+        shared, own = shared_columns(chain, plan, self.data), frame_columns(chain, plan, self.data)
+        out = []
+        for patch in make_patches(number, chain, pieces, self.free_gains):
+            z, mean = patch.transform(shared, grid)
+            z_own, mean_own = patch.transform(own, grid)
+            out.append(Rows(patch, z, mean, z_own, mean_own, patch.shadow(shared), patch.shadow(own)))
+        return out
+
     def look(self, names: Sequence[str], shams: int = SHAMS) -> View:
         """Rows and products of everything, with the effects ``names`` as candidates."""
         chains = self.chains()
-        grid, pieces = self.grid()
+        grid, _ = self.grid()
         plan = make_plan(chains[0], names, self.data)
 
-        def of(k: int) -> list[Rows]:
-            chain = chains[k]
-            patches = make_patches(k, chain, pieces, self.free_gains)
-            shared, own = shared_columns(chain, plan, self.data), frame_columns(chain, plan, self.data)
-            out = []
-            for patch in patches:
-                z, mean = patch.transform(shared, grid)
-                z_own, mean_own = patch.transform(own, grid)
-                out.append(Rows(patch, z, mean, z_own, mean_own, patch.shadow(shared), patch.shadow(own)))
-            return out
-
-        rows = [r for part in per_site(of, range(len(chains))) for r in part]
+        rows = [r for part in per_site(lambda k: self.rows(k, chains[k], plan), range(len(chains))) for r in part]
         model = estimate([r.patch for r in rows], [(r.shared[0], r.shared_mean[0]) for r in rows], grid, self.frames)
         model.dark = shadow_variance([r.patch for r in rows], [r.shared_dark[0] for r in rows])
         self.covariance = model
@@ -157,8 +157,6 @@ class State:
             tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
         units = per_site(lambda k: products(rows[k], model, grid, self.frames, tricks[k]), range(len(rows)))
         whole = Whole(units, plan, self.frames)
-        for group in plan.scattered:
-            whole.let_scatter(whole.known_places([1 + k for k in group]))
         for name in dict.fromkeys(plan.per_frame):
             if get_effect(name).scatters:
                 places = whole.frame_places([k for k, n in enumerate(plan.per_frame) if n == name])
