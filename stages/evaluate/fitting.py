@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from stages.evaluate import fit
+import stages.evaluate.fit as fit
 from stages.evaluate.renderers import Batch, Constant, Reader, Renderer, batches, read_batch, unit_images
 from stages.evaluate.rows import HAPKE_FREE, Row
 from stages.physics.formation.radiometry import full_scale
