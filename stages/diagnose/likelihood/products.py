@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -25,6 +25,18 @@ class Rows:
     own_mean: Tensor
     shared_dark: Tensor
     own_dark: Tensor
+
+
+def without_frames(rows: Rows, frames: Sequence[int]) -> Rows | None:
+    """The same patch as if these frames had not been taken; None where no image is left."""
+    kept = torch.tensor([int(f) not in frames for f in rows.patch.frames])
+    if not bool(kept.any()):
+        return None
+    patch = rows.patch
+    by_image = ("images", "weight", "scale", "slopes", "level", "frames", "dark")
+    fewer = replace(patch, **{name: getattr(patch, name)[kept] for name in by_image})
+    names = ("shared", "shared_mean", "own", "own_mean", "shared_dark", "own_dark")
+    return Rows(fewer, *(getattr(rows, name)[:, kept] for name in names))
 
 
 Residual = tuple[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 
@@ -22,7 +23,8 @@ from stages.effects import Effect, effect_names, get_effect
 
 
 def score(state: State, answer: Answer) -> HeldOut:
-    """Squared errors of both models on the same pixels, with the same nuisance: gains of dn images, smooth fields of displacement.
+    """Squared errors of both models on the same pixels, with the same nuisance: the albedo of every pixel that several images show, gains
+    of dn images, smooth fields of displacement.
 
     Relative to brightness for dn images, else in I/F. What registration found counts where it is named, else both have it.
     """
@@ -36,9 +38,12 @@ def score(state: State, answer: Answer) -> HeldOut:
     for site, first, last in zip(state.hidden, plain, moved, strict=True):
         images = [aligned(site.read, site.read_valid, *d) if d else (site.read, site.read_valid) for d in (first, last)]
         mask = lit_mask_read(state.reference.chain(site, [])) & images[0][1] & images[1][1]
-        before[site.ground] += _squares(site, state.reference.chain(site, []), images[0][0], mask, state.free_gains)
-        after[site.ground] += _squares(site, state.nominal.chain(site, effects), images[1][0], mask, state.free_gains)
-        count += float(mask.sum())
+        squares, pixels = _squares(site, state.reference.chain(site, []), images[0][0], mask, state.free_gains)
+        before[site.ground] += squares
+        after[site.ground] += _squares(site, state.nominal.chain(site, effects), images[1][0], mask, state.free_gains)[
+            0
+        ]
+        count += pixels
     if not count > 0:
         return HeldOut()
     _, low, high = gain_interval(before, after)
@@ -66,16 +71,58 @@ def displacements(state: State, named: Sequence[Effect]) -> tuple[Fields, Fields
 Fields = list[tuple[torch.Tensor, torch.Tensor]] | list[None]
 
 
-def _squares(site: Site, chain: Chain, image: torch.Tensor, mask: torch.Tensor, free: bool) -> float:
+def _squares(site: Site, chain: Chain, image: torch.Tensor, mask: torch.Tensor, free: bool) -> tuple[float, float]:
+    """Squared error and number of pixels. Where several images show a pixel its own albedo is a nuisance: one factor for all of them.
+
+    Without it albedo, which no cause is about, would drown what the images of a place disagree on.
+    """
     site.image = image
     predicted = chain.predict()
-    error = ((image - predicted) * mask).double()
     if free:
         scale_images(site, image, predicted, mask)
-        weight = mask.double()
+    weight = mask.double()
+    if len(weight) > 1:
+        weight = weight * (weight.sum(0) > 1)
+        seen = (weight * predicted.square()).sum(0).clamp(min=1e-12)
+        predicted = predicted * ((weight * predicted * site.image).sum(0) / seen)
+    error = (site.image - predicted).double() * weight
+    if free:
         level = (image * weight).sum((-2, -1)) / weight.sum((-2, -1)).clamp(min=1)
-        error = (site.image - predicted) * weight * (site.gain / level.clamp(min=1e-9))[:, None, None]
-    return float(error.square().sum())
+        error = error * (site.gain / level.clamp(min=1e-9))[:, None, None]
+    return float(error.square().sum()), float(weight.sum())
+
+
+def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
+    """Take out causes of the search that gain nothing on the test pairs; name -> its gain in nats where it was learned, and why."""
+    out: dict[str, tuple[float, str]] = {}
+    for cause in list(state.causes):
+        with_cause = _hidden_squares(state)
+        kept, nominal = list(state.causes), state.nominal
+        state.causes[:] = [c for c in kept if c is not cause]
+        state.nominal = copy.copy(nominal)
+        state.fit()
+        without = _hidden_squares(state)
+        if without.sum() > 0 and with_cause.sum() >= without.sum():
+            loss = 100 * (with_cause.sum() / without.sum() - 1)
+            out[cause.effect.name] = (
+                f"the test pairs do not confirm it: their squared error is {loss:.1f} % higher with it"
+            )
+            continue
+        state.causes[:], state.nominal = kept, nominal
+        state.fit()
+    return out
+
+
+def _hidden_squares(state: State) -> np.ndarray:
+    """Squared error on every ground of the test pairs."""
+    total = np.zeros(max((s.ground for s in state.hidden), default=0) + 1)
+    for site in state.hidden:
+        image, valid = site.read, site.read_valid
+        if site.displacement is not None:
+            image, valid = aligned(image, valid, *site.displacement)
+        chain = state.nominal.chain(site, state.base)
+        total[site.ground] += _squares(site, chain, image, lit_mask_read(chain) & valid, state.free_gains)[0]
+    return total
 
 
 def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:

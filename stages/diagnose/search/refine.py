@@ -9,9 +9,10 @@ import torch
 from numpy.typing import NDArray
 
 from stages.diagnose.likelihood.jackknife import jackknife_error
+from stages.diagnose.likelihood.products import without_frames
 from stages.diagnose.likelihood.weigh import Whole
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.settings import SETTLED, STEPS
+from stages.diagnose.settings import FOLDS, SETTLED, STEPS
 from stages.effects import Survey, get_effect
 
 
@@ -53,6 +54,38 @@ def refine(state: State) -> View:
     return view
 
 
+def errors_over_images(state: State) -> None:
+    """Raise the errors of scene-wide values to those of a jackknife over images.
+
+    What is wrong with the law goes with an image's geometry and is the same on all ground: leaving out ground does not show it.
+    """
+    if not any(type(c.effect).scope == "scene" for c in state.causes):
+        return
+    view = state.look([n for n in state.open_names() if _ordinary(n) or get_effect(n).always], 0)
+    _, owned = _scene_places(view)
+    frames = sorted({int(f) for row in view.rows for f in row.patch.frames})
+    groups = [frames[k::FOLDS] for k in range(min(FOLDS, len(frames)))]
+    left = []
+    for group in groups if len(frames) > 2 else []:
+        whole = state.weigh([r for row in view.rows if (r := without_frames(row, group)) is not None], view)
+        places, _ = _scene_places(view)
+        for p in places:
+            whole.precision.pop(int(p), None)
+        if whole.seen[places].all():
+            left.append(_amounts(state, whole, places, [place for place, _, _ in owned])[0])
+    if len(left) > 1:
+        for (place, name, _), error in zip(owned, jackknife_error(np.array(left)), strict=True):
+            errors = state.causes[place].errors
+            errors[name] = max(errors.get(name, 0.0), float(error))
+
+
+def _scene_places(view: View) -> tuple[NDArray[np.int64], list[tuple[int, str, float]]]:
+    """Places of the values of scene-wide causes among the columns, and whose they are."""
+    plan = view.plan
+    first = next((k for k, n in enumerate(plan.shared) if "." in n), len(plan.shared))
+    return np.array([1 + first + k for k in range(len(plan.steps))], dtype=np.int64), list(plan.steps)
+
+
 def _ordinary(name: str) -> bool:
     cls = get_effect(name)
     return cls.scope == "scene" and bool(cls.tolerance)
@@ -60,12 +93,11 @@ def _ordinary(name: str) -> bool:
 
 def _step(state: State, view: View) -> float:
     """Move all values; returns the largest move in standard errors."""
-    whole, plan = view.whole, view.plan
-    scene = [(k, step) for k, step in enumerate(plan.steps)]
-    first = next((k for k, n in enumerate(plan.shared) if "." in n), len(plan.shared))
+    whole = view.whole
+    places, steps = _scene_places(view)
+    scene = list(enumerate(steps))
     largest = 0.0
     if scene:
-        places = np.array([1 + first + k for k, _ in scene])
         seen = whole.seen[places]
         for p in places:
             whole.precision.pop(int(p), None)
@@ -138,4 +170,4 @@ def _step_frames(state: State, view: View, cause: Cause) -> float:
     return float(np.sqrt((move**2).mean() / max(inverse.diagonal().mean(), 1e-12)))
 
 
-__all__ = ["as_effect", "refine"]
+__all__ = ["as_effect", "errors_over_images", "refine"]

@@ -155,7 +155,17 @@ class State:
         tricks: list[Residual | None] = [None] * len(rows)
         if shams:
             tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
-        units = per_site(lambda k: products(rows[k], model, grid, self.frames, tricks[k]), range(len(rows)))
+        whole = self._whole(rows, tricks, plan, grid, model)
+        return View(whole, plan, rows, grid, model)
+
+    def weigh(self, rows: Sequence[Rows], view: View) -> Whole:
+        """The sums of other rows under the covariance of a look."""
+        return self._whole(rows, [None] * len(rows), view.plan, view.grid, view.model)
+
+    def _whole(
+        self, rows: Sequence[Rows], shams: Sequence[Residual | None], plan: Plan, grid: Grid, model: Covariance
+    ) -> Whole:
+        units = per_site(lambda k: products(rows[k], model, grid, self.frames, shams[k]), range(len(rows)))
         whole = Whole(units, plan, self.frames)
         for name in dict.fromkeys(plan.per_frame):
             if get_effect(name).scatters:
@@ -163,7 +173,7 @@ class State:
                 whole.let_scatter(places)
                 if not get_effect(name).displaces:
                     whole.scattered = places
-        return View(whole, plan, rows, grid, model)
+        return whole
 
 
 @dataclass
