@@ -93,9 +93,9 @@ def _squares(site: Site, chain: Chain, image: torch.Tensor, mask: torch.Tensor, 
 
 
 def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
-    """Take out causes of the search that gain nothing on the test pairs; name -> its gain in nats where it was learned, and why."""
+    """Take out causes of the search that gain nothing on the test pairs, the last one first; name -> its gain in nats where it was learned, and why."""
     out: dict[str, tuple[float, str]] = {}
-    for cause in list(state.causes):
+    for cause in state.causes[::-1]:  # what was found last stands on what was found before
         with_cause = _hidden_squares(state)
         kept, nominal = list(state.causes), state.nominal
         state.causes[:] = [c for c in kept if c is not cause]
@@ -104,9 +104,8 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
         without = _hidden_squares(state)
         if without.sum() > 0 and with_cause.sum() >= without.sum():
             loss = 100 * (with_cause.sum() / without.sum() - 1)
-            out[cause.effect.name] = (
-                f"the test pairs do not confirm it: their squared error is {loss:.1f} % higher with it"
-            )
+            why = f"the test pairs do not confirm it: their squared error is {loss:.1f} % higher with it"
+            out[cause.effect.name] = cause.found.gain, why
             continue
         state.causes[:], state.nominal = kept, nominal
         state.fit()
