@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
+import torch
 from test_diagnose import _pairs, scene  # noqa: F401
 
 from schemas.files.outputs import Output
 from stages import diagnose
+from stages.diagnose.likelihood.products import without_frames
+from stages.diagnose.result.score import unconfirmed
+from stages.diagnose.search.refine import errors_over_images
+from stages.effects import get_effect
 
 TEST = 2
 
 
 @pytest.fixture(scope="module")
 def answers(scene, tmp_path_factory):  # noqa: F811
-    """JSON of a diagnosis of a wrong Sun, and of the same with noise on the images of the test pairs."""
+    """JSON of a diagnosis of a wrong Sun, and of the same with noise on the images of the test pairs; what the first knows."""
     folder = tmp_path_factory.mktemp("leaks")
     pairs = _pairs(scene, folder, {"sun_azimuth": {"error_deg": 4.0}})
     noisy = folder / "noisy.h5"
@@ -29,15 +35,17 @@ def answers(scene, tmp_path_factory):  # noqa: F811
         image = file["image"][...]
         image[test] += np.random.default_rng(3).normal(0, 0.01 * image[test].std(), image[test].shape)
         file["image"][...] = image
-    said = []
+    said, results = [], []
     for path in (pairs, noisy):
-        diagnose.run(path, None, Output(folder / f"{path.stem}_d.h5", json=folder / "d.json", overwrite=True))
+        results.append(
+            diagnose.run(path, None, Output(folder / f"{path.stem}_d.h5", json=folder / "d.json", overwrite=True))
+        )
         said.append(json.loads((folder / "d.json").read_text()))
-    return said
+    return [*said, results[0].state]
 
 
 def test_causes_are_learned_without_the_test_pairs(answers):
-    plain, noisy = answers
+    plain, noisy, _ = answers
     assert [c["effect"] for c in plain["causes"]] == [c["effect"] for c in noisy["causes"]]
     for one, other in zip(plain["causes"], noisy["causes"], strict=True):
         assert one["parameters"] == other["parameters"]
@@ -46,7 +54,7 @@ def test_causes_are_learned_without_the_test_pairs(answers):
 
 
 def test_the_score_is_of_the_test_pairs(answers):
-    plain, noisy = (a["held_out"] for a in answers)
+    plain, noisy = (a["held_out"] for a in answers[:2])
     assert plain["pairs"] == noisy["pairs"] < answers[0]["data"]["pairs"]
     assert noisy["mse_extended"] > plain["mse_extended"] and noisy["mse_nominal"] > plain["mse_nominal"]
 
@@ -55,3 +63,39 @@ def test_p_tells_what_was_planted_from_what_was_not(answers):
     """p comes from shams: it cannot be 0, nor small for everything."""
     planted = answers[0]["causes"][0]["p_family_wise"]
     assert 0 < planted <= 0.05
+
+
+def test_the_test_pairs_take_a_name_back(answers):
+    """Gains of single images that nothing has: the test pairs refuse them, and leave the Sun its name."""
+    state = answers[2]
+    before = [c.effect.name for c in state.causes]
+    assert before[0] == "sun_azimuth"
+    gains = torch.linspace(-0.1, 0.1, state.frames)
+    invented = get_effect("image_gain")({"gain": gains}, state.data)
+    state.causes.append(replace(state.causes[0], effect=invented))
+    try:
+        refused = unconfirmed(state)
+    finally:
+        state.causes[:] = [c for c in state.causes if c.effect is not invented]
+    assert list(refused) == ["image_gain"] and "test pairs" in refused["image_gain"][1]
+    assert [c.effect.name for c in state.causes] == before
+
+
+def test_errors_are_those_over_images_where_these_are_larger(answers):
+    """Leaving out images is leaving out their rows; what is left is what it was."""
+    state = answers[2]
+    errors = dict(state.causes[0].errors)
+    state.causes[0].errors = dict.fromkeys(errors, 0.0)
+    errors_over_images(state)
+    over_images = dict(state.causes[0].errors)
+    state.causes[0].errors = dict.fromkeys(errors, 99.0)
+    errors_over_images(state)
+    assert all(0 < v < 4 for v in over_images.values())
+    assert set(state.causes[0].errors.values()) == {99.0}
+    state.causes[0].errors = errors
+    row = state.look(["image_gain"], 0).rows[0]
+    gone = int(row.patch.frames[0])
+    fewer = without_frames(row, [gone])
+    assert gone not in fewer.patch.frames and len(fewer.patch.frames) == len(row.patch.frames) - 1
+    torch.testing.assert_close(fewer.shared, row.shared[:, 1:])
+    assert without_frames(row, row.patch.frames.tolist()) is None
