@@ -27,6 +27,12 @@ SAMPLE = [
     "no validation pairs",
     "image all nodata",
     # tracebacks
+    "scene: /path a group",
+    "trajectory: fov_deg = 'nan'",
+    "trajectory: a column twice",
+    "ISD: focal_length_model.focal_length = nan",
+    "parts: gsd_m of one is nan",
+    "convert: bands 'a=1,b=2,c=99'",
     "pairs: attribute inputs = '{'",
     "pairs: attribute provenance = '5'",
     "pairs: nothing valid",

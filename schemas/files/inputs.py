@@ -141,8 +141,9 @@ def _in_artefact(path: Path) -> Iterator[Path]:
     with contextlib.suppress(OSError, RuntimeError, ValueError, KeyError, TypeError), h5py.File(path, "r") as file:
         named += [_text(file.attrs["scene"])] if "scene" in file.attrs else []
         for column in FILE_COLUMNS:
-            if column in file and file[column].ndim == 1:
-                named += map(_text, file[column][...])
+            data = file.get(column)
+            if isinstance(data, h5py.Dataset) and data.ndim == 1:
+                named += map(_text, data[...])
         for data in file.values():
             if isinstance(data, h5py.Dataset) and data.is_virtual:
                 plan = data.id.get_create_plist()
