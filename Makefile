@@ -36,7 +36,7 @@ test-slow: $(STAMP) ## the longer checks
 mutants: $(STAMP) ## plant bugs one at a time and see whether the tests notice, before a release; ONLY=word for some
 	OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py --only "$(ONLY)"
 
-fuzz: $(STAMP) ## over two thousand malformed inputs through the real commands: one line each, no traceback, nothing left
+fuzz: $(STAMP) ## three thousand malformed inputs through the real commands: one line each, no traceback, nothing left
 	OMP_NUM_THREADS=1 $(BIN)/python tests/malformed.py
 
 endurance: $(STAMP) ## interrupt every stage TIMES times (20) at random moments, run it again, compare every byte

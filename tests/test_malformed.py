@@ -24,6 +24,7 @@ SAMPLE = [
     "infer --body mars on a scene",
     "sample --crop '0'",
     "infer --stride '0'",
+    "render --altitude '0'",
     "no validation pairs",
     "image all nodata",
     # tracebacks

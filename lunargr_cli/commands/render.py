@@ -197,6 +197,8 @@ def command(
     from stages import render
 
     console, to = Console(quiet), Output(output, overwrite, resume, json=json_file)
+    if stereo is None and altitude is not None:
+        raise ConfigError("--altitude: expected together with --stereo; a single view has its height in --position.")
     if stereo is not None:
         if trajectory is not None or camera or position or shard or resume:
             raise ConfigError(
