@@ -1,0 +1,167 @@
+"""Bugs planted in the physics."""
+
+from __future__ import annotations
+
+from mutant import Mutant
+
+PHYSICS = (
+    Mutant(
+        "stages/physics/photometry/quantities.py",
+        "    return radiance_factor / math.pi\n",
+        "    return radiance_factor\n",
+        ("tests/test_photometry.py::test_quantities_go_there_and_back",),
+        "bidirectional reflectance lacks a factor of pi",
+    ),
+    Mutant(
+        "stages/physics/photometry/lambert.py",
+        "* angles.cos_incidence\n",
+        "* angles.cos_emission\n",
+        ("tests/test_photometry.py::test_lambert_and_lommel_seeliger_in_closed_form",),
+        "Lambert's law takes the emission angle for the incidence angle",
+    ),
+    Mutant(
+        "stages/physics/photometry/lommel_seeliger.py",
+        "        mu0 = angles.cos_incidence\n",
+        "        mu0 = angles.cos_emission\n",
+        ("tests/test_photometry.py::test_lambert_and_lommel_seeliger_in_closed_form",),
+        "Lommel-Seeliger's law has mu in the place of mu0",
+    ),
+    Mutant(
+        "stages/physics/photometry/lunar_lambert.py",
+        "    g = torch.rad2deg(phase)\n",
+        "    g = phase\n",
+        ("tests/test_photometry.py::test_lunar_lambert_between_its_two_laws", "tests/test_photometry_oracles.py"),
+        "McEwen's L(g) takes radians for degrees",
+    ),
+    Mutant(
+        "stages/physics/photometry/hapke.py",
+        "return hs / (hs + tan_half_phase)",
+        "return hs / (hs + 2 * tan_half_phase)",
+        ("tests/test_photometry.py::test_opposition_terms_at_their_limits", "tests/test_photometry_oracles.py"),
+        "shadow hiding is half as wide",
+    ),
+    Mutant(
+        "stages/physics/photometry/hapke.py",
+        "((1 + c) * backward + (1 - c) * forward)",
+        "((1 - c) * backward + (1 + c) * forward)",
+        ("tests/test_photometry_oracles.py",),
+        "the lobes of the phase function change places",
+    ),
+    Mutant(
+        "stages/physics/formation/geometry.py",
+        "    cos_incidence = (sz - slope_east * sx - slope_north * sy) * inverse\n",
+        "    cos_incidence = (sz + slope_east * sx - slope_north * sy) * inverse\n",
+        ("tests/test_formation.py::test_one_pass_gives_what_the_chain_gives",),
+        "the normal leans the wrong way in the chain",
+    ),
+    Mutant(
+        "stages/physics/formation/facets.py",
+        "q = (above[j] - below[j]) * step - bend",
+        "q = (below[j] - above[j]) * step - bend",
+        ("tests/test_formation.py::test_one_pass_gives_what_the_chain_gives",),
+        "rows run north in the fused geometry",
+    ),
+    Mutant(
+        "stages/physics/formation/geometry.py",
+        "return slope_east - east / body_radius",
+        "return slope_east + east / body_radius",
+        ("tests/test_formation.py::test_one_pass_gives_what_the_chain_gives",),
+        "the body is hollow: its curvature tilts slopes the wrong way",
+    ),
+    Mutant(
+        "stages/physics/maps/grid.py",
+        "GDAL_CENTRE = 0.5 ",
+        "GDAL_CENTRE = 0.0 ",
+        ("tests/test_formats.py::test_the_first_pixel_lies_half_a_pixel_within_the_corner",),
+        "pixel centres are taken for pixel corners, half a pixel off",
+    ),
+    Mutant(
+        "stages/physics/maps/grid.py",
+        "        east = np.cross(north, up)\n",
+        "        east = np.cross(up, north)\n",
+        ("tests/test_project.py::test_sun_and_camera_follow_spherical_trigonometry",),
+        "east points west in local frames",
+    ),
+    Mutant(
+        "stages/physics/maps/grid.py",
+        "moved = self.transform @ Affine.translation(col, row)",
+        "moved = self.transform @ Affine.translation(row, col)",
+        ("tests/test_formats.py::test_the_first_pixel_lies_half_a_pixel_within_the_corner",),
+        "rows and columns change places in windows of a grid",
+    ),
+    Mutant(
+        "stages/physics/horizon/sweeps.py",
+        "east, north = math.sin(azimuth) / east_size, math.cos(azimuth) / south_size",
+        "east, north = -math.sin(azimuth) / east_size, math.cos(azimuth) / south_size",
+        ("tests/test_horizon.py::test_wall",),
+        "azimuths of the horizon run counter-clockwise",
+    ),
+    Mutant(
+        "stages/physics/horizon/sweeps.py",
+        "    return sinks[0] * d * d\n",
+        "    return 0.0 * sinks[0] * d * d\n",
+        ("tests/test_horizon.py::test_curvature_hides_a_distant_peak",),
+        "terrain does not sink with distance",
+    ),
+    Mutant(
+        "stages/physics/horizon/sweeps.py",
+        "            1 / max(abs(east), abs(north)),\n",
+        "            1.0,\n",
+        ("tests/test_horizon.py::test_dome",),
+        "a step along an oblique ray is as long as one along a row",
+    ),
+    Mutant(
+        "stages/physics/horizon/scene.py",
+        "y = (row + r - north * distance - 0.5 * (cell - 1)) / cell",
+        "y = (row + r + north * distance - 0.5 * (cell - 1)) / cell",
+        (
+            "tests/test_horizon_scene.py::test_a_distant_wall_is_found_through_the_overview",
+            "tests/test_horizon_scene.py::test_crops_see_the_whole_scene",
+        ),
+        "the far terrain is looked for in the opposite direction",
+    ),
+    Mutant(
+        "stages/physics/images/orthorectify.py",
+        "* (terrain.grid.radius + height)[..., None]",
+        "* (terrain.grid.radius + 0 * height)[..., None]",
+        ("tests/test_orthorectify.py::test_a_pattern_on_the_terrain_is_put_back",),
+        "orthorectification ignores the heights",
+    ),
+    Mutant(
+        "stages/physics/images/orthorectify.py",
+        "np.meshgrid(np.arange(height + 1) + row - 0.5, np.arange(width + 1) + col - 0.5",
+        "np.meshgrid(np.arange(height + 1) + row, np.arange(width + 1) + col - 0.5",
+        ("tests/test_orthorectify.py::test_an_aligned_image_comes_back_as_block_means",),
+        "orthorectified images are half a pixel off",
+    ),
+    Mutant(
+        "stages/physics/images/orthorectify.py",
+        "            if ground > height:",
+        "            if ground < height - 1e9:",
+        ("tests/test_orthorectify.py::test_a_wall_hides_what_lies_behind_it",),
+        "nothing hides anything from a camera",
+    ),
+    Mutant(
+        "stages/physics/images/correlation.py",
+        "np.fft.irfft2(first * np.conj(second), shape)[lags]",
+        "np.fft.irfft2(np.conj(first) * second, shape)[lags]",
+        ("tests/test_registration.py::test_planted_shifts_come_back",),
+        "registration finds shifts of the opposite sign",
+    ),
+    Mutant(
+        "stages/physics/images/orthorectify.py",
+        "row, col = row + dy, col + dx",
+        "row, col = row - dy, col - dx",
+        ("tests/test_cameras_registration.py", "tests/test_registration_frame.py"),
+        "what registration finds is put on instead of taken off",
+    ),
+    Mutant(
+        "stages/physics/images/displacement.py",
+        "end = camera + (-along - np.sqrt(root))",
+        "end = camera + (-along + np.sqrt(root))",
+        (
+            "tests/test_registration_field.py::test_relief_displacement_is_height_times_tangent_of_emission_away_from_the_camera",
+        ),
+        "the relief displacement is looked up on the far side of the body",
+    ),
+)
