@@ -87,7 +87,7 @@ def products(
 ) -> Products:
     """shams : whitened sham residuals; groups : of frames, each to be left out once."""
     patch = rows.patch
-    columns = _Columns(rows, model, grid)
+    columns = _Columns(rows, model, grid, bool(groups))
     factor = _factor(model, patch, grid).real
     mean = None if patch.free else torch.linalg.inv(torch.linalg.cholesky(model.mean_matrix(patch)))
     every = torch.ones(len(patch.frames), dtype=torch.float64)
@@ -120,34 +120,44 @@ def _given_others(factor: Tensor, gone: Tensor) -> Tensor:
 class _Columns:
     """The columns of one patch, ready for products under several weights."""
 
-    def __init__(self, rows: Rows, model: Covariance, grid: Grid) -> None:
+    def __init__(self, rows: Rows, model: Covariance, grid: Grid, often: bool) -> None:
         self.rows, self.dark = rows, model.dark**0.5
         counts = torch.bincount(grid.bins, minlength=grid.annuli * SECTORS).tolist()
         ends = np.concatenate([[0], np.cumsum(counts)])
         self.bins = [(b, slice(int(ends[b]), int(ends[b + 1]))) for b, count in enumerate(counts) if count]
         self.k, n = len(rows.own), rows.own.shape[1]
-        self.inner = {}
+        self.inner, self.across = (
+            {},
+            {},
+        )  # of each bin: own columns among themselves, and (m, n, k, n) beside the shared ones
         for b, at in self.bins if self.k else []:
             x = rows.own[:, :, at].reshape(self.k * n, -1)
             self.inner[b] = (x @ x.mH).real.double().view(self.k, n, self.k, n)
+            if often:
+                y = rows.shared[:, :, at].flatten(0, 1)
+                self.across[b] = (y @ x.mH).real.double().view(-1, n, self.k, n)
 
     def gram(self, factor: Tensor, mean: Tensor | None, images: Tensor) -> Array:
         """(M, M) of all columns, whitened by ``factor`` (B, r, n) and, their means, by (r, n); images : (n,) whose deep shadow counts."""
         rows, k = self.rows, self.k
         n = factor.shape[-1]
         white = torch.empty(len(rows.shared), factor.shape[1], rows.shared.shape[-1], dtype=rows.shared.dtype)
-        back = torch.empty_like(rows.shared)
+        back = torch.empty_like(rows.shared) if k and not self.across else None
+        cross = torch.zeros(len(white), k, n, dtype=torch.float64)
         own = torch.zeros(k, n, k, n, dtype=torch.float64)
         for b, at in self.bins:
             f = factor[b].to(white.dtype)
             white[:, :, at] = f @ rows.shared[:, :, at]
             if k:
-                back[:, :, at] = f.mT @ white[:, :, at]
-                own += self.inner[b] * (factor[b].mT @ factor[b]).double()[None, :, None]
+                precision = (factor[b].mT @ factor[b]).double()
+                own += self.inner[b] * precision[None, :, None]
+                if back is None:
+                    cross += (self.across[b] * precision[None, :, None]).sum(1)
+                else:
+                    back[:, :, at] = f.mT @ white[:, :, at]
         flat = _real(white)
         dense = (flat @ flat.T).double()
-        cross = torch.zeros(len(dense), k, n, dtype=torch.float64)
-        if k:
+        if back is not None:
             x, y = (torch.view_as_real(t).flatten(2).transpose(0, 1) for t in (back, rows.own))
             cross = (x @ y.transpose(1, 2)).double().permute(1, 2, 0)
         if mean is not None:

@@ -50,8 +50,11 @@ class Plan:
         return [(name, self.per_frame[:k].count(name)) for k, name in enumerate(self.per_frame)]
 
 
-def make_plan(chain: Chain, names: Sequence[str], data: Survey) -> Plan:
-    """Columns for the nominal model's freedom, the effects in the chain, ordinary imperfections, and the candidates ``names``."""
+def make_plan(chain: Chain, names: Sequence[str], data: Survey, candidates: bool = True) -> Plan:
+    """Columns for the nominal model's freedom, the effects in the chain, and the effects ``names``.
+
+    candidates : every way these may look; otherwise what every data set has of them
+    """
     plan = Plan()
 
     def shared(name: str, prior: float | None = None) -> int:
@@ -82,7 +85,7 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey) -> Plan:
         if cls.never_named and not cls.always:
             continue
         if cls.scope == "scene":
-            for trial in cls.trials(data):
+            for trial in cls.trials(data) if candidates else cls.trials(data)[:1]:
                 places = tuple(shared(name) for _ in trial.columns)
                 plan.guises.append(Guise(name, trial, places))
                 if name not in plan.ordinary and (size := cls.ordinary(trial)) > 0:

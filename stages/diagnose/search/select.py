@@ -146,15 +146,17 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     first = as_effect(found, state.data, state.frames, view.whole)
     if cls.scope == "scene" and not cls.plausible({k: float(v) for k, v in first.values.items()}, state.data):
         return ODD
+    if why := ordinary(first):
+        return why
     vector, causes = state.nominal.vector, list(state.causes)
     saved = [(c, c.effect, dict(c.errors)) for c in causes]
     cause = Cause(first, found, group=group)
     state.causes.append(cause)
     look = refine(state, view)
-    errors_over_images(state, look)
-    why = doubt(state, cause) or next(
-        (f"beside it {c.effect.name} is no cause any more: {w}" for c in causes if (w := doubt(state, c))), ""
-    )
+    why = _doubt_any(state, cause)
+    if not why:
+        errors_over_images(state, look)
+        why = _doubt_any(state, cause)
     if not why:
         gains, total, tested, unseen = secant_gains(state, cause, look)
         low, high = interval(gains)
@@ -172,6 +174,25 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         state.nominal.vector = vector
         state.fit()
     return why
+
+
+def ordinary(first: Effect) -> str:
+    """Why the effect is nothing special already at a first estimate of its values, or ''."""
+    cls = type(first)
+    if cls.scope == "scene":
+        for name, least in cls.tolerance.items():
+            size = cls.size(first.values) if name not in first.values else abs(first.values[name] - cls.null()[name])
+            if size < least / 2:
+                return f"{name} is {size:.2g}, and less than {least:.2g} is ordinary"
+    return ""
+
+
+def _doubt_any(state: State, cause: Cause) -> str:
+    """Why the cause, or another beside it, cannot be one, or ''."""
+    others = [c for c in state.causes if c is not cause]
+    return doubt(state, cause) or next(
+        (f"beside it {c.effect.name} is no cause any more: {w}" for c in others if (w := doubt(state, c))), ""
+    )
 
 
 def contradicted(gains: np.ndarray) -> str:

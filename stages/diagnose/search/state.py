@@ -154,12 +154,12 @@ class State:
         return View(whole, plan, rows, grid, model)
 
     def again(self, view: View, names: Sequence[str], model: Covariance | None = None) -> View:
-        """A look with these candidates for which only the residual and the causes' own columns are rendered, the rest is as in ``view``.
+        """A look beside ordinary amounts of these effects. Only the residual and the causes' own columns are rendered, the rest is as in ``view``.
 
         model : the covariance, estimated where None
         """
         chains = self.chains()
-        plan = make_plan(chains[0], names, self.data)
+        plan = make_plan(chains[0], names, self.data, candidates=False)
 
         def site(k: int) -> list[Rows]:
             moved = moved_columns(chains[k], plan, self.data)
