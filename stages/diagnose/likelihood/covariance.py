@@ -11,15 +11,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.nominal import lit_mask
-from stages.diagnose.model.sites import Site
 from stages.diagnose.rows.patches import Grid, Patch
-from stages.diagnose.settings import ADDED, BORROWED, DARKEST, ROUNDS, SECTORS
+from stages.diagnose.settings import ADDED, BORROWED, ROUNDS, SECTORS
 
 
 @dataclass
@@ -172,34 +168,4 @@ def _means(model: Covariance, patches: Sequence[Patch], means: Sequence[Tensor])
     model.mean_size = sizes
 
 
-def texture(site: Site, chain: Chain, model: Covariance) -> Tensor:
-    """(H, W) relative albedo of the ground: what all its images share, as far as the covariance lets it be known (Wiener 1949)."""
-    mask = lit_mask(chain).float()
-    level = (chain.predict() * mask).sum((-2, -1), keepdim=True) / mask.sum((-2, -1), keepdim=True).clamp(min=1)
-    scale = torch.maximum(chain.predict(), DARKEST * level).clamp(min=1e-6)
-    relative = (site.image - chain.predict()) / scale
-    own = model.own[:, torch.from_numpy(site.frames)].mean(0).float()
-    weight = mask / own[:, None, None]
-    total = weight.sum(0)
-    mean = (relative * weight).sum(0) / total.clamp(min=1e-9)
-    known = total > 0.2 * total.max()
-    level = mean[known].mean() if bool(known.any()) else torch.zeros(())
-    varied = torch.where(known, mean - level, 0.0)
-    height, width = varied.shape
-    radius = torch.hypot(torch.fft.fftfreq(height)[:, None], torch.fft.rfftfreq(width))
-    beside = (model.relief * float(_bend(chain, mask))) / len(mask) + model.own.mean(1) / len(mask)
-    share = (model.albedo / (model.albedo + beside)).numpy()
-    keep = np.interp(radius.numpy(), model.radius, share)
-    smooth = torch.fft.irfft2(torch.fft.rfft2(varied) * torch.from_numpy(keep).float(), s=(height, width))
-    return (1 + level + smooth).clamp(min=0.2, max=5.0)
-
-
-def _bend(chain: Chain, mask: Tensor) -> Tensor:
-    image = chain.predict()
-    parts = [
-        (t / image.clamp(min=1e-6) * mask).square().sum() / mask.sum().clamp(min=1) for t in chain.slope_tangents()
-    ]
-    return torch.stack(parts).mean()
-
-
-__all__ = ["Covariance", "estimate", "shadow_variance", "texture"]
+__all__ = ["Covariance", "estimate", "shadow_variance"]

@@ -98,7 +98,7 @@ class Whole:
         the amounts of each unit are integrated out.
         """
         places = 1 + np.array(
-            [k for k, n in enumerate(self.plan.shared) if n.startswith("coefficient") and "albedo" not in n],
+            [k for k, n in enumerate(self.plan.shared) if n.startswith("coefficient")],
             dtype=np.int64,
         )
         if not len(places):

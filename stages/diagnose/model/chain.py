@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -52,7 +53,7 @@ class Chain:
     """Renders a site with the effects named so far (``base``) plus one more.
 
     coefficients : broadcastable to (n, C, H, W). moved : effects that the site's images are rid of; free : coefficients
-    that may move, None for all. Templates carry the site's albedo texture; predictions do not.
+    that may move, None for all
     """
 
     def __init__(
@@ -71,12 +72,7 @@ class Chain:
         self._sharp = SharpSlopes(site.observation.gsd, site.observation.body_radius)
         self._state = self._illuminate(self.base)
         self._state.reflectance = self._surface(self._state)
-        self.textured = self.render()
-        # of the image that they belong to: it changes once its texture is known
-        self._tangents: tuple[Tensor | None, list[Tensor]] = (None, [])
-        self._slope_tangents: tuple[Tensor | None, tuple[Tensor, Tensor]] = (None, (self.textured, self.textured))
-        self._gradients: tuple[Tensor | None, tuple[Tensor, Tensor]] = (None, (self.textured, self.textured))
-        self._unresolved: tuple[Tensor | None, Tensor] = (None, self.textured)
+        self.rendered = self.render()
 
     @property
     def state(self) -> State:
@@ -90,19 +86,19 @@ class Chain:
         c = self.coefficients if coefficients is None else coefficients
         return masked_radiance_factor(self.model, self.model.unpack(c, dim=1), state.angles)
 
-    def _expose(self, state: State, reflectance: Tensor, effects: list[Effect], texture: bool = True) -> Tensor:
+    def _expose(self, state: State, reflectance: Tensor, effects: list[Effect], measured: bool = True) -> Tensor:
         state = copy.copy(state)
         state.further_light = list(state.further_light)
-        state.reflectance = reflectance * self.site.texture if texture else reflectance
-        state.measured = self._measured if texture else None
+        state.reflectance = reflectance
+        state.measured = self._measured if measured else None
         return formation.expose(state, effects)
 
     def predict(self) -> Tensor:
-        """(n, H, W) I/F without the texture."""
-        return self._expose(self._state, self._state.reflectance, self.base, texture=False)
+        """(n, H, W) I/F, of which nothing is taken from the image."""
+        return self._expose(self._state, self._state.reflectance, self.base, measured=False)
 
     def render(self, extra: Effect | None = None) -> Tensor:
-        """(n, H, W) I/F with the texture and one more effect."""
+        """(n, H, W) I/F with one more effect, which may know the image."""
         if extra is None:
             return self._expose(self._state, self._state.reflectance, self.base)
         effects = [*self.base, extra]
@@ -129,16 +125,16 @@ class Chain:
         state.displacement = None
         effect.apply(state)
         if state.displacement is None:
-            return torch.zeros_like(self.textured)
-        if self._gradients[0] is not self.textured:
-            self._gradients = self.textured, gradients(self.textured)
-        (east, south), (far, down) = self._gradients[1], state.displacement
+            return torch.zeros_like(self.rendered)
+        (east, south), (far, down) = self._gradients, state.displacement
         return (east * far + south * down) * self.lit()
 
-    def surface_tangents(self, keep: bool = True) -> list[Tensor]:
+    @cached_property
+    def _gradients(self) -> tuple[Tensor, Tensor]:
+        return gradients(self.rendered)
+
+    def surface_tangents(self) -> list[Tensor]:
         """d image / d coefficient, one (n, H, W) per free coefficient: the nominal model's own freedom."""
-        if self._tangents[0] is self.textured:
-            return self._tangents[1]
         columns: list[Tensor] = []
         for k in range(self.coefficients.shape[1]):
             if self.free is not None and not bool(self.free[k]):
@@ -147,9 +143,7 @@ class Chain:
             step = 0.05 * float(c[:, k].abs().mean()) + 1e-4
             c[:, k] += step
             shifted = self._expose(self._state, self._surface(self._state, c), self.base)
-            columns.append((shifted - self.textured) / step)
-        if keep:
-            self._tangents = (self.textured, columns)
+            columns.append((shifted - self.rendered) / step)
         return columns
 
     @property
@@ -170,33 +164,28 @@ class Chain:
             surface = masked_radiance_factor(rich, rich.unpack(c, dim=1), self._state.angles)
             step = 0.02 * self._state.reflectance.mean() / surface.mean().abs().clamp(min=1e-9)
             more = self._expose(self._state, self._state.reflectance + step * surface, self.base)
-            out.append(more - self.textured)
+            out.append(more - self.rendered)
         return out
 
+    @cached_property
     def slope_tangents(self) -> tuple[Tensor, Tensor]:
         """d image / d slope to the east and to the north: how an error of the DEM shows in every image."""
-        if self._slope_tangents[0] is self.textured:
-            return self._slope_tangents[1]
         east, north = self._state.slopes
         out = []
         for de, dn in ((STEP, 0.0), (0.0, STEP)):
             state = copy.copy(self._state)
             state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
-            out.append((self._expose(state, self._surface(state), self.base) - self.textured) / STEP)
-        self._slope_tangents = self.textured, (out[0], out[1])
+            out.append((self._expose(state, self._surface(state), self.base) - self.rendered) / STEP)
         return out[0], out[1]
 
     def unresolved_slopes(self) -> Tensor:
         """What a scatter of slopes within a pixel, or of the DEM's own slopes, does to the mean: its second order."""
-        if self._unresolved[0] is self.textured:
-            return self._unresolved[1]
         east, north = self._state.slopes
-        out = -self.textured.clone()
+        out = -self.rendered.clone()
         for de, dn in ((SCATTER, 0.0), (-SCATTER, 0.0), (0.0, SCATTER), (0.0, -SCATTER)):
             state = copy.copy(self._state)
             state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
             out += 0.25 * self._expose(state, self._surface(state), self.base)
-        self._unresolved = self.textured, out
         return out
 
     def lit(self) -> Tensor:

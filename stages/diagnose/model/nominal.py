@@ -177,12 +177,12 @@ def _normal_equations(
     masks = [lit_mask(chain) for chain in chains]
     if units == "dn":
         for chain, raw, mask in zip(chains, measured, masks, strict=True):
-            scale_images(chain.site, raw, chain.textured, mask)
+            scale_images(chain.site, raw, chain.rendered, mask)
     dark = DARK * _brightness(chains, masks)
 
     def of(place: int) -> tuple[Tensor, Tensor, float, float]:
         chain = chains[place]
-        site, predicted = chain.site, chain.textured
+        site, predicted = chain.site, chain.rendered
         # darker: in the shadow of something that the horizon does not know
         mask = masks[place] & (site.image > dark * predicted)
         # relative weights: every image counts alike, however low its Sun
@@ -192,7 +192,7 @@ def _normal_equations(
         residual = (site.image - predicted).double() * weight
         flat = residual.new_zeros(count_free, 1)
         if fitted:
-            flat = (torch.stack(chain.surface_tangents(keep=False)).double() * weight).flatten(1)
+            flat = (torch.stack(chain.surface_tangents()).double() * weight).flatten(1)
         on = flat @ residual.flatten() if fitted else flat[:, 0]
         return flat @ flat.T, on, float(residual.square().sum()), float((weight > 0).sum())
 
@@ -225,7 +225,7 @@ def _brightness(chains: Sequence[Chain], masks: Sequence[Tensor]) -> float:
     """Measured over predicted brightness, the median over the images of each one's median over lit pixels."""
     ratios = []
     for chain, mask in zip(chains, masks, strict=True):
-        ratio = chain.site.image / chain.textured.clamp(min=1e-6)
+        ratio = chain.site.image / chain.rendered.clamp(min=1e-6)
         ratios += [float(r[m].median()) for r, m in zip(ratio, mask, strict=True) if int(m.sum()) > 50]
     return max(float(torch.tensor(ratios).median()), 0.0) if ratios else 0.0
 

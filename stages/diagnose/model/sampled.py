@@ -34,7 +34,7 @@ def sampled_fit(
 ) -> Tensor:
     """The (C,) coefficients with the least squared relative residual, by a trust region within their bounds (Branch et al. 1999).
 
-    What effects and texture make of the reflectance is taken as the factor that it is at ``vector``.
+    What effects make of the reflectance is taken as the factor that it is at ``vector``.
 
     images : (n, H, W) per site, as measured; scaled : each has a gain and an offset of its own
     pull : weight of the published coefficients, as a share of the cost at a quarter of their range from them
@@ -86,7 +86,7 @@ def _draw(
     cosines, factors, values = [], [], []
     for chain, mask, image in zip(chains, masks, images, strict=True):
         angles, surface = chain.state.angles, chain.state.reflectance
-        for k, used in enumerate(mask & (surface > 0) & (chain.textured > 0)):
+        for k, used in enumerate(mask & (surface > 0) & (chain.rendered > 0)):
             lit = torch.nonzero(used.flatten())[:, 0]
             if len(lit) < FEWEST_SAMPLES:
                 continue
@@ -96,7 +96,7 @@ def _draw(
                     [c[k].flatten()[pick] for c in (angles.cos_incidence, angles.cos_emission, angles.cos_phase)]
                 )
             )
-            factors.append(chain.textured[k].flatten()[pick] / surface[k].flatten()[pick])
+            factors.append(chain.rendered[k].flatten()[pick] / surface[k].flatten()[pick])
             values.append(image[k].flatten()[pick])
     if not values:
         return torch.zeros(3, 0, 1), torch.zeros(0, 1), np.zeros((0, 1))

@@ -25,7 +25,6 @@ class Site:
     read, read_valid : the same as they were read
     pairs : (n,) indices into the file; number : the site's number in the file; place : (2,) row and column in the scene, px
     gain, offset : (n,), measured = gain x I/F + offset; 1 and 0 for calibrated images
-    texture : (H, W), relative albedo of the ground beyond the nominal model
     displacement : where each image looks for its pixels, (columns east, rows south), px, broadcastable to it
     left_out : of the images, those too seldom seen for a covariance of their own
     ground : number that sites share whose crops overlap: what is learned on one is known on the other
@@ -41,7 +40,6 @@ class Site:
     place: tuple[float, float]
     gain: Tensor
     offset: Tensor
-    texture: Tensor
     displacement: tuple[Tensor, Tensor] | None = None
     left_out: frozenset[int] = frozenset()
     ground: int = 0
@@ -81,10 +79,8 @@ def load_site(reader: PairReader, pairs: NDArray[np.int64]) -> Site | None:
     if observation.sun_horizon is not None:
         valid &= torch.isfinite(observation.sun_horizon)
     one = torch.ones(len(pairs))
-    height, width = image.shape[-2:]
     place = tuple(float(reader.file[name][pairs[0]]) if name in reader.file else 0.0 for name in ("row", "col"))
-    texture = torch.ones(height, width)
-    return Site(observation, image, valid, image, valid, pairs, number, (place[0], place[1]), one, one * 0, texture)
+    return Site(observation, image, valid, image, valid, pairs, number, (place[0], place[1]), one, one * 0)
 
 
 def group_pairs(reader: PairReader, pairs: NDArray[np.int64], most: int) -> list[NDArray[np.int64]]:

@@ -66,8 +66,6 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey, candidates: bool
     free = range(chain.coefficients.shape[1]) if chain.free is None else torch.nonzero(chain.free)[:, 0].tolist()
     for k in free:
         shared(f"coefficient {k}", float("inf"))
-    for k in free:
-        shared(f"coefficient {k} with albedo", float("inf"))
     if not chain.free_form:
         for k in range(len(chain.form_tangents())):
             plan.form.append(shared(f"form {k}", float("inf")))
@@ -105,15 +103,12 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey, candidates: bool
 def shared_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
     """(1 + m, n, H, W): the residual first, then the shared columns in the plan's order.
 
-    The residual is that of the bare prediction, albedo being part of its covariance; what effects add goes with the albedo.
+    Albedo that all images of a place share is part of the residual's covariance.
     """
-    tangents = chain.surface_tangents()
-    bright = chain.site.texture - chain.site.texture.mean()
     moved = moved_columns(chain, plan, data)
     out = [
         *moved[:1],
-        *tangents,
-        *(t * bright for t in tangents),
+        *chain.surface_tangents(),
         *chain.form_tangents(),
         chain.unresolved_slopes(),
         *moved[1:],
@@ -122,7 +117,7 @@ def shared_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
         if not guise.per_frame:
             cls = get_effect(guise.effect)
             for column in guise.trial.columns:
-                out.append(chain.render(cls({**guise.trial.fixed, **column}, data)) - chain.textured)
+                out.append(chain.render(cls({**guise.trial.fixed, **column}, data)) - chain.rendered)
     return torch.stack(out)
 
 
@@ -132,7 +127,7 @@ def moved_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
     for place, coordinate, step in plan.steps:
         effect = chain.base[place]
         moved = type(effect)({**effect.values, coordinate: float(effect.values[coordinate]) + step}, data)
-        out.append((chain.replace(place, moved) - chain.textured) / step)
+        out.append((chain.replace(place, moved) - chain.rendered) / step)
     return torch.stack(out)
 
 
@@ -160,8 +155,8 @@ def frame_columns(chain: Chain, plan: Plan, data: Survey, named: bool = False) -
                 )
             else:
                 moved = chain.render(cls({name: torch.full((frames,), size)}, data))
-            out.append(moved - chain.textured)
-    return torch.stack(out) if out else torch.zeros(0, *chain.textured.shape)
+            out.append(moved - chain.rendered)
+    return torch.stack(out) if out else torch.zeros(0, *chain.rendered.shape)
 
 
 __all__ = ["Guise", "Plan", "frame_columns", "make_plan", "moved_columns", "shared_columns"]

@@ -179,7 +179,7 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
     scale = torch.maximum(image, DARKEST * level[:, None, None]).clamp(min=1e-6)
     # what is bright all the same is lit ground that the DEM does not know of
     deep &= chain.site.image < DARKEST * level[:, None, None]
-    east, north = chain.slope_tangents()
+    east, north = chain.slope_tangents
     h, w = height // pieces, width // pieces
     out = []
     for i in range(pieces):

@@ -48,7 +48,7 @@ def refine(state: State, view: View) -> View:
     best = [(c.effect, dict(c.errors), c.rms) for c in state.causes]
     for _ in range(STEPS):
         state.fit()
-        now = state.again(view, along(state, view), look and look.model)
+        now = state.again(view, along(state, view), look.model if look else None)
         left = _left(now)
         if look is not None and abs(left - least) < SETTLED:
             break

@@ -40,7 +40,6 @@ def search(state: State, most: int) -> Outcome:
     out = Outcome()
     refused: set[str] = set()
     while True:
-        state.learn_texture()
         view = state.look(state.open_names())
         best, _ = weigh_all(view.whole)
         out.rejected = {k: v for k, v in out.rejected.items() if k in refused}
@@ -140,7 +139,7 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
 def take(state: State, view: View, found: Found, group: list[str]) -> str:
     """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
     cls = get_effect(found.effect)
-    law = max(len(view.plan.form), sum(n.startswith("coefficient") for n in view.plan.shared) // 2)
+    law = max(len(view.plan.form), sum(n.startswith("coefficient") for n in view.plan.shared))
     if cls.scatters and not cls.displaces and state.frames <= law:
         return f"{TOO_FEW}: a law of {law} coefficients can give {state.frames} any brightness"
     first = as_effect(found, state.data, state.frames, view.whole)

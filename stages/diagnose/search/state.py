@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_variance, texture
+from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_variance
 from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
 from stages.diagnose.likelihood.weigh import Found, Whole
 from stages.diagnose.model.chain import Chain
@@ -17,7 +17,7 @@ from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.explain import Registration
 from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, moved_columns, shared_columns
-from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patches
+from stages.diagnose.rows.patches import Grid, cuts, make_grid, make_patches
 from stages.diagnose.settings import FOLDS, SEEN, SHAMS
 from stages.effects import Effect, Survey, get_effect
 
@@ -52,7 +52,6 @@ class State:
     hidden: list[Site] = field(default_factory=list)  # of the test pairs, which nothing is fitted to
     registration: Registration | None = None
     causes: list[Cause] = field(default_factory=list)
-    covariance: Covariance | None = None
     reference: Nominal | None = None
     say: Callable[[str], None] = lambda text: None
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
@@ -86,12 +85,7 @@ class State:
     def fit(self, start: bool = False) -> None:
         """Fit the nominal model (and gain and offset of dn images) to the aligned images."""
         self.align()
-        kept = [site.texture for site in self.sites]
-        for site in self.sites:
-            site.texture = torch.ones_like(site.texture)
         fit(self.nominal, self.sites, self.base, self.units, [s.image for s in self.sites], start=start)
-        for site, known in zip(self.sites, kept, strict=True):
-            site.texture = known
 
     def leave_out_rare_images(self) -> None:
         """Images that show too few pieces of ground, unless that is all there are."""
@@ -101,24 +95,6 @@ class State:
         if seen is not None and int(seen.max()) >= SEEN:
             for site in self.sites:
                 site.left_out = frozenset(k for k, f in enumerate(site.frames) if seen[f] < SEEN)
-
-    def learn_texture(self) -> None:
-        """Estimate the covariance from the bare residual, and with it the ground's albedo, which effects go with."""
-        chains = self.chains()
-        grid, pieces = self.grid()
-        patches: list[Patch] = []
-        rows: list[tuple[Tensor, Tensor]] = []
-        for k, chain in enumerate(chains):
-            residual = (chain.site.image - chain.predict())[None]
-            for patch in make_patches(k, chain, pieces, self.free_gains):
-                z, mean = patch.transform(residual, grid)
-                patches.append(patch)
-                rows.append((z[0], mean[0]))
-        if not patches:
-            return
-        self.covariance = estimate(patches, rows, grid, self.frames)
-        for chain in chains:
-            chain.site.texture = texture(chain.site, chain, self.covariance)
 
     def open_names(self) -> list[str]:
         """Effects that are not named and that data of this kind can show."""
@@ -173,7 +149,6 @@ class State:
     def _covariance(self, rows: Sequence[Rows], grid: Grid) -> Covariance:
         model = estimate([r.patch for r in rows], [(r.shared[0], r.shared_mean[0]) for r in rows], grid, self.frames)
         model.dark = shadow_variance([r.patch for r in rows], [r.shared_dark[0] for r in rows])
-        self.covariance = model
         return model
 
     def without_images(self, view: View) -> list[Whole]:

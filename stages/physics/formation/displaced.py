@@ -24,7 +24,8 @@ def displace(image: Tensor, east: Tensor, south: Tensor) -> Tensor:
     east, south = east.expand_as(image), south.expand_as(image)
     if image.dtype == torch.float32 and image.device.type == "cpu" and not _has_gradient(image, east, south):
         moved = torch.empty(image.shape)
-        _displace(*(t.float().contiguous().numpy() for t in (image, east, south)), moved.numpy())
+        pixels, right, down = (t.float().contiguous().numpy() for t in (image, east, south))
+        _displace(pixels, right, down, moved.numpy())
         return moved
     return sampled(image, east, south)
 
