@@ -11,7 +11,8 @@ import torch
 from schemas import RegistryError
 from stages.effects import Survey, effect_names, fields, get_effect
 from stages.effects.filters import gaussian
-from stages.physics.formation.chain import Observation, displace, form
+from stages.physics.formation.chain import Observation, form
+from stages.physics.formation.displaced import displace, sampled
 from stages.physics.photometry import get_model
 
 CATALOGUE = [
@@ -195,6 +196,20 @@ def test_a_ramp_is_displaced_by_what_is_asked_for(alike):
     east, south = torch.full((2, 1, 1), 0.1), torch.full((2, 1, 1), -0.3)
     moved = displace(ramp, east if alike else east.expand_as(ramp), south)
     assert torch.allclose((moved - ramp)[:, 4:-4, 4:-4], torch.tensor(0.1 - 0.9), atol=1e-4)
+
+
+def test_the_compiled_displacement_is_the_plain_one(rng):
+    image, east, south = (torch.from_numpy(rng.normal(size=(3, 20, 31))).float() for _ in range(3))
+    assert torch.allclose(displace(image, 9 * east, 9 * south), sampled(image, 9 * east, 9 * south), atol=2e-5)
+    shift = torch.tensor([0.3, -7.6, 40.0])[:, None, None]
+    far = shift.expand_as(image)
+    assert torch.allclose(displace(image, shift, 2 * shift), sampled(image, far, 2 * far), atol=2e-5)
+    moved = torch.full((3, 1, 1), 0.3, requires_grad=True)
+    displace(image, moved.expand_as(image), moved).square().sum().backward()
+    slope = moved.grad.clone()
+    moved.grad = None
+    displace(image, moved, moved).square().sum().backward()
+    assert torch.allclose(slope, moved.grad, rtol=1e-4)
 
 
 def test_gradients_of_a_wave_that_is_hardly_resolved():

@@ -37,6 +37,7 @@ UNITS = 12  # pieces of ground at least, over which a jackknife has the degrees 
 PATCH = 32  # px: crops are not cut into smaller pieces than this
 SHAMS = 99  # sham residuals: p values go down to 1 %
 DISCOVERY = 0.05  # false discovery rate
+FAINT = 0.02  # of what images leave, rms: the covariance and the law are not known better, and many pixels would make that sure
 SURE = 4.0  # standard errors: an effect found at this size is never called invisible
 CORRELATED = 16.0  # px^2 per independent sample of a residual: what is left of albedo and relief is some 4 px wide
 PEAK = 6.0  # times the median of its annulus: a single wave of one frame that the spectrum of ground and noise does not have

@@ -26,7 +26,7 @@ from stages.diagnose.result.answer import Answer
 from stages.diagnose.result.files import write_diagnosis
 from stages.diagnose.result.named import by_histogram, by_registration, by_search
 from stages.diagnose.result.score import blind_effects, displacements, score, unconfirmed
-from stages.diagnose.search.refine import errors_over_images
+from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, search
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import LINE, MISFIT
@@ -129,7 +129,9 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     progress(2, 5, "search")
     outcome = search(state, config.most_causes)
     doubted = unconfirmed(state)
-    errors_over_images(state)
+    assert outcome.view is not None
+    if doubted:
+        settle(state, outcome.view)
     placed, refused = by_registration(state)
     answer.causes = placed + by_search(state) + [c for c in [cut(data, state) if cut else None] if c]
     answer.rejected = refused | outcome.rejected | doubted

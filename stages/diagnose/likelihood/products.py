@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -12,6 +12,9 @@ from torch import Tensor
 
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.rows.patches import Grid, Patch
+from stages.diagnose.settings import SECTORS
+
+Array = NDArray[np.float64]
 
 
 @dataclass
@@ -27,18 +30,6 @@ class Rows:
     own_dark: Tensor
 
 
-def without_frames(rows: Rows, frames: Sequence[int]) -> Rows | None:
-    """The same patch as if these frames had not been taken; None where no image is left."""
-    kept = torch.tensor([int(f) not in frames for f in rows.patch.frames])
-    if not bool(kept.any()):
-        return None
-    patch = rows.patch
-    by_image = ("images", "weight", "scale", "slopes", "level", "frames", "dark")
-    fewer = replace(patch, **{name: getattr(patch, name)[kept] for name in by_image})
-    names = ("shared", "shared_mean", "own", "own_mean", "shared_dark", "own_dark")
-    return Rows(fewer, *(getattr(rows, name)[:, kept] for name in names))
-
-
 Residual = tuple[
     Tensor, Tensor, Tensor
 ]  # coefficients (n, K), means (n,), means in deep shadow (n,); or (R, ...) of each
@@ -48,15 +39,21 @@ Residual = tuple[
 class Products:
     """Sums over one patch. gram : (M, M), place : (M,) where its columns stand in the whole; sham : (M, R) with sham residuals
 
+    images : for every group of images (M, M), what is gone from ``gram`` without them: the squares of these images given the others
     The whole: residual, shared columns, then column by column the frames.
     """
 
-    gram: NDArray[np.float64]
+    gram: Array
     place: NDArray[np.int64]
-    sham: NDArray[np.float64]
-    sham_squares: NDArray[np.float64]
+    sham: Array
+    sham_squares: Array
     ground: int
     site: int
+    images: list[Array] = field(default_factory=list)
+
+    def without(self, group: int) -> Products:
+        """The sums as if a group of images had not been taken."""
+        return replace(self, gram=self.gram - self.images[group], images=[])
 
 
 def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> Residual:
@@ -80,75 +77,120 @@ def _factor(model: Covariance, patch: Patch, grid: Grid) -> Tensor:
     return torch.linalg.inv(lower).to(torch.complex64)
 
 
-def products(rows: Rows, model: Covariance, grid: Grid, frames: int, shams: Residual | None) -> Products:
-    """shams : whitened sham residuals."""
+def products(
+    rows: Rows,
+    model: Covariance,
+    grid: Grid,
+    frames: int,
+    shams: Residual | None = None,
+    groups: Sequence[Sequence[int]] = (),
+) -> Products:
+    """shams : whitened sham residuals; groups : of frames, each to be left out once."""
     patch = rows.patch
-    n = len(patch.frames)
-    factor = _factor(model, patch, grid)
+    columns = _Columns(rows, model, grid, bool(groups))
+    factor = _factor(model, patch, grid).real
+    mean = None if patch.free else torch.linalg.inv(torch.linalg.cholesky(model.mean_matrix(patch)))
+    every = torch.ones(len(patch.frames), dtype=torch.float64)
+    gram = columns.gram(factor, mean, every)
     m, k = len(rows.shared), len(rows.own)
-    white = torch.empty_like(rows.shared)
-    counts = torch.bincount(grid.bins, minlength=len(factor)).tolist()
-    own = torch.zeros(k, n, k, n, dtype=torch.float64)
-    back = torch.empty_like(rows.shared)
-    start = 0
-    for b, count in enumerate(counts):
-        if not count:
-            continue
-        at = slice(start, start + count)
-        start += count
-        white[:, :, at] = factor[b] @ rows.shared[:, :, at]
-        back[:, :, at] = factor[b].mH @ white[:, :, at]
-        if k:
-            x = rows.own[:, :, at].reshape(k * n, count)
-            inner = (x @ x.mH).real.double().view(k, n, k, n)
-            own += inner * (factor[b].mH @ factor[b]).real.double()[None, :, None]
-    flat = _real(white)
-    dense = (flat @ flat.T).double()
-    cross = torch.zeros(m, 0, n).double()
-    if k:
-        x_, y_ = (torch.view_as_real(t).flatten(2).transpose(0, 1) for t in (back, rows.own))
-        cross = (x_ @ y_.transpose(1, 2)).double().permute(1, 2, 0)
-    if not patch.free:
-        lower = torch.linalg.cholesky(model.mean_matrix(patch))
-        a = torch.linalg.solve_triangular(lower, rows.shared_mean.double().T, upper=False)
-        dense += a.T @ a
-        inverse = torch.cholesky_inverse(lower)
-        if k:
-            cross += torch.einsum("mi,in,an->man", rows.shared_mean.double(), inverse, rows.own_mean.double())
-            own += torch.einsum("ai,ij,bj->aibj", rows.own_mean.double(), inverse, rows.own_mean.double())
-    shadow, own_shadow = (x.double() / model.dark**0.5 for x in (rows.shared_dark, rows.own_dark))
-    dense += shadow @ shadow.T
-    if k:
-        cross += shadow[:, None] * own_shadow
-        own += torch.diag_embed(own_shadow[:, None] * own_shadow).permute(0, 2, 1, 3)
-    top = torch.cat([dense, cross.flatten(1)], 1)
-    low = torch.cat([cross.flatten(1).T, own.reshape(k * n, k * n)], 1)
     place = np.concatenate([np.arange(m), (m + np.arange(k)[:, None] * frames + patch.frames.numpy()[None]).flatten()])
     sham, squares = np.zeros((len(place), 0)), np.zeros(0)
     if shams is not None:
-        z, mean, dark = shams
-        with_shared = (flat @ _real(z).T).double() + shadow @ dark.double().T
-        squares = (z.real.square() + z.imag.square()).sum((1, 2)).double().numpy()
-        parts = [with_shared]
-        if k:
-            spread = torch.empty_like(z)
-            start = 0
-            for b, count in enumerate(counts):
-                at = slice(start, start + count)
-                start += count
-                if count:
-                    spread[:, :, at] = factor[b].mH @ z[:, :, at]
-            a_, b_ = (torch.view_as_real(t).flatten(2).transpose(0, 1) for t in (rows.own, spread))
-            by_frame = (a_ @ b_.transpose(1, 2)).double().transpose(0, 1)
-            parts.append((by_frame + own_shadow[..., None] * dark.double().T).flatten(0, 1))
-        if not patch.free:
-            parts[0] = parts[0] + a.T @ mean.double().T
-            squares = squares + mean.double().square().sum(1).numpy()
+        sham, squares = columns.beside(shams, factor, mean)
+    parts = []
+    for group in groups:
+        gone = torch.tensor([int(f) in group for f in patch.frames])
+        part = np.zeros_like(gram)
+        if bool(gone.any()):
+            rest = None if mean is None else _given_others(mean[None], gone)[0]
+            part = columns.gram(_given_others(factor, gone), rest, gone.double())
+            own = np.concatenate([np.zeros(m, bool), np.tile(gone.numpy(), k)])
+            part[own], part[:, own] = gram[own], gram[:, own]  # to the last bit: nothing is left of them
+        parts.append(part)
+    return Products(gram, place, sham, squares, patch.ground, patch.site, parts)
+
+
+def _given_others(factor: Tensor, gone: Tensor) -> Tensor:
+    """(B, g, n) whitening of some images given the others, of (B, n, n) whitening of all: by the Schur complement of the precision."""
+    precision = factor.mT.double() @ factor.double()
+    lower = torch.linalg.cholesky(precision[:, gone][:, :, gone])
+    return torch.linalg.solve_triangular(lower, precision[:, gone], upper=False).to(factor.dtype)
+
+
+class _Columns:
+    """The columns of one patch, ready for products under several weights."""
+
+    def __init__(self, rows: Rows, model: Covariance, grid: Grid, often: bool) -> None:
+        self.rows, self.dark = rows, model.dark**0.5
+        counts = torch.bincount(grid.bins, minlength=grid.annuli * SECTORS).tolist()
+        ends = np.concatenate([[0], np.cumsum(counts)])
+        self.bins = [(b, slice(int(ends[b]), int(ends[b + 1]))) for b, count in enumerate(counts) if count]
+        self.k, n = len(rows.own), rows.own.shape[1]
+        self.inner, self.across = (
+            {},
+            {},
+        )  # of each bin: own columns among themselves, and (m, n, k, n) beside the shared ones
+        for b, at in self.bins if self.k else []:
+            x = rows.own[:, :, at].reshape(self.k * n, -1)
+            self.inner[b] = (x @ x.mH).real.double().view(self.k, n, self.k, n)
+            if often:
+                y = rows.shared[:, :, at].flatten(0, 1)
+                self.across[b] = (y @ x.mH).real.double().view(-1, n, self.k, n)
+
+    def gram(self, factor: Tensor, mean: Tensor | None, images: Tensor) -> Array:
+        """(M, M) of all columns, whitened by ``factor`` (B, r, n) and, their means, by (r, n); images : (n,) whose deep shadow counts."""
+        rows, k = self.rows, self.k
+        n = factor.shape[-1]
+        white = torch.empty(len(rows.shared), factor.shape[1], rows.shared.shape[-1], dtype=rows.shared.dtype)
+        back = torch.empty_like(rows.shared) if k and not self.across else None
+        cross = torch.zeros(len(white), k, n, dtype=torch.float64)
+        own = torch.zeros(k, n, k, n, dtype=torch.float64)
+        for b, at in self.bins:
+            f = factor[b].to(white.dtype)
+            white[:, :, at] = f @ rows.shared[:, :, at]
             if k:
-                upper = torch.linalg.solve_triangular(lower.T, mean.double().T, upper=True)  # (n, R)
-                parts[1] = parts[1] + torch.einsum("an,nr->anr", rows.own_mean.double(), upper).flatten(0, 1)
-        sham = torch.cat(parts).numpy()
-    return Products(torch.cat([top, low]).numpy(), place, sham, squares, patch.ground, patch.site)
+                precision = (factor[b].mT @ factor[b]).double()
+                own += self.inner[b] * precision[None, :, None]
+                if back is None:
+                    cross += (self.across[b] * precision[None, :, None]).sum(1)
+                else:
+                    back[:, :, at] = f.mT @ white[:, :, at]
+        flat = _real(white)
+        dense = (flat @ flat.T).double()
+        if back is not None:
+            x, y = (torch.view_as_real(t).flatten(2).transpose(0, 1) for t in (back, rows.own))
+            cross = (x @ y.transpose(1, 2)).double().permute(1, 2, 0)
+        if mean is not None:
+            shared, others = rows.shared_mean.double() @ mean.T, mean.T @ mean
+            dense += shared @ shared.T
+            cross += (shared @ mean)[:, None] * rows.own_mean.double()
+            own += torch.einsum("ai,ij,bj->aibj", rows.own_mean.double(), others, rows.own_mean.double())
+        shadow, own_shadow = (x.double() * images / self.dark for x in (rows.shared_dark, rows.own_dark))
+        dense += shadow @ shadow.T
+        cross += shadow[:, None] * own_shadow
+        own += torch.diag_embed(own_shadow[:, None] * own_shadow).permute(0, 2, 1, 3)
+        top = torch.cat([dense, cross.flatten(1)], 1)
+        low = torch.cat([cross.flatten(1).T, own.reshape(k * n, k * n)], 1)
+        return torch.cat([top, low]).numpy()
+
+    def beside(self, shams: Residual, factor: Tensor, mean: Tensor | None) -> tuple[Array, Array]:
+        """Products (M, R) of all columns with whitened sham residuals, and the squares of these, (R,)."""
+        rows = self.rows
+        z, means, dark = shams
+        white, back = torch.empty_like(rows.shared), torch.empty_like(z)
+        for b, at in self.bins:
+            f = factor[b].to(white.dtype)
+            white[:, :, at], back[:, :, at] = f @ rows.shared[:, :, at], f.mT @ z[:, :, at]
+        first = (_real(white) @ _real(z).T).double() + (rows.shared_dark.double() / self.dark) @ dark.double().T
+        x, y = (torch.view_as_real(t).flatten(2).transpose(0, 1) for t in (rows.own, back))
+        second = (x @ y.transpose(1, 2)).double().transpose(0, 1)
+        second += (rows.own_dark.double() / self.dark)[..., None] * dark.double().T
+        squares = (z.real.square() + z.imag.square()).sum((1, 2)).double()
+        if mean is not None:
+            first += rows.shared_mean.double() @ mean.T @ means.double().T
+            second += torch.einsum("an,nr->anr", rows.own_mean.double(), mean.T @ means.double().T)
+            squares += means.double().square().sum(1)
+        return torch.cat([first, second.flatten(0, 1)]).numpy(), squares.numpy()
 
 
 def make_shams(white: Sequence[Residual], grid: Grid, count: int, seed: int) -> list[Residual]:

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stages.diagnose.model.aligned import aligned
 from stages.diagnose.settings import FEWEST_PIXELS
 from stages.effects import Survey, fields
 from stages.effects.relief_displacement import lean
@@ -44,6 +45,14 @@ class Site:
     displacement: tuple[Tensor, Tensor] | None = None
     left_out: frozenset[int] = frozenset()
     ground: int = 0
+    _laid: tuple[object, Tensor, Tensor] | None = None  # for one displacement: image and mask over the ground
+
+    def align(self) -> None:
+        """Lay the images, as they were read, over the ground."""
+        if self._laid is None or self._laid[0] is not self.displacement:
+            laid = aligned(self.read, self.read_valid, *self.displacement or 2 * [torch.zeros(self.count, 1, 1)])
+            self._laid = self.displacement, *laid
+        _, self.image, self.valid = self._laid
 
     @property
     def count(self) -> int:

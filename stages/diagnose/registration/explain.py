@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, jackknife_error, nats
+from stages.diagnose.model.aligned import aligned
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import Nominal, lit_mask
 from stages.diagnose.model.parallel import per_site
@@ -23,7 +24,6 @@ from stages.diagnose.registration.forms import (
     Form,
     Frame,
     Matched,
-    aligned,
     displacement,
     match,
     solve,

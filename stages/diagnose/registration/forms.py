@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from stages.diagnose.model.aligned import aligned
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.registration.capture import fine
 from stages.diagnose.settings import BROAD, FIELD_ORDER
 from stages.effects.filters import gradients
 from stages.effects.relief_displacement import lean
-from stages.physics.formation.chain import displace
 
 TERMS = tuple((i, k - i) for k in range(FIELD_ORDER + 1) for i in range(k + 1))  # powers of x and y
 
@@ -71,19 +71,6 @@ class Matched:
     basis: Tensor
     leaning: tuple[Tensor, Tensor]
     part: Tensor
-
-
-def aligned(image: Tensor, valid: Tensor, east: Tensor, south: Tensor) -> tuple[Tensor, Tensor]:
-    """An image laid over the ground again, given where it looks for its pixels."""
-    east, south = (d.expand_as(image) if d.ndim == 3 else d[:, None, None].expand_as(image) for d in (east, south))
-    if not float(torch.maximum(east.abs().max(), south.abs().max())) > 1e-6:
-        return image, valid
-    # a pixel x shows ground x + d(x), so the ground at g is seen at x = g - d(x): one step from d(g) is enough
-    at = []
-    for d in (east, south):
-        slope = gradients(d)
-        at.append(d - slope[0] * east - slope[1] * south)
-    return displace(image, -at[0], -at[1]), displace(valid.float(), -at[0], -at[1]) > 0.99
 
 
 def match(

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from stages.diagnose.likelihood.jackknife import gain_interval
+from stages.diagnose.model.aligned import aligned
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.nominal import scale_images
+from stages.diagnose.model.nominal import lit_mask, scale_images
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.explain import lit_mask_read
-from stages.diagnose.registration.forms import aligned
 from stages.diagnose.result.answer import Answer, HeldOut
 from stages.diagnose.search.select import Outcome
 from stages.diagnose.search.state import State
@@ -116,11 +116,9 @@ def _hidden_squares(state: State) -> np.ndarray:
     """Squared error on every ground of the test pairs."""
     total = np.zeros(max((s.ground for s in state.hidden), default=0) + 1)
     for site in state.hidden:
-        image, valid = site.read, site.read_valid
-        if site.displacement is not None:
-            image, valid = aligned(image, valid, *site.displacement)
+        site.align()
         chain = state.nominal.chain(site, state.base)
-        total[site.ground] += _squares(site, chain, image, lit_mask_read(chain) & valid, state.free_gains)[0]
+        total[site.ground] += _squares(site, chain, site.image, lit_mask(chain), state.free_gains)[0]
     return total
 
 

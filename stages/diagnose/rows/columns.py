@@ -41,9 +41,20 @@ class Plan:
     guises: list[Guise] = field(default_factory=list)
     steps: list[tuple[int, str, float]] = field(default_factory=list)  # base effect, coordinate, step: tangents
 
+    def shared_keys(self) -> list[tuple[str, int]]:
+        """What each shared column is, to find it in another plan: a name, and of effects its number among their columns."""
+        return [(name, self.shared[:k].count(name)) for k, name in enumerate(self.shared)]
 
-def make_plan(chain: Chain, names: Sequence[str], data: Survey) -> Plan:
-    """Columns for the nominal model's freedom, the effects in the chain, ordinary imperfections, and the candidates ``names``."""
+    def frame_keys(self) -> list[tuple[str, int]]:
+        """The same of the columns per frame."""
+        return [(name, self.per_frame[:k].count(name)) for k, name in enumerate(self.per_frame)]
+
+
+def make_plan(chain: Chain, names: Sequence[str], data: Survey, candidates: bool = True) -> Plan:
+    """Columns for the nominal model's freedom, the effects in the chain, and the effects ``names``.
+
+    candidates : every way these may look; otherwise what every data set has of them
+    """
     plan = Plan()
 
     def shared(name: str, prior: float | None = None) -> int:
@@ -74,7 +85,7 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey) -> Plan:
         if cls.never_named and not cls.always:
             continue
         if cls.scope == "scene":
-            for trial in cls.trials(data):
+            for trial in cls.trials(data) if candidates else cls.trials(data)[:1]:
                 places = tuple(shared(name) for _ in trial.columns)
                 plan.guises.append(Guise(name, trial, places))
                 if name not in plan.ordinary and (size := cls.ordinary(trial)) > 0:
@@ -92,23 +103,21 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey) -> Plan:
 
 
 def shared_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
-    """(m, n, H, W): the residual first, then the shared columns in the plan's order.
+    """(1 + m, n, H, W): the residual first, then the shared columns in the plan's order.
 
     The residual is that of the bare prediction, albedo being part of its covariance; what effects add goes with the albedo.
     """
     tangents = chain.surface_tangents()
     bright = chain.site.texture - chain.site.texture.mean()
+    moved = moved_columns(chain, plan, data)
     out = [
-        chain.site.image - chain.predict(),
+        *moved[:1],
         *tangents,
         *(t * bright for t in tangents),
         *chain.form_tangents(),
         chain.unresolved_slopes(),
+        *moved[1:],
     ]
-    for place, coordinate, step in plan.steps:
-        effect = chain.base[place]
-        moved = type(effect)({**effect.values, coordinate: float(effect.values[coordinate]) + step}, data)
-        out.append((chain.replace(place, moved) - chain.textured) / step)
     for guise in plan.guises:
         if not guise.per_frame:
             cls = get_effect(guise.effect)
@@ -117,13 +126,26 @@ def shared_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
     return torch.stack(out)
 
 
-def frame_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
-    """(k, n, H, W): what each coordinate of the effects with values per frame adds to the frame's own image."""
+def moved_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
+    """(1 + steps, n, H, W): the residual, and what a small step of every value of the causes in the chain changes."""
+    out = [chain.site.image - chain.predict()]
+    for place, coordinate, step in plan.steps:
+        effect = chain.base[place]
+        moved = type(effect)({**effect.values, coordinate: float(effect.values[coordinate]) + step}, data)
+        out.append((chain.replace(place, moved) - chain.textured) / step)
+    return torch.stack(out)
+
+
+def frame_columns(chain: Chain, plan: Plan, data: Survey, named: bool = False) -> Tensor:
+    """(k, n, H, W): what each coordinate of the effects with values per frame adds to the frame's own image.
+
+    named : of the causes in the chain only
+    """
     out = []
     frames = int(chain.site.frames.max()) + 1
     base = {e.name: k for k, e in enumerate(chain.base)}
     for guise in plan.guises:
-        if not guise.per_frame:
+        if not guise.per_frame or (named and guise.effect not in base):
             continue
         cls = get_effect(guise.effect)
         for column in guise.trial.columns:
@@ -142,4 +164,4 @@ def frame_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
     return torch.stack(out) if out else torch.zeros(0, *chain.textured.shape)
 
 
-__all__ = ["Guise", "Plan", "frame_columns", "make_plan", "shared_columns"]
+__all__ = ["Guise", "Plan", "frame_columns", "make_plan", "moved_columns", "shared_columns"]

@@ -114,6 +114,8 @@ class Patch:
     def transform(self, fields: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
         """Fields (m, N, H, W) -> coefficients (m, n, K) complex and means (m, n)."""
         x = self.relative(fields)
+        if not len(x):
+            return torch.zeros(*x.shape[:2], len(grid.keep), dtype=torch.complex64), torch.zeros(x.shape[:2])
         w = self.weight
         total = w.sum((-2, -1)).clamp(min=1e-9)
         mean = (x * w).sum((-2, -1)) / total

@@ -9,10 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from stages.diagnose.likelihood.jackknife import jackknife_error
-from stages.diagnose.likelihood.products import without_frames
 from stages.diagnose.likelihood.weigh import Whole
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.settings import FOLDS, SETTLED, STEPS
+from stages.diagnose.settings import SETTLED, STEPS
 from stages.effects import Survey, get_effect
 
 
@@ -39,36 +38,68 @@ def as_effect(found, data: Survey, frames: int, whole):
     return effect
 
 
-def refine(state: State) -> View:
-    """Fit the nominal model and all causes' values together; sets values and errors; returns the last look."""
-    view = None
+def refine(state: State, view: View) -> View:
+    """Fit the nominal model and all causes' values together; sets values and errors; returns the last look.
+
+    view : at nearly the same values: what it has of other effects is not rendered again
+    """
+    look: View | None = None
+    least, share = math.inf, 1.0  # squares left at the best values so far, and how much of a step is gone
+    best = [(c.effect, dict(c.errors), c.rms) for c in state.causes]
     for _ in range(STEPS):
         state.fit()
-        along = [n for n in state.open_names() if _ordinary(n) or get_effect(n).always]
-        view = state.look(along, 0)
-        largest = _step(state, view)
-        if largest < SETTLED:
+        now = state.again(view, along(state, view), look and look.model)
+        left = _left(now)
+        if look is not None and abs(left - least) < SETTLED:
+            break
+        if left > least:  # the step was too long: half of it, from where it started
+            share *= 0.5
+            for cause, (effect, errors, rms) in zip(state.causes, best, strict=True):
+                cause.effect, cause.errors, cause.rms = effect, dict(errors), rms
+        else:
+            look, least = now, left
+            best = [(c.effect, dict(c.errors), c.rms) for c in state.causes]
+        assert look is not None
+        if _step(state, look, share) < SETTLED:
             break
     state.fit()
-    assert view is not None
-    return view
+    assert look is not None
+    return look
 
 
-def errors_over_images(state: State) -> None:
+def _left(view: View) -> float:
+    """Whitened squares of the residual, all nuisance fitted along."""
+    whole = view.whole
+    kept = dict(whole.precision)
+    for place in _scene_places(view)[0]:
+        whole.precision.pop(int(place), None)
+    _, score, _, _ = whole.reduce(np.zeros(1, dtype=np.int64))
+    whole.precision = kept
+    return float(score[0])
+
+
+def settle(state: State, view: View) -> None:
+    """Values and errors of all causes, fitted together once more."""
+    if state.causes:
+        errors_over_images(state, refine(state, view))
+
+
+def along(state: State, view: View) -> list[str]:
+    """Effects that are fitted beside the causes: those that all data have a little of."""
+    known = {*view.plan.shared, *view.plan.per_frame}
+    return [n for n in state.open_names() if n in known and (_ordinary(n) or get_effect(n).always)]
+
+
+def errors_over_images(state: State, view: View) -> None:
     """Raise the errors of scene-wide values to those of a jackknife over images.
 
     What is wrong with the law goes with an image's geometry and is the same on all ground: leaving out ground does not show it.
     """
-    if not any(type(c.effect).scope == "scene" for c in state.causes):
+    places, owned = _scene_places(view)
+    if not len(places):
         return
-    view = state.look([n for n in state.open_names() if _ordinary(n) or get_effect(n).always], 0)
-    _, owned = _scene_places(view)
-    frames = sorted({int(f) for row in view.rows for f in row.patch.frames})
-    groups = [frames[k::FOLDS] for k in range(min(FOLDS, len(frames)))]
     left = []
-    for group in groups if len(frames) > 2 else []:
-        whole = state.weigh([r for row in view.rows if (r := without_frames(row, group)) is not None], view)
-        places, _ = _scene_places(view)
+    for whole in state.without_images(view):
         for p in places:
             whole.precision.pop(int(p), None)
         if whole.seen[places].all():
@@ -91,8 +122,8 @@ def _ordinary(name: str) -> bool:
     return cls.scope == "scene" and bool(cls.tolerance)
 
 
-def _step(state: State, view: View) -> float:
-    """Move all values; returns the largest move in standard errors."""
+def _step(state: State, view: View, share: float) -> float:
+    """Move all values by a share of the Gauss-Newton step; returns the largest move in standard errors."""
     whole = view.whole
     places, steps = _scene_places(view)
     scene = list(enumerate(steps))
@@ -113,7 +144,7 @@ def _step(state: State, view: View) -> float:
             low, high = cls.bounds(name)
             now = float(cause.effect.values[name])
             limit = max(abs(now - cls.null()[name]), 10 * cls.step(name, state.data))
-            moved = min(max(now + float(np.clip(amount, -limit, limit)), low), high)
+            moved = min(max(now + share * float(np.clip(amount, -limit, limit)), low), high)
             largest = max(largest, abs(moved - now) / max(error, 1e-12))
             effect = cls({**cause.effect.values, name: moved}, state.data)
             effect.held = cause.effect.held
@@ -122,7 +153,7 @@ def _step(state: State, view: View) -> float:
             alone[cls.name] += 1
     for cause in state.causes:
         if cause.found.guise.per_frame:
-            largest = max(largest, _step_frames(state, view, cause))
+            largest = max(largest, _step_frames(state, view, cause, share))
     return largest
 
 
@@ -136,7 +167,7 @@ def _amounts(state: State, whole: Whole, places, owners: list[int]) -> list[NDAr
     return out
 
 
-def _step_frames(state: State, view: View, cause: Cause) -> float:
+def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     """Move the values per frame, drawn to nothing as far as the first estimate found."""
     whole = view.whole
     guise = next((g for g in view.plan.guises if g.effect == cause.effect.name), None)
@@ -153,7 +184,7 @@ def _step_frames(state: State, view: View, cause: Cause) -> float:
     prior = cause.found.spread**-2
     information, score, _, _ = whole.reduce(places)
     inverse = np.linalg.inv(information + prior * np.eye(len(places)))
-    move = inverse @ (score - prior * now)
+    move = share * inverse @ (score - prior * now)
     out = table.copy()
     out[column, frame] = (now + move) * sizes[column]
     cause.effect = cls({n: torch.from_numpy(out[k].copy()).float() for k, n in enumerate(names)}, state.data)
@@ -170,4 +201,4 @@ def _step_frames(state: State, view: View, cause: Cause) -> float:
     return float(np.sqrt((move**2).mean() / max(inverse.diagonal().mean(), 1e-12)))
 
 
-__all__ = ["as_effect", "errors_over_images", "refine"]
+__all__ = ["as_effect", "errors_over_images", "refine", "settle"]

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 
 from stages.diagnose.likelihood.covariance import Covariance
-from stages.diagnose.likelihood.products import Rows, products
+from stages.diagnose.likelihood.products import Products, Rows, products
 from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.search.refine import as_effect, refine
+from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.search.tested import hidden_rows
-from stages.diagnose.settings import DISCOVERY, NOTABLE, SIMPLER, SURE, TRIED, TRIES
+from stages.diagnose.settings import DISCOVERY, FAINT, NOTABLE, SIMPLER, SURE, TRIED, TRIES
 from stages.effects import Effect, get_effect
 
 TOO_FEW = "it takes more images"
@@ -56,10 +56,16 @@ def search(state: State, most: int) -> Outcome:
             whole.precision = kept
         strong = [f for f in strong if not (f in strong[:TRIED] and another_law(view.whole, f, out))]
         tried = sorted(strong[:TRIED], key=lambda f: -f.gain)
-        sure = [f for f in tried if f.gain_interval()[0] > 0]
+        faint = FAINT**2 / 2 * float(view.whole.gram[0, 0])
+        sure = [f for f in tried if f.gain_interval()[0] > 0 and f.gain > faint]
         for f in tried:
             low, high = f.gain_interval()
-            if f not in sure:
+            if low > 0 and f not in sure:
+                out.rejected[f.effect] = (
+                    f.gain,
+                    f"it gains {f.gain:.0f} nats, and less than {faint:.0f} is ordinary in so many pixels",
+                )
+            elif f not in sure:
                 out.rejected[f.effect] = (
                     f.gain,
                     f"on ground that it was not fitted to it gains {f.gain:.0f} nats ({low:.0f} .. {high:.0f}), which may be nothing",
@@ -85,6 +91,7 @@ def search(state: State, most: int) -> Outcome:
                 state.say(f"{chosen.effect} gains {chosen.gain:.0f} nats on held-out ground")
         if not taken:
             break
+    settle(state, view)
     for cause in state.causes:
         out.rejected.pop(cause.effect.name, None)
     return out
@@ -139,21 +146,26 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     first = as_effect(found, state.data, state.frames, view.whole)
     if cls.scope == "scene" and not cls.plausible({k: float(v) for k, v in first.values.items()}, state.data):
         return ODD
+    if why := ordinary(first):
+        return why
     vector, causes = state.nominal.vector, list(state.causes)
     saved = [(c, c.effect, dict(c.errors)) for c in causes]
     cause = Cause(first, found, group=group)
     state.causes.append(cause)
-    look = refine(state)
-    why = doubt(state, cause) or next(
-        (f"beside it {c.effect.name} is no cause any more: {w}" for c in causes if (w := doubt(state, c))), ""
-    )
+    look = refine(state, view)
+    why = _doubt_any(state, cause)
     if not why:
-        gains, total, tested = secant_gains(state, cause, look)
+        errors_over_images(state, look)
+        why = _doubt_any(state, cause)
+    if not why:
+        gains, total, tested, unseen = secant_gains(state, cause, look)
         low, high = interval(gains)
         cause.gain_percent, cause.gain_low, cause.gain_high = (200 * x / total for x in (float(gains.sum()), low, high))
         cause.found = dataclasses.replace(cause.found, gains=gains)
         if low <= 0:
             why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
+        if not why and unseen < 0:
+            why = f"images that it was not fitted to contradict it: it gains {unseen:.3g} nats there"
         why = why or contradicted(tested)
     if why:
         state.causes[:] = causes
@@ -162,6 +174,25 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         state.nominal.vector = vector
         state.fit()
     return why
+
+
+def ordinary(first: Effect) -> str:
+    """Why the effect is nothing special already at a first estimate of its values, or ''."""
+    cls = type(first)
+    if cls.scope == "scene":
+        for name, least in cls.tolerance.items():
+            size = cls.size(first.values) if name not in first.values else abs(first.values[name] - cls.null()[name])
+            if size < least / 2:
+                return f"{name} is {size:.2g}, and less than {least:.2g} is ordinary"
+    return ""
+
+
+def _doubt_any(state: State, cause: Cause) -> str:
+    """Why the cause, or another beside it, cannot be one, or ''."""
+    others = [c for c in state.causes if c is not cause]
+    return doubt(state, cause) or next(
+        (f"beside it {c.effect.name} is no cause any more: {w}" for c in others if (w := doubt(state, c))), ""
+    )
 
 
 def contradicted(gains: np.ndarray) -> str:
@@ -198,43 +229,37 @@ def doubt(state: State, cause: Cause) -> str:
     return ""
 
 
-def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, float, np.ndarray]:
-    """Held-out gain (labels,) in nats of the cause as it was rendered, everything else fitted along; the squares without it; its gain on the test pairs.
+def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, float, np.ndarray, float]:
+    """Nats that the cause, as it was rendered, gains beside everything else: on held-out ground, (labels,); the squares without it; its
+    gains on the test pairs; and on images that were left out.
 
     Effects with many values keep the gain that their columns had on held-out ground: one amount for all would not be held out.
     """
     others = [c.effect for c in state.causes if c is not cause]
     few = 1 + sum(n.startswith("coefficient") for n in look.plan.shared)
     flat = Covariance.white(look.grid.annuli, state.frames)
-    sites = [(chain, [r for r in look.rows if r.patch.site == k]) for k, chain in enumerate(state.chains())]
-    added, plain = [], []
-    for chain, rows in sites:
-        for more in _with_cause(state, chain, others, rows, look):
-            added.append(products(more, look.model, look.grid, state.frames, None))
-            less = dataclasses.replace(
-                more,
-                shared=torch.cat([more.shared[:few], more.shared[-1:]]),
-                shared_mean=torch.cat([more.shared_mean[:few], more.shared_mean[-1:]]),
-                shared_dark=0 * torch.cat([more.shared_dark[:few], more.shared_dark[-1:]]),
-                own=more.own[:0],
-                own_mean=more.own_mean[:0],
-                own_dark=more.own_dark[:0],
-            )
-            plain.append(products(less, flat, look.grid, state.frames, None).gram)
-    plan = dataclasses.replace(look.plan, shared=[*look.plan.shared, "secant"])
-    whole = Whole(added, plan, state.frames)
-    for k in [k for k, n in enumerate(look.plan.shared) if n.startswith(cause.effect.name + ".")]:
-        whole.precision.pop(1 + k, None)
-    first = look.whole.first
-    whole.precision |= {k + 1: v for k, v in look.whole.precision.items() if k >= first}  # one shared column more
+    alone = type(cause.effect).scope == "scene" and len(cause.found.guise.columns) == 1
+    groups = state.image_groups(look.rows) if alone else []
+    pieces = [
+        more
+        for k, chain in enumerate(state.chains())
+        for more in _with_cause(state, chain, others, [r for r in look.rows if r.patch.site == k], look)
+    ]
+    plain = [products(_few(more, few), flat, look.grid, state.frames).gram for more in pieces]
     cause.rms_before, cause.rms_after = _rms(np.sum(plain, 0), look)
+    units = [products(more, look.model, look.grid, state.frames, None, groups) for more in pieces]
+    whole = _beside(units, cause, look, state.frames)
     total = float(whole.gram[0, 0])
-    if type(cause.effect).scope == "image" or len(cause.found.guise.columns) > 1:
-        return cause.found.gains, total, np.zeros(0)
+    if not alone:
+        return cause.found.gains, total, np.zeros(0), 0.0
     form = list(whole.form_places()) if type(cause.effect).of_law else []
     place = np.array([whole.first - 1])
+    unseen = 0.0
+    for g in range(len(groups)):
+        rest = _beside([u.without(g) for u in units], cause, look, state.frames)
+        unseen += rest.gains_on([dataclasses.replace(u, gram=u.images[g]) for u in units], place, form).sum()
     tested = [
-        products(more, look.model, look.grid, state.frames, None)
+        products(more, look.model, look.grid, state.frames)
         for chain, rows in hidden_rows(state, look.plan)
         for more in _with_cause(state, chain, others, rows, look)
     ]
@@ -242,7 +267,31 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
     grounds = [u.ground for u in tested]
     if len(set(grounds)) >= 3:  # else pieces of ground, where there are too few grounds for an interval
         gains = np.bincount(grounds, weights=gains).astype(np.float64)
-    return whole.held_out(place, form), total, gains
+    return whole.held_out(place, form), total, gains, unseen
+
+
+def _few(rows: Rows, count: int) -> Rows:
+    """The first and the last of the shared columns, and none per frame."""
+    keep = [*range(count), -1]
+    return dataclasses.replace(
+        rows,
+        shared=rows.shared[keep],
+        shared_mean=rows.shared_mean[keep],
+        shared_dark=0 * rows.shared_dark[keep],
+        own=rows.own[:0],
+        own_mean=rows.own_mean[:0],
+        own_dark=rows.own_dark[:0],
+    )
+
+
+def _beside(units: Sequence[Products], cause: Cause, look: View, frames: int) -> Whole:
+    """Everything but the cause's own values, what it brought as the last shared column."""
+    whole = Whole(units, dataclasses.replace(look.plan, shared=[*look.plan.shared, "secant"]), frames)
+    for k in [k for k, n in enumerate(look.plan.shared) if n.startswith(cause.effect.name + ".")]:
+        whole.precision.pop(1 + k, None)
+    first = look.whole.first
+    whole.precision |= {k + 1: v for k, v in look.whole.precision.items() if k >= first}  # one shared column more
+    return whole
 
 
 def _with_cause(state: State, chain: Chain, others: Sequence[Effect], rows: Sequence[Rows], look: View) -> list[Rows]:

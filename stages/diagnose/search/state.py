@@ -16,10 +16,9 @@ from stages.diagnose.model.nominal import Nominal, fit
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.explain import Registration
-from stages.diagnose.registration.forms import aligned
-from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, shared_columns
+from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, moved_columns, shared_columns
 from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patches
-from stages.diagnose.settings import SEEN, SHAMS
+from stages.diagnose.settings import FOLDS, SEEN, SHAMS
 from stages.effects import Effect, Survey, get_effect
 
 
@@ -82,9 +81,7 @@ class State:
     def align(self) -> None:
         """Lay the images over the ground as the registration has them."""
         for site in self.sites:
-            site.image, site.valid = site.read, site.read_valid
-            if site.displacement is not None:
-                site.image, site.valid = aligned(site.read, site.read_valid, *site.displacement)
+            site.align()
 
     def fit(self, start: bool = False) -> None:
         """Fit the nominal model (and gain and offset of dn images) to the aligned images."""
@@ -149,24 +146,60 @@ class State:
         plan = make_plan(chains[0], names, self.data)
 
         rows = [r for part in per_site(lambda k: self.rows(k, chains[k], plan), range(len(chains))) for r in part]
-        model = estimate([r.patch for r in rows], [(r.shared[0], r.shared_mean[0]) for r in rows], grid, self.frames)
-        model.dark = shadow_variance([r.patch for r in rows], [r.shared_dark[0] for r in rows])
-        self.covariance = model
+        model = self._covariance(rows, grid)
         tricks: list[Residual | None] = [None] * len(rows)
         if shams:
             tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
         whole = self._whole(rows, tricks, plan, grid, model)
         return View(whole, plan, rows, grid, model)
 
-    def weigh(self, rows: Sequence[Rows], view: View) -> Whole:
-        """The sums of other rows under the covariance of a look."""
-        return self._whole(rows, [None] * len(rows), view.plan, view.grid, view.model)
+    def again(self, view: View, names: Sequence[str], model: Covariance | None = None) -> View:
+        """A look beside ordinary amounts of these effects. Only the residual and the causes' own columns are rendered, the rest is as in ``view``.
+
+        model : the covariance, estimated where None
+        """
+        chains = self.chains()
+        plan = make_plan(chains[0], names, self.data, candidates=False)
+
+        def site(k: int) -> list[Rows]:
+            moved = moved_columns(chains[k], plan, self.data)
+            own = frame_columns(chains[k], plan, self.data, named=True)
+            return [_taken_over(r, view, plan, moved, own) for r in view.rows if r.patch.site == k]
+
+        rows = [r for part in per_site(site, range(len(chains))) for r in part]
+        model = model or self._covariance(rows, view.grid)
+        return View(self._whole(rows, [None] * len(rows), plan, view.grid, model), plan, rows, view.grid, model)
+
+    def _covariance(self, rows: Sequence[Rows], grid: Grid) -> Covariance:
+        model = estimate([r.patch for r in rows], [(r.shared[0], r.shared_mean[0]) for r in rows], grid, self.frames)
+        model.dark = shadow_variance([r.patch for r in rows], [r.shared_dark[0] for r in rows])
+        self.covariance = model
+        return model
+
+    def without_images(self, view: View) -> list[Whole]:
+        """The sums of a look as if one group of images after the other had not been taken."""
+        groups = self.image_groups(view.rows)
+        units = per_site(
+            lambda k: products(view.rows[k], view.model, view.grid, self.frames, None, groups), range(len(view.rows))
+        )
+        return [
+            self._scattered(Whole([u.without(g) for u in units], view.plan, self.frames)) for g in range(len(groups))
+        ]
+
+    def image_groups(self, rows: Sequence[Rows]) -> list[list[int]]:
+        """Frames that are left out together; none where there are too few to leave one out."""
+        frames = sorted({int(f) for row in rows for f in row.patch.frames})
+        return [frames[k::FOLDS] for k in range(min(FOLDS, len(frames)))] if len(frames) > 2 else []
 
     def _whole(
         self, rows: Sequence[Rows], shams: Sequence[Residual | None], plan: Plan, grid: Grid, model: Covariance
     ) -> Whole:
         units = per_site(lambda k: products(rows[k], model, grid, self.frames, shams[k]), range(len(rows)))
-        whole = Whole(units, plan, self.frames)
+        return self._scattered(Whole(units, plan, self.frames))
+
+    def _scattered(self, whole: Whole) -> Whole:
+        """With the scatter of values per image estimated."""
+        plan = whole.plan
         for name in dict.fromkeys(plan.per_frame):
             if get_effect(name).scatters:
                 places = whole.frame_places([k for k, n in enumerate(plan.per_frame) if n == name])
@@ -185,6 +218,33 @@ class View:
     rows: list[Rows]
     grid: Grid
     model: Covariance
+
+
+def _taken_over(row: Rows, view: View, plan: Plan, moved: Tensor, own: Tensor) -> Rows:
+    """Rows of another plan: ``moved`` and ``own`` are fields of the site, all other columns stand in ``row``."""
+    grid = view.grid
+    fresh = ["residual", *(n for n in plan.shared if "." in n)]
+    shared = _order([("residual", 0), *plan.shared_keys()], fresh, [("residual", 0), *view.plan.shared_keys()])
+    per_frame = _order(plan.frame_keys(), plan.per_frame[: len(own)], view.plan.frame_keys())
+    z, mean = row.patch.transform(moved, grid)
+    z_own, mean_own = row.patch.transform(own, grid)
+    dark, dark_own = row.patch.shadow(moved), row.patch.shadow(own)
+    return Rows(
+        row.patch,
+        torch.cat([z, row.shared])[shared],
+        torch.cat([mean, row.shared_mean])[shared],
+        torch.cat([z_own, row.own])[per_frame],
+        torch.cat([mean_own, row.own_mean])[per_frame],
+        torch.cat([dark, row.shared_dark])[shared],
+        torch.cat([dark_own, row.own_dark])[per_frame],
+    )
+
+
+def _order(wanted: Sequence[tuple[str, int]], fresh: Sequence[str], kept: Sequence[tuple[str, int]]) -> list[int]:
+    """Places of the wanted columns among the fresh ones, which go first, and those that are kept."""
+    known = {key: len(fresh) + k for k, key in enumerate(kept)}
+    known |= {(name, fresh[:k].count(name)): k for k, name in enumerate(fresh)}
+    return [known[key] for key in wanted]
 
 
 __all__ = ["Cause", "State", "View"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from stages.diagnose.likelihood.products import Rows
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import lit_mask, scale_images
-from stages.diagnose.registration.forms import aligned
 from stages.diagnose.rows.columns import Plan
 from stages.diagnose.search.state import State
 
@@ -16,13 +15,10 @@ def hidden_rows(state: State, plan: Plan) -> list[tuple[Chain, list[Rows]]]:
     """Rows of the test pairs, laid over the ground as the registration has them."""
     out = []
     for number, site in enumerate(state.hidden):
-        image, site.valid = site.read, site.read_valid
-        if site.displacement is not None:
-            image, site.valid = aligned(site.read, site.read_valid, *site.displacement)
-        site.image = image
+        site.align()
         chain = state.nominal.chain(site, state.base)
         if state.free_gains:
-            scale_images(site, image, chain.predict(), lit_mask(chain))
+            scale_images(site, site.image, chain.predict(), lit_mask(chain))
         out.append((chain, state.rows(NOT_LEARNED + number, chain, plan)))
     return out
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from stages.physics.formation import facets, geometry
+from stages.physics.formation.displaced import displace
 from stages.physics.formation.geometry import Angles
 from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
 from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
@@ -165,51 +166,6 @@ def expose(state: State, extensions: Sequence[Extension] = ()) -> Tensor:
     state.image = state.radiance if state.displacement is None else displace(state.radiance, *state.displacement)
     _apply(state, extensions, "sensor")
     return state.image
-
-
-def displace(image: Tensor, east: Tensor, south: Tensor) -> Tensor:
-    """The image as seen ``east`` columns and ``south`` rows further on, by the cubic of Catmull & Rom (Keys 1981), edges repeated.
-
-    It moves straight lines and parabolas exactly. Bilinear sampling would blur by up to a quarter of a squared pixel; the cubic
-    of ``torch.nn.functional.grid_sample`` moves a ramp by 0.14 px where 0.1 is asked for.
-
-    image : (B, H, W); east, south : px, broadcastable to it
-    """
-    height, width = image.shape[-2:]
-    alike = east.ndim < 2 or east.shape[-2:] == (1, 1)
-    if alike and (south.ndim < 2 or south.shape[-2:] == (1, 1)):  # rows and columns one after the other
-        right, x = _taps(torch.arange(width, dtype=image.dtype) + east.expand(len(image), 1, 1)[:, 0], width)
-        down, y = _taps(torch.arange(height, dtype=image.dtype) + south.expand(len(image), 1, 1)[:, 0], height)
-        wide = image.new_zeros(image.shape)
-        for k, weight in enumerate(x):
-            wide = wide + weight[:, None] * image.gather(2, right[k][:, None].expand_as(image))
-        moved = image.new_zeros(image.shape)
-        for k, weight in enumerate(y):
-            moved = moved + weight[..., None] * wide.gather(1, down[k][..., None].expand_as(image))
-        return moved
-    right, x = _taps((torch.arange(width, dtype=image.dtype) + east).expand_as(image), width)
-    down, y = _taps((torch.arange(height, dtype=image.dtype)[:, None] + south).expand_as(image), height)
-    flat, moved = image.flatten(1), image.new_zeros(image.shape)
-    for row, high in zip(down, y, strict=True):
-        along = image.new_zeros(image.shape)
-        for column, across in zip(right, x, strict=True):
-            along = along + across * flat.gather(1, (row * width + column).flatten(1)).view(image.shape)
-        moved = moved + high * along
-    return moved
-
-
-def _taps(place: Tensor, count: int) -> tuple[list[Tensor], list[Tensor]]:
-    """The four pixels about every place, kept within the image, and their weights."""
-    first = place.detach().floor()
-    t = place - first
-    index = [(first.long() + k).clamp(0, count - 1) for k in (-1, 0, 1, 2)]
-    weights = [
-        ((2 - t) * t - 1) * t / 2,
-        ((3 * t - 5) * t * t + 2) / 2,
-        ((4 - 3 * t) * t + 1) * t / 2,
-        (t - 1) * t * t / 2,
-    ]
-    return index, weights
 
 
 def _apply(state: State, extensions: Sequence[Extension], slot: str) -> None:
