@@ -110,7 +110,7 @@ demo: $(STAMP) ## run every stage on the embedded scene and name a report to ope
 	@echo; echo "Open $(abspath $(D)/report.html)"; echo "and  $(abspath $(D)/view.html)"
 
 # Of steps beside each other every line says whose it is, and bars, which draw over each other, become lines.
-SAYS = $(if $(BESIDE),2> >(trap "" INT; sed "s/^/$(basename $(@F)): /" >&2))
+SAYS = $(if $(BESIDE),2> >(trap "" INT; sed -u "s/^/$(basename $(@F)): /" >&2))
 
 $(D)/scene/images.csv: | $(STAMP)
 	$(LUNARGR) simulate -o $(D)/scene --hidden sun_azimuth:error_deg=5 --overwrite
