@@ -20,8 +20,8 @@ from stages.view.photographs import Photograph
 HEIGHT_STEP = 1e-3  # of a pixel: slopes are then kept to 2e-4
 # Steps of a map's range. Twice what a colour bar shows; what makes the picture is then kept to a few parts in ten thousand.
 LEVELS = 512
-# Of other maps, which no picture is made of: deviations and counts, of which nobody reads more than two digits.
-OTHER_LEVELS = 128
+# Of other maps, which no picture is made of: as many as a colour bar has colours.
+OTHER_LEVELS = 256
 PHOTOGRAPH_LEVELS = 1024
 SCRIPTS = ("decode.js", "shadows.js", "relight.js", "terrain.js", "panel.js", "photographs.js", "main.js")
 SHADERS = ("common", "lattice", "spread", "visible", "shade", "draw_vertex", "draw")
