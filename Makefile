@@ -9,7 +9,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 LUNARGR := $(BIN)/lunargr
 STAMP := $(VENV)/.installed
+TESTED := $(VENV)/.installed-tests
 SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
+
+# A module is compiled once, when it is first imported: pip leaves it to us (see below).
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help install demo demo-paper figures test test-slow mutants fuzz endurance lint bench campaign campaign-real docs wheel vendor-js reproduce-apollo15 reproduce-models clean
 
@@ -18,52 +22,60 @@ help: ## list the targets
 
 install: $(STAMP) ## create .venv with the lunargr command
 
+# --no-compile: of ten thousand modules a tenth is ever used, and compiling all took half of the time. Those are imported here.
+PIP := $(BIN)/python -m pip install --quiet --no-compile
+
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "lunargr needs Python >= 3.11; name one with make PYTHON=...")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(PIP) --upgrade pip
 	@# torch first and pinned: the CPU build, where the registry has one, instead of gigabytes of CUDA packages
-	$(BIN)/python -m pip install --quiet $$(grep '^torch==' constraints.txt)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[test,lint,spice]'
+	$(PIP) $$(grep '^torch==' constraints.txt)
+	$(PIP) --constraint constraints.txt --editable .
+	$(BIN)/python -c 'import pkgutil, stages; [__import__(m.name) for m in pkgutil.walk_packages(stages.__path__, "stages.")]'
 	@touch $@
 
-test: $(STAMP) ## the tests that every change must pass (under 10 minutes on two cores)
+$(TESTED): $(STAMP)
+	$(PIP) --constraint constraints.txt --editable '.[test,lint,spice]'
+	@touch $@
+
+test: $(TESTED) ## the tests that every change must pass (under 10 minutes on two cores)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
-test-slow: $(STAMP) ## the longer checks
+test-slow: $(TESTED) ## the longer checks
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
-mutants: $(STAMP) ## plant bugs one at a time and see whether the tests notice, before a release; ONLY=word for some
+mutants: $(TESTED) ## plant bugs one at a time and see whether the tests notice, before a release; ONLY=word for some
 	OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py --only "$(ONLY)"
 
-fuzz: $(STAMP) ## three thousand malformed inputs through the real commands: one line each, no traceback, nothing left
+fuzz: $(TESTED) ## three thousand malformed inputs through the real commands: one line each, no traceback, nothing left
 	OMP_NUM_THREADS=1 $(BIN)/python tests/malformed.py
 
-endurance: $(STAMP) ## interrupt every stage TIMES times (20) at random moments, run it again, compare every byte
+endurance: $(TESTED) ## interrupt every stage TIMES times (20) at random moments, run it again, compare every byte
 	$(BIN)/python tests/endurance.py --times $(or $(TIMES),20)
 
-lint: $(STAMP) ## ruff, formatting and mypy
+lint: $(TESTED) ## ruff, formatting and mypy
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-bench: $(STAMP) ## speed and memory, each beside a named peer in the same run; on a quiet machine, then make figures; ONLY=word for some
+bench: $(TESTED) ## speed and memory, each beside a named peer in the same run; on a quiet machine, then make figures; ONLY=word for some
 	mkdir -p results/bench
 	for script in tests/benchmarks/bench_*$(ONLY)*.py; do echo "== $$script"; \
 	  $(BIN)/python $$script | tee results/bench/$$(basename $$script .py).txt; done
 
-campaign: $(STAMP) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
+campaign: $(TESTED) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
 	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign
 
 # Pairs of real photographs; REGISTERED=pairs.h5 adds a registered set.
-campaign-real: $(STAMP) results/apollo15/diagnosis.h5 ## plant effects into real photographs and see what diagnose names (needs the reference data)
+campaign-real: $(TESTED) results/apollo15/diagnosis.h5 ## plant effects into real photographs and see what diagnose names (needs the reference data)
 	$(BIN)/python tests/planted.py --raw $(A)/stack.h5 $(if $(REGISTERED),--registered $(REGISTERED)) --seed $(or $(SEED),5) --output results/planted
 
-docs: $(STAMP) ## write the generated parts of docs/ again, and build the site in build/site
+docs: $(TESTED) ## write the generated parts of docs/ again, and build the site in build/site
 	$(BIN)/python examples/cli_page.py
 	@if [ -d $(SHARED)/oracles ]; then $(BIN)/python examples/photometry_page.py; \
 	  else echo "docs/photometry.md stays as it is: no outside tables at $(SHARED)/oracles"; fi
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	$(PIP) --constraint constraints.txt --editable '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "Open $(abspath build/site/index.html)"
 
@@ -88,8 +100,17 @@ DEMO_SPLIT := --split 65/10/25
 DEMO_TRAIN := --epochs 6 --batch 8 --precision fp32
 DEMO_RUNS := $(foreach seed,0 1 2,$(D)/checkpoint_$(seed).h5)
 
-demo: $(D)/report.html ## run every stage on the embedded scene and name a report to open
+CORES := $(shell nproc 2>/dev/null || getconf _NPROCESSORS_ONLN)
+# Of four steps beside each other; small crops gain little from a second thread.
+THREADS := $(shell echo $$(($(CORES) < 8 ? 1 : $(CORES) / 4)))
+
+demo: $(STAMP) ## run every stage on the embedded scene and name a report to open
+	+$(MAKE) --no-print-directory $(D)/pairs.h5
+	+OMP_NUM_THREADS=$(THREADS) $(MAKE) --no-print-directory -j $(CORES) BESIDE=1 $(D)/report.html
 	@echo; echo "Open $(abspath $(D)/report.html)"; echo "and  $(abspath $(D)/view.html)"
+
+# Of steps beside each other every line says whose it is, and bars, which draw over each other, become lines.
+SAYS = $(if $(BESIDE),2> >(trap "" INT; sed -u "s/^/$(basename $(@F)): /" >&2))
 
 $(D)/scene/images.csv: | $(STAMP)
 	$(LUNARGR) simulate -o $(D)/scene --hidden sun_azimuth:error_deg=5 --overwrite
@@ -105,46 +126,47 @@ $(D)/pairs.h5: $(D)/crops.h5
 
 # Training is random: three seeds, so that a gain can be told from luck.
 $(DEMO_RUNS): $(D)/checkpoint_%.h5: $(D)/pairs.h5
-	$(LUNARGR) train $< $(DEMO_TRAIN) --seed $* -o $@ --overwrite --resume
+	$(LUNARGR) train $< $(DEMO_TRAIN) --seed $* -o $@ --overwrite --resume $(SAYS)
 
 $(D)/svbrdf.h5: $(D)/scene.h5 $(D)/checkpoint_0.h5
-	$(LUNARGR) infer $^ -o $@ --overwrite
+	$(LUNARGR) infer $^ -o $@ --overwrite $(SAYS)
 
 # what the photographs show beyond terrain: all of them, for pictures ...
 $(D)/svbrdf_albedo.h5: $(D)/svbrdf.h5 $(D)/scene.h5
-	$(LUNARGR) albedo $^ -o $@ --overwrite
+	$(LUNARGR) albedo $^ -o $@ --overwrite $(SAYS)
 
 # ... and without every fourth, to be judged by these
 $(D)/fold_1.h5: $(D)/svbrdf.h5 $(D)/scene.h5
-	$(LUNARGR) albedo $^ --fold 1/4 --no-geotiff -o $@ --overwrite
+	$(LUNARGR) albedo $^ --fold 1/4 --no-geotiff -o $@ --overwrite $(SAYS)
 
 $(D)/render.exr: $(D)/svbrdf_albedo.h5
-	$(LUNARGR) render $< --sun-azimuth 270 --sun-elevation 25 -o $@ --overwrite
+	$(LUNARGR) render $< --sun-azimuth 270 --sun-elevation 25 -o $@ --overwrite $(SAYS)
 
 $(D)/view.html: $(D)/svbrdf_albedo.h5 $(D)/pairs.h5
-	$(LUNARGR) view $< --pairs $(D)/pairs.h5 -o $@ --title "lunargr demo: the embedded scene" --overwrite
+	$(LUNARGR) view $< --pairs $(D)/pairs.h5 -o $@ --title "lunargr demo: the embedded scene" --overwrite $(SAYS)
 
 $(D)/evaluation.h5: $(D)/pairs.h5 $(DEMO_RUNS)
-	$(LUNARGR) evaluate $^ -o $@ --figures $(D)/figures --overwrite
+	$(LUNARGR) evaluate $^ -o $@ --figures $(D)/figures --overwrite $(SAYS)
 
 $(D)/held_out.h5: $(D)/pairs.h5 $(D)/fold_1.h5
-	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite
+	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite $(SAYS)
 
 $(D)/match.json: $(D)/pairs.h5 $(D)/checkpoint_0.h5
-	$(LUNARGR) match $^ --count 8 --json $@ --figures $(D)/figures --overwrite
+	$(LUNARGR) match $^ --count 8 --json $@ --figures $(D)/figures --overwrite $(SAYS)
 
 # Places that every image covers: what the images disagree on there cannot be the ground.
 $(D)/stack.h5: $(D)/scene.h5
-	$(LUNARGR) sample $< --stack --crop 64 --count 20 $(DEMO_SPLIT) -o $(D)/stack_crops.h5 --overwrite
-	$(LUNARGR) project $(D)/stack_crops.h5 -o $@ --overwrite
+	$(LUNARGR) sample $< --stack --crop 64 --count 20 $(DEMO_SPLIT) -o $(D)/stack_crops.h5 --overwrite $(SAYS)
+	$(LUNARGR) project $(D)/stack_crops.h5 -o $@ --overwrite $(SAYS)
 
 $(D)/diagnosis.h5: $(D)/stack.h5
-	$(LUNARGR) diagnose $< --model hapke -o $@ --json $(D)/diagnosis.json --report $(D)/diagnosis.html --overwrite
+	$(LUNARGR) diagnose $< --model hapke -o $@ --json $(D)/diagnosis.json --report $(D)/diagnosis.html --overwrite $(SAYS)
 
-$(D)/report.html: $(D)/evaluation.h5 $(D)/held_out.h5 $(D)/match.json $(D)/render.exr $(D)/diagnosis.h5 $(D)/view.html
+# the long ones first: no core is left alone with one of them
+$(D)/report.html: $(DEMO_RUNS) $(D)/diagnosis.h5 $(D)/evaluation.h5 $(D)/held_out.h5 $(D)/match.json $(D)/render.exr $(D)/view.html
 	$(LUNARGR) report $(D)/scene.h5 $(D)/crops.h5 $(D)/pairs.h5 $(D)/checkpoint_0.h5 $(D)/svbrdf_albedo.h5 $(D)/evaluation.h5 \
 	    $(D)/held_out.h5 $(D)/match.json $(D)/diagnosis.json $(D)/render.png $(D)/figures/match_daisy_1.png $(D)/figures/match_sift_1.png \
-	    $(D)/view.html -o $@ --title "lunargr demo: the embedded scene" --overwrite
+	    $(D)/view.html -o $@ --title "lunargr demo: the embedded scene" --overwrite $(SAYS)
 
 demo-paper: $(D)/m2.h5 ## the model M2 of the Lunar-G2R paper on the demo's pairs, one run with the paper's network
 
@@ -155,7 +177,7 @@ $(D)/checkpoint_m2.h5: $(D)/pairs.h5
 $(D)/m2.h5: $(D)/pairs.h5 $(D)/checkpoint_m2.h5
 	$(LUNARGR) evaluate $^ --only learned --only learned_gain_offset -o $@ --overwrite
 
-figures: ## write every figure of README.md and docs/, and the notebook, from what demo, reproduce-* and bench left
+figures: $(TESTED) ## write every figure of README.md and docs/, and the notebook, from what demo, reproduce-* and bench left
 	$(BIN)/python examples/figures.py
 	@# the notebook trains its own network for two passes, and keeps it
 	if [ -f $(D)/pairs.h5 ]; then cd $(D) && ../$(BIN)/python ../examples/notebook_page.py; fi

@@ -189,10 +189,12 @@ def models(root: Path) -> list[str]:
 
 def commands(_: Path) -> list[str]:
     """What `make demo` runs, as make itself lists it, from within demo/."""
-    listed = subprocess.run(["make", "-nB", "demo"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    listed = subprocess.run(
+        ["make", "-nB", "demo/report.html"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
     found = re.findall(r"^\.venv/bin/(lunargr (?:.*\\\n)*.*)$", listed, re.M)
     lines = "\n".join(found).replace(" --overwrite", "").replace(" --resume", "").replace("demo/", "")
-    return [f"    {re.sub(r'^ +', '    ', line)}" for line in lines.splitlines()]
+    return [f"    {re.sub(r'^ +', '    ', line)}".rstrip() for line in lines.splitlines()]
 
 
 def benchmark(root: Path, name: str) -> list[str]:

@@ -2,7 +2,7 @@
 # # From pairs to a relit map
 # What `lunargr project` wrote, `pairs.h5`, opened with xarray; a network trained on it; its map relit with numpy, and held against
 # `lunargr render`. The files are those of `make demo`. This page is `examples/relight.py`, run cell by cell by `examples/notebook_page.py`:
-# open the [notebook](relight.ipynb) in Jupyter, or run the script in the folder of the files.
+# open the [notebook](relight.ipynb) in Jupyter, or run the script in the folder of the files. It needs xarray and h5netcdf.
 
 # %%
 import subprocess

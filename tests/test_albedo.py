@@ -209,8 +209,8 @@ def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
     from lunargr_cli.fanout.job import Work
     from lunargr_cli.fanout.stages import run_albedo
 
-    # blocks so small that the map has four rows of them
-    monkeypatch.setattr("stages.albedo.stage.BLOCK_PX", 64)
+    # blocks so small that the map has a row of them for each part
+    monkeypatch.setattr("stages.albedo.stage.BLOCK_PX", 96)
     config = replace(QUIET, geotiff=True)
     names = ("albedo", "albedo_std", "albedo_images", "coefficients", "elevation", "albedo_gain", "albedo_image_std")
     whole = tmp_path / "whole.h5"

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from stages.physics.formation.chain import Observation, facets, form
+from stages.physics.formation.cosine_sums import cosine_sum
 from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
 from stages.physics.photometry import get_model, model_names
-from stages.physics.photometry.cosine_sums import cosine_sum
 
 
 def test_gradients_in_elevation_sun_and_camera():

@@ -64,6 +64,17 @@ def test_help_needs_no_heavy_import():
     assert out.strip() == "[]"
 
 
+def test_models_are_listed_without_torch_which_still_comes_when_it_is_asked_for():
+    code = """import sys
+from lunargr_cli.commands import models
+models.command(name="hapke")
+print("torch._C" in sys.modules)
+from stages.physics.photometry import evaluate
+print(evaluate("lambert", {"albedo": 1.0}, 0.0, 0.0, 0.0), "torch._C" in sys.modules)"""
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()
+    assert out[0].startswith("hapke: ") and out[-2:] == ["False", "1.0 True"]
+
+
 CORE = sorted(path for top in ("stages", "schemas") for path in (ROOT / top).rglob("*.py"))
 
 

@@ -25,6 +25,9 @@ def command(
     overwrite: Overwrite = False,
 ) -> None:
     """List the reflectance models: parameters, bounds, units, defaults, reference, reciprocal or not."""
+    from schemas.later import import_when_used
+
+    import_when_used("torch")  # half of this command's time; what is listed here needs none of it
     from stages.physics.photometry import catalogue, get_model
 
     chosen = None if name is None else get_model(name)

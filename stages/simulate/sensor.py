@@ -115,10 +115,18 @@ class Lattice:
         solution, *_ = np.linalg.lstsq(design, np.stack([tx, ty], axis=1), rcond=None)
         si = _scaled(np.arange(first, first + height), first, height)[:, None]
         ti = _scaled(np.arange(image.width), 0, image.width)[None]
-        gx = sum(k * (si**i * ti**j) for k, (i, j) in zip(solution[:, 0], powers, strict=True))
-        gy = sum(k * (si**i * ti**j) for k, (i, j) in zip(solution[:, 1], powers, strict=True))
+        gx, gy = (_cubic(dict(zip(powers, values, strict=True)), si, ti) for values in solution.T)
         row, col = scene.rowcol(gx, gy)
         return cls(row, col, gx, gy)
+
+
+def _cubic(factors: dict[tuple[int, int], float], s: Floats, t: Floats) -> Floats:
+    """Sum of factors[i, j] s^i t^j, s : (H, 1), t : (1, W); a few passes over (H, W) instead of one for each factor."""
+    total = np.zeros((s.size, t.size))
+    for j in (3, 2, 1, 0):
+        total *= t
+        total += sum(factors[i, j] * s**i for i in range(4 - j))
+    return total
 
 
 def _scaled(values: NDArray, first: float, count: int) -> Floats:

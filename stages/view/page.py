@@ -18,6 +18,11 @@ from stages.view.packing import Blob, pack_map, spread_step
 from stages.view.photographs import Photograph
 
 HEIGHT_STEP = 1e-3  # of a pixel: slopes are then kept to 2e-4
+# Steps of a map's range. Twice what a colour bar shows; what makes the picture is then kept to a few parts in ten thousand.
+LEVELS = 512
+# Of other maps, which no picture is made of: as many as a colour bar has colours.
+OTHER_LEVELS = 256
+PHOTOGRAPH_LEVELS = 1024
 SCRIPTS = ("decode.js", "shadows.js", "relight.js", "terrain.js", "panel.js", "photographs.js", "main.js")
 SHADERS = ("common", "lattice", "spread", "visible", "shade", "draw_vertex", "draw")
 COLOURS = ("viridis", "magma", "cividis")
@@ -55,9 +60,10 @@ def describe(content: Content, frames: Frames, photographs: Sequence[Photograph]
     for layer in content.coefficients:
         mapped &= np.isfinite(layer.values)
     fields = []
-    for layer in [*content.coefficients, *content.others]:
+    for k, layer in enumerate([*content.coefficients, *content.others]):
         good = np.isfinite(layer.values)
-        packed = pack_map(layer.values, good, spread_step(layer.values, good))
+        levels = LEVELS if k < len(content.coefficients) else OTHER_LEVELS
+        packed = pack_map(layer.values, good, spread_step(layer.values, good, levels))
         entry: dict[str, Any] = {"name": layer.name, "title": layer.title, "unit": layer.unit}
         entry["map"] = blob.add_map(packed)
         # most maps are known where the coefficients are
@@ -97,7 +103,7 @@ def _photograph(photograph: Photograph, blob: Blob) -> dict[str, Any]:
         "azimuth": photograph.sun_azimuth_deg,
         "elevation": photograph.sun_elevation_deg,
         "camera": photograph.camera.tolist(),
-        "map": blob.add_map(pack_map(photograph.image, good, spread_step(photograph.image, good))),
+        "map": blob.add_map(pack_map(photograph.image, good, spread_step(photograph.image, good, PHOTOGRAPH_LEVELS))),
         "known": blob.add_map(pack_map(good, np.ones_like(good), 1.0)),
     }
 

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from schemas.errors import RegistryError
 from stages.physics.formation.geometry import Angles
@@ -48,8 +47,8 @@ def evaluate(model: str, parameters: Mapping[str, Any], incidence: Any, emission
     reflectance = get_model(model)
     full = {**reflectance.defaults(), **_in_radians(reflectance, parameters)}
     given = {"incidence": incidence, "emission": emission, "phase": phase, **full}
-    as_tensor = any(isinstance(v, Tensor) for v in given.values())
-    tensors = {k: v if isinstance(v, Tensor) else torch.from_numpy(np.array(v)) for k, v in given.items()}
+    as_tensor = any(isinstance(v, torch.Tensor) for v in given.values())
+    tensors = {k: v if isinstance(v, torch.Tensor) else torch.from_numpy(np.array(v)) for k, v in given.items()}
     single = {t.dtype for t in tensors.values() if t.ndim} == {torch.float32}
     dtype = torch.float32 if single else torch.float64
     device = next((t.device for t in tensors.values() if t.device.type != "cpu"), torch.device("cpu"))
@@ -66,7 +65,7 @@ def _in_radians(model: ReflectanceModel, parameters: Mapping[str, Any]) -> dict[
     known: dict[str, Any] = {}
     for name, value in parameters.items():
         if name in degrees:
-            known[degrees[name]] = value * (math.pi / 180) if isinstance(value, Tensor) else np.radians(value)
+            known[degrees[name]] = value * (math.pi / 180) if isinstance(value, torch.Tensor) else np.radians(value)
         elif name in names:
             known[name] = value
         else:

@@ -6,11 +6,15 @@ It is in no registry: networks are not trained on it, `lunargr albedo` makes suc
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
-from torch import Tensor
+import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 FACTOR = Parameter("albedo_factor", "1", 0.0, 100.0, 1.0, "I/F relative to that of the other parameters")
 GLSL = """
@@ -36,7 +40,7 @@ class AlbedoFactor(ReflectanceModel):
         return self.model.radiance_factor(parameters, angles) * parameters[FACTOR.name]
 
     def lit(self, coefficients: Tensor | Mapping[str, Tensor], angles: Angles, light: Tensor) -> Tensor:
-        if isinstance(coefficients, Tensor):
+        if isinstance(coefficients, torch.Tensor):
             return self.model.lit(coefficients[:, :-1], angles, light) * coefficients[:, -1]
         rest = {name: value for name, value in coefficients.items() if name != FACTOR.name}
         return self.model.lit(rest, angles, light) * coefficients[FACTOR.name]

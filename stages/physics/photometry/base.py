@@ -5,13 +5,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
-from torch import Tensor
 
 from schemas.errors import RegistryError
 from stages.physics.formation.geometry import Angles
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ class ReflectanceModel(ABC):
 
         coefficients : (..., C, ...) with the parameters along ``dim``; returns each without that axis
         """
-        if not isinstance(coefficients, Tensor):
+        if not isinstance(coefficients, torch.Tensor):
             return dict(coefficients)
         # unbind and not select: its backward is one stack, where select writes a full stack of zeros per parameter
         return dict(zip((p.name for p in self.parameters), coefficients.unbind(dim), strict=True))

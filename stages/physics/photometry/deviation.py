@@ -6,12 +6,15 @@ var(I/F) = sum over parameters of (dI/dp sigma_p)^2
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ReflectanceModel, masked_radiance_factor
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def radiance_deviation(

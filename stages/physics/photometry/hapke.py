@@ -28,14 +28,16 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
-from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
 from stages.physics.photometry.roughness import GLSL_ROUGH_SURFACE, rough_surface
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 # Defaults: Sato et al. (2014), 643 nm, mean over the Moon (set "sato2014_643nm" of `published.py`).
 OPTIONAL = (

@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, register
 from stages.physics.photometry.hapke import OPTIONAL, Hapke, HapkeBase
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 # Helfenstein and Veverka (1987), whole Moon; B0 = S(0) / (w p(0)) with S(0) = 0.71.
 _LUNAR = {"w": 0.21, "Bs0": 0.71 / (0.21 * 1.68), "hs": 0.07, "theta": math.radians(20)}

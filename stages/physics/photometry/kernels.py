@@ -17,13 +17,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, horizon_cosine, register
 from stages.physics.photometry.roughness import GLSL_ROUGH_SURFACE, rough_surface
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 ROUGH = math.radians(20)
 KERNELS = (

@@ -8,11 +8,13 @@ The albedo is that of a perfectly diffuse surface: 1 reflects all light.
 from __future__ import annotations
 
 from collections.abc import Mapping
-
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, ReflectanceModel, register
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @register

@@ -8,11 +8,13 @@ The factor 2 makes the albedo the normal albedo, as in ISIS; in Hapke's terms it
 from __future__ import annotations
 
 from collections.abc import Mapping
-
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, ReflectanceModel, register
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @register

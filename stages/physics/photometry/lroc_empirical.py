@@ -10,12 +10,15 @@ with g in degrees. The defaults are the published sets for the NAC (broadband, 6
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def _terms(rows: tuple[tuple[str, str, float, str], ...], spread: float) -> tuple[Parameter, ...]:

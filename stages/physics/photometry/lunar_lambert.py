@@ -9,12 +9,15 @@ curve L(g) of the user's.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, register
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 # McEwen (1996): L(g) = 1 + A g + B g^2 + C g^3 with g in degrees; negative beyond 105 deg.
 MCEWEN = (1.0, -0.019, 2.42e-4, -1.46e-6)

@@ -9,13 +9,16 @@ McEwen's law, which is negative beyond some 105 deg of phase: there the polynomi
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, register
 from stages.physics.photometry.lunar_lambert import GLSL_MIXTURE, MCEWEN, lunar_share, mixture
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @register

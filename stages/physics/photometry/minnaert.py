@@ -8,11 +8,13 @@ The albedo is the normal albedo; k rises with phase, and with k < 1 the law is i
 from __future__ import annotations
 
 from collections.abc import Mapping
-
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, register
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @register

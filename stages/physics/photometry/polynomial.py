@@ -15,12 +15,15 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from torch import Tensor
+import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 class CosinePolynomial(ReflectanceModel):
@@ -55,10 +58,10 @@ class IncidencePhasePolynomial(CosinePolynomial):
 
     def lit(self, coefficients: Tensor | Mapping[str, Tensor], angles: Angles, light: Tensor) -> Tensor:
         # numba takes a quarter of a second to load, which `lunargr models` has no use for
-        from stages.physics.photometry.cosine_sums import cosine_sum, fits
+        from stages.physics.formation.cosine_sums import cosine_sum, fits
 
         geometry = angles.cos_incidence, angles.cos_phase, light
-        if not (isinstance(coefficients, Tensor) and fits(coefficients, *geometry)):
+        if not (isinstance(coefficients, torch.Tensor) and fits(coefficients, *geometry)):
             return super().lit(coefficients, angles, light)
         return cosine_sum(coefficients, *geometry, self.powers)
 

@@ -9,12 +9,14 @@ BRDF                        r / cos(i)        = I/F / (pi cos(i))      sr^-1   (
 from __future__ import annotations
 
 import math
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-from torch import Tensor
 
-Array = TypeVar("Array", float, np.ndarray, Tensor)
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Array = TypeVar("Array", float, np.ndarray, "Tensor")
 
 
 def to_bidirectional_reflectance(radiance_factor: Array) -> Array:

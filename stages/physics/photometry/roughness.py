@@ -17,11 +17,14 @@ mu0e and mue are the mu of whichever angle is incidence and emission.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 GLSL_ROUGH_SURFACE = """
 vec2 facets(float cot_angle, float cot_theta) {

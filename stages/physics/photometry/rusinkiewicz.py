@@ -24,13 +24,16 @@ carry over.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
-from torch import Tensor
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import register
 from stages.physics.photometry.polynomial import CosinePolynomial, coefficient
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def half_difference_cosines(angles: Angles) -> tuple[Tensor, Tensor, Tensor, Tensor]:
