@@ -236,9 +236,9 @@ STAGES = (
         "an epoch leaves out a pair",
     ),
     Mutant(
-        "stages/network/cpu/strips.py",
-        "self.x0 = max(0, (self.col - net.reach) // stride * stride)",
-        "self.x0 = max(0, (self.col - net.reach // 2) // stride * stride)",
+        "stages/network/mapper.py",
+        "r0, c0 = (max(0, (k - reach) // lattice * lattice) for k in (row, col))",
+        "r0, c0 = (max(0, (k - reach // 2) // lattice * lattice) for k in (row, col))",
         ("tests/test_strips.py",),
         "strips have too little context: seams",
     ),

@@ -37,7 +37,7 @@ from stages.infer.parallel import in_order, side_by_side
 from stages.infer.terrain import TerrainReader, valid_part
 from stages.infer.windows import Box, axis_windows, own_rows, swaths_of, window_and_stride, windows_of
 from stages.infer.writing import Blend, Outputs
-from stages.network.cpu.mapper import Mapper
+from stages.network.mapper import Mapper
 from stages.network.precision import check_precision, choose_inference_precision
 from stages.network.predictor import choose_device, load_predictor
 from stages.pairs.holes import fill_holes
@@ -156,7 +156,7 @@ def _predict(
     if config.shard[1] > 1:
         writer.file.attrs["shard_rows"] = np.array(own, np.int64)
     window, stride = window_and_stride(config)
-    if mapper.in_strips and config.window is None and config.stride is None:
+    if config.window is None and config.stride is None:
         boxes = swaths_of(elevation.shape, config, mapper.together)
     else:
         boxes = windows_of(elevation.shape, config)
