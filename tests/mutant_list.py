@@ -272,8 +272,8 @@ STAGES = (
     ),
     Mutant(
         "stages/physics/maps/geotiff.py",
-        'else {"transform": self.grid.transform, ',
-        'else {"transform": self.grid.window(0, 1, 1, 1).transform, ',
+        "transform=self.grid.transform, ",
+        "transform=self.grid.window(0, 1, 1, 1).transform, ",
         ("tests/test_infer.py::test_geotiff_aligns_with_the_dem_and_says_what_it_holds",),
         "the GeoTIFF lies one pixel off",
     ),

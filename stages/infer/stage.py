@@ -41,7 +41,7 @@ from stages.network.mapper import Mapper
 from stages.network.precision import check_precision, choose_inference_precision
 from stages.network.predictor import choose_device, load_predictor
 from stages.pairs.holes import fill_holes
-from stages.physics.maps.geotiff import EVEN, MapTiff, band_names, map_tags
+from stages.physics.maps.geotiff import MapTiff, band_names, map_tags
 from stages.physics.maps.grid import check_same_body, read_grid
 
 QUANTITY = "radiance factor I/F = pi r, including cos(incidence)"
@@ -168,9 +168,7 @@ def _predict(
                 yield row, part[1], values
         return_freed_memory()  # or what windows of other sizes leave behind would grow with the map
 
-    # The GeoTIFF takes strips as they come where its overviews can be made of each by itself.
-    at_once = window == stride and all(row % EVEN == 0 and col % EVEN == 0 for row, col, _, _ in boxes)
-    outputs = Outputs(writer, elevation, dem_valid, own, picture if at_once else None)
+    outputs = Outputs(writer, elevation, dem_valid, own, picture)
     blend = Blend(outputs, window - stride, own) if window > stride else None
     found = side_by_side(boxes, work, mapper.together)
     rows, done = sum(box[2] for box in boxes), 0
@@ -193,8 +191,6 @@ def _predict(
         blend.flush(own[1])
     while outputs.copy_elevation():
         pass
-    if picture and not at_once:
-        picture.put_all(*(f for f in (outputs.coefficients, outputs.deviations) if f is not None))
     progress(rows, rows, "rows of windows")
     return len(boxes)
 
