@@ -20,7 +20,7 @@ from schemas.files.outputs import Output
 from schemas.provenance import raster_record
 from schemas.rasters import TIFF_TAG
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.physics.maps.geotiff import BLOCK, EVEN, MapTiff
+from stages.physics.maps.geotiff import BLOCK, MapTiff
 from stages.physics.maps.rasters import open_raster, read_window
 from stages.physics.photometry.conventions import Convention, convert_maps, get_convention, model_difference
 
@@ -124,8 +124,8 @@ def _named(data: DatasetReader, names: Sequence[str]) -> list[str]:
 
 
 def _strips(data: DatasetReader, bands: int) -> Iterator[Window]:
-    """Windows of whole rows, as the output needs them: a multiple of its tile height where that fits the memory."""
+    """Windows of whole rows, a multiple of the output's tile height where that fits the memory."""
     rows = max(1, BLOCK_VALUES // max(1, data.width * bands))
-    rows = rows // BLOCK * BLOCK or max(EVEN, rows // EVEN * EVEN)
+    rows = rows // BLOCK * BLOCK or rows
     for row in range(0, data.height, rows):
         yield Window(0, row, data.width, min(rows, data.height - row))

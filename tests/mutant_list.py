@@ -236,9 +236,9 @@ STAGES = (
         "an epoch leaves out a pair",
     ),
     Mutant(
-        "stages/network/cpu/strips.py",
-        "self.x0 = max(0, (self.col - net.reach) // stride * stride)",
-        "self.x0 = max(0, (self.col - net.reach // 2) // stride * stride)",
+        "stages/network/mapper.py",
+        "r0, c0 = (max(0, (k - reach) // lattice * lattice) for k in (row, col))",
+        "r0, c0 = (max(0, (k - reach // 2) // lattice * lattice) for k in (row, col))",
         ("tests/test_strips.py",),
         "strips have too little context: seams",
     ),
@@ -272,8 +272,8 @@ STAGES = (
     ),
     Mutant(
         "stages/physics/maps/geotiff.py",
-        'else {"transform": self.grid.transform, ',
-        'else {"transform": self.grid.window(0, 1, 1, 1).transform, ',
+        "transform=self.grid.transform, ",
+        "transform=self.grid.window(0, 1, 1, 1).transform, ",
         ("tests/test_infer.py::test_geotiff_aligns_with_the_dem_and_says_what_it_holds",),
         "the GeoTIFF lies one pixel off",
     ),

@@ -122,7 +122,7 @@ def test_a_failure_where_a_dataset_is_let_go_of_is_not_lost(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("size", [100_000, 1_000_000, 5_000_000])  # while tiles are written, and while they are joined
+@pytest.mark.parametrize("size", [100_000, 1_000_000, 5_000_000])  # while tiles are written, and while they are copied
 def test_a_disk_that_fills_under_a_geotiff_leaves_nothing(tmp_path, rng, size):
     values = rng.normal(size=(2, 768, 768)).astype(np.float32)
     path, transform = tmp_path / "map.tif", Affine(5, 0, 0, 0, -5, 0)

@@ -9,7 +9,7 @@ import torch
 from stages.infer.parallel import in_order, side_by_side
 from stages.infer.terrain import TerrainReader, valid_part
 from stages.network.coefficient_maps import CoefficientMaps
-from stages.network.cpu.mapper import Mapper
+from stages.network.mapper import Mapper
 from stages.network.predictor import Predictor
 from stages.network.unet import WIDTHS, UNet
 from stages.pairs.holes import fill_holes

@@ -7,15 +7,19 @@ one small Gram matrix per frame, so that the fit streams and is exact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from stages.common.threads import one_thread_each
+from stages.network.pixels import Pixels, fit_pixels
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
+
+ROUNDS = 100  # of a fit that is not linear: a baseline is to be as good as its law allows
 
 
 class FrameGram:
@@ -97,8 +101,8 @@ class PixelSample:
 
     @property
     def angles(self) -> Angles:
-        """(1, N) float64."""
-        return Angles(*(c.double()[None] for c in (self.cos_incidence, self.cos_emission, self.cos_phase)))
+        """(N,) float64."""
+        return Angles(*(c.double() for c in (self.cos_incidence, self.cos_emission, self.cos_phase)))
 
     def thin(self, most: int) -> PixelSample:
         """At most ``most`` pixels, evenly taken."""
@@ -110,7 +114,7 @@ def sample_gram(model: ReflectanceModel, sample: PixelSample, frames: int) -> np
     """The Gram matrices of a linear model over sampled pixels, (F, K + 2, K + 2)."""
     angles, count = sample.angles, len(model.parameters)
     units = torch.eye(count, dtype=torch.float64)
-    images = [masked_radiance_factor(model, model.unpack(unit[None, :, None], 1), angles)[0] for unit in units]
+    images = [masked_radiance_factor(model, model.unpack(unit, 0), angles) for unit in units]
     gram = FrameGram(count, frames)
     for f in torch.unique(sample.frame).tolist():
         mine = sample.frame == f
@@ -121,88 +125,9 @@ def sample_gram(model: ReflectanceModel, sample: PixelSample, frames: int) -> np
 
 
 def fit_nonlinear(
-    model: ReflectanceModel,
-    sample: PixelSample,
-    frames: int,
-    calibrated: bool,
-    free: Sequence[str] = (),
-    rounds: int = 60,
+    model: ReflectanceModel, sample: PixelSample, calibrated: bool, free: Sequence[str] = ()
 ) -> np.ndarray:
-    """One parameter set for all pixels by Levenberg-Marquardt, within the model's bounds; (C,).
-
-    Starts at the model's defaults, where parameters not in ``free`` (all where empty) stay. Uncalibrated frames get
-    their best gain and offset in every round.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # thousands of small operations: handing them to threads costs more than it saves
-    try:
-        return _levenberg_marquardt(model, sample, frames, calibrated, free, rounds)
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _levenberg_marquardt(
-    model: ReflectanceModel, sample: PixelSample, frames: int, calibrated: bool, free: Sequence[str], rounds: int
-) -> np.ndarray:
-    angles = sample.angles
-    visibility, image = sample.visibility.double(), sample.image.double()
-    default = torch.tensor([p.default for p in model.parameters], dtype=torch.float64)
-    moves = torch.tensor([not free or p.name in free for p in model.parameters])
-    start = model.unconstrain(default[None], 1)[0].clamp(-8, 8)
-
-    def values(raw: Tensor) -> Tensor:
-        every = start.clone()
-        every[moves] = raw
-        return torch.where(moves, model.constrain(every[None], 1)[0], default)
-
-    def render(raw: Tensor) -> Tensor:
-        parameters = model.unpack(values(raw)[None, :, None], 1)
-        return masked_radiance_factor(model, parameters, angles)[0] * visibility
-
-    def residual(raw: Tensor) -> tuple[Tensor, Tensor]:
-        rendered = render(raw)
-        gain = torch.ones(frames, dtype=torch.float64)
-        offset = torch.zeros(frames, dtype=torch.float64)
-        if not calibrated:
-            gram = FrameGram(1, frames)
-            for f in range(frames):
-                mine = sample.frame == f
-                if mine.any():
-                    r, y = rendered[mine][None, None, None], image[mine][None, None]
-                    gram.add(r, y, torch.ones_like(y, dtype=torch.bool), np.array([f]))
-            gain, offset = (torch.from_numpy(v) for v in solve_gain_offset(gram.gram, np.ones(1)))
-        pixel_gain = gain[sample.frame]
-        return image - pixel_gain * rendered - offset[sample.frame], pixel_gain
-
-    raw = start[moves]
-    damping = 1e-3
-    error, pixel_gain = residual(raw)
-    loss = float(error @ error)
-    for _ in range(rounds):
-        columns = _jacobian(render, raw) * pixel_gain[:, None]
-        normal, slope = columns.T @ columns, columns.T @ error
-        improved = False
-        for _ in range(8):
-            lift = torch.diag(damping * normal.diagonal().clamp(min=1e-12 * float(normal.diagonal().max() + 1e-300)))
-            candidate = (raw + torch.linalg.lstsq(normal + lift, slope[:, None]).solution[:, 0]).clamp(-12, 12)
-            error_new, gain_new = residual(candidate)
-            loss_new = float(error_new @ error_new)
-            if loss_new < loss:
-                gained = (loss - loss_new) / max(loss, 1e-300)
-                raw, error, pixel_gain, loss = candidate, error_new, gain_new, loss_new
-                damping, improved = max(damping / 5, 1e-12), True
-                break
-            damping *= 5
-        if not improved or gained < 1e-7:
-            break
-    return values(raw).numpy()
-
-
-def _jacobian(render: Callable[[Tensor], Tensor], raw: Tensor, step: float = 1e-5) -> Tensor:
-    """Central differences in double precision, (N, C): a few parameters only, and exact to about 1e-9."""
-    columns = []
-    for k in range(len(raw)):
-        shift = torch.zeros_like(raw)
-        shift[k] = step
-        columns.append((render(raw + shift) - render(raw - shift)) / (2 * step))
-    return torch.stack(columns, dim=1)
+    """One parameter set for all pixels, within the model's bounds, (C,): see :func:`fit_pixels`."""
+    pixels = Pixels(sample.angles, sample.visibility.double(), sample.image.double())
+    with one_thread_each():  # thousands of small operations, whose sums must not hang on the number of threads
+        return fit_pixels(model, pixels, free, None if calibrated else sample.frame, ROUNDS).double().numpy()

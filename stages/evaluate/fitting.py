@@ -115,7 +115,7 @@ def _fit_sets(data: Fitting, renderers: Sequence[Renderer], tick: Callable[[int]
         found = Constant(_solve_linear(gram.gram, shared[0], calibrated))
     elif shared and sample is not None:
         thin = sample.thin(LEVENBERG_PIXELS)
-        found = Constant(fit.fit_nonlinear(shared[0].model, thin, frames, calibrated))
+        found = Constant(fit.fit_nonlinear(shared[0].model, thin, calibrated))
     for renderer in shared:
         renderer.coefficients = found
     if "kernels" in of and sample is not None:
@@ -123,7 +123,7 @@ def _fit_sets(data: Fitting, renderers: Sequence[Renderer], tick: Callable[[int]
         of["kernels"].coefficients = Constant(_solve_linear(grams, of["kernels"], calibrated))
     if "hapke_fitted" in of and sample is not None:
         hapke, thin = of["hapke_fitted"], sample.thin(LEVENBERG_PIXELS)
-        hapke.coefficients = Constant(fit.fit_nonlinear(hapke.model, thin, frames, calibrated, HAPKE_FREE))
+        hapke.coefficients = Constant(fit.fit_nonlinear(hapke.model, thin, calibrated, HAPKE_FREE))
 
 
 def _solve_linear(gram: np.ndarray, renderer: Renderer, calibrated: bool) -> np.ndarray:

@@ -37,11 +37,11 @@ from stages.infer.parallel import in_order, side_by_side
 from stages.infer.terrain import TerrainReader, valid_part
 from stages.infer.windows import Box, axis_windows, own_rows, swaths_of, window_and_stride, windows_of
 from stages.infer.writing import Blend, Outputs
-from stages.network.cpu.mapper import Mapper
+from stages.network.mapper import Mapper
 from stages.network.precision import check_precision, choose_inference_precision
 from stages.network.predictor import choose_device, load_predictor
 from stages.pairs.holes import fill_holes
-from stages.physics.maps.geotiff import EVEN, MapTiff, band_names, map_tags
+from stages.physics.maps.geotiff import MapTiff, band_names, map_tags
 from stages.physics.maps.grid import check_same_body, read_grid
 
 QUANTITY = "radiance factor I/F = pi r, including cos(incidence)"
@@ -156,7 +156,7 @@ def _predict(
     if config.shard[1] > 1:
         writer.file.attrs["shard_rows"] = np.array(own, np.int64)
     window, stride = window_and_stride(config)
-    if mapper.in_strips and config.window is None and config.stride is None:
+    if config.window is None and config.stride is None:
         boxes = swaths_of(elevation.shape, config, mapper.together)
     else:
         boxes = windows_of(elevation.shape, config)
@@ -168,9 +168,7 @@ def _predict(
                 yield row, part[1], values
         return_freed_memory()  # or what windows of other sizes leave behind would grow with the map
 
-    # The GeoTIFF takes strips as they come where its overviews can be made of each by itself.
-    at_once = window == stride and all(row % EVEN == 0 and col % EVEN == 0 for row, col, _, _ in boxes)
-    outputs = Outputs(writer, elevation, dem_valid, own, picture if at_once else None)
+    outputs = Outputs(writer, elevation, dem_valid, own, picture)
     blend = Blend(outputs, window - stride, own) if window > stride else None
     found = side_by_side(boxes, work, mapper.together)
     rows, done = sum(box[2] for box in boxes), 0
@@ -193,8 +191,6 @@ def _predict(
         blend.flush(own[1])
     while outputs.copy_elevation():
         pass
-    if picture and not at_once:
-        picture.put_all(*(f for f in (outputs.coefficients, outputs.deviations) if f is not None))
     progress(rows, rows, "rows of windows")
     return len(boxes)
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.pairs.holes import FILL_REACH, fill_holes
-from stages.physics.maps.geotiff import EVEN
 
+STEP = 8  # px, of the edges of what is worked on
 READ = 1024  # rows read at once: what filling holes needs around them is read again with the next
 
 
@@ -55,7 +55,7 @@ class TerrainReader:
 
 
 def valid_part(dem_valid: Any, box: tuple[int, int, int, int]) -> tuple[int, int, int, int] | None:
-    """The smallest box (row, col, height, width) around what is valid in a box, in steps of EVEN; None where nothing is."""
+    """The smallest box (row, col, height, width) around what is valid in a box, in steps of STEP; None where nothing is."""
     row, col, height, width = box
     rows, columns = np.zeros(height, bool), np.zeros(width, bool)
     for first in range(row, row + height, READ):
@@ -69,7 +69,7 @@ def valid_part(dem_valid: Any, box: tuple[int, int, int, int]) -> tuple[int, int
 
 
 def _extent(known: NDArray[np.bool_]) -> tuple[int, int]:
-    """(first, length) of what is known along an axis, in steps of EVEN."""
-    first = int(known.argmax()) // EVEN * EVEN
+    """(first, length) of what is known along an axis, in steps of STEP."""
+    first = int(known.argmax()) // STEP * STEP
     last = known.size - int(known[::-1].argmax())
-    return first, min(known.size, -(-last // EVEN) * EVEN) - first
+    return first, min(known.size, -(-last // STEP) * STEP) - first

@@ -12,7 +12,7 @@ from schemas import ConfigError
 from stages.infer.config import Config
 from stages.physics.maps.window import Box
 
-BAND = 1024  # rows, by which shards share a map out; the window where the network cannot run strip by strip
+BAND = 1024  # rows, by which shards share a map out
 # Context costs a wide window little, and one that runs from north to south nothing but at its ends. Memory follows the width.
 WIDEST, TALLEST, SHORTEST = 4096, 8192, 512
 CHUNK = 256  # px of the artefact's chunks, which are best written whole

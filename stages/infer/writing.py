@@ -16,7 +16,7 @@ from stages.physics.maps.geotiff import MapTiff
 class Outputs:
     """The fields of a map in its artefact, and the DEM that they are made of. own : (first, last) row
 
-    tiff : gets coefficients and deviations too, where strips begin and end as it needs them to
+    tiff : gets coefficients and deviations too
     """
 
     def __init__(

@@ -75,41 +75,72 @@ def sample_pixels(
     return Pixels(Angles(mu0, mu, phase), light, image, tuple(rest))
 
 
-def fit_pixels(model: ReflectanceModel, pixels: Pixels, rounds: int = 40) -> Tensor:
+def fit_pixels(
+    model: ReflectanceModel,
+    pixels: Pixels,
+    free: Sequence[str] = (),
+    frame: Tensor | None = None,
+    rounds: int = 40,
+) -> Tensor:
     """One set of parameters (C,) within the model's bounds, by Levenberg-Marquardt from its defaults.
 
     What the pixels do not tell stays at its default: leaving it costs a millionth of the images' power per unit of the
     unbounded parameter. That also keeps the fit from wandering along valleys, in which rounding would choose the place.
+
+    free : the parameters that may leave their defaults; all where empty
+    frame : (N,) int64, the images of which the pixels are, where each has an unknown gain and offset: the best in every round
     """
     names = [p.name for p in model.parameters]
+    free = free or names
+    default = {p.name: torch.tensor(p.default, dtype=torch.float64) for p in model.parameters}
+
+    def values(raw: Tensor) -> dict[str, Tensor]:
+        return default | dict(zip(free, model.constrain(raw, 0, free), strict=True))
 
     def render(raw: Tensor) -> Tensor:
-        values = dict(zip(names, model.constrain(raw, 0), strict=True))
-        return masked_radiance_factor(model, values, pixels.angles) * pixels.light
+        return masked_radiance_factor(model, values(raw), pixels.angles) * pixels.light
 
-    home = model.unconstrain(torch.tensor([p.default for p in model.parameters], dtype=torch.float64), 0).clamp(-8, 8)
+    home = model.unconstrain(torch.stack([default[name] for name in free]), 0, free).clamp(-8, 8)
     tie = 1e-6 * pixels.image.square().sum()
     raw, damping = home, 1e-3
-    error = pixels.image - render(raw)
+    gain, error = _residual(render(raw), pixels.image, frame)
     loss = error.square().sum()
     for _ in range(rounds):
-        columns = _slopes(render, raw)
+        # products and sums instead of BLAS, whose sums hang on where arrays lie in memory
+        columns = _slopes(render, raw) * gain
         normal = torch.stack([(columns * c).sum(dim=1) for c in columns]) + tie * torch.eye(len(raw))
         slope = (columns * error).sum(dim=1) - tie * (raw - home)
         gained = 0.0
         for _ in range(8):
             step = torch.linalg.solve(normal + damping * torch.diag(normal.diagonal()), slope)
             moved = (raw + step).clamp(-12, 12)
-            error_there = pixels.image - render(moved)
+            gain_there, error_there = _residual(render(moved), pixels.image, frame)
             loss_there = error_there.square().sum() + tie * (moved - home).square().sum()
             if loss_there < loss:
                 gained = float((loss - loss_there) / loss)
-                raw, error, loss, damping = moved, error_there, loss_there, damping / 5
+                raw, gain, error, loss, damping = moved, gain_there, error_there, loss_there, damping / 5
                 break
             damping *= 5
         if gained < 1e-7:
             break
-    return model.constrain(raw, 0).float()
+    return torch.stack([values(raw)[name] for name in names]).float()
+
+
+def _residual(rendered: Tensor, image: Tensor, frame: Tensor | None) -> tuple[Tensor, Tensor]:
+    """(the gain of each pixel's image, or 1; what is left), with the best gain and offset of each image where unknown."""
+    if frame is None:
+        return torch.ones(()), image - rendered
+    count = torch.bincount(frame).clamp(min=1)
+
+    def centred(values: Tensor) -> tuple[Tensor, Tensor]:
+        mean = torch.bincount(frame, values) / count
+        return mean, values - mean[frame]
+
+    (mean, x), (_, y) = centred(rendered), centred(image)
+    variance, covariance = (torch.bincount(frame, x * other) / count for other in (x, y))
+    told = variance > 1e-12 * mean.square()  # a constant rendering says nothing of a gain
+    gain = torch.where(told, covariance / torch.where(told, variance, 1), 0)[frame]
+    return gain, y - gain * x
 
 
 def _slopes(render: Callable[[Tensor], Tensor], raw: Tensor, step: float = 1e-5) -> Tensor:

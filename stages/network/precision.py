@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from schemas.errors import ConfigError
-from stages.network.cpu.mapper import Mapper
+from stages.network.mapper import Mapper
 from stages.network.predictor import Predictor
 
 CLOSE = 0.02  # of a coefficient's spread: what bf16 may cost in inference
@@ -52,10 +52,10 @@ def choose_inference_precision(predictor: Predictor, sample: NDArray[np.float32]
 def _coefficients(predictor: Predictor, device: torch.device, precision: str, sample: NDArray) -> NDArray[np.float32]:
     """(C, H, W) of a sample that is taken for a whole map."""
     rows, columns = (-(-edge // predictor.net.stride) * predictor.net.stride for edge in sample.shape)
-    continued = np.pad(sample, ((2, rows + 2 - sample.shape[0]), (0, columns - sample.shape[1])), mode="edge")
+    continued = np.pad(sample, ((0, rows - sample.shape[0]), (0, columns - sample.shape[1])), mode="edge")
 
     def terrain(first: int, last: int, left: int, right: int) -> NDArray:
-        return np.ascontiguousarray(continued[first + 2 : last + 2, left:right])
+        return np.ascontiguousarray(continued[first:last, left:right])
 
     found = Mapper(predictor, device, precision).strips(terrain, sample.shape, (0, 0, *sample.shape))
     return np.concatenate([values for _, values in found], axis=1)

@@ -54,9 +54,7 @@ def render_map(
                 tags = {TIFF_TAG if k == "record" else k: v for k, v in facts.items()}
                 partial = stack.enter_context(atomic_path(named[suffix]))
                 tif = stack.enter_context(MapTiff(partial, grid, bands, tags, units))
-        rows = max(
-            32, min(BAND_ROWS, BAND_PX // grid.width // 16 * 16)
-        )  # EXR packs 16 rows together, a GeoTIFF's levels 8
+        rows = max(32, min(BAND_ROWS, BAND_PX // grid.width // 16 * 16))  # EXR packs 16 rows together
         for row in range(0, grid.height, rows):
             progress(row, grid.height, "rows")
             height = min(rows, grid.height - row)

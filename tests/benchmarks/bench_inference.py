@@ -29,7 +29,7 @@ from schemas import CHECKPOINT, ArtefactWriter
 from stages.common.memory import keep_freed_memory
 from stages.infer.terrain import TerrainReader
 from stages.network.coefficient_maps import CoefficientMaps
-from stages.network.cpu.mapper import Mapper
+from stages.network.mapper import Mapper
 from stages.network.predictor import Predictor, write_state
 from stages.network.unet import DROPOUT, WIDTHS, UNet
 from stages.physics.photometry import get_model
@@ -85,7 +85,7 @@ def write_inputs(folder: Path) -> tuple[Path, Path]:
     nn.init.normal_(predictor.net.head.weight, 0, 0.1)
     attributes = {
         "model": "M2", "coefficients": '["a", "b", "c"]', "elevation_scale_m": 10.0, "output_scale": 0.03, "gsd_m": 5.0,
-        "body_radius_m": 1737400.0, "maps": '["a", "b", "c"]', "globals": "{}", "positive": np.int32(0), "image_units": "iof", "best_epoch": np.int32(1), "start": "{}", "precision": "fp32",
+        "body_radius_m": 1737400.0, "maps": '["a", "b", "c"]', "globals": "{}", "positive": np.int32(0), "deviations": np.int32(0), "image_units": "iof", "best_epoch": np.int32(1), "start": "{}", "precision": "fp32",
     }  # fmt: skip
     config = {"widths": WIDTHS, "dropout": DROPOUT}
     with ArtefactWriter(
