@@ -86,10 +86,10 @@ def test_errors_are_those_over_images_where_these_are_larger(answers):
     state = answers[2]
     errors = dict(state.causes[0].errors)
     state.causes[0].errors = dict.fromkeys(errors, 0.0)
-    errors_over_images(state)
+    errors_over_images(state, view)
     over_images = dict(state.causes[0].errors)
     state.causes[0].errors = dict.fromkeys(errors, 99.0)
-    errors_over_images(state)
+    errors_over_images(state, view)
     assert all(0 < v < 4 for v in over_images.values())
     assert set(state.causes[0].errors.values()) == {99.0}
     state.causes[0].errors = errors

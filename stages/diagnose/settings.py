@@ -54,5 +54,6 @@ TRIED = 8  # candidates per look whose held-out gain is computed, the most surpr
 TRIES = 6  # candidates per look that are fitted before the search ends: of real data three or four turn out ordinary
 SIMPLER = 0.8  # of the gain of values per frame, with which one value for all is preferred
 NOTABLE = 0.01  # of the weighted squares: an impossible fit that gains so much is structure
-STEPS = 6  # Gauss-Newton steps at most
+STEPS = 10  # Gauss-Newton steps at most
+LONGEST = 16.0  # times a Gauss-Newton step, where steps do not get shorter
 SETTLED = 0.1  # standard errors: a smaller move is the last

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.weigh import Whole
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.settings import SETTLED, STEPS
+from stages.diagnose.settings import LONGEST, SETTLED, STEPS
 from stages.effects import Survey, get_effect
 
 
@@ -44,10 +44,10 @@ def refine(state: State, view: View) -> View:
     view : at nearly the same values: what it has of other effects is not rendered again
     """
     look: View | None = None
-    least, share = math.inf, 1.0  # squares left at the best values so far, and how much of a step is gone
+    least, share, last = math.inf, 1.0, math.inf  # squares left at the best values so far, share of a step, errors of the last one
     best = [(c.effect, dict(c.errors), c.rms) for c in state.causes]
+    state.fit()  # from here on the coefficients move along as columns
     for _ in range(STEPS):
-        state.fit()
         now = state.again(view, along(state, view), look.model if look else None)
         left = _left(now)
         if look is not None and abs(left - least) < SETTLED:
@@ -60,8 +60,12 @@ def refine(state: State, view: View) -> View:
             look, least = now, left
             best = [(c.effect, dict(c.errors), c.rms) for c in state.causes]
         assert look is not None
-        if _step(state, look, share) < SETTLED:
+        moved = _step(state, look, share)
+        if moved < SETTLED:
             break
+        if look is now:  # steps that do not get shorter are too short: the squares are no parabola
+            share = min(2 * share, LONGEST) if moved > 0.5 * last else share
+            last = moved
     state.fit()
     assert look is not None
     return look

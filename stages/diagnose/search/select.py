@@ -91,6 +91,11 @@ def search(state: State, most: int) -> Outcome:
         if not taken:
             break
     settle(state, view)
+    while doubted := [(c, why) for c in state.causes[::-1] if (why := doubt(state, c))]:  # what was found last stands on the rest
+        cause, why = doubted[0]
+        state.causes.remove(cause)
+        out.rejected[cause.effect.name] = cause.found.gain, f"fitted with everything else {why}"
+        settle(state, view)
     for cause in state.causes:
         out.rejected.pop(cause.effect.name, None)
     return out

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numba import njit
+from numpy.typing import NDArray
 from torch import Tensor
 
 
@@ -24,8 +25,7 @@ def displace(image: Tensor, east: Tensor, south: Tensor) -> Tensor:
     east, south = east.expand_as(image), south.expand_as(image)
     if image.dtype == torch.float32 and image.device.type == "cpu" and not _has_gradient(image, east, south):
         moved = torch.empty(image.shape)
-        pixels, right, down = (t.float().contiguous().numpy() for t in (image, east, south))
-        _displace(pixels, right, down, moved.numpy())
+        _displace(_array(image), _array(east), _array(south), moved.numpy())
         return moved
     return sampled(image, east, south)
 
@@ -42,6 +42,10 @@ def sampled(image: Tensor, east: Tensor, south: Tensor) -> Tensor:
             along = along + across * flat.gather(1, (row * width + column).flatten(1)).view(image.shape)
         moved = moved + high * along
     return moved
+
+
+def _array(field: Tensor) -> NDArray[np.float32]:
+    return field.float().contiguous().numpy()
 
 
 def _has_gradient(*tensors: Tensor) -> bool:
