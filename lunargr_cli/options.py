@@ -96,7 +96,7 @@ GeoTiff = Annotated[
     Writes.FILE,
 ]
 NoGeoTiff = Annotated[
-    bool, typer.Option("--no-geotiff", help="Write the HDF5 map only: on large maps a quarter of the time less.")
+    bool, typer.Option("--no-geotiff", help="Write the HDF5 map only: on large maps a seventh of the time less.")
 ]
 # Of `train` and `compare`
 Epochs = Annotated[int, typer.Option("--epochs", min=1, max=100_000, help="Passes over the training pairs.")]

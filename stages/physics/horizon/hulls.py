@@ -286,12 +286,7 @@ def _by_columns(
             )  # fmt: skip
 
 
-# Small grids are swept by the calling thread alone: no start-up cost, and safe in worker processes and threads.
-_KERNELS = {
-    (columns, parallel): kernel
-    for columns, function in ((False, _by_rows), (True, _by_columns))
-    for parallel, kernel in compile_kernels(function).items()
-}
+_KERNELS = compile_kernels(_by_rows, _by_columns)
 
 
 def sweep_horizon(

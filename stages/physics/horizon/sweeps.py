@@ -100,15 +100,20 @@ def strip_width(lines: int, aim: int) -> int:
     return -(-lines // strips)
 
 
-def compile_kernels(function: Callable[..., None]) -> dict[bool, Any]:
-    """The kernel for one thread (False) and for all (True), cached on disk.
+def compile_kernels(by_rows: Callable[..., None], by_columns: Callable[..., None]) -> dict[tuple[bool, bool], Any]:
+    """(by columns, on all threads) -> the kernel of a sweep, cached on disk.
 
+    Small grids are swept by the calling thread alone: no start-up cost, and safe in worker processes and threads.
     Numba's cache tells functions apart by name and code, not by options: under one name the kernel for all threads
     would be read back as the one for one thread. The second goes by another name.
     """
-    twin = FunctionType(function.__code__, function.__globals__, f"{function.__name__}_parallel")
-    twin.__qualname__, twin.__module__ = twin.__name__, function.__module__
-    return {False: numba.njit(cache=True)(function), True: numba.njit(parallel=True, cache=True)(twin)}
+    kernels = {}
+    for columns, function in ((False, by_rows), (True, by_columns)):
+        twin = FunctionType(function.__code__, function.__globals__, f"{function.__name__}_parallel")
+        twin.__qualname__, twin.__module__ = twin.__name__, function.__module__
+        kernels[columns, False] = numba.njit(cache=True)(function)
+        kernels[columns, True] = numba.njit(parallel=True, cache=True)(twin)
+    return kernels
 
 
 @dataclass(frozen=True)
