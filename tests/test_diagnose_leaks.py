@@ -14,7 +14,7 @@ from test_diagnose import _pairs, scene  # noqa: F401
 
 from schemas.files.outputs import Output
 from stages import diagnose
-from stages.diagnose.likelihood.products import without_frames
+from stages.diagnose.likelihood.products import Rows, products
 from stages.diagnose.result.score import unconfirmed
 from stages.diagnose.search.refine import errors_over_images
 from stages.effects import get_effect
@@ -82,9 +82,9 @@ def test_the_test_pairs_take_a_name_back(answers):
 
 
 def test_errors_are_those_over_images_where_these_are_larger(answers):
-    """Leaving out images is leaving out their rows; what is left is what it was."""
     state = answers[2]
     errors = dict(state.causes[0].errors)
+    view = state.look(["image_gain"], 0)
     state.causes[0].errors = dict.fromkeys(errors, 0.0)
     errors_over_images(state, view)
     over_images = dict(state.causes[0].errors)
@@ -93,9 +93,23 @@ def test_errors_are_those_over_images_where_these_are_larger(answers):
     assert all(0 < v < 4 for v in over_images.values())
     assert set(state.causes[0].errors.values()) == {99.0}
     state.causes[0].errors = errors
-    row = state.look(["image_gain"], 0).rows[0]
-    gone = int(row.patch.frames[0])
-    fewer = without_frames(row, [gone])
-    assert gone not in fewer.patch.frames and len(fewer.patch.frames) == len(row.patch.frames) - 1
-    torch.testing.assert_close(fewer.shared, row.shared[:, 1:])
-    assert without_frames(row, row.patch.frames.tolist()) is None
+
+
+def test_leaving_out_images_is_leaving_out_their_rows(answers):
+    """The Schur complement of the precision gives what the rows of the other images alone give."""
+    state = answers[2]
+    view = state.look(["image_gain"], 0)
+    row = next(r for r in view.rows if len(r.patch.frames) > 2)
+    gone = [int(f) for f in row.patch.frames[:2]]
+    by_schur = products(row, view.model, view.grid, state.frames, None, [gone])
+    kept = torch.tensor([int(f) not in gone for f in row.patch.frames])
+    of_patch = ("images", "weight", "scale", "slopes", "level", "frames", "dark")
+    patch = replace(row.patch, **{name: getattr(row.patch, name)[kept] for name in of_patch})
+    of_rows = ("shared", "shared_mean", "own", "own_mean", "shared_dark", "own_dark")
+    fewer = Rows(patch, **{name: getattr(row, name)[:, kept] for name in of_rows})
+    plain = products(fewer, view.model, view.grid, state.frames)
+    there = np.isin(by_schur.place, plain.place)
+    scale = np.sqrt(np.outer(plain.gram.diagonal(), plain.gram.diagonal())).clip(1e-20)
+    without = by_schur.without(0).gram
+    assert (np.abs(without[np.ix_(there, there)] - plain.gram) / scale).max() < 2e-5
+    assert not without[~there].any()

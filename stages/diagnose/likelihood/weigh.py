@@ -13,12 +13,10 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.special import gammaincc, gammaln
 
 from stages.diagnose.likelihood.jackknife import FRACTION, jackknife_error, student
-from stages.diagnose.likelihood.products import Products
+from stages.diagnose.likelihood.products import Array, Products
 from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.settings import DRIFTING, FOLDS, LEVELS, UNITS
 from stages.effects import get_effect
-
-Array = NDArray[np.float64]
 
 
 @dataclass

@@ -91,7 +91,9 @@ def search(state: State, most: int) -> Outcome:
         if not taken:
             break
     settle(state, view)
-    while doubted := [(c, why) for c in state.causes[::-1] if (why := doubt(state, c))]:  # what was found last stands on the rest
+    while doubted := [
+        (c, why) for c in state.causes[::-1] if (why := doubt(state, c))
+    ]:  # what was found last stands on the rest
         cause, why = doubted[0]
         state.causes.remove(cause)
         out.rejected[cause.effect.name] = cause.found.gain, f"fitted with everything else {why}"
