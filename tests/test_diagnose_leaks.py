@@ -83,16 +83,14 @@ def test_the_test_pairs_take_a_name_back(answers):
 
 def test_errors_are_those_over_images_where_these_are_larger(answers):
     state = answers[2]
-    errors = dict(state.causes[0].errors)
-    view = state.look(["image_gain"], 0)
-    state.causes[0].errors = dict.fromkeys(errors, 0.0)
-    errors_over_images(state, view)
-    over_images = dict(state.causes[0].errors)
-    state.causes[0].errors = dict.fromkeys(errors, 99.0)
-    errors_over_images(state, view)
-    assert all(0 < v < 4 for v in over_images.values())
-    assert set(state.causes[0].errors.values()) == {99.0}
-    state.causes[0].errors = errors
+    cause = state.causes[0]
+    kept = dict(cause.over_images), dict(cause.errors)
+    errors_over_images(state, state.look(["image_gain"], 0))
+    assert 0 < cause.over_images["error_deg"] < 4
+    for ground, images in ((1.0, 2.0), (3.0, 2.0)):
+        cause.errors, cause.over_images = {"error_deg": ground}, {"error_deg": images}
+        assert cause.reported_errors == {"error_deg": max(ground, images)}
+    cause.over_images, cause.errors = kept
 
 
 def test_leaving_out_images_is_leaving_out_their_rows(answers):

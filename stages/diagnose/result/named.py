@@ -30,7 +30,7 @@ def by_search(state: State) -> list[Named]:
         units = {p.name: p.unit for p in cls.parameters}
         if cls.scope == "scene":
             values = {k: float(v) for k, v in cause.effect.values.items()}
-            found = cls.report(values, cause.errors)
+            found = cls.report(values, cause.reported_errors)
         else:
             found = {cls.parameters[0].name: (cause.rms, cause.errors.get("rms", math.inf))}
         low, high = interval(cause.found.gains)

@@ -99,7 +99,7 @@ def along(state: State, view: View) -> list[str]:
 
 
 def errors_over_images(state: State, view: View) -> None:
-    """Raise the errors of scene-wide values to those of a jackknife over images.
+    """Errors of scene-wide values by a jackknife over images.
 
     What is wrong with the law goes with an image's geometry and is the same on all ground: leaving out ground does not show it.
     """
@@ -114,8 +114,7 @@ def errors_over_images(state: State, view: View) -> None:
             left.append(_amounts(state, whole, places, [place for place, _, _ in owned])[0])
     if len(left) > 1:
         for (place, name, _), error in zip(owned, jackknife_error(np.array(left)), strict=True):
-            errors = state.causes[place].errors
-            errors[name] = max(errors.get(name, 0.0), float(error))
+            state.causes[place].over_images[name] = float(error)
 
 
 def _scene_places(view: View) -> tuple[NDArray[np.int64], list[tuple[int, str, float]]]:

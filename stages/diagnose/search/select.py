@@ -11,13 +11,14 @@ import numpy as np
 import torch
 
 from stages.diagnose.likelihood.covariance import Covariance
+from stages.diagnose.likelihood.jackknife import FRACTION, student
 from stages.diagnose.likelihood.products import Products, Rows, products
 from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.search.tested import hidden_rows
-from stages.diagnose.settings import DISCOVERY, FAINT, NOTABLE, SIMPLER, SURE, TRIED, TRIES
+from stages.diagnose.settings import DISCOVERY, FAINT, FOLDS, NOTABLE, SIMPLER, SURE, TRIED, TRIES
 from stages.effects import Effect, get_effect
 
 TOO_FEW = "it takes more images"
@@ -228,6 +229,12 @@ def doubt(state: State, cause: Cause) -> str:
     sizes = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in cause.errors.items() if n not in cls.shaped]
     if math.sqrt(sum(s * s for s in sizes)) < SURE:
         return f"it comes out {math.sqrt(sum(s * s for s in sizes)):.1f} errors from nothing"
+    away = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in cause.over_images.items() if n not in cls.shaped]
+    groups = min(FOLDS, state.frames)
+    if away and math.hypot(*away) < student.ppf(0.5 + FRACTION / 2, groups - 1):
+        return (
+            f"other images give it other values: it comes out {math.hypot(*away):.1f} errors over images from nothing"
+        )
     for name, least in cls.tolerance.items():
         size = cls.size(values) if name not in values else abs(values[name] - cls.null()[name])
         if size - 2 * cause.errors.get(name, 0.0) < least:

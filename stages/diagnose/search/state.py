@@ -29,6 +29,7 @@ class Cause:
     effect: Effect
     found: Found
     errors: dict[str, float] = field(default_factory=dict)
+    over_images: dict[str, float] = field(default_factory=dict)  # errors by leaving out images
     rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)
     gain_percent: float = float("nan")
@@ -36,6 +37,11 @@ class Cause:
     gain_high: float = float("nan")
     rms_before: float = float("nan")
     rms_after: float = float("nan")
+
+    @property
+    def reported_errors(self) -> dict[str, float]:
+        """The larger ones of either."""
+        return {k: max(e, self.over_images.get(k, 0.0)) for k, e in self.errors.items()}
 
 
 @dataclass
