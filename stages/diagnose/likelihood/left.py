@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
+from scipy.ndimage import median_filter
 from scipy.stats import gamma
+from torch import Tensor
 
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.products import Rows, whitened_residual
 from stages.diagnose.rows.patches import Grid
 from stages.diagnose.settings import PEAK
+
+NEAR, FAR = 1.5, 4  # waves: a window's leakage ends before, a line is alone within
 
 
 def budget(rows: list[Rows], model: Covariance, grid: Grid, before: float, after: float) -> dict[str, float]:
@@ -52,7 +57,8 @@ def peak(rows: list[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[
         level = torch.zeros(grid.annuli, dtype=torch.float64)
         for a in range(grid.annuli):
             level[a] = p[grid.annulus == a].median()
-        ratio = (p / level[grid.annulus].clamp(min=1e-30))[fine]
+        ratio = p / level[grid.annulus].clamp(min=1e-30)
+        ratio = (ratio / _about(ratio, grid).clamp(min=1))[fine]
         top = float(ratio.max())
         shape = max(float(n), 1.0)
         middle = float(gamma.median(shape))
@@ -61,6 +67,18 @@ def peak(rows: list[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[
         if top > PEAK and chance > best:
             best, largest = chance, float((p[fine] * (ratio > PEAK)).sum() / p.sum())
     return best, largest
+
+
+def _about(power: Tensor, grid: Grid) -> Tensor:
+    """(K,) median power of the waves some way off each one: slanting light and optics make power go with direction, in no line."""
+    columns = grid.width // 2 + 1
+    row, column = grid.keep // columns, grid.keep % columns
+    plane = np.full((grid.height, grid.width), float(power.median()))
+    plane[row, column] = power
+    plane[-row % grid.height, -column % grid.width] = power
+    y, x = np.ogrid[-FAR : FAR + 1, -FAR : FAR + 1]
+    ring = (np.hypot(y, x) <= FAR) & (np.hypot(y, x) > NEAR)
+    return torch.from_numpy(median_filter(plane, footprint=ring, mode="wrap")[row, column])
 
 
 __all__ = ["budget", "peak"]
