@@ -165,14 +165,12 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         errors_over_images(state, look)
         why = _doubt_any(state, cause)
     if not why:
-        gains, total, tested, unseen = secant_gains(state, cause, look)
+        gains, total, tested = secant_gains(state, cause, look)
         low, high = interval(gains)
         cause.gain_percent, cause.gain_low, cause.gain_high = (200 * x / total for x in (float(gains.sum()), low, high))
         cause.found = dataclasses.replace(cause.found, gains=gains)
         if low <= 0:
             why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
-        if not why and unseen < 0:
-            why = f"images that it was not fitted to contradict it: it gains {unseen:.3g} nats there"
         why = why or contradicted(tested)
     if why:
         state.causes[:] = causes
@@ -242,9 +240,9 @@ def doubt(state: State, cause: Cause) -> str:
     return ""
 
 
-def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, float, np.ndarray, float]:
+def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, float, np.ndarray]:
     """Nats that the cause, as it was rendered, gains beside everything else: on held-out ground, (labels,); the squares without it; its
-    gains on the test pairs; and on images that were left out.
+    gains on the test pairs.
 
     Effects with many values keep the gain that their columns had on held-out ground: one amount for all would not be held out.
     """
@@ -252,7 +250,6 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
     few = 1 + sum(n.startswith("coefficient") for n in look.plan.shared)
     flat = Covariance.white(look.grid.annuli, state.frames)
     alone = type(cause.effect).scope == "scene" and len(cause.found.guise.columns) == 1
-    groups = state.image_groups(look.rows) if alone else []
     pieces = [
         more
         for k, chain in enumerate(state.chains())
@@ -260,17 +257,13 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
     ]
     plain = [products(_few(more, few), flat, look.grid, state.frames).gram for more in pieces]
     cause.rms_before, cause.rms_after = _rms(np.sum(plain, 0), look)
-    units = [products(more, look.model, look.grid, state.frames, None, groups) for more in pieces]
+    units = [products(more, look.model, look.grid, state.frames) for more in pieces]
     whole = _beside(units, cause, look, state.frames)
     total = float(whole.gram[0, 0])
     if not alone:
-        return cause.found.gains, total, np.zeros(0), 0.0
+        return cause.found.gains, total, np.zeros(0)
     form = list(whole.form_places()) if type(cause.effect).of_law else []
     place = np.array([whole.first - 1])
-    unseen = 0.0
-    for g in range(len(groups)):
-        rest = _beside([u.without(g) for u in units], cause, look, state.frames)
-        unseen += rest.gains_on([dataclasses.replace(u, gram=u.images[g]) for u in units], place, form).sum()
     tested = [
         products(more, look.model, look.grid, state.frames)
         for chain, rows in hidden_rows(state, look.plan)
@@ -280,7 +273,7 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
     grounds = [u.ground for u in tested]
     if len(set(grounds)) >= 3:  # else pieces of ground, where there are too few grounds for an interval
         gains = np.bincount(grounds, weights=gains).astype(np.float64)
-    return whole.held_out(place, form), total, gains, unseen
+    return whole.held_out(place, form), total, gains
 
 
 def _few(rows: Rows, count: int) -> Rows:
