@@ -55,5 +55,6 @@ TRIES = 6  # candidates per look that are fitted before the search ends: of real
 SIMPLER = 0.8  # of the gain of values per frame, with which one value for all is preferred
 NOTABLE = 0.01  # of the weighted squares: an impossible fit that gains so much is structure
 STEPS = 10  # Gauss-Newton steps at most
+SHORTEST = 0.1  # of a Gauss-Newton step: where that does not help either, the values stay
 LONGEST = 16.0  # times a Gauss-Newton step, where steps do not get shorter
 SETTLED = 0.1  # standard errors: a smaller move is the last

@@ -80,6 +80,7 @@ class Effect(ABC):
     never_named  judged by a step of its own: registration, or a histogram
     leans        ... and displaces relief by its height, not images as a whole
     keep_below   what is brighter than this times a level that was read off says nothing more
+    one_sided    a fixed coordinate by whose sign it is told from what is alike on both sides
     of_law       another form of the reflectance law could do the same: it is a cause only where that form has nothing to add
     table        where values per image (or site) stand in diagnosis.h5, and the name of their second dimension
     linear       whether the image is linear in the coordinates: the first estimate needs no second one
@@ -107,6 +108,7 @@ class Effect(ABC):
     scatters: ClassVar[bool] = False
     never_named: ClassVar[bool] = False
     leans: ClassVar[bool] = False
+    one_sided: ClassVar[str] = ""
     of_law: ClassVar[bool] = False
     keep_below: ClassVar[float] = 1.0
     table: ClassVar[tuple[str, str | None] | None] = None

@@ -36,6 +36,7 @@ class Echo(Effect):
     )
     coordinates = (*parameters, Parameter("axis", "1", 0.0, 1.0, 0.0, "0 along samples, 1 along lines"))
     strong: ClassVar = {"fraction": 0.05}
+    one_sided: ClassVar = "lag_px"  # blur and relief that the DEM has not are alike before and behind
     tolerance: ClassVar = {"fraction": 0.003}
 
     @classmethod
@@ -51,8 +52,8 @@ class Echo(Effect):
 
     @classmethod
     def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
-        """Nearer, an echo is not told from blur and soft shadows."""
-        return abs(values["lag_px"]) >= CLEAR_LAG
+        """Nearer, an echo is not told from blur, soft shadows and relief that the DEM has not, all of which are some 4 px wide."""
+        return abs(values["lag_px"]) > CLEAR_LAG
 
     def apply(self, state: State) -> None:
         observation = state.observation

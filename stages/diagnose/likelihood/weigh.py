@@ -354,15 +354,19 @@ def weigh_all(whole: Whole) -> tuple[dict[str, Found], Array]:
     """The best guise of every effect with its family-wise p, and the largest surprise of every sham."""
     best: dict[str, Found] = {}
     null: dict[str, Array] = {}
-    for guise in whole.plan.guises:
-        if (
-            get_effect(guise.effect).never_named
-            or not len(whole.places(guise))
-            or not whole.seen[whole.places(guise)].all()
-        ):
-            continue
-        found, shams = whole.weigh(guise)
+    every = [
+        (guise, *whole.weigh(guise))
+        for guise in whole.plan.guises
+        if not get_effect(guise.effect).never_named
+        and len(whole.places(guise))
+        and whole.seen[whole.places(guise)].all()
+    ]
+    others = {_look(guise): (found.surprise, shams) for guise, found, shams in every}
+    for guise, found, shams in every:
         e = guise.effect
+        if get_effect(e).one_sided:
+            alike, by_chance = others.get(_look(guise, -1), (0.0, np.zeros(1)))
+            found.surprise, shams = max(found.surprise - alike, 0.0), np.maximum(shams - by_chance, 0.0)
         null[e] = np.maximum(null[e], shams) if e in null else shams
         if e not in best or found.surprise > best[e].surprise:
             best[e] = found
@@ -372,6 +376,13 @@ def weigh_all(whole: Whole) -> tuple[dict[str, Found], Array]:
     for found in best.values():
         found.p = (1 + float((largest >= found.surprise).sum())) / (1 + len(largest))
     return best, largest
+
+
+def _look(guise: Guise, sign: int = 1) -> tuple[object, ...]:
+    """What tells a guise from the others of its effect; or the same on the other side."""
+    side = get_effect(guise.effect).one_sided
+    fixed = ((k, sign * v if k == side else v) for k, v in sorted(guise.trial.fixed.items()))
+    return guise.effect, *fixed, *(tuple(sorted(c.items())) for c in guise.trial.columns)
 
 
 def _surprise(ratio: Array, freedom: int) -> Array:

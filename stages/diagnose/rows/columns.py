@@ -123,7 +123,7 @@ def shared_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
 
 def moved_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
     """(1 + steps, n, H, W): the residual, and what a small step of every value of the causes in the chain changes."""
-    out = [chain.site.image - chain.predict()]
+    out = [chain.site.image - chain.rendered]
     for place, coordinate, step in plan.steps:
         effect = chain.base[place]
         moved = type(effect)({**effect.values, coordinate: float(effect.values[coordinate]) + step}, data)

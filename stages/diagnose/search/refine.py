@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.weigh import Whole
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.settings import LONGEST, SETTLED, STEPS
+from stages.diagnose.settings import LONGEST, SETTLED, SHORTEST, STEPS
 from stages.effects import Survey, get_effect
 
 
@@ -60,6 +60,8 @@ def refine(state: State, view: View) -> View:
             share *= 0.5
             for cause, (effect, errors, rms) in zip(state.causes, best, strict=True):
                 cause.effect, cause.errors, cause.rms = effect, dict(errors), rms
+            if share < SHORTEST:
+                break
         else:
             look, least = now, left
             best = [(c.effect, dict(c.errors), c.rms) for c in state.causes]
@@ -68,7 +70,7 @@ def refine(state: State, view: View) -> View:
         if moved < SETTLED:
             break
         if look is now:  # steps that do not get shorter are too short: the squares are no parabola
-            share = min(2 * share, LONGEST) if moved > 0.5 * last else share
+            share = min(2 * share, LONGEST) if moved > max(0.5 * last, 1.0) else share
             last = moved
     state.fit()
     assert look is not None
