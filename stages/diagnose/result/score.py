@@ -136,10 +136,13 @@ def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
         if name not in seen or found is None:
             out.append(name)
             continue
+        assert outcome.view is not None
+        whole = outcome.view.whole
+        if cls.of_law and not len(whole.form_places()):  # a law that is fitted freely follows it
+            out.append(name)
+            continue
         if found.alone >= SURE and name not in outcome.hidden:
             continue
-        whole = outcome.view.whole if outcome.view else None
-        assert whole is not None
         error = math.inf
         for guise in whole.plan.guises:
             if guise.effect != name:
