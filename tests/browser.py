@@ -84,7 +84,7 @@ def _server() -> Iterator[tuple[int, queue.Queue[bytes]]]:
 def run_in_page(page: Path, script: str, *, timeout: float = 180, flags: tuple[str, ...] = ()) -> Any:
     """What the body of an async function returns inside the page, once the page's ``window.lunargr`` is there."""
     program = chromium()
-    with _server() as (port, answers), tempfile.TemporaryDirectory() as profile:
+    with _server() as (port, answers), tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         sender = SENDER.replace("PORT", str(port)).replace("SCRIPT", script)
         copy = Path(profile) / "page.html"
         # the page itself may not speak to anyone: the copy that is tested must
@@ -115,7 +115,7 @@ def _arrays(value: dict[str, Any]) -> Any:
 def read_dom(page: Path, flags: tuple[str, ...] = ("--dump-dom",)) -> str:
     """The page's document after its scripts have run, with nothing in it changed."""
     program = chromium()
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         command = [
             program,
             *FLAGS,
