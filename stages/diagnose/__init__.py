@@ -14,8 +14,8 @@ likelihood    The covariance of the residuals, estimated from them by wavelength
               to), gains and shifts per frame, and ordinary amounts of other effects. Sham residuals, those of other ground
               mirrored and shuffled, say how large the largest of all statistics is when nothing is there.
 search        The effect that gains most on held-out ground, if shams hardly do as well, is rendered at its values and everything is fitted
-              again. It is named if it is real (its own file says what is plausible and what is ordinary) and if its held-out gain is
-              above zero for sure. Then the next.
+              again. It is named if it is real (its own file says what is plausible and what is ordinary), if it is there
+              whichever images are left out, and if its held-out gain is above zero for sure. Then the next.
 result        What is named, how much of the residual is what, what was refused and why, what these data could not have shown.
 
 Whatever is special about one effect stands in its own file under ``stages/effects``; every number set by hand stands in ``settings.py``.

@@ -13,9 +13,7 @@ from torch import Tensor
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.products import Rows, whitened_residual
 from stages.diagnose.rows.patches import Grid
-from stages.diagnose.settings import PEAK
-
-NEAR, FAR = 1.5, 4  # waves: a window's leakage ends before, a line is alone within
+from stages.diagnose.settings import FAR, NEAR, PEAK
 
 
 def budget(rows: list[Rows], model: Covariance, grid: Grid, before: float, after: float) -> dict[str, float]:

@@ -44,11 +44,8 @@ def refine(state: State, view: View) -> View:
     view : at nearly the same values: what it has of other effects is not rendered again
     """
     look: View | None = None
-    least, share, last = (
-        math.inf,
-        1.0,
-        math.inf,
-    )  # squares left at the best values so far, share of a step, errors of the last one
+    least, last = math.inf, math.inf  # squares left at the best values so far, length of the last step
+    share = 1.0  # of a step
     best = [(c.effect, dict(c.errors), c.rms) for c in state.causes]
     state.fit()  # from here on the coefficients move along as columns
     for _ in range(STEPS):

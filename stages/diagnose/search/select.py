@@ -92,10 +92,8 @@ def search(state: State, most: int) -> Outcome:
         if not taken:
             break
     settle(state, view)
-    while doubted := [
-        (c, why) for c in state.causes[::-1] if (why := doubt(state, c))
-    ]:  # what was found last stands on the rest
-        cause, why = doubted[0]
+    while doubted := [(c, why) for c in state.causes if (why := doubt(state, c))]:
+        cause, why = doubted[-1]  # what was found last stands on the rest
         state.causes.remove(cause)
         out.rejected[cause.effect.name] = cause.found.gain, f"fitted with everything else {why}"
         settle(state, view)
@@ -156,7 +154,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     if why := ordinary(first):
         return why
     vector, causes = state.nominal.vector, list(state.causes)
-    saved = [(c, c.effect, dict(c.errors)) for c in causes]
+    saved = [(c, c.effect, dict(c.errors), dict(c.over_images), c.rms) for c in causes]
     cause = Cause(first, found, group=group)
     state.causes.append(cause)
     look = refine(state, view)
@@ -174,8 +172,8 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         why = why or contradicted(tested)
     if why:
         state.causes[:] = causes
-        for c, effect, errors in saved:
-            c.effect, c.errors = effect, errors
+        for c, effect, errors, over_images, rms in saved:
+            c.effect, c.errors, c.over_images, c.rms = effect, errors, over_images, rms
         state.nominal.vector = vector
         state.fit()
     return why
