@@ -18,7 +18,7 @@ from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.diagnose.config import Config
 from stages.diagnose.likelihood.left import budget, peak
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.form import better_form, relative_misfit
+from stages.diagnose.model.form import better_form, other_laws, relative_misfit
 from stages.diagnose.model.nominal import fit, lit_mask, load_nominal
 from stages.diagnose.model.sites import Site, group_pairs, load_site, number_grounds, survey
 from stages.diagnose.registration.explain import explain
@@ -96,8 +96,9 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     frames, units = len(reader.image_ids), reader.units
     cut = by_histogram(sites, units)
     fit(nominal, sites, [], units, [s.read for s in sites], start=True)
+    nominal.laws = other_laws(nominal, sites, units)
     if not config.free and (other := better_form(nominal, sites, units)):
-        answer.form, nominal = other.model.name, other
+        answer.form, nominal = other.model.title, other
         say(f"{config.model} has the wrong form: {answer.form} is fitted in its place")
         fit(nominal, sites, [], units, [s.read for s in sites])
     data = survey(sites, frames, units)

@@ -79,6 +79,7 @@ class Effect(ABC):
     scatters     ... whose ordinary size is estimated from the data
     never_named  judged by a step of its own: registration, or a histogram
     leans        ... and displaces relief by its height, not images as a whole
+    along_lines  ... and displaces the lines of an image against each other
     keep_below   what is brighter than this times a level that was read off says nothing more
     one_sided    a fixed coordinate by whose sign it is told from what is alike on both sides
     of_law       another form of the reflectance law could do the same: it is a cause only where that form has nothing to add
@@ -108,6 +109,7 @@ class Effect(ABC):
     scatters: ClassVar[bool] = False
     never_named: ClassVar[bool] = False
     leans: ClassVar[bool] = False
+    along_lines: ClassVar[bool] = False
     one_sided: ClassVar[str] = ""
     of_law: ClassVar[bool] = False
     keep_below: ClassVar[float] = 1.0

@@ -6,12 +6,19 @@ import math
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from stages.effects.base import Effect, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
 ORDERS = (1, 2, 3)
+
+
+def line_waves(height: int) -> Tensor:
+    """(len(ORDERS), height): cosines over the lines, of mean square 1."""
+    u = (torch.arange(height) + 0.5) / height
+    return math.sqrt(2) * torch.cos(math.pi * torch.tensor(ORDERS)[:, None] * u)
 
 
 @register
@@ -21,6 +28,8 @@ class LineJitter(Effect):
     scope = "image"
     table = ("line_jitter_px", "mode")
     displaces = True
+    never_named = True
+    along_lines = True
     relative = True
     title = "lines shifted against each other"
     mechanism = (
@@ -40,12 +49,10 @@ class LineJitter(Effect):
     tolerance: ClassVar = {"rms_px": 0.15}
 
     def apply(self, state: State) -> None:
-        height = state.elevation.shape[-2]
-        u = (torch.arange(height, dtype=state.elevation.dtype) + 0.5) / height
         none = torch.zeros(())
         east, south = state.displacement or (none, none)
-        for k in ORDERS:
-            wave = math.sqrt(2) * torch.cos(math.pi * k * u)[:, None]
+        waves = line_waves(state.elevation.shape[-2]).to(state.elevation)[:, :, None]
+        for k, wave in zip(ORDERS, waves, strict=True):
             east = east + self.value(f"east{k}_px", state) * wave
             south = south + self.value(f"south{k}_px", state) * wave
         state.displacement = (east, south)

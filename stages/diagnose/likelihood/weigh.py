@@ -73,6 +73,11 @@ class Whole:
             self.gram[np.ix_(u.place, u.place)] += u.gram
             self.sham[u.place] += u.sham
             self.sham_squares += u.sham_squares
+        for k, at in plan.pull.items():  # what is known of a coefficient beforehand, as one more observation
+            weight = plan.prior[k] ** -2
+            self.gram[0, 0] += weight * at**2
+            self.gram[0, 1 + k] -= weight * at
+            self.gram[1 + k, 0] -= weight * at
         self.seen = self.gram.diagonal() > 1e-12 * max(self.gram.diagonal().max(), 1e-30)
         self.scattered = np.zeros(0, np.int64)  # places of the gains per frame
         self.precision = self._precision()

@@ -9,16 +9,16 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from stages.diagnose.model.laws import LunarLaws
 from stages.diagnose.model.sites import Site
 from stages.effects import Effect
 from stages.effects.filters import gradients
 from stages.physics.formation import chain as formation
 from stages.physics.formation import geometry
 from stages.physics.formation.chain import State
-from stages.physics.photometry import ReflectanceModel, get_model, masked_radiance_factor
+from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
 
 STEP = 0.02  # of a slope, as tangent
-RICH = "kernels"  # the model that follows any smooth law
 SCATTER = 0.14  # 8 deg: rms slope of relief below a typical DEM's resolution
 
 
@@ -53,7 +53,7 @@ class Chain:
     """Renders a site with the effects named so far (``base``) plus one more.
 
     coefficients : broadcastable to (n, C, H, W). moved : effects that the site's images are rid of; free : coefficients
-    that may move, None for all
+    that may move, None for all; laws : the directions in which the law may be another one
     """
 
     def __init__(
@@ -64,10 +64,11 @@ class Chain:
         base: Sequence[Effect],
         moved: Sequence[Effect] = (),
         free: Tensor | None = None,
+        laws: LunarLaws | None = None,
     ) -> None:
         self.site, self.model, self.coefficients, self.base = site, model, coefficients, list(base)
         self.moved = list(moved)
-        self.free = free
+        self.free, self.laws = free, laws
         self._measured = torch.where(site.valid, site.image, torch.nan)
         self._sharp = SharpSlopes(site.observation.gsd, site.observation.body_radius)
         self._state = self._illuminate(self.base)
@@ -146,25 +147,15 @@ class Chain:
             columns.append((shifted - self.rendered) / step)
         return columns
 
-    @property
-    def free_form(self) -> bool:
-        """Whether the nominal model is the sum of kernels itself."""
-        return self.model.name == RICH
-
     def form_tangents(self) -> list[Tensor]:
-        """d image / d coefficient of a sum of kernels that stands beside the nominal model, (n, H, W) each."""
-        if self.free_form:
+        """What another law of the ground adds, (n, H, W) for a standard deviation in each direction in which measured laws differ."""
+        if self.laws is None or isinstance(self.model, LunarLaws):
             return []
-        rich = get_model(RICH)
-        zero = torch.zeros(1, len(rich.parameters), 1, 1)
         out = []
-        for k in range(len(rich.parameters)):
-            c = zero.clone()
-            c[:, k] = 1.0
-            surface = masked_radiance_factor(rich, rich.unpack(c, dim=1), self._state.angles)
-            step = 0.02 * self._state.reflectance.mean() / surface.mean().abs().clamp(min=1e-9)
-            more = self._expose(self._state, self._state.reflectance + step * surface, self.base)
-            out.append(more - self.rendered)
+        parts = self.laws.parts(self._state.angles)
+        for part, size in zip(parts[1:], self.laws.scatter[1:], strict=True):
+            more = self._state.reflectance * (part / parts[0].clamp(min=1e-9) * size)
+            out.append(self._expose(self._state, self._state.reflectance + more, self.base) - self.rendered)
         return out
 
     @cached_property

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from stages.diagnose.model.nominal import Nominal, fit, lit_mask, load_nominal
-from stages.diagnose.model.parallel import per_site
-from stages.diagnose.model.sites import Site
-from stages.diagnose.settings import GROSS, HALVED
+import torch
 
-LUNAR = ("kernels", "hapke")  # a sum of kernels that follows any smooth law, and the physical one
+from stages.diagnose.model.laws import LunarLaws, lunar_laws
+from stages.diagnose.model.nominal import Nominal, fit, lit_mask
+from stages.diagnose.model.parallel import per_site
+from stages.diagnose.model.sampled import draw
+from stages.diagnose.model.sites import Site
+from stages.diagnose.settings import HALVED
 
 
 def relative_misfit(nominal: Nominal, sites: Sequence[Site], varied: bool = False, whole: bool = False) -> float:
@@ -34,25 +36,29 @@ def relative_misfit(nominal: Nominal, sites: Sequence[Site], varied: bool = Fals
     return math.sqrt(left / light) if whole else math.sqrt(left / count) / (light / count)
 
 
+def other_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> LunarLaws | None:
+    """In which ways the law may be another one at the angles of these sites; None where nothing is lit."""
+    chains = per_site(lambda site: nominal.chain(site, []), sites)
+    cosines, _, measured = draw(chains, [lit_mask(c) for c in chains], [s.image for s in sites])
+    if not len(measured):
+        return None
+    return lunar_laws(cosines.flatten(1), float(measured.mean()) if units == "iof" else None)
+
+
 def better_form(nominal: Nominal, sites: Sequence[Site], units: str) -> Nominal | None:
-    """A fitted model of another form that halves a gross misfit, or None. The sites are as they were."""
-    if nominal.predictor is not None or nominal.model.name in LUNAR:
+    """Measured lunar laws, fitted, if they leave less than half of the squared residual; or None. The sites are as they were."""
+    if nominal.predictor is not None or nominal.laws is None:
         return None
-    now = relative_misfit(nominal, sites)
-    if not now > GROSS:
-        return None
-    best, least = None, HALVED * now
+    laws = nominal.laws
+    vector = torch.tensor([p.default for p in laws.parameters])
+    other = Nominal(laws, vector, torch.ones(len(vector), dtype=torch.bool))
     kept = [(s.image, s.gain, s.offset) for s in sites]
     measured = [s.image * s.gain[:, None, None] + s.offset[:, None, None] for s in sites]
-    for name in LUNAR:
-        other = load_nominal(None, name, units)
-        fit(other, sites, [], units, measured, start=True)
-        left = relative_misfit(other, sites)
-        if left < least:
-            best, least = other, left
-        for site, (image, gain, offset) in zip(sites, kept, strict=True):
-            site.image, site.gain, site.offset = image, gain, offset
-    return best
+    fit(other, sites, [], units, measured, start=True)
+    left = relative_misfit(other, sites)
+    for site, (image, gain, offset) in zip(sites, kept, strict=True):
+        site.image, site.gain, site.offset = image, gain, offset
+    return other if left**2 < HALVED * relative_misfit(nominal, sites) ** 2 else None
 
 
-__all__ = ["better_form", "relative_misfit"]
+__all__ = ["better_form", "other_laws", "relative_misfit"]

@@ -13,10 +13,11 @@ from torch import Tensor
 
 from schemas.errors import ArtefactError, RegistryError
 from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.laws import LunarLaws
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sampled import sampled_fit
 from stages.diagnose.model.sites import Site
-from stages.diagnose.settings import GRAZING, LIT_MARGIN
+from stages.diagnose.settings import CORRELATED, GRAZING, LIT_MARGIN
 from stages.effects import Effect
 from stages.physics.photometry import ReflectanceModel, get_model
 
@@ -35,6 +36,7 @@ class Nominal:
     vector: Tensor
     free: Tensor
     predictor: Any = None
+    laws: LunarLaws | None = None  # the directions in which the law may be another one
     maps: dict[int, Tensor] = field(default_factory=dict)  # what the network says of each site
 
     def coefficients(self, site: Site) -> Tensor:
@@ -49,7 +51,7 @@ class Nominal:
     def chain(self, site: Site, base: Sequence[Effect], moved: Sequence[Effect] = ()) -> Chain:
         """The formation chain of one site with these effects."""
         free = self.free if self.predictor is None else None  # maps may still drift
-        return Chain(site, self.model, self.coefficients(site), base, moved, free)
+        return Chain(site, self.model, self.coefficients(site), base, moved, free, self.laws)
 
 
 def load_nominal(checkpoint: Path | None, model: str, units: str, free: Sequence[str] = ()) -> Nominal:
@@ -118,6 +120,7 @@ def fit(
     if not fitted or nominal.model.linear:
         for _ in range(rounds):
             gram, score, cost, count = _normal_equations(nominal, sites, base, units, measured, fitted)
+            _drawn_to_measured(nominal, gram, score, cost)
             if (
                 fitted
                 and _step(nominal, gram, score, 1e-7 if units == "iof" else DAMPING / 100) < SETTLED * cost * count
@@ -219,6 +222,14 @@ def _drawn_to_published(nominal: Nominal, gram: Tensor, score: Tensor, cost: flo
     gram += torch.diag(pull / width.square())
     score -= pull * away / width
     return PULL * cost * float(away.square().mean())
+
+
+def _drawn_to_measured(nominal: Nominal, gram: Tensor, score: Tensor, cost: float) -> None:
+    """Add what is known of the coefficients of lunar laws to the normal equations."""
+    if isinstance(nominal.model, LunarLaws):
+        pull = cost * CORRELATED * nominal.model.scatter.double() ** -2
+        gram += torch.diag(pull)
+        score -= pull * nominal.vector.double()
 
 
 def _brightness(chains: Sequence[Chain], masks: Sequence[Tensor]) -> float:

@@ -39,7 +39,7 @@ def sampled_fit(
     images : (n, H, W) per site, as measured; scaled : each has a gain and an offset of its own
     pull : weight of the published coefficients, as a share of the cost at a quarter of their range from them
     """
-    cosines, factor, measured = _draw(chains, masks, images)
+    cosines, factor, measured = draw(chains, masks, images)
     if not len(measured):
         return vector
     level = measured.std(1, keepdims=True) if scaled else measured.mean(1, keepdims=True)
@@ -77,7 +77,7 @@ def sampled_fit(
     return torch.from_numpy(base).float()
 
 
-def _draw(
+def draw(
     chains: Sequence[Chain], masks: Sequence[Tensor], images: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor, NDArray[np.float64]]:
     """Of every image as many lit pixels, evenly spread: cosines (3, I, S), factor and measured value (I, S)."""
@@ -111,4 +111,4 @@ def _stretched(predicted: NDArray[Any], measured: NDArray[Any]) -> NDArray[Any]:
     return gain * varied + level
 
 
-__all__ = ["sampled_fit"]
+__all__ = ["draw", "sampled_fit"]

@@ -21,9 +21,11 @@ from stages.diagnose.registration.capture import capture
 from stages.diagnose.registration.forms import (
     FORMS,
     TERMS,
+    WAVES,
     Form,
     Frame,
     Matched,
+    basis,
     displacement,
     match,
     solve,
@@ -114,12 +116,13 @@ class Registration:
         """Of the second form over the first."""
         return Gain(*gain_interval(self.squares[first.name], self.squares[second.name]))
 
-    def at(self, chain: Chain) -> tuple[Tensor, Tensor]:
-        """Where the form has the images of any site look, (n, H, W) px each."""
+    def at(self, chain: Chain, waves: bool = True) -> tuple[Tensor, Tensor]:
+        """Where the form has the images of any site look, (n, H, W) px each; ``waves``: those over the lines with it."""
         site = chain.site
-        basis = self.frame.basis(site.place, *site.read.shape[-2:])
         own = self.coefficients[torch.from_numpy(site.frames)].float()
-        field = torch.einsum("nat,thw->anhw", own, basis)
+        if not waves:
+            own = own[..., : len(TERMS)]
+        field = torch.einsum("nat,thw->anhw", own, basis(self.frame, site)[: own.shape[-1]])
         east, south = lean(site.observation, self.level)
         return field[0] + self.share * east, field[1] + self.share * south
 
@@ -155,8 +158,8 @@ class Registration:
         total, count = torch.zeros(frames, 2), torch.zeros(frames)
         for site in sites:
             own = self.coefficients[torch.from_numpy(site.frames)].float()
-            basis = self.frame.basis(site.place, *site.read.shape[-2:]).mean((-2, -1))
-            total.index_add_(0, torch.from_numpy(site.frames), own @ basis)
+            mean = basis(self.frame, site).mean((-2, -1))
+            total.index_add_(0, torch.from_numpy(site.frames), own @ mean)
             count.index_add_(0, torch.from_numpy(site.frames), torch.ones(site.count))
         return total / count.clamp(min=1)[:, None]
 
@@ -201,10 +204,9 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     squares = _held_out(matched, frames, spread)
     gains = {f.name: Gain(*gain_interval(squares[0], after)) for f, after in zip(FORMS, squares, strict=True)}
     best = _best(squares)
-    plain = next(k for k, f in enumerate(FORMS) if f.terms == FORMS[best].terms and not f.leaning)
-    slanted = next(k for k, f in enumerate(FORMS) if f.terms == FORMS[best].terms and f.leaning)
-    leaning = Gain(*gain_interval(squares[plain], squares[slanted]))
     form = FORMS[best]
+    plain, slanted = (FORMS.index(form.beside(leaning=leans)) for leans in (False, True))
+    leaning = Gain(*gain_interval(squares[plain], squares[slanted]))
     coefficients, share = solve(matched, form, frames, spread)
     group = _grounds(matched)
     without = [
@@ -220,8 +222,9 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     pixels = sum(float(s.read_valid.sum()) for s in sites)
     by_name = {f.name: q for f, q in zip(FORMS, squares, strict=True)}
     rms = {k: math.sqrt(float(q.sum()) / max(pixels, 1.0)) for k, q in by_name.items()}
+    axis = len(TERMS) + WAVES  # columns of an axis
     shifts = [
-        torch.linalg.inv(m.gram[:, [0, len(TERMS)]][:, :, [0, len(TERMS)]] / CORRELATED + 1e-9 * torch.eye(2))
+        torch.linalg.inv(m.gram[:, [0, axis]][:, :, [0, axis]] / CORRELATED + 1e-9 * torch.eye(2))
         for m in matched
     ]
     every = torch.cat([s.diagonal(dim1=1, dim2=2).sum(1) for s in shifts])
@@ -263,7 +266,8 @@ def _own_fields(
 
     terms : 1 for a shift, 3 for an affine map about the crop's centre; the scatter of either is estimated
     """
-    place = torch.tensor([*range(terms), *range(len(TERMS), len(TERMS) + terms)])
+    axis = len(TERMS) + WAVES
+    place = torch.tensor([*range(terms), *range(axis, axis + terms)])
     degree = torch.tensor([min(k, 1) for k in range(terms)] * 2)
     parts = []
     for k in range(0, len(matched), pieces):

@@ -1,46 +1,68 @@
-"""Forms of displacement: nothing, a constant, an affine map or a smooth field per frame, with or without relief displacement.
+"""Forms of displacement: nothing, a constant, waves over the lines, an affine map or a smooth field per frame, with or without relief
+displacement.
 
 Every pixel says, to first order, how far its image lies beside the ground: residual = gradient x displacement. A form is a sum of
-polynomials over the scene per frame and of h tan(emission), so that fitting one is linear least squares.
+polynomials over the scene and of waves over a crop's lines per frame, and of h tan(emission), so that fitting one is linear least squares.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from stages.diagnose.model.aligned import aligned
 from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.capture import fine
 from stages.diagnose.settings import BROAD, FIELD_ORDER
 from stages.effects.filters import gradients
+from stages.effects.line_jitter import ORDERS, line_waves
 from stages.effects.relief_displacement import lean
 
 TERMS = tuple((i, k - i) for k in range(FIELD_ORDER + 1) for i in range(k + 1))  # powers of x and y
+WAVES = len(ORDERS)
 
 
 @dataclass(frozen=True)
 class Form:
-    """``terms`` of the polynomial per frame; ``leaning``: with relief displacement."""
+    """``terms`` of the polynomial and of the waves over the lines, per frame; ``leaning``: with relief displacement."""
 
     name: str
     terms: int
+    waves: int = 0
     leaning: bool = False
 
+    @property
+    def places(self) -> list[int]:
+        """Of its columns among all of an axis, the polynomial's first."""
+        return [*range(self.terms), *range(len(TERMS), len(TERMS) + self.waves)]
 
-FORMS = (
+    def beside(self, **changes: Any) -> Form:
+        """The form that differs in so much."""
+        wanted = {"terms": self.terms, "waves": self.waves, "leaning": self.leaning, **changes}
+        return next(f for f in FORMS if all(getattr(f, k) == v for k, v in wanted.items()))
+
+
+PLAIN = (
     Form("none", 0),
     Form("constant", 1),
+    Form("lines", 1, WAVES),
     Form("affine", 3),
     Form("field", len(TERMS)),
-    Form("leaning", 0, True),
-    Form("constant, leaning", 1, True),
-    Form("affine, leaning", 3, True),
-    Form("field, leaning", len(TERMS), True),
 )
+LEANING = tuple(Form(f"{f.name}, leaning" if f.terms else "leaning", f.terms, f.waves, True) for f in PLAIN)
+FORMS = PLAIN + LEANING
+
+
+def basis(frame: Frame, site: Site) -> Tensor:
+    """(T, H, W): what every frame has an amount of, in either direction."""
+    height, width = site.read.shape[-2:]
+    waves = line_waves(height)[:, :, None].expand(-1, -1, width)
+    return torch.cat([frame.basis(site.place, height, width), waves])
 
 
 @dataclass
@@ -87,12 +109,12 @@ def match(
     variance = residual.square().sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
     weight = mask / variance.clamp(min=1e-20)[:, None, None]
     target = residual + east * known[0] + south * known[1]
-    basis = frame.basis(site.place, *image.shape[-2:])
+    fields = basis(frame, site)
     leaning = lean(site.observation, level)
     columns = torch.cat(
         [
-            east[:, None] * basis,
-            south[:, None] * basis,
+            east[:, None] * fields,
+            south[:, None] * fields,
             (east * leaning[0] + south * leaning[1])[:, None],
         ],
         1,
@@ -102,7 +124,7 @@ def match(
         weighted = columns * (weight * part).flatten(1)[:, None]
         gram = (weighted @ columns.transpose(1, 2)).double()
         score = torch.einsum("npx,nx->np", weighted, target.flatten(1)).double()
-        out.append(Matched(chain, gram, score, basis, leaning, part))
+        out.append(Matched(chain, gram, score, fields, leaning, part))
     return out
 
 
@@ -114,10 +136,11 @@ def _parts(height: int, width: int, pieces: int) -> list[Tensor]:
 
 def solve(sites: Sequence[Matched], form: Form, frames: int, spread: float) -> tuple[Tensor, float]:
     """Coefficients (frames, 2, T) and the share of leaning; ``spread`` px is what is expected of a coefficient."""
-    t, count = form.terms, len(TERMS)
+    places, count = form.places, len(TERMS) + WAVES
+    t = len(places)
     if not sites or not (t or form.leaning):
         return torch.zeros(frames, 2, count, dtype=torch.float64), 0.0
-    chosen = torch.tensor([*range(t), *range(count, count + t)], dtype=torch.long)
+    chosen = torch.tensor([*places, *(count + p for p in places)], dtype=torch.long)
     size = 2 * t
     total = torch.zeros(frames * size + 1, frames * size + 1, dtype=torch.float64)
     score = torch.zeros(len(total), dtype=torch.float64)
@@ -133,7 +156,7 @@ def solve(sites: Sequence[Matched], form: Form, frames: int, spread: float) -> t
     prior[-1] = 1e-6
     found = torch.linalg.solve(total + torch.diag(prior), score)
     out = torch.zeros(frames, 2, count, dtype=torch.float64)
-    out[..., :t] = found[:-1].view(frames, 2, t)
+    out[..., places] = found[:-1].view(frames, 2, t)
     return out, float(found[-1])
 
 

@@ -14,7 +14,7 @@ from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, nat
 from stages.diagnose.likelihood.weigh import interval
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.explain import Registration, lit_mask_read
-from stages.diagnose.registration.forms import FORMS, Form
+from stages.diagnose.registration.forms import FORMS, TERMS, Form
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import CORRELATED, FOLDS, SURE
@@ -61,7 +61,8 @@ def by_registration(state: State) -> tuple[list[Named], dict[str, tuple[float, s
     for name in effect_names():
         cls = get_effect(name)
         if cls.displaces and cls.never_named:
-            made, why = _leaning(state, r, name) if cls.leans else _shifts(state, r, name)
+            explained = _leaning if cls.leans else _lines if cls.along_lines else _shifts
+            made, why = explained(state, r, name)
             if made is not None and why:
                 refused[name] = (made.gain, why)
             elif made is not None:
@@ -86,15 +87,31 @@ def _leaning(state: State, r: Registration, name: str) -> tuple[Named | None, st
         "share": (r.share, r.share_error, "1"),
         "rms_px": (size, r.share_error * state.data.lean_px, "px"),
     }
-    plain = next(f for f in FORMS if f.terms == r.form.terms and not f.leaning)
+    plain = r.form.beside(leaning=False)
     return _named(effect, parameters, r, plain, r.form), r.doubt(plain.name, r.form.name, ("own", "own, leaning"))
+
+
+def _lines(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
+    """Named where waves over the lines explain more than any other form, and are more than ordinary."""
+    cls = get_effect(name)
+    if not r.form.waves:
+        return None, ""
+    amounts = r.coefficients[:, :, len(TERMS) :].float()  # (frames, 2, waves), as the effect's coordinates are ordered
+    effect = cls({p.name: amounts.flatten(1)[:, k] for k, p in enumerate(cls.fitted())}, state.data)
+    size = cls.size(effect.values)
+    if size < max(cls.tolerance.values()):
+        return None, ""
+    plain = r.form.beside(waves=0)
+    error = r.shift_error * math.sqrt(2 * r.form.waves)
+    made = _named(effect, {"rms_px": (size, error, "px")}, r, plain, r.form)
+    return made, r.doubt(plain.name, r.form.name, (plain.name, r.form.name))
 
 
 def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
     """Named where one shift per frame gains for sure, alone or beside relief displacement, and is more than ordinary."""
     cls = get_effect(name)
     first = next(f for f in FORMS if f.terms == 0 and f.leaning == r.form.leaning)
-    forms = [f for f in FORMS if f.leaning == r.form.leaning and 0 < f.terms <= r.form.terms]
+    forms = [f for f in FORMS if f.leaning == r.form.leaning and not f.waves and 0 < f.terms <= r.form.terms]
     if not forms:
         return None, ""
     shifts = r.mean_shifts(state.sites, state.frames)

@@ -64,7 +64,10 @@ def displacements(state: State, named: Sequence[Effect]) -> tuple[Fields, Fields
         share = r.share if r.form.leaning else 0.0
         last = r.settled(state.hidden, state.nominal, share)
         return (r.settled(state.hidden, state.nominal, 0.0) if leans else last), last
-    last = [r.at(state.nominal.chain(site, [])) for site in state.hidden]
+    chains = [state.nominal.chain(site, []) for site in state.hidden]
+    last = [r.at(chain) for chain in chains]
+    if any(e.along_lines for e in named):
+        return [r.at(chain, waves=False) for chain in chains], last
     return (nothing if named else last), last
 
 
@@ -138,7 +141,7 @@ def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
             continue
         assert outcome.view is not None
         whole = outcome.view.whole
-        if cls.of_law and not len(whole.form_places()):  # a law that is fitted freely follows it
+        if cls.of_law and not len(whole.form_places()):  # a law that is fitted follows it
             out.append(name)
             continue
         if found.alone >= SURE and name not in outcome.hidden:

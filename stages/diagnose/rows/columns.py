@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.laws import LunarLaws
 from stages.effects import Survey, Trial, get_effect
 
 
@@ -38,6 +40,7 @@ class Plan:
     form: list[int] = field(
         default_factory=list
     )  # of another form of the reflectance: a nuisance of all but effects of the law
+    pull: dict[int, float] = field(default_factory=dict)  # columns whose prior is not about what is rendered: its distance, in the column's unit
     guises: list[Guise] = field(default_factory=list)
     steps: list[tuple[int, str, float]] = field(default_factory=list)  # base effect, coordinate, step: tangents
 
@@ -65,10 +68,13 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey, candidates: bool
 
     free = range(chain.coefficients.shape[1]) if chain.free is None else torch.nonzero(chain.free)[:, 0].tolist()
     for k in free:
-        shared(f"coefficient {k}", float("inf"))
-    if not chain.free_form:
-        for k in range(len(chain.form_tangents())):
-            plan.form.append(shared(f"form {k}", float("inf")))
+        known = isinstance(chain.model, LunarLaws)
+        place = shared(f"coefficient {k}", float(chain.model.scatter[k]) if known else math.inf)
+        if known and math.isfinite(plan.prior[place]):
+            plan.pull[place] = float(chain.coefficients.flatten()[k])
+    if chain.laws is not None and not isinstance(chain.model, LunarLaws):
+        for k in range(len(chain.laws.scatter) - 1):
+            plan.form.append(shared(f"form {k}", 1.0))
     shared("slopes within a pixel", 1.0)
     for place, effect in enumerate(chain.base):
         if effect.scope == "scene":

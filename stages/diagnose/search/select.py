@@ -129,10 +129,7 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
     if not get_effect(found.effect).of_law:
         return False
     if not len(whole.form_places()):
-        out.rejected[found.effect] = (
-            found.gain,
-            "the nominal law is a sum of kernels, and what is left of it has no form of its own",
-        )
+        out.rejected[found.effect] = (found.gain, "the law is fitted to these images, and what is left of it has no form of its own")
         return True
     added = whole.law_adds(found)
     if interval(added)[0] <= 0:
@@ -145,9 +142,6 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
 def take(state: State, view: View, found: Found, group: list[str]) -> str:
     """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
     cls = get_effect(found.effect)
-    law = max(len(view.plan.form), sum(n.startswith("coefficient") for n in view.plan.shared))
-    if cls.scatters and not cls.displaces and state.frames <= law:
-        return f"{TOO_FEW}: a law of {law} coefficients can give {state.frames} any brightness"
     first = as_effect(found, state.data, state.frames, view.whole)
     if cls.scope == "scene" and not cls.plausible({k: float(v) for k, v in first.values.items()}, state.data):
         return ODD

@@ -181,6 +181,7 @@ class State:
     def _scattered(self, whole: Whole) -> Whole:
         """With the scatter of values per image estimated."""
         plan = whole.plan
+        whole.let_scatter(whole.form_places())
         for name in dict.fromkeys(plan.per_frame):
             if get_effect(name).scatters:
                 places = whole.frame_places([k for k, n in enumerate(plan.per_frame) if n == name])

@@ -1,0 +1,175 @@
+"""Which laws the ground of the Moon may have: a mean law, and the few ways in which measured ones differ from it at the angles at hand.
+
+Laws with parameters drawn over what has been published of them are evaluated at angles of the data. Their mean and the main directions
+of their scatter (principal components) make a linear law whose coefficients have known standard deviations: what no measured law does
+costs likelihood, so that a wrong Sun or DEM is not taken for a peculiar law.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stages.physics.formation.geometry import Angles
+from stages.physics.photometry import Parameter, ReflectanceModel, get_model
+from stages.physics.photometry.base import horizon_cosine
+
+Array = NDArray[np.float64]
+
+DRAWS = 360  # laws: the scatter of the twelfth direction is known to a tenth
+DIRECTIONS = 12  # in which laws may differ: further ones change brightness by less than 0.05 %
+DEGREE = 5  # of the polynomials in both cosines and the root of the phase angle that stand for a law: 0.02 % of it
+SEED = 1
+TERMS = [(i, j, k) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) for k in range(DEGREE + 1 - i - j)]
+
+
+class LunarLaws(ReflectanceModel):
+    """Lommel-Seeliger's law times polynomials: ``level`` times the mean law, and an amount of each direction.
+
+    scatter : (C,) standard deviations of the coefficients among measured laws, that of the level infinite
+    """
+
+    name = "lunar_laws"
+    title = "measured lunar laws"
+    formula = "mean of measured lunar laws, and the main directions of their scatter"
+    reference = "Hapke (2012), Akimov (1976), Minnaert (1941), McEwen (1996), LROC team (2014, 2019)"
+    reciprocal = False
+    linear = True
+
+    def __init__(self, low: Array, high: Array, weights: Array, scatter: Array) -> None:
+        self.low, self.high = low, high
+        self.weights = torch.from_numpy(weights).float()
+        self.scatter = torch.from_numpy(np.concatenate([[math.inf], scatter])).float()
+        directions = [f"direction {k + 1}" for k in range(len(scatter))]
+        self.parameters = tuple(  # type: ignore[misc]
+            Parameter(name, "1", -1.0, 2.0, default, "of the law")
+            for name, default in [("level", 1.0), *((name, 0.0) for name in directions)]
+        )
+
+    def parts(self, angles: Angles) -> list[Tensor]:
+        """I/F that a coefficient of 1 adds, of the shape of the angles, for each coefficient."""
+        polynomials, seeliger = self._polynomials(angles)
+        return [_sum(w.tolist(), polynomials) * seeliger for w in self.weights]
+
+    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        amounts = [torch.as_tensor(parameters[p.name]) for p in self.parameters]
+        if any(a.numel() > 1 for a in amounts):
+            return torch.stack([a * part for a, part in zip(amounts, self.parts(angles), strict=True)]).sum(0)
+        weights = torch.stack([a.flatten()[0] for a in amounts]).to(self.weights.dtype) @ self.weights
+        polynomials, seeliger = self._polynomials(angles)
+        return _sum(weights.tolist(), polynomials) * seeliger
+
+    def _polynomials(self, angles: Angles) -> tuple[list[list[Tensor]], Tensor]:
+        mu0, mu = angles.cos_incidence, angles.cos_emission
+        floor = horizon_cosine(mu0.dtype)
+        seeliger = mu0.clamp(min=floor) / (mu0.clamp(min=floor) + mu.clamp(min=floor))
+        return _chebyshev((mu0, mu, angles.cos_phase), self.low, self.high), seeliger
+
+
+def lunar_laws(cosines: Tensor, brightness: float | None = None) -> LunarLaws:
+    """The laws at these angles.
+
+    cosines : (3, N) of incidence, emission and phase, all facets lit and seen
+    brightness : mean I/F at a level of 1; that of the mean law where None
+    """
+    angles = Angles(*cosines.double().unbind(0))
+    at = [angles.cos_incidence.numpy(), angles.cos_emission.numpy(), np.sqrt(angles.phase.numpy())]
+    low = np.array([x.min() for x in at])
+    high = np.maximum(np.array([x.max() for x in at]), low + 1e-3)
+    laws = _draw(angles)
+    laws = laws / laws.mean(1, keepdims=True)
+    mean = laws.mean(0)
+    departures = laws / mean - 1
+    _, sizes, axes = np.linalg.svd(departures / math.sqrt(departures.size), full_matrices=False)
+    count = min(DIRECTIONS, len(sizes))
+    seeliger = (angles.cos_incidence / (angles.cos_incidence + angles.cos_emission)).numpy()
+    shapes = np.concatenate([np.ones((1, len(mean))), axes[:count] * math.sqrt(len(mean))]) * mean / seeliger
+    shapes *= (brightness or 0.06) / (mean * shapes[0] / shapes[0]).mean()
+    polynomials = _chebyshev(tuple(cosines.double()), low, high)
+    terms = np.stack([(polynomials[0][i] * polynomials[1][j] * polynomials[2][k]).numpy() for i, j, k in TERMS])
+    weights = np.linalg.lstsq(terms.T, shapes.T, rcond=1e-10)[0].T
+    return LunarLaws(low, high, weights, sizes[:count])
+
+
+def _chebyshev(cosines: Sequence[Tensor], low: Array, high: Array) -> list[list[Tensor]]:
+    """Polynomials of degree 0 to DEGREE of both cosines and the root of the phase angle; what is beyond the known angles counts as the nearest."""
+    out = []
+    for x, a, b in zip((*cosines[:2], torch.arccos(cosines[2].clamp(-1, 1)).sqrt()), low, high, strict=True):
+        scaled = ((x - a) * (2 / (b - a)) - 1).clamp(-1, 1)
+        each = [torch.ones_like(scaled), scaled]
+        while len(each) <= DEGREE:
+            each.append(2 * scaled * each[-1] - each[-2])
+        out.append(each)
+    return out
+
+
+def _sum(weights: Sequence[float], polynomials: list[list[Tensor]]) -> Tensor:
+    """The weighted sum of all products up to the total degree, innermost variable first."""
+    weight = dict(zip(TERMS, weights, strict=True))
+    first, second, third = polynomials
+    total = torch.zeros_like(first[0])
+    for i in range(DEGREE + 1):
+        outer = torch.zeros_like(total)
+        for j in range(DEGREE + 1 - i):
+            inner = torch.full_like(total, weight[i, j, 0])
+            for k in range(1, DEGREE + 1 - i - j):
+                inner.add_(third[k], alpha=weight[i, j, k])
+            outer.addcmul_(inner, second[j])
+        total.addcmul_(outer, first[i])
+    return total
+
+
+def _draw(angles: Angles) -> Array:
+    """(DRAWS, N) I/F of laws whose parameters scatter as those that were published for the Moon.
+
+    Hapke: maps of Sato et al. (2014). Disk functions: Akimov's exponent from maria to theory (Shkuratov et al. 2011), McEwen's (1996)
+    share of Lommel-Seeliger's law, Minnaert's exponent as it grows with phase (McEwen 1991), and the LROC team's fits with slopes
+    that scatter as they differ from each other. Phase functions of disk functions: exp(-beta g) times an opposition surge
+    (Hicks et al. 2011, Velikodsky et al. 2011).
+    """
+    rng = np.random.default_rng(SEED)
+    g = angles.phase.numpy()
+    degrees = np.degrees(g)
+    mu0, mu = angles.cos_incidence.numpy(), angles.cos_emission.numpy()
+
+    def published(name: str, **values: float) -> Array:
+        model = get_model(name)
+        every = {k: torch.tensor(float(v), dtype=torch.float64) for k, v in {**model.defaults(), **values}.items()}
+        return model.radiance_factor(every, angles).double().numpy()
+
+    def phase_function() -> Array:
+        surge = 1 + rng.uniform(0, 1) / (1 + np.tan(g / 2) / rng.uniform(0.02, 0.12))
+        return np.exp(-rng.uniform(0.3, 1.2) * g) * surge
+
+    def hapke() -> Array:
+        return published(
+            "hapke", w=rng.uniform(0.15, 0.6), b=rng.uniform(0.1, 0.4), c=rng.uniform(-0.1, 0.8), Bs0=rng.uniform(0.5, 2.5),
+            hs=rng.uniform(0.02, 0.12), theta=math.radians(rng.uniform(8, 40)),
+        )  # fmt: skip
+
+    def akimov() -> Array:
+        return published("akimov", eta=rng.uniform(0.2, 1.0)) * phase_function()
+
+    def minnaert() -> Array:
+        k = rng.uniform(0.45, 0.8) + rng.uniform(0, 0.006) * degrees
+        return mu0**k * mu ** (k - 1) * phase_function()
+
+    def lunar_lambert() -> Array:
+        share = 1 - rng.uniform(0.7, 1.3) * (0.019 * degrees - 2.42e-4 * degrees**2 + 1.46e-6 * degrees**3)
+        return (2 * share * mu0 / (mu0 + mu) + (1 - share) * mu0) * phase_function()
+
+    def lroc() -> Array:
+        name = ("lroc_empirical_2014", "lroc_empirical_2019")[int(rng.integers(2))]
+        slopes = rng.normal(0, 0.15, 3)
+        return published(name) * np.exp(slopes[0] * g + slopes[1] * mu0 + slopes[2] * mu)
+
+    kinds = (hapke, hapke, akimov, minnaert, lunar_lambert, lroc)
+    return np.stack([kinds[k % len(kinds)]() for k in range(DRAWS)])
+
+
+__all__ = ["LunarLaws", "lunar_laws"]
