@@ -2,16 +2,17 @@
 
 One likelihood, in five steps, each a folder:
 
-model         The nominal simulation of every site, rendered again with small changes.
+model         The nominal simulation of every site, rendered again with small changes. Where its law does not fit, the mean of measured lunar
+              laws takes its place, with the directions in which these differ.
 registration  Where the images lie. Shifts of up to 8 px are captured by correlation with the rendering, then explained: by nothing, a
-              constant, an affine map or a smooth field per frame, with or without relief displacement. The simplest form that no other
+              constant, waves over the lines, an affine map or a smooth field per frame, with or without relief displacement. The simplest form that no other
               beats on held-out sites wins.
 rows          Residuals relative to brightness, and what a little of everything would add to them, in windows on pieces of ground, as
               Fourier coefficients. Deep shadow counts, shadow edges do not.
 likelihood    The covariance of the residuals, estimated from them by wavelength: albedo and relief that all images of a place share,
               what each image has of its own, noise. One image of a place is enough, several tell the parts apart. Under it, generalised least squares
               for every effect, along with the nominal coefficients (which may drift from place to place, by as much as they are seen
-              to), gains and shifts per frame, and ordinary amounts of other effects. Sham residuals, those of other ground
+              to), the directions in which the law may be another one, gains and shifts per frame, and ordinary amounts of other effects. Sham residuals, those of other ground
               mirrored and shuffled, say how large the largest of all statistics is when nothing is there.
 search        The effect that gains most on held-out ground, if shams hardly do as well, is rendered at its values and everything is fitted
               again. It is named if it is real (its own file says what is plausible and what is ordinary), if it is there

@@ -49,7 +49,6 @@ LINE = 25.0  # -log10 of the chance of the strongest single wave: leakage of win
 BORROWED = 20.0  # waves' worth of the mean over frames in each frame's own variance: broad annuli have few waves
 ADDED = 50.0  # waves' worth of a size of 1 in each piece of ground's own size
 FOLDS = 8  # parts of the ground, or of the images, one left out at a time
-DRIFTING = 4  # directions in which the nominal coefficients may drift from place to place
 LEVELS = (0.03, 0.1, 0.3, 1.0, 3.0)  # standard deviations of values per frame that are tried, in worthwhile sizes
 TRIED = 8  # candidates per look whose held-out gain is computed, the most surprising first
 TRIES = 6  # candidates per look that are fitted before the search ends: of real data three or four turn out ordinary

@@ -6,20 +6,22 @@ from typing import ClassVar
 
 import torch
 
-from stages.effects.base import Effect, register
+from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
+
+LOWEST = 0.1  # sine of the Sun's elevation: lower, relief below a pixel lies in its own shadow
 
 
 @register
 class AzimuthalAnisotropy(Effect):
     name = "azimuthal_anisotropy"
     slot = "reflectance"
-    linear = True
     title = "dependence on the Sun's azimuth"
     mechanism = (
         "Unresolved ripples, ejecta lineations or cliffs of one orientation reflect more when lit from one side: reflectance is "
-        "multiplied by 1 + east sin(azimuth) + north cos(azimuth) of the Sun."
+        "multiplied by 1 + (east sin(azimuth) + north cos(azimuth)) cot(elevation)^shading of the Sun: 0 for what is painted on, 1 for "
+        "relief below a pixel, which shades the more the lower the Sun."
     )
     reference = "Shkuratov et al. (2011), Planet. Space Sci. 59, 1326 (photometric anisotropy of the lunar surface)"
     confused_with = ("sun_azimuth", "image_gain")
@@ -28,12 +30,19 @@ class AzimuthalAnisotropy(Effect):
         Parameter("east", "1", -0.3, 0.3, 0.0, "relative change when lit from the east"),
         Parameter("north", "1", -0.3, 0.3, 0.0, "relative change when lit from the north"),
     )
+    coordinates = (*parameters, Parameter("shading", "1", 0.0, 1.5, 0.0, "how it grows as the Sun gets lower"))
     strong: ClassVar = {"east": 0.05, "north": 0.05}
+    shaped = ("shading",)
+
+    @classmethod
+    def trials(cls, survey: Survey) -> list[Trial]:
+        columns = ({"east": 0.05}, {"north": 0.05})
+        return [Trial(columns, {"shading": shading}) for shading in (0.0, 1.0)]
 
     def apply(self, state: State) -> None:
         sun = state.sun_direction.to(state.elevation.dtype)
         level = torch.sqrt(sun[:, 0] ** 2 + sun[:, 1] ** 2).clamp(min=1e-6)
         east, north = (sun[:, 0] / level)[:, None, None], (sun[:, 1] / level)[:, None, None]
-        state.reflectance = state.reflectance * (
-            1 + self.value("east", state) * east + self.value("north", state) * north
-        )
+        across = self.value("east", state) * east + self.value("north", state) * north
+        height = (sun[:, 2].clamp(min=LOWEST) / level)[:, None, None]
+        state.reflectance = state.reflectance * (1 + across * height ** -self.value("shading", state))

@@ -28,6 +28,7 @@ class ImageGain(Effect):
     parameters = (Parameter("rms", "1", 0.0, 1.0, 0.0, "rms of the gains about their mean"),)
     coordinates = (Parameter("gain", "1", -0.9, 4.0, 0.0, "relative gain of an image"),)
     strong: ClassVar = {"gain": 0.02}
+    tolerance: ClassVar = {"rms": 0.01}  # images of one calibration agree to about a hundredth
 
     @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:

@@ -20,7 +20,10 @@ from stages.diagnose.settings import ADDED, BORROWED, ROUNDS, SECTORS
 
 @dataclass
 class Covariance:
-    """Variances of a wave, relative to brightness squared. albedo, relief : (A,); own : (A, frames); mean_* : of a patch's means"""
+    """Variances of a wave, relative to brightness squared. albedo, relief : (A,); own : (A, frames); mean_* : of a patch's means about ``level``
+
+    level : (frames,) mean of an image's residual over all patches, which is no noise
+    """
 
     albedo: Tensor
     relief: Tensor
@@ -29,6 +32,7 @@ class Covariance:
     mean_relief: float
     mean_own: float
     dark: float = 1.0  # of a piece's mean in deep shadow
+    level: Tensor | None = None
     size: dict[int, float] = field(default_factory=dict)  # of a patch (by its number), times the above
     mean_size: dict[int, float] = field(default_factory=dict)
     radius: list[float] = field(default_factory=list)  # (A,) cycles/px
@@ -117,7 +121,7 @@ def estimate(patches: Sequence[Patch], rows: Sequence[tuple[Tensor, Tensor]], gr
         model = Covariance(
             (a / n_ar.clamp(min=1e-9)).clamp(min=0), (r / n_ar.clamp(min=1e-9)).clamp(min=0), own, 0.0, 0.0, 0.0
         )
-    _means(model, patches, [m.double() for _, m in rows])
+    _means(model, patches, [m.double() for _, m in rows], frames)
     model.size, model.radius = sizes, grid.radius.tolist()
     return model
 
@@ -135,37 +139,47 @@ def _unit_mean(sizes: dict[int, float]) -> dict[int, float]:
     return {k: v / middle for k, v in sizes.items()}
 
 
-def _means(model: Covariance, patches: Sequence[Patch], means: Sequence[Tensor]) -> None:
-    """Variances of the patches' mean brightness, likewise."""
+def _means(model: Covariance, patches: Sequence[Patch], means: Sequence[Tensor], frames: int) -> None:
+    """Variances of the patches' mean brightness, likewise, about a level of each image that all patches share.
+
+    What acts on an image as a whole is to be told from what differs from patch to patch, and must not pass for it.
+    """
     everything = torch.cat(list(means))
     level = max(float(everything.square().mean()), 1e-12)
     albedo, relief, own = 0.5 * level, 0.1 * level, 0.4 * level
     sizes = {p.number: 1.0 for p in patches}
+    shared = torch.zeros(frames, dtype=torch.float64)
+    seen = torch.bincount(torch.cat([p.frames for p in patches]), minlength=frames).clamp(min=1)
     for _ in range(ROUNDS):
         fits: dict[int, float] = {}
         sums = [0.0, 0.0, 0.0]
-        numbers = [0, 0, 0]
+        numbers = [0.0, 0.0, 0.0]
+        asked = torch.zeros_like(shared)
         for patch, m in zip(patches, means, strict=True):
+            m = m - shared[patch.frames]
             load = torch.cat([torch.ones(len(m), 1, dtype=torch.float64), patch.slopes.double()], 1)
             size = torch.tensor([albedo, relief, relief], dtype=torch.float64)
             sigma = (load * size) @ load.T + own * torch.eye(len(m), dtype=torch.float64)
             inverse = torch.linalg.inv(sigma)
             fits[patch.number] = (float(m @ inverse @ m) + 5.0) / (len(m) + 5.0)
-            m = m / math.sqrt(sizes[patch.number])
+            scale = math.sqrt(sizes[patch.number])
+            m = m / scale
             gain = (size[:, None] * load.T) @ inverse
             mean = gain @ m
             second = torch.outer(mean, mean) + torch.diag(size) - gain @ load * size
             rest = m - load @ mean
+            asked.index_add_(0, patch.frames, rest * scale)
             sums[0] += float(second[0, 0])
             sums[1] += float(second[1, 1] + second[2, 2])
             sums[2] += float(rest @ rest + ((load @ (torch.diag(size) - gain @ load * size)) * load).sum())
             numbers[0] += 1
             numbers[1] += 2
-            numbers[2] += len(m)
+            numbers[2] += float((1 - 1 / seen[patch.frames]).sum())  # a level is fitted to each image
+        shared = shared + asked / seen
         sizes = _unit_mean(fits)
         albedo, relief, own = (max(s / max(k, 1), 1e-4 * level) for s, k in zip(sums, numbers, strict=True))
     model.mean_albedo, model.mean_relief, model.mean_own = albedo, relief, own
-    model.mean_size = sizes
+    model.mean_size, model.level = sizes, shared
 
 
 __all__ = ["Covariance", "estimate", "shadow_variance"]

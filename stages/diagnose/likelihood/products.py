@@ -50,19 +50,20 @@ class Products:
     ground: int
     site: int
     images: list[Array] = field(default_factory=list)
+    level: Products | None = None  # of the means alone
 
     def without(self, group: int) -> Products:
         """The sums as if a group of images had not been taken."""
-        return replace(self, gram=self.gram - self.images[group], images=[])
+        return replace(self, gram=self.gram - self.images[group], images=[], level=None)
 
 
 def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> Residual:
     """The residual with unit covariance, for shams."""
     factor = _factor(model, rows.patch, grid)
     white = torch.einsum("kij,jk->ik", factor[grid.bins], rows.shared[0])
-    mean = torch.linalg.solve_triangular(
-        torch.linalg.cholesky(model.mean_matrix(rows.patch)), rows.shared_mean[0].double()[:, None], upper=False
-    )
+    about = rows.shared_mean[0].double() - (0 if model.level is None else model.level[rows.patch.frames])
+    lower = torch.linalg.cholesky(model.mean_matrix(rows.patch))
+    mean = torch.linalg.solve_triangular(lower, about[:, None], upper=False)
     return white, mean[:, 0], rows.shared_dark[0] / model.dark**0.5
 
 
@@ -97,6 +98,7 @@ def products(
     sham, squares = np.zeros((len(place), 0)), np.zeros(0)
     if shams is not None:
         sham, squares = columns.beside(shams, factor, mean)
+    level = None if mean is None else _of_means(rows, mean, place, shams)
     parts = []
     for group in groups:
         gone = torch.tensor([int(f) in group for f in patch.frames])
@@ -107,7 +109,17 @@ def products(
             own = np.concatenate([np.zeros(m, bool), np.tile(gone.numpy(), k)])
             part[own], part[:, own] = gram[own], gram[:, own]  # to the last bit: nothing is left of them
         parts.append(part)
-    return Products(gram, place, sham, squares, patch.ground, patch.site, parts)
+    return Products(gram, place, sham, squares, patch.ground, patch.site, parts, level)
+
+
+def _of_means(rows: Rows, mean: Tensor, place: NDArray[np.int64], shams: Residual | None) -> Products:
+    """The products of the patch's means alone, whitened by ``mean`` (n, n)."""
+    shared = rows.shared_mean.double() @ mean.T
+    own = torch.einsum("rn,kn->knr", mean, rows.own_mean.double()).flatten(0, 1)
+    every = torch.cat([shared, own])
+    means = shams[1].double() if shams is not None else every[:0]
+    sham = (every @ means.T).numpy()
+    return Products((every @ every.T).numpy(), place, sham, means.square().sum(1).numpy(), rows.patch.ground, rows.patch.site)
 
 
 def _given_others(factor: Tensor, gone: Tensor) -> Tensor:

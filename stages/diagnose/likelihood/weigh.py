@@ -15,7 +15,7 @@ from scipy.special import gammaincc, gammaln
 from stages.diagnose.likelihood.jackknife import FRACTION, jackknife_error, student
 from stages.diagnose.likelihood.products import Array, Products
 from stages.diagnose.rows.columns import Guise, Plan
-from stages.diagnose.settings import DRIFTING, FOLDS, LEVELS, UNITS
+from stages.diagnose.settings import FOLDS, LEVELS, UNITS
 from stages.effects import get_effect
 
 
@@ -60,11 +60,15 @@ def interval(gains: Array) -> tuple[float, float]:
 class Whole:
     """All units' products put together, with the nuisance among the columns."""
 
-    def __init__(self, units: Sequence[Products], plan: Plan, frames: int) -> None:
+    def __init__(self, units: Sequence[Products], plan: Plan, frames: int, drifting: bool = True) -> None:
         self.units, self.plan, self.frames = list(units), plan, frames
+        levels = [u.level for u in units if u.level is not None]
+        # brightness of images as wholes, which what is not known of their insides must not decide on
+        self.levels = Whole(levels, plan, frames, drifting=False) if levels else None
         self.first = 1 + len(plan.shared)
         self.drift: tuple[NDArray[np.int64], Array, Array] | None = None  # places, main directions, their scatter
-        self._let_coefficients_drift()
+        if drifting:
+            self._let_coefficients_drift()
         self.size = self.first + len(plan.per_frame) * frames
         self.gram = np.zeros((self.size, self.size))
         shams = units[0].sham.shape[1]
@@ -109,7 +113,7 @@ class Whole:
         total = np.sum([u.gram[np.ix_(places, places)] for u in self.units], 0)
         scale = 1 / np.sqrt(np.maximum(total.diagonal(), 1e-30))
         _, axes = np.linalg.eigh(total * np.outer(scale, scale))
-        main = (scale[:, None] * axes[:, -DRIFTING:]) * math.sqrt(
+        main = (scale[:, None] * axes) * math.sqrt(
             len(self.units)
         )  # a unit's column has about unit information
         spread = np.full(main.shape[1], 1.0)
@@ -198,11 +202,6 @@ class Whole:
         for p in places:
             self.precision[int(p)] = max(spread, 1e-4) ** -2
 
-    def set_scatter(self, spread: float) -> None:
-        """Set the prior precision of what scatters from image to image."""
-        for p in self.scattered:
-            self.precision[int(p)] = max(spread, 1e-4) ** -2
-
     def reduce(
         self, places: NDArray[np.int64], exclude: Sequence[int] = ()
     ) -> tuple[Array, Array, Array, NDArray[np.int64]]:
@@ -235,6 +234,9 @@ class Whole:
     def weigh(self, guise: Guise) -> tuple[Found, Array]:
         """Evidence for one guise, and the same of every sham."""
         places = self.places(guise)
+        effect = get_effect(guise.effect)
+        if self.levels is not None and effect.scatters and not effect.displaces:
+            return self.levels.weigh(guise)
         information, score, shams, _ = self.reduce(places, self.exclude(guise))
         if guise.per_frame:
             return self._weigh_frames(guise, information, score, shams)
@@ -249,7 +251,7 @@ class Whole:
             guise.effect, guise, amount, error, float(surprises[0]), alone=math.sqrt(max(ratio / inflation, 0.0))
         )
         if len(self.scattered):
-            beside, spread = self._beside_gains(places, self.exclude(guise))
+            beside, spread = (self.levels or self)._beside_gains(places, self.exclude(guise))
             if beside / inflation > ratio / inflation:
                 found.surprise = max(found.surprise, float(_surprise(np.array([beside / inflation]), len(places))[0]))
                 found.beside = spread

@@ -49,11 +49,10 @@ def search(state: State, most: int) -> Outcome:
         strong.sort(key=lambda f: -f.surprise)
         for found in strong[:TRIED]:
             whole = view.whole
-            kept = dict(whole.precision)
-            if found.beside:
-                whole.set_scatter(found.beside)
-            found.gains = whole.held_out(whole.places(found.guise), whole.exclude(found.guise), found.spread)
-            whole.precision = kept
+            # beside gains of every image nothing is left to gain: they know already how bright each is on other ground
+            beside = whole.scattered.tolist() if found.beside else []
+            without = [*whole.exclude(found.guise), *beside]
+            found.gains = whole.held_out(whole.places(found.guise), without, found.spread)
         strong = [f for f in strong if not (f in strong[:TRIED] and another_law(view.whole, f, out))]
         tried = sorted(strong[:TRIED], key=lambda f: -f.gain)
         faint = FAINT**2 / 2 * float(view.whole.gram[0, 0])
@@ -255,6 +254,8 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
     if not alone:
         return cause.found.gains, total, np.zeros(0)
     form = list(whole.form_places()) if type(cause.effect).of_law else []
+    if cause.found.beside:
+        form += (look.whole.scattered + 1).tolist()  # one shared column more
     place = np.array([whole.first - 1])
     tested = [
         products(more, look.model, look.grid, state.frames)

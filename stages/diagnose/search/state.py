@@ -182,12 +182,17 @@ class State:
         """With the scatter of values per image estimated."""
         plan = whole.plan
         whole.let_scatter(whole.form_places())
+        if whole.levels is not None:
+            whole.levels.precision |= {int(p): whole.precision[int(p)] for p in whole.form_places()}
         for name in dict.fromkeys(plan.per_frame):
             if get_effect(name).scatters:
                 places = whole.frame_places([k for k, n in enumerate(plan.per_frame) if n == name])
-                whole.let_scatter(places)
-                if not get_effect(name).displaces:
-                    whole.scattered = places
+                if get_effect(name).displaces or whole.levels is None:
+                    whole.let_scatter(places)
+                    continue
+                whole.levels.let_scatter(places)
+                whole.precision |= {int(p): whole.levels.precision[int(p)] for p in places}
+                whole.scattered = whole.levels.scattered = places
         return whole
 
 
