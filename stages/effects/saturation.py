@@ -52,7 +52,7 @@ class Saturation(Effect):
         pile = float(counts[best - 1 : best + 2].sum())
         if pile < PILE or counts[best] < STANDS_OUT * before or above > 0.05 * pile:
             return None
-        inside = (bright > edges[best]) & (bright < edges[best + 1])
+        inside = (bright >= edges[best]) & (bright < edges[best + 1])
         level = float(bright[inside].median())
         # an unbent histogram would hold a quarter of the pile in its last bin
         return level, 0.005 * level, 1.386 * int((bright >= cls.keep_below * level).sum())

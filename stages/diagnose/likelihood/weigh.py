@@ -34,6 +34,7 @@ class Found:
     surprise: float
     p: float = 1.0
     gains: Array = field(default_factory=lambda: np.zeros(0))
+    sizes: Array = field(default_factory=lambda: np.ones(1))  # squares of the residual on these units
     spread: float = 0.0
     beside: float = 0.0  # scatter of the gains per frame beside it, where that is less than without
     alone: float = 0.0  # standard errors by which the largest amount differs from nothing
@@ -45,16 +46,26 @@ class Found:
 
     def gain_interval(self) -> tuple[float, float]:
         """95 % interval of the held-out gain, nats, by the scatter over pieces of ground."""
-        return interval(self.gains)
+        return interval(self.gains, self.sizes)
+
+    def more_than(self, other: Found) -> tuple[float, float]:
+        """The same of what it gains more than another effect."""
+        return interval(self.gains - other.gains, self.sizes)
 
 
-def interval(gains: Array) -> tuple[float, float]:
-    """95 % interval of a sum of gains over independent pieces of ground, by Student's t."""
+def interval(gains: Array, sizes: Array | None = None) -> tuple[float, float]:
+    """95 % interval of a sum of gains over independent pieces of ground, by Student's t.
+
+    sizes : of the pieces, to which gains are in proportion but for chance (a ratio estimate: Cochran 1977, ch. 6); alike where None
+    """
     units = len(gains)
     if units < 3:
         return -math.inf, math.inf
-    half = student.ppf(0.5 + FRACTION / 2, units - 1) * math.sqrt(units) * float(gains.std(ddof=1))
-    return float(gains.sum()) - half, float(gains.sum()) + half
+    total = float(gains.sum())
+    share = np.full(units, 1 / units) if sizes is None or len(sizes) != units else sizes / sizes.sum()
+    chance = gains - total * share
+    half = float(student.ppf(0.5 + FRACTION / 2, units - 1)) * math.sqrt(units / (units - 1) * float(chance @ chance))
+    return total - half, total + half
 
 
 class Whole:
@@ -86,6 +97,7 @@ class Whole:
         self.scattered = np.zeros(0, np.int64)  # places of the gains per frame
         self.precision = self._precision()
         self.labels = self._labels()
+        self.sizes = np.bincount(self.labels, weights=[u.gram[0, 0] for u in self.units])
         self.folds = [np.flatnonzero(np.array([u % FOLDS for u in self.labels]) == k) for k in range(FOLDS)]
         self.folds = [f for f in self.folds if len(f)]
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, nats
-from stages.diagnose.likelihood.weigh import interval
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.explain import Registration, lit_mask_read
 from stages.diagnose.registration.forms import FORMS, TERMS, Form
@@ -33,7 +32,7 @@ def by_search(state: State) -> list[Named]:
             found = cls.report(values, cause.reported_errors)
         else:
             found = {cls.parameters[0].name: (cause.rms, cause.errors.get("rms", math.inf))}
-        low, high = interval(cause.found.gains)
+        low, high = cause.found.gain_interval()
         out.append(
             Named(
                 cause.effect,

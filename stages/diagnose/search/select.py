@@ -53,6 +53,7 @@ def search(state: State, most: int) -> Outcome:
             beside = whole.scattered.tolist() if found.beside else []
             without = [*whole.exclude(found.guise), *beside]
             found.gains = whole.held_out(whole.places(found.guise), without, found.spread)
+            found.sizes = whole.sizes
         strong = [f for f in strong if not (f in strong[:TRIED] and another_law(view.whole, f, out))]
         tried = sorted(strong[:TRIED], key=lambda f: -f.gain)
         faint = FAINT**2 / 2 * float(view.whole.gram[0, 0])
@@ -112,15 +113,14 @@ def choose(sure: list[Found]) -> tuple[Found, list[str]]:
         best = max(simple, key=lambda f: f.gain, default=best)
     group = []
     for f in sorted(sure, key=lambda f: -f.gain):
-        less = best.gains - f.gains
-        if f is best or interval(less)[0] <= 0:
+        if f is best or best.more_than(f)[0] <= 0:
             group.append(f.effect)
     group.sort(key=lambda n: n != best.effect)
     return best, group
 
 
 def _as_good(found: Found, best: Found) -> bool:
-    return found.gain > SIMPLER * best.gain or interval(best.gains - found.gains)[0] <= 0
+    return found.gain > SIMPLER * best.gain or best.more_than(found)[0] <= 0
 
 
 def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
@@ -131,7 +131,7 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
         out.rejected[found.effect] = (found.gain, "the law is fitted to these images, and what is left of it has no form of its own")
         return True
     added = whole.law_adds(found)
-    if interval(added)[0] <= 0:
+    if interval(added, whole.sizes)[0] <= 0:
         return False
     why = f"the nominal law has another form, which gains {added.sum():.0f} nats more beside it; the effect stands for a part of that"
     out.rejected[found.effect] = (found.gain, why)
@@ -157,7 +157,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         why = _doubt_any(state, cause)
     if not why:
         gains, total, tested = secant_gains(state, cause, look)
-        low, high = interval(gains)
+        low, high = interval(gains, cause.found.sizes)
         cause.gain_percent, cause.gain_low, cause.gain_high = (200 * x / total for x in (float(gains.sum()), low, high))
         cause.found = dataclasses.replace(cause.found, gains=gains)
         if low <= 0:
