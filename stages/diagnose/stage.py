@@ -19,6 +19,7 @@ from stages.diagnose.config import Config
 from stages.diagnose.likelihood.left import budget, peak
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import better_form, other_laws, relative_misfit
+from stages.diagnose.model.laws import LunarLaws
 from stages.diagnose.model.nominal import fit, lit_mask, load_nominal
 from stages.diagnose.model.sites import Site, group_pairs, load_site, number_grounds, survey
 from stages.diagnose.registration.explain import explain
@@ -97,9 +98,8 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     cut = by_histogram(sites, units)
     fit(nominal, sites, [], units, [s.read for s in sites], start=True)
     nominal.laws = other_laws(nominal, sites, units)
-    if not config.free and (other := better_form(nominal, sites, units)):
-        answer.form, nominal = other.model.title, other
-        say(f"{config.model} has the wrong form: {answer.form} is fitted in its place")
+    if other := better_form(nominal, sites, units):
+        nominal = other
         fit(nominal, sites, [], units, [s.read for s in sites])
     data = survey(sites, frames, units)
     state = State(
@@ -129,6 +129,9 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         return Result(answer, state, None)
     progress(2, 5, "search")
     outcome = search(state, config.most_causes)
+    if isinstance(state.nominal.model, LunarLaws):
+        answer.form = state.nominal.model.title
+        say(f"{config.model} has not the form of the ground's law: {answer.form} took its place")
     doubted = unconfirmed(state)
     assert outcome.view is not None
     if doubted:
@@ -144,17 +147,20 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     answer.budget = budget(view.rows, view.model, view.grid, before, after)
     line, share = peak(view.rows, view.model, view.grid, frames)
     answer.blind = blind_effects(state, outcome, {c.effect.name for c in answer.causes})
-    structure = line > LINE
-    answer.unexplained_fraction = share if structure else 0.0
-    if answer.causes:
-        answer.verdict = "named"
-    elif structure or outcome.sure:
-        answer.verdict = "unexplained"
+    answer.unexplained_fraction = share if line > LINE else 0.0
+    if not answer.causes and outcome.sure:
         answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)
-    else:
-        answer.verdict = "cannot_tell" if answer.blind else "nothing_significant"
+    answer.verdict = _verdict(answer)
     answer.held_out = score(state, answer)
     return Result(answer, state, outcome)
+
+
+def _verdict(answer: Answer) -> str:
+    if answer.causes:
+        return "named"
+    if answer.unexplained_fraction:
+        return "unexplained"
+    return "cannot_tell" if answer.blind else "nothing_significant"
 
 
 def _load(reader: PairReader, pairs: np.ndarray, config: Config) -> list[Site]:

@@ -119,7 +119,9 @@ def _of_means(rows: Rows, mean: Tensor, place: NDArray[np.int64], shams: Residua
     every = torch.cat([shared, own])
     means = shams[1].double() if shams is not None else every[:0]
     sham = (every @ means.T).numpy()
-    return Products((every @ every.T).numpy(), place, sham, means.square().sum(1).numpy(), rows.patch.ground, rows.patch.site)
+    return Products(
+        (every @ every.T).numpy(), place, sham, means.square().sum(1).numpy(), rows.patch.ground, rows.patch.site
+    )
 
 
 def _given_others(factor: Tensor, gone: Tensor) -> Tensor:

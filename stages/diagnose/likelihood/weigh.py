@@ -15,7 +15,7 @@ from scipy.special import gammaincc, gammaln
 from stages.diagnose.likelihood.jackknife import FRACTION, jackknife_error, student
 from stages.diagnose.likelihood.products import Array, Products
 from stages.diagnose.rows.columns import Guise, Plan
-from stages.diagnose.settings import FOLDS, LEVELS, UNITS
+from stages.diagnose.settings import FOLDS, LEVELS, SIMPLER, UNITS
 from stages.effects import get_effect
 
 
@@ -97,7 +97,7 @@ class Whole:
         self.scattered = np.zeros(0, np.int64)  # places of the gains per frame
         self.precision = self._precision()
         self.labels = self._labels()
-        self.sizes = np.bincount(self.labels, weights=[u.gram[0, 0] for u in self.units])
+        self.sizes = np.bincount(self.labels, weights=[u.gram[0, 0] for u in self.units]).astype(np.float64)
         self.folds = [np.flatnonzero(np.array([u % FOLDS for u in self.labels]) == k) for k in range(FOLDS)]
         self.folds = [f for f in self.folds if len(f)]
 
@@ -125,9 +125,7 @@ class Whole:
         total = np.sum([u.gram[np.ix_(places, places)] for u in self.units], 0)
         scale = 1 / np.sqrt(np.maximum(total.diagonal(), 1e-30))
         _, axes = np.linalg.eigh(total * np.outer(scale, scale))
-        main = (scale[:, None] * axes) * math.sqrt(
-            len(self.units)
-        )  # a unit's column has about unit information
+        main = (scale[:, None] * axes) * math.sqrt(len(self.units))  # a unit's column has about unit information
         spread = np.full(main.shape[1], 1.0)
         squares = [main.T @ u.gram[np.ix_(places, places)] @ main for u in self.units]
         score = np.array([main.T @ u.gram[places, 0] for u in self.units])
@@ -358,12 +356,21 @@ class Whole:
         scatter = jackknife_error(self.without_one(places, exclude))
         return inverse @ score, np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter)
 
-    def law_adds(self, found: Found) -> Array:
-        """(labels,) nats that another form of the reflectance gains on held-out ground beside an effect of the law."""
-        places = self.places(found.guise)
+    def another_law(self, guise: Guise | None) -> float:
+        """Nats that another form of the reflectance surely has to add beside an effect of the law, which explains less than most of what
+        that form does alone; 0 where it has not.
+        """
+        added = self.law_adds(guise)
+        if interval(added, self.sizes)[0] <= 0 or added.sum() < (1 - SIMPLER) * self.law_adds(None).sum():
+            return 0.0
+        return float(added.sum())
+
+    def law_adds(self, guise: Guise | None) -> Array:
+        """(labels,) nats that another form of the reflectance gains on held-out ground, alone or beside an effect of the law."""
+        places = self.places(guise) if guise else np.zeros(0, np.int64)
         kept = dict(self.precision)
         self.precision |= {int(p): 1e-10 * self.gram[p, p] for p in places}
-        ordinary = [1 + k for k in self.plan.ordinary.get(found.effect, [])]
+        ordinary = [1 + k for k in self.plan.ordinary.get(guise.effect if guise else "", [])]
         added = self.held_out(self.form_places(), [k for k in ordinary if k not in places])
         self.precision = kept
         return added

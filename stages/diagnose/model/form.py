@@ -47,18 +47,25 @@ def other_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> LunarLaws
 
 def better_form(nominal: Nominal, sites: Sequence[Site], units: str) -> Nominal | None:
     """Measured lunar laws, fitted, if they leave less than half of the squared residual; or None. The sites are as they were."""
-    if nominal.predictor is not None or nominal.laws is None:
+    other = measured_laws(nominal, sites, units)
+    if other is None or relative_misfit(other, sites) ** 2 > HALVED * relative_misfit(nominal, sites) ** 2:
         return None
+    return other
+
+
+def measured_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> Nominal | None:
+    """Measured lunar laws, fitted in the place of a fitted model; or None. The sites are as they were."""
     laws = nominal.laws
+    if nominal.predictor is not None or laws is None or not bool(nominal.free.all()):
+        return None
     vector = torch.tensor([p.default for p in laws.parameters])
     other = Nominal(laws, vector, torch.ones(len(vector), dtype=torch.bool))
     kept = [(s.image, s.gain, s.offset) for s in sites]
     measured = [s.image * s.gain[:, None, None] + s.offset[:, None, None] for s in sites]
     fit(other, sites, [], units, measured, start=True)
-    left = relative_misfit(other, sites)
     for site, (image, gain, offset) in zip(sites, kept, strict=True):
         site.image, site.gain, site.offset = image, gain, offset
-    return other if left**2 < HALVED * relative_misfit(nominal, sites) ** 2 else None
+    return other
 
 
-__all__ = ["better_form", "other_laws", "relative_misfit"]
+__all__ = ["better_form", "measured_laws", "other_laws", "relative_misfit"]

@@ -12,14 +12,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from stages.common.arrays import Floats
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import Parameter, ReflectanceModel, get_model
 from stages.physics.photometry.base import horizon_cosine
-
-Array = NDArray[np.float64]
 
 DRAWS = 360  # laws: the scatter of the twelfth direction is known to a tenth
 DIRECTIONS = 12  # in which laws may differ: further ones change brightness by less than 0.05 %
@@ -41,7 +39,7 @@ class LunarLaws(ReflectanceModel):
     reciprocal = False
     linear = True
 
-    def __init__(self, low: Array, high: Array, weights: Array, scatter: Array) -> None:
+    def __init__(self, low: Floats, high: Floats, weights: Floats, scatter: Floats) -> None:
         self.low, self.high = low, high
         self.weights = torch.from_numpy(weights).float()
         self.scatter = torch.from_numpy(np.concatenate([[math.inf], scatter])).float()
@@ -57,6 +55,7 @@ class LunarLaws(ReflectanceModel):
         return [_sum(w.tolist(), polynomials) * seeliger for w in self.weights]
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+        """I/F (...,) of the law with these coefficients."""
         amounts = [torch.as_tensor(parameters[p.name]) for p in self.parameters]
         if any(a.numel() > 1 for a in amounts):
             return torch.stack([a * part for a, part in zip(amounts, self.parts(angles), strict=True)]).sum(0)
@@ -96,7 +95,7 @@ def lunar_laws(cosines: Tensor, brightness: float | None = None) -> LunarLaws:
     return LunarLaws(low, high, weights, sizes[:count])
 
 
-def _chebyshev(cosines: Sequence[Tensor], low: Array, high: Array) -> list[list[Tensor]]:
+def _chebyshev(cosines: Sequence[Tensor], low: Floats, high: Floats) -> list[list[Tensor]]:
     """Polynomials of degree 0 to DEGREE of both cosines and the root of the phase angle; what is beyond the known angles counts as the nearest."""
     out = []
     for x, a, b in zip((*cosines[:2], torch.arccos(cosines[2].clamp(-1, 1)).sqrt()), low, high, strict=True):
@@ -124,7 +123,7 @@ def _sum(weights: Sequence[float], polynomials: list[list[Tensor]]) -> Tensor:
     return total
 
 
-def _draw(angles: Angles) -> Array:
+def _draw(angles: Angles) -> Floats:
     """(DRAWS, N) I/F of laws whose parameters scatter as those that were published for the Moon.
 
     Hapke: maps of Sato et al. (2014). Disk functions: Akimov's exponent from maria to theory (Shkuratov et al. 2011), McEwen's (1996)
@@ -137,33 +136,33 @@ def _draw(angles: Angles) -> Array:
     degrees = np.degrees(g)
     mu0, mu = angles.cos_incidence.numpy(), angles.cos_emission.numpy()
 
-    def published(name: str, **values: float) -> Array:
+    def published(name: str, **values: float) -> Floats:
         model = get_model(name)
         every = {k: torch.tensor(float(v), dtype=torch.float64) for k, v in {**model.defaults(), **values}.items()}
         return model.radiance_factor(every, angles).double().numpy()
 
-    def phase_function() -> Array:
+    def phase_function() -> Floats:
         surge = 1 + rng.uniform(0, 1) / (1 + np.tan(g / 2) / rng.uniform(0.02, 0.12))
         return np.exp(-rng.uniform(0.3, 1.2) * g) * surge
 
-    def hapke() -> Array:
+    def hapke() -> Floats:
         return published(
             "hapke", w=rng.uniform(0.15, 0.6), b=rng.uniform(0.1, 0.4), c=rng.uniform(-0.1, 0.8), Bs0=rng.uniform(0.5, 2.5),
             hs=rng.uniform(0.02, 0.12), theta=math.radians(rng.uniform(8, 40)),
         )  # fmt: skip
 
-    def akimov() -> Array:
+    def akimov() -> Floats:
         return published("akimov", eta=rng.uniform(0.2, 1.0)) * phase_function()
 
-    def minnaert() -> Array:
+    def minnaert() -> Floats:
         k = rng.uniform(0.45, 0.8) + rng.uniform(0, 0.006) * degrees
         return mu0**k * mu ** (k - 1) * phase_function()
 
-    def lunar_lambert() -> Array:
+    def lunar_lambert() -> Floats:
         share = 1 - rng.uniform(0.7, 1.3) * (0.019 * degrees - 2.42e-4 * degrees**2 + 1.46e-6 * degrees**3)
         return (2 * share * mu0 / (mu0 + mu) + (1 - share) * mu0) * phase_function()
 
-    def lroc() -> Array:
+    def lroc() -> Floats:
         name = ("lroc_empirical_2014", "lroc_empirical_2019")[int(rng.integers(2))]
         slopes = rng.normal(0, 0.15, 3)
         return published(name) * np.exp(slopes[0] * g + slopes[1] * mu0 + slopes[2] * mu)

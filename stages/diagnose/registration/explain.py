@@ -224,8 +224,7 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     rms = {k: math.sqrt(float(q.sum()) / max(pixels, 1.0)) for k, q in by_name.items()}
     axis = len(TERMS) + WAVES  # columns of an axis
     shifts = [
-        torch.linalg.inv(m.gram[:, [0, axis]][:, :, [0, axis]] / CORRELATED + 1e-9 * torch.eye(2))
-        for m in matched
+        torch.linalg.inv(m.gram[:, [0, axis]][:, :, [0, axis]] / CORRELATED + 1e-9 * torch.eye(2)) for m in matched
     ]
     every = torch.cat([s.diagonal(dim1=1, dim2=2).sum(1) for s in shifts])
     shift_error = math.sqrt(float(every.median()) * frames / max(len(every), 1))

@@ -40,7 +40,9 @@ class Plan:
     form: list[int] = field(
         default_factory=list
     )  # of another form of the reflectance: a nuisance of all but effects of the law
-    pull: dict[int, float] = field(default_factory=dict)  # columns whose prior is not about what is rendered: its distance, in the column's unit
+    pull: dict[int, float] = field(
+        default_factory=dict
+    )  # columns whose prior is not about what is rendered: its distance, in the column's unit
     guises: list[Guise] = field(default_factory=list)
     steps: list[tuple[int, str, float]] = field(default_factory=list)  # base effect, coordinate, step: tangents
 
@@ -67,12 +69,12 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey, candidates: bool
         return len(plan.shared) - 1
 
     free = range(chain.coefficients.shape[1]) if chain.free is None else torch.nonzero(chain.free)[:, 0].tolist()
+    measured = chain.model if isinstance(chain.model, LunarLaws) else None
     for k in free:
-        known = isinstance(chain.model, LunarLaws)
-        place = shared(f"coefficient {k}", float(chain.model.scatter[k]) if known else math.inf)
-        if known and math.isfinite(plan.prior[place]):
+        place = shared(f"coefficient {k}", float(measured.scatter[k]) if measured else math.inf)
+        if math.isfinite(plan.prior[place]):
             plan.pull[place] = float(chain.coefficients.flatten()[k])
-    if chain.laws is not None and not isinstance(chain.model, LunarLaws):
+    if chain.laws is not None and not measured:
         for k in range(len(chain.laws.scatter) - 1):
             plan.form.append(shared(f"form {k}", 1.0))
     shared("slopes within a pixel", 1.0)

@@ -46,22 +46,22 @@ def refine(state: State, view: View) -> View:
     look: View | None = None
     least, last = math.inf, math.inf  # squares left at the best values so far, length of the last step
     share = 1.0  # of a step
-    best = [(c.effect, dict(c.errors), c.rms) for c in state.causes]
+    best = [c.effect for c in state.causes]
     state.fit()  # from here on the coefficients move along as columns
     for _ in range(STEPS):
         now = state.again(view, along(state, view), look.model if look else None)
-        left = _left(now)
+        left = _left(state, now)
         if look is not None and abs(left - least) < SETTLED:
             break
         if left > least:  # the step was too long: half of it, from where it started
             share *= 0.5
-            for cause, (effect, errors, rms) in zip(state.causes, best, strict=True):
-                cause.effect, cause.errors, cause.rms = effect, dict(errors), rms
+            for cause, effect in zip(state.causes, best, strict=True):
+                cause.effect = effect
             if share < SHORTEST:
                 break
         else:
             look, least = now, left
-            best = [(c.effect, dict(c.errors), c.rms) for c in state.causes]
+            best = [c.effect for c in state.causes]
         assert look is not None
         moved = _step(state, look, share)
         if moved < SETTLED:
@@ -74,13 +74,13 @@ def refine(state: State, view: View) -> View:
     return look
 
 
-def _left(view: View) -> float:
+def _left(state: State, view: View) -> float:
     """Whitened squares of the residual, all nuisance fitted along."""
     whole = view.whole
     kept = dict(whole.precision)
     for place in _scene_places(view)[0]:
         whole.precision.pop(int(place), None)
-    _, score, _, _ = whole.reduce(np.zeros(1, dtype=np.int64))
+    _, score, _, _ = whole.reduce(np.zeros(1, dtype=np.int64), _no_form(state, whole))
     whole.precision = kept
     return float(score[0])
 
@@ -110,7 +110,7 @@ def errors_over_images(state: State, view: View) -> None:
         for p in places:
             whole.precision.pop(int(p), None)
         if whole.seen[places].all():
-            left.append(_amounts(state, whole, places, [place for place, _, _ in owned])[0])
+            left.append(_amounts(state, whole, places)[0])
     if len(left) > 1:
         for (place, name, _), error in zip(owned, jackknife_error(np.array(left)), strict=True):
             state.causes[place].over_images[name] = float(error)
@@ -138,7 +138,7 @@ def _step(state: State, view: View, share: float) -> float:
         seen = whole.seen[places]
         for p in places:
             whole.precision.pop(int(p), None)
-        amounts, errors = _amounts(state, whole, places[seen], [scene[k][1][0] for k in np.flatnonzero(seen)])
+        amounts, errors = _amounts(state, whole, places[seen])
         for p in places:
             whole.precision[int(p)] = 1e-10 * whole.gram[p, p]
         alone = {c.effect.name: 0 for c in state.causes}
@@ -163,14 +163,14 @@ def _step(state: State, view: View, share: float) -> float:
     return largest
 
 
-def _amounts(state: State, whole: Whole, places, owners: list[int]) -> list[NDArray[np.float64]]:
-    """Moves of all coordinates and their errors; beside what is of the law no other form of it stands."""
-    out = list(whole.errors(places))
-    law = np.array([type(state.causes[k].effect).of_law for k in owners], dtype=bool)
-    if law.any():
-        alone = whole.errors(places, list(whole.form_places()))
-        out = [np.where(law, b, a) for a, b in zip(out, alone, strict=True)]
-    return out
+def _amounts(state: State, whole: Whole, places: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+    """Moves of all coordinates and their errors."""
+    return list(whole.errors(places, _no_form(state, whole)))
+
+
+def _no_form(state: State, whole: Whole) -> list[int]:
+    """Places of another form of the law where a cause is of the law: beside it no other form stands."""
+    return whole.form_places().tolist() if any(type(c.effect).of_law for c in state.causes) else []
 
 
 def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:

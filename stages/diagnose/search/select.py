@@ -42,6 +42,8 @@ def search(state: State, most: int) -> Outcome:
     refused: set[str] = set()
     while True:
         view = state.look(state.open_names())
+        if not state.causes and state.law_is_another(view):
+            continue
         best, _ = weigh_all(view.whole)
         out.rejected = {k: v for k, v in out.rejected.items() if k in refused}
         out.view, out.best = view, best
@@ -128,12 +130,15 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
     if not get_effect(found.effect).of_law:
         return False
     if not len(whole.form_places()):
-        out.rejected[found.effect] = (found.gain, "the law is fitted to these images, and what is left of it has no form of its own")
+        out.rejected[found.effect] = (
+            found.gain,
+            "the law is fitted to these images, and what is left of it has no form of its own",
+        )
         return True
-    added = whole.law_adds(found)
-    if interval(added, whole.sizes)[0] <= 0:
+    added = whole.another_law(found.guise)
+    if not added:
         return False
-    why = f"the nominal law has another form, which gains {added.sum():.0f} nats more beside it; the effect stands for a part of that"
+    why = f"the nominal law has another form, which gains {added:.0f} nats more beside it; the effect stands for a part of that"
     out.rejected[found.effect] = (found.gain, why)
     return True
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -12,13 +13,14 @@ from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_v
 from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
 from stages.diagnose.likelihood.weigh import Found, Whole
 from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.form import measured_laws
 from stages.diagnose.model.nominal import Nominal, fit
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.explain import Registration
 from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, moved_columns, shared_columns
 from stages.diagnose.rows.patches import Grid, cuts, make_grid, make_patches
-from stages.diagnose.settings import FOLDS, SEEN, SHAMS
+from stages.diagnose.settings import FAINT, FOLDS, SEEN, SHAMS
 from stages.effects import Effect, Survey, get_effect
 
 
@@ -76,6 +78,24 @@ class State:
         """The formation chain of every site with the effects found so far."""
         base = self.base
         return per_site(lambda site: self.nominal.chain(site, base), self.sites)
+
+    def law_is_another(self, view: View) -> bool:
+        """Whether another law surely gains on held-out ground whatever effect of the law stands beside it; measured ones take the nominal one's place then."""
+        whole = view.whole
+        places = whole.form_places()
+        if not len(places):
+            return False
+        least = FAINT**2 / 2 * float(whole.gram[0, 0])
+        alone = [g for g in whole.plan.guises if get_effect(g.effect).of_law and whole.seen[whole.places(g)].all()]
+        if min(whole.another_law(guise) for guise in [None, *alone]) < least:
+            return False
+        other = measured_laws(self.nominal, self.sites, self.units)
+        if other is None:
+            return False
+        self.nominal = other
+        self.fit()
+        self.reference = copy.copy(other)
+        return True
 
     def grid(self) -> tuple[Grid, int]:
         """The patches' frequencies, and into how many pieces a side a crop is cut."""
