@@ -144,7 +144,7 @@ def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
         if cls.of_law and not len(whole.form_places()):  # a law that is fitted follows it
             out.append(name)
             continue
-        if found.alone >= SURE and name not in outcome.hidden:
+        if found.alone >= SURE:
             continue
         error = math.inf
         for guise in whole.plan.guises:
@@ -162,7 +162,7 @@ def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
                 size = abs(at - cls.null()[coordinate])
                 worth = cls.strong.get(coordinate, 0.0) or size
                 error = min(error, size / worth / math.sqrt(max(float(information[k, k]), 1e-30)))
-        if SURE * error > 1 or name in outcome.hidden:
+        if SURE * error > 1:
             out.append(name)
     return out
 

@@ -21,7 +21,6 @@ from stages.diagnose.search.tested import hidden_rows
 from stages.diagnose.settings import DISCOVERY, FAINT, FOLDS, NOTABLE, SIMPLER, SURE, TRIED, TRIES
 from stages.effects import Effect, get_effect
 
-TOO_FEW = "it takes more images"
 ODD = "nothing real has the values that fit best"
 
 
@@ -32,7 +31,6 @@ class Outcome:
     view: View | None = None
     best: dict[str, Found] = field(default_factory=dict)
     rejected: dict[str, tuple[float, str]] = field(default_factory=dict)
-    hidden: set[str] = field(default_factory=set)  # what a law may imitate at will: too few images to tell
     sure: bool = False  # whether something stands out that no plausible effect explains
 
 
@@ -85,8 +83,6 @@ def search(state: State, most: int) -> Outcome:
                 sure = [f for f in sure if f is not chosen]
                 refused.add(chosen.effect)
                 out.rejected[chosen.effect] = (chosen.gain, why)
-                if why.startswith(TOO_FEW):
-                    out.hidden.add(chosen.effect)
                 out.sure |= why.startswith(ODD) and chosen.gain > NOTABLE * float(view.whole.gram[0, 0])
                 state.say(f"{chosen.effect} is not taken: {why}")
             else:
