@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -42,8 +43,11 @@ class Cause:
 
     @property
     def reported_errors(self) -> dict[str, float]:
-        """The larger ones of either."""
-        return {k: max(e, self.over_images.get(k, 0.0)) for k, e in self.errors.items()}
+        """The larger ones of either, and what every data set has of the effect, which is part of what was found."""
+        ordinary = type(self.effect).tolerance
+        return {
+            k: math.hypot(max(e, self.over_images.get(k, 0.0)), ordinary.get(k, 0.0)) for k, e in self.errors.items()
+        }
 
 
 @dataclass
