@@ -25,7 +25,7 @@ class SunAzimuth(Effect):
     )
     confused_with = ("misregistration", "azimuthal_anisotropy")
     separate = "an image of the same ground with the Sun on another side"
-    parameters = (Parameter("error_deg", "degree", -10.0, 10.0, 0.0, "truth minus given, the same for all images"),)
+    parameters = (Parameter("error_deg", "degree", -45.0, 45.0, 0.0, "truth minus given, the same for all images"),)
     strong: ClassVar = {"error_deg": 0.5}
 
     @classmethod

@@ -54,9 +54,12 @@ def better_form(nominal: Nominal, sites: Sequence[Site], units: str) -> Nominal 
 
 
 def measured_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> Nominal | None:
-    """Measured lunar laws, fitted in the place of a fitted model; or None. The sites are as they were."""
+    """Measured lunar laws, fitted in the place of a fitted sum of terms; or None. The sites are as they were.
+
+    A physical law, such as Hapke's, is one of those measured, and stays with the freedom that it has.
+    """
     laws = nominal.laws
-    if nominal.predictor is not None or laws is None or not bool(nominal.free.all()):
+    if nominal.predictor is not None or laws is None or not nominal.model.linear or not bool(nominal.free.all()):
         return None
     vector = torch.tensor([p.default for p in laws.parameters])
     other = Nominal(laws, vector, torch.ones(len(vector), dtype=torch.bool))
