@@ -48,6 +48,11 @@ def reference(small_artefacts, checkpoint, tmp_path_factory):
     return maps(small_artefacts["scene"], checkpoint, tmp_path_factory.mktemp("reference") / "map.h5", window=512)
 
 
+def rounding(values: np.ndarray) -> float:
+    """Eight last bits of single precision: processors sum convolutions of other widths in another order."""
+    return 8 * float(np.spacing(np.float32(np.nanmax(np.abs(values)))))
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -63,7 +68,7 @@ def test_the_grid_of_windows_does_not_matter(small_artefacts, checkpoint, refere
     for k in range(got.shape[0]):
         spread = np.nanstd(reference[0][k])
         assert spread > 0
-        assert np.nanmax(np.abs(got[k] - reference[0][k])) < 1e-3 * spread
+        assert np.nanmax(np.abs(got[k] - reference[0][k])) < 1e-3 * spread + rounding(reference[0])
 
 
 def test_no_squares_at_window_borders(small_artefacts, checkpoint, reference, tmp_path):
@@ -120,10 +125,11 @@ def test_without_a_geotiff_the_map_is_the_same(small_artefacts, checkpoint, tmp_
         infer.run(small_artefacts["scene"], checkpoint, part, infer.Config(window=100, shard=(k, 2), **alone))
     merge.run(parts, tmp_path / "merged.h5")
     assert [p.name for p in tmp_path.glob("*.tif")] == ["both.tif"]
-    with h5py.File(tmp_path / "both.h5") as both:
-        for name in ("alone", "merged"):
-            with h5py.File(tmp_path / f"{name}.h5") as file:
-                np.testing.assert_array_equal(file["coefficients"][...], both["coefficients"][...])
+    both, alone_, merged = (
+        h5py.File(tmp_path / f"{name}.h5")["coefficients"][...] for name in ("both", "alone", "merged")
+    )
+    np.testing.assert_array_equal(alone_, both)
+    assert np.nanmax(np.abs(merged - both)) <= rounding(both)  # of other windows
 
 
 def test_svbrdf_opens_in_xarray_with_coordinates(small_artefacts, checkpoint, tmp_path):
@@ -214,7 +220,7 @@ def test_a_dem_with_nothing_at_its_edges(checkpoint, tmp_path):
     one, valid = maps(tmp_path / "s.h5", checkpoint, tmp_path / "a.h5", window=512)
     two, _ = maps(tmp_path / "s.h5", checkpoint, tmp_path / "b.h5", window=80, stride=80, offset=31)
     np.testing.assert_array_equal(valid, np.isfinite(z))
-    assert np.nanmax(np.abs(one - two)) < 1e-3 * np.nanstd(one[0])
+    assert np.nanmax(np.abs(one - two)) < 1e-3 * np.nanstd(one[0]) + rounding(one)
 
 
 def test_weights_of_neighbouring_windows_add_up_to_one():
