@@ -25,9 +25,9 @@ def checkpoint(small_artefacts, tmp_path_factory):
     path = tmp_path_factory.mktemp("infer") / "checkpoint.h5"
     config = train.Config(
         model="M2",
-        epochs=2,
+        epochs=6,
         batch=16,
-        lr=1e-2,
+        lr=3e-2,
         schedule="constant",
         widths=(4, 4, 8, 8, 8),
         device="cpu",
@@ -48,11 +48,6 @@ def reference(small_artefacts, checkpoint, tmp_path_factory):
     return maps(small_artefacts["scene"], checkpoint, tmp_path_factory.mktemp("reference") / "map.h5", window=512)
 
 
-def rounding(values: np.ndarray) -> float:
-    """Eight last bits of single precision: processors sum convolutions of other widths in another order."""
-    return 8 * float(np.spacing(np.float32(np.nanmax(np.abs(values)))))
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -68,7 +63,7 @@ def test_the_grid_of_windows_does_not_matter(small_artefacts, checkpoint, refere
     for k in range(got.shape[0]):
         spread = np.nanstd(reference[0][k])
         assert spread > 0
-        assert np.nanmax(np.abs(got[k] - reference[0][k])) < 1e-3 * spread + rounding(reference[0])
+        assert np.nanmax(np.abs(got[k] - reference[0][k])) < 1e-3 * spread
 
 
 def test_no_squares_at_window_borders(small_artefacts, checkpoint, reference, tmp_path):
@@ -125,11 +120,10 @@ def test_without_a_geotiff_the_map_is_the_same(small_artefacts, checkpoint, tmp_
         infer.run(small_artefacts["scene"], checkpoint, part, infer.Config(window=100, shard=(k, 2), **alone))
     merge.run(parts, tmp_path / "merged.h5")
     assert [p.name for p in tmp_path.glob("*.tif")] == ["both.tif"]
-    both, alone_, merged = (
-        h5py.File(tmp_path / f"{name}.h5")["coefficients"][...] for name in ("both", "alone", "merged")
-    )
-    np.testing.assert_array_equal(alone_, both)
-    assert np.nanmax(np.abs(merged - both)) <= rounding(both)  # of other windows
+    infer.run(small_artefacts["scene"], checkpoint, tmp_path / "whole.h5", infer.Config(window=100, **alone))
+    for first, second in (("alone", "both"), ("merged", "whole")):  # equal to the bit in equal windows
+        with h5py.File(tmp_path / f"{first}.h5") as one, h5py.File(tmp_path / f"{second}.h5") as two:
+            np.testing.assert_array_equal(one["coefficients"][...], two["coefficients"][...])
 
 
 def test_svbrdf_opens_in_xarray_with_coordinates(small_artefacts, checkpoint, tmp_path):
@@ -220,7 +214,7 @@ def test_a_dem_with_nothing_at_its_edges(checkpoint, tmp_path):
     one, valid = maps(tmp_path / "s.h5", checkpoint, tmp_path / "a.h5", window=512)
     two, _ = maps(tmp_path / "s.h5", checkpoint, tmp_path / "b.h5", window=80, stride=80, offset=31)
     np.testing.assert_array_equal(valid, np.isfinite(z))
-    assert np.nanmax(np.abs(one - two)) < 1e-3 * np.nanstd(one[0]) + rounding(one)
+    assert np.nanmax(np.abs(one - two)) < 1e-3 * np.nanstd(one[0])
 
 
 def test_weights_of_neighbouring_windows_add_up_to_one():
