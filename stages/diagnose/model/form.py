@@ -62,7 +62,9 @@ def measured_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> Nomina
     if nominal.predictor is not None or laws is None or not nominal.model.linear or not bool(nominal.free.all()):
         return None
     vector = torch.tensor([p.default for p in laws.parameters])
-    other = Nominal(laws, vector, torch.ones(len(vector), dtype=torch.bool))
+    free = torch.ones(len(vector), dtype=torch.bool)
+    free[0] = units == "iof"  # beside gains of all images the level means nothing, and would drift
+    other = Nominal(laws, vector, free)
     kept = [(s.image, s.gain, s.offset) for s in sites]
     measured = [s.image * s.gain[:, None, None] + s.offset[:, None, None] for s in sites]
     fit(other, sites, [], units, measured, start=True)

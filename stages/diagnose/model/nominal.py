@@ -189,7 +189,9 @@ def _normal_equations(
         # darker: in the shadow of something that the horizon does not know
         mask = masks[place] & (site.image > dark * predicted)
         # relative weights: every image counts alike, however low its Sun
-        level = (predicted * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
+        level = (site.image * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
+        if units == "dn":  # as it was read: an image that lies beside the ground has a low gain, and says little
+            level = level + site.offset / site.gain
         weight = (mask / level.clamp(min=1e-6)[:, None, None]).double()
         weight = weight * _near(site.image - predicted, weight)
         residual = (site.image - predicted).double() * weight
@@ -227,9 +229,9 @@ def _drawn_to_published(nominal: Nominal, gram: Tensor, score: Tensor, cost: flo
 def _drawn_to_measured(nominal: Nominal, gram: Tensor, score: Tensor, cost: float) -> None:
     """Add what is known of the coefficients of lunar laws to the normal equations."""
     if isinstance(nominal.model, LunarLaws):
-        pull = cost * CORRELATED * nominal.model.scatter.double() ** -2
+        pull = cost * CORRELATED * nominal.model.scatter[nominal.free].double() ** -2
         gram += torch.diag(pull)
-        score -= pull * nominal.vector.double()
+        score -= pull * nominal.vector[nominal.free].double()
 
 
 def _brightness(chains: Sequence[Chain], masks: Sequence[Tensor]) -> float:
@@ -261,7 +263,7 @@ def scale_images(site: Site, raw: Tensor, predicted: Tensor, mask: Tensor) -> No
     my = (raw * weight).sum((-2, -1)) / n
     dx = (predicted - mx[:, None, None]) * weight
     gain = (dx * raw).sum((-2, -1)) / (dx * dx).sum((-2, -1)).clamp(min=1e-12)
-    usable = gain.abs() > 1e-9
+    usable = gain > 1e-9  # brighter is brighter: an image that lies beside the ground may say otherwise
     gain = torch.where(usable, gain, my / mx.clamp(min=1e-9))
     site.gain = gain.float()
     site.offset = torch.where(usable, my - gain * mx, 0.0).float()

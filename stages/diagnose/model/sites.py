@@ -45,12 +45,18 @@ class Site:
     ground: int = 0
     _laid: tuple[object, Tensor, Tensor] | None = None  # for one displacement: image and mask over the ground
 
+    @property
+    def laid(self) -> Tensor:
+        """(n, H, W) the images as read, over the ground, since :meth:`align`."""
+        return self.read if self._laid is None else self._laid[1]
+
     def align(self) -> None:
-        """Lay the images, as they were read, over the ground."""
+        """Lay the images over the ground, with the gains and offsets that are known so far."""
         if self._laid is None or self._laid[0] is not self.displacement:
             laid = aligned(self.read, self.read_valid, *self.displacement or 2 * [torch.zeros(self.count, 1, 1)])
             self._laid = self.displacement, *laid
-        _, self.image, self.valid = self._laid
+        _, laid_image, self.valid = self._laid
+        self.image = (laid_image - self.offset[:, None, None]) / self.gain[:, None, None]
 
     @property
     def count(self) -> int:

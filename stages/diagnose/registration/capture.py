@@ -44,9 +44,19 @@ def capture(
     image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, most: int, sigma: float
 ) -> tuple[Tensor, Tensor]:
     """Shift (n, 2) east and south, px, that brings each image over its rendering, and the correlation there, (n,)."""
+    return peak(correlations(image, valid, rendered, lit, most, sigma))
+
+
+def correlations(image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, most: int, sigma: float) -> Tensor:
+    """:func:`correlation` of what is finer than ``sigma`` px."""
     valid, lit = valid.float(), lit.float()
-    map_ = correlation(fine(image, valid, sigma), valid, fine(rendered, lit, sigma), lit, most)
+    return correlation(fine(image, valid, sigma), valid, fine(rendered, lit, sigma), lit, most)
+
+
+def peak(map_: Tensor) -> tuple[Tensor, Tensor]:
+    """Where maps (n, S, S) of all shifts are highest, (n, 2) px east and south, and the value there, (n,)."""
     best, place = map_.flatten(1).max(1)
+    most = map_.shape[-1] // 2
     row, column = place // map_.shape[-1], place % map_.shape[-1]
     n = torch.arange(len(map_))
     inner_row, inner_column = row.clamp(1, 2 * most - 1), column.clamp(1, 2 * most - 1)
@@ -60,4 +70,4 @@ def capture(
     return torch.stack([column - most + east, row - most + south], 1), best
 
 
-__all__ = ["capture", "correlation", "fine"]
+__all__ = ["capture", "correlation", "correlations", "fine", "peak"]

@@ -17,7 +17,6 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import Nominal, lit_mask
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.capture import capture
 from stages.diagnose.registration.forms import (
     FORMS,
     TERMS,
@@ -30,10 +29,13 @@ from stages.diagnose.registration.forms import (
     match,
     solve,
 )
+from stages.diagnose.registration.start import Field, captured, laid, start
 from stages.diagnose.rows.patches import cuts
-from stages.diagnose.settings import BROAD, CAPTURE, CORRELATED, FOLDS, SURE
+from stages.diagnose.settings import CORRELATED, DISCOVERY, FOLDS, SURE
 from stages.effects import Effect
 from stages.effects.relief_displacement import lean
+
+OWN = "own", "own, leaning"  # each image's own shift, without and with relief displacement
 
 
 @dataclass
@@ -62,7 +64,7 @@ class Registration:
     known: list[tuple[Tensor, Tensor]]
     frame: Frame
     level: float
-    squares: dict[str, NDArray[np.float64]]
+    squares: dict[str, NDArray[np.float64]]  # (pieces of ground, frames)
     rms: dict[str, float]
     shift_error: float
     pixels: float
@@ -78,25 +80,29 @@ class Registration:
         known = [self.at(c) for c in chains]
         matched = _match_all(sites, nominal, [], known, self.frame, self.level, 1)
         fields = {f.name: [displacement(m, *self.fitted[f.name]) for m in matched] for f in FORMS}
-        own = {leans: self.settled(sites, nominal, self.share if leans else 0.0) for leans in (False, True)}
+        own = {leans: self.settled(sites, nominal, self.share if leans else 0.0, 1) for leans in (False, True)}
         for m, k in zip(matched, range(len(sites)), strict=True):
             every = [*(fields[f.name][k] for f in FORMS), own[False][k], own[True][k]]
-            for name, squares in zip([*fields, "own", "own, leaning"], left(m, every), strict=True):
-                self.tested.setdefault(name, np.zeros(max(group) + 1))[group[k]] += squares.sum()
+            for name, squares in zip([*fields, *OWN], left(m, every), strict=True):
+                total = self.tested.setdefault(name, np.zeros((max(group) + 1, len(self.coefficients))))
+                np.add.at(total[group[k]], m.chain.site.frames, squares)
 
-    def doubt(self, first: str, second: str, tested: tuple[str, str]) -> str:
-        """Why the second form's gain over the first is not sure, with the test pairs' part in it; ''"""
-        low, high = gain_interval(self.squares[first], self.squares[second])[1:]
+    def doubt(self, first: str, second: str, tested: tuple[str, str], frames: NDArray[np.int64] | None = None) -> str:
+        """Why the second form's gain over the first is not sure, with the test pairs' part in it; ''. frames : that count, all where None"""
+        learned = _shown(*(_of(self.squares[name], frames) for name in (first, second)))
+        low, high = gain_interval(*learned)[1:]
         if not low > 0:
             return f"its held-out gain is {low:.0f} .. {high:.0f} %, which may be nothing"
         if not self.tested:
             return ""
-        before, after = (self.tested[t] for t in tested)
+        before, after = _shown(*(_of(self.tested[t], frames) for t in tested))
+        if not before.sum() > 0:
+            return ""
         part, low, high = gain_interval(before, after)
         if high < 0 or (math.isnan(high) and after.sum() > before.sum()):
             return f"the test pairs contradict it: it gains {100 * (1 - after.sum() / before.sum()):.0f} % there"
         # what one comparison gains there counts with the rest of the held-out ground
-        both = [np.concatenate([self.squares[f], t]) for f, t in ((first, before), (second, after))]
+        both = [np.concatenate(pair) for pair in zip(learned, (before, after), strict=True)]
         part, low, high = gain_interval(*both)
         return (
             ""
@@ -104,17 +110,20 @@ class Registration:
             else f"with the test pairs its held-out gain is {part:.0f} % ({low:.0f} .. {high:.0f}), which may be nothing"
         )
 
-    def evidence(self, first: Form, second: Form) -> tuple[float, float, float]:
+    def evidence(self, first: str, second: str, frames: NDArray[np.int64] | None = None) -> tuple[float, float, float]:
         """Chance of the second form's gain over the first where there is none, the gain in nats, and its error."""
-        before, after = self.squares[first.name], self.squares[second.name]
-        gain = self.gain(first, second)
-        total = nats(float(before.sum()), float(after.sum()), self.pixels, CORRELATED)
+        before, after = _shown(_of(self.squares[first], frames), _of(self.squares[second], frames))
+        gain = Gain(*gain_interval(before, after))
+        pixels = self.pixels * float(before.sum()) / float(self.squares[first].sum())
+        total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
         error = abs(total) * (gain.high - gain.low) / (4 * max(abs(gain.percent), 1e-9))
         return gain_chance(before, after), total, error
 
-    def gain(self, first: Form, second: Form) -> Gain:
-        """Of the second form over the first."""
-        return Gain(*gain_interval(self.squares[first.name], self.squares[second.name]))
+    def gain(self, first: str, second: str, frames: NDArray[np.int64] | None = None) -> Gain:
+        """Of the second form over the first, as a share of the squared residual of all images."""
+        before, after = _shown(_of(self.squares[first], frames), _of(self.squares[second], frames))
+        share = float(before.sum() / self.squares[first].sum())
+        return Gain(*(share * g for g in gain_interval(before, after)))
 
     def at(self, chain: Chain, waves: bool = True) -> tuple[Tensor, Tensor]:
         """Where the form has the images of any site look, (n, H, W) px each; ``waves``: those over the lines with it."""
@@ -126,112 +135,114 @@ class Registration:
         east, south = lean(site.observation, self.level)
         return field[0] + self.share * east, field[1] + self.share * south
 
-    def settled(self, sites: Sequence[Site], nominal: Nominal, share: float) -> list[tuple[Tensor, Tensor]]:
+    def settled(self, sites: Sequence[Site], nominal: Nominal, share: float, terms: int = 3) -> list[Field]:
         """Relief displacement by ``share`` plus each image's own shift and affine map, captured beside it: a nuisance of any comparison."""
-        leaning = [tuple(share * d for d in lean(s.observation, self.level)) for s in sites]
-        kept = [(s.read, s.read_valid) for s in sites]
-        for site, (east, south) in zip(sites, leaning, strict=True):
-            site.read, site.read_valid = aligned(site.read, site.read_valid, east, south)
-        shifts = captured(sites, nominal, [])
-        for site, (image, valid) in zip(sites, kept, strict=True):
-            site.read, site.read_valid = image, valid
-        none = torch.zeros_like(self.coefficients)
-        ends, matched = [], []
-        for share_of_shift in (0.0, 1.0):  # the strongest peak of a correlation may be a neighbouring crater
-            known = [
-                (e + share_of_shift * d[:, :1, None], s + share_of_shift * d[:, 1:, None])
-                for (e, s), d in zip(leaning, shifts, strict=True)
-            ]
-            for _ in range(3):
-                matched = _match_all(sites, nominal, [], known, self.frame, self.level, 1)
-                known = _own_fields(matched, none, share, 1, 3)
-            ends.append(known)
-        out = []
-        for m, first, second in zip(matched, *ends, strict=True):
-            near, far = left(m, [first, second])
-            better = torch.from_numpy(far < near)[:, None, None]
-            out.append((torch.where(better, second[0], first[0]), torch.where(better, second[1], first[1])))
-        return out
-
-    def mean_shifts(self, sites: Sequence[Site], frames: int) -> Tensor:
-        """(frames, 2) px east and south: the field of every frame without relief displacement, meaned over what it shows."""
-        total, count = torch.zeros(frames, 2), torch.zeros(frames)
-        for site in sites:
-            own = self.coefficients[torch.from_numpy(site.frames)].float()
-            mean = basis(self.frame, site).mean((-2, -1))
-            total.index_add_(0, torch.from_numpy(site.frames), own @ mean)
-            count.index_add_(0, torch.from_numpy(site.frames), torch.ones(site.count))
-        return total / count.clamp(min=1)[:, None]
-
-
-def captured(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect]) -> list[Tensor]:
-    """(n, 2) shift east and south per site, px: each image's own, where it stands out from what its frame has in common."""
-
-    def of(site: Site) -> tuple[Tensor, Tensor, Tensor]:
-        chain = nominal.chain(site, base)
-        lit = lit_mask(chain) | (site.read_valid & chain.lit())
-        shift, peak = capture(site.read, site.read_valid, chain.predict(), lit, CAPTURE, BROAD)
-        _, still = capture(site.read, site.read_valid, chain.predict(), lit, 1, BROAD)
-        count = (site.read_valid & lit).sum((-2, -1)).float()
-        z = (torch.atanh(peak.clamp(max=0.999)) - torch.atanh(still.clamp(-0.9, 0.999))) * (count / CORRELATED).sqrt()
-        border = (shift.abs() > CAPTURE - 0.5).any(1)
-        return shift, torch.where(border, 0.0, z), still
-
-    out = []
-    for shift, z, still in per_site(of, sites):
-        near = shift.abs().amax(1) <= 1.5
-        sure = (z > SURE) | (near & (still > 0.3))
-        out.append(torch.where(sure[:, None], shift, 0.0))
-    return out
+        shifts, _ = self.fitted["constant, leaning" if share else "constant"]
+        return own_fields(sites, nominal, shifts, [share] * len(sites), self.frame, self.level, terms)
 
 
 def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], frames: int, level: float) -> Registration:
-    """Capture, fit every form, score each on held-out sites, and align the sites by the best; sites' ``displacement`` is set."""
-    shifts = captured(sites, nominal, base)
-    known = [
-        (d[:, 0, None, None].expand_as(s.image), d[:, 1, None, None].expand_as(s.image))
-        for d, s in zip(shifts, sites, strict=True)
-    ]
+    """Capture, fit every form, score each on held-out sites; ``known`` is where the images are by the best, each image's own shift beside it."""
+    known, spread = start(sites, nominal, base, frames, level)
     frame = _frame(sites)
     pieces = cuts(min(sites[0].image.shape[-2:]), len(sites))
-    spread = max(float(torch.cat(shifts).square().mean().sqrt()), 0.3)
+    spread = max(spread, 0.3)
     matched: list[Matched] = []
     for _ in range(2):
         matched = _match_all(sites, nominal, base, known, frame, level, pieces)
         coefficients, share = solve(matched, FORMS[-1], frames, spread)
         known = _own_fields(matched, coefficients, share, pieces**2)
     matched = _match_all(sites, nominal, base, known, frame, level, pieces)
-    squares = _held_out(matched, frames, spread)
-    gains = {f.name: Gain(*gain_interval(squares[0], after)) for f, after in zip(FORMS, squares, strict=True)}
-    best = _best(squares)
-    form = FORMS[best]
-    plain, slanted = (FORMS.index(form.beside(leaning=leans)) for leans in (False, True))
-    leaning = Gain(*gain_interval(squares[plain], squares[slanted]))
-    coefficients, share = solve(matched, form, frames, spread)
     group = _grounds(matched)
-    without = [
-        solve([m for m, g in zip(matched, group, strict=True) if g != gone], form, frames, spread)[1]
-        for gone in sorted(set(group))
-    ]
-    error = float(jackknife_error(np.array(without)))
+    # by the form with most freedom: what else displaces images must not pass for relief
+    share = solve(matched, FORMS[-1], frames, spread)[1]
+    without = {g: _share_without(matched, group, g, frames, spread) for g in sorted(set(group))}
+    error = float(jackknife_error(np.array(list(without.values()))))
+    fitted = {f.name: solve(matched, f, frames, spread, share if f.leaning else None) for f in FORMS}
+    squares = dict(zip((f.name for f in FORMS), _held_out(matched, group, frames, spread), strict=True))
+    shares = [without[g] for g in group[:: pieces**2]]
+    plain = own_fields(sites, nominal, fitted["constant"][0], [0.0] * len(sites), frame, level, 1)
+    slanted = own_fields(sites, nominal, fitted["constant, leaning"][0], shares, frame, level, 1)
+    squares |= _beside_own(matched, group, [plain, slanted], frames, pieces**2)
+    gains = {k: Gain(*gain_interval(squares["none"].sum(1), q.sum(1))) for k, q in squares.items() if k in fitted}
+    leaning = Gain(*gain_interval(squares[OWN[0]].sum(1), squares[OWN[1]].sum(1)))
+    form = _best(squares, leaning.low > 0 and abs(share) > SURE * error)
+    coefficients, share = fitted[form.name]
     # what nothing explains is left alone: a wrong Sun looks like a shift of its own at every site
-    if best:
+    if form.terms or form.leaning:
         known = _own_fields(matched, coefficients, share, pieces**2)
     else:
         known = [displacement(m, coefficients, share) for m in matched[:: pieces**2]]
     pixels = sum(float(s.read_valid.sum()) for s in sites)
-    by_name = {f.name: q for f, q in zip(FORMS, squares, strict=True)}
-    rms = {k: math.sqrt(float(q.sum()) / max(pixels, 1.0)) for k, q in by_name.items()}
+    rms = {k: math.sqrt(float(q.sum()) / max(pixels, 1.0)) for k, q in squares.items()}
     axis = len(TERMS) + WAVES  # columns of an axis
     shifts = [
         torch.linalg.inv(m.gram[:, [0, axis]][:, :, [0, axis]] / CORRELATED + 1e-9 * torch.eye(2)) for m in matched
     ]
     every = torch.cat([s.diagonal(dim1=1, dim2=2).sum(1) for s in shifts])
     shift_error = math.sqrt(float(every.median()) * frames / max(len(every), 1))
-    fitted = {f.name: solve(matched, f, frames, spread) for f in FORMS}
     return Registration(
-        form, coefficients, share, error, gains, leaning, known, frame, level, by_name, rms, shift_error, pixels, fitted
+        form, coefficients, share, error, gains, leaning, known, frame, level, squares, rms, shift_error, pixels, fitted
     )
+
+
+def _share_without(matched: Sequence[Matched], group: Sequence[int], gone: int, frames: int, spread: float) -> float:
+    """Share of relief displacement by all ground but one piece."""
+    rest = [m for m, g in zip(matched, group, strict=True) if g != gone]
+    return solve(rest, FORMS[-1], frames, spread)[1]
+
+
+def _beside_own(
+    matched: Sequence[Matched], group: Sequence[int], fields: Sequence[Sequence[Field]], frames: int, pieces: int
+) -> dict[str, NDArray[np.float64]]:
+    """Squares (pieces of ground, frames) without and with relief displacement, its share by other ground, beside each image's own shift.
+
+    Unlike a form of the whole scene such shifts need no other ground to be known.
+    """
+    out = {name: np.zeros((max(group) + 1, frames)) for name in OWN}
+    for k, (m, g) in enumerate(zip(matched, group, strict=True)):
+        for name, squares in zip(OWN, left(m, [f[k // pieces] for f in fields]), strict=True):
+            np.add.at(out[name][g], m.chain.site.frames, squares)
+    return out
+
+
+def own_fields(
+    sites: Sequence[Site],
+    nominal: Nominal,
+    shifts: Tensor,
+    shares: Sequence[float],
+    frame: Frame,
+    level: float,
+    terms: int,
+) -> list[Field]:
+    """Relief displacement by a share at each site plus each image's own shift (``terms`` 1) or affine map (3), captured beside it and the
+    ``shifts`` (frames, 2, T) of frames.
+    """
+    ends = []
+    matched: list[Matched] = []
+    # the strongest peak of a correlation may be a neighbouring crater, and the shift of a frame one of another part of the scene
+    for own_share, of_frame in ((0.0, 1.0), (1.0, 1.0), (1.0, 0.0)):
+        known = []
+        for site, share in zip(sites, shares, strict=True):
+            moved = of_frame * shifts[torch.from_numpy(site.frames), :, 0].float()[..., None, None]
+            east, south = lean(site.observation, level)
+            known.append((share * east + moved[:, 0], share * south + moved[:, 1]))
+        if own_share:
+            with laid(sites, known):
+                own = captured(sites, nominal, [])
+            known = [(e + d[:, :1, None], s + d[:, 1:, None]) for (e, s), d in zip(known, own, strict=True)]
+        for _ in range(3):
+            matched = _match_all(sites, nominal, [], known, frame, level, 1)
+            known = _own_fields(matched, torch.zeros_like(shifts), shares, 1, terms)
+        ends.append(known)
+    out = []
+    for k, m in enumerate(matched):
+        every = [end[k] for end in ends]
+        best = torch.from_numpy(np.argmin(left(m, every), 0))
+        n = torch.arange(len(best))
+        east, south = (torch.stack([field[axis] for field in every])[best, n] for axis in (0, 1))
+        out.append((east, south))
+    return out
 
 
 def _frame(sites: Sequence[Site]) -> Frame:
@@ -259,22 +270,25 @@ def lit_mask_read(chain) -> Tensor:
 
 
 def _own_fields(
-    matched: Sequence[Matched], coefficients: Tensor, share: float, pieces: int, terms: int = 1
-) -> list[tuple[Tensor, Tensor]]:
+    matched: Sequence[Matched], coefficients: Tensor, share: float | Sequence[float], pieces: int, terms: int = 1
+) -> list[Field]:
     """The form's displacement plus each image's own beside it, drawn to nothing as far as it is not known.
 
+    share : of relief displacement, or one per site
     terms : 1 for a shift, 3 for an affine map about the crop's centre; the scatter of either is estimated
     """
     axis = len(TERMS) + WAVES
     place = torch.tensor([*range(terms), *range(axis, axis + terms)])
     degree = torch.tensor([min(k, 1) for k in range(terms)] * 2)
     parts = []
-    for k in range(0, len(matched), pieces):
-        own_parts = matched[k : k + pieces]
+    number = len(matched) // pieces
+    shares = [share] * number if isinstance(share, float) else list(share)
+    for k, site_share in enumerate(shares):
+        own_parts = matched[k * pieces : (k + 1) * pieces]
         m = own_parts[0]
         turn = _about_centre(m, terms)
         known = coefficients[torch.from_numpy(m.chain.site.frames)].flatten(1)
-        known = torch.cat([known, torch.full((len(known), 1), share, dtype=known.dtype)], 1)
+        known = torch.cat([known, torch.full((len(known), 1), site_share, dtype=known.dtype)], 1)
         gram = torch.stack([m.gram for m in own_parts]).sum(0)[:, place] / CORRELATED
         # what the residual still asks for once the form is taken out
         asks = torch.stack([m.score for m in own_parts]).sum(0)[:, place] / CORRELATED
@@ -290,10 +304,10 @@ def _own_fields(
             n.index_add_(0, degree, torch.full((len(degree),), float(len(own)), dtype=torch.float64))
         spread = (squares / n.clamp(min=1)).sqrt().clamp(min=1e-3)
     out = []
-    for gram, asks, turn, m in parts:
+    for (gram, asks, turn, m), site_share in zip(parts, shares, strict=True):
         own = torch.linalg.solve(gram + torch.diag(spread[degree] ** -2), asks[..., None])[..., 0] @ turn.T
         field = torch.einsum("nat,thw->anhw", own.float().view(len(own), 2, terms), m.basis[:terms])
-        east, south = displacement(m, coefficients, share)
+        east, south = displacement(m, coefficients, site_share)
         out.append((east + field[0], south + field[1]))
     return out
 
@@ -308,20 +322,41 @@ def _about_centre(m: Matched, terms: int) -> Tensor:
     return torch.block_diag(turn, turn)
 
 
-def _held_out(matched: list[Matched], frames: int, spread: float) -> list[NDArray[np.float64]]:
-    """Squared residual per site, (sites,) for each form, fitted to other sites."""
-    group = _grounds(matched)
+def _held_out(matched: list[Matched], group: Sequence[int], frames: int, spread: float) -> list[NDArray[np.float64]]:
+    """Squared residual per piece of ground and frame, (pieces, frames) for each form, fitted to other ground."""
     folds = [[k for k, g in enumerate(group) if g % FOLDS == fold] for fold in range(FOLDS)]
     folds = [f for f in folds if f]
-    out = [np.zeros(max(group) + 1) for _ in FORMS]
+    out = [np.zeros((max(group) + 1, frames)) for _ in FORMS]
     for fold in folds:
         rest = [m for k, m in enumerate(matched) if k not in fold]
-        found = [solve(rest, form, frames, spread) for form in FORMS]
+        share = solve(rest, FORMS[-1], frames, spread)[1]
+        found = [solve(rest, form, frames, spread, share if form.leaning else None) for form in FORMS]
         for k in fold:
             fields = [displacement(matched[k], *f) for f in found]
             for into, squares in zip(out, left(matched[k], fields), strict=True):
-                into[group[k]] += squares.sum()
+                np.add.at(into[group[k]], matched[k].chain.site.frames, squares)
     return out
+
+
+def shifted_frames(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Frames whose squares (pieces of ground, frames) surely get smaller on the ground that shows them; false ones are as rare as the
+    false discovery rate has it (Benjamini & Hochberg 1995).
+    """
+    chance = np.array([gain_chance(*_shown(b, a)) for b, a in zip(before.T, after.T, strict=True)])
+    chance = np.where(np.isfinite(chance), chance, 1.0)
+    order = np.argsort(chance)
+    passed = np.flatnonzero(chance[order] <= DISCOVERY * np.arange(1, len(order) + 1) / len(order))
+    return np.sort(order[: passed.max() + 1]) if len(passed) else np.zeros(0, np.int64)
+
+
+def _of(squares: NDArray[np.float64], frames: NDArray[np.int64] | None) -> NDArray[np.float64]:
+    """(pieces,) of some frames, or of all."""
+    return squares.sum(1) if frames is None else squares[:, frames].sum(1)
+
+
+def _shown(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of the pieces of ground that show anything."""
+    return before[before > 0], after[before > 0]
 
 
 def _grounds(matched: Sequence[Matched]) -> list[int]:
@@ -344,7 +379,7 @@ def left(m: Matched, fields) -> list[NDArray[np.float64]]:
     for image, _ in moved:
         y = image * weight
         y = (y - (y.sum((-2, -1)) / n)[:, None, None]) * weight
-        slope = (x * y).sum((-2, -1)) / x.square().sum((-2, -1)).clamp(min=1e-20)
+        slope = ((x * y).sum((-2, -1)) / x.square().sum((-2, -1)).clamp(min=1e-20)).clamp(min=0)  # brighter is brighter
         kept = y - slope[:, None, None] * x
         out.append((kept.square().sum((-2, -1)) / _norm(chain)).numpy())
     return out
@@ -356,10 +391,15 @@ def _norm(chain: Chain) -> Tensor:
     return ((chain.site.read * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)).square().clamp(min=1e-20)
 
 
-def _best(squares: list[NDArray[np.float64]]) -> int:
-    """The form that leaves least on held-out sites, of those that leave less than nothing does for sure; the first if there is none."""
-    sure = [k for k in range(1, len(FORMS)) if gain_interval(squares[0], squares[k])[1] > 0]
-    return min(sure, key=lambda k: float(squares[k].sum()), default=0)
+def _best(squares: dict[str, NDArray[np.float64]], leans: bool) -> Form:
+    """Of the forms with relief displacement, or of those without, the one that leaves least on held-out ground, of those that leave less than
+    nothing does for sure; else a shift of those frames that it surely places better; else the plain one.
+    """
+    plain = next(f for f in FORMS if not f.terms and f.leaning == leans)
+    others = [f for f in FORMS if f.terms and f.leaning == leans]
+    sure = [f for f in others if gain_interval(squares["none"].sum(1), squares[f.name].sum(1))[1] > 0]
+    sure = sure or [f for f in others if f.terms == 1 and len(shifted_frames(squares[plain.name], squares[f.name]))]
+    return min(sure, key=lambda f: float(squares[f.name].sum()), default=plain)
 
 
 __all__ = ["Gain", "Registration", "explain"]

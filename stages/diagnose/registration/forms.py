@@ -103,7 +103,7 @@ def match(
     image, valid = aligned(site.read, site.read_valid, *known)
     mask = (valid & lit).float()
     measured, predicted = fine(image, mask, BROAD), fine(rendered, mask, BROAD)
-    scale = (measured * predicted).sum((-2, -1)) / predicted.square().sum((-2, -1)).clamp(min=1e-20)
+    scale = ((measured * predicted).sum((-2, -1)) / predicted.square().sum((-2, -1)).clamp(min=1e-20)).clamp(min=0)
     residual = measured - scale[:, None, None] * predicted
     east, south = (fine(g, mask, BROAD) * scale[:, None, None] for g in gradients(rendered))
     variance = residual.square().sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
@@ -134,8 +134,12 @@ def _parts(height: int, width: int, pieces: int) -> list[Tensor]:
     return [((row == i) & (column == j)).float() for i in range(pieces) for j in range(pieces)]
 
 
-def solve(sites: Sequence[Matched], form: Form, frames: int, spread: float) -> tuple[Tensor, float]:
-    """Coefficients (frames, 2, T) and the share of leaning; ``spread`` px is what is expected of a coefficient."""
+def solve(
+    sites: Sequence[Matched], form: Form, frames: int, spread: float, share: float | None = None
+) -> tuple[Tensor, float]:
+    """Coefficients (frames, 2, T) and the share of leaning, or the former beside a given ``share``; ``spread`` px is what is expected of a
+    coefficient.
+    """
     places, count = form.places, len(TERMS) + WAVES
     t = len(places)
     if not sites or not (t or form.leaning):
@@ -150,8 +154,10 @@ def solve(sites: Sequence[Matched], form: Form, frames: int, spread: float) -> t
             own = torch.cat([chosen, torch.tensor([2 * count])])
             total[place[:, None], place] += site.gram[k][own[:, None], own]
             score[place] += site.score[k][own]
-    if not form.leaning:
-        total[-1], total[:, -1], total[-1, -1], score[-1] = 0.0, 0.0, 1.0, 0.0
+    if not form.leaning or share is not None:
+        given = share or 0.0
+        score -= given * total[-1]
+        total[-1], total[:, -1], total[-1, -1], score[-1] = 0.0, 0.0, 1.0, given
     prior = torch.full((len(total),), spread**-2, dtype=torch.float64)
     prior[-1] = 1e-6
     found = torch.linalg.solve(total + torch.diag(prior), score)

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, nats
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.explain import Registration, lit_mask_read
-from stages.diagnose.registration.forms import FORMS, TERMS, Form
+from stages.diagnose.registration.explain import OWN, Registration, lit_mask_read, shifted_frames
+from stages.diagnose.registration.forms import FORMS, TERMS
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CORRELATED, FOLDS, SURE
+from stages.diagnose.settings import CORRELATED, FOLDS
 from stages.effects import Effect, Survey, effect_names, get_effect
 from stages.effects.filters import gaussian
 
@@ -69,16 +69,16 @@ def by_registration(state: State) -> tuple[list[Named], dict[str, tuple[float, s
     return out, refused
 
 
-def _named(effect, parameters, r: Registration, first: Form, second: Form) -> Named:
-    """The second form's gain over the first."""
-    gain = r.gain(first, second)
-    before, after = r.rms[first.name], r.rms[second.name]
+def _named(effect, parameters, r: Registration, first: str, second: str, frames=None) -> Named:
+    """The second form's gain over the first, of some frames or all."""
+    gain = r.gain(first, second, frames)
+    before, after = r.rms[first], r.rms[second]
     percent = (gain.percent, gain.low, gain.high)
-    return Named(effect, parameters, *r.evidence(first, second), before, after, percent, [effect.name])
+    return Named(effect, parameters, *r.evidence(first, second, frames), before, after, percent, [effect.name])
 
 
 def _leaning(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
-    if not r.form.leaning or not r.leaning.low > 0 or abs(r.share) < SURE * r.share_error:
+    if not r.form.leaning:
         return None, ""
     effect = get_effect(name)({"share": r.share}, state.data)
     size = abs(r.share) * state.data.lean_px
@@ -87,7 +87,8 @@ def _leaning(state: State, r: Registration, name: str) -> tuple[Named | None, st
         "rms_px": (size, r.share_error * state.data.lean_px, "px"),
     }
     plain = r.form.beside(leaning=False)
-    return _named(effect, parameters, r, plain, r.form), r.doubt(plain.name, r.form.name, ("own", "own, leaning"))
+    compared = (plain.name, r.form.name) if plain.terms else OWN
+    return _named(effect, parameters, r, *compared), r.doubt(*compared, OWN)
 
 
 def _lines(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
@@ -102,25 +103,29 @@ def _lines(state: State, r: Registration, name: str) -> tuple[Named | None, str]
         return None, ""
     plain = r.form.beside(waves=0)
     error = r.shift_error * math.sqrt(2 * r.form.waves)
-    made = _named(effect, {"rms_px": (size, error, "px")}, r, plain, r.form)
+    made = _named(effect, {"rms_px": (size, error, "px")}, r, plain.name, r.form.name)
     return made, r.doubt(plain.name, r.form.name, (plain.name, r.form.name))
 
 
 def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
-    """Named where one shift per frame gains for sure, alone or beside relief displacement, and is more than ordinary."""
+    """Named where one shift per frame gains for sure, of all frames or of some, alone or beside relief displacement, and is more than ordinary."""
     cls = get_effect(name)
-    first = next(f for f in FORMS if f.terms == 0 and f.leaning == r.form.leaning)
-    forms = [f for f in FORMS if f.leaning == r.form.leaning and not f.waves and 0 < f.terms <= r.form.terms]
-    if not forms:
+    if not r.form.terms:
         return None, ""
-    shifts = r.mean_shifts(state.sites, state.frames)
+    first, form = (
+        next(f.name for f in FORMS if f.terms == n and f.leaning == r.form.leaning and not f.waves) for n in (0, 1)
+    )
+    some = shifted_frames(r.squares[first], r.squares[form])
+    frames = some if r.doubt(first, form, (first, form)) and len(some) else None
+    shifts = r.fitted[form][0][:, :, 0].float()
+    if frames is not None:
+        shifts[np.setdiff1d(np.arange(state.frames), frames)] = 0.0
     effect = cls({"east_px": shifts[:, 0], "south_px": shifts[:, 1]}, state.data)
     size = cls.size(effect.values)
     if size < max(cls.tolerance.values()):
         return None, ""
-    doubts = [(r.doubt(first.name, f.name, (first.name, f.name)), f) for f in forms]
-    why, form = min(doubts, key=lambda d: (bool(d[0]), -r.gain(first, d[1]).low))
-    return _named(effect, {"rms_px": (size, r.shift_error, "px")}, r, first, form), why
+    why = r.doubt(first, form, (first, form), frames)
+    return _named(effect, {"rms_px": (size, r.shift_error, "px")}, r, first, form, frames), why
 
 
 def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State], Named | None] | None:

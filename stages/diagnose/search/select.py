@@ -40,22 +40,27 @@ def search(state: State, most: int) -> Outcome:
     refused: set[str] = set()
     while True:
         view = state.look(state.open_names())
-        if not state.causes and state.law_is_another(view):
+        if not state.causes and state.law_is_another(view, refused):
+            refused -= {n for n in refused if not get_effect(n).of_law}  # nothing was judged beside this law
             continue
         best, _ = weigh_all(view.whole)
         out.rejected = {k: v for k, v in out.rejected.items() if k in refused}
         out.view, out.best = view, best
         strong = [f for f in best.values() if f.p <= DISCOVERY and f.effect not in refused]
         strong.sort(key=lambda f: -f.surprise)
-        for found in strong[:TRIED]:
+        tried: list[Found] = []
+        for found in strong:
             whole = view.whole
             # beside gains of every image nothing is left to gain: they know already how bright each is on other ground
             beside = whole.scattered.tolist() if found.beside else []
             without = [*whole.exclude(found.guise), *beside]
             found.gains = whole.held_out(whole.places(found.guise), without, found.spread)
             found.sizes = whole.sizes
-        strong = [f for f in strong if not (f in strong[:TRIED] and another_law(view.whole, f, out))]
-        tried = sorted(strong[:TRIED], key=lambda f: -f.gain)
+            if not another_law(whole, found, out):
+                tried.append(found)
+            if len(tried) == TRIED:
+                break
+        tried.sort(key=lambda f: -f.gain)
         faint = FAINT**2 / 2 * float(view.whole.gram[0, 0])
         sure = [f for f in tried if f.gain_interval()[0] > 0 and f.gain > faint]
         for f in tried:
@@ -148,7 +153,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     if why := ordinary(first):
         return why
     vector, causes = state.nominal.vector, list(state.causes)
-    saved = [(c, c.effect, dict(c.errors), dict(c.over_images), c.rms) for c in causes]
+    saved = [(c, c.copy()) for c in causes]
     cause = Cause(first, found, group=group)
     state.causes.append(cause)
     look = refine(state, view)
@@ -166,8 +171,8 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         why = why or contradicted(tested)
     if why:
         state.causes[:] = causes
-        for c, effect, errors, over_images, rms in saved:
-            c.effect, c.errors, c.over_images, c.rms = effect, errors, over_images, rms
+        for c, before in saved:
+            vars(c).update(vars(before))
         state.nominal.vector = vector
         state.fit()
     return why
@@ -216,15 +221,19 @@ def doubt(state: State, cause: Cause) -> str:
             values[name],
         ):
             return f"{ODD}: {name} ends at its bound of {values[name]:.3g}"
-    sizes = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in cause.errors.items() if n not in cls.shaped]
-    if math.sqrt(sum(s * s for s in sizes)) < SURE:
-        return f"it comes out {math.sqrt(sum(s * s for s in sizes)):.1f} errors from nothing"
-    away = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in cause.over_images.items() if n not in cls.shaped]
-    groups = min(FOLDS, state.frames)
-    if away and math.hypot(*away) < student.ppf(0.5 + FRACTION / 2, groups - 1):
-        return (
-            f"other images give it other values: it comes out {math.hypot(*away):.1f} errors over images from nothing"
-        )
+
+    def away(errors: dict[str, float]) -> float:
+        every = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in errors.items() if n not in cls.shaped]
+        return math.hypot(*every) if every else math.inf
+
+    if away(cause.within) < SURE:
+        return f"it comes out {away(cause.within):.1f} errors from nothing"
+    parts = (("ground", cause.over_ground, cause.grounds), ("images", cause.over_images, min(FOLDS, state.frames)))
+    for what, errors, count in parts:
+        if away(errors) < student.ppf(0.5 + FRACTION / 2, max(count - 1, 1)):
+            return (
+                f"other {what} gives it other values: it comes out {away(errors):.1f} errors over {what} from nothing"
+            )
     for name, least in cls.tolerance.items():
         size = cls.size(values) if name not in values else abs(values[name] - cls.null()[name])
         if size - 2 * cause.errors.get(name, 0.0) < least:
@@ -241,7 +250,6 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
     others = [c.effect for c in state.causes if c is not cause]
     few = 1 + sum(n.startswith("coefficient") for n in look.plan.shared)
     flat = Covariance.white(look.grid.annuli, state.frames)
-    alone = type(cause.effect).scope == "scene" and len(cause.found.guise.columns) == 1
     pieces = [
         more
         for k, chain in enumerate(state.chains())
@@ -252,7 +260,7 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
     units = [products(more, look.model, look.grid, state.frames) for more in pieces]
     whole = _beside(units, cause, look, state.frames)
     total = float(whole.gram[0, 0])
-    if not alone:
+    if not cause.single:
         return cause.found.gains, total, np.zeros(0)
     form = list(whole.form_places()) if type(cause.effect).of_law else []
     if cause.found.beside:

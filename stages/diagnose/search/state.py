@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -32,7 +32,10 @@ class Cause:
     effect: Effect
     found: Found
     errors: dict[str, float] = field(default_factory=dict)
-    over_images: dict[str, float] = field(default_factory=dict)  # errors by leaving out images
+    within: dict[str, float] = field(default_factory=dict)  # errors by the likelihood alone
+    over_ground: dict[str, float] = field(default_factory=dict)  # by leaving out pieces of ground
+    over_images: dict[str, float] = field(default_factory=dict)  # by leaving out images
+    grounds: int = 0  # pieces of ground that were left out, one after the other
     rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)
     gain_percent: float = float("nan")
@@ -40,6 +43,17 @@ class Cause:
     gain_high: float = float("nan")
     rms_before: float = float("nan")
     rms_after: float = float("nan")
+
+    @property
+    def single(self) -> bool:
+        """Whether one amount acts on all images, which other ground can be asked about by itself."""
+        return type(self.effect).scope == "scene" and len(self.found.guise.columns) == 1
+
+    def copy(self) -> Cause:
+        """As it is now, whatever is fitted later."""
+        out = copy.copy(self)
+        vars(out).update({k: dict(v) for k, v in vars(self).items() if isinstance(v, dict)})
+        return out
 
     @property
     def reported_errors(self) -> dict[str, float]:
@@ -83,14 +97,21 @@ class State:
         base = self.base
         return per_site(lambda site: self.nominal.chain(site, base), self.sites)
 
-    def law_is_another(self, view: View) -> bool:
-        """Whether another law surely gains on held-out ground whatever effect of the law stands beside it; measured ones take the nominal one's place then."""
+    def law_is_another(self, view: View, refused: Container[str] = ()) -> bool:
+        """Whether another law surely gains on held-out ground whatever effect of the law stands beside it; measured ones take the nominal one's place then.
+
+        refused : effects that stand for nothing any more
+        """
         whole = view.whole
         places = whole.form_places()
         if not len(places):
             return False
         least = FAINT**2 / 2 * float(whole.gram[0, 0])
-        alone = [g for g in whole.plan.guises if get_effect(g.effect).of_law and whole.seen[whole.places(g)].all()]
+        alone = [
+            g
+            for g in whole.plan.guises
+            if get_effect(g.effect).of_law and g.effect not in refused and whole.seen[whole.places(g)].all()
+        ]
         if min(whole.another_law(guise) for guise in [None, *alone]) < least:
             return False
         other = measured_laws(self.nominal, self.sites, self.units)
@@ -115,7 +136,7 @@ class State:
     def fit(self, start: bool = False) -> None:
         """Fit the nominal model (and gain and offset of dn images) to the aligned images."""
         self.align()
-        fit(self.nominal, self.sites, self.base, self.units, [s.image for s in self.sites], start=start)
+        fit(self.nominal, self.sites, self.base, self.units, [s.laid for s in self.sites], start=start)
 
     def leave_out_rare_images(self) -> None:
         """Images that show too few pieces of ground, unless that is all there are."""

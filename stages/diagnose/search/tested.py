@@ -18,7 +18,8 @@ def hidden_rows(state: State, plan: Plan) -> list[tuple[Chain, list[Rows]]]:
         site.align()
         chain = state.nominal.chain(site, state.base)
         if state.free_gains:
-            scale_images(site, site.image, chain.predict(), lit_mask(chain))
+            scale_images(site, site.laid, chain.predict(), lit_mask(chain))
+            chain = state.nominal.chain(site, state.base)  # of the image in I/F
         out.append((chain, state.rows(NOT_LEARNED + number, chain, plan)))
     return out
 
