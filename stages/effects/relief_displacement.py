@@ -11,6 +11,8 @@ from stages.physics.formation import geometry
 from stages.physics.formation.chain import Observation, State
 from stages.physics.photometry import Parameter
 
+ORDINARY = 0.1  # px: what errors of the heights leave in any orthorectified image
+
 
 @register
 class ReliefDisplacement(Effect):
@@ -35,6 +37,7 @@ class ReliefDisplacement(Effect):
     )
     coordinates = (parameters[0],)
     strong: ClassVar = {"share": 0.5}
+    tolerance: ClassVar = {"rms_px": ORDINARY}
 
     @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:

@@ -5,67 +5,18 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.special import gammaincc, gammaln
 
-from stages.diagnose.likelihood.jackknife import FRACTION, jackknife_error, student
+from stages.diagnose.likelihood.found import Found, interval
+from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.products import Array, Products
 from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.settings import FOLDS, LEVELS, SIMPLER, UNITS
 from stages.effects import get_effect
-
-
-@dataclass
-class Found:
-    """An effect in its best guise. amount, error : in multiples of the guise's columns (per frame: of ``strong``)
-
-    surprise : -log10 of the chance of so much likelihood, calibrated on shams; p : family-wise
-    gains : (units,) nats on held-out ground; spread : standard deviation over the frames, of an effect per frame
-    """
-
-    effect: str
-    guise: Guise
-    amount: Array
-    error: Array
-    surprise: float
-    p: float = 1.0
-    gains: Array = field(default_factory=lambda: np.zeros(0))
-    sizes: Array = field(default_factory=lambda: np.ones(1))  # squares of the residual on these units
-    spread: float = 0.0
-    beside: float = 0.0  # scatter of the gains per frame beside it, where that is less than without
-    alone: float = 0.0  # standard errors by which the largest amount differs from nothing
-
-    @property
-    def gain(self) -> float:
-        """Held-out gain over all pieces of ground, nats."""
-        return float(self.gains.sum())
-
-    def gain_interval(self) -> tuple[float, float]:
-        """95 % interval of the held-out gain, nats, by the scatter over pieces of ground."""
-        return interval(self.gains, self.sizes)
-
-    def more_than(self, other: Found) -> tuple[float, float]:
-        """The same of what it gains more than another effect."""
-        return interval(self.gains - other.gains, self.sizes)
-
-
-def interval(gains: Array, sizes: Array | None = None) -> tuple[float, float]:
-    """95 % interval of a sum of gains over independent pieces of ground, by Student's t.
-
-    sizes : of the pieces, to which gains are in proportion but for chance (a ratio estimate: Cochran 1977, ch. 6); alike where None
-    """
-    units = len(gains)
-    if units < 3:
-        return -math.inf, math.inf
-    total = float(gains.sum())
-    share = np.full(units, 1 / units) if sizes is None or len(sizes) != units else sizes / sizes.sum()
-    chance = gains - total * share
-    half = float(student.ppf(0.5 + FRACTION / 2, units - 1)) * math.sqrt(units / (units - 1) * float(chance @ chance))
-    return total - half, total + half
 
 
 class Whole:
@@ -455,4 +406,4 @@ def _left(unit: Products, b: Array) -> float:
     return float(unit.gram[0, 0] - 2 * own @ unit.gram[:, 0] + own @ unit.gram @ own)
 
 
-__all__ = ["Found", "Whole", "interval", "weigh_all"]
+__all__ = ["Whole", "weigh_all"]

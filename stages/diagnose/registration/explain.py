@@ -33,7 +33,7 @@ from stages.diagnose.registration.start import Field, captured, laid, start
 from stages.diagnose.rows.patches import cuts
 from stages.diagnose.settings import CORRELATED, DISCOVERY, FOLDS, SURE
 from stages.effects import Effect
-from stages.effects.relief_displacement import lean
+from stages.effects.relief_displacement import ORDINARY, lean
 
 OWN = "own", "own, leaning"  # each image's own shift, without and with relief displacement
 
@@ -166,7 +166,9 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     squares |= _beside_own(matched, group, [plain, slanted], frames, pieces**2)
     gains = {k: Gain(*gain_interval(squares["none"].sum(1), q.sum(1))) for k, q in squares.items() if k in fitted}
     leaning = Gain(*gain_interval(squares[OWN[0]].sum(1), squares[OWN[1]].sum(1)))
-    form = _best(squares, leaning.low > 0 and abs(share) > SURE * error)
+    far = torch.cat([torch.stack(m.leaning).square().sum(0).flatten() for m in matched]).mean().sqrt()
+    surely = leaning.low > 0 and abs(share) > SURE * error
+    form = _best(squares, surely and abs(share) * float(far) > ORDINARY)
     coefficients, share = fitted[form.name]
     # what nothing explains is left alone: a wrong Sun looks like a shift of its own at every site
     if form.terms or form.leaning:

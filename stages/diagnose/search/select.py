@@ -11,9 +11,10 @@ import numpy as np
 import torch
 
 from stages.diagnose.likelihood.covariance import Covariance
+from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.likelihood.jackknife import FRACTION, student
 from stages.diagnose.likelihood.products import Products, Rows, products
-from stages.diagnose.likelihood.weigh import Found, Whole, interval, weigh_all
+from stages.diagnose.likelihood.weigh import Whole, weigh_all
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle
 from stages.diagnose.search.state import Cause, State, View

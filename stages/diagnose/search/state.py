@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_variance
+from stages.diagnose.likelihood.found import Found
 from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
-from stages.diagnose.likelihood.weigh import Found, Whole
+from stages.diagnose.likelihood.weigh import Whole
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import measured_laws
 from stages.diagnose.model.nominal import Nominal, fit
