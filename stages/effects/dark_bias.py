@@ -24,6 +24,7 @@ class DarkBias(Effect):
     parameters = (Parameter("iof", "1", -0.1, 0.1, 0.0, "added I/F, truth minus given"),)
     strong: ClassVar = {"iof": 0.004}
     tolerance: ClassVar = {"iof": 5e-5}  # half a step of 12 bits
+    of_law = True  # on lit ground light that is always added is a term of the law
 
     @classmethod
     def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:

@@ -112,11 +112,21 @@ def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str
     cls = get_effect(name)
     if not r.form.terms:
         return None, ""
-    first, form = (
-        next(f.name for f in FORMS if f.terms == n and f.leaning == r.form.leaning and not f.waves) for n in (0, 1)
-    )
-    some = shifted_frames(r.squares[first], r.squares[form])
-    frames = some if r.doubt(first, form, (first, form)) and len(some) else None
+
+    def judge(leaning: bool) -> tuple[str, str, NDArray[np.int64] | None, str]:
+        """The forms without and with a shift, the frames that are shifted (None for all), and why that is not sure."""
+        first, form = (
+            next(f.name for f in FORMS if f.terms == n and f.leaning == leaning and not f.waves) for n in (0, 1)
+        )
+        why = r.doubt(first, form, (first, form))
+        some = shifted_frames(r.squares[first], r.squares[form])
+        if why and len(some):
+            return first, form, some, r.doubt(first, form, (first, form), some)
+        return first, form, None, why
+
+    first, form, frames, why = judge(r.form.leaning)
+    if not why and not r.form.leaning and judge(True)[3]:
+        why = "relief displacement, of which these data are not sure, would explain it as well"
     shifts = r.fitted[form][0][:, :, 0].float()
     if frames is not None:
         shifts[np.setdiff1d(np.arange(state.frames), frames)] = 0.0
@@ -124,7 +134,6 @@ def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str
     size = cls.size(effect.values)
     if size < max(cls.tolerance.values()):
         return None, ""
-    why = r.doubt(first, form, (first, form), frames)
     return _named(effect, {"rms_px": (size, r.shift_error, "px")}, r, first, form, frames), why
 
 

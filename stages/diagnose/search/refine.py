@@ -138,14 +138,13 @@ def _step(state: State, view: View, share: float) -> float:
         seen = whole.seen[places]
         for p in places:
             whole.precision.pop(int(p), None)
-        amounts, within, over_ground = _amounts(state, whole, places[seen])
+        amounts, errors = _amounts(state, whole, places[seen])
         for p in places:
             whole.precision[int(p)] = 1e-10 * whole.gram[p, p]
         alone = {c.effect.name: 0 for c in state.causes}
-        for (_, (place, name, _)), amount, inner, outer in zip(
-            [s for s, ok in zip(scene, seen, strict=True) if ok], amounts, within, over_ground, strict=True
+        for (_, (place, name, _)), amount, error in zip(
+            [s for s, ok in zip(scene, seen, strict=True) if ok], amounts, errors, strict=True
         ):
-            error = max(inner, outer)
             cause = state.causes[place]
             cls = type(cause.effect)
             low, high = cls.bounds(name)
@@ -156,8 +155,7 @@ def _step(state: State, view: View, share: float) -> float:
             effect = cls({**cause.effect.values, name: moved}, state.data)
             effect.held = cause.effect.held
             cause.effect = effect
-            cause.errors[name], cause.within[name], cause.over_ground[name] = float(error), float(inner), float(outer)
-            cause.grounds = len(whole.sizes)
+            cause.errors[name] = float(error)
             alone[cls.name] += 1
     for cause in state.causes:
         if cause.found.guise.per_frame:

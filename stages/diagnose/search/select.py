@@ -227,14 +227,11 @@ def doubt(state: State, cause: Cause) -> str:
         every = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in errors.items() if n not in cls.shaped]
         return math.hypot(*every) if every else math.inf
 
-    if away(cause.within) < SURE:
-        return f"it comes out {away(cause.within):.1f} errors from nothing"
-    parts = (("ground", cause.over_ground, cause.grounds), ("images", cause.over_images, min(FOLDS, state.frames)))
-    for what, errors, count in parts:
-        if away(errors) < student.ppf(0.5 + FRACTION / 2, max(count - 1, 1)):
-            return (
-                f"other {what} gives it other values: it comes out {away(errors):.1f} errors over {what} from nothing"
-            )
+    if away(cause.errors) < SURE:
+        return f"it comes out {away(cause.errors):.1f} errors from nothing"
+    groups = min(FOLDS, state.frames)
+    if away(cause.over_images) < student.ppf(0.5 + FRACTION / 2, max(groups - 1, 1)):
+        return f"other images give it other values: {away(cause.over_images):.1f} errors over images from nothing"
     for name, least in cls.tolerance.items():
         size = cls.size(values) if name not in values else abs(values[name] - cls.null()[name])
         if size - 2 * cause.errors.get(name, 0.0) < least:

@@ -33,10 +33,7 @@ class Cause:
     effect: Effect
     found: Found
     errors: dict[str, float] = field(default_factory=dict)
-    within: dict[str, float] = field(default_factory=dict)  # errors by the likelihood alone
-    over_ground: dict[str, float] = field(default_factory=dict)  # by leaving out pieces of ground
-    over_images: dict[str, float] = field(default_factory=dict)  # by leaving out images
-    grounds: int = 0  # pieces of ground that were left out, one after the other
+    over_images: dict[str, float] = field(default_factory=dict)  # errors by leaving out images
     rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)
     gain_percent: float = float("nan")
