@@ -112,13 +112,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         answer.note, answer.blind = "too few pixels of the pairs show fully lit ground", effect_names()
         return Result(answer, state, None)
     progress(1, 5, "registration")
-    state.registration = explain(sites, nominal, [], frames, data.elevation[0])
-    if state.registration.form.name != "none":
-        for site, known in zip(sites, state.registration.known, strict=True):
-            site.displacement = known
-        for site, found in zip(hidden, displacements(state, [])[1], strict=True):
-            site.displacement = found
-    state.fit()
+    _register(state)
     misfit = relative_misfit(nominal, sites, varied=units == "dn", whole=True) * (0.5 if units == "dn" else 1.0)
     if not misfit < MISFIT:
         answer.verdict, answer.unexplained_fraction = "unexplained", 1.0
@@ -134,7 +128,10 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         say(f"{config.model} has not the form of the ground's law: {answer.form} took its place")
     doubted = unconfirmed(state)
     assert outcome.view is not None
-    if doubted:
+    displaced = state.registration is not None and state.registration.form.name != "none"
+    if state.causes and displaced:  # what looked like a displacement may have been a cause that is named by now
+        _register(state)
+    if doubted or (state.causes and displaced):
         settle(state, outcome.view)
     placed, refused = by_registration(state)
     answer.causes = placed + by_search(state) + [c for c in [cut(data, state) if cut else None] if c]
@@ -153,6 +150,17 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     answer.verdict = _verdict(answer)
     answer.held_out = score(state, answer)
     return Result(answer, state, outcome)
+
+
+def _register(state: State) -> None:
+    """Find where the images lie beside the causes that are named so far, lay them there, and fit the nominal model."""
+    state.registration = explain(state.sites, state.nominal, state.base, state.frames, state.data.elevation[0])
+    placed = state.registration.form.name != "none"
+    for site, known in zip(state.sites, state.registration.known, strict=True):
+        site.displacement = known if placed else None
+    for site, found in zip(state.hidden, displacements(state, [])[1], strict=True):
+        site.displacement = found if placed else None
+    state.fit()
 
 
 def _verdict(answer: Answer) -> str:
