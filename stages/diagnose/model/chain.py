@@ -95,7 +95,11 @@ class Chain:
         return formation.expose(state, effects)
 
     def predict(self) -> Tensor:
-        """(n, H, W) I/F, of which nothing is taken from the image."""
+        """(n, H, W) I/F, of which nothing is taken from the image; not to be changed."""
+        return self._predicted
+
+    @cached_property
+    def _predicted(self) -> Tensor:
         return self._expose(self._state, self._state.reflectance, self.base, measured=False)
 
     def render(self, extra: Effect | None = None) -> Tensor:

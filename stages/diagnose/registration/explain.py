@@ -78,9 +78,9 @@ class Registration:
         group = [s.ground for s in sites]
         chains = [nominal.chain(s, []) for s in sites]
         known = [self.at(c) for c in chains]
-        matched = _match_all(sites, nominal, [], known, self.frame, self.level, 1)
+        matched = _match_all(chains, known, self.frame, self.level, 1)
         fields = {f.name: [displacement(m, *self.fitted[f.name]) for m in matched] for f in FORMS}
-        own = {leans: self.settled(sites, nominal, self.share if leans else 0.0, 1) for leans in (False, True)}
+        own = {leans: self.settled(chains, self.share if leans else 0.0, 1) for leans in (False, True)}
         for m, k in zip(matched, range(len(sites)), strict=True):
             every = [*(fields[f.name][k] for f in FORMS), own[False][k], own[True][k]]
             for name, squares in zip([*fields, *OWN], left(m, every), strict=True):
@@ -135,24 +135,25 @@ class Registration:
         east, south = lean(site.observation, self.level)
         return field[0] + self.share * east, field[1] + self.share * south
 
-    def settled(self, sites: Sequence[Site], nominal: Nominal, share: float, terms: int = 3) -> list[Field]:
+    def settled(self, chains: Sequence[Chain], share: float, terms: int = 3) -> list[Field]:
         """Relief displacement by ``share`` plus each image's own shift and affine map, captured beside it: a nuisance of any comparison."""
         shifts, _ = self.fitted["constant, leaning" if share else "constant"]
-        return own_fields(sites, nominal, shifts, [share] * len(sites), self.frame, self.level, terms)
+        return own_fields(chains, shifts, [share] * len(chains), self.frame, self.level, terms)
 
 
 def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], frames: int, level: float) -> Registration:
     """Capture, fit every form, score each on held-out sites; ``known`` is where the images are by the best, each image's own shift beside it."""
-    known, spread = start(sites, nominal, base, frames, level)
+    chains = per_site(lambda site: nominal.chain(site, base), sites)
+    known, spread = start(chains, frames, level)
     frame = _frame(sites)
     pieces = cuts(min(sites[0].image.shape[-2:]), len(sites))
     spread = max(spread, 0.3)
     matched: list[Matched] = []
     for _ in range(2):
-        matched = _match_all(sites, nominal, base, known, frame, level, pieces)
+        matched = _match_all(chains, known, frame, level, pieces)
         coefficients, share = solve(matched, FORMS[-1], frames, spread)
         known = _own_fields(matched, coefficients, share, pieces**2)
-    matched = _match_all(sites, nominal, base, known, frame, level, pieces)
+    matched = _match_all(chains, known, frame, level, pieces)
     group = _grounds(matched)
     # by the form with most freedom: what else displaces images must not pass for relief
     share = solve(matched, FORMS[-1], frames, spread)[1]
@@ -161,8 +162,8 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     fitted = {f.name: solve(matched, f, frames, spread, share if f.leaning else None) for f in FORMS}
     squares = dict(zip((f.name for f in FORMS), _held_out(matched, group, frames, spread), strict=True))
     shares = [without[g] for g in group[:: pieces**2]]
-    plain = own_fields(sites, nominal, fitted["constant"][0], [0.0] * len(sites), frame, level, 1)
-    slanted = own_fields(sites, nominal, fitted["constant, leaning"][0], shares, frame, level, 1)
+    plain = own_fields(chains, fitted["constant"][0], [0.0] * len(sites), frame, level, 1)
+    slanted = own_fields(chains, fitted["constant, leaning"][0], shares, frame, level, 1)
     squares |= _beside_own(matched, group, [plain, slanted], frames, pieces**2)
     gains = {k: Gain(*gain_interval(squares["none"].sum(1), q.sum(1))) for k, q in squares.items() if k in fitted}
     leaning = Gain(*gain_interval(squares[OWN[0]].sum(1), squares[OWN[1]].sum(1)))
@@ -209,8 +210,7 @@ def _beside_own(
 
 
 def own_fields(
-    sites: Sequence[Site],
-    nominal: Nominal,
+    chains: Sequence[Chain],
     shifts: Tensor,
     shares: Sequence[float],
     frame: Frame,
@@ -220,6 +220,7 @@ def own_fields(
     """Relief displacement by a share at each site plus each image's own shift (``terms`` 1) or affine map (3), captured beside it and the
     ``shifts`` (frames, 2, T) of frames.
     """
+    sites = [c.site for c in chains]
     ends = []
     matched: list[Matched] = []
     # the strongest peak of a correlation may be a neighbouring crater, and the shift of a frame one of another part of the scene
@@ -231,10 +232,10 @@ def own_fields(
             known.append((share * east + moved[:, 0], share * south + moved[:, 1]))
         if own_share:
             with laid(sites, known):
-                own = captured(sites, nominal, [])
+                own = captured(chains)
             known = [(e + d[:, :1, None], s + d[:, 1:, None]) for (e, s), d in zip(known, own, strict=True)]
         for _ in range(3):
-            matched = _match_all(sites, nominal, [], known, frame, level, 1)
+            matched = _match_all(chains, known, frame, level, 1)
             known = _own_fields(matched, torch.zeros_like(shifts), shares, 1, terms)
         ends.append(known)
     out = []
@@ -255,12 +256,14 @@ def _frame(sites: Sequence[Site]) -> Frame:
     return Frame((float(centre[0]), float(centre[1])), float((high - low).max()) / 2)
 
 
-def _match_all(sites, nominal: Nominal, base, known, frame: Frame, level: float, pieces: int) -> list[Matched]:
+def _match_all(
+    chains: Sequence[Chain], known: Sequence[Field], frame: Frame, level: float, pieces: int
+) -> list[Matched]:
     def of(k: int) -> list[Matched]:
-        chain = nominal.chain(sites[k], base)
+        chain = chains[k]
         return match(chain, chain.predict(), lit_mask_read(chain), known[k], frame, level, pieces)
 
-    return [m for part in per_site(of, range(len(sites))) for m in part]
+    return [m for part in per_site(of, range(len(chains))) for m in part]
 
 
 def lit_mask_read(chain) -> Tensor:

@@ -9,34 +9,33 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.model.aligned import aligned
-from stages.diagnose.model.nominal import Nominal, lit_mask
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.nominal import lit_mask
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.capture import capture, correlations, peak
 from stages.diagnose.settings import BROAD, CAPTURE, CORRELATED, SURE
-from stages.effects import Effect
 from stages.effects.relief_displacement import lean
 
 Field = tuple[Tensor, Tensor]  # (n, H, W) px east and south, or broadcastable to it
 
 
-def start(
-    sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], frames: int, level: float
-) -> tuple[list[Field], float]:
+def start(chains: Sequence[Chain], frames: int, level: float) -> tuple[list[Field], float]:
     """Displacement of every site's images, and the rms shift, px.
 
     One image of a small crop may look like the next crater. All images of a frame together seldom do: their shift is taken from the sum of
     their log likelihoods over all shifts, with relief displacement and without, whichever fits better for sure.
     """
+    sites = [c.site for c in chains]
     found = []
     for share in (0.0, 1.0):
         leaning = [_leaning(s, share, level) for s in sites]
         with laid(sites, leaning):
-            found.append((leaning, *_frame_shifts(sites, nominal, base, frames)))
+            found.append((leaning, *_frame_shifts(chains, frames)))
     leaning, shifts, _ = found[found[1][2] > found[0][2] + SURE**2 / 2]
     known = [_moved(d, shifts[torch.from_numpy(s.frames)]) for d, s in zip(leaning, sites, strict=True)]
     with laid(sites, known):
-        own = captured(sites, nominal, base)
+        own = captured(chains)
     whole = torch.cat([shifts[torch.from_numpy(s.frames)] + d for d, s in zip(own, sites, strict=True)])
     return [_moved(k, d) for k, d in zip(known, own, strict=True)], float(whole.square().mean().sqrt())
 
@@ -54,11 +53,11 @@ def laid(sites: Sequence[Site], known: Sequence[Field]) -> Iterator[None]:
             site.read, site.read_valid = image, valid
 
 
-def captured(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect]) -> list[Tensor]:
+def captured(chains: Sequence[Chain]) -> list[Tensor]:
     """(n, 2) shift east and south per site, px: each image's own, where it stands out from lying where it is."""
 
-    def of(site: Site) -> tuple[Tensor, Tensor, Tensor]:
-        rendered, lit = _rendered(site, nominal, base)
+    def of(chain: Chain) -> tuple[Tensor, Tensor, Tensor]:
+        site, rendered, lit = chain.site, chain.predict(), _lit(chain)
         shift, highest = capture(site.read, site.read_valid, rendered, lit, CAPTURE, BROAD)
         _, still = capture(site.read, site.read_valid, rendered, lit, 1, BROAD)
         count = (site.read_valid & lit).sum((-2, -1)).float()
@@ -69,35 +68,34 @@ def captured(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect]) ->
         return shift, torch.where(border, 0.0, z), still
 
     out = []
-    for shift, z, still in per_site(of, sites):
+    for shift, z, still in per_site(of, chains):
         near = shift.abs().amax(1) <= 1.5
         sure = (z > SURE) | (near & (still > 0.3))
         out.append(torch.where(sure[:, None], shift, 0.0))
     return out
 
 
-def _frame_shifts(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], frames: int) -> tuple[Tensor, float]:
+def _frame_shifts(chains: Sequence[Chain], frames: int) -> tuple[Tensor, float]:
     """(frames, 2) px east and south, 0 where no shift is surely better, and the log likelihood of all frames there, nats."""
 
-    def of(site: Site) -> Tensor:
-        rendered, lit = _rendered(site, nominal, base)
+    def of(chain: Chain) -> Tensor:
+        site, rendered, lit = chain.site, chain.predict(), _lit(chain)
         r = correlations(site.read, site.read_valid, rendered, lit, CAPTURE, BROAD).clamp(0, 0.999)
         count = (site.read_valid & lit).sum((-2, -1)) / CORRELATED
         return -0.5 * count[:, None, None] * torch.log1p(-r.square())
 
     side = 2 * CAPTURE + 1
     likelihood = torch.zeros(frames, side, side)
-    for site, own in zip(sites, per_site(of, sites), strict=True):
-        likelihood.index_add_(0, torch.from_numpy(site.frames), own)
+    for chain, own in zip(chains, per_site(of, chains), strict=True):
+        likelihood.index_add_(0, torch.from_numpy(chain.site.frames), own)
     shifts, best = peak(likelihood)
     still = likelihood[:, CAPTURE, CAPTURE]
     sure = best > still + SURE**2 / 2
     return torch.where(sure[:, None], shifts, 0.0), float(torch.where(sure, best, still).sum())
 
 
-def _rendered(site: Site, nominal: Nominal, base: Sequence[Effect]) -> tuple[Tensor, Tensor]:
-    chain = nominal.chain(site, base)
-    return chain.predict(), lit_mask(chain) | (site.read_valid & chain.lit())
+def _lit(chain: Chain) -> Tensor:
+    return lit_mask(chain) | (chain.site.read_valid & chain.lit())
 
 
 def _leaning(site: Site, share: float, level: float) -> Field:

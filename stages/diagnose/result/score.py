@@ -59,12 +59,12 @@ def displacements(state: State, named: Sequence[Effect]) -> tuple[Fields, Fields
     r, nothing = state.registration, [None] * len(state.hidden)
     if r is None or r.form.name == "none":
         return nothing, nothing
+    chains = [state.nominal.chain(site, []) for site in state.hidden]
     leans = any(e.leans for e in named)
     if leans or r.form.terms > 1:
         share = r.share if r.form.leaning else 0.0
-        last = r.settled(state.hidden, state.nominal, share)
-        return (r.settled(state.hidden, state.nominal, 0.0) if leans else last), last
-    chains = [state.nominal.chain(site, []) for site in state.hidden]
+        last = r.settled(chains, share)
+        return (r.settled(chains, 0.0) if leans else last), last
     last = [r.at(chain) for chain in chains]
     if any(e.along_lines for e in named):
         return [r.at(chain, waves=False) for chain in chains], last
