@@ -52,7 +52,7 @@ class Registration:
     """What explains where the images lie.
 
     coefficients : (frames, 2, T), px; share : of the relief displacement; gains : of each form over nothing
-    leaning : of relief displacement beside the same form without; errors of the constants, (frames, 2), px
+    squares : of the residual, (pieces of ground, frames) for every form, and in OWN without and with relief displacement; tested : of the test pairs
     """
 
     form: Form
@@ -60,7 +60,6 @@ class Registration:
     share: float
     share_error: float
     gains: dict[str, Gain]
-    leaning: Gain
     known: list[tuple[Tensor, Tensor]]
     frame: Frame
     level: float
@@ -185,7 +184,7 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     every = torch.cat([s.diagonal(dim1=1, dim2=2).sum(1) for s in shifts])
     shift_error = math.sqrt(float(every.median()) * frames / max(len(every), 1))
     return Registration(
-        form, coefficients, share, error, gains, leaning, known, frame, level, squares, rms, shift_error, pixels, fitted
+        form, coefficients, share, error, gains, known, frame, level, squares, rms, shift_error, pixels, fitted
     )
 
 
