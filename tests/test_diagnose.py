@@ -17,7 +17,6 @@ from planted import semi_real
 from typer.testing import CliRunner
 
 from schemas import ArtefactError
-from schemas.files.outputs import Output
 from stages import diagnose
 from stages.effects import effect_names, load_extension
 
@@ -46,14 +45,32 @@ def _pairs(scene, folder, effect, seed=11, **changes):
     return write_pairs(folder / "pairs.h5", scene.make(truth, seed), scene.layout, units=truth.units)
 
 
+@pytest.fixture(scope="module")
+def diagnosed(scene, tmp_path_factory):
+    """effect -> the folder of d.h5, d.json and d.html that the command makes of data with that effect planted; made when first asked for."""
+    from lunargr_cli.main import app
+
+    made = {}
+
+    def make(effect):
+        if effect not in made:
+            folder = tmp_path_factory.mktemp(effect)
+            pairs = _pairs(scene, folder, {effect: PLANTS[effect]})
+            names = [str(folder / n) for n in ("d.h5", "d.json", "d.html")]
+            command = ["diagnose", str(pairs), "-o", names[0], "--json", names[1], "--report", names[2], "-q"]
+            out = CliRunner().invoke(app, command)
+            assert out.exit_code == 0, out.output
+            made[effect] = folder
+        return made[effect]
+
+    return make
+
+
 @pytest.mark.parametrize("effect", SHOWN)
-def test_planted_cause_is_named(scene, tmp_path, effect):
+def test_planted_cause_is_named(scene, diagnosed, effect):
     """... and every kind of cause can be written, reported, and read back as an extension of the model."""
-    files = [tmp_path / name for name in ("d.h5", "d.json", "d.html")]
-    output = Output(files[0], json=files[1], report=files[2])
-    diagnose.run(_pairs(scene, tmp_path, {effect: PLANTS[effect]}), None, output)
-    answer = json.loads(files[1].read_text())
-    assert [e.name for e in load_extension(files[0])] == [c["effect"] for c in answer["causes"]]
+    answer = json.loads((diagnosed(effect) / "d.json").read_text())
+    assert [e.name for e in load_extension(diagnosed(effect) / "d.h5")] == [c["effect"] for c in answer["causes"]]
     assert answer["verdict"] == "named"
     first = answer["causes"][0]
     assert first["effect"] == effect
@@ -80,8 +97,8 @@ def test_lines_outside_the_catalogue_are_unexplained(scene, tmp_path):
     assert answer.verdict == "unexplained" and not answer.causes
 
 
-def test_every_name_has_a_gain_that_is_sure_and_the_budget_adds_up(scene, tmp_path):
-    said = diagnose.run(_pairs(scene, tmp_path, {"psf_blur": PLANTS["psf_blur"]})).answer.to_json()
+def test_every_name_has_a_gain_that_is_sure_and_the_budget_adds_up(diagnosed):
+    said = json.loads((diagnosed("psf_blur") / "d.json").read_text())
     assert all(c["held_out_low"] > 0 for c in said["causes"])
     assert sum(said["budget"].values()) == pytest.approx(1.0)
     assert all(share >= 0 for share in said["budget"].values())
@@ -190,24 +207,17 @@ def test_the_apollo_frames_were_never_orthorectified(shared, tmp_path):
     assert said["verdict"] == "named"
 
 
-def test_outputs(scene, tmp_path):
-    from lunargr_cli.main import app
-
-    pairs = _pairs(scene, tmp_path, {"misregistration": PLANTS["misregistration"]})
-    names = [str(tmp_path / n) for n in ("d.h5", "d.json", "d.html")]
-    out = CliRunner().invoke(
-        app, ["diagnose", str(pairs), "-o", names[0], "--json", names[1], "--report", names[2], "-q"]
-    )
-    assert out.exit_code == 0, out.output
-    answer = json.loads((tmp_path / "d.json").read_text())
+def test_outputs(diagnosed):
+    folder = diagnosed("misregistration")
+    answer = json.loads((folder / "d.json").read_text())
     keys = {"verdict", "causes", "unexplained_fraction", "blind", "held_out", "data", "config"}
     assert keys <= set(answer)
     cause = answer["causes"][0]
     assert {"effect", "parameters", "p_family_wise", "gain_nats", "gain_error", "group", "to_separate"} <= set(cause)
     assert answer["held_out"]["gain_percent"] > 0  # one place is kept away: no interval
-    page = (tmp_path / "d.html").read_text()
+    page = (folder / "d.html").read_text()
     assert "data:image/" in page and "http" not in page.split("</style>")[1].replace("https://", "")
-    effects = {e.name: e for e in load_extension(tmp_path / "d.h5", ["image-003", "never-seen"])}
+    effects = {e.name: e for e in load_extension(folder / "d.h5", ["image-003", "never-seen"])}
     shifts = effects["misregistration"].values["east_px"]
     assert shifts.shape == (2,) and float(shifts[1]) == 0.0
 

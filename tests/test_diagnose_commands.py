@@ -40,8 +40,6 @@ def test_a_wrong_sun_is_found_from_files(answer):
     assert load_extension(found)[0].name == "sun_azimuth"
 
 
-@pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="comes out 3.6 of 4 deg; why is not known yet")
 def test_a_wrong_sun_has_its_size(answer):
     said, _, _ = answer
     assert said["causes"][0]["parameters"]["error_deg"]["value"] == pytest.approx(4.0, rel=0.1)

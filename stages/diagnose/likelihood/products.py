@@ -12,7 +12,6 @@ from torch import Tensor
 
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.rows.patches import Grid, Patch
-from stages.diagnose.settings import SECTORS
 
 Array = NDArray[np.float64]
 
@@ -67,9 +66,15 @@ def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> Residual:
     return white, mean[:, 0], rows.shared_dark[0] / model.dark**0.5
 
 
-def _real(z: Tensor) -> Tensor:
-    """(m, n, K) complex as (m, 2 n K) real ones."""
-    return torch.view_as_real(z.contiguous()).flatten(1)
+def _by_wave(z: Tensor) -> Tensor:
+    """(m, n, K) complex as (K, n, 2 m): real parts, then imaginary ones."""
+    return torch.cat([z.real, z.imag]).permute(2, 1, 0).contiguous()
+
+
+def _real_part(products: Tensor, count: int) -> Tensor:
+    """Of (..., 2 m, 2 k) products of real and imaginary parts, the real part of the Hermitian ones, (..., m, k); ``count`` is m."""
+    width = products.shape[-1] // 2
+    return products[..., :count, :width] + products[..., count:, width:]
 
 
 def _factor(model: Covariance, patch: Patch, grid: Grid) -> Tensor:
@@ -132,56 +137,59 @@ def _given_others(factor: Tensor, gone: Tensor) -> Tensor:
 
 
 class _Columns:
-    """The columns of one patch, ready for products under several weights."""
+    """The columns of one patch, ready for products under several weights.
+
+    Real and imaginary parts of a column stand side by side, (K, n, 2 m): a product over waves and images is one matrix product.
+    """
 
     def __init__(self, rows: Rows, model: Covariance, grid: Grid, often: bool) -> None:
-        self.rows, self.dark = rows, model.dark**0.5
-        counts = torch.bincount(grid.bins, minlength=grid.annuli * SECTORS).tolist()
-        ends = np.concatenate([[0], np.cumsum(counts)])
-        self.bins = [(b, slice(int(ends[b]), int(ends[b + 1]))) for b, count in enumerate(counts) if count]
-        self.k, n = len(rows.own), rows.own.shape[1]
-        self.inner, self.across = (
-            {},
-            {},
-        )  # of each bin: own columns among themselves, and (m, n, k, n) beside the shared ones
-        for b, at in self.bins if self.k else []:
-            x = rows.own[:, :, at].reshape(self.k * n, -1)
-            self.inner[b] = (x @ x.mH).real.double().view(self.k, n, self.k, n)
+        self.rows, self.dark, self.of_wave = rows, model.dark**0.5, grid.bins
+        self.bins = torch.unique(grid.bins)
+        self.k = len(rows.own)
+        self.shared = _by_wave(rows.shared)
+        self.own = _by_wave(rows.own)
+        n = rows.own.shape[1]
+        self.inner = self.across = torch.zeros(
+            0
+        )  # of each bin: own columns among themselves, and beside the shared ones
+        if self.k:
+            inner, across = [], []
+            for b in self.bins:
+                of = slice(*torch.searchsorted(grid.bins, torch.stack([b, b + 1])).tolist())
+                x = rows.own[:, :, of].reshape(self.k * n, -1)
+                inner.append((x @ x.mH).real)
+                if often:
+                    across.append((rows.shared[:, :, of].flatten(0, 1) @ x.mH).real)
+            self.inner = torch.stack(inner).double().view(-1, self.k, n, self.k, n)
             if often:
-                y = rows.shared[:, :, at].flatten(0, 1)
-                self.across[b] = (y @ x.mH).real.double().view(-1, n, self.k, n)
+                self.across = torch.stack(across).double().view(len(inner), -1, n, self.k, n)
 
     def gram(self, factor: Tensor, mean: Tensor | None, images: Tensor) -> Array:
         """(M, M) of all columns, whitened by ``factor`` (B, r, n) and, their means, by (r, n); images : (n,) whose deep shadow counts."""
         rows, k = self.rows, self.k
-        n = factor.shape[-1]
-        white = torch.empty(len(rows.shared), factor.shape[1], rows.shared.shape[-1], dtype=rows.shared.dtype)
-        back = torch.empty_like(rows.shared) if k and not self.across else None
-        cross = torch.zeros(len(white), k, n, dtype=torch.float64)
+        n, m = factor.shape[-1], len(rows.shared)
+        by_wave = factor[self.of_wave].to(self.shared.dtype)
+        white = by_wave @ self.shared
+        dense = _real_part(white.flatten(0, 1).T @ white.flatten(0, 1), m).double()
+        cross = torch.zeros(m, k, n, dtype=torch.float64)
         own = torch.zeros(k, n, k, n, dtype=torch.float64)
-        for b, at in self.bins:
-            f = factor[b].to(white.dtype)
-            white[:, :, at] = f @ rows.shared[:, :, at]
-            if k:
-                precision = (factor[b].mT @ factor[b]).double()
-                own += self.inner[b] * precision[None, :, None]
-                if back is None:
-                    cross += (self.across[b] * precision[None, :, None]).sum(1)
-                else:
-                    back[:, :, at] = f.mT @ white[:, :, at]
-        flat = _real(white)
-        dense = (flat @ flat.T).double()
-        if back is not None:
-            x, y = (torch.view_as_real(t).flatten(2).transpose(0, 1) for t in (back, rows.own))
-            cross = (x @ y.transpose(1, 2)).double().permute(1, 2, 0)
+        if k:
+            precision = (factor[self.bins].mT @ factor[self.bins]).double()
+            own = (self.inner * precision[:, None, :, None]).sum(0)
+            if len(self.across):
+                cross = torch.einsum("bmrkn,brn->mkn", self.across, precision)
+            else:
+                back = (by_wave.mT @ white).transpose(0, 1)  # (n, K, 2 m)
+                products = back.mT @ self.own.transpose(0, 1)  # (n, 2 m, 2 k)
+                cross = _real_part(products, m).double().permute(1, 2, 0)
         if mean is not None:
             shared, others = rows.shared_mean.double() @ mean.T, mean.T @ mean
             dense += shared @ shared.T
-            cross += (shared @ mean)[:, None] * rows.own_mean.double()
+            cross = cross + (shared @ mean)[:, None] * rows.own_mean.double()
             own += torch.einsum("ai,ij,bj->aibj", rows.own_mean.double(), others, rows.own_mean.double())
         shadow, own_shadow = (x.double() * images / self.dark for x in (rows.shared_dark, rows.own_dark))
         dense += shadow @ shadow.T
-        cross += shadow[:, None] * own_shadow
+        cross = cross + shadow[:, None] * own_shadow
         own += torch.diag_embed(own_shadow[:, None] * own_shadow).permute(0, 2, 1, 3)
         top = torch.cat([dense, cross.flatten(1)], 1)
         low = torch.cat([cross.flatten(1).T, own.reshape(k * n, k * n)], 1)
@@ -191,13 +199,12 @@ class _Columns:
         """Products (M, R) of all columns with whitened sham residuals, and the squares of these, (R,)."""
         rows = self.rows
         z, means, dark = shams
-        white, back = torch.empty_like(rows.shared), torch.empty_like(z)
-        for b, at in self.bins:
-            f = factor[b].to(white.dtype)
-            white[:, :, at], back[:, :, at] = f @ rows.shared[:, :, at], f.mT @ z[:, :, at]
-        first = (_real(white) @ _real(z).T).double() + (rows.shared_dark.double() / self.dark) @ dark.double().T
-        x, y = (torch.view_as_real(t).flatten(2).transpose(0, 1) for t in (rows.own, back))
-        second = (x @ y.transpose(1, 2)).double().transpose(0, 1)
+        by_wave = factor[self.of_wave].to(self.shared.dtype)
+        white, sham = by_wave @ self.shared, _by_wave(z)
+        first = _real_part(white.flatten(0, 1).T @ sham.flatten(0, 1), len(rows.shared)).double()
+        first += (rows.shared_dark.double() / self.dark) @ dark.double().T
+        back = by_wave.mT @ sham
+        second = _real_part(self.own.permute(1, 2, 0) @ back.transpose(0, 1), self.k).double().transpose(0, 1)
         second += (rows.own_dark.double() / self.dark)[..., None] * dark.double().T
         squares = (z.real.square() + z.imag.square()).sum((1, 2)).double()
         if mean is not None:

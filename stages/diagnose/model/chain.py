@@ -141,14 +141,23 @@ class Chain:
     def surface_tangents(self) -> list[Tensor]:
         """d image / d coefficient, one (n, H, W) per free coefficient: the nominal model's own freedom."""
         columns: list[Tensor] = []
+        reflectance = self._state.reflectance
+        angles = self._state.angles
+        facing = (angles.cos_incidence > 0) & (angles.cos_emission > 0)
+        parts = self.model.parts(angles) if isinstance(self.model, LunarLaws) else None
         for k in range(self.coefficients.shape[1]):
             if self.free is not None and not bool(self.free[k]):
                 continue
-            c = self.coefficients.clone()
-            step = 0.05 * float(c[:, k].abs().mean()) + 1e-4
-            c[:, k] += step
-            shifted = self._expose(self._state, self._surface(self._state, c), self.base)
-            columns.append((shifted - self.rendered) / step)
+            size = float(self.coefficients[:, k].abs().mean())
+            if parts is None:
+                step = 0.05 * size + 1e-4
+                c = self.coefficients.clone()
+                c[:, k] += step
+                moved = self._surface(self._state, c)
+            else:  # a sum of parts, of which 1 is the mean law: a small step would drown in rounding
+                step = 0.05 * max(size, 1.0)
+                moved = reflectance + step * torch.where(facing, parts[k], 0.0)
+            columns.append((self._expose(self._state, moved, self.base) - self.rendered) / step)
         return columns
 
     def form_tangents(self) -> list[Tensor]:

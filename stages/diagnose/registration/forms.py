@@ -141,29 +141,26 @@ def solve(
     coefficient.
     """
     places, count = form.places, len(TERMS) + WAVES
-    t = len(places)
-    if not sites or not (t or form.leaning):
+    if not sites or not (places or form.leaning):
         return torch.zeros(frames, 2, count, dtype=torch.float64), 0.0
     chosen = torch.tensor([*places, *(count + p for p in places)], dtype=torch.long)
-    size = 2 * t
-    total = torch.zeros(frames * size + 1, frames * size + 1, dtype=torch.float64)
-    score = torch.zeros(len(total), dtype=torch.float64)
-    for site in sites:
-        for k, f in enumerate(site.chain.site.frames.tolist()):
-            place = torch.cat([f * size + torch.arange(size), torch.tensor([len(total) - 1])])
-            own = torch.cat([chosen, torch.tensor([2 * count])])
-            total[place[:, None], place] += site.gram[k][own[:, None], own]
-            score[place] += site.score[k][own]
-    if not form.leaning or share is not None:
-        given = share or 0.0
-        score -= given * total[-1]
-        total[-1], total[:, -1], total[-1, -1], score[-1] = 0.0, 0.0, 1.0, given
-    prior = torch.full((len(total),), spread**-2, dtype=torch.float64)
-    prior[-1] = 1e-6
-    found = torch.linalg.solve(total + torch.diag(prior), score)
+    every = torch.cat([torch.from_numpy(s.chain.site.frames) for s in sites])
+    gram = torch.zeros(frames, 2 * count + 1, 2 * count + 1, dtype=torch.float64)
+    gram.index_add_(0, every, torch.cat([s.gram for s in sites]))
+    score = torch.zeros(frames, 2 * count + 1, dtype=torch.float64)
+    score.index_add_(0, every, torch.cat([s.score for s in sites]))
+    # frames have nothing to do with each other but the share
+    inner = gram[:, chosen[:, None], chosen] + spread**-2 * torch.eye(len(chosen), dtype=torch.float64)
+    border = gram[:, chosen, -1]
+    alone, by_share = torch.linalg.solve(inner, torch.stack([score[:, chosen], border], -1)).unbind(-1)
+    if share is None:
+        share = 0.0
+        if form.leaning:
+            wanted = score[:, -1].sum() - (border * alone).sum()
+            share = float(wanted / (gram[:, -1, -1].sum() + 1e-6 - (border * by_share).sum()))
     out = torch.zeros(frames, 2, count, dtype=torch.float64)
-    out[..., places] = found[:-1].view(frames, 2, t)
-    return out, float(found[-1])
+    out[..., places] = (alone - share * by_share).view(frames, 2, len(places))
+    return out, share
 
 
 def displacement(site: Matched, coefficients: Tensor, share: float) -> tuple[Tensor, Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -46,7 +47,7 @@ class Grid:
         """Rings of equal spatial frequency."""
         return len(self.radius)
 
-    @property
+    @cached_property
     def bins(self) -> Tensor:
         """(H, W) number of the ring and sector that each frequency belongs to."""
         return self.annulus * SECTORS + self.sector
