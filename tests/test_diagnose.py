@@ -13,7 +13,7 @@ import torch
 from campaign import PLANTS, UNKNOWN, random_world
 from hidden.drawn import drawn
 from hidden.scene import Layout, Scene, Truth, write_pairs
-from planted import semi_real
+from planted import plant, semi_real
 from typer.testing import CliRunner
 
 from schemas import ArtefactError
@@ -185,19 +185,124 @@ def test_jackknife_intervals_cover():
     assert held > 270
 
 
-@pytest.mark.slow
-def test_the_apollo_frames_were_never_orthorectified(shared, tmp_path):
-    """Real photographs: relief displacement, share 1, and no gain that may be negative."""
+def test_a_shadow_from_beyond_the_dem_is_seen_whatever_the_law():
+    """Ground that is dark where the Sun should shine: a wall in the west, and nothing where there is none; a Sun that stands too high."""
+    from types import SimpleNamespace
+
+    from stages.diagnose.search.shadows import by_shadows
+    from stages.effects import Survey, get_effect
+    from stages.physics.light.sun_disc import sun_visibility
+
+    rng = np.random.default_rng(5)
+    survey = Survey(crop_px=64, gsd=10.0)
+    suns = torch.tensor([[-np.cos(a), 0.0, np.sin(a)] for a in np.radians([8.0, 14.0, 30.0])], dtype=torch.float32)
+
+    class Ground:
+        """A site that a Sun in the west shines on; its horizon is rough."""
+
+        def __init__(self, number, planted):
+            east = torch.linspace(-315.0, 315.0, 64).expand(3, 64, 64)
+            self.horizon = torch.from_numpy(np.radians(rng.normal(2.0, 6.0, (1, 64, 64)))).float().expand(3, 64, 64)
+            self.state = SimpleNamespace(
+                sun_horizon=self.horizon, reflectance=torch.full((3, 64, 64), 0.05), sun_direction=suns,
+                elevation=torch.zeros(3, 64, 64), sun_radius=np.radians(0.2666), observation=SimpleNamespace(gsd=10.0),
+            )  # fmt: skip
+            horizon, up = self.horizon, torch.asin(suns[:, 2])[:, None, None]
+            if planted == "wall":
+                horizon = torch.maximum(horizon, torch.atan2(torch.tensor(110.0), 320.0 + 320.0 + east))
+            if planted == "sun":
+                up = up + np.radians(1.5)
+            image = (
+                0.05
+                * sun_visibility(up, horizon, np.radians(0.2666))
+                * torch.from_numpy(rng.normal(1, 0.1, (1, 64, 64))).float()
+            )
+            self.site = SimpleNamespace(ground=number, valid=torch.ones(3, 64, 64, dtype=torch.bool), image=image)
+
+        def lit(self):
+            return self.horizon < torch.asin(suns[:, 2])[:, None, None]
+
+        def visibility(self, effects):
+            from stages.diagnose.model.chain import Chain
+
+            return Chain.visibility(SimpleNamespace(_state=self.state), effects)
+
+    for planted, name in (("", None), ("wall", "distant_shadow"), ("sun", "sun_elevation")):
+        chains = [Ground(k, planted) for k in range(4)]
+        found = by_shadows(SimpleNamespace(chains=lambda c=chains: c, causes=[], data=survey))
+        assert [c.effect.name for c in found] == ([name] if name else [])
+        if planted == "sun":
+            value, error, _ = found[0].parameters["error_deg"]
+            assert abs(value - 1.5) < 3 * error < 1.5
+        if planted == "wall":
+            assert get_effect(name).name in found[0].group and found[0].percent[1] > 0
+            assert found[0].effect.values["side"] in (0.0, 4.0)
+
+
+def test_a_pile_of_a_tenth_of_all_pixels_is_clipping():
+    """Of a narrow histogram a tenth lies within two per cent of brightness anyway; values that are all the same do not."""
+    from stages.effects import get_effect
+
+    saturation = get_effect("saturation")
+    values = torch.from_numpy(np.random.default_rng(2).normal(160.0, 25.0, 100_000)).float().clamp(min=1)
+    assert saturation.read_off(values) is None
+    level = float(values.quantile(0.9))
+    assert saturation.read_off(values.clamp(max=level))[0] == pytest.approx(level, rel=0.002)
+
+
+def test_a_sharpened_dem_keeps_its_borders():
+    """A tilted plane is sharp already: mirrored at its borders it would have creases there."""
+    from types import SimpleNamespace
+
+    from stages.effects import get_effect
+
+    row, column = np.mgrid[:48, :48]
+    hill = 80 * np.exp(-((row - 24.0) ** 2 + (column - 24.0) ** 2) / (2 * 6.0**2))
+    plane = torch.from_numpy(300.0 + 40 * row + 25 * column).float()[None]
+    effect = get_effect("dem_smoothing")({"sigma2_px2": 1.0})
+    state = SimpleNamespace(elevation=plane.clone())
+    effect.apply(state)
+    assert torch.allclose(state.elevation, plane, atol=0.02)
+    state.elevation = plane + torch.from_numpy(hill).float()
+    effect.apply(state)
+    sharp = 80 * 36 / 35 * np.exp(-((row - 24.0) ** 2 + (column - 24.0) ** 2) / (2 * 35.0))
+    assert np.abs(state.elevation[0].numpy() - plane[0].numpy() - sharp).max() < 0.1
+
+
+@pytest.fixture(scope="module")
+def photographs(shared, tmp_path_factory):
+    """pairs.h5 of the Apollo 15 frames."""
     from stages import ingest, project, sample
 
     data = shared / "data" / "apollo15"
     if not (data / "images.csv").is_file():
         pytest.skip("no data/apollo15 beside the oracles")
-    scene, crops, pairs = (tmp_path / f"{n}.h5" for n in ("scene", "crops", "pairs"))
+    folder = tmp_path_factory.mktemp("apollo")
+    scene, crops, pairs = (folder / f"{n}.h5" for n in ("scene", "crops", "pairs"))
     ingest.run(data / "gld100_64ppd.tif", data / "images.csv", scene, ingest.Config(gsd=474, crop=48))
     sample.run(scene, crops, sample.Config(stack=True, count=24, tile_m=32000, split=(0.7, 0.1, 0.2)))
     project.run(crops, pairs, project.Config())
-    said = diagnose.run(pairs).answer.to_json()
+    return pairs
+
+
+def _shift(answer, frame):
+    """(east, south) px that a diagnosis gives a frame; 0 where it names none."""
+    effect = next((c.effect for c in answer.causes if c.effect.name == "misregistration"), None)
+    return np.array([float(effect.values[k][frame]) for k in ("east_px", "south_px")]) if effect else np.zeros(2)
+
+
+@pytest.mark.slow
+def test_a_shift_planted_into_photographs_has_its_size(photographs, tmp_path):
+    """... beside the shifts that the frames have: what is planted is the difference."""
+    before = diagnose.run(photographs).answer
+    after = diagnose.run(plant(photographs, tmp_path / "p.h5", "shift of one frame by 3 px")).answer
+    assert np.abs(_shift(after, 0) - _shift(before, 0) - [3.0, 0.0]).max() < 0.3
+
+
+@pytest.mark.slow
+def test_the_apollo_frames_were_never_orthorectified(photographs):
+    """Real photographs: relief displacement, share 1, and no gain that may be negative."""
+    said = diagnose.run(photographs).answer.to_json()
     causes = {c["effect"]: c for c in said["causes"]}
     leaning = causes["relief_displacement"]
     assert leaning["parameters"]["share"]["value"] == pytest.approx(1.0, abs=0.15)

@@ -8,7 +8,7 @@ registration  Where the images lie. Shifts of up to 8 px are captured by correla
               constant, waves over the lines, an affine map or a smooth field per frame, with or without relief displacement. The simplest form that no other
               beats on held-out sites wins.
 rows          Residuals relative to brightness, and what a little of everything would add to them, in windows on pieces of ground, as
-              Fourier coefficients. Deep shadow counts, shadow edges do not.
+              Fourier coefficients. Deep shadow counts, shadow edges do not: which ground is dark is judged by itself, last (``search/shadows.py``).
 likelihood    The covariance of the residuals, estimated from them by wavelength: albedo and relief that all images of a place share,
               what each image has of its own, noise. One image of a place is enough, several tell the parts apart. Under it, generalised least squares
               for every effect, along with the nominal coefficients (which may drift from place to place, by as much as they are seen

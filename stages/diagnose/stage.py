@@ -29,6 +29,7 @@ from stages.diagnose.result.named import by_histogram, by_registration, by_searc
 from stages.diagnose.result.score import blind_effects, displacements, score, unconfirmed
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, search
+from stages.diagnose.search.shadows import by_shadows
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import LINE, MISFIT
 from stages.effects import effect_names
@@ -134,8 +135,11 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     if doubted or (state.causes and displaced):
         settle(state, outcome.view)
     placed, refused = by_registration(state)
-    answer.causes = placed + by_search(state) + [c for c in [cut(data, state) if cut else None] if c]
-    answer.rejected = refused | outcome.rejected | doubted
+    answer.causes = (
+        placed + by_search(state) + by_shadows(state) + [c for c in [cut(data, state) if cut else None] if c]
+    )
+    rejected = refused | outcome.rejected | doubted
+    answer.rejected = {k: v for k, v in rejected.items() if k not in {c.effect.name for c in answer.causes}}
     if state.registration is not None:
         answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}
     view = outcome.view

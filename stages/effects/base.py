@@ -83,6 +83,7 @@ class Effect(ABC):
     keep_below   what is brighter than this times a level that was read off says nothing more
     one_sided    a fixed coordinate by whose sign it is told from what is alike on both sides
     of_law       another form of the reflectance law could do the same: it is a cause only where that form has nothing to add
+    shadow_error how far its first coordinate may be off where shadows alone tell it, since the DEM's horizons are
     table        where values per image (or site) stand in diagnosis.h5, and the name of their second dimension
     linear       whether the image is linear in the coordinates: the first estimate needs no second one
     """
@@ -112,6 +113,7 @@ class Effect(ABC):
     along_lines: ClassVar[bool] = False
     one_sided: ClassVar[str] = ""
     of_law: ClassVar[bool] = False
+    shadow_error: ClassVar[float] = 0.0
     keep_below: ClassVar[float] = 1.0
     table: ClassVar[tuple[str, str | None] | None] = None
 
@@ -136,6 +138,16 @@ class Effect(ABC):
     def trials(cls, survey: Survey) -> Sequence[Trial]:
         """Alternative templates; the default is one joint trial with a column per coordinate at ``strong``."""
         return [Trial(tuple({p.name: cls.strong[p.name]} for p in cls.fitted()))]
+
+    @classmethod
+    def shadow_trials(cls, survey: Survey) -> Sequence[Trial]:
+        """Values at which shadows are compared, in order, if the effect moves or widens them."""
+        return ()
+
+    @classmethod
+    def shadows_ordinarily(cls, values: Mapping[str, Any]) -> bool:
+        """Whether shadows of every data set look as with these values, since relief has finer detail than the DEM."""
+        return False
 
     @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from stages.effects.base import Effect, Survey, Trial, register
-from stages.effects.filters import gaussian
+from stages.effects.filters import gaussian, plane
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
@@ -36,5 +36,5 @@ class DemSmoothing(Effect):
 
     def apply(self, state: State) -> None:
         z = state.elevation
-        mean = z.mean(dim=(-2, -1), keepdim=True)
-        state.elevation = mean + gaussian(z - mean, -self.value("sigma2_px2", state))
+        tilt = plane(z)
+        state.elevation = tilt + gaussian(z - tilt, -self.value("sigma2_px2", state), slopes=True)

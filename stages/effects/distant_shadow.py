@@ -48,6 +48,10 @@ class DistantShadow(Effect):
         return Trial(({"height_m": height},), {"distance_px": distance * survey.crop_px, "side": float(side)})
 
     @classmethod
+    def shadow_trials(cls, survey: Survey) -> list[Trial]:
+        return list(cls.trials(survey))
+
+    @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:
         return "sun_horizon" in has
 

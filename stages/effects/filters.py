@@ -11,19 +11,42 @@ from torch.nn.functional import pad
 MARGIN = 12  # px of mirrored border, over 3 sigma of anything that the effects ask for
 
 
-def gaussian(image: Tensor, sigma2: Tensor | float, limit: float = 4.0) -> Tensor:
+def gaussian(image: Tensor, sigma2: Tensor | float, limit: float = 4.0, slopes: bool = False) -> Tensor:
     """Blur by a Gaussian of variance ``sigma2`` px^2; negative: sharpen, each frequency at most ``limit`` times.
 
     image : (B, H, W); sigma2 : scalar. Differentiable in both.
+    slopes : go on beyond the borders with the slope that there is (heights), not mirrored (brightness): no crease is sharpened
     """
     margin = min(MARGIN, image.shape[-1] - 1, image.shape[-2] - 1)
-    wide = pad(image[:, None], (margin,) * 4, mode="reflect")[:, 0]
+    if slopes:
+        wide = _turned(_turned(image, margin).transpose(-2, -1), margin).transpose(-2, -1)
+    else:
+        wide = pad(image[:, None], (margin,) * 4, mode="reflect")[:, 0]
     height, width = wide.shape[-2:]
     ky = torch.fft.fftfreq(height, device=image.device)[:, None] * (2 * math.pi)
     kx = torch.fft.rfftfreq(width, device=image.device) * (2 * math.pi)
     gain = torch.exp(-0.5 * torch.as_tensor(sigma2, dtype=image.dtype) * (kx * kx + ky * ky)).clamp(max=limit)
     blurred = torch.fft.irfft2(torch.fft.rfft2(wide) * gain, s=(height, width))
     return blurred[:, margin : height - margin, margin : width - margin]
+
+
+def plane(heights: Tensor) -> Tensor:
+    """(B, H, W) the plane nearest to heights (B, H, W), by least squares."""
+    height, width = heights.shape[-2:]
+    y = torch.linspace(-1, 1, height, dtype=heights.dtype)[:, None]
+    x = torch.linspace(-1, 1, width, dtype=heights.dtype)
+
+    def along(ramp: Tensor) -> Tensor:
+        return (heights * ramp).mean((-2, -1), keepdim=True) / ramp.square().mean() * ramp
+
+    return heights.mean((-2, -1), keepdim=True) + along(x) + along(y)
+
+
+def _turned(image: Tensor, margin: int) -> Tensor:
+    """(..., margin + W + margin): columns beyond either border, turned by half a circle about it."""
+    left = 2 * image[..., :1] - image[..., 1 : margin + 1].flip(-1)
+    right = 2 * image[..., -1:] - image[..., -margin - 1 : -1].flip(-1)
+    return torch.cat([left, image, right], -1)
 
 
 def laplacian(image: Tensor, gsd: float) -> Tensor:

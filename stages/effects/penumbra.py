@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 
@@ -44,6 +44,14 @@ class Penumbra(Effect):
     def trials(cls, survey: Survey) -> list[Trial]:
         radii = (0.45, 0.8, 1.2, 1.6, 2.0, 2.5, 3.0)
         return [Trial(({"disc_deg2": r * r},), {"relief_deg": RELIEF}) for r in radii]
+
+    @classmethod
+    def shadow_trials(cls, survey: Survey) -> list[Trial]:
+        return [Trial(({"disc_deg2": r * r},)) for r in (0.2666, 0.45, 0.6, 0.75, 0.9, 1.05, 1.3, 1.6, 2.0, 2.5, 3.0)]
+
+    @classmethod
+    def shadows_ordinarily(cls, values: Mapping[str, Any]) -> bool:
+        return True  # errors of the DEM make edges as wide: what they do cannot be told from a wide Sun
 
     @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:

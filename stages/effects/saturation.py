@@ -12,7 +12,8 @@ from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
 PILE = 150  # pixels
-STANDS_OUT = 3.0  # times the bins (2 %) below
+STANDS_OUT = 3.0  # times the bins below
+BINS = (0.02, 0.002)  # of the level: noise added later makes the pile wide, a crowded histogram asks for narrow ones
 
 
 @register
@@ -43,14 +44,17 @@ class Saturation(Effect):
         top = float(bright.kthvalue(max(1, int(0.9995 * len(bright)))).values)
         if top <= 0:
             return None
-        edges = top * 1.02 ** torch.arange(-16.0, 4.0)
-        counts = torch.histogram(bright, edges)[0]
-        best = int(counts[6:].argmax()) + 6
-        before = counts[max(best - 5, 0) : best - 1].mean()
-        above = float(counts[best + 2 :].sum())
-        # resampling rings a little over the level, noise added later blurs it: the pile is three bins wide
-        pile = float(counts[best - 1 : best + 2].sum())
-        if pile < PILE or counts[best] < STANDS_OUT * before or above > 0.05 * pile:
+        for width in BINS:
+            edges = top * (1 + width) ** torch.arange(-16.0, 4.0)
+            counts = torch.histogram(bright, edges)[0]
+            best = int(counts[6:].argmax()) + 6
+            before = counts[max(best - 5, 0) : best - 1].mean()
+            above = float(counts[best + 2 :].sum())
+            # resampling rings a little over the level, noise added later blurs it: the pile is three bins wide
+            pile = float(counts[best - 1 : best + 2].sum())
+            if pile >= PILE and counts[best] >= STANDS_OUT * before and above <= 0.05 * pile:
+                break
+        else:
             return None
         inside = (bright >= edges[best]) & (bright < edges[best + 1])
         level = float(bright[inside].median())

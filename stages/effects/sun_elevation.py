@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 
@@ -11,14 +12,15 @@ from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
+HORIZON = 0.5  # deg: what errors of the DEM do to horizons
+
 
 @register
 class SunElevation(Effect):
     name = "sun_elevation"
     slot = "illumination"
-    of_law = (
-        True  # on lit ground it goes with incidence as the law does; shadow edges, which would tell, are not judged
-    )
+    of_law = True  # on lit ground it goes with incidence as the law does; shadows tell
+    shadow_error = HORIZON / 2
     title = "elevation of the Sun"
     mechanism = (
         "A wrong time, a wrong latitude or a local frame that is not level raises or lowers the Sun in every image alike: "
@@ -35,6 +37,14 @@ class SunElevation(Effect):
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
         return [Trial(({"error_deg": 0.2},))]
+
+    @classmethod
+    def shadow_trials(cls, survey: Survey) -> list[Trial]:
+        return [Trial(({"error_deg": 0.25 * k},)) for k in range(-20, 21)]
+
+    @classmethod
+    def shadows_ordinarily(cls, values: Mapping[str, Any]) -> bool:
+        return float(values["error_deg"]) <= HORIZON  # too dark is also what relief and the law at grazing light make
 
     def apply(self, state: State) -> None:
         east, north, up = state.sun_direction.to(state.elevation.dtype).unbind(-1)

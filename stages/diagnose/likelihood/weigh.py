@@ -307,12 +307,14 @@ class Whole:
         scatter = jackknife_error(self.without_one(places, exclude))
         return inverse @ score, np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter)
 
-    def another_law(self, guise: Guise | None) -> float:
-        """Nats that another form of the reflectance surely has to add beside an effect of the law, which explains less than most of what
-        that form does alone; 0 where it has not.
+    def another_law(self, guise: Guise | None, surely: bool = False) -> float:
+        """Nats that another form of the reflectance has to add beside an effect of the law, which explains less than most of what
+        that form does alone; 0 where it has not. surely : with a lower bound above zero
         """
         added = self.law_adds(guise)
-        if interval(added, self.sizes)[0] <= 0 or added.sum() < (1 - SIMPLER) * self.law_adds(None).sum():
+        if surely and interval(added, self.sizes)[0] <= 0:
+            return 0.0
+        if added.sum() <= 0 or added.sum() < (1 - SIMPLER) * self.law_adds(None).sum():
             return 0.0
         return float(added.sum())
 

@@ -16,6 +16,7 @@ from stages.effects.filters import gradients
 from stages.physics.formation import chain as formation
 from stages.physics.formation import geometry
 from stages.physics.formation.chain import State
+from stages.physics.light.sun_disc import sun_visibility
 from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
 
 STEP = 0.02  # of a slope, as tangent
@@ -181,6 +182,16 @@ class Chain:
             state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
             out.append((self._expose(state, self._surface(state), self.base) - self.rendered) / STEP)
         return out[0], out[1]
+
+    def visibility(self, effects: Sequence[Effect]) -> Tensor | None:
+        """(n, H, W) share of the Sun's disc above the horizon, with these effects of the illumination beside the base."""
+        state = copy.copy(self._state)
+        for effect in effects:
+            effect.apply(state)
+        if state.sun_horizon is None:
+            return None
+        sun = torch.asin(state.sun_direction[:, 2].clamp(-1, 1)).to(state.elevation.dtype)
+        return sun_visibility(sun[:, None, None], state.sun_horizon, state.sun_radius)
 
     def unresolved_slopes(self) -> Tensor:
         """What a scatter of slopes within a pixel, or of the DEM's own slopes, does to the mean: its second order."""

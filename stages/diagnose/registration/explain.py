@@ -52,6 +52,7 @@ class Registration:
     """What explains where the images lie.
 
     coefficients : (frames, 2, T), px; share : of the relief displacement; gains : of each form over nothing
+    fitted : coefficients and share of every form; without : coefficients by all ground but one piece, of the form and of constant ones
     squares : of the residual, (pieces of ground, frames) for every form, and in OWN without and with relief displacement; tested : of the test pairs
     """
 
@@ -68,6 +69,7 @@ class Registration:
     shift_error: float
     pixels: float
     fitted: dict[str, tuple[Tensor, float]]
+    without: dict[str, list[Tensor]]
     tested: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def test(self, sites: Sequence[Site], nominal: Nominal) -> None:
@@ -134,6 +136,17 @@ class Registration:
         east, south = lean(site.observation, self.level)
         return field[0] + self.share * east, field[1] + self.share * south
 
+    def mean_shifts(self, sites: Sequence[Site], coefficients: Tensor) -> Tensor:
+        """(frames, 2) px east and south: of a form's polynomial over the places that show each frame. coefficients : (frames, 2, T)"""
+        coefficients = coefficients[..., : len(TERMS)]
+        total, count = torch.zeros(coefficients.shape[:2], dtype=torch.float64), torch.zeros(len(coefficients))
+        for site in sites:
+            frames = torch.from_numpy(site.frames)
+            here = basis(self.frame, site)[: len(TERMS)].double().mean((-2, -1))
+            total.index_add_(0, frames, coefficients[frames] @ here)
+            count.index_add_(0, frames, torch.ones(len(frames)))
+        return (total / count.clamp(min=1)[:, None]).float()
+
     def settled(self, chains: Sequence[Chain], share: float, terms: int = 3) -> list[Field]:
         """Relief displacement by ``share`` plus each image's own shift and affine map, captured beside it: a nuisance of any comparison."""
         shifts, _ = self.fitted["constant, leaning" if share else "constant"]
@@ -156,7 +169,8 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     group = _grounds(matched)
     # by the form with most freedom: what else displaces images must not pass for relief
     share = solve(matched, FORMS[-1], frames, spread)[1]
-    without = {g: _share_without(matched, group, g, frames, spread) for g in sorted(set(group))}
+    rest = {g: [m for m, k in zip(matched, group, strict=True) if k != g] for g in sorted(set(group))}
+    without = {g: solve(m, FORMS[-1], frames, spread)[1] for g, m in rest.items()}
     error = float(jackknife_error(np.array(list(without.values()))))
     fitted = {f.name: solve(matched, f, frames, spread, share if f.leaning else None) for f in FORMS}
     squares = dict(zip((f.name for f in FORMS), _held_out(matched, group, frames, spread), strict=True))
@@ -170,6 +184,11 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     surely = leaning.low > 0 and abs(share) > SURE * error
     form = _best(squares, surely and abs(share) * float(far) > ORDINARY)
     coefficients, share = fitted[form.name]
+    told = [f for f in FORMS if f is form or f.terms == 1]
+    by_rest = {
+        f.name: [solve(m, f, frames, spread, without[g] if f.leaning else None)[0] for g, m in rest.items()]
+        for f in told
+    }
     # what nothing explains is left alone: a wrong Sun looks like a shift of its own at every site
     if form.terms or form.leaning:
         known = _own_fields(matched, coefficients, share, pieces**2)
@@ -184,14 +203,8 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     every = torch.cat([s.diagonal(dim1=1, dim2=2).sum(1) for s in shifts])
     shift_error = math.sqrt(float(every.median()) * frames / max(len(every), 1))
     return Registration(
-        form, coefficients, share, error, gains, known, frame, level, squares, rms, shift_error, pixels, fitted
+        form, coefficients, share, error, gains, known, frame, level, squares, rms, shift_error, pixels, fitted, by_rest
     )
-
-
-def _share_without(matched: Sequence[Matched], group: Sequence[int], gone: int, frames: int, spread: float) -> float:
-    """Share of relief displacement by all ground but one piece."""
-    rest = [m for m, g in zip(matched, group, strict=True) if g != gone]
-    return solve(rest, FORMS[-1], frames, spread)[1]
 
 
 def _beside_own(

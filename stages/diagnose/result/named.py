@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, nats
+from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, jackknife_error, nats
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.explain import OWN, Registration, lit_mask_read, shifted_frames
 from stages.diagnose.registration.forms import FORMS, TERMS
@@ -87,7 +87,9 @@ def _leaning(state: State, r: Registration, name: str) -> tuple[Named | None, st
         "rms_px": (size, r.share_error * state.data.lean_px, "px"),
     }
     plain = r.form.beside(leaning=False)
-    compared = (plain.name, r.form.name) if plain.terms else OWN
+    compared = (plain.name, r.form.name)
+    if not plain.terms or r.doubt(*compared, OWN):  # beside each image's own shift it was found sure
+        compared = OWN
     return _named(effect, parameters, r, *compared), r.doubt(*compared, OWN)
 
 
@@ -125,16 +127,25 @@ def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str
         return first, form, None, why
 
     first, form, frames, why = judge(r.form.leaning)
+    some = shifted_frames(r.squares[first], r.squares[r.form.name])
+    if why and r.form.terms > 1 and len(some):  # a shift is part of what displaces these frames
+        form, frames = r.form.name, some
+        why = r.doubt(first, form, (first, form), some)
     if not why and not r.form.leaning and judge(True)[3]:
         why = "relief displacement, of which these data are not sure, would explain it as well"
-    shifts = r.fitted[form][0][:, :, 0].float()
-    if frames is not None:
-        shifts[np.setdiff1d(np.arange(state.frames), frames)] = 0.0
-    effect = cls({"east_px": shifts[:, 0], "south_px": shifts[:, 1]}, state.data)
+
+    def made(coefficients: Tensor) -> Effect:
+        shifts = r.mean_shifts(state.sites, coefficients)
+        if frames is not None:
+            shifts[np.setdiff1d(np.arange(state.frames), frames)] = 0.0
+        return cls({"east_px": shifts[:, 0], "south_px": shifts[:, 1]}, state.data)
+
+    effect = made(r.fitted[form][0])
     size = cls.size(effect.values)
     if size < max(cls.tolerance.values()):
         return None, ""
-    return _named(effect, {"rms_px": (size, r.shift_error, "px")}, r, first, form, frames), why
+    error = float(jackknife_error(np.array([cls.size(made(c).values) for c in r.without[form]])))
+    return _named(effect, {"rms_px": (size, max(error, r.shift_error), "px")}, r, first, form, frames), why
 
 
 def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State], Named | None] | None:

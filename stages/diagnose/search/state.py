@@ -110,7 +110,7 @@ class State:
             for g in whole.plan.guises
             if get_effect(g.effect).of_law and g.effect not in refused and whole.seen[whole.places(g)].all()
         ]
-        if min(whole.another_law(guise) for guise in [None, *alone]) < least:
+        if min(whole.another_law(guise, surely=True) for guise in [None, *alone]) < least:
             return False
         other = measured_laws(self.nominal, self.sites, self.units)
         if other is None:

@@ -1,0 +1,136 @@
+"""What cast shadows tell by themselves: which ground is dark, whatever the law of the ground.
+
+Where the Sun should shine on a facet, the share of its light that arrives is measured, brightness over that of the sunlit facet, and
+compared with the share of the Sun's disc above the horizon. Effects that move or widen shadows are tried at the values that they name
+(``shadow_trials``), beside what relief finer than the DEM does on all ground; each piece of ground is judged at the value that other ground
+likes best.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, jackknife_error, nats
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.parallel import per_site
+from stages.diagnose.result.answer import Named
+from stages.diagnose.search.state import State
+from stages.diagnose.settings import CORRELATED, DARKEST, FOLDS, SHADED, UNITS
+from stages.effects import Effect, effect_names, get_effect
+
+PARTS = 4  # bands of a site's lines that are judged apart, where grounds are few
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Tried:
+    """An effect at all values that were tried. squares : (values, pieces of ground); held_out : (pieces,) at the value that other ground likes best"""
+
+    effects: list[Effect]
+    squares: Array
+    held_out: Array
+
+    @property
+    def best(self) -> Effect:
+        """Where the squares are least."""
+        return self.effects[int(np.argmin(self.squares.sum(1)))]
+
+    def value(self, without: int | None = None) -> float:
+        """Of the first coordinate, where the squares are least, between values by a parabola; ``without`` one piece of ground."""
+        kept = np.arange(self.squares.shape[1]) != without if without is not None else slice(None)
+        total = self.squares[:, kept].sum(1)
+        k = int(np.argmin(total))
+        first, *others = (p.name for p in self.effects[0].fitted())
+        at = np.array([float(e.values[first]) for e in self.effects])
+        near = [j for j in (k - 1, k, k + 1) if 0 <= j < len(at)]
+        if len(near) < 3 or any(self.effects[j].values[n] != self.effects[k].values[n] for j in near for n in others):
+            return float(at[k])
+        bend, slope, _ = np.polyfit(at[near] - at[k], total[near], 2)
+        move = -slope / (2 * bend) if bend > 0 else 0.0
+        return float(np.clip(at[k] + move, at[near].min(), at[near].max()))
+
+
+def by_shadows(state: State) -> list[Named]:
+    """The cause that moves shadows surely, more than is ordinary and more than any other does; [] where there is none."""
+    chains = [c for c in state.chains() if c.state.sun_horizon is not None]
+    every = {
+        n: [get_effect(n)({**t.fixed, **t.columns[0]}, state.data) for t in get_effect(n).shadow_trials(state.data)]
+        for n in effect_names()
+    }
+    named = {type(c.effect).name for c in state.causes}
+    if any(c.effect.slot == "geometry" and not c.effect.displaces for c in state.causes):
+        # relief that is wrong casts wrong shadows
+        named |= {n for n in every if get_effect(n).shadow_error}
+    if not chains or not any(every.values()):
+        return []
+    group = [c.site.ground for c in chains for _ in range(PARTS)]
+    numbers = np.unique(group, return_inverse=True)[1] if len(set(group)) >= UNITS else np.arange(len(group))
+
+    def tried(effects: list[Effect], beside: Sequence[Effect]) -> Tried:
+        of_sites = per_site(lambda chain: _squares(chain, effects, beside), chains)
+        squares = np.array([np.bincount(numbers, weights=s) for s in np.concatenate(of_sites, 1)], dtype=np.float64)
+        fold = np.arange(squares.shape[1]) % FOLDS
+        chosen = [int(np.argmin(squares[:, fold != f].sum(1))) for f in fold]
+        return Tried(effects, squares, squares[chosen, np.arange(len(fold))])
+
+    beside: list[Effect] = []  # what all ground does, one effect after the other
+    for effects in every.values():
+        if usual := [e for e in effects if e.shadows_ordinarily(e.values)]:
+            plain = tried(usual, beside)
+            beside.append(plain.best)
+    found = [
+        tried(unusual, beside)
+        for n, effects in every.items()
+        if n not in named and (unusual := [e for e in effects if not e.shadows_ordinarily(e.values)])
+    ]
+    first = min(found, key=lambda t: float(t.held_out.sum()), default=None)
+    shown = plain.held_out > 0
+    if first is None or not shown.any():
+        return []
+    before, after = plain.held_out[shown], first.held_out[shown]
+    percent = gain_interval(before, after)
+    effect, value = first.best, first.value()
+    name = effect.fitted()[0].name
+    error = float(jackknife_error(np.array([first.value(int(k)) for k in np.flatnonzero(shown)])))
+    apart = [abs(float(e.values[name] - effect.values[name])) for e in first.effects]
+    error = max(error, min(a for a in apart if a > 0) / math.sqrt(12))  # of the values that were tried
+    nearer = math.copysign(max(abs(value) - 2 * error, 0.0), value)
+    if not percent[1] > 0 or percent[0] < 100 * SHADED or effect.shadows_ordinarily({**effect.values, name: nearer}):
+        return []
+    made = type(effect)({**effect.values, name: value}, state.data)
+    rivals = [t.best.name for t in found if t is not first and not gain_interval(t.held_out[shown], after)[1] > 0]
+    units = {p.name: p.unit for p in made.parameters}
+    known = {name: math.hypot(error, made.shadow_error)}
+    report = made.report({k: float(v) for k, v in made.values.items()}, known)
+    pixels = float(sum(c.site.valid.sum() for c in chains))
+    total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
+    spread = abs(total) * (percent[2] - percent[1]) / (4 * percent[0])
+    was, now = (math.sqrt(float(x.sum()) / pixels) for x in (before, after))
+    parameters = {k: (v, e, units[k]) for k, (v, e) in report.items()}
+    group_of = [made.name, *rivals]
+    return [Named(made, parameters, gain_chance(before, after), total, spread, was, now, percent, group_of)]
+
+
+def _squares(chain: Chain, effects: Sequence[Effect], beside: Sequence[Effect]) -> Array:
+    """(effects, PARTS) of measured less expected share of sunlight, on facets that the Sun would shine on."""
+    site, facet = chain.site, chain.state.reflectance
+    lit = chain.lit() & site.valid
+    level = (facet * lit).sum((-2, -1), keepdim=True) / lit.sum((-2, -1), keepdim=True).clamp(min=1)
+    use = (site.valid & (facet > DARKEST * level)).float()
+    measured = (site.image / facet.clamp(min=1e-9)).clamp(0, 1)
+    out = []
+    for effect in effects:
+        share = chain.visibility([*(b for b in beside if b.name != effect.name), effect])
+        assert share is not None
+        lines = ((measured - share) ** 2 * use).sum((0, 2))
+        out.append([float(p.sum()) for p in torch.tensor_split(lines, PARTS)])
+    return np.array(out)
+
+
+__all__ = ["by_shadows"]
