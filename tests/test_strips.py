@@ -65,8 +65,10 @@ def several_threads():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize("precision", ["fp32", "bf16"])
-@pytest.mark.parametrize("widths", [SMALL, WIDTHS])
+@pytest.mark.parametrize(
+    ("widths", "precision"),
+    [(SMALL, "fp32"), (SMALL, "bf16"), (WIDTHS, "fp32"), pytest.param(WIDTHS, "bf16", marks=pytest.mark.slow)],
+)
 def test_cuts_leave_no_trace(terrain, widths, precision, several_threads):
     """Not a bit of the kernels' own, and of the convolutions far less than 1e-4 of a coefficient's spread."""
     predictor = shaken(widths)

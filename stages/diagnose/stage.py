@@ -29,7 +29,7 @@ from stages.diagnose.result.named import by_histogram, by_registration, by_searc
 from stages.diagnose.result.score import blind_effects, displacements, score, unconfirmed
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, search
-from stages.diagnose.search.shadows import by_shadows
+from stages.diagnose.search.shadows import by_shadows, contradicted
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import LINE, MISFIT
 from stages.effects import effect_names
@@ -127,7 +127,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     if isinstance(state.nominal.model, LunarLaws):
         answer.form = state.nominal.model.title
         say(f"{config.model} has not the form of the ground's law: {answer.form} took its place")
-    doubted = unconfirmed(state)
+    doubted = unconfirmed(state) | contradicted(state)
     assert outcome.view is not None
     displaced = state.registration is not None and state.registration.form.name != "none"
     if state.causes and displaced:  # what looked like a displacement may have been a cause that is named by now

@@ -59,15 +59,14 @@ class Tried:
 def by_shadows(state: State) -> list[Named]:
     """The cause that moves shadows surely, more than is ordinary and more than any other does; [] where there is none."""
     chains = [c for c in state.chains() if c.state.sun_horizon is not None]
-    every = {
-        n: [get_effect(n)({**t.fixed, **t.columns[0]}, state.data) for t in get_effect(n).shadow_trials(state.data)]
-        for n in effect_names()
-    }
+    every: dict[str, list[Effect]] = {}
+    for e in _of_shadows(state):
+        every.setdefault(e.name, []).append(e)
     named = {type(c.effect).name for c in state.causes}
     if any(c.effect.slot == "geometry" and not c.effect.displaces for c in state.causes):
         # relief that is wrong casts wrong shadows
         named |= {n for n in every if get_effect(n).shadow_error}
-    if not chains or not any(every.values()):
+    if not chains or not every:
         return []
     group = [c.site.ground for c in chains for _ in range(PARTS)]
     numbers = np.unique(group, return_inverse=True)[1] if len(set(group)) >= UNITS else np.arange(len(group))
@@ -117,8 +116,39 @@ def by_shadows(state: State) -> list[Named]:
     return [Named(made, parameters, gain_chance(before, after), total, spread, was, now, percent, group_of)]
 
 
-def _squares(chain: Chain, effects: Sequence[Effect], beside: Sequence[Effect]) -> Array:
-    """(effects, PARTS) of measured less expected share of sunlight, on facets that the Sun would shine on."""
+def _of_shadows(state: State) -> list[Effect]:
+    """Every effect that moves or widens shadows, at every value to try."""
+    classes = [get_effect(n) for n in effect_names()]
+    return [c({**t.fixed, **t.columns[0]}, state.data) for c in classes for t in c.shadow_trials(state.data)]
+
+
+def contradicted(state: State) -> dict[str, tuple[float, str]]:
+    """Take back causes that change the relief where shadows surely fit worse with them; effect -> nats, why."""
+    out: dict[str, tuple[float, str]] = {}
+    wide = [e for e in _of_shadows(state) if e.shadows_ordinarily(e.values) and not e.shadow_error]
+    for cause in [c for c in state.causes if c.effect.slot == "geometry" and not c.effect.displaces]:
+        others = [c.effect for c in state.causes if c is not cause]
+        chains = [c for c in state.chains() if c.state.sun_horizon is not None]
+        if not (chains and wide):
+            return out
+        with_ = np.concatenate([_squares(c, wide, []) for c in chains], 1)
+        plain = [_squares(c, wide, [], state.nominal.chain(c.site, others)) for c in chains]
+        before, after = (x[int(np.argmin(x.sum(1)))] for x in (np.concatenate(plain, 1), with_))
+        percent = gain_interval(before[before > 0], after[before > 0])
+        if percent[2] < 0:
+            state.causes.remove(cause)
+            why = (
+                f"shadows contradict it: they fit worse by {-percent[0]:.1f} % ({-percent[2]:.1f} .. {-percent[1]:.1f})"
+            )
+            out[cause.effect.name] = cause.found.gain, why
+    return out
+
+
+def _squares(chain: Chain, effects: Sequence[Effect], beside: Sequence[Effect], ground: Chain | None = None) -> Array:
+    """(effects, PARTS) of measured less expected share of sunlight, on facets that the Sun would shine on.
+
+    ground : the chain whose relief casts the shadows, if it is another one
+    """
     site, facet = chain.site, chain.state.reflectance
     lit = chain.lit() & site.valid
     level = (facet * lit).sum((-2, -1), keepdim=True) / lit.sum((-2, -1), keepdim=True).clamp(min=1)
@@ -126,11 +156,11 @@ def _squares(chain: Chain, effects: Sequence[Effect], beside: Sequence[Effect]) 
     measured = (site.image / facet.clamp(min=1e-9)).clamp(0, 1)
     out = []
     for effect in effects:
-        share = chain.visibility([*(b for b in beside if b.name != effect.name), effect])
+        share = (ground or chain).visibility([*(b for b in beside if b.name != effect.name), effect])
         assert share is not None
         lines = ((measured - share) ** 2 * use).sum((0, 2))
         out.append([float(p.sum()) for p in torch.tensor_split(lines, PARTS)])
     return np.array(out)
 
 
-__all__ = ["by_shadows"]
+__all__ = ["by_shadows", "contradicted"]
