@@ -66,7 +66,7 @@ def by_registration(state: State) -> tuple[list[Named], dict[str, tuple[float, s
                 refused[name] = (made.gain, why)
             elif made is not None:
                 out.append(made)
-    return out, refused
+    return sorted(out, key=lambda cause: -cause.gain), refused
 
 
 def _named(effect, parameters, r: Registration, first: str, second: str, frames=None) -> Named:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from stages.common.arrays import Floats
 from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, jackknife_error, nats
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.parallel import per_site
@@ -25,7 +25,6 @@ from stages.diagnose.settings import CORRELATED, DARKEST, FOLDS, SHADED, UNITS
 from stages.effects import Effect, effect_names, get_effect
 
 PARTS = 4  # bands of a site's lines that are judged apart, where grounds are few
-Array = NDArray[np.float64]
 
 
 @dataclass
@@ -33,8 +32,8 @@ class Tried:
     """An effect at all values that were tried. squares : (values, pieces of ground); held_out : (pieces,) at the value that other ground likes best"""
 
     effects: list[Effect]
-    squares: Array
-    held_out: Array
+    squares: Floats
+    held_out: Floats
 
     @property
     def best(self) -> Effect:
@@ -144,7 +143,7 @@ def contradicted(state: State) -> dict[str, tuple[float, str]]:
     return out
 
 
-def _squares(chain: Chain, effects: Sequence[Effect], beside: Sequence[Effect], ground: Chain | None = None) -> Array:
+def _squares(chain: Chain, effects: Sequence[Effect], beside: Sequence[Effect], ground: Chain | None = None) -> Floats:
     """(effects, PARTS) of measured less expected share of sunlight, on facets that the Sun would shine on.
 
     ground : the chain whose relief casts the shadows, if it is another one
