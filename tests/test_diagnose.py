@@ -207,6 +207,7 @@ def test_a_shadow_from_beyond_the_dem_is_seen_whatever_the_law():
                 sun_horizon=self.horizon, reflectance=torch.full((3, 64, 64), 0.05), sun_direction=suns,
                 elevation=torch.zeros(3, 64, 64), sun_radius=np.radians(0.2666), observation=SimpleNamespace(gsd=10.0),
             )  # fmt: skip
+            self.state.sun_visibility = self.visibility([])
             horizon, up = self.horizon, torch.asin(suns[:, 2])[:, None, None]
             if planted == "wall":
                 horizon = torch.maximum(horizon, torch.atan2(torch.tensor(110.0), 320.0 + 320.0 + east))
@@ -219,6 +220,9 @@ def test_a_shadow_from_beyond_the_dem_is_seen_whatever_the_law():
             )
             self.site = SimpleNamespace(ground=number, valid=torch.ones(3, 64, 64, dtype=torch.bool), image=image)
 
+        def predict(self):
+            return self.state.reflectance * self.state.sun_visibility
+
         def lit(self):
             return self.horizon < torch.asin(suns[:, 2])[:, None, None]
 
@@ -229,7 +233,7 @@ def test_a_shadow_from_beyond_the_dem_is_seen_whatever_the_law():
 
     for planted, name in (("", None), ("wall", "distant_shadow"), ("sun", "sun_elevation")):
         chains = [Ground(k, planted) for k in range(4)]
-        found = by_shadows(SimpleNamespace(chains=lambda c=chains: c, causes=[], data=survey))
+        found = by_shadows(SimpleNamespace(chains=lambda c=chains: c, causes=[], data=survey, free_gains=False))
         assert [c.effect.name for c in found] == ([name] if name else [])
         if planted == "sun":
             value, error, _ = found[0].parameters["error_deg"]

@@ -65,7 +65,7 @@ def by_shadows(state: State) -> list[Named]:
     if any(c.effect.slot == "geometry" and not c.effect.displaces for c in state.causes):
         # relief that is wrong casts wrong shadows
         named |= {n for n in every if get_effect(n).shadow_error}
-    if not chains or not every:
+    if not chains or not every or state.free_gains:  # how dark a shadow is nobody knows beside free offsets
         return []
     group = [c.site.ground for c in chains for _ in range(PARTS)]
     numbers = np.unique(group, return_inverse=True)[1] if len(set(group)) >= UNITS else np.arange(len(group))
@@ -99,7 +99,13 @@ def by_shadows(state: State) -> list[Named]:
     apart = [abs(float(e.values[name] - effect.values[name])) for e in first.effects]
     error = max(error, min(a for a in apart if a > 0) / math.sqrt(12))  # of the values that were tried
     nearer = math.copysign(max(abs(value) - 2 * error, 0.0), value)
-    if not percent[1] > 0 or percent[0] < 100 * SHADED or effect.shadows_ordinarily({**effect.values, name: nearer}):
+    most = max(abs(float(e.values[name])) for e in first.effects)
+    if (
+        not percent[1] > 0
+        or abs(value) >= most
+        or percent[0] < 100 * SHADED
+        or effect.shadows_ordinarily({**effect.values, name: nearer})
+    ):
         return []
     made = type(effect)({**effect.values, name: value}, state.data)
     rivals = [t.best.name for t in found if t is not first and not gain_interval(t.held_out[shown], after)[1] > 0]
@@ -128,7 +134,7 @@ def contradicted(state: State) -> dict[str, tuple[float, str]]:
     for cause in [c for c in state.causes if c.effect.slot == "geometry" and not c.effect.displaces]:
         others = [c.effect for c in state.causes if c is not cause]
         chains = [c for c in state.chains() if c.state.sun_horizon is not None]
-        if not (chains and wide):
+        if not (chains and wide) or state.free_gains:
             return out
         with_ = np.concatenate([_squares(c, wide, []) for c in chains], 1)
         plain = [_squares(c, wide, [], state.nominal.chain(c.site, others)) for c in chains]
@@ -152,7 +158,9 @@ def _squares(chain: Chain, effects: Sequence[Effect], beside: Sequence[Effect], 
     lit = chain.lit() & site.valid
     level = (facet * lit).sum((-2, -1), keepdim=True) / lit.sum((-2, -1), keepdim=True).clamp(min=1)
     use = (site.valid & (facet > DARKEST * level)).float()
-    measured = (site.image / facet.clamp(min=1e-9)).clamp(0, 1)
+    known = chain.state.sun_visibility
+    assert known is not None
+    measured = (known + (site.image - chain.predict()) / facet.clamp(min=1e-9)).clamp(0, 1)
     out = []
     for effect in effects:
         share = (ground or chain).visibility([*(b for b in beside if b.name != effect.name), effect])
