@@ -250,6 +250,7 @@ def test_a_pile_of_a_tenth_of_all_pixels_is_clipping():
     saturation = get_effect("saturation")
     values = torch.from_numpy(np.random.default_rng(2).normal(160.0, 25.0, 100_000)).float().clamp(min=1)
     assert saturation.read_off(values) is None
+    assert saturation.read_off(values.round()) is None
     level = float(values.quantile(0.9))
     assert saturation.read_off(values.clamp(max=level))[0] == pytest.approx(level, rel=0.002)
 

@@ -48,8 +48,10 @@ class Saturation(Effect):
             edges = top * (1 + width) ** torch.arange(-16.0, 4.0)
             counts = torch.histogram(bright, edges)[0]
             best = int(counts[6:].argmax()) + 6
-            before = counts[max(best - 5, 0) : best - 1].mean()
-            above = float(counts[best + 2 :].sum())
+            if width == BINS[0]:
+                before, above = counts[max(best - 5, 0) : best - 1].mean(), float(counts[best + 2 :].sum())
+            else:  # whole numbers leave bins between them empty, and brighter ones lie beyond the bins
+                before, above = counts[: best - 1].max(), float((bright >= edges[best + 2]).sum())
             # resampling rings a little over the level, noise added later blurs it: the pile is three bins wide
             pile = float(counts[best - 1 : best + 2].sum())
             if pile >= PILE and counts[best] >= STANDS_OUT * before and above <= 0.05 * pile:

@@ -142,6 +142,7 @@ def contradicted(state: State) -> dict[str, tuple[float, str]]:
         percent = gain_interval(before[before > 0], after[before > 0])
         if percent[2] < 0:
             state.causes.remove(cause)
+            state.fit()  # the coefficients were fitted beside it
             why = (
                 f"shadows contradict it: they fit worse by {-percent[0]:.1f} % ({-percent[2]:.1f} .. {-percent[1]:.1f})"
             )
