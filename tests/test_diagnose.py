@@ -20,14 +20,15 @@ from schemas import ArtefactError
 from stages import diagnose
 from stages.effects import effect_names, load_extension
 
-# What two sites of 64 px in ten images can show, with the first parameter's relative error where it is recovered.
+# What two sites of 64 px in ten images can show, with the first parameter's relative error where it is recovered;
+# a wrong Sun stands in test_diagnose_leaks.py.
 SHOWN = {
     "misregistration": None,  # the campaign plants a mean size, which the frames' own draws differ from
     "psf_blur": 0.15,
     "dem_smoothing": None,  # noise of the DEM and relief within a pixel take it to two thirds
-    "sun_azimuth": 0.1,
     "phase_slope": 0.1,
 }
+SLOW = ("dem_smoothing", "phase_slope")
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ def diagnosed(scene, tmp_path_factory):
     return make
 
 
-@pytest.mark.parametrize("effect", SHOWN)
+@pytest.mark.parametrize("effect", [pytest.param(e, marks=[pytest.mark.slow] if e in SLOW else []) for e in SHOWN])
 def test_planted_cause_is_named(scene, diagnosed, effect):
     """... and every kind of cause can be written, reported, and read back as an extension of the model."""
     answer = json.loads((diagnosed(effect) / "d.json").read_text())

@@ -44,6 +44,15 @@ def answers(scene, tmp_path_factory):  # noqa: F811
     return [*said, results[0].state]
 
 
+def test_a_planted_sun_is_named_with_its_size(answers):
+    said = answers[0]
+    assert said["verdict"] == "named"
+    first = said["causes"][0]
+    assert first["effect"] == "sun_azimuth" and "sun_azimuth" in first["group"]
+    found = first["parameters"]["error_deg"]
+    assert found["value"] == pytest.approx(4.0, rel=0.1) and found["unit"] == "degree"
+
+
 def test_causes_are_learned_without_the_test_pairs(answers):
     plain, noisy, _ = answers
     assert [c["effect"] for c in plain["causes"]] == [c["effect"] for c in noisy["causes"]]

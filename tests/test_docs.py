@@ -79,6 +79,7 @@ def notebook():
     return SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "notebook_page.py")))
 
 
+@pytest.mark.slow
 def test_the_notebook_goes_from_pairs_to_a_relit_map(notebook, small_artefacts, tmp_path, monkeypatch):
     """As it stands, on a smaller scene: its map is what the command renders."""
     for name in ("scene", "pairs"):

@@ -144,6 +144,7 @@ def test_a_worker_s_error_is_one_line(inputs, cluster, tmp_path):
     assert not (tmp_path / "s.h5").exists()
 
 
+@pytest.mark.slow
 def test_a_diagnosis_on_a_worker(inputs, cluster, tmp_path):
     cluster.fill()
     texts = []

@@ -38,7 +38,8 @@ def test_integer_factor_is_the_area_mean_of_valid_pixels(small_files, tmp_path):
         np.testing.assert_allclose(scene["elevation"][...], mean, rtol=1e-6)
 
 
-@pytest.mark.parametrize("gsd", [60, 50])  # means of 3 x 3, and a reprojection (no multiple of the DEM's 20 m)
+# means of 3 x 3, and a reprojection (no multiple of the DEM's 20 m)
+@pytest.mark.parametrize("gsd", [60, pytest.param(50, marks=pytest.mark.slow)])
 def test_pieces_however_small_give_the_same_scene(small_files, tmp_path, monkeypatch, gsd):
     """What is read at a time, which the source's strips and the memory decide, does not show in the result."""
     strips = tmp_path / "strips.tif"

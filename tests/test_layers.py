@@ -75,6 +75,12 @@ print(evaluate("lambert", {"albedo": 1.0}, 0.0, 0.0, 0.0), "torch._C" in sys.mod
     assert out[0].startswith("hapke: ") and out[-2:] == ["False", "1.0 True"]
 
 
+def test_images_are_projected_without_torch():
+    """Whose import would take longer than the rest of a small run: registration alone renders."""
+    code = "import stages.project.stage, sys; print('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
+
+
 CORE = sorted(path for top in ("stages", "schemas") for path in (ROOT / top).rglob("*.py"))
 
 

@@ -174,7 +174,7 @@ def test_views_agree_with_mitsuba(scenes, tmp_path, name, sun_elevation_deg):
     assert np.percentile(miss, 99) < 0.1 * grid.gsd, np.percentile(miss, [50, 90, 99, 100])
 
 
-@pytest.mark.parametrize("name", ["nadir", "oblique"])
+@pytest.mark.parametrize("name", [pytest.param("nadir", marks=pytest.mark.slow), "oblique"])
 def test_one_bounce_agrees_with_mitsuba(scenes, tmp_path, name):
     """What a low Sun's light adds after one bounce, in shadows and beside them, through a camera."""
     scene_name, (row, col, altitude_px), target = VIEWS[name]

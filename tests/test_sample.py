@@ -90,6 +90,26 @@ def test_stack_crops_every_image_that_covers_a_place(small_artefacts, tmp_path):
     assert len(data["site"]) > 40
 
 
+def test_places_of_a_stack_lie_side_by_side_while_there_is_room():
+    """On open ground no two crops overlap; where there are more places than room all are taken, as far apart as may be."""
+    from stages.sample.places import _apart
+
+    rng = np.random.default_rng(1)
+    row, col = rng.integers(0, 400, (2, 2000))
+    _, first = np.unique(row * 1000 + col, return_index=True)
+    row, col = row[first], col[first]
+
+    def nearest(wanted):
+        chosen = np.flatnonzero(_apart(row, col, wanted, 48, rng))
+        assert len(chosen) == wanted
+        apart = np.maximum(*(np.abs(v[chosen, None] - v[chosen]) for v in (row, col)))
+        return apart[~np.eye(wanted, dtype=bool)].min()
+
+    assert nearest(25) >= 48
+    assert nearest(100) >= 24
+    assert nearest(len(row)) >= 1
+
+
 def test_tiles_are_metres_on_the_body(small_artefacts, tmp_path):
     """1280 m at 20 m a pixel is 64 pixels; a geodesic along a row of the scene says the same."""
     _, data = crops(small_artefacts, tmp_path)

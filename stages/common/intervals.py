@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
+from scipy import special
 
 LEVEL = 0.95
 FEWEST_UNITS = 4  # coverage is tested from here on
@@ -73,15 +73,15 @@ def ratio_interval(total: NDArray, weight: NDArray, unit: NDArray, scale: Scale 
     that are not finite do not count.
     The value is the ratio of the means over runs. Where a ratio does not exist on ``scale`` it stays as it is.
     """
-    totals, weights, labels = _known(total, weight, unit)
-    if not len(labels):
+    totals, weights = _per_unit(total, weight, unit)
+    if not totals.size:
         return Interval(math.nan, math.nan, math.nan)
     value = float(_ratio(totals.mean(0).sum(), weights.mean(0).sum()))
     runs = _ratio(totals.sum(axis=1), weights.sum(axis=1))
-    asked = np.concatenate([_without_one(totals, weights, labels), runs])
+    asked = np.concatenate([_without_one(totals.mean(0), weights.mean(0)), runs])
     if not bool(((asked > scale.low) & (asked < scale.high)).all()):
         scale = PLAIN
-    parts = [ground_variance(totals, weights, labels, scale)]
+    parts = [_ground_variance(totals.mean(0), weights.mean(0), scale)]
     if len(totals) > 1:
         parts.append(run_variance(scale.to(runs)))
     noise = join(parts)
@@ -108,12 +108,7 @@ def ground_variance(total: NDArray, weight: NDArray, unit: NDArray, scale: Scale
     total, weight : (runs, N); unit : (N,)
     """
     totals, weights = _per_unit(total, weight, unit)
-    count = len(weights)
-    if count < 2:
-        return Variance(math.nan, 0.0)
-    without, of_all = scale.to(_without_one(total, weight, unit)), scale.to(_ratio(totals.sum(), weights.sum()))
-    spread = np.square(without - of_all).sum() * (count - 1) / count
-    return Variance(float(spread), max(1.0, effective_units(weights) - 1))
+    return _ground_variance(totals.mean(0), weights.mean(0), scale)
 
 
 def run_variance(values: Sequence[float] | NDArray) -> Variance:
@@ -140,32 +135,36 @@ def join(parts: Sequence[Variance]) -> Variance:
 
 def student_quantile(freedom: float, level: float = LEVEL) -> float:
     """Half width of the central interval of Student's t that holds ``level``."""
-    return float(stats.t.ppf(0.5 + level / 2, freedom))
+    return float(special.stdtrit(freedom, 0.5 + level / 2))
 
 
 def two_sided_p(t: float, freedom: float) -> float:
     """Probability that |Student's t| exceeds |t|."""
-    return float(2 * stats.t.sf(abs(t), freedom))
-
-
-def _known(total: NDArray, weight: NDArray, unit: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    totals, weights = np.broadcast_arrays(
-        np.atleast_2d(np.asarray(total, float)), np.atleast_2d(np.asarray(weight, float))
-    )
-    known = (np.isfinite(totals) & np.isfinite(weights)).all(axis=0)
-    return totals[:, known], weights[:, known], np.asarray(unit)[known]
+    return float(2 * special.stdtr(freedom, -abs(t)))
 
 
 def _per_unit(total: NDArray, weight: NDArray, unit: NDArray) -> tuple[NDArray, NDArray]:
-    """Sums over each unit of the means over runs, (units,) each; units without weight do not count."""
-    _, index = np.unique(unit, return_inverse=True)
-    totals, weights = (np.bincount(index, np.atleast_2d(v).mean(0)) for v in (total, weight))
-    return totals[weights > 0], weights[weights > 0]
+    """Sums over each unit of what is finite in all runs, (runs, units) each; units without weight do not count."""
+    pairs = np.broadcast_arrays(*(np.atleast_2d(np.asarray(v, float)) for v in (total, weight)))
+    known = (np.isfinite(pairs[0]) & np.isfinite(pairs[1])).all(axis=0)
+    _, index = np.unique(np.asarray(unit)[known], return_inverse=True)
+    totals, weights = (np.stack([np.bincount(index, run[known]) for run in values]) for values in pairs)
+    weighty = weights.sum(0) > 0
+    return totals[:, weighty], weights[:, weighty]
 
 
-def _without_one(total: NDArray, weight: NDArray, unit: NDArray) -> NDArray:
+def _ground_variance(totals: NDArray, weights: NDArray, scale: Scale) -> Variance:
+    """ground_variance of sums over units, (units,) each."""
+    count = len(weights)
+    if count < 2:
+        return Variance(math.nan, 0.0)
+    without, of_all = scale.to(_without_one(totals, weights)), scale.to(_ratio(totals.sum(), weights.sum()))
+    spread = np.square(without - of_all).sum() * (count - 1) / count
+    return Variance(float(spread), max(1.0, effective_units(weights) - 1))
+
+
+def _without_one(totals: NDArray, weights: NDArray) -> NDArray:
     """The ratio of all units but one, (units,); empty for a single unit."""
-    totals, weights = _per_unit(total, weight, unit)
     return _ratio(totals.sum() - totals, weights.sum() - weights)[: len(weights) * (len(weights) > 1)]
 
 

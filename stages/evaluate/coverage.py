@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 LEVELS = (68, 95)  # percent
 BANDS_DEG = (0.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # incidence on the terrain
@@ -16,7 +16,7 @@ BANDS_DEG = (0.0, 30.0, 45.0, 60.0, 75.0, 90.0)  # incidence on the terrain
 
 def gaussian_widths(std: NDArray) -> list[NDArray]:
     """Half-widths of the intervals of LEVELS of a normal distribution."""
-    return [norm.ppf(0.5 + level / 200) * std for level in LEVELS]
+    return [float(ndtri(0.5 + level / 200)) * std for level in LEVELS]
 
 
 def count_within(away: NDArray, widths: Sequence[NDArray], incidence: NDArray) -> NDArray[np.int64]:

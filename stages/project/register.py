@@ -11,7 +11,6 @@ import numpy as np
 
 from schemas import ArtefactWriter
 from stages.physics.images.displacement import Field
-from stages.physics.images.register_frame import choose_blocks, register_frame
 from stages.physics.images.source_images import Source
 from stages.physics.images.table import Frame
 from stages.project.config import Config
@@ -21,6 +20,9 @@ from stages.project.summary import Registered
 
 def register(frame: Frame, index: int, source: Source, crops: h5py.File, scene: Scene, config: Config) -> Registered:
     """Register one image by blocks about all of its crops, whatever the shard: every shard takes off the same."""
+    # here: it renders with torch, whose import would be most of the time that small crops take
+    from stages.physics.images.register_frame import choose_blocks, register_frame
+
     began = time.monotonic()
     mine = crops["image_index"][...] == index
     size = crops["elevation"].shape[1]

@@ -1,4 +1,7 @@
-"""Where crops are centred: drawn within each image, each part of the split by its share."""
+"""Where crops are centred: drawn within each image, each part of the split by its share.
+
+Places of a stack are drawn in the scene, side by side as long as there is room: crops that share ground are one witness of it.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,9 @@ from stages.common.progress import Progress
 from stages.physics.maps.grid import Grid
 from stages.physics.maps.ground_tiles import PositionMasks, Tiles
 from stages.sample.config import Config
+
+CANDIDATES = 50  # drawn for each place of a stack
+MOST_CANDIDATES = 200_000
 
 CHOSEN = np.dtype([("frame", "i4"), ("row", "i4"), ("col", "i4"), ("site", "i4"), ("tile", "i4"), ("split", "u1")])
 
@@ -38,7 +44,9 @@ def choose(
     take = np.zeros_like(counts)
     for index, k in np.ndindex(len(layers), 3):
         if wanted[index, k]:
-            take[index, k] = _spread(rng, counts[index, k], int(wanted[index, k]))
+            take[index, k] = _spread(
+                rng, counts[index, k], _drawn(int(wanted[index, k]), int(counts[index, k].sum()), config)
+            )
     for number, block in enumerate(positions.blocks):
         progress(len(positions.blocks) + number, 2 * len(positions.blocks), "choosing positions")
         if not take[:, :, number].any():
@@ -53,6 +61,8 @@ def choose(
                 row, col = np.unravel_index(np.sort(flat), part.shape)
                 picked.append((layer, k, row + block[0], col + block[1], block, here))
     progress(2 * len(positions.blocks), 2 * len(positions.blocks), "choosing positions")
+    if config.stack:
+        picked = _side_by_side(picked, wanted[0], positions.crop, rng)
     return _records(picked, positions, tiles, config.stack)
 
 
@@ -94,6 +104,47 @@ def _spread(rng: np.random.Generator, counts: NDArray[np.int64], wanted: int) ->
         result[k] = min(int(n), rng.binomial(left, n / remaining)) if remaining else 0
         left, remaining = left - int(result[k]), remaining - int(n)
     return result
+
+
+def _drawn(wanted: int, available: int, config: Config) -> int:
+    """Positions to draw for so many places."""
+    return min(available, max(wanted, min(CANDIDATES * wanted, MOST_CANDIDATES))) if config.stack else wanted
+
+
+def _side_by_side(picked: list, wanted: NDArray[np.int64], crop: int, rng: np.random.Generator) -> list:
+    """Of the candidates those whose crops share least ground, as many as are wanted of each part of the split."""
+    kept = []
+    for k in range(3):
+        mine = [p for p in picked if p[1] == k]
+        if not mine:
+            continue
+        row, col = (np.concatenate([p[j] for p in mine]) for j in (2, 3))
+        chosen = _apart(row, col, int(wanted[k]), crop, rng)
+        ends = np.cumsum([len(p[2]) for p in mine])[:-1]
+        for part, here in zip(mine, np.split(chosen, ends), strict=True):
+            kept.append((*part[:2], part[2][here], part[3][here], *part[4:]))
+    return kept
+
+
+def _apart(row: NDArray, col: NDArray, wanted: int, crop: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Which places to take: in random order, first those that share no ground, then at half that distance, and so on."""
+    order, distance = rng.permutation(len(row)), crop
+    taken: list[int] = []
+    chosen = np.zeros(len(row), bool)
+    while distance and len(taken) < wanted:
+        cells: dict[tuple[int, int], list[int]] = {}
+        for place in taken:
+            cells.setdefault((int(row[place]) // distance, int(col[place]) // distance), []).append(place)
+        for place in order[~chosen[order]]:
+            r, c = int(row[place]), int(col[place])
+            at = r // distance, c // distance
+            near = [q for i in (-1, 0, 1) for j in (-1, 0, 1) for q in cells.get((at[0] + i, at[1] + j), ())]
+            if len(taken) < wanted and not any(abs(r - row[q]) < distance and abs(c - col[q]) < distance for q in near):
+                cells.setdefault(at, []).append(place)
+                taken.append(place)
+                chosen[place] = True
+        distance //= 2
+    return chosen
 
 
 def _records(picked: list, positions: PositionMasks, tiles: Tiles, stack: bool) -> NDArray:

@@ -6,9 +6,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
-FRACTION = 0.95
+from stages.diagnose.likelihood.tails import student_reach, student_tail
 
 
 def jackknife_error(without: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -26,7 +25,7 @@ def gain_interval(before: NDArray[np.float64], after: NDArray[np.float64]) -> tu
         return math.nan, math.nan, math.nan
     gain = 100 * (1 - float(after.sum()) / total)
     without = 100 * (1 - (after.sum() - after) / np.maximum(total - before, 1e-30))
-    half = float(student.ppf(0.5 + FRACTION / 2, len(before) - 1)) * float(jackknife_error(without))
+    half = student_reach(len(before) - 1) * float(jackknife_error(without))
     return gain, gain - half, gain + half
 
 
@@ -36,8 +35,8 @@ def gain_chance(before: NDArray[np.float64], after: NDArray[np.float64]) -> floa
     units = len(before)
     if not math.isfinite(low):
         return math.nan
-    error = (gain - low) / float(student.ppf(0.5 + FRACTION / 2, units - 1))
-    return float(student.sf(gain / max(error, 1e-30), units - 1))
+    error = (gain - low) / student_reach(units - 1)
+    return student_tail(gain / max(error, 1e-30), units - 1)
 
 
 def nats(before: float, after: float, pixels: float, per_sample: float) -> float:

@@ -7,11 +7,12 @@ import math
 import numpy as np
 import torch
 from scipy.ndimage import median_filter
-from scipy.stats import gamma
+from scipy.special import gammaincinv
 from torch import Tensor
 
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.products import Rows, whitened_residual
+from stages.diagnose.likelihood.tails import surprise
 from stages.diagnose.rows.patches import Grid
 from stages.diagnose.settings import FAR, NEAR, PEAK
 
@@ -59,8 +60,8 @@ def peak(rows: list[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[
         ratio = (ratio / _about(ratio, grid).clamp(min=1))[fine]
         top = float(ratio.max())
         shape = max(float(n), 1.0)
-        middle = float(gamma.median(shape))
-        chance = -float(gamma.logsf(top * middle, shape)) / math.log(10) - math.log10(len(ratio) * len(power))
+        middle = float(gammaincinv(shape, 0.5))
+        chance = float(surprise(np.array([2 * top * middle]), 2 * shape)[0]) - math.log10(len(ratio) * len(power))
         # neighbours share a wave through the window: what stands out by a little is no line
         if top > PEAK and chance > best:
             best, largest = chance, float((p[fine] * (ratio > PEAK)).sum() / p.sum())

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.special import gammaincc, gammaln
 
 from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.products import Array, Products
+from stages.diagnose.likelihood.tails import surprise
 from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.settings import FOLDS, LEVELS, SIMPLER, UNITS
 from stages.effects import get_effect
@@ -207,14 +207,14 @@ class Whole:
         null = np.einsum("ar,ab,br->r", shams, inverse, shams)
         inflation = max(1.0, float(null.mean()) / len(places)) if len(null) else 1.0
         error = np.sqrt(np.maximum(inverse.diagonal(), 0))
-        surprises = _surprise(np.concatenate([[ratio], null]) / inflation, len(places))
+        surprises = surprise(np.concatenate([[ratio], null]) / inflation, len(places))
         found = Found(
             guise.effect, guise, amount, error, float(surprises[0]), alone=math.sqrt(max(ratio / inflation, 0.0))
         )
         if len(self.scattered):
             beside, spread = (self.levels or self)._beside_gains(places, self.exclude(guise))
             if beside / inflation > ratio / inflation:
-                found.surprise = max(found.surprise, float(_surprise(np.array([beside / inflation]), len(places))[0]))
+                found.surprise = max(found.surprise, float(surprise(np.array([beside / inflation]), len(places))[0]))
                 found.beside = spread
                 found.alone = math.sqrt(beside / inflation)
         return found, surprises[1:]
@@ -362,14 +362,6 @@ def _look(guise: Guise, sign: int = 1) -> tuple[object, ...]:
     side = get_effect(guise.effect).one_sided
     fixed = ((k, sign * v if k == side else v) for k, v in sorted(guise.trial.fixed.items()))
     return guise.effect, *fixed, *(tuple(sorted(c.items())) for c in guise.trial.columns)
-
-
-def _surprise(ratio: Array, freedom: int) -> Array:
-    """-log10 of the upper tail of chi square, by its leading term where that underflows."""
-    ratio = np.maximum(ratio, 1e-12)
-    leading = ratio / 2 - (freedom / 2 - 1) * np.log(ratio / 2) + gammaln(freedom / 2)
-    exact = -np.log(np.maximum(gammaincc(freedom / 2, ratio / 2), 1e-300))
-    return np.maximum(np.where(exact < 600, exact, leading) / math.log(10), 0.0)
 
 
 def _scatter(information: Array, score: Array) -> tuple[float, float]:

@@ -12,8 +12,8 @@ import torch
 
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.found import Found, interval
-from stages.diagnose.likelihood.jackknife import FRACTION, student
 from stages.diagnose.likelihood.products import Products, Rows, products
+from stages.diagnose.likelihood.tails import student_reach
 from stages.diagnose.likelihood.weigh import Whole, weigh_all
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle
@@ -230,7 +230,7 @@ def doubt(state: State, cause: Cause) -> str:
     if away(cause.errors) < SURE:
         return f"it comes out {away(cause.errors):.1f} errors from nothing"
     groups = min(FOLDS, state.frames)
-    if away(cause.over_images) < student.ppf(0.5 + FRACTION / 2, max(groups - 1, 1)):
+    if away(cause.over_images) < student_reach(max(groups - 1, 1)):
         return f"other images give it other values: {away(cause.over_images):.1f} errors over images from nothing"
     for name, least in cls.tolerance.items():
         size = cls.size(values) if name not in values else abs(values[name] - cls.null()[name])

@@ -1,0 +1,32 @@
+"""Tails of chi square and of Student's t, from scipy.special: scipy.stats takes more than a second to import."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincc, gammaln, stdtr, stdtrit
+
+FRACTION = 0.95
+
+
+def surprise(ratio: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
+    """-log10 of the upper tail of chi square, by its leading term where that underflows."""
+    ratio = np.maximum(ratio, 1e-12)
+    leading = ratio / 2 - (freedom / 2 - 1) * np.log(ratio / 2) + gammaln(freedom / 2)
+    exact = -np.log(np.maximum(gammaincc(freedom / 2, ratio / 2), 1e-300))
+    return np.maximum(np.where(exact < 600, exact, leading) / math.log(10), 0.0)
+
+
+def student_reach(freedom: float) -> float:
+    """Standard errors within which Student's t lies with 95 % chance."""
+    return float(stdtrit(freedom, 0.5 + FRACTION / 2))
+
+
+def student_tail(t: float, freedom: float) -> float:
+    """Chance that Student's t exceeds t."""
+    return float(stdtr(freedom, -t))
+
+
+__all__ = ["student_reach", "student_tail", "surprise"]
