@@ -69,7 +69,7 @@ campaign: $(TESTED) ## what diagnose names on fresh hidden scenes (hours); SEED=
 
 # Pairs of real photographs; REGISTERED=pairs.h5 adds a registered set.
 campaign-real: $(TESTED) results/apollo15/diagnosis.h5 ## plant effects into real photographs and see what diagnose names (needs the reference data)
-	$(BIN)/python tests/planted.py --raw $(A)/stack.h5 $(if $(REGISTERED),--registered $(REGISTERED)) --seed $(or $(SEED),5) --output results/planted
+	OMP_NUM_THREADS=1 $(BIN)/python tests/planted.py --raw $(A)/stack.h5 $(if $(REGISTERED),--registered $(REGISTERED)) --seed $(or $(SEED),5) --resamples $(or $(RESAMPLES),40) --jobs $(or $(JOBS),2) --output results/planted
 
 docs: $(TESTED) ## write the generated parts of docs/ again, and build the site in build/site
 	$(BIN)/python examples/cli_page.py

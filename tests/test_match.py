@@ -155,7 +155,7 @@ def trained(tmp_path_factory):
         model="M2", epochs=2, batch=8, widths=(4, 8), dropout=(0.0, 0.0), device="cpu", precision="fp32"
     )
     train.run(folder / "pairs.h5", folder / "checkpoint.h5", config)
-    settings = evaluate.Config(device="cpu")
+    settings = evaluate.Config(device="cpu", only=("learned", "hapke_minmax"))
     evaluate.run(folder / "pairs.h5", folder / "checkpoint.h5", folder / "evaluation.h5", settings)
     return folder
 
@@ -200,7 +200,7 @@ def test_bad_input_is_one_line(trained, texture, tmp_path, case):
     cv2.imwrite(str(second), texture[:200])
     text.write_text("no picture")
     if case == "no renderings kept":
-        settings = evaluate.Config(device="cpu", renderings=False)
+        settings = evaluate.Config(device="cpu", renderings=False, only=("learned",))
         evaluate.run(trained / "pairs.h5", trained / "checkpoint.h5", tmp_path / "bare.h5", settings)
     files = {
         "missing image": [first, tmp_path / "absent.png"],

@@ -36,7 +36,11 @@ def command(
         float | None, typer.Option("--density", help="Crops per km2 of each image's valid positions.")
     ] = None,
     stack: Annotated[
-        bool, typer.Option("--stack", help="Crop every image that covers a chosen place: pairs share a 'site'.")
+        bool,
+        typer.Option(
+            "--stack",
+            help="Crop every image that covers a chosen place: pairs share a 'site'. Places lie side by side while there is room.",
+        ),
     ] = Config.stack,
     tile_m: Annotated[
         float | None, typer.Option("--tile-m", help="Edge of a ground tile of the split, m (default: up to 4 crops).")
