@@ -306,6 +306,14 @@ def test_a_shift_planted_into_photographs_has_its_size(photographs, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_smoothed_dem_is_no_optics_that_sharpen(photographs, tmp_path):
+    """The images are sharper than the rendering by more than optics can be; beside that nothing would be left for the DEM."""
+    said = diagnose.run(plant(photographs, tmp_path / "p.h5", "DEM smoothed by 1.5 px")).answer.to_json()
+    found = {c["effect"]: c["parameters"] for c in said["causes"]}["dem_smoothing"]["sigma2_px2"]
+    assert abs(found["value"] - 2.25) < 3 * found["error"]
+
+
+@pytest.mark.slow
 def test_the_apollo_frames_were_never_orthorectified(photographs):
     """Real photographs: relief displacement, share 1, and no gain that may be negative."""
     said = diagnose.run(photographs).answer.to_json()

@@ -28,10 +28,10 @@ from stages.diagnose.result.files import write_diagnosis
 from stages.diagnose.result.named import by_histogram, by_registration, by_search
 from stages.diagnose.result.score import blind_effects, displacements, score, unconfirmed
 from stages.diagnose.search.refine import settle
-from stages.diagnose.search.select import Outcome, search
+from stages.diagnose.search.select import Outcome, doubt_all, search
 from stages.diagnose.search.shadows import by_shadows, contradicted
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import LINE, MISFIT
+from stages.diagnose.settings import LINE, MISFIT, STILL
 from stages.effects import effect_names
 from stages.pairs.reader import PairReader
 
@@ -134,6 +134,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         _register(state)
     if doubted or (state.causes and displaced):
         settle(state, outcome.view)
+        doubted |= doubt_all(state, outcome.view, STILL)
     placed, refused = by_registration(state)
     answer.causes = (
         placed + by_search(state) + by_shadows(state) + [c for c in [cut(data, state) if cut else None] if c]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -55,10 +55,13 @@ class Plan:
         return [(name, self.per_frame[:k].count(name)) for k, name in enumerate(self.per_frame)]
 
 
-def make_plan(chain: Chain, names: Sequence[str], data: Survey, candidates: bool = True) -> Plan:
+def make_plan(
+    chain: Chain, names: Sequence[str], data: Survey, candidates: bool = True, impossible: Container[str] = ()
+) -> Plan:
     """Columns for the nominal model's freedom, the effects in the chain, and the effects ``names``.
 
     candidates : every way these may look; otherwise what every data set has of them
+    impossible : effects of which these data cannot have an ordinary amount
     """
     plan = Plan()
 
@@ -94,7 +97,7 @@ def make_plan(chain: Chain, names: Sequence[str], data: Survey, candidates: bool
             for trial in cls.trials(data) if candidates else cls.trials(data)[:1]:
                 places = tuple(shared(name) for _ in trial.columns)
                 plan.guises.append(Guise(name, trial, places))
-                if name not in plan.ordinary and (size := cls.ordinary(trial)) > 0:
+                if name not in plan.ordinary and name not in impossible and (size := cls.ordinary(trial)) > 0:
                     plan.ordinary[name] = list(places)
                     plan.prior |= {k: size for k in places}
         elif cls.scope == "image":

@@ -89,12 +89,15 @@ def settle(state: State, view: View) -> None:
     """Values and errors of all causes, fitted together once more."""
     if state.causes:
         errors_over_images(state, refine(state, view))
+    else:
+        state.fit()
 
 
 def along(state: State, view: View) -> list[str]:
     """Effects that are fitted beside the causes: those that all data have a little of."""
     known = {*view.plan.shared, *view.plan.per_frame}
-    return [n for n in state.open_names() if n in known and (_ordinary(n) or get_effect(n).always)]
+    ordinary = [n for n in state.open_names() if n in known and n not in state.impossible]
+    return [n for n in ordinary if _ordinary(n) or get_effect(n).always]
 
 
 def errors_over_images(state: State, view: View) -> None:

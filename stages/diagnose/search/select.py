@@ -40,9 +40,11 @@ def search(state: State, most: int) -> Outcome:
     out = Outcome()
     refused: set[str] = set()
     while True:
+        known = set(state.impossible)
         view = state.look(state.open_names())
         if not state.causes and state.law_is_another(view, refused):
             refused -= {n for n in refused if not get_effect(n).of_law}  # nothing was judged beside this law
+            state.impossible.clear()
             continue
         best, _ = weigh_all(view.whole)
         out.rejected = {k: v for k, v in out.rejected.items() if k in refused}
@@ -89,20 +91,34 @@ def search(state: State, most: int) -> Outcome:
                 sure = [f for f in sure if f is not chosen]
                 refused.add(chosen.effect)
                 out.rejected[chosen.effect] = (chosen.gain, why)
-                out.sure |= why.startswith(ODD) and chosen.gain > NOTABLE * float(view.whole.gram[0, 0])
+                if why.startswith(ODD) and chosen.gain > NOTABLE * float(view.whole.gram[0, 0]):
+                    out.sure = True
+                    state.impossible.add(chosen.effect)
                 state.say(f"{chosen.effect} is not taken: {why}")
             else:
                 state.say(f"{chosen.effect} gains {chosen.gain:.0f} nats on held-out ground")
-        if not taken:
+        if not taken and state.impossible == known:
             break
+        if not taken:  # the others were judged beside amounts of it that nothing has
+            refused = set(state.impossible)
     settle(state, view)
-    while doubted := [(c, why) for c in state.causes if (why := doubt(state, c))]:
-        cause, why = doubted[-1]  # what was found last stands on the rest
-        state.causes.remove(cause)
-        out.rejected[cause.effect.name] = cause.found.gain, f"fitted with everything else {why}"
-        settle(state, view)
+    out.rejected |= doubt_all(state, view)
     for cause in state.causes:
         out.rejected.pop(cause.effect.name, None)
+    return out
+
+
+def doubt_all(state: State, view: View, sure: float = SURE) -> dict[str, tuple[float, str]]:
+    """Take out one by one the causes that cannot be any, as they are fitted now; effect -> nats, why.
+
+    sure : standard errors from nothing that are asked
+    """
+    out = {}
+    while doubted := [(c, why) for c in state.causes if (why := doubt(state, c, sure))]:
+        cause, why = doubted[-1]  # what was found last stands on the rest
+        state.causes.remove(cause)
+        out[cause.effect.name] = cause.found.gain, f"fitted with everything else {why}"
+        settle(state, view)
     return out
 
 
@@ -206,7 +222,7 @@ def contradicted(gains: np.ndarray) -> str:
     return ""
 
 
-def doubt(state: State, cause: Cause) -> str:
+def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     """Why the fitted values cannot be a cause, or ''."""
     cls = type(cause.effect)
     if cls.scope == "image":
@@ -227,7 +243,7 @@ def doubt(state: State, cause: Cause) -> str:
         every = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in errors.items() if n not in cls.shaped]
         return math.hypot(*every) if every else math.inf
 
-    if away(cause.errors) < SURE:
+    if away(cause.errors) < sure:
         return f"it comes out {away(cause.errors):.1f} errors from nothing"
     groups = min(FOLDS, state.frames)
     if away(cause.over_images) < student_reach(max(groups - 1, 1)):
@@ -328,4 +344,4 @@ def _rms(gram: np.ndarray, look: View) -> tuple[float, float]:
     return out[0], out[1]
 
 
-__all__ = ["Outcome", "search"]
+__all__ = ["Outcome", "doubt_all", "search"]

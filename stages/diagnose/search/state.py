@@ -76,6 +76,8 @@ class State:
     hidden: list[Site] = field(default_factory=list)  # of the test pairs, which nothing is fitted to
     registration: Registration | None = None
     causes: list[Cause] = field(default_factory=list)
+    # effects whose best values nothing real has: of them the others have no ordinary amounts beside them
+    impossible: set[str] = field(default_factory=set)
     reference: Nominal | None = None
     say: Callable[[str], None] = lambda text: None
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
@@ -168,7 +170,7 @@ class State:
         """Rows and products of everything, with the effects ``names`` as candidates."""
         chains = self.chains()
         grid, _ = self.grid()
-        plan = make_plan(chains[0], names, self.data)
+        plan = make_plan(chains[0], names, self.data, impossible=self.impossible)
 
         rows = [r for part in per_site(lambda k: self.rows(k, chains[k], plan), range(len(chains))) for r in part]
         model = self._covariance(rows, grid)
@@ -184,7 +186,7 @@ class State:
         model : the covariance, estimated where None
         """
         chains = self.chains()
-        plan = make_plan(chains[0], names, self.data, candidates=False)
+        plan = make_plan(chains[0], names, self.data, candidates=False, impossible=self.impossible)
 
         def site(k: int) -> list[Rows]:
             moved = moved_columns(chains[k], plan, self.data)
