@@ -18,12 +18,13 @@ SHARED = Path(os.environ.get("LUNARGR_SHARED", ROOT.parent / "shared"))
 
 # Two workers take one file after the other: with the longest ones first, none of them waits for the other at the end.
 LONGEST = (
+    "test_albedo",
     "test_fanout",
-    "test_diagnose_commands",
+    "test_diagnose_leaks",
     "test_diagnose",
-    "test_cameras_registration",
     "test_view_browser",
     "test_provenance",
+    "test_train",
 )
 
 

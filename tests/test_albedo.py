@@ -205,6 +205,7 @@ def test_gain_and_offset_of_images_in_dn_do_not_matter(rng, tmp_path):
     assert rms(away - away.mean()) < 0.35 * np.log(truth).std()
 
 
+@pytest.mark.slow
 def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
     from lunargr_cli.fanout.job import Work
     from lunargr_cli.fanout.stages import run_albedo

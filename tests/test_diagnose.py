@@ -92,6 +92,7 @@ def test_nothing_hidden_names_nothing(scene, tmp_path, seed):
     assert answer.verdict in ("nothing_significant", "cannot_tell")
 
 
+@pytest.mark.slow
 def test_lines_outside_the_catalogue_are_unexplained(scene, tmp_path):
     answer = diagnose.run(_pairs(scene, tmp_path, {"banding": UNKNOWN["banding"]})).answer
     assert answer.unexplained_fraction > 0

@@ -12,6 +12,8 @@ from typer.testing import CliRunner
 from lunargr_cli.main import app
 from stages.effects import load_extension
 
+pytestmark = pytest.mark.slow  # a minute; what make demo does as well
+
 
 @pytest.fixture(scope="module")
 def answer(tmp_path_factory):
