@@ -132,6 +132,7 @@ def test_registration_options_are_checked(small_artefacts, tmp_path):
             project.run(small_artefacts["crops"], tmp_path / "pairs.h5", project.Config(**config))
 
 
+@pytest.mark.slow
 def test_shards_join_into_what_one_run_gives(rough, tmp_path):
     """Each shard registers the images it holds, by all their crops: parts agree, and the whole knows every shift."""
     dem, image = rough

@@ -28,7 +28,7 @@ SHOWN = {
     "dem_smoothing": None,  # noise of the DEM and relief within a pixel take it to two thirds
     "phase_slope": 0.1,
 }
-SLOW = ("dem_smoothing", "phase_slope")
+SLOW = ("psf_blur", "dem_smoothing", "phase_slope")
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_lines_outside_the_catalogue_are_unexplained(scene, tmp_path):
 
 
 def test_every_name_has_a_gain_that_is_sure_and_the_budget_adds_up(diagnosed):
-    said = json.loads((diagnosed("psf_blur") / "d.json").read_text())
+    said = json.loads((diagnosed("misregistration") / "d.json").read_text())
     assert all(c["held_out_low"] > 0 for c in said["causes"])
     assert sum(said["budget"].values()) == pytest.approx(1.0)
     assert all(share >= 0 for share in said["budget"].values())

@@ -41,7 +41,7 @@ def trained(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("suffix", ["", "_dn"])
+@pytest.mark.parametrize("suffix", ["", pytest.param("_dn", marks=pytest.mark.slow)])
 def test_evaluate_writes_table_json_artefact_and_figures(trained, tmp_path, suffix):
     output, copy = tmp_path / "evaluation.h5", tmp_path / "copy.json"
     files = (trained / f"pairs{suffix}.h5", trained / f"checkpoint{suffix}.h5")

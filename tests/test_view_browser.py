@@ -19,6 +19,7 @@ from stages.render.pictures import read_exr
 
 SUNS = ((270.0, 25.0), (80.0, 6.0), (200.0, 12.0), (40.0, 45.0), (330.0, 75.0))
 FAMILIES = ("M2", "hapke", "lunar_lambert", "kernels")
+SLOW = ("M2", "lunar_lambert")  # every formula is compared below
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -43,7 +44,7 @@ def rendered(path, folder, **config):
     return np.where(np.isfinite(image), np.maximum(image, 0), np.nan)
 
 
-@pytest.mark.parametrize("model", FAMILIES)
+@pytest.mark.parametrize("model", [pytest.param(m, marks=[pytest.mark.slow] if m in SLOW else []) for m in FAMILIES])
 def test_the_page_shows_what_render_gives(tmp_path, model):
     path, page = make_map(tmp_path, model), tmp_path / "v.html"
     view.run(path, None, page, view.Config())
