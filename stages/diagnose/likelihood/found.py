@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.products import Array
-from stages.diagnose.likelihood.tails import student_reach
 from stages.diagnose.rows.columns import Guise
 
 
@@ -57,7 +57,7 @@ def interval(gains: Array, sizes: Array | None = None) -> tuple[float, float]:
     total = float(gains.sum())
     share = np.full(units, 1 / units) if sizes is None or len(sizes) != units else sizes / sizes.sum()
     chance = gains - total * share
-    half = student_reach(units - 1) * math.sqrt(units / (units - 1) * float(chance @ chance))
+    half = student_quantile(units - 1) * math.sqrt(units / (units - 1) * float(chance @ chance))
     return total - half, total + half
 
 

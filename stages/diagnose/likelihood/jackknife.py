@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.diagnose.likelihood.tails import student_reach, student_tail
+from stages.common.intervals import student_quantile
+from stages.diagnose.likelihood.tails import student_tail
 
 
 def jackknife_error(without: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -25,7 +26,7 @@ def gain_interval(before: NDArray[np.float64], after: NDArray[np.float64]) -> tu
         return math.nan, math.nan, math.nan
     gain = 100 * (1 - float(after.sum()) / total)
     without = 100 * (1 - (after.sum() - after) / np.maximum(total - before, 1e-30))
-    half = student_reach(len(before) - 1) * float(jackknife_error(without))
+    half = student_quantile(len(before) - 1) * float(jackknife_error(without))
     return gain, gain - half, gain + half
 
 
@@ -35,7 +36,7 @@ def gain_chance(before: NDArray[np.float64], after: NDArray[np.float64]) -> floa
     units = len(before)
     if not math.isfinite(low):
         return math.nan
-    error = (gain - low) / student_reach(units - 1)
+    error = (gain - low) / student_quantile(units - 1)
     return student_tail(gain / max(error, 1e-30), units - 1)
 
 

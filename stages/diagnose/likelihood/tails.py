@@ -6,9 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincc, gammaln, stdtr, stdtrit
-
-FRACTION = 0.95
+from scipy.special import gammaincc, gammaln, stdtr
 
 
 def surprise(ratio: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
@@ -19,14 +17,9 @@ def surprise(ratio: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
     return np.maximum(np.where(exact < 600, exact, leading) / math.log(10), 0.0)
 
 
-def student_reach(freedom: float) -> float:
-    """Standard errors within which Student's t lies with 95 % chance."""
-    return float(stdtrit(freedom, 0.5 + FRACTION / 2))
-
-
 def student_tail(t: float, freedom: float) -> float:
     """Chance that Student's t exceeds t."""
     return float(stdtr(freedom, -t))
 
 
-__all__ = ["student_reach", "student_tail", "surprise"]
+__all__ = ["student_tail", "surprise"]

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 
+from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.likelihood.products import Products, Rows, products
-from stages.diagnose.likelihood.tails import student_reach
 from stages.diagnose.likelihood.weigh import Whole, weigh_all
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle
@@ -246,7 +246,7 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     if away(cause.errors) < sure:
         return f"it comes out {away(cause.errors):.1f} errors from nothing"
     groups = min(FOLDS, state.frames)
-    if away(cause.over_images) < student_reach(max(groups - 1, 1)):
+    if away(cause.over_images) < student_quantile(max(groups - 1, 1)):
         return f"other images give it other values: {away(cause.over_images):.1f} errors over images from nothing"
     for name, least in cls.tolerance.items():
         size = cls.size(values) if name not in values else abs(values[name] - cls.null()[name])
