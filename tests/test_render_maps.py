@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -220,3 +221,19 @@ def test_deviations_of_the_map_reach_the_image(tmp_path):
     exr = read_exr(tmp_path / "o.exr")
     cosine = np.cos(np.radians(exr["incidence_deg"]))
     np.testing.assert_allclose(exr["image_std"], np.hypot(sigma * cosine, 0.002), rtol=1e-3)
+
+    # through a camera, each pixel has what the map says of the ground that it sees
+    config = render.Config(
+        view="pinhole", position=(LON, LAT, 3000.0), size_px=(40, 40), fov_deg=5.0, sun_azimuth_deg=100.0,
+        sun_elevation_deg=35.0,
+    )  # fmt: skip
+    render.run(path, tmp_path / "view.exr", config)
+    view = read_exr(tmp_path / "view.exr")
+    _, col = grid.rowcol_of_lonlat(view["longitude_deg"], view["latitude_deg"])
+    expected = np.interp(col, np.arange(grid.width), sigma[0]) * np.cos(np.radians(view["incidence_deg"]))
+    np.testing.assert_allclose(view["image_std"], np.hypot(expected, 0.002), rtol=1e-3)
+    render.run(
+        path, tmp_path / "coarse.exr", replace(config, fov_deg=7.0, size_px=(8, 8))
+    )  # several px of the map each
+    coarse = read_exr(tmp_path / "coarse.exr")
+    assert (np.diff(coarse["image_std"], axis=1) > 0).all() and np.isfinite(coarse["image_std"]).all()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numba
@@ -21,7 +21,14 @@ from stages.physics.formation.geometry import Angles
 from stages.physics.maps.grid import CSM_CENTRE, Grid
 from stages.physics.maps.window import Window
 from stages.physics.photometry import masked_radiance_factor
-from stages.physics.terrain.shading import BACKPLANES, HALO_PX, Light, form_window, further_radiance
+from stages.physics.terrain.shading import (
+    BACKPLANES,
+    HALO_PX,
+    Light,
+    form_window,
+    further_radiance,
+    image_deviation,
+)
 from stages.physics.terrain.sun_visibility import visible_share
 from stages.physics.terrain.surface import Surface
 from stages.render.ray_points import HitAngles, hit_angles, hit_points, sample_maps
@@ -42,6 +49,7 @@ class Scene:
     maps : (C, h, w) coefficients or (C, 1, 1); horizon : (h, w), rad, or None
     lit : (2, h, w) I/F where extensions have shaded the ground beforehand, and where it was clipped at 0; or None
     added : (h, w) I/F that the Earth and the terrain around add, or None
+    deviation : (h, w) I/F, standard deviation of photographs about the ground's I/F, or None where it is not asked for
     """
 
     grid: Grid
@@ -52,6 +60,7 @@ class Scene:
     added: Floats32 | None
     samples: int
     distance: float
+    deviation: Floats32 | None = None
 
 
 def seen_window(
@@ -153,9 +162,14 @@ def _check_above_ground(surface: Surface, origins: Floats, relief: tuple[float, 
 
 
 def make_scene(
-    surface: Surface, camera: Camera, light: Light, relief: tuple[float, float], samples: int | None
+    surface: Surface,
+    camera: Camera,
+    light: Light,
+    relief: tuple[float, float],
+    samples: int | None,
+    errors: bool = False,
 ) -> Scene:
-    """Read and prepare what a camera sees. Raises GeometryError."""
+    """Read and prepare what a camera sees, with its standard deviations if ``errors``. Raises GeometryError."""
     window, samples, factor, distance = seen_window(surface, camera, relief, samples)
     grid = surface.grid.window(*window)
     elevation = surface.elevation[window.part]
@@ -169,28 +183,40 @@ def make_scene(
         maps = np.zeros((0, 1, 1), np.float32)
     else:
         maps = surface.read_coefficients(*window)
+    deviation = _blocks(window, lambda b: _deviation(surface, light, b, lit, window)) if errors else None
     if factor > 1:
         elevation = coarsen(elevation, factor)
         horizon = None if horizon is None else coarsen(horizon, factor)
         lit = None if lit is None else np.stack([coarsen(m, factor) for m in lit])
         added = None if added is None else coarsen(added, factor)
+        deviation = None if deviation is None else coarsen(deviation, factor)  # errors of neighbours are alike
         if maps.shape[1] > 1:
             maps = np.stack([coarsen(m, factor) for m in maps])
         coarse = grid.transform @ Affine.scale(factor)
         grid = Grid(grid.crs_wkt, coarse, elevation.shape[0], elevation.shape[1], grid.radius)
-    return Scene(grid, build_height_field(elevation, grid), maps, horizon, lit, added, samples, distance)
+    return Scene(grid, build_height_field(elevation, grid), maps, horizon, lit, added, samples, distance, deviation)
 
 
 def _added(surface: Surface, light: Light, window: Window) -> Floats32 | None:
-    """(h, w) I/F that further light adds, block by block; None without such light."""
+    """(h, w) I/F that further light adds; None without such light."""
     if light.earthshine is None and light.bounce is None:
         return None
+    return _blocks(window, lambda block: further_radiance(surface, light, block)[0])
+
+
+def _deviation(surface: Surface, light: Light, block: Window, lit: Floats32 | None, window: Window) -> Floats32:
+    """(h, w) I/F of a block of the window, standard deviation; lit : of the window, as in ``Scene``."""
+    return image_deviation(surface, light, block, None if lit is None else lit[0][block.within(window).part])
+
+
+def _blocks(window: Window, field: Callable[[Window], Floats32 | None]) -> Floats32:
+    """(h, w) of the window, a field drawn block by block."""
     result = np.empty((window.height, window.width), np.float32)
     for r in range(0, window.height, BLOCK_PX):
         for c in range(0, window.width, BLOCK_PX):
             height, width = min(BLOCK_PX, window.height - r), min(BLOCK_PX, window.width - c)
             block = Window(window.row + r, window.col + c, height, width)
-            result[block.within(window).part] = further_radiance(surface, light, block)[0]
+            result[block.within(window).part] = field(block)
     return result
 
 
@@ -211,13 +237,16 @@ def coarsen(values: Floats32, factor: int) -> Floats32:
 def render_view(surface: Surface, camera: Camera, light: Light, scene: Scene) -> Iterator[dict[str, Floats32]]:
     """Bands of image lines from the top down: ``image`` (I/F, mean over each pixel) and backplanes at pixel centres.
 
-    NaN where the map is unknown; space is 0. Backplanes are NaN where there is no ground.
+    NaN where the map is unknown; space is 0. Backplanes are NaN where there is no ground. ``image_std`` is among them where
+    the scene has standard deviations: errors of the ground within a pixel are taken to be alike.
     """
     lines_at_once = max(1, RAYS_AT_ONCE // (camera.samples * scene.samples**2))
     for first in range(0, camera.lines, lines_at_once):
         count = min(lines_at_once, camera.lines - first)
         centre = _trace(camera, scene, first, count, 1)
         band = _backplanes(surface, light, scene, centre)
+        if scene.deviation is not None:
+            band["image_std"] = sample_maps(scene.deviation[None], centre.hits)[0]
         fine = centre if scene.samples == 1 else _trace(camera, scene, first, count, scene.samples)
         radiance, clipped = _radiance(surface, light, scene, fine)
         band["image"] = _mean(radiance, count, camera.samples, scene.samples)

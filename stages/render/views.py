@@ -118,12 +118,13 @@ def render_camera(
 ) -> Summary:
     """One view, streamed to its files band by band."""
     light = replace(light, camera_position=camera_place(camera))
-    scene = make_scene(surface, camera, light, relief, config.samples)
-    channels = ["image", *BACKPLANES]
+    named = {path.suffix.lower(): path for path in files}
+    errors = surface.knows_errors and ".exr" in named
+    scene = make_scene(surface, camera, light, relief, config.samples, errors)
+    channels = ["image", *(["image_std"] if errors else []), *BACKPLANES]
     bands: Iterable[dict[str, Floats32]] = render_view(surface, camera, light, scene)
     if any(effect.slot == "sensor" for effect in light.extensions):  # these need the whole image
         bands = [_whole(bands, light, scene.grid)]
-    named = {path.suffix.lower(): path for path in files}
     preview, tally, done, ground = Preview(camera.lines, camera.samples, 8192), Tally(), 0, False
     with contextlib.ExitStack() as stack:
         exr = None

@@ -106,17 +106,9 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
     planes = {"image": image, "clipped": clipped}
     if sky is not None:
         planes["sky_view"] = sky[window.within(around).part]
-    shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
-    shadow[np.isnan(geometry.cos_incidence)] = np.nan
-    if surface.albedo_error is not None:
-        # photographs have corrected the coefficients' errors: those of the albedo stand in their place
-        inner, _ = surface.albedo_error.half_widths(
-            row, col, image, geometry.cos_incidence, shadow > SHADOWED, np.clip(geometry.sun[2], 0.0, 1.0)
-        )
-        inner[np.isnan(image)] = np.nan
-        planes["image_std"] = inner
-    elif surface.deviations is not None:
-        planes["image_std"] = _image_deviation(surface, geometry, visible, window)
+    shadow = _shadow(geometry, visible)
+    if surface.knows_errors:
+        planes["image_std"] = _deviation(surface, geometry, visible, window, image)
     return planes | {
         "incidence_deg": _degrees(geometry.cos_incidence),
         "emission_deg": _degrees(geometry.cos_emission),
@@ -172,14 +164,46 @@ def further_radiance(surface: Surface, light: Light, window: Window) -> tuple[Fl
     return added, sky
 
 
-def _image_deviation(surface: Surface, geometry: BlockGeometry, visible: Floats32, window: Window) -> Floats32:
-    """(h, w) I/F: errors of the coefficients, through the model, and the images' own."""
+def image_deviation(surface: Surface, light: Light, window: Window, image: Floats32 | None = None) -> Floats32:
+    """Standard deviation of a photograph about a rendering of a map that knows its errors, NaN where the map is unknown.
+
+    image : (h, w) I/F of the window, where extensions have shaded it; returns (h, w), I/F
+    """
+    elevation = surface.read_padded(*window, 1)
+    geometry = block_geometry(
+        surface.grid, window.row, window.col, elevation, light.sun.position, light.camera_position
+    )
+    visible = _visible(light.horizon, light.sun, geometry, window)
+    if image is None:
+        image = _reflected(surface, geometry, visible, window)[0]
+    return _deviation(surface, geometry, visible, window, image)
+
+
+def _deviation(
+    surface: Surface, geometry: BlockGeometry, visible: Floats32, window: Window, image: Floats32
+) -> Floats32:
+    """(h, w) I/F: errors of the coefficients, through the model, or of the albedo, and the images' own."""
+    if surface.albedo_error is not None:
+        # photographs have corrected the coefficients' errors: those of the albedo stand in their place
+        dark = _shadow(geometry, visible) > SHADOWED
+        found, _ = surface.albedo_error.half_widths(
+            window.row, window.col, image, geometry.cos_incidence, dark, np.clip(geometry.sun[2], 0.0, 1.0)
+        )
+        found[np.isnan(image)] = np.nan
+        return found
     known = torch.from_numpy(np.ascontiguousarray(surface.read_coefficients(*window)))
     values = surface.model.unpack(known, dim=0)
     deviations = {k: torch.from_numpy(v) for k, v in surface.read_deviations(*window).items()}
     found = radiance_deviation(surface.model, values, deviations, _angles(geometry)).numpy() * visible
     found[np.isnan(geometry.cos_incidence) | ~np.isfinite(known.numpy()).all(axis=0)] = np.nan
     return np.hypot(found, np.float32(surface.image_noise))
+
+
+def _shadow(geometry: BlockGeometry, visible: Floats32) -> Floats32:
+    """(h, w) share of the Sun's disc that is hidden, by the facet itself or the terrain; NaN where the ground is unknown."""
+    shadow = np.where(geometry.cos_incidence > 0, 1 - visible, np.float32(1))
+    shadow[np.isnan(geometry.cos_incidence)] = np.nan
+    return shadow
 
 
 def form_window(
