@@ -55,12 +55,10 @@ def with_bounds(value: float, low: float | None, high: float | None, spread: flo
     power = math.floor(math.log10(value)) if value > 0 else 0
     text = f"{value / 10**power:.2f}" + (f"e{power}" if power else "")
     text += "" if spread is None else f" +- {spread / 10**power:.2f}"
-    ends = (
-        "no interval"
-        if low is None
-        else f"{low / 10**power:#.3g} .. " + ("unbounded" if high is None else f"{high / 10**power:#.3g}")
-    )
-    return f"{text} ({ends})"
+    if low is None:
+        return f"{text} (no interval)"
+    low_text, high_text = ("unbounded" if x is None else f"{x / 10**power:#.3g}".removesuffix(".") for x in (low, high))
+    return f"{text} ({low_text} .. {high_text})"
 
 
 def said(sentences: list[Sentence]) -> list[str]:
