@@ -16,7 +16,8 @@ from schemas.files.outputs import Output
 from stages import diagnose
 from stages.diagnose.likelihood.products import Rows, products
 from stages.diagnose.result.score import unconfirmed
-from stages.diagnose.search.refine import errors_over_images
+from stages.diagnose.search.refine import along, errors_over_images
+from stages.diagnose.search.tested import hidden_look, hidden_rows
 from stages.effects import get_effect
 
 TEST = 2
@@ -120,3 +121,39 @@ def test_leaving_out_images_is_leaving_out_their_rows(answers):
     without = by_schur.without(0).gram
     assert (np.abs(without[np.ix_(there, there)] - plain.gram) / scale).max() < 2e-5
     assert not without[~there].any()
+
+
+def test_columns_of_the_test_pairs_are_those_of_the_others(answers):
+    """A step along the columns means the same on test pairs, once a cause has moved: those of one ground are equal as either."""
+    state = answers[2]
+    twin = replace(state, hidden=[state.sites[0]], causes=[c.copy() for c in state.causes])
+    view = twin.look(["dem_scale", "image_gain", "misregistration"], 0)
+    before = hidden_look(twin, view)
+    (cause,) = [c for c in twin.causes if c.effect.name == "sun_azimuth"]
+    cause.effect = type(cause.effect)({"error_deg": float(cause.effect.values["error_deg"]) + 2.0}, twin.data)
+    look = twin.again(view, along(twin, view))
+    (chain, rows), *_ = hidden_rows(twin, before, look.plan)
+    learned = [r for r in look.rows if r.patch.site == 0]
+    assert len(rows) == len(learned) > 0 and chain.site is twin.sites[0]
+    for one, other in zip(rows, learned, strict=True):
+        for name in ("shared", "shared_mean", "own", "own_mean"):
+            torch.testing.assert_close(getattr(one, name), getattr(other, name))
+
+
+def test_what_is_known_from_the_ground_left_out_alone_is_nothing_without_it(answers):
+    """A column that one piece of ground has to itself gains nothing there, and stops no fit."""
+    state = answers[2]
+    whole = state.look(["dem_scale", "image_gain"], 0).whole
+    (guise,) = [g for g in whole.plan.guises if g.effect == "dem_scale"]
+    places = whole.places(guise)
+    for unit in whole.units[1:]:
+        at = np.isin(unit.place, places)
+        unit.gram[at] = unit.gram[:, at] = 0.0
+    whole.gram[places], whole.gram[:, places] = 0.0, 0.0
+    alone = whole.units[0]
+    whole.gram[np.ix_(places, alone.place)] = alone.gram[np.isin(alone.place, places)]
+    whole.gram[np.ix_(alone.place, places)] = alone.gram[:, np.isin(alone.place, places)]
+    whole.gram[np.ix_(places, places)] *= 1 - 1e-15  # sums differ by rounding
+    gains = whole.held_out(places, whole.exclude(guise))
+    assert abs(gains[whole.labels[0]]) < 0.01 and np.isfinite(gains).all()
+    assert np.isfinite(whole.without_one(places, whole.exclude(guise))).all()

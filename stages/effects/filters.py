@@ -30,6 +30,12 @@ def gaussian(image: Tensor, sigma2: Tensor | float, limit: float = 4.0, slopes: 
     return blurred[:, margin : height - margin, margin : width - margin]
 
 
+def fine(image: Tensor, mask: Tensor, sigma: float) -> Tensor:
+    """The image less its Gaussian mean over ``sigma`` px of valid pixels, 0 where invalid; (n, H, W)."""
+    share = gaussian(mask, sigma**2).clamp(min=1e-3)
+    return (image - gaussian(image * mask, sigma**2) / share) * mask
+
+
 def plane(heights: Tensor) -> Tensor:
     """(B, H, W) the plane nearest to heights (B, H, W), by least squares."""
     height, width = heights.shape[-2:]

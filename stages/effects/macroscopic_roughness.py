@@ -12,7 +12,7 @@ from torch import Tensor
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
-from stages.physics.photometry.roughness import rough_surface
+from stages.physics.photometry.roughness import roughness_factor
 
 
 @register
@@ -52,10 +52,4 @@ class MacroscopicRoughness(Effect):
 
     def _ratio(self, state: State) -> Tensor:
         """Rough over smooth reflectance, (B, H, W); 1 where the Sun or the camera is below the facet."""
-        theta = torch.deg2rad(self.value("theta_bar_deg", state))
-        mu0, mu = state.angles.cos_incidence, state.angles.cos_emission
-        x, y, shadowing = rough_surface(state.angles, theta)  # effective cosines in either order, S / mue
-        smooth = mu0 / (mu0 + mu)
-        ratio = shadowing * (x * y / (x + y)) / smooth
-        up = (mu0 > 1e-3) & (mu > 1e-3)
-        return torch.where(up, ratio, 1.0)
+        return roughness_factor(state.angles, torch.deg2rad(self.value("theta_bar_deg", state)))

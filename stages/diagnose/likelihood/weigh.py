@@ -145,6 +145,10 @@ class Whole:
         """Inverse prior variances."""
         return np.array([self.precision.get(int(k), 1.0) for k in places])
 
+    def _least(self, places: NDArray[np.int64]) -> Array:
+        """Weights that keep at nothing what other ground says nothing of, once all that does is left out."""
+        return 1e-6 * self.gram.diagonal()[places]
+
     def let_scatter(self, places: NDArray[np.int64]) -> None:
         """Estimate the scatter of nuisance about nothing by expectation-maximisation and make it their prior."""
         if not len(places):
@@ -264,8 +268,8 @@ class Whole:
         """
         n = self.nuisance([*places, *exclude])
         every = np.concatenate([n, places])
-        precision = self.weight(n)
-        more = np.concatenate([precision, np.full(len(places), spread**-2 if spread else 0.0)])
+        precision = self.weight(n) + self._least(n)
+        more = np.concatenate([precision, np.full(len(places), spread**-2 if spread else 0.0) + self._least(places)])
         out = np.zeros(max(self.labels) + 1)
         judge = scored or self
         for fold in self.folds:
@@ -289,7 +293,7 @@ class Whole:
         n = self.nuisance([*places, *exclude])
         every = np.concatenate([n, places])
         pull = spread**-2 if spread else 0.0
-        more = np.diag(np.concatenate([self.weight(n), np.full(len(places), pull)]))
+        more = np.diag(np.concatenate([self.weight(n), np.full(len(places), pull)]) + self._least(every))
         pulled = np.concatenate([np.zeros(len(n)), pull * now if now is not None else np.zeros(len(places))])
         out = []
         for label in sorted(set(self.labels)):

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from stages.diagnose.model.laws import LunarLaws
 from stages.diagnose.model.sites import Site
+from stages.diagnose.settings import BROAD
 from stages.effects import Effect
-from stages.effects.filters import gradients
+from stages.effects.filters import fine, gradients
 from stages.physics.formation import chain as formation
 from stages.physics.formation import geometry
 from stages.physics.formation.chain import State
@@ -70,7 +71,6 @@ class Chain:
         self.site, self.model, self.coefficients, self.base = site, model, coefficients, list(base)
         self.moved = list(moved)
         self.free, self.laws = free, laws
-        self._measured = torch.where(site.valid, site.image, torch.nan)
         self._sharp = SharpSlopes(site.observation.gsd, site.observation.body_radius)
         self._state = self._illuminate(self.base)
         self._state.reflectance = self._surface(self._state)
@@ -102,6 +102,14 @@ class Chain:
     @cached_property
     def _predicted(self) -> Tensor:
         return self._expose(self._state, self._state.reflectance, self.base, measured=False)
+
+    @cached_property
+    def _measured(self) -> Tensor:
+        """(n, H, W) the image, NaN where invalid, without what is broad and not rendered: albedo is like itself some way off, as an echo is."""
+        site, predicted = self.site, self.predict()
+        return torch.where(
+            site.valid, predicted + fine(site.image - predicted, site.valid.float(), 2 * BROAD), torch.nan
+        )
 
     def render(self, extra: Effect | None = None) -> Tensor:
         """(n, H, W) I/F with one more effect, which may know the image."""

@@ -8,7 +8,7 @@ costs likelihood, so that a wrong Sun or DEM is not taken for a peculiar law.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -18,13 +18,17 @@ from stages.common.arrays import Floats
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import Parameter, ReflectanceModel, get_model
 from stages.physics.photometry.base import horizon_cosine
+from stages.physics.photometry.roughness import roughness_factor
 
-DRAWS = 360  # laws: the scatter of the twelfth direction is known to a tenth
-DIRECTIONS = 12  # in which laws may differ: further ones change brightness by less than 0.05 %
-DEGREE = 5  # of the polynomials in both cosines and the root of the phase angle that stand for a law: 0.02 % of it
+DRAWS = 360  # laws: the scatter of a direction is known to a tenth
+DIRECTIONS = 24  # in which laws may differ: further ones change brightness by less than 0.01 %
+DEGREE = 6  # of the polynomials in both cosines and the root of the phase angle that stand for a law
+ROUGH = math.radians(20), math.radians(38)  # Hapke's roughness bends where no polynomial does ...
+ROUGH_DEGREE = 2  # ... and is another one for other parameters: of the polynomials that multiply it
 SEED = 1
 BLOCK = 1 << 14  # pixels whose products are held at a time
 TERMS = [(i, j, k) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) for k in range(DEGREE + 1 - i - j)]
+SIMPLE = [n for n, term in enumerate(TERMS) if sum(term) <= ROUGH_DEGREE]
 
 
 class LunarLaws(ReflectanceModel):
@@ -52,8 +56,7 @@ class LunarLaws(ReflectanceModel):
 
     def parts(self, angles: Angles) -> Tensor:
         """(C, ...) I/F that a coefficient of 1 adds, over the shape of the angles, for each coefficient."""
-        polynomials, seeliger = self._polynomials(angles)
-        return _sums(self.weights, polynomials) * seeliger
+        return _sums(self.weights, self._factors(angles)) * _seeliger(angles)
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         """I/F (...,) of the law with these coefficients."""
@@ -61,14 +64,17 @@ class LunarLaws(ReflectanceModel):
         if any(a.numel() > 1 for a in amounts):
             return torch.stack([a * part for a, part in zip(amounts, self.parts(angles), strict=True)]).sum(0)
         weights = torch.stack([a.flatten()[0] for a in amounts]).to(self.weights.dtype) @ self.weights
-        polynomials, seeliger = self._polynomials(angles)
-        return _sums(weights[None], polynomials)[0] * seeliger
+        return _sums(weights[None], self._factors(angles))[0] * _seeliger(angles)
 
-    def _polynomials(self, angles: Angles) -> tuple[list[list[Tensor]], Tensor]:
-        mu0, mu = angles.cos_incidence, angles.cos_emission
-        floor = horizon_cosine(mu0.dtype)
-        seeliger = mu0.clamp(min=floor) / (mu0.clamp(min=floor) + mu.clamp(min=floor))
-        return _chebyshev((mu0, mu, angles.cos_phase), self.low, self.high), seeliger
+    def _factors(self, angles: Angles) -> list[list[Tensor]]:
+        return _factors(angles, self.low, self.high)
+
+
+def _seeliger(angles: Angles) -> Tensor:
+    """(...) of Lommel and Seeliger's law, facets at the horizon kept apart from zero."""
+    floor = horizon_cosine(angles.cos_incidence.dtype)
+    mu0, mu = angles.cos_incidence.clamp(min=floor), angles.cos_emission.clamp(min=floor)
+    return mu0 / (mu0 + mu)
 
 
 def lunar_laws(cosines: Tensor, brightness: float | None = None) -> LunarLaws:
@@ -90,36 +96,48 @@ def lunar_laws(cosines: Tensor, brightness: float | None = None) -> LunarLaws:
     seeliger = (angles.cos_incidence / (angles.cos_incidence + angles.cos_emission)).numpy()
     shapes = np.concatenate([np.ones((1, len(mean))), axes[:count] * math.sqrt(len(mean))]) * mean / seeliger
     shapes *= (brightness or 0.06) / (mean * shapes[0] / shapes[0]).mean()
-    polynomials = _chebyshev(tuple(cosines.double()), low, high)
-    terms = np.stack([(polynomials[0][i] * polynomials[1][j] * polynomials[2][k]).numpy() for i, j, k in TERMS])
-    weights = np.linalg.lstsq(terms.T, shapes.T, rcond=1e-10)[0].T
+    factors = _factors(angles, low, high)
+    terms = _terms(factors).numpy()
+    # by what is wrong with brightness, since at grazing light laws go apart without bound
+    weights = np.linalg.lstsq((terms * seeliger).T, (shapes * seeliger).T, rcond=1e-10)[0].T
     return LunarLaws(low, high, weights, sizes[:count])
 
 
-def _chebyshev(cosines: Sequence[Tensor], low: Floats, high: Floats) -> list[list[Tensor]]:
-    """Polynomials of degree 0 to DEGREE of both cosines and the root of the phase angle; what is beyond the known angles counts as the nearest."""
+def _factors(angles: Angles, low: Floats, high: Floats) -> list[list[Tensor]]:
+    """What terms are products of: polynomials of degree 0 to DEGREE of both cosines and the root of the phase angle; roughness.
+
+    What is beyond the known angles counts as the nearest.
+    """
     out = []
-    for x, a, b in zip((*cosines[:2], torch.arccos(cosines[2].clamp(-1, 1)).sqrt()), low, high, strict=True):
+    for x, a, b in zip((angles.cos_incidence, angles.cos_emission, angles.phase.sqrt()), low, high, strict=True):
         scaled = ((x - a) * (2 / (b - a)) - 1).clamp(-1, 1)
         each = [torch.ones_like(scaled), scaled]
         while len(each) <= DEGREE:
             each.append(2 * scaled * each[-1] - each[-2])
         out.append(each)
+    return [*out, [roughness_factor(angles, torch.tensor(theta, dtype=out[0][0].dtype)) for theta in ROUGH]]
+
+
+def _terms(factors: list[list[Tensor]]) -> Tensor:
+    """(terms, N): products of polynomials up to the total degree, then the simple ones times roughness; factors : of N pixels each."""
+    first, second, third, rough = factors
+    out = torch.empty(len(TERMS) + len(rough) * len(SIMPLE), len(first[0]), dtype=first[0].dtype)
+    pairs = {(i, j): first[i] * second[j] for i, j, k in TERMS if k == 0}
+    for row, (i, j, k) in zip(out, TERMS, strict=False):
+        torch.mul(pairs[i, j], third[k], out=row)
+    for n, factor in enumerate(rough):
+        start = len(TERMS) + n * len(SIMPLE)
+        torch.mul(out[SIMPLE], factor, out=out[start : start + len(SIMPLE)])
     return out
 
 
-def _sums(weights: Tensor, polynomials: list[list[Tensor]]) -> Tensor:
-    """(R, ...) sums of all products up to the total degree, weighted by (R, TERMS)."""
-    shape = polynomials[0][0].shape
-    first, second, third = ([x.flatten() for x in p] for p in polynomials)
-    out = torch.empty(len(weights), len(first[0]), dtype=first[0].dtype)
-    for at in range(0, len(first[0]), BLOCK):
-        part = slice(at, at + BLOCK)
-        pairs = {(i, j): first[i][part] * second[j][part] for i, j, k in TERMS if k == 0}
-        products = torch.empty(len(TERMS), len(pairs[0, 0]), dtype=out.dtype)
-        for row, (i, j, k) in zip(products, TERMS, strict=True):
-            torch.mul(pairs[i, j], third[k][part], out=row)
-        out[:, part] = weights.to(out.dtype) @ products
+def _sums(weights: Tensor, factors: list[list[Tensor]]) -> Tensor:
+    """(R, ...) sums of all terms, weighted by (R, terms)."""
+    shape = factors[0][0].shape
+    flat = [[x.expand(shape).flatten() for x in f] for f in factors]
+    out = torch.empty(len(weights), len(flat[0][0]), dtype=flat[0][0].dtype)
+    for at in range(0, out.shape[1], BLOCK):
+        out[:, at : at + BLOCK] = weights.to(out.dtype) @ _terms([[x[at : at + BLOCK] for x in f] for f in flat])
     return out.unflatten(1, shape)
 
 

@@ -5,13 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from stages.effects.filters import gaussian
-
-
-def fine(image: Tensor, mask: Tensor, sigma: float) -> Tensor:
-    """The image less its Gaussian mean over ``sigma`` px of valid pixels, 0 where invalid; (n, H, W)."""
-    share = gaussian(mask, sigma**2).clamp(min=1e-3)
-    return (image - gaussian(image * mask, sigma**2) / share) * mask
+from stages.effects.filters import fine
 
 
 def correlation(image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, most: int) -> Tensor:
@@ -70,4 +64,4 @@ def peak(map_: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([column - most + east, row - most + south], 1), best
 
 
-__all__ = ["capture", "correlation", "correlations", "fine", "peak"]
+__all__ = ["capture", "correlation", "correlations", "peak"]

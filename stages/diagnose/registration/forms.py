@@ -17,9 +17,8 @@ from torch import Tensor
 from stages.diagnose.model.aligned import aligned
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.capture import fine
 from stages.diagnose.settings import BROAD, FIELD_ORDER
-from stages.effects.filters import gradients
+from stages.effects.filters import fine, gradients
 from stages.effects.line_jitter import ORDERS, line_waves
 from stages.effects.relief_displacement import lean
 

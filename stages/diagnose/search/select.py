@@ -18,7 +18,7 @@ from stages.diagnose.likelihood.weigh import Whole, weigh_all
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.search.tested import hidden_rows
+from stages.diagnose.search.tested import hidden_look, hidden_rows
 from stages.diagnose.settings import DISCOVERY, FAINT, FOLDS, NOTABLE, SIMPLER, SURE, TRIED, TRIES
 from stages.effects import Effect, get_effect
 
@@ -169,6 +169,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         return ODD
     if why := ordinary(first):
         return why
+    tested = hidden_look(state, view)
     vector, causes = state.nominal.vector, list(state.causes)
     saved = [(c, c.copy()) for c in causes]
     cause = Cause(first, found, group=group)
@@ -179,13 +180,13 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         errors_over_images(state, look)
         why = _doubt_any(state, cause)
     if not why:
-        gains, total, tested = secant_gains(state, cause, look)
+        gains, total, test_gains = secant_gains(state, cause, look, tested)
         low, high = interval(gains, cause.found.sizes)
         cause.gain_percent, cause.gain_low, cause.gain_high = (200 * x / total for x in (float(gains.sum()), low, high))
         cause.found = dataclasses.replace(cause.found, gains=gains)
         if low <= 0:
             why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
-        why = why or contradicted(tested)
+        why = why or contradicted(test_gains)
     if why:
         state.causes[:] = causes
         for c, before in saved:
@@ -255,9 +256,9 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     return ""
 
 
-def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, float, np.ndarray]:
+def secant_gains(state: State, cause: Cause, look: View, before: View | None) -> tuple[np.ndarray, float, np.ndarray]:
     """Nats that the cause, as it was rendered, gains beside everything else: on held-out ground, (labels,); the squares without it; its
-    gains on the test pairs.
+    gains on the test pairs, which are ``before`` as they were without it.
 
     Effects with many values keep the gain that their columns had on held-out ground: one amount for all would not be held out.
     """
@@ -282,7 +283,7 @@ def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, fl
     place = np.array([whole.first - 1])
     tested = [
         products(more, look.model, look.grid, state.frames)
-        for chain, rows in hidden_rows(state, look.plan)
+        for chain, rows in hidden_rows(state, before, look.plan)
         for more in _with_cause(state, chain, others, rows, look)
     ]
     gains = whole.gains_on(tested, place, form)

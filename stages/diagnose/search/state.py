@@ -188,14 +188,17 @@ class State:
         chains = self.chains()
         plan = make_plan(chains[0], names, self.data, candidates=False, impossible=self.impossible)
 
-        def site(k: int) -> list[Rows]:
-            moved = moved_columns(chains[k], plan, self.data)
-            own = frame_columns(chains[k], plan, self.data, named=True)
-            return [_taken_over(r, view, plan, moved, own) for r in view.rows if r.patch.site == k]
-
-        rows = [r for part in per_site(site, range(len(chains))) for r in part]
+        rows = [
+            r for part in per_site(lambda k: self.moved(view, k, chains[k], plan), range(len(chains))) for r in part
+        ]
         model = model or self._covariance(rows, view.grid)
         return View(self._whole(rows, [None] * len(rows), plan, view.grid, model), plan, rows, view.grid, model)
+
+    def moved(self, view: View, site: int, chain: Chain, plan: Plan) -> list[Rows]:
+        """Rows of one site of a look under another plan: the residual and the causes' columns by ``chain``, all others as they are."""
+        moved = moved_columns(chain, plan, self.data)
+        own = frame_columns(chain, plan, self.data, named=True)
+        return [_taken_over(r, view, plan, moved, own) for r in view.rows if r.patch.site == site]
 
     def _covariance(self, rows: Sequence[Rows], grid: Grid) -> Covariance:
         model = estimate([r.patch for r in rows], [(r.shared[0], r.shared_mean[0]) for r in rows], grid, self.frames)
@@ -203,14 +206,15 @@ class State:
         return model
 
     def without_images(self, view: View) -> list[Whole]:
-        """The sums of a look as if one group of images after the other had not been taken."""
+        """The sums of a look as if one group of images after the other had not been taken; what scatters does so as it did with all."""
         groups = self.image_groups(view.rows)
         units = per_site(
             lambda k: products(view.rows[k], view.model, view.grid, self.frames, None, groups), range(len(view.rows))
         )
-        return [
-            self._scattered(Whole([u.without(g) for u in units], view.plan, self.frames)) for g in range(len(groups))
-        ]
+        left = [Whole([u.without(g) for u in units], view.plan, self.frames) for g in range(len(groups))]
+        for whole in left:
+            whole.precision |= {p: v for p, v in view.whole.precision.items() if p in whole.precision}
+        return left
 
     def image_groups(self, rows: Sequence[Rows]) -> list[list[int]]:
         """Frames that are left out together; none where there are too few to leave one out."""

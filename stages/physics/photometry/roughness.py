@@ -52,6 +52,17 @@ vec3 rough_surface(float mu0, float mu, float cos_g, float theta) {
 """
 
 
+def roughness_factor(angles: Angles, theta: Tensor) -> Tensor:
+    """Reflectance of rough over that of smooth Lommel-Seeliger ground; 1 where the Sun or the camera is below the facet.
+
+    theta : mean slope angle, rad; returns the shape of the angles and theta together
+    """
+    mu0, mu = angles.cos_incidence, angles.cos_emission
+    x, y, shadowing = rough_surface(angles, theta)
+    factor = shadowing * (x * y / (x + y)) / (mu0 / (mu0 + mu))
+    return torch.where((mu0 > 1e-3) & (mu > 1e-3), factor, 1.0)
+
+
 def rough_surface(angles: Angles, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Effective cosines of the smaller and of the larger of incidence and emission, and S / mue.
 
