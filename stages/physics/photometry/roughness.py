@@ -55,7 +55,7 @@ vec3 rough_surface(float mu0, float mu, float cos_g, float theta) {
 def roughness_factor(angles: Angles, theta: Tensor) -> Tensor:
     """Reflectance of rough over that of smooth Lommel-Seeliger ground; 1 where the Sun or the camera is below the facet.
 
-    theta : mean slope angle, rad; returns the shape of the angles and theta together
+    angles : (...,) each; theta : () or (...,), mean slope angle, rad; returns (...,)
     """
     mu0, mu = angles.cos_incidence, angles.cos_emission
     x, y, shadowing = rough_surface(angles, theta)
