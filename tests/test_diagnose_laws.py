@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from hidden.laws import LAWS
+from orbital_angles import orbital_cosines
 
 from stages.diagnose.model.laws import lunar_laws
 from stages.physics.formation.geometry import Angles
@@ -20,19 +21,7 @@ LEFT = {
 @pytest.fixture(scope="module")
 def angles():
     """Cosines (3, N) of rough ground in twelve orbital images."""
-    rng = np.random.default_rng(5)
-    sun = np.radians(np.linspace(10, 70, 12))
-    parts = []
-    for k in range(12):
-        view, azimuth = np.radians(rng.uniform(0, 35)), rng.uniform(0, 2 * np.pi)
-        s = np.array([np.cos(sun[k]), 0, np.sin(sun[k])])
-        v = np.array([np.sin(view) * np.cos(azimuth), np.sin(view) * np.sin(azimuth), np.cos(view)])
-        normal = np.concatenate([-rng.normal(0, 0.15, (1500, 2)), np.ones((1500, 1))], 1)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        mu0, mu = normal @ s, normal @ v
-        seen = (mu0 > np.cos(np.radians(76))) & (mu > 0.3)
-        parts.append(np.stack([mu0[seen], mu[seen], np.full(seen.sum(), s @ v)]))
-    return torch.from_numpy(np.concatenate(parts, 1))
+    return torch.from_numpy(orbital_cosines(np.random.default_rng(5), np.radians(np.linspace(10, 70, 12)), 0.15, 1500))
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import photometry_oracles as oracles
 import pytest
 import torch
 from conftest import SHARED
+from orbital_angles import orbital_cosines
 from photometry_samples import directions, interior, reciprocity_error
 
 from schemas import RegistryError
@@ -158,18 +159,7 @@ def test_kernels_follow_lunar_laws(law, rng):
     """Least squares of the kernels to laws written elsewhere, at angles of orbital images: a few thousandths are left."""
     from hidden.laws import LAWS
 
-    sun = np.radians(rng.uniform(10, 70, 12))
-    parts = []
-    for k in range(12):
-        view, azimuth = np.radians(rng.uniform(0, 35)), rng.uniform(0, 2 * np.pi)
-        s = np.array([np.cos(sun[k]), 0, np.sin(sun[k])])
-        v = np.array([np.sin(view) * np.cos(azimuth), np.sin(view) * np.sin(azimuth), np.cos(view)])
-        normal = np.concatenate([-rng.normal(0, 0.12, (1000, 2)), np.ones((1000, 1))], 1)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        mu0, mu = normal @ s, normal @ v
-        seen = (mu0 > np.cos(np.radians(76))) & (mu > 0.3)
-        parts.append(np.stack([mu0[seen], mu[seen], np.full(seen.sum(), s @ v)]))
-    mu0, mu, cosine = np.concatenate(parts, 1)
+    mu0, mu, cosine = orbital_cosines(rng, np.radians(rng.uniform(10, 70, 12)), 0.12, 1000)
     truth = LAWS[law](mu0, mu, cosine, 1.0)
     model = get_model("kernels")
     angles = (np.arccos(c) for c in (mu0, mu, cosine))

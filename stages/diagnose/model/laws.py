@@ -56,7 +56,7 @@ class LunarLaws(ReflectanceModel):
 
     def parts(self, angles: Angles) -> Tensor:
         """(C, ...) I/F that a coefficient of 1 adds, over the shape of the angles, for each coefficient."""
-        return _sums(self.weights, self._factors(angles)) * _seeliger(angles)
+        return _sums(self.weights, _factors(angles, self.low, self.high)) * _seeliger(angles)
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         """I/F (...,) of the law with these coefficients."""
@@ -64,10 +64,7 @@ class LunarLaws(ReflectanceModel):
         if any(a.numel() > 1 for a in amounts):
             return torch.stack([a * part for a, part in zip(amounts, self.parts(angles), strict=True)]).sum(0)
         weights = torch.stack([a.flatten()[0] for a in amounts]).to(self.weights.dtype) @ self.weights
-        return _sums(weights[None], self._factors(angles))[0] * _seeliger(angles)
-
-    def _factors(self, angles: Angles) -> list[list[Tensor]]:
-        return _factors(angles, self.low, self.high)
+        return _sums(weights[None], _factors(angles, self.low, self.high))[0] * _seeliger(angles)
 
 
 def _seeliger(angles: Angles) -> Tensor:
