@@ -33,7 +33,7 @@ class Earthshine(Effect):
     coordinates = (
         Parameter("east", "1", -0.1, 0.1, 0.0, "irradiance times the direction's east component"),
         Parameter("north", "1", -0.1, 0.1, 0.0, "irradiance times the direction's north component"),
-        Parameter("up", "1", -0.1, 0.1, 0.0, "irradiance times the direction's up component"),
+        Parameter("up", "1", 0.0, 0.1, 0.0, "irradiance times the direction's up component"),
     )
     strong: ClassVar = {"east": 0.004, "north": 0.004, "up": 0.004}
 
@@ -59,8 +59,8 @@ class Earthshine(Effect):
 
     @classmethod
     def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
-        """A source above the horizon."""
-        return values["up"] > 0
+        """A source that is not below the horizon."""
+        return values["up"] >= 0
 
     def apply(self, state: State) -> None:
         state.further_light.append(self._shine)
@@ -72,5 +72,7 @@ class Earthshine(Effect):
         dark = all(not torch.is_tensor(v) and v == 0 for v in self.values.values())
         if not dark:
             # a facet turned away gets nothing; the sign of a single trial column is kept so that columns stay linear
-            above = self.value("up", state) > 0
+            above = (self.value("up", state) > 0) | (
+                (self.value("east", state) != 0) & (self.value("north", state) != 0)
+            )
             state.radiance = state.radiance + torch.where(above, facing.clamp(min=0), facing)

@@ -216,17 +216,20 @@ class Whole:
             guise.effect, guise, amount, error, float(surprises[0]), alone=math.sqrt(max(ratio / inflation, 0.0))
         )
         if len(self.scattered):
-            beside, spread = (self.levels or self)._beside_gains(places, self.exclude(guise))
-            if beside / inflation > ratio / inflation:
+            beside, spread, instead = (self.levels or self)._beside_gains(places, self.exclude(guise))
+            if beside > ratio:
                 found.surprise = max(found.surprise, float(surprise(np.array([beside / inflation]), len(places))[0]))
                 found.beside = spread
                 found.alone = math.sqrt(beside / inflation)
+                found.amount = amount if instead is None else instead
         return found, surprises[1:]
 
-    def _beside_gains(self, places: NDArray[np.int64], exclude: Sequence[int]) -> tuple[float, float]:
-        """Twice the log likelihood that the columns gain if the scatter of the gains is estimated with and without them, and it.
+    def _beside_gains(self, places: NDArray[np.int64], exclude: Sequence[int]) -> tuple[float, float, Array | None]:
+        """Twice the log likelihood that the columns gain if the scatter of the gains is estimated with and without them, and it;
+        their amounts where they stand for the gains.
 
-        What a gain of every image can do as well, one amount for all does better.
+        Columns that alone explain what gains of every image do, less two for each of their values (Akaike 1974), stand for
+        these: nothing is taken off for what gains would explain.
         """
         gains = self.scattered
         j = len(places)
@@ -236,7 +239,10 @@ class Whole:
         left = score[j:] - information[j:, :j] @ own @ score[:j]
         best, spread = _scatter(with_, left)
         none, _ = _scatter(information[j:, j:], score[j:])
-        return max(float(score[:j] @ own @ score[:j]) + best - none, 0.0), spread
+        explained = float(score[:j] @ own @ score[:j])
+        if explained - 2 * j > none:
+            return explained, spread, own @ score[:j]
+        return max(explained + best - none, 0.0), spread, None
 
     def _weigh_frames(self, guise: Guise, information: Array, score: Array, shams: Array) -> tuple[Found, Array]:
         power, axes = np.linalg.eigh(information)

@@ -193,10 +193,16 @@ def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State],
     return None
 
 
+BRIGHTER = (1.0, 1.1, 1.25, 1.5, 2.0, 4.0)  # than cut off: gains of an image that are tried
+
+
 def _clipped(
     state: State, images: Sequence[Tensor], masks: Sequence[Tensor], cls: type[Effect]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Squared relative residuals of every quarter of a site's ground, without and with the level of the other ground; their pixels."""
+    """Squared relative residuals of every quarter of a site's ground, without and with the level of the other ground; their pixels.
+
+    Every image has its own gain in either: the law may be extrapolated to one that is cut off as a whole.
+    """
     quarters = [(k, rows) for k, x in enumerate(images) for rows in range(4)]
 
     def part(k: int, quarter: int, x: Tensor) -> Tensor:
@@ -221,10 +227,12 @@ def _clipped(
         lit = part(k, quarter, masks[k] & lit_mask_read(chains[k]))
         image, plain = part(k, quarter, images[k]), part(k, quarter, predicted)
         level = images[k][masks[k]].mean()
-        squares = [
-            (((image - p) * lit / level).double().square().sum()) for p in (plain, plain.clamp(max=levels[g % FOLDS]))
+        own = ((image * plain * lit).sum((-2, -1)) / (plain.square() * lit).sum((-2, -1)).clamp(min=1e-12))[
+            :, None, None
         ]
-        out.append([float(s) for s in squares])
+        cut = [(own * plain * more).clamp(max=levels[g % FOLDS]) for more in BRIGHTER]
+        without, *with_ = (((image - p) * lit / level).double().square().sum((-2, -1)) for p in (own * plain, *cut))
+        out.append([float(without.sum()), float(torch.stack(with_).amin(0).sum())])
         count += float(lit.sum())
     before, after = np.array(out).T
     return before, after, max(count, 1.0)

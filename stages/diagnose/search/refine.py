@@ -104,18 +104,21 @@ def errors_over_images(state: State, view: View) -> None:
     """Errors of scene-wide values by a jackknife over images.
 
     What is wrong with the law goes with an image's geometry and is the same on all ground: leaving out ground does not show it.
+    What only shapes an effect stays as it is: it means nothing where the effect may be nothing.
     """
-    places, owned = _scene_places(view)
+    every, owned = _scene_places(view)
+    amounts = [k for k, (place, name, _) in enumerate(owned) if name not in type(state.causes[place].effect).shaped]
+    places = every[amounts]
     if not len(places):
         return
     left = []
     for whole in state.without_images(view):
-        for p in places:
+        for p in every:
             whole.precision.pop(int(p), None)
         if whole.seen[places].all():
             left.append(_amounts(state, whole, places)[0])
     if len(left) > 1:
-        for (place, name, _), error in zip(owned, jackknife_error(np.array(left)), strict=True):
+        for (place, name, _), error in zip([owned[k] for k in amounts], jackknife_error(np.array(left)), strict=True):
             state.causes[place].over_images[name] = float(error)
 
 
