@@ -257,6 +257,52 @@ def test_a_pile_of_a_tenth_of_all_pixels_is_clipping():
     assert saturation.read_off(values.clamp(max=level))[0] == pytest.approx(level, rel=0.002)
 
 
+def test_images_that_are_cut_off_as_a_whole_are_clipping(monkeypatch):
+    """Nothing of them is left to fit, and the law that is extrapolated to them may be too dark: their own brightness is not asked."""
+    from types import SimpleNamespace
+
+    from stages.diagnose.likelihood.jackknife import gain_interval
+    from stages.diagnose.result import named
+    from stages.effects import get_effect
+
+    rng, level = np.random.default_rng(6), 0.085
+    for bright, gains in ((0.12, True), (0.07, False)):
+        shading = 1 + 0.05 * rng.normal(size=(4, 6, 64, 64))
+        light = torch.from_numpy(shading * np.array([0.02, 0.03, 0.04, 0.05, bright, bright])[:, None, None]).float()
+        predicted = light.clone()
+        predicted[:, 4:] *= 0.5
+        images = (light + 0.0005 * torch.randn(light.shape, generator=torch.manual_seed(1))).clamp(max=level)
+        chains = [
+            SimpleNamespace(predict=lambda p=p: p, site=SimpleNamespace(gain=torch.ones(6), offset=torch.zeros(6)))
+            for p in predicted
+        ]
+        monkeypatch.setattr(named, "lit_mask_read", lambda chain: torch.ones(6, 64, 64, dtype=torch.bool))
+        masks = [torch.ones(6, 64, 64, dtype=torch.bool)] * 4
+        before, after, _ = named._clipped(
+            SimpleNamespace(chains=lambda c=chains: c), list(images), masks, get_effect("saturation")
+        )
+        assert (gain_interval(before, after)[1] > 0) == gains
+
+
+def test_one_amount_for_all_images_stands_for_the_gains_that_it_explains():
+    """A pattern over images explains gains that follow it; gains that follow nothing stay what they are."""
+    from stages.diagnose.likelihood.weigh import Whole
+
+    rng = np.random.default_rng(4)
+    azimuth = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    pattern = np.stack([np.sin(azimuth), np.cos(azimuth)], 1)
+    columns = 5.0 * np.concatenate([pattern, np.eye(12)], 1)  # five standard errors per unit of a gain
+    for measured, stands in ((pattern @ [2.0, 1.0], True), (rng.normal(0, 1.5, 12), False)):
+        seen = 5.0 * measured + rng.normal(size=12)
+        whole = Whole.__new__(Whole)
+        whole.scattered = np.arange(2, 14)
+        whole.reduce = lambda places, exclude, seen=seen: (columns.T @ columns, columns.T @ seen, None, None)
+        nats, spread, instead = whole._beside_gains(np.arange(2), [])
+        assert (instead is not None) == stands
+        if stands:
+            assert instead == pytest.approx([2.0, 1.0], abs=0.3) and spread < 0.3 and nats > 100
+
+
 def test_a_sharpened_dem_keeps_its_borders():
     """A tilted plane is sharp already: mirrored at its borders it would have creases there."""
     from types import SimpleNamespace
