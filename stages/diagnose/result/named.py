@@ -193,7 +193,10 @@ def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State],
     return None
 
 
-BRIGHTER = (1.0, 1.1, 1.25, 1.5, 2.0, 4.0)  # than cut off: gains of an image that are tried
+def _own_gain(image: Tensor, plain: Tensor, use: Tensor) -> Tensor:
+    """(n, 1, 1) by least squares over the pixels in use; image, plain, use : (n, H, W)."""
+    across = (image * plain * use).sum((-2, -1), keepdim=True)
+    return across / (plain.square() * use).sum((-2, -1), keepdim=True).clamp(min=1e-12)
 
 
 def _clipped(
@@ -201,7 +204,8 @@ def _clipped(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Squared relative residuals of every quarter of a site's ground, without and with the level of the other ground; their pixels.
 
-    Every image has its own gain in either: the law may be extrapolated to one that is cut off as a whole.
+    Every image has its own gain in either, for the law may be extrapolated to it: beside a level that of its uncut pixels, and of
+    an image that is cut off as a whole any.
     """
     quarters = [(k, rows) for k, x in enumerate(images) for rows in range(4)]
 
@@ -227,12 +231,12 @@ def _clipped(
         lit = part(k, quarter, masks[k] & lit_mask_read(chains[k]))
         image, plain = part(k, quarter, images[k]), part(k, quarter, predicted)
         level = images[k][masks[k]].mean()
-        own = ((image * plain * lit).sum((-2, -1)) / (plain.square() * lit).sum((-2, -1)).clamp(min=1e-12))[
-            :, None, None
-        ]
-        cut = [(own * plain * more).clamp(max=levels[g % FOLDS]) for more in BRIGHTER]
-        without, *with_ = (((image - p) * lit / level).double().square().sum((-2, -1)) for p in (own * plain, *cut))
-        out.append([float(without.sum()), float(torch.stack(with_).amin(0).sum())])
+        top = levels[g % FOLDS]
+        below = lit & (image < cls.keep_below * top)
+        endless = torch.full_like(plain[:, :1, :1], math.inf)
+        free = torch.where(below.any(-1, keepdim=True).any(-2, keepdim=True), _own_gain(image, plain, below), endless)
+        both = _own_gain(image, plain, lit) * plain, (free * plain).clamp(max=top)
+        out.append([float((torch.where(lit, image - p, 0.0) / level).double().square().sum()) for p in both])
         count += float(lit.sum())
     before, after = np.array(out).T
     return before, after, max(count, 1.0)
