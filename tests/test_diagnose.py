@@ -213,6 +213,8 @@ def test_a_shadow_from_beyond_the_dem_is_seen_whatever_the_law():
             horizon, up = self.horizon, torch.asin(suns[:, 2])[:, None, None]
             if planted == "wall":
                 horizon = torch.maximum(horizon, torch.atan2(torch.tensor(110.0), 320.0 + 320.0 + east))
+            if planted == "far wall":
+                horizon = torch.maximum(horizon, torch.atan2(torch.tensor(200.0), 768.0 + 320.0 + east))
             if planted == "sun":
                 up = up + np.radians(1.5)
             image = (
@@ -233,7 +235,12 @@ def test_a_shadow_from_beyond_the_dem_is_seen_whatever_the_law():
 
             return Chain.visibility(SimpleNamespace(_state=self.state), effects)
 
-    for planted, name in (("", None), ("wall", "distant_shadow"), ("sun", "sun_elevation")):
+    for planted, name in (
+        ("", None),
+        ("wall", "distant_shadow"),
+        ("far wall", "distant_shadow"),
+        ("sun", "sun_elevation"),
+    ):
         chains = [Ground(k, planted) for k in range(4)]
         found = by_shadows(SimpleNamespace(chains=lambda c=chains: c, causes=[], data=survey, free_gains=False))
         assert [c.effect.name for c in found] == ([name] if name else [])
@@ -243,6 +250,9 @@ def test_a_shadow_from_beyond_the_dem_is_seen_whatever_the_law():
         if planted == "wall":
             assert get_effect(name).name in found[0].group and found[0].percent[1] > 0
             assert found[0].effect.values["side"] in (0.0, 4.0)
+        if "wall" in planted:
+            height, (value, error, _) = {"wall": 110.0, "far wall": 200.0}[planted], found[0].parameters["height_m"]
+            assert abs(value - height) < 2 * error < height
 
 
 def test_a_pile_of_a_tenth_of_all_pixels_is_clipping():

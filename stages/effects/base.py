@@ -144,6 +144,10 @@ class Effect(ABC):
         """Values at which shadows are compared, in order, if the effect moves or widens them."""
         return ()
 
+    def shadow_neighbours(self, survey: Survey) -> Sequence[Trial]:
+        """Values to compare beside these, once shadows have told the effect, in coordinates that ``shadow_trials`` hold fixed."""
+        return ()
+
     @classmethod
     def shadows_ordinarily(cls, values: Mapping[str, Any]) -> bool:
         """Whether shadows of every data set look as with these values, since relief has finer detail than the DEM."""

@@ -14,6 +14,9 @@ from stages.physics.photometry import Parameter
 SIDES = ("any", "north", "east", "south", "west")
 
 TANGENTS = (0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)
+USUAL = 0.5  # crops from the border: where a wall is sought first
+FINER = tuple(2.0 ** (k / 8) for k in range(-8, 9))  # times the height that was found first
+DISTANCES = (0.25, 0.35, USUAL, 0.7, 1.0, 1.4, 2.0, 2.8)  # crops: beyond them a ridge hides the Sun everywhere alike
 
 
 @register
@@ -39,7 +42,7 @@ class DistantShadow(Effect):
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
-        return [cls.trial(survey, tangent, 0.5, side) for side in range(len(SIDES)) for tangent in TANGENTS]
+        return [cls.trial(survey, tangent, USUAL, side) for side in range(len(SIDES)) for tangent in TANGENTS]
 
     @classmethod
     def trial(cls, survey: Survey, tangent: float, distance: float, side: int) -> Trial:
@@ -50,6 +53,12 @@ class DistantShadow(Effect):
     @classmethod
     def shadow_trials(cls, survey: Survey) -> list[Trial]:
         return list(cls.trials(survey))
+
+    def shadow_neighbours(self, survey: Survey) -> list[Trial]:
+        """A low wall that is near ends its shadow on the crop where a high one that is far does, but not under a Sun of another elevation."""
+        side, far = int(self.values["side"]), float(self.values["distance_px"]) / survey.crop_px
+        tangent = float(self.values["height_m"]) / ((far + 0.5) * survey.crop_px * survey.gsd)
+        return [self.trial(survey, tangent * step, distance, side) for distance in DISTANCES for step in FINER]
 
     @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:

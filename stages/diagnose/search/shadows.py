@@ -54,6 +54,22 @@ class Tried:
         move = -slope / (2 * bend) if bend > 0 else 0.0
         return float(np.clip(at[k] + move, at[near].min(), at[near].max()))
 
+    def open_between(self, squares: float) -> tuple[Effect, float]:
+        """The middle of what is left open, and the first coordinate's standard deviation there.
+
+        Of each value of the further coordinates the best counts, if it leaves at most so many ``squares`` more than the least.
+        """
+        first, *others = (p.name for p in self.effects[0].fitted())
+        total = self.squares.sum(1)
+        best: dict[tuple[float, ...], int] = {}
+        for k, effect in enumerate(self.effects):
+            at = tuple(float(effect.values[n]) for n in others)
+            if at not in best or total[k] < total[best[at]]:
+                best[at] = k
+        left = [self.effects[k] for k in best.values() if total[k] <= total.min() + squares]
+        values = np.array([float(e.values[first]) for e in left])
+        return left[int(np.argmin(np.abs(values - np.median(values))))], float(values.std())
+
 
 def by_shadows(state: State) -> list[Named]:
     """The cause that moves shadows surely, more than is ordinary and more than any other does; [] where there is none."""
@@ -107,6 +123,17 @@ def by_shadows(state: State) -> list[Named]:
         or effect.shadows_ordinarily({**effect.values, name: nearer})
     ):
         return []
+    if around := effect.shadow_neighbours(state.data):
+        values = [type(effect)({**t.fixed, **t.columns[0]}, state.data) for t in around]
+        # what all ground does was fitted without this effect and took a part of it: the two are fitted in turn
+        beside, least = [], math.inf
+        while (near := tried(values, beside)).squares.sum(1).min() < least:
+            least, at, beside = near.squares.sum(1).min(), near, []
+            for effects in every.values():
+                if usual := [e for e in effects if e.shadows_ordinarily(e.values)]:
+                    beside.append(tried(usual, [*beside, at.best]).best)
+        effect, scatter = at.open_between(SHADED * float(before.sum()))
+        value, error = float(effect.values[name]), math.hypot(error, scatter)
     made = type(effect)({**effect.values, name: value}, state.data)
     rivals = [t.best.name for t in found if t is not first and not gain_interval(t.held_out[shown], after)[1] > 0]
     units = {p.name: p.unit for p in made.parameters}
