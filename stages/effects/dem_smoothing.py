@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from stages.effects.base import Effect, Survey, Trial, register
-from stages.effects.filters import gaussian, plane
+from stages.effects.filters import gaussian, plane, seams
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
@@ -36,5 +36,6 @@ class DemSmoothing(Effect):
 
     def apply(self, state: State) -> None:
         z = state.elevation
-        tilt = plane(z)
-        state.elevation = tilt + gaussian(z - tilt, -self.value("sigma2_px2", state), slopes=True)
+        sharp = seams(z)  # pieces are put together after they were smoothed
+        sharp = sharp + plane(z - sharp)
+        state.elevation = sharp + gaussian(z - sharp, -self.value("sigma2_px2", state), slopes=True)

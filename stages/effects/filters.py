@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+SEAM = 8.0  # robust standard deviations: relief has no line that is so straight and so high
 MARGIN = 12  # px of mirrored border, over 3 sigma of anything that the effects ask for
 
 
@@ -46,6 +47,27 @@ def plane(heights: Tensor) -> Tensor:
         return (heights * ramp).mean((-2, -1), keepdim=True) / ramp.square().mean() * ramp
 
     return heights.mean((-2, -1), keepdim=True) + along(x) + along(y)
+
+
+def seams(heights: Tensor) -> Tensor:
+    """What steps along whole rows or columns, which mosaics and tracks leave, add to heights (B, H, W); m, (B, H, W).
+
+    A step is the median, along the line, of how far the heights jump more than beside it; it counts where it is SEAM robust
+    standard deviations of all lines.
+    """
+
+    def along(z: Tensor) -> Tensor:
+        jump = z.diff(dim=-2)
+        beside = 0.5 * (jump[:, :-2] + jump[:, 2:])
+        step = pad((jump[:, 1:-1] - beside).median(-1).values, (1, 1))
+        size = step.abs()
+        highest = size >= torch.nn.functional.max_pool1d(size[:, None], 3, 1, 1)[:, 0]
+        usual = 1.4826 * size.median(-1, keepdim=True).values
+        step = torch.where(highest & (size > SEAM * usual), step, 0.0)
+        return pad(step.cumsum(-1), (1, 0))[..., None]
+
+    z = heights.detach()
+    return (along(z) + along(z.mT).mT).expand_as(z)
 
 
 def _turned(image: Tensor, margin: int) -> Tensor:

@@ -127,10 +127,16 @@ def estimate(patches: Sequence[Patch], rows: Sequence[tuple[Tensor, Tensor]], gr
 
 
 def shadow_variance(patches: Sequence[Patch], residuals: Sequence[Tensor]) -> float:
-    """Variance of the means in deep shadow about what they have in common; residuals : (n,) of every patch."""
+    """Variance of the means in deep shadow about what they have in common; residuals : (n,) of every patch.
+
+    One value more is taken to lie as far from it as they all do from nothing: two that agree by chance are not exact.
+    """
     seen = [r[p.dark.sum((-2, -1)) > 0] for p, r in zip(patches, residuals, strict=True)]
     values = torch.cat(seen).double()
-    return max(float(values.var()), 1e-10) if len(values) > 1 else 1.0
+    if not len(values):
+        return 1.0
+    squares = (values - values.mean()).square().sum() + values.square().mean()
+    return max(float(squares) / len(values), 1e-10)
 
 
 def _unit_mean(sizes: dict[int, float]) -> dict[int, float]:

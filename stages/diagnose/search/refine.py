@@ -145,12 +145,18 @@ def _step(state: State, view: View, share: float) -> float:
         for p in places:
             whole.precision.pop(int(p), None)
         amounts, errors = _amounts(state, whole, places[seen])
+        owned = [step for (_, step), ok in zip(scene, seen, strict=True) if ok]
+        amount_only = np.array([name not in type(state.causes[place].effect).shaped for place, name, _ in owned])
+        if amount_only.any():
+            held = _amounts(state, whole, places[seen][amount_only])[1]
+            for (place, name, _), error in zip(
+                [o for o, ok in zip(owned, amount_only, strict=True) if ok], held, strict=True
+            ):
+                state.causes[place].of_given_shape[name] = float(error)
         for p in places:
             whole.precision[int(p)] = 1e-10 * whole.gram[p, p]
         alone = {c.effect.name: 0 for c in state.causes}
-        for (_, (place, name, _)), amount, error in zip(
-            [s for s, ok in zip(scene, seen, strict=True) if ok], amounts, errors, strict=True
-        ):
+        for (place, name, _), amount, error in zip(owned, amounts, errors, strict=True):
             cause = state.causes[place]
             cls = type(cause.effect)
             low, high = cls.bounds(name)

@@ -33,6 +33,7 @@ class Cause:
     effect: Effect
     found: Found
     errors: dict[str, float] = field(default_factory=dict)
+    of_given_shape: dict[str, float] = field(default_factory=dict)  # errors where what only shapes the effect is held
     over_images: dict[str, float] = field(default_factory=dict)  # errors by leaving out images
     rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)
