@@ -19,7 +19,7 @@ search        The effect that gains most on held-out ground, if shams hardly do 
               whichever images are left out, and if its held-out gain is above zero for sure. Then the next.
 result        What is named, how much of the residual is what, what was refused and why, what these data could not have shown.
 
-Whatever is special about one effect stands in its own file under ``stages/effects``; every number set by hand stands in ``settings.py``.
+Whatever is special about one effect stands in its own file under ``stages/effects``; the numbers set by hand that decide what is found stand in ``settings.py``.
 """
 
 from __future__ import annotations

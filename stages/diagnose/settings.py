@@ -1,4 +1,7 @@
-"""Every number of the method that is set by hand, with its unit and its reason. There are no others."""
+"""The numbers set by hand that decide what is found, each with its unit and its reason.
+
+Steps of derivatives, sizes of samples and counts of rounds stand where they are used.
+"""
 
 from __future__ import annotations
 

@@ -9,11 +9,12 @@ likes best.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from stages.common.arrays import Floats
 from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, jackknife_error, nats
@@ -54,6 +55,13 @@ class Tried:
         move = -slope / (2 * bend) if bend > 0 else 0.0
         return float(np.clip(at[k] + move, at[near].min(), at[near].max()))
 
+    def error(self, grounds: Sequence[int] | NDArray[np.int64]) -> float:
+        """Of that value, by leaving out one of these pieces of ground after the other; not less than values that were tried are apart."""
+        name = self.effects[0].fitted()[0].name
+        apart = [abs(float(e.values[name]) - float(self.best.values[name])) for e in self.effects]
+        scatter = float(jackknife_error(np.array([self.value(int(k)) for k in grounds])))
+        return max(scatter, min(a for a in apart if a > 0) / math.sqrt(12))
+
     def open_between(self, squares: float) -> tuple[Effect, float]:
         """The middle of what is left open, and the first coordinate's standard deviation there.
 
@@ -71,49 +79,76 @@ class Tried:
         return left[int(np.argmin(np.abs(values - np.median(values))))], float(values.std())
 
 
-def by_shadows(state: State) -> list[Named]:
-    """The cause that moves shadows surely, more than is ordinary and more than any other does; [] where there is none."""
-    chains = [c for c in state.chains() if c.state.sun_horizon is not None]
-    every: dict[str, list[Effect]] = {}
-    for e in _of_shadows(state):
-        every.setdefault(e.name, []).append(e)
-    named = {type(c.effect).name for c in state.causes}
-    if any(c.effect.slot == "geometry" and not c.effect.displaces for c in state.causes):
-        # relief that is wrong casts wrong shadows
-        named |= {n for n in every if get_effect(n).shadow_error}
-    if not chains or not every or state.free_gains:  # how dark a shadow is nobody knows beside free offsets
-        return []
-    group = [c.site.ground for c in chains for _ in range(PARTS)]
-    numbers = np.unique(group, return_inverse=True)[1] if len(set(group)) >= UNITS else np.arange(len(group))
+class Shadows:
+    """All shadows of the data, and every effect that moves or widens them, at every value to try (name -> effects)."""
 
-    def tried(effects: list[Effect], beside: Sequence[Effect]) -> Tried:
-        of_sites = per_site(lambda chain: _squares(chain, effects, beside), chains)
-        squares = np.array([np.bincount(numbers, weights=s) for s in np.concatenate(of_sites, 1)], dtype=np.float64)
+    def __init__(self, state: State) -> None:
+        self.chains = [c for c in state.chains() if c.state.sun_horizon is not None]
+        self.every: dict[str, list[Effect]] = {}
+        for e in _of_shadows(state):
+            self.every.setdefault(e.name, []).append(e)
+        group = [c.site.ground for c in self.chains for _ in range(PARTS)]
+        enough = len(set(group)) >= UNITS
+        self.numbers = np.unique(group, return_inverse=True)[1] if enough else np.arange(len(group))
+
+    def tried(self, effects: list[Effect], beside: Sequence[Effect]) -> Tried:
+        """What these values leave, beside other effects."""
+        of_sites = per_site(lambda chain: _squares(chain, effects, beside), self.chains)
+        squares = np.array(
+            [np.bincount(self.numbers, weights=s) for s in np.concatenate(of_sites, 1)], dtype=np.float64
+        )
         fold = np.arange(squares.shape[1]) % FOLDS
         chosen = [int(np.argmin(squares[:, fold != f].sum(1))) for f in fold]
         return Tried(effects, squares, squares[chosen, np.arange(len(fold))])
 
-    beside: list[Effect] = []  # what all ground does, one effect after the other
-    for effects in every.values():
-        if usual := [e for e in effects if e.shadows_ordinarily(e.values)]:
-            plain = tried(usual, beside)
-            beside.append(plain.best)
-    found = [
-        tried(unusual, beside)
-        for n, effects in every.items()
-        if n not in named and (unusual := [e for e in effects if not e.shadows_ordinarily(e.values)])
-    ]
+    def usual(self, beside: Sequence[Effect] = ()) -> list[Tried]:
+        """What all ground does, one effect after the other, each beside those before it."""
+        out: list[Tried] = []
+        for effects in self.every.values():
+            if ordinary := [e for e in effects if e.shadows_ordinarily(e.values)]:
+                out.append(self.tried(ordinary, [*(t.best for t in out), *beside]))
+        return out
+
+    def unusual(self, beside: Sequence[Effect], named: Container[str]) -> list[Tried]:
+        """What not all ground does, one effect at a time."""
+        beyond = {
+            n: [e for e in effects if not e.shadows_ordinarily(e.values)]
+            for n, effects in self.every.items()
+            if n not in named
+        }
+        return [self.tried(effects, beside) for effects in beyond.values() if effects]
+
+    def in_turn(self, effects: list[Effect]) -> Tried:
+        """The same where what all ground does was fitted without these effects and took a part of them: the two are fitted in turn."""
+        best, found = math.inf, self.tried(effects, [])
+        while (least := float(found.squares.sum(1).min())) < best:
+            best, kept = least, found
+            found = self.tried(effects, [t.best for t in self.usual([kept.best])])
+        return kept
+
+
+def by_shadows(state: State) -> list[Named]:
+    """The cause that moves shadows surely, more than is ordinary and more than any other does; [] where there is none."""
+    shadows = Shadows(state)
+    named = {type(c.effect).name for c in state.causes}
+    if any(c.effect.slot == "geometry" and not c.effect.displaces for c in state.causes):
+        # relief that is wrong casts wrong shadows
+        named |= {n for n in shadows.every if get_effect(n).shadow_error}
+    if (
+        not shadows.chains or not shadows.every or state.free_gains
+    ):  # how dark a shadow is nobody knows beside free offsets
+        return []
+    usual = shadows.usual()
+    found = shadows.unusual([t.best for t in usual], named)
     first = min(found, key=lambda t: float(t.held_out.sum()), default=None)
-    shown = plain.held_out > 0
+    shown = usual[-1].held_out > 0
     if first is None or not shown.any():
         return []
-    before, after = plain.held_out[shown], first.held_out[shown]
+    before, after = usual[-1].held_out[shown], first.held_out[shown]
     percent = gain_interval(before, after)
     effect, value = first.best, first.value()
     name = effect.fitted()[0].name
-    error = float(jackknife_error(np.array([first.value(int(k)) for k in np.flatnonzero(shown)])))
-    apart = [abs(float(e.values[name] - effect.values[name])) for e in first.effects]
-    error = max(error, min(a for a in apart if a > 0) / math.sqrt(12))  # of the values that were tried
+    error = first.error(np.flatnonzero(shown))
     nearer = math.copysign(max(abs(value) - 2 * error, 0.0), value)
     most = max(abs(float(e.values[name])) for e in first.effects)
     if (
@@ -124,28 +159,26 @@ def by_shadows(state: State) -> list[Named]:
     ):
         return []
     if around := effect.shadow_neighbours(state.data):
-        values = [type(effect)({**t.fixed, **t.columns[0]}, state.data) for t in around]
-        # what all ground does was fitted without this effect and took a part of it: the two are fitted in turn
-        beside, least = [], math.inf
-        while (near := tried(values, beside)).squares.sum(1).min() < least:
-            least, at, beside = near.squares.sum(1).min(), near, []
-            for effects in every.values():
-                if usual := [e for e in effects if e.shadows_ordinarily(e.values)]:
-                    beside.append(tried(usual, [*beside, at.best]).best)
-        effect, scatter = at.open_between(SHADED * float(before.sum()))
+        near = shadows.in_turn([type(effect)({**t.fixed, **t.columns[0]}, state.data) for t in around])
+        effect, scatter = near.open_between(SHADED * float(before.sum()))
         value, error = float(effect.values[name]), math.hypot(error, scatter)
     made = type(effect)({**effect.values, name: value}, state.data)
     rivals = [t.best.name for t in found if t is not first and not gain_interval(t.held_out[shown], after)[1] > 0]
+    pixels = float(sum(c.site.valid.sum() for c in shadows.chains))
+    return [_named(made, error, before, after, pixels, rivals)]
+
+
+def _named(made: Effect, error: float, before: Floats, after: Floats, pixels: float, rivals: Sequence[str]) -> Named:
+    """The cause with its parameters and evidence. before, after : squares on every piece of ground"""
+    name, percent = made.fitted()[0].name, gain_interval(before, after)
     units = {p.name: p.unit for p in made.parameters}
     known = {name: math.hypot(error, made.shadow_error)}
     report = made.report({k: float(v) for k, v in made.values.items()}, known)
-    pixels = float(sum(c.site.valid.sum() for c in chains))
     total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
     spread = abs(total) * (percent[2] - percent[1]) / (4 * percent[0])
     was, now = (math.sqrt(float(x.sum()) / pixels) for x in (before, after))
     parameters = {k: (v, e, units[k]) for k, (v, e) in report.items()}
-    group_of = [made.name, *rivals]
-    return [Named(made, parameters, gain_chance(before, after), total, spread, was, now, percent, group_of)]
+    return Named(made, parameters, gain_chance(before, after), total, spread, was, now, percent, [made.name, *rivals])
 
 
 def _of_shadows(state: State) -> list[Effect]:
