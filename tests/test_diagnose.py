@@ -374,6 +374,21 @@ def test_two_shadows_that_agree_by_chance_are_not_exact():
     assert variance(many.tolist()) ** 0.5 == pytest.approx(0.01, rel=0.15)
 
 
+def test_light_from_below_is_no_earthshine():
+    """... which a first estimate must not hide by moving it to the ground; an estimate that is below by chance may stand."""
+    from stages.diagnose.likelihood.found import Found
+    from stages.diagnose.rows.columns import Guise
+    from stages.diagnose.search.select import beyond_bounds
+    from stages.effects import get_effect
+    from stages.effects.base import Survey
+
+    trial = get_effect("earthshine").trials(Survey())[0]
+    for up, error, impossible in ((-24.0, 0.8, True), (-0.1, 0.4, False), (1.0, 0.4, False)):
+        amount, errors = np.array([up, 0.6, -0.3]), np.array([error, 0.05, 0.05])
+        found = Found("earthshine", Guise("earthshine", trial, (0, 1, 2)), amount, errors, 40.0)
+        assert beyond_bounds(found) == impossible
+
+
 def test_a_shape_that_is_open_does_not_make_an_effect_nothing():
     """Height and width of a surge trade places: that its width is open does not say that there may be none."""
     from types import SimpleNamespace

@@ -136,9 +136,8 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         settle(state, outcome.view)
         doubted |= doubt_all(state, outcome.view, STILL)
     placed, refused = by_registration(state)
-    answer.causes = (
-        placed + by_search(state) + by_shadows(state) + [c for c in [cut(data, state) if cut else None] if c]
-    )
+    clipped = cut(data, state) if cut else None  # was taken out of the images before anything was sought
+    answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + by_shadows(state)
     rejected = refused | outcome.rejected | doubted
     answer.rejected = {k: v for k, v in rejected.items() if k not in {c.effect.name for c in answer.causes}}
     if state.registration is not None:

@@ -85,7 +85,7 @@ class Effect(ABC):
     of_law       another form of the reflectance law could do the same: it is a cause only where that form has nothing to add
     shadow_error how far its first coordinate may be off where shadows alone tell it, since the DEM's horizons are
     table        where values per image (or site) stand in diagnosis.h5, and the name of their second dimension
-    linear       whether the image is linear in the coordinates: the first estimate needs no second one
+    linear       whether the image is linear in the coordinates: a first estimate beyond their bounds stays there
     """
 
     name: ClassVar[str]

@@ -17,6 +17,7 @@ from stages.physics.photometry import Parameter
 class Earthshine(Effect):
     name = "earthshine"
     slot = "illumination"
+    linear = True
     title = "light from the Earth or the sky"
     mechanism = (
         "The full Earth lights the near side with up to 1e-4 of the Sun; other distant sources act alike. Facets that face it "

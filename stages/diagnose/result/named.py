@@ -16,9 +16,11 @@ from stages.diagnose.registration.explain import OWN, Registration, lit_mask_rea
 from stages.diagnose.registration.forms import FORMS, TERMS
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CORRELATED, FOLDS
+from stages.diagnose.settings import CORRELATED, FOLDS, ROUNDS
 from stages.effects import Effect, Survey, effect_names, get_effect
 from stages.effects.filters import gaussian
+
+ENDLESS = 1e9  # a gain that takes all lit ground beyond any level
 
 
 def by_search(state: State) -> list[Named]:
@@ -193,10 +195,16 @@ def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State],
     return None
 
 
-def _own_gain(image: Tensor, plain: Tensor, use: Tensor) -> Tensor:
-    """(n, 1, 1) by least squares over the pixels in use; image, plain, use : (n, H, W)."""
-    across = (image * plain * use).sum((-2, -1), keepdim=True)
-    return across / (plain.square() * use).sum((-2, -1), keepdim=True).clamp(min=1e-12)
+def _own_gain(image: Tensor, plain: Tensor, use: Tensor, top: float = math.inf) -> Tensor:
+    """(n, 1, 1) by least squares over the pixels in use, of what is cut off at ``top``; image, plain, use : (n, H, W)."""
+    gain = torch.ones_like(plain[:, :1, :1])
+    for _ in range(ROUNDS if math.isfinite(top) else 1):
+        below = use & (gain * plain < top) if math.isfinite(top) else use
+        across = (image * plain * below).sum((-2, -1), keepdim=True)
+        found = across / (plain.square() * below).sum((-2, -1), keepdim=True).clamp(min=1e-12)
+        # of an image that is cut off as a whole any gain is as good that is high enough
+        gain = torch.where(below.any(-1, keepdim=True).any(-2, keepdim=True), found, ENDLESS)
+    return gain
 
 
 def _clipped(
@@ -204,8 +212,7 @@ def _clipped(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Squared relative residuals of every quarter of a site's ground, without and with the level of the other ground; their pixels.
 
-    Every image has its own gain in either, for the law may be extrapolated to it: beside a level that of its uncut pixels, and of
-    an image that is cut off as a whole any.
+    Every image has its own gain in either, fitted to its other quarters, for the law may be extrapolated to it.
     """
     quarters = [(k, rows) for k, x in enumerate(images) for rows in range(4)]
 
@@ -228,14 +235,13 @@ def _clipped(
     for (k, quarter), g in zip(quarters, group, strict=True):
         site = chains[k].site
         predicted = chains[k].predict() * site.gain[:, None, None] + site.offset[:, None, None]
-        lit = part(k, quarter, masks[k] & lit_mask_read(chains[k]))
+        elsewhere = masks[k] & lit_mask_read(chains[k])
+        lit = part(k, quarter, elsewhere).clone()
+        part(k, quarter, elsewhere)[:] = False
         image, plain = part(k, quarter, images[k]), part(k, quarter, predicted)
         level = images[k][masks[k]].mean()
         top = levels[g % FOLDS]
-        below = lit & (image < cls.keep_below * top)
-        endless = torch.full_like(plain[:, :1, :1], math.inf)
-        free = torch.where(below.any(-1, keepdim=True).any(-2, keepdim=True), _own_gain(image, plain, below), endless)
-        both = _own_gain(image, plain, lit) * plain, (free * plain).clamp(max=top)
+        both = [(_own_gain(images[k], predicted, elsewhere, cut) * plain).clamp(max=cut) for cut in (math.inf, top)]
         out.append([float((torch.where(lit, image - p, 0.0) / level).double().square().sum()) for p in both])
         count += float(lit.sum())
     before, after = np.array(out).T

@@ -164,6 +164,8 @@ def another_law(whole: Whole, found: Found, out: Outcome) -> bool:
 def take(state: State, view: View, found: Found, group: list[str]) -> str:
     """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
     cls = get_effect(found.effect)
+    if cls.linear and not found.guise.per_frame and beyond_bounds(found):
+        return ODD
     first = as_effect(found, state.data, state.frames, view.whole)
     if cls.scope == "scene" and not cls.plausible({k: float(v) for k, v in first.values.items()}, state.data):
         return ODD
@@ -194,6 +196,18 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         state.nominal.vector = vector
         state.fit()
     return why
+
+
+def beyond_bounds(found: Found) -> bool:
+    """Whether a coordinate of the first estimate is surely not within its bounds: what these allow is not what was found."""
+    cls = get_effect(found.effect)
+    for amount, error, column in zip(found.amount, found.error, found.guise.trial.columns, strict=True):
+        for name, at in column.items():
+            null, (low, high) = cls.null()[name], cls.bounds(name)
+            value, least = null + amount * (at - null), SURE * error * abs(at - null)
+            if value < low - least or value > high + least:
+                return True
+    return False
 
 
 def ordinary(first: Effect) -> str:
