@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, chdtri, gammaincc, gammaln, stdtr
+from scipy.special import gammaincc, gammaln, stdtr
 
 
 def surprise(ratio: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
@@ -17,14 +17,9 @@ def surprise(ratio: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
     return np.maximum(np.where(exact < 600, exact, leading) / math.log(10), 0.0)
 
 
-def as_errors(ratio: float, freedom: int) -> float:
-    """Standard errors of one value that chance exceeds as seldom as chi square of more degrees of freedom exceeds ``ratio``."""
-    return math.sqrt(float(chdtri(1, chdtrc(freedom, ratio)))) if freedom > 1 else math.sqrt(ratio)
-
-
 def student_tail(t: float, freedom: float) -> float:
     """Chance that Student's t exceeds t."""
     return float(stdtr(freedom, -t))
 
 
-__all__ = ["as_errors", "student_tail", "surprise"]
+__all__ = ["student_tail", "surprise"]

@@ -310,13 +310,12 @@ class Whole:
             out.append(_solve(rest[np.ix_(every, every)] + more, rest[every, 0] - pulled)[len(n) :])
         return np.array(out)
 
-    def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array, Array]:
-        """Amounts, their standard errors (the larger of the likelihood's and the jackknife's), and how the errors are correlated, (J, J)."""
+    def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array]:
+        """Amounts and their standard errors: the larger of the likelihood's and the jackknife's."""
         information, score, _, _ = self.reduce(places, exclude)
         inverse = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
-        own = np.sqrt(np.maximum(inverse.diagonal(), 1e-30))
         scatter = jackknife_error(self.without_one(places, exclude))
-        return inverse @ score, np.maximum(own, scatter), inverse / np.outer(own, own)
+        return inverse @ score, np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter)
 
     def another_law(self, guise: Guise | None, surely: bool = False) -> float:
         """Nats that another form of the reflectance has to add beside an effect of the law, which explains less than most of what

@@ -144,16 +144,15 @@ def _step(state: State, view: View, share: float) -> float:
         seen = whole.seen[places]
         for p in places:
             whole.precision.pop(int(p), None)
-        amounts, errors, _ = _amounts(state, whole, places[seen])
+        amounts, errors = _amounts(state, whole, places[seen])
         owned = [step for (_, step), ok in zip(scene, seen, strict=True) if ok]
         amount_only = np.array([name not in type(state.causes[place].effect).shaped for place, name, _ in owned])
         if amount_only.any():
-            _, held, correlation = _amounts(state, whole, places[seen][amount_only])
-            known = [o for o, ok in zip(owned, amount_only, strict=True) if ok]
-            for place, cause in enumerate(state.causes):
-                own = [k for k, (of, _, _) in enumerate(known) if of == place]
-                cause.of_given_shape = {known[k][1]: float(held[k]) for k in own}
-                cause.correlation = correlation[np.ix_(own, own)]
+            held = _amounts(state, whole, places[seen][amount_only])[1]
+            for (place, name, _), error in zip(
+                [o for o, ok in zip(owned, amount_only, strict=True) if ok], held, strict=True
+            ):
+                state.causes[place].of_given_shape[name] = float(error)
         for p in places:
             whole.precision[int(p)] = 1e-10 * whole.gram[p, p]
         alone = {c.effect.name: 0 for c in state.causes}
@@ -177,7 +176,7 @@ def _step(state: State, view: View, share: float) -> float:
 
 
 def _amounts(state: State, whole: Whole, places: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-    """Moves of all coordinates, their errors, and how these are correlated."""
+    """Moves of all coordinates and their errors."""
     return list(whole.errors(places, _no_form(state, whole)))
 
 

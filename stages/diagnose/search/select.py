@@ -254,10 +254,15 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
         ):
             return f"{ODD}: {name} ends at its bound of {values[name]:.3g}"
 
-    if (away := cause.away(cause.of_given_shape)) < sure:
-        return f"it comes out {away:.1f} errors from nothing"
-    if (away := cause.away(cause.over_images)) < student_quantile(max(min(FOLDS, state.frames) - 1, 1)):
-        return f"other images give it other values: {away:.1f} errors over images from nothing"
+    def away(errors: dict[str, float]) -> float:
+        every = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in errors.items()]
+        return math.hypot(*every) if every else math.inf
+
+    if away(cause.of_given_shape) < sure:  # an effect that may be nothing has no shape that could be uncertain
+        return f"it comes out {away(cause.of_given_shape):.1f} errors from nothing"
+    groups = min(FOLDS, state.frames)
+    if away(cause.over_images) < student_quantile(max(groups - 1, 1)):
+        return f"other images give it other values: {away(cause.over_images):.1f} errors over images from nothing"
     for name, least in cls.tolerance.items():
         size = cls.size(values) if name not in values else abs(values[name] - cls.null()[name])
         if size - 2 * cause.errors.get(name, 0.0) < least:

@@ -7,15 +7,12 @@ import math
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_variance
 from stages.diagnose.likelihood.found import Found
 from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
-from stages.diagnose.likelihood.tails import as_errors
 from stages.diagnose.likelihood.weigh import Whole
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import measured_laws
@@ -37,7 +34,6 @@ class Cause:
     found: Found
     errors: dict[str, float] = field(default_factory=dict)
     of_given_shape: dict[str, float] = field(default_factory=dict)  # errors where what only shapes the effect is held
-    correlation: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))  # ... of these
     over_images: dict[str, float] = field(default_factory=dict)  # errors by leaving out images
     rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)
@@ -51,19 +47,6 @@ class Cause:
     def single(self) -> bool:
         """Whether one amount acts on all images, which other ground can be asked about by itself."""
         return type(self.effect).scope == "scene" and len(self.found.guise.columns) == 1
-
-    def away(self, errors: dict[str, float]) -> float:
-        """Standard errors from nothing: as many as one value with the same chance, where there are several (Wald's test).
-
-        errors : of the values that do not only shape the effect: there is no shape where there may be no effect
-        """
-        null = type(self.effect).null()
-        z = np.array([(float(self.effect.values[n]) - null[n]) / max(e, 1e-12) for n, e in errors.items()])
-        if not len(z):
-            return math.inf
-        place = [list(self.of_given_shape).index(n) for n in errors]
-        alike = self.correlation[np.ix_(place, place)]
-        return as_errors(float(z @ np.linalg.pinv(alike, rcond=1e-6, hermitian=True) @ z), len(z))
 
     def copy(self) -> Cause:
         """As it is now, whatever is fitted later."""
