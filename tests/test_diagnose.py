@@ -374,6 +374,20 @@ def test_two_shadows_that_agree_by_chance_are_not_exact():
     assert variance(many.tolist()) ** 0.5 == pytest.approx(0.01, rel=0.15)
 
 
+def test_a_fit_that_ends_beside_a_bound_is_nothing_real():
+    """Half a pixel sharper than the optics is where the search stops, not what a camera does."""
+    from types import SimpleNamespace
+
+    from stages.diagnose.search.select import ODD, doubt
+    from stages.diagnose.search.state import Cause
+    from stages.effects import get_effect
+
+    for value, possible in ((-0.494, False), (-0.5, False), (0.8, True)):
+        cause = Cause(get_effect("psf_blur")({"sigma2_px2": value}), found=None)
+        cause.errors = cause.of_given_shape = cause.over_images = {"sigma2_px2": 0.01}
+        assert doubt(SimpleNamespace(data=None, frames=8), cause).startswith(ODD) != possible
+
+
 def test_light_from_below_is_no_earthshine():
     """... which a first estimate must not hide by moving it to the ground; an estimate that is below by chance may stand."""
     from stages.diagnose.likelihood.found import Found

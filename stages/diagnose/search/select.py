@@ -248,11 +248,10 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     if not cls.plausible(values, state.data):
         return ODD
     for name in cause.errors:
-        low, high = cls.bounds(name)
-        if (abs(values[name] - low) < 1e-9 or abs(values[name] - high) < 1e-9) and cls.null()[name] not in (
-            values[name],
-        ):
-            return f"{ODD}: {name} ends at its bound of {values[name]:.3g}"
+        value, near = values[name], cause.of_given_shape.get(name, 1e-9)  # a shape may end anywhere
+        bounds = [b for b in cls.bounds(name) if b != cls.null()[name]]
+        if any(abs(value - b) < near for b in bounds):
+            return f"{ODD}: {name} ends at {value:.3g}, within an error of a bound of what is possible"
 
     def away(errors: dict[str, float]) -> float:
         every = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in errors.items()]
