@@ -1,0 +1,77 @@
+"""When `diagnose` doubts what it found: values that nothing real has, shapes that are open, measurements that agree by chance."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hidden.terrain import make_terrain
+from scipy.ndimage import gaussian_filter
+
+from stages.diagnose.likelihood.covariance import shadow_variance
+from stages.diagnose.likelihood.found import Found
+from stages.diagnose.rows.columns import Guise
+from stages.diagnose.search.select import ODD, beyond_bounds, doubt
+from stages.diagnose.search.state import Cause
+from stages.effects import get_effect
+from stages.effects.base import Survey
+from stages.effects.filters import seams
+
+
+def test_a_seam_of_a_dem_is_not_sharpened():
+    """Pieces are put together after they were smoothed: sharpened, a step would be a ridge that no image shows."""
+    for seed in range(5):
+        fine = make_terrain(np.random.default_rng(seed), 97, 2.0, 8.0)[:96, :96]
+        smooth = gaussian_filter(fine, 1.2, mode="nearest")
+        plain = torch.from_numpy(smooth).float()[None]
+        assert float(seams(plain).abs().max()) == 0  # craters and their rims are none
+        step = torch.zeros(1, 96, 96)
+        step[:, 50:] += 0.4
+        step[:, :, 30:] -= 0.3
+        assert torch.allclose(seams(plain + step), step, atol=0.05)
+        sharp = {}
+        for name, z in (("plain", plain), ("seamed", plain + step)):
+            state = SimpleNamespace(elevation=z.clone())
+            get_effect("dem_smoothing")({"sigma2_px2": 1.44}).apply(state)
+            sharp[name] = state.elevation
+        assert torch.allclose(sharp["seamed"] - step, sharp["plain"], atol=0.06)
+
+
+def test_two_shadows_that_agree_by_chance_are_not_exact():
+    """As wide as they all lie from nothing where they are few, as they scatter where they are many."""
+
+    def variance(values):
+        return shadow_variance([SimpleNamespace(dark=torch.ones(len(values), 4, 4))], [torch.tensor(values)])
+
+    assert variance([]) == 1.0
+    assert variance([-0.0054, -0.0050]) ** 0.5 > 0.003
+    many = np.random.default_rng(1).normal(0.05, 0.01, 400)
+    assert variance(many.tolist()) ** 0.5 == pytest.approx(0.01, rel=0.15)
+
+
+def test_a_fit_that_ends_beside_a_bound_is_nothing_real():
+    """Half a pixel sharper than the optics is where the search stops, not what a camera does."""
+    for value, possible in ((-0.494, False), (-0.5, False), (0.8, True)):
+        cause = Cause(get_effect("psf_blur")({"sigma2_px2": value}), found=None)
+        cause.errors = cause.of_given_shape = cause.over_images = {"sigma2_px2": 0.01}
+        assert doubt(SimpleNamespace(data=None, frames=8), cause).startswith(ODD) != possible
+
+
+def test_light_from_below_is_no_earthshine():
+    """... which a first estimate must not hide by moving it to the ground; an estimate that is below by chance may stand."""
+    trial = get_effect("earthshine").trials(Survey())[0]
+    for up, error, impossible in ((-24.0, 0.8, True), (-0.1, 0.4, False), (1.0, 0.4, False)):
+        amount, errors = np.array([up, 0.6, -0.3]), np.array([error, 0.05, 0.05])
+        found = Found("earthshine", Guise("earthshine", trial, (0, 1, 2)), amount, errors, 40.0)
+        assert beyond_bounds(found) == impossible
+
+
+def test_a_shape_that_is_open_does_not_make_an_effect_nothing():
+    """Height and width of a surge trade places: that its width is open does not say that there may be none."""
+    cause = Cause(get_effect("opposition_surge")({"B0": 0.6, "h": 0.03}), found=None)
+    cause.errors, cause.over_images = {"B0": 0.2, "h": 0.01}, {"B0": 0.05}
+    for error, sure in ((0.05, True), (0.2, False)):
+        cause.of_given_shape = {"B0": error}
+        assert (doubt(SimpleNamespace(data=None, frames=8), cause) == "") == sure
