@@ -15,7 +15,7 @@ SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 # A module is compiled once, when it is first imported: pip leaves it to us (see below).
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help install demo demo-paper figures test test-slow mutants fuzz endurance lint bench campaign campaign-real docs wheel vendor-js reproduce-apollo15 reproduce-models clean
+.PHONY: help install demo demo-paper demo-albedo figures test test-slow mutants fuzz endurance lint bench campaign campaign-real docs wheel vendor-js reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -105,7 +105,7 @@ CORES := $(shell nproc 2>/dev/null || getconf _NPROCESSORS_ONLN)
 THREADS := $(shell echo $$(($(CORES) < 8 ? 1 : $(CORES) / 4)))
 
 demo: $(STAMP) ## run every stage on the embedded scene and name a report to open
-	+$(MAKE) --no-print-directory $(D)/pairs.h5
+	+$(MAKE) --no-print-directory $(D)/scene.h5
 	+OMP_NUM_THREADS=$(THREADS) $(MAKE) --no-print-directory -j $(CORES) BESIDE=1 $(D)/report.html
 	@echo; echo "Open $(abspath $(D)/report.html)"; echo "and  $(abspath $(D)/view.html)"
 
@@ -119,10 +119,10 @@ $(D)/scene.h5: $(D)/scene/images.csv
 	$(LUNARGR) ingest $(D)/scene/dem.tif --images $(D)/scene/images.csv --gsd 5 -o $@ --overwrite
 
 $(D)/crops.h5: $(D)/scene.h5
-	$(LUNARGR) sample $< --count 1200 $(DEMO_SPLIT) -o $@ --overwrite
+	$(LUNARGR) sample $< --count 1200 $(DEMO_SPLIT) -o $@ --overwrite $(SAYS)
 
 $(D)/pairs.h5: $(D)/crops.h5
-	$(LUNARGR) project $< -o $@ --overwrite
+	$(LUNARGR) project $< -o $@ --overwrite $(SAYS)
 
 # Training is random: three seeds, so that a gain can be told from luck.
 $(DEMO_RUNS): $(D)/checkpoint_%.h5: $(D)/pairs.h5
@@ -136,8 +136,8 @@ $(D)/svbrdf_albedo.h5: $(D)/svbrdf.h5 $(D)/scene.h5
 	$(LUNARGR) albedo $^ -o $@ --overwrite $(SAYS)
 
 # ... and without every fourth, to be judged by these
-$(D)/fold_1.h5: $(D)/svbrdf.h5 $(D)/scene.h5
-	$(LUNARGR) albedo $^ --fold 1/4 --no-geotiff -o $@ --overwrite $(SAYS)
+$(D)/fold_%.h5: $(D)/svbrdf.h5 $(D)/scene.h5
+	$(LUNARGR) albedo $^ --fold $*/4 --no-geotiff -o $@ --overwrite $(SAYS)
 
 $(D)/render.exr: $(D)/svbrdf_albedo.h5
 	$(LUNARGR) render $< --sun-azimuth 270 --sun-elevation 25 -o $@ --overwrite $(SAYS)
@@ -176,6 +176,14 @@ $(D)/checkpoint_m2.h5: $(D)/pairs.h5
 
 $(D)/m2.h5: $(D)/pairs.h5 $(D)/checkpoint_m2.h5
 	$(LUNARGR) evaluate $^ --only learned --only learned_gain_offset -o $@ --overwrite
+
+demo-albedo: $(D)/match_albedo.json ## judge the demo's albedo by all of its images, each left out once, and by matching features
+
+$(D)/held_out_all.h5: $(D)/pairs.h5 $(foreach fold,1 2 3 4,$(D)/fold_$(fold).h5)
+	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite
+
+$(D)/match_albedo.json: $(D)/held_out_all.h5
+	$(LUNARGR) match $< --count 20 --json $@ --overwrite
 
 figures: $(TESTED) ## write every figure of README.md and docs/, and the notebook, from what demo, reproduce-* and bench left
 	$(BIN)/python examples/figures.py

@@ -32,6 +32,7 @@ KNOWS = {
 }
 BRIEF = ("learned", "global", "hapke_fitted", "hapke_raw", "hapke_minmax", "learned_gain_offset", "hapke_gain_offset")
 DEMO, APOLLO, PAPER = "make demo", "make reproduce-apollo15", "make reproduce-models"
+ALBEDO = "make demo-albedo"
 
 
 class Absent(Exception):
@@ -131,9 +132,9 @@ def demo_rows(root: Path) -> list[str]:
     return evaluated(result, result["models"], paper_row(root))
 
 
-def held_out(root: Path, folder: str, command: str) -> list[str]:
+def held_out(root: Path, name: str, command: str) -> list[str]:
     """Seen ground under unseen images."""
-    result = read(root, f"{folder}/held_out.json", command)
+    result = read(root, name, command)
     rows = [
         [MAPS.get(name, name), with_bounds(row["mse"], row["mse_low"], row["mse_high"]),
          "-" if row.get("ssim") is None else f"{row['ssim']:.3f}"]
@@ -145,9 +146,9 @@ def held_out(root: Path, folder: str, command: str) -> list[str]:
     return lines + covered(result)
 
 
-def matched(root: Path, folder: str, command: str) -> list[str]:
+def matched(root: Path, name: str, command: str) -> list[str]:
     """Shares of matches within 1 px."""
-    result = read(root, f"{folder}/match.json", command)
+    result = read(root, name, command)
     rows = []
     for matcher, renderings in result["matchers"].items():
         for name, row in renderings.items():
@@ -292,12 +293,14 @@ BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "demo-commands": commands,
     "demo": demo,
     "demo-rows": demo_rows,
-    "demo-held-out": lambda root: held_out(root, "demo", DEMO),
-    "demo-match": lambda root: matched(root, "demo", DEMO),
+    "demo-held-out": lambda root: held_out(root, "demo/held_out.json", DEMO),
+    "demo-albedo": lambda root: held_out(root, "demo/held_out_all.json", ALBEDO),
+    "demo-albedo-match": lambda root: matched(root, "demo/match_albedo.json", ALBEDO),
+    "demo-match": lambda root: matched(root, "demo/match.json", DEMO),
     "demo-diagnosis": lambda root: diagnosed(root, "demo", DEMO),
     "apollo15": apollo15,
-    "apollo15-held-out": lambda root: held_out(root, "results/apollo15", APOLLO),
-    "apollo15-match": lambda root: matched(root, "results/apollo15", APOLLO),
+    "apollo15-held-out": lambda root: held_out(root, "results/apollo15/held_out.json", APOLLO),
+    "apollo15-match": lambda root: matched(root, "results/apollo15/match.json", APOLLO),
     "apollo15-diagnosis": lambda root: diagnosed(root, "results/apollo15", APOLLO),
     "models": models,
     "demo-sizes": sizes,

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 
 from stages.common.intervals import (
     ERROR,
@@ -19,6 +19,7 @@ from stages.common.intervals import (
     run_variance,
     student_quantile,
     two_sided_p,
+    unseen_quantile,
 )
 
 TRIALS = 2500
@@ -171,3 +172,25 @@ def test_student_of_one_degree_is_cauchy():
 def test_the_variance_of_a_mean_of_runs_divides_by_one_less():
     found = run_variance([1.0, 2.0, 4.0])
     assert found.value == pytest.approx(((4 / 3) ** 2 + (1 / 3) ** 2 + (5 / 3) ** 2) / 2 / 3) and found.freedom == 2
+
+
+@pytest.mark.parametrize("units", [4, 9])
+def test_the_quantile_for_an_unseen_unit_holds_as_often_as_it_says(units):
+    """Errors whose size differs from unit to unit by half; the next unit, drawn alike, against the law that drew it."""
+    rng = np.random.default_rng(units)
+    plain, unseen = [], []
+    for _ in range(1000):
+        size = rng.lognormal(0, 0.5, units + 1)
+        values, unit = np.abs(rng.normal(size=(units, 200)) * size[:units, None]), np.repeat(np.arange(units), 200)
+        for held, quantile in (
+            (plain, np.quantile(values, 0.95)),
+            (unseen, unseen_quantile(values.ravel(), unit, 0.95)),
+        ):
+            held.append(special.erf(quantile / size[units] / math.sqrt(2)))
+    assert np.mean(unseen) == pytest.approx(0.95, abs=0.01)
+    assert np.mean(plain) < np.mean(unseen) - 0.005
+
+
+def test_a_single_unit_has_the_plain_quantile(rng):
+    values = rng.exponential(size=1000)
+    assert unseen_quantile(values, np.zeros(1000), 0.95) == np.quantile(values, 0.95)

@@ -1,11 +1,11 @@
 """How far an image that had no part in the albedo lies from the map: half-widths of intervals that hold so often.
 
 Errors of photographs have long tails, so that one standard deviation cannot serve for both 68 and 95 %: each width is a
-quantile of residuals of images left out in turn (conformal prediction by splitting: Papadopoulos et al. 2002, ECML:345),
-in units of the predicted standard deviation and by cos(incidence); in shadow, where the map has nothing to multiply, in
-units of the sine of the Sun's elevation. Residuals of one image share errors (its gain, the angles that only it has), and a
-scene has few images: the part of the variance that lies between images takes the factor of a prediction interval from so
-many of them (Student's t, Hahn & Meeker 1991, "Statistical Intervals", ch. 4).
+quantile of residuals of images left out in turn, in units of the predicted standard deviation and by cos(incidence); in
+shadow, where the map has nothing to multiply, in units of the sine of the Sun's elevation. Residuals of one image share
+errors (its gain, the angles that only it has), and a scene has few images: all widths are multiplied by what makes them
+hold for each image when they come from the others alone (cross-conformal prediction by units: Vovk 2015, Ann. Math. Artif.
+Intell. 74:9).
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri, stdtrit
 
 from stages.albedo.posterior import Spread, estimate, settle
 from stages.albedo.references import Look
@@ -49,24 +48,45 @@ def unseen_intervals(stacks: Sequence[Stack], spread: Spread, edges: Floats) -> 
     """
     bins = len(edges) - 1
     residuals, places, images = _residuals(stacks, spread, edges)
-    result, shadow = np.tile(np.array(GAUSSIAN)[:, None], bins), np.zeros(2)
     lit = places < bins
-    if not lit.any():
-        return result, shadow
-    allowance = _allowance(residuals[lit], images[lit])
-    result[:] = (_quantiles(residuals[lit]) * allowance)[:, None]
-    enough = [
-        k
-        for k in range(bins)
-        if (places == k).sum() >= LEAST_PX and len(np.unique(images[places == k])) >= LEAST_IMAGES
-    ]
-    if enough:
-        middles = 0.5 * (edges[1:] + edges[:-1])
-        widths = [_quantiles(residuals[places == k]) * allowance for k in enough]
-        result = np.stack([np.interp(middles, middles[enough], level) for level in np.transpose(widths)])
-    if not lit.all():
-        shadow = _quantiles(residuals[~lit]) * allowance
+    result, shadow = np.tile(np.array(GAUSSIAN)[:, None], bins), np.zeros(2)
+    if lit.any():
+        result = _unseen_widths(residuals[lit], places[lit], images[lit], bins)
+        if not lit.all():
+            shadow = _unseen_widths(residuals[~lit], places[~lit] - bins, images[~lit], 1)[:, 0]
     return result, shadow
+
+
+def _unseen_widths(residual: Floats32, place: NDArray[np.intp], image: NDArray[np.intp], bins: int) -> Floats:
+    """(2, bins) half-widths that hold for an image that is not among these, on the average over such images.
+
+    residual : (N,) absolute; place, image : (N,) bins and images of them
+    """
+    widths = _widths(residual, place, image, bins)
+    names = np.unique(image)
+    if len(names) < 2:
+        return widths
+    over = np.empty((2, len(residual)))  # residuals in units of the widths that the other images give
+    for name in names:
+        own = image == name
+        over[:, own] = residual[own] / np.maximum(
+            _widths(residual[~own], place[~own], image[~own], bins)[:, place[own]], 1e-12
+        )
+    return widths * [[np.quantile(ratio, share)] for ratio, share in zip(over, SHARES, strict=True)]
+
+
+def _widths(residual: Floats32, place: NDArray[np.intp], image: NDArray[np.intp], bins: int) -> Floats:
+    """(2, bins) quantiles of residuals, those of the neighbours where a bin has too few; arguments as above."""
+    result = np.tile(np.quantile(residual, SHARES)[:, None], bins)
+    enough = [k for k in range(bins) if _is_enough(image[place == k])]
+    if enough:
+        quantiles = [np.quantile(residual[place == k], SHARES) for k in enough]
+        result = np.stack([np.interp(range(bins), enough, level) for level in np.transpose(quantiles)])
+    return result
+
+
+def _is_enough(image: NDArray[np.intp]) -> bool:
+    return len(image) >= LEAST_PX and len(np.unique(image)) >= LEAST_IMAGES
 
 
 def _residuals(
@@ -92,7 +112,7 @@ def _residuals(
             shadow, unit = look.shadow.ravel()[use], np.sqrt(std.ravel()[use] ** 2 + own) * predicted
             unit = np.where(shadow, np.float32(max(look.sun_sine, 1e-3)), unit)
             place = np.clip(np.digitize(look.cos_incidence.ravel()[use], edges) - 1, 0, len(edges) - 2)
-            residual = ((stack.measured[out].ravel()[use] - predicted) / unit).astype(np.float32)
+            residual = (np.abs(stack.measured[out].ravel()[use] - predicted) / unit).astype(np.float32)
             found.append(
                 (residual, np.where(shadow, len(edges) - 1, place), np.full(len(use), stack.images[out], np.intp))
             )
@@ -100,20 +120,3 @@ def _residuals(
         return np.zeros(0, np.float32), np.zeros(0, np.intp), np.zeros(0, np.intp)
     residuals, places, images = (np.concatenate([f[k] for f in found]) for k in range(3))
     return residuals, places, images
-
-
-def _quantiles(residual: Floats32) -> Floats:
-    return np.quantile(np.abs(residual), SHARES)
-
-
-def _allowance(residual: Floats32, image: NDArray[np.intp]) -> Floats:
-    """(2,) factors on quantiles for an image that is not among those seen."""
-    names, counts = np.unique(image, return_counts=True)
-    images = counts.sum() ** 2 / np.square(counts).sum()  # as many equal ones as these unequal ones count for (Kish)
-    if images < 2:
-        return np.ones(2)
-    middles = np.array([np.median(residual[image == k]) for k in names])
-    between = np.average(middles**2, weights=counts) / _quantiles(residual)[0] ** 2
-    tail = np.array([0.5 + share / 2 for share in SHARES])
-    student = stdtrit(images - 1, tail) * np.sqrt(1 + 1 / images) / ndtri(tail)
-    return np.sqrt(1 + min(1.0, float(between)) * (student**2 - 1))

@@ -24,6 +24,7 @@ from scipy import special
 
 LEVEL = 0.95
 FEWEST_UNITS = 4  # coverage is tested from here on
+TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -141,6 +142,24 @@ def student_quantile(freedom: float, level: float = LEVEL) -> float:
 def two_sided_p(t: float, freedom: float) -> float:
     """Probability that |Student's t| exceeds |t|."""
     return float(2 * special.stdtr(freedom, -abs(t)))
+
+
+def unseen_quantile(values: NDArray, unit: NDArray, share: float) -> float:
+    """What a share of the values of a unit stay below that is not among these units, on the average over such units.
+
+    The quantile of all values, times the same quantile of each unit's values over that of all other units: a quantile of
+    few units is too low for the next one. values, unit : (N,); cross-conformal prediction by units (Vovk 2015, Ann. Math.
+    Artif. Intell. 74:9).
+    """
+    names, index = np.unique(unit, return_inverse=True)
+    found = float(np.quantile(values, share))
+    if len(names) < 2:
+        return found
+    ratios = np.empty(len(values))
+    for k in range(len(names)):
+        own = index == k
+        ratios[own] = values[own] / max(float(np.quantile(values[~own], share)), TINY)
+    return found * float(np.quantile(ratios, share))
 
 
 def _per_unit(total: NDArray, weight: NDArray, unit: NDArray) -> tuple[NDArray, NDArray]:

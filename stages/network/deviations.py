@@ -7,11 +7,13 @@ A residual is taken for the sum of independent errors: of each map, by its effec
 where ln sigma_c is linear in the trained network's last features (Gaussian likelihood, the maps held fixed: a last layer
 fitted afterwards costs maps nothing). What terrain does not show rules these errors, and neighbouring pixels share it: the
 deviations are those of single pixels, means over many are hardly better known. One factor for all is then chosen on
-validation ground, which the maps never saw, such that 95 % of its pixels lie within 1.96 standard deviations.
+validation ground, which the maps never saw, such that 95 % of the pixels of a ground tile lie within 1.96 standard
+deviations when the factor is chosen on the other tiles.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stages.common.intervals import unseen_quantile
 from stages.network.losses import Radiometry
 from stages.network.normalisation import scale_elevation
 from stages.network.pixels import Pixels, sample_pixels
@@ -46,21 +49,20 @@ def fit_deviations(
     train, validation : (n,), indices of pairs
     """
     predictor.eval()
-    seen = _residuals(predictor, radiometry, reader, train, extensions)
-    residual, effects, features = seen
+    residual, effects, features, tile = _residuals(predictor, radiometry, reader, train, extensions)
     middle, spread = features.mean(dim=0), features.std(dim=0).clamp(min=1e-6)
     weights, constants, noise = _likelihood(residual, effects, (features - middle) / spread)
     if len(validation):
-        residual, effects, features = _residuals(predictor, radiometry, reader, validation, extensions)
+        residual, effects, features, tile = _residuals(predictor, radiometry, reader, validation, extensions)
     deviation = _deviation(effects, (features - middle) / spread, weights, constants, noise)
-    factor = torch.quantile((residual / deviation).abs(), 0.95) / WIDTH_95
+    factor = unseen_quantile((residual / deviation).abs().numpy(), tile, 0.95) / WIDTH_95
     maps, head = predictor.maps, predictor.net.head
     count = len(maps.maps)
     with torch.no_grad():
         assert head.bias is not None
         head.weight[count:, :, 0, 0] = (weights / spread / maps.output_scale).to(head.weight)
         head.bias[count:] = 0
-        shift = constants - (weights * middle / spread).sum(dim=1) + factor.log()
+        shift = constants - (weights * middle / spread).sum(dim=1) + math.log(factor)
         maps.start[count:] = shift.to(maps.start)
     predictor.image_noise = float(noise.exp() * factor)
 
@@ -72,8 +74,10 @@ def _residuals(
     reader: PairReader,
     indices: NDArray[np.int64],
     extensions: Sequence[Extension],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Of some pixels: residuals (N,), I/F; effects of the maps on them (N, M), I/F per unit; the last features (N, F)."""
+) -> tuple[Tensor, Tensor, Tensor, NDArray[np.int64]]:
+    """Of some pixels: residuals (N,), I/F; effects of the maps on them (N, M), I/F per unit; the last features (N, F);
+    ground tiles (N,).
+    """
     maps, model = predictor.maps, predictor.model
     device = maps.start.device
 
@@ -85,7 +89,13 @@ def _residuals(
 
     pixels = sample_pixels(reader, indices, radiometry, more)
     features, coefficients, rendered = pixels.more
-    return pixels.image - rendered, _effects(predictor, pixels, coefficients), features
+    assert pixels.pair is not None
+    return (
+        pixels.image - rendered,
+        _effects(predictor, pixels, coefficients),
+        features,
+        reader.tile[pixels.pair.numpy()],
+    )
 
 
 def _effects(predictor: Predictor, pixels: Pixels, coefficients: Tensor) -> Tensor:

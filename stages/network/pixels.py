@@ -21,28 +21,31 @@ MAXIMUM_PAIRS = 512  # enough for a handful of numbers
 MAXIMUM_PIXELS = 30_000
 
 
-def batches_of(reader: PairReader, indices: NDArray[np.int64], size: int = 32) -> Iterator[Batch]:
-    """Batches of evenly chosen pairs, at most about MAXIMUM_PAIRS of them.
+def batches_of(
+    reader: PairReader, indices: NDArray[np.int64], size: int = 32
+) -> Iterator[tuple[NDArray[np.int64], Batch]]:
+    """(pairs, their batch) of evenly chosen pairs, at most about MAXIMUM_PAIRS of them.
 
     indices : (n,), of pairs
     """
     step = max(1, len(indices) // MAXIMUM_PAIRS)
     chosen = indices[::step]
     for first in range(0, len(chosen), size):
-        yield reader.batch(chosen[first : first + size])
+        yield chosen[first : first + size], reader.batch(chosen[first : first + size])
 
 
 @dataclass(frozen=True)
 class Pixels:
     """Valid pixels of many images, (N,) float64 each: cosines, the share of the Sun that lights them, and I/F.
 
-    more : (N, ...) float64, whatever else was asked for
+    more : (N, ...) float64, whatever else was asked for; pair : (N,) int64, the pairs that the pixels are of
     """
 
     angles: Angles
     light: Tensor
     image: Tensor
     more: tuple[Tensor, ...] = ()
+    pair: Tensor | None = None
 
 
 def sample_pixels(
@@ -60,7 +63,7 @@ def sample_pixels(
     part = np.s_[..., step // 2 :: step, step // 2 :: step]
     gain, offset = (value().detach().cpu() for value in (radiometry.gain, radiometry.offset))
     found: list[list[Tensor]] = []
-    for batch in batches_of(reader, indices):
+    for pairs, batch in batches_of(reader, indices):
         o = batch.observation
         seen = facets.angles_and_light(
             o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius
@@ -68,11 +71,12 @@ def sample_pixels(
         assert seen is not None and o.frame is not None  # on the CPU, without gradients
         angles, light = seen
         image = (batch.image - offset[o.frame, None, None]) / gain[o.frame, None, None]
-        fields = (angles.cos_incidence, angles.cos_emission, angles.cos_phase, light, image, *more(batch))
+        pair = torch.from_numpy(pairs)[:, None, None].expand(image.shape)
+        fields = (pair, angles.cos_incidence, angles.cos_emission, angles.cos_phase, light, image, *more(batch))
         valid = batch.valid[part]
         found.append([field[part].movedim((-2, -1), (1, 2))[valid].double() for field in fields])
-    mu0, mu, phase, light, image, *rest = (torch.cat(parts) for parts in zip(*found, strict=True))
-    return Pixels(Angles(mu0, mu, phase), light, image, tuple(rest))
+    pair, mu0, mu, phase, light, image, *rest = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return Pixels(Angles(mu0, mu, phase), light, image, tuple(rest), pair.long())
 
 
 def fit_pixels(

@@ -54,7 +54,7 @@ def fit_radiometry(
         uniform = torch.tensor([p.default for p in model.parameters])
     defaults = _uniform(uniform)
     moments = torch.zeros(frames, 5, dtype=torch.float64)  # n, sum x, sum y, sum xx, sum xy
-    for batch in batches_of(reader, indices):
+    for _, batch in batches_of(reader, indices):
         x = form(batch.observation, model, defaults).double() * batch.valid
         y = batch.image.double() * batch.valid
         terms = torch.stack([batch.valid.double(), x, y, x * x, x * y], dim=1).sum(dim=(2, 3))
