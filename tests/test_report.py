@@ -274,7 +274,7 @@ def test_unseen_images_are_a_section_of_their_own(tmp_path):
     text = (tmp_path / "page.html").read_text()
     [(kind, sentence)] = _said(text)
     assert kind == "good" and "86.4 % lower than the map from terrain alone" in sentence
-    assert "another claim" in sentence and "1 to 9 deg" in sentence and "1 unseen image, 40 pairs" in sentence
+    assert sentence.startswith("Another claim") and "1 to 9 deg" in sentence and "1 unseen image, 40 pairs" in sentence
     assert "seventh" in text and "4.200e-06" in text and "94.9" in text and "91.5" in text
 
 
@@ -335,6 +335,19 @@ def test_a_page_of_view_is_linked_given_or_beside(folder, tmp_path):
     (tmp_path / "out" / "view.html").write_text("page")
     report.run([folder / "match.json"], Output(tmp_path / "out" / "report.html", overwrite=True), report.Config())
     assert '<a href="view.html">' in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_the_rendered_map_stands_on_the_first_screen_and_not_once_more(folder, tmp_path):
+    """Behind it the conclusions, and before both the way to the page that relights the map."""
+    for name in ("render", "errors"):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((40, 40), 90, np.uint8))
+    (tmp_path / "view.html").write_text("page")
+    files = [folder / "checkpoint.h5", tmp_path / "errors.png", tmp_path / "render.png", tmp_path / "view.html"]
+    titles = report.run(files, tmp_path / "page.html", report.Config())
+    text = (tmp_path / "page.html").read_text()
+    first, rest = text.split("<nav>")
+    assert first.index("view.html") < first.index('class="conclusions"') < first.index("The map as")
+    assert "The map as" not in rest and "Errors of the compared models" in rest and "Pictures" in titles
 
 
 def test_heavy_pictures_are_made_light_and_say_what_they_show(folder, tmp_path):

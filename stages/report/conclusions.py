@@ -13,8 +13,8 @@ from stages.physics.photometry import get_model
 
 # (row, what it may know of the scored crops)
 CLAIMS = (
-    ("learned", "none", "knowing nothing of the scored images, reflectance learned from terrain"),
-    ("learned_gain_offset", "gain_offset", "with a gain and an offset for each scored crop, reflectance learned from terrain"),
+    ("learned", "none", "On unseen ground the learned reflectance"),
+    ("learned_gain_offset", "gain_offset", "On unseen ground, with a gain and an offset fitted to each scored crop, the learned reflectance"),
 )  # fmt: skip
 
 
@@ -59,7 +59,7 @@ def evaluation(result: dict[str, Any]) -> list[Sentence]:
             if gain and gain["gain_percent"] is not None:
                 title = result.get("titles", {}).get(other, str(other).replace("_", " "))
                 who = f"{which}, '{title}'"
-                found.append(compared(f"On unseen ground, {words}", who, gain, basis(result)))
+                found.append(compared(words, who, gain, basis(result)))
     return found
 
 
@@ -72,7 +72,7 @@ def held_out_images(result: dict[str, Any]) -> list[Sentence]:
     unseen = f"{counted(len(result.get('images', [])), 'unseen image')}, {basis(result)}"
     if sun:
         unseen += f", their Suns {sun['least']:.0f} to {sun['most']:.0f} deg from the nearest one used"
-    what = "On seen ground under unseen images, which is another claim, albedo from the other photographs"
+    what = "Another claim: on seen ground, under unseen images, albedo from the other photographs"
     return [compared(what, "the map from terrain alone", gain, unseen)]
 
 

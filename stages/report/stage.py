@@ -92,14 +92,18 @@ def run(
             found.append(part)
     found.sort(key=lambda part: ORDER.index(part[0]))
     chapters = [section for _, section, _ in found]
-    if shown:
-        chapters.append(_gallery(shown))
+    first = next((path for path in shown if path.stem.startswith("render")), None)
+    rest = [path for path in shown if path != first]
+    if rest:
+        chapters.append(_gallery(rest))
     if details:
         chapters.append(page.Section("Provenance", details))
-    if not chapters:
+    if not chapters and first is None:
         raise ConfigError("report: expected artefacts or results of lunargr, found nothing that can be shown.")
     progress(len(files), len(files), "report")
     head = _head(found, linked, output.file)
+    if first is not None:
+        head = [page.beside(head, _figure(first))]
     subtitle = f"made by lunargr {version('lunargr')} from {len(files)} files"
     footer = "Every number and picture on this page is read from the files named under Provenance."
     with atomic_path(output.file) as partial:
@@ -111,16 +115,16 @@ Part = tuple[str, page.Section, list[Sentence]]  # kind, section, what it says o
 
 
 def _head(found: Sequence[Part], linked: Sequence[Path], output: Path) -> list[Markup]:
-    """The first screen: conclusions, each once, and a way to the page that relights the map."""
+    """The first screen: a way to the page that relights the map, and conclusions, each once."""
     beside = output.with_name("view.html")
     if beside.is_file() and beside.resolve() not in [path.resolve() for path in linked]:
         linked = [*linked, beside]
-    said = [s for kind in FIRST for part, _, sentences in found if part == kind for s in sentences]
-    head = [page.conclusions(dict.fromkeys(said))] if said else []
+    head = []
     for path in linked:
         address = quote(os.path.relpath(path, output.parent).replace(os.sep, "/"))
         head.append(page.link(address, f"Move the Sun and the camera over this map: {path.name}"))
-    return head
+    sentences = [s for kind in FIRST for part, _, found_there in found if part == kind for s in found_there]
+    return [*head, page.conclusions(dict.fromkeys(sentences))] if sentences else head
 
 
 def _artefact(path: Path, details: list[Markup], seen: list[Any]) -> Part | None:
@@ -167,24 +171,24 @@ def _result(result: dict[str, Any], file: Any) -> Part | None:
 
 
 def _gallery(paths: Sequence[Path]) -> page.Section:
-    section = page.Section("Pictures")
-    figures = []
-    for path in paths:
-        check_file(path, "a PNG or JPEG picture")
-        try:
-            content = path.read_bytes()
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from None
-        if len(content) > LARGEST_PICTURE:
-            raise InputError(
-                f"{path}: expected a picture below {LARGEST_PICTURE // 2**20} MiB, found {len(content) / 2**20:.0f} MiB; "
-                "make a smaller preview."
-            )
-        if content[:4] not in (b"\x89PNG",) and content[:2] != b"\xff\xd8":
-            raise InputError(f"{path}: expected a PNG or JPEG picture, found another kind of file.")
-        figures.append(page.picture(_light(content, path), _caption(path)))
-    section.add(page.grid(figures))
-    return section
+    return page.Section("Pictures", [page.grid([_figure(path) for path in paths])])
+
+
+def _figure(path: Path) -> Markup:
+    """A picture with what it shows. Raises InputError for a file that is none."""
+    check_file(path, "a PNG or JPEG picture")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from None
+    if len(content) > LARGEST_PICTURE:
+        raise InputError(
+            f"{path}: expected a picture below {LARGEST_PICTURE // 2**20} MiB, found {len(content) / 2**20:.0f} MiB; "
+            "make a smaller preview."
+        )
+    if content[:4] not in (b"\x89PNG",) and content[:2] != b"\xff\xd8":
+        raise InputError(f"{path}: expected a PNG or JPEG picture, found another kind of file.")
+    return page.picture(_light(content, path), _caption(path))
 
 
 def _light(content: bytes, path: Path) -> str:

@@ -107,6 +107,11 @@ def grid(figures: Iterable[Markup]) -> Markup:
     return _part("grid", list(figures))
 
 
+def beside(parts: Iterable[Markup], figure: Markup) -> Markup:
+    """Text with a picture to its right, below it on narrow screens."""
+    return _part("beside", list(parts), figure)
+
+
 def crops(figures: Iterable[Markup]) -> Markup:
     """Small pictures in a row that scrolls."""
     return _part("crops", list(figures))
