@@ -70,7 +70,7 @@ def test_content_has_every_map_of_the_file(hilly_map):
     assert content.factor == 1 and content.grid.transform == grid.transform
     np.testing.assert_array_equal(content.elevation, elevation.astype(np.float32))
     assert [layer.name for layer in content.coefficients] == ["a", "b", "c", "albedo"]  # albedo is in the picture
-    expected = ["albedo_images", *(f"coefficient_std_{k}" for k in "abc"), "coefficients_std_b"]
+    expected = ["albedo_images", "b_std", *(f"coefficient_std_{k}" for k in "abc")]
     assert sorted(layer.name for layer in content.others) == expected
     titles = {layer.name: layer.title for layer in content.others}
     assert titles["albedo_images"] == "albedo images: how many made it"

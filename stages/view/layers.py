@@ -98,10 +98,12 @@ def _others(file: h5py.File, grid: Grid, names: list[str], factor: int) -> list[
             found.append(_layer(variable, name, name, (), factor))
         elif variable.ndim == 3 and variable.shape[1:] == (grid.height, grid.width):
             # of every coefficient, or of those that vary by place
-            which = mapped if name == "coefficients_std" else names
+            deviations = name == "coefficients_std"
+            which = mapped if deviations else names
             if len(which) == len(variable):
                 found += [
-                    _layer(variable, f"{name}_{of}", f"{name} of {of}", (k,), factor) for k, of in enumerate(which)
+                    _layer(variable, f"{of}_std" if deviations else f"{name}_{of}", f"{name} of {of}", (k,), factor)
+                    for k, of in enumerate(which)
                 ]
     return [layer for layer in found if np.isfinite(layer.values).any()]
 

@@ -99,7 +99,8 @@ class Panel {
   }
 
   contrast(limits, colours) {
-    const digits = (v) => Number(v.toPrecision(3)).toString();
+    const span = limits[1] - limits[0]; // three digits of the range: below that nobody sees a difference
+    const digits = (v) => (span > 1e-9 ? Number(v.toFixed(Math.max(0, 2 - Math.floor(Math.log10(span))))) : Number(v.toPrecision(3))).toString();
     [byId("low").textContent, byId("high").textContent] = limits.map(digits);
     for (const [id, value] of [["black", limits[0]], ["white", limits[1]]]) if (document.activeElement !== byId(id)) byId(id).value = digits(value);
     if (this.barColours === (colours ?? "grey")) return;
