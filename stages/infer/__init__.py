@@ -1,4 +1,7 @@
-"""Stage infer. stage: from files to files; windows: where the map is cut; terrain: the DEM in rows; working: threads; writing: the map."""
+"""infer: coefficient maps for a DEM.
+
+stage: from files to files; windows: where the map is cut; terrain: the DEM in rows; parallel: threads; writing: the map
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from schemas.later import imported_later
 from stages.infer.config import Config, Summary
 
 if TYPE_CHECKING:
-    from stages.infer.stage import check_body, check_files, count_bands, open_terrain, run, summarise
+    from stages.infer.stage import check_body, check_files, count_bands, run, summarise
     from stages.infer.windows import axis_windows, blend_weights
 
 __getattr__ = imported_later(__name__, "stage", "windows")
@@ -20,7 +23,6 @@ __all__ = [
     "check_body",
     "check_files",
     "count_bands",
-    "open_terrain",
     "run",
     "summarise",
 ]

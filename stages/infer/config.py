@@ -1,4 +1,4 @@
-"""What infer is told, and what it says of the map."""
+"""The settings of infer, and its summary of a map."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Config:
-    """window, stride : px; windows overlap by their difference and are blended; None: as large as the machine likes best;
-    offset : px, shifts their grid; precision : fp32, bf16, or auto (see ``stages.network.precision``); geotiff : whether the
-    map is written as a GeoTIFF as well.
+    """window, stride : px; windows overlap by their difference and are blended; None: chosen for speed and memory;
+    offset : px, shifts their lattice; precision : fp32, bf16, or auto (see ``stages.network.precision``); any_gsd :
+    whether the grid may differ from that of training; geotiff : whether the map is written as a GeoTIFF as well.
     """
 
     window: int | None = None

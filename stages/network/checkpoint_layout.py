@@ -1,4 +1,4 @@
-"""Names and shapes that a checkpoint must hold for its network, checked before any memory of their size is taken."""
+"""Checks of the names and shapes in a checkpoint against its network, before memory of their size is allocated."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from schemas.errors import ArtefactError
 from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.unet import UNet
 
-WIDEST, DEEPEST = 65536, 12  # channels of a stage, stages: beyond any network, and short of any machine's memory
+WIDEST, DEEPEST = 65536, 12  # most channels of a stage, and most stages
 
 
 def read_layout(path: Path, config: dict[str, Any], model: str) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """(widths, dropout) of the network that a checkpoint's options name. Raises ArtefactError."""
+    """(widths, dropout) of the network, from the options in a checkpoint. Raises ArtefactError."""
     widths, dropout, name = config.get("widths"), config.get("dropout"), config.get("model", model)
     where = f"{path}: root attribute 'config'"
     if not isinstance(name, str) or name.lower() != model.lower():
@@ -38,7 +38,7 @@ def read_layout(path: Path, config: dict[str, Any], model: str) -> tuple[tuple[i
 def check_weights(
     path: Path, group: Any, maps: CoefficientMaps, widths: tuple[int, ...], dropout: tuple[float, ...]
 ) -> None:
-    """Names, shapes and kinds of the stored arrays against the network's. Raises ArtefactError."""
+    """Refuse stored arrays whose names, shapes or kinds are not the network's. Raises ArtefactError."""
     with torch.device("meta"):
         net = UNet(maps.channels, widths, dropout)
     states = {"net": net.state_dict(), "maps": maps.state_dict()}

@@ -1,4 +1,4 @@
-"""Where the Sun and the camera stand, seen from the crops."""
+"""Directions from the crops to the Sun and the camera."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def crop_geometry(
 
 
 def check_directions(frame: Frame, geometry: Geometry) -> None:
-    """Sun and camera must stand above every crop's horizon plane. Raises GeometryError."""
+    """Refuse a Sun or a camera below the horizontal plane of a crop. Raises GeometryError."""
     if geometry.sun[:, 2].min() <= 0:
         raise GeometryError(
             f"image '{frame.image_id}': the Sun is below the horizon at {int((geometry.sun[:, 2] <= 0).sum())} crop centres; "

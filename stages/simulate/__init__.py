@@ -3,8 +3,8 @@
 recipe.py       every number of a scene                     noise.py     fractal noise as a function of place
 craters.py      population, profiles, decay                 terrain.py   the ground, block by block
 reflectance.py  the truth's albedo and other parameters     orbits.py    times, Sun, spacecraft, strips
-render.py       light from each DEM pixel                   sensor.py    optics, response, noise, footprints
-hidden.py       what the pipeline is not told               write.py     DEM, images, table, truth
+radiance.py     light from each DEM pixel, optics           sensor.py    resampling, response, noise, footprints
+hidden.py       effects that only the truth records         write.py     DEM, images, table, truth
 stage.py        the stage: all of it in order
 """
 

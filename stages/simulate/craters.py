@@ -82,7 +82,7 @@ def populate(
     left, bottom, right, top = bounds
     sizes = []
     n_transition = float(cumulative_density(transition, density, transition))
-    # the margin outside grows with the size, so that small craters are not drawn where nobody sees them
+    # the margin outside grows with the size, so that small craters are not drawn where they cannot be seen
     edges = np.geomspace(smallest, largest, 25)
     xs, ys = [], []
     for low, high in itertools.pairwise(edges):

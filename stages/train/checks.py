@@ -1,4 +1,4 @@
-"""What is refused before anything is learned."""
+"""Checks of the settings and of the pairs, before training begins."""
 
 from __future__ import annotations
 
