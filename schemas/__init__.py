@@ -6,15 +6,7 @@ from typing import TYPE_CHECKING
 
 from schemas.artefacts import CHECKPOINT, CROPS, DIAGNOSIS, EVALUATION, PAIRS, SCENE, SPLITS, SVBRDF, TRUTH, UNITS
 from schemas.declaration import SCHEMAS, Attribute, Schema, Variable, get_schema
-from schemas.errors import (
-    EXIT_CODE,
-    ArtefactError,
-    ConfigError,
-    GeometryError,
-    InputError,
-    LunargrError,
-    RegistryError,
-)
+from schemas.errors import EXIT_CODE, ArtefactError, ConfigError, GeometryError, InputError, LunargrError, RegistryError
 from schemas.later import imported_later
 
 if TYPE_CHECKING:

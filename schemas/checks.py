@@ -91,13 +91,11 @@ def _check_attribute(path: Path, file: h5py.File, attribute: Attribute, advice: 
         raise ArtefactError(f"{where}: cannot be read ({error}); {advice}.") from None
     if attribute.kind in ("number", "integer"):
         number = np.ravel(value) if isinstance(value, np.ndarray | np.generic | int | float) else np.array(["?"])
-        good = number.size == 1 and number.dtype.kind in "iufb" and math.isfinite(number[0])
-        if good and attribute.kind == "integer":
-            good = float(number[0]).is_integer()
-        if good:
-            low, high = _bounds(attribute)
-            good = low <= number[0] <= high
-        if not good:
+        low, high = _bounds(attribute)
+        good = (
+            number.size == 1 and number.dtype.kind in "iufb" and math.isfinite(number[0]) and low <= number[0] <= high
+        )
+        if not good or (attribute.kind == "integer" and not float(number[0]).is_integer()):
             raise ArtefactError(f"{where}: expected {_wanted(attribute)}, found {_short(value)}; {advice}.")
         return
     text = as_text(value)

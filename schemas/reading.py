@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,8 @@ from schemas.errors import ArtefactError
 from schemas.files.hdf5 import silence_hdf5
 
 
-def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5py.File:
-    """Open an artefact for reading after checking that it is what it should be.
-
-    ``need`` names optional variables that this caller cannot do without. Raises ArtefactError.
-    """
+def open_artefact(path: Path, schema: Schema) -> h5py.File:
+    """Open an artefact for reading, after checking that it is what it should be. Raises ArtefactError."""
     path = Path(path)
     file = _open_hdf5(path)
     try:
@@ -28,7 +24,7 @@ def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5
         for variable in schema.variables:
             if variable.name in file:
                 _check_variable(path, file, variable)
-            elif variable.required or variable.name in need:
+            elif variable.required:
                 raise ArtefactError(
                     f"{path}:/{variable.name}: expected a variable ({variable.description}), found none; "
                     f"write it again with 'lunargr {schema.stage}'."

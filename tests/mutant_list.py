@@ -317,8 +317,8 @@ STAGES = (
     ),
     Mutant(
         "stages/common/intervals.py",
-        "float(special.stdtrit(freedom, 0.5 + level / 2))",
-        "float(special.ndtri(0.5 + level / 2))",
+        "float(special.stdtrit(freedom, 0.5 + LEVEL / 2))",
+        "float(special.ndtri(0.5 + LEVEL / 2))",
         ("tests/test_intervals.py::test_student_of_one_degree_is_cauchy",),
         "intervals take the normal quantile for Student's",
     ),

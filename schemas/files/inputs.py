@@ -27,15 +27,11 @@ FILE_COLUMNS = ("path", "camera")
 
 
 class Inputs:
-    """A set of files, and what they name. Raises InputError for a link that leads to itself."""
+    """A set of files, and of all files that they name in turn. Raises InputError for a link that leads to itself."""
 
     def __init__(self, paths: Iterable[Path] = ()) -> None:
         self._files: dict[Hashable, Path] = {}
         self._folders: dict[str, dict[str, Path]] = {}
-        self.add(paths)
-
-    def add(self, paths: Iterable[Path]) -> None:
-        """Take in files, and what they link to or name as their own inputs."""
         waiting = [Path(p) for p in paths]
         while waiting:
             path = waiting.pop()

@@ -133,9 +133,9 @@ def join(parts: Sequence[Variance]) -> Variance:
     return Variance(value, value**2 / below if below > 0 else max(part.freedom for part in parts))
 
 
-def student_quantile(freedom: float, level: float = LEVEL) -> float:
-    """Half width of the central interval of Student's t that holds ``level``."""
-    return float(special.stdtrit(freedom, 0.5 + level / 2))
+def student_quantile(freedom: float) -> float:
+    """Half width of the central 95 % interval of Student's t."""
+    return float(special.stdtrit(freedom, 0.5 + LEVEL / 2))
 
 
 def two_sided_p(t: float, freedom: float) -> float:

@@ -8,21 +8,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from schemas.later import imported_later
-from stages.infer.config import Config, Summary
+from stages.infer.config import Config
 
 if TYPE_CHECKING:
     from stages.infer.stage import check_body, check_files, count_bands, run, summarise
-    from stages.infer.windows import axis_windows, blend_weights
 
-__getattr__ = imported_later(__name__, "stage", "windows")
-__all__ = [
-    "Config",
-    "Summary",
-    "axis_windows",
-    "blend_weights",
-    "check_body",
-    "check_files",
-    "count_bands",
-    "run",
-    "summarise",
-]
+__getattr__ = imported_later(__name__, "stage")
+__all__ = ["Config", "check_body", "check_files", "count_bands", "run", "summarise"]

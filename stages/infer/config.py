@@ -1,12 +1,8 @@
-"""The settings of infer, and its summary of a map."""
+"""The settings of infer."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from stages.physics.maps.grid import Grid
 
 
 @dataclass(frozen=True)
@@ -24,14 +20,3 @@ class Config:
     any_gsd: bool = False
     shard: tuple[int, int] = (0, 1)
     geotiff: bool = True
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Ranges of the coefficients, for the table at the end: name -> (mean, std, 1 %, 99 %)."""
-
-    grid: Grid
-    model: str
-    valid_share: float
-    windows: int
-    coefficients: dict[str, tuple[float, float, float, float]]

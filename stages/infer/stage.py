@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import h5py
@@ -17,20 +17,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from schemas import (
-    SCENE,
-    SVBRDF,
-    ArtefactWriter,
-    ConfigError,
-    atomic_path,
-    open_artefact,
-    read_strings,
-)
+from schemas import SCENE, SVBRDF, ArtefactWriter, ConfigError, atomic_path, open_artefact, read_strings
 from schemas.files.companions import companions_of
 from schemas.files.outputs import Output, Target, check_apart, check_outputs
 from stages.common.memory import keep_freed_memory, return_freed_memory
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.infer.config import Config, Summary
+from stages.infer.config import Config
 from stages.infer.parallel import in_order, run_in_threads
 from stages.infer.terrain import TerrainReader, valid_part
 from stages.infer.windows import Box, axis_windows, cut_swaths, list_windows, shard_rows, window_and_stride
@@ -40,10 +32,22 @@ from stages.network.precision import check_precision, choose_inference_precision
 from stages.network.predictor import choose_device, load_predictor
 from stages.pairs.holes import fill_holes
 from stages.physics.maps.geotiff import MapTiff, band_names, map_tags
-from stages.physics.maps.grid import check_same_body, read_grid
+from stages.physics.maps.grid import Grid, check_same_body, read_grid
 
+SAMPLE = 256  # px, edge of the terrain by which the precision is chosen
 QUANTITY = "radiance factor I/F = pi r, including cos(incidence)"
-GSD_TOLERANCE = 0.05  # relative; beyond it the network would meet terrain at a scale it never saw
+GSD_TOLERANCE = 0.05  # relative; beyond it terrain has another scale than the network was trained at
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Ranges of the coefficients, for the table at the end: name -> (mean, std, 1 %, 99 %)."""
+
+    grid: Grid
+    model: str
+    valid_share: float
+    windows: int
+    coefficients: dict[str, tuple[float, float, float, float]]
 
 
 def run(
@@ -193,11 +197,11 @@ def _predict(
     return len(boxes)
 
 
-def _read_sample(scene: h5py.File, size: int = 256) -> NDArray[np.float32]:
+def _read_sample(scene: h5py.File) -> NDArray[np.float32]:
     """A window of terrain from the middle of a scene, holes filled."""
     height, width = scene["elevation"].shape
-    r0, c0 = max(0, (height - size) // 2), max(0, (width - size) // 2)
-    part = np.s_[r0 : r0 + size, c0 : c0 + size]
+    r0, c0 = max(0, (height - SAMPLE) // 2), max(0, (width - SAMPLE) // 2)
+    part = np.s_[r0 : r0 + SAMPLE, c0 : c0 + SAMPLE]
     return fill_holes(scene["elevation"][part], scene["dem_valid"][part].astype(bool))
 
 

@@ -12,11 +12,7 @@ from numpy.typing import NDArray
 from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
-from schemas import (
-    ArtefactError,
-    ArtefactWriter,
-    InputError,
-)
+from schemas import ArtefactError, ArtefactWriter, InputError
 from stages.common.progress import Progress
 from stages.ingest.config import Config
 from stages.ingest.plan import Plan

@@ -13,11 +13,7 @@ from rasterio.transform import Affine
 from rasterio.warp import Resampling, calculate_default_transform
 from rasterio.windows import Window
 
-from schemas import (
-    ConfigError,
-    GeometryError,
-    InputError,
-)
+from schemas import ConfigError, GeometryError, InputError
 from stages.common.progress import Progress, show_nothing
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, local_metric_crs

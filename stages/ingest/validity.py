@@ -9,11 +9,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 
-from schemas import (
-    ArtefactWriter,
-    GeometryError,
-    InputError,
-)
+from schemas import ArtefactWriter, GeometryError, InputError
 from schemas.provenance import sha256
 from stages.common.progress import Progress
 from stages.ingest.config import Config

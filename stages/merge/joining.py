@@ -14,6 +14,7 @@ from stages.merge.parts import ROWS, Parts, moved
 
 PATHS = ("path", "camera")
 BUFFER = 1 << 26  # bytes that are copied at a time
+BLOCK_ROWS = 256  # rows of a map that are copied at a time
 
 
 def join_variable(parts: Parts, name: str, writer: ArtefactWriter, virtual: bool) -> None:
@@ -133,15 +134,15 @@ def _common_values(files: Sequence[h5py.File], name: str) -> Any:
     return values
 
 
-def _overlay(files: Sequence[h5py.File], name: str, target: h5py.Dataset, rows: int = 256) -> None:
+def _overlay(files: Sequence[h5py.File], name: str, target: h5py.Dataset) -> None:
     """Each part's own rows; without ``shard_rows``, whatever part has a value there (the others have NaN, or 0)."""
     if all(ROWS in file.attrs for file in files):
         for file in files:
             _copy_rows(file[name], target, *(int(v) for v in file.attrs[ROWS]))
         return
     height = target.shape[-2]
-    for first in range(0, height, rows):
-        part = (..., slice(first, min(height, first + rows)), slice(None))
+    for first in range(0, height, BLOCK_ROWS):
+        part = (..., slice(first, min(height, first + BLOCK_ROWS)), slice(None))
         joined = files[0][name][part]
         for file in files[1:]:
             other = file[name][part]
@@ -151,7 +152,7 @@ def _overlay(files: Sequence[h5py.File], name: str, target: h5py.Dataset, rows: 
         target[part] = joined
 
 
-def _copy_rows(source: h5py.Dataset, target: h5py.Dataset, first: int, last: int, rows: int = 256) -> None:
-    for row in range(first - first % rows, last, rows):
-        part = (..., slice(max(first, row), min(last, row + rows)), slice(None))
+def _copy_rows(source: h5py.Dataset, target: h5py.Dataset, first: int, last: int) -> None:
+    for row in range(first - first % BLOCK_ROWS, last, BLOCK_ROWS):
+        part = (..., slice(max(first, row), min(last, row + BLOCK_ROWS)), slice(None))
         target[part] = source[part]

@@ -19,17 +19,19 @@ from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
 
 MAXIMUM_PAIRS = 512  # enough for a handful of numbers
 MAXIMUM_PIXELS = 30_000
+BATCH = 32  # pairs
+STEP = 1e-5  # of central differences, which in double precision are then exact to about 1e-9
 
 
-def sample_batches(reader: PairReader, indices: NDArray[np.int64], size: int = 32) -> Iterator[Batch]:
+def sample_batches(reader: PairReader, indices: NDArray[np.int64]) -> Iterator[Batch]:
     """Batches of evenly chosen pairs, at most about MAXIMUM_PAIRS of them.
 
     indices : (n,), of pairs
     """
     step = max(1, len(indices) // MAXIMUM_PAIRS)
     chosen = indices[::step]
-    for first in range(0, len(chosen), size):
-        yield reader.batch(chosen[first : first + size])
+    for first in range(0, len(chosen), BATCH):
+        yield reader.batch(chosen[first : first + BATCH])
 
 
 @dataclass(frozen=True)
@@ -145,7 +147,7 @@ def _residual(rendered: Tensor, image: Tensor, frame: Tensor | None) -> tuple[Te
     return gain, y - gain * x
 
 
-def _slopes(render: Callable[[Tensor], Tensor], raw: Tensor, step: float = 1e-5) -> Tensor:
-    """(C, N) by central differences: in double precision exact to about 1e-9."""
-    shifts = step * torch.eye(len(raw), dtype=raw.dtype)
-    return torch.stack([(render(raw + shift) - render(raw - shift)) / (2 * step) for shift in shifts])
+def _slopes(render: Callable[[Tensor], Tensor], raw: Tensor) -> Tensor:
+    """(C, N) by central differences."""
+    shifts = STEP * torch.eye(len(raw), dtype=raw.dtype)
+    return torch.stack([(render(raw + shift) - render(raw - shift)) / (2 * STEP) for shift in shifts])

@@ -18,7 +18,6 @@ class Geometry:
 
     sun: NDArray[np.float64]
     camera: NDArray[np.float64]
-    convergence_deg: NDArray[np.float64]
 
 
 def crop_geometry(
@@ -30,7 +29,7 @@ def crop_geometry(
     to_sun /= np.linalg.norm(to_sun, axis=1, keepdims=True)
     sun = np.einsum("nij,nj->ni", local.axes, to_sun)
     camera = np.einsum("nij,nj->ni", local.axes, camera_position - centre)
-    return Geometry(sun, camera, local.convergence_deg)
+    return Geometry(sun, camera)
 
 
 def check_directions(frame: Frame, geometry: Geometry) -> None:

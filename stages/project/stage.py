@@ -177,7 +177,7 @@ def _pair(view: View, place: int, heights: NDArray[np.float32], scene: Scene) ->
         horizon=angle,
         sun=sun,
         camera=camera,
-        convergence_deg=float(view.geometry.convergence_deg[place]),
+        convergence_deg=float(view.local.convergence_deg[place]),
         displacement=displacement,
         ortho=pixels.ortho,
     )

@@ -16,7 +16,7 @@ from schemas.later import imported_later
 from stages.simulate.recipe import Config, make_config, read_recipe, recipe_json
 
 if TYPE_CHECKING:
-    from stages.simulate.stage import Summary, run
+    from stages.simulate.stage import run
 
 __getattr__ = imported_later(__name__, "stage")
-__all__ = ["Config", "Summary", "make_config", "read_recipe", "recipe_json", "run"]
+__all__ = ["Config", "make_config", "read_recipe", "recipe_json", "run"]

@@ -24,7 +24,7 @@ from stages.simulate.hidden import Hidden
 from stages.simulate.orbits import RADIUS, Pass, plan_passes
 from stages.simulate.radiance import Scene, View, blur, point_spread, radiance
 from stages.simulate.recipe import Config
-from stages.simulate.reflectance import MARGIN, Truth, albedo
+from stages.simulate.reflectance import MARGIN, Truth, log_albedo
 from stages.simulate.terrain import Terrain
 from stages.simulate.write import NODATA_FLOAT, ImageFile, ImageTruth, open_geotiff, table_row, write_table, write_truth
 
@@ -121,11 +121,9 @@ def _make_ground(config: Config, terrain: Terrain, scene: Scene, progress: Progr
         progress(first, size, "terrain rows")
         count = min(GROUND_ROWS, size - first)
         ground = terrain.block(first - MARGIN, -MARGIN, count + 2 * MARGIN, size + 2 * MARGIN)
-        logs = albedo(config, ground, first, 0)
         rows = slice(first, first + count)
         scene.elevation[rows] = ground.elevation[MARGIN:-MARGIN, MARGIN:-MARGIN]
-        scene.log_geometry[rows] = logs.geometry
-        scene.log_free[rows] = logs.free
+        scene.log_geometry[rows], scene.log_free[rows] = log_albedo(config, ground, first)
     progress(size, size, "terrain rows")
 
 

@@ -13,7 +13,7 @@ from stages.train.config import Config
 
 if TYPE_CHECKING:
     from stages.train.checks import check
-    from stages.train.stage import Summary, run
+    from stages.train.stage import run
 
 __getattr__ = imported_later(__name__, "stage", "checks")
-__all__ = ["Config", "Summary", "check", "run"]
+__all__ = ["Config", "check", "run"]

@@ -59,11 +59,7 @@ def prefetch(
         for indices, turns in steps:
             following = pool.submit(reader.batch, indices, turns)
             if waiting is not None:
-                yield _arrive(waiting.result(), device)
+                yield waiting.result().to(device)
             waiting = following
         if waiting is not None:
-            yield _arrive(waiting.result(), device)
-
-
-def _arrive(batch: Batch, device: torch.device) -> Batch:
-    return batch if device.type == "cpu" else batch.to(device)
+            yield waiting.result().to(device)

@@ -11,7 +11,7 @@ from typing import Any
 from markupsafe import Markup
 
 from stages.common import page
-from stages.common.page.sentences import Sentence, compared, counted, listed
+from stages.common.page.sentences import Sentence, compared, counted, listed, words
 
 BUDGET = {
     "named": "the causes that were named",
@@ -119,9 +119,9 @@ def _cause(cause: dict[str, Any]) -> list[str]:
     values = []
     for name, v in cause.get("parameters", {}).items():
         unit = "" if v.get("unit", "1") == "1" else f" {v['unit']}"
-        value = f"{name} = {number(v['value'], '.3g')} +- {number(v['error'], '.1g')}{unit}"
+        value = f"{name} = {formatted(v['value'], '.3g')} +- {formatted(v['error'], '.1g')}{unit}"
         values.append(value.replace(" ", "\u00a0"))
-    before, after = (number(cause.get(f"residual_rms_{k}"), ".4f") for k in ("before", "after"))
+    before, after = (formatted(cause.get(f"residual_rms_{k}"), ".4f") for k in ("before", "after"))
     others = [words(name) for name in cause.get("group", []) if name != cause["effect"]]
     gain = [cause.get(k) for k in ("held_out_gain_percent", "held_out_low", "held_out_high")]
     return [
@@ -129,7 +129,7 @@ def _cause(cause: dict[str, Any]) -> list[str]:
         "; ".join(values) or "-",
         f"{before} to {after}",
         percent(*gain),
-        number(cause.get("p_family_wise"), ".2g"),
+        formatted(cause.get("p_family_wise"), ".2g"),
         ", ".join(others) or "-",
     ]
 
@@ -137,7 +137,7 @@ def _cause(cause: dict[str, Any]) -> list[str]:
 def _rejected(result: dict[str, Any]) -> list[Markup]:
     parts = []
     rows = [
-        [words(r["effect"]), number(r.get("gain_nats"), ".0f"), str(r.get("why", "-"))]
+        [words(r["effect"]), formatted(r.get("gain_nats"), ".0f"), str(r.get("why", "-"))]
         for r in result.get("rejected") or []
     ]
     if rows:
@@ -169,13 +169,8 @@ def _unsettled(result: dict[str, Any], about: Callable[[str], About] | None) -> 
     return parts
 
 
-def words(name: str) -> str:
-    """'sun_azimuth' as 'sun azimuth'"""
-    return name.replace("_", " ")
-
-
-def number(value: float | None, form: str) -> str:
-    """A number as text, "-" where there is none."""
+def formatted(value: float | None, form: str) -> str:
+    """A number in Python's format, "-" where there is none."""
     return "-" if value is None else format(value, form)
 
 

@@ -23,8 +23,13 @@ def bounds(gain: dict[str, Any]) -> str:
 
 def listed(names: list[str]) -> str:
     """'a, b and c', as words."""
-    words = [name.replace("_", " ") for name in names]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else "nothing"
+    spoken = [words(name) for name in names]
+    return spoken[0] if len(spoken) == 1 else f"{', '.join(spoken[:-1])} and {spoken[-1]}" if spoken else "nothing"
+
+
+def words(name: str) -> str:
+    """'sun_azimuth' as 'sun azimuth'"""
+    return name.replace("_", " ")
 
 
 def compared(ours: str, other: str, gain: dict[str, Any], on: str) -> Sentence:
