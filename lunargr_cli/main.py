@@ -23,7 +23,7 @@ from lunargr_cli.console import flush_out, own_streams, say_effort, say_error, w
 from lunargr_cli.options import check_numbers
 from lunargr_cli.paths import guarded
 from lunargr_cli.spelling import running, spell
-from schemas.command_line import said
+from schemas.command_line import recording
 from schemas.errors import EXIT_CODE, InputError, LunargrError
 from schemas.files.locks import claim
 
@@ -81,12 +81,9 @@ def _alone(command: Callable[..., None], shared: bool) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
-        before = said.set((_plain(_command_line()), _plain(_folder())))
-        try:
-            with guarded(command, *arguments, **options), _lock(*arguments, **options):
-                command(*arguments, **options)
-        finally:
-            said.reset(before)
+        made_by = _plain(_command_line()), _plain(_folder())
+        with recording(made_by), guarded(command, *arguments, **options), _lock(*arguments, **options):
+            command(*arguments, **options)
 
     def _lock(*arguments: Any, **options: Any) -> contextlib.AbstractContextManager[None]:
         output = inspect.signature(command).bind(*arguments, **options).arguments.get("output")

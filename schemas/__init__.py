@@ -4,19 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from schemas.artefacts import CHECKPOINT, CROPS, DIAGNOSIS, EVALUATION, PAIRS, SCENE, SPLITS, SVBRDF, UNITS
+from schemas.artefacts import CHECKPOINT, CROPS, DIAGNOSIS, EVALUATION, PAIRS, SCENE, SPLITS, SVBRDF, TRUTH, UNITS
 from schemas.declaration import SCHEMAS, Attribute, Schema, Variable, get_schema
-from schemas.errors import (
-    EXIT_CODE,
-    ArtefactError,
-    ConfigError,
-    GeometryError,
-    InputError,
-    LunargrError,
-    RegistryError,
-)
+from schemas.errors import EXIT_CODE, ArtefactError, ConfigError, GeometryError, InputError, LunargrError, RegistryError
 from schemas.later import imported_later
-from schemas.truth import TRUTH
 
 if TYPE_CHECKING:
     from schemas.files.outputs import atomic_path, check_output, write_json

@@ -1,4 +1,4 @@
-"""What a file's numbers, text and links must be, by its declaration: looked at once, whenever an artefact is opened."""
+"""Checks of an artefact's numbers, text and links against its declaration, made whenever one is opened."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from schemas.errors import ArtefactError
 
 UNIT_TOLERANCE = 1e-3  # of a unit vector's length: writers in float32, and in few decimals
 GSD_TOLERANCE = 1e-3  # relative: what writing numbers as text may cost
-LARGEST_TABLE = 100_000_000  # values of a table; beyond it a size is a slip of the pen, or worse
+LARGEST_TABLE = 100_000_000  # values of a table; a larger size is an error of the file's writer
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def has_control_characters(text: str) -> bool:
-    """Whether text holds what a terminal would obey and no file can be named by."""
+    """Whether text holds control characters, which a terminal obeys, or surrogates, which no file name can hold."""
     return _CONTROL.search(text) is not None
 
 
 def parse_json(text: str, where: str, error: type[Exception] = ArtefactError, advice: str = "write it again") -> Any:
-    """What JSON text holds. Raises ``error`` for anything else, for deep nesting and for text that is no Unicode."""
+    """The content of JSON text. Raises ``error`` for other text, for deep nesting and for what is no Unicode."""
     try:
         found = json.loads(text)
         json.dumps(found, ensure_ascii=False).encode()
@@ -44,10 +44,10 @@ def parse_json(text: str, where: str, error: type[Exception] = ArtefactError, ad
 
 
 def check_links(path: Path, file: h5py.File) -> None:
-    """All that an artefact holds lies in it: no external file is opened for it, no link goes round. Raises ArtefactError."""
+    """Refuse data outside the file, and links that lead nowhere or in a circle. Raises ArtefactError."""
     seen: set[int] = set()
 
-    def look(group: h5py.Group) -> None:
+    def visit(group: h5py.Group) -> None:
         for name in group:
             where = f"{path}:{group.name.rstrip('/')}/{name}"
             link = group.get(name, getlink=True)
@@ -70,14 +70,14 @@ def check_links(path: Path, file: h5py.File) -> None:
                 address = h5py.h5o.get_info(node.id).addr
                 if address not in seen:
                     seen.add(address)
-                    look(node)
+                    visit(node)
 
     seen.add(h5py.h5o.get_info(file.id).addr)
-    look(file)
+    visit(file)
 
 
 def check_attributes(path: Path, file: h5py.File, schema: Schema) -> None:
-    """Kinds, ranges and choices of the root attributes. Raises ArtefactError."""
+    """Check kinds, ranges and choices of the root attributes. Raises ArtefactError."""
     for attribute in (*ROOT_ATTRIBUTES, *schema.attributes):
         if attribute.name in file.attrs:
             _check_attribute(path, file, attribute, f"write it again with 'lunargr {schema.stage}'")
@@ -91,13 +91,11 @@ def _check_attribute(path: Path, file: h5py.File, attribute: Attribute, advice: 
         raise ArtefactError(f"{where}: cannot be read ({error}); {advice}.") from None
     if attribute.kind in ("number", "integer"):
         number = np.ravel(value) if isinstance(value, np.ndarray | np.generic | int | float) else np.array(["?"])
-        good = number.size == 1 and number.dtype.kind in "iufb" and math.isfinite(number[0])
-        if good and attribute.kind == "integer":
-            good = float(number[0]).is_integer()
-        if good:
-            low, high = _bounds(attribute)
-            good = low <= number[0] <= high
-        if not good:
+        low, high = _bounds(attribute)
+        good = (
+            number.size == 1 and number.dtype.kind in "iufb" and math.isfinite(number[0]) and low <= number[0] <= high
+        )
+        if not good or (attribute.kind == "integer" and not float(number[0]).is_integer()):
             raise ArtefactError(f"{where}: expected {_wanted(attribute)}, found {_short(value)}; {advice}.")
         return
     text = as_text(value)
@@ -113,7 +111,7 @@ def _check_attribute(path: Path, file: h5py.File, attribute: Attribute, advice: 
 
 
 def check_georeference(path: Path, file: h5py.File, schema: Schema) -> None:
-    """The numbers that place a map: north up, in pixels as large as the file says. Raises ArtefactError."""
+    """Refuse a map whose georeference is absent, not north up, or not of pixels of ``gsd_m``. Raises ArtefactError."""
     if not any(v.georeferenced for v in schema.variables):
         return
     where, advice = f"{path}:/crs", f"write it again with 'lunargr {schema.stage}'"
@@ -146,7 +144,7 @@ def as_text(value: Any) -> str | None:
 
 
 def check_values(path: Path, file: h5py.File, schema: Schema) -> None:
-    """Ranges, flags, indices, directions and text of everything small. Raises ArtefactError."""
+    """Check ranges, flags, indices, directions and text of all variables that are tables. Raises ArtefactError."""
     for variable in schema.variables:
         if variable.is_table and variable.name in file:
             data = file[variable.name]

@@ -1,17 +1,29 @@
-"""The command line that a run was started with, for those that write it down; light, for those that know it."""
+"""The command line of the run, which artefacts record. Imports nothing heavy: the command line's own module sets it."""
 
 from __future__ import annotations
 
+import contextlib
 import shlex
+from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
 # (command line, folder), None where lunargr is used as a library
-said: ContextVar[tuple[str, str] | None] = ContextVar("said", default=None)
+running_command: ContextVar[tuple[str, str] | None] = ContextVar("running_command", default=None)
+
+
+@contextlib.contextmanager
+def recording(command: tuple[str, str] | None) -> Iterator[None]:
+    """Within this block artefacts record this (command line, folder) as what made them."""
+    token = running_command.set(command)
+    try:
+        yield
+    finally:
+        running_command.reset(token)
 
 
 def whole_command(command: str, output: Path) -> str:
-    """What one run would have been called with, from a shard's command line: no --shard, and the whole's name."""
+    """The command line of one whole run, from that of a shard: without --shard, and with the whole's ``output``."""
     words, kept, named, skip = shlex.split(command), [], False, False
     for word in words:
         name, equals, _ = word.partition("=")

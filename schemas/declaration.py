@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import functools
+from dataclasses import dataclass
 
 from schemas.errors import RegistryError
 
@@ -14,10 +15,10 @@ class Variable:
     """One variable of an artefact.
 
     ``unit`` is a UDUNITS string, ``"1"`` for pure numbers, ``"dn"`` among ``unit_choices`` where images may be uncalibrated;
-    ``flags`` maps meaning -> value for flag variables; ``compress`` is for masks, which deflate to nothing.
-    What the values must be is looked at whenever a file is opened, for all that is no map and no stack of crops:
-    ``minimum`` .. ``maximum``, ``finite`` (otherwise NaN = unknown), ``unit_vector`` along the last dimension, ``index_of``
-    a dimension; flags hold their own values only, and integers are whole.
+    ``flags`` : (meaning, value) of a flag variable; ``compress`` is for masks, which deflate to nearly nothing.
+    Checked whenever a file is opened, but for maps and stacks of crops: ``minimum`` .. ``maximum``, ``finite``
+    (otherwise NaN = unknown), ``unit_vector`` along the last dimension, ``index_of`` a dimension; flag variables hold
+    the values in ``flags`` only, integers are whole.
     """
 
     name: str
@@ -39,7 +40,7 @@ class Variable:
 
     @property
     def is_table(self) -> bool:
-        """Whether it is small, and its values are checked on opening; maps and crops are looked at as they are read."""
+        """Whether its values are checked when a file is opened; those of maps and crops are checked when read."""
         return len(self.dims) <= 2 and not self.georeferenced
 
 
@@ -84,10 +85,10 @@ class Schema:
     sizes: tuple[tuple[str, int], ...] = ()  # dimensions of a fixed size
     # Other programs also write pairs.h5: such a file need not name its schema, only hold its variables.
     foreign_writers: bool = False
-    _index: dict[str, Variable] = field(default_factory=dict, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
-        self._index.update({v.name: v for v in self.variables})
+    @functools.cached_property
+    def _index(self) -> dict[str, Variable]:
+        return {v.name: v for v in self.variables}
 
     def __getitem__(self, name: str) -> Variable:
         try:

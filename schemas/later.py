@@ -1,4 +1,4 @@
-"""What is imported when it is first asked for: short commands must answer at once."""
+"""Modules that are imported when they are first used: short commands must answer at once."""
 
 from __future__ import annotations
 
@@ -11,13 +11,10 @@ from typing import Any
 
 
 def imported_later(package: str, *modules: str) -> Callable[[str], Any]:
-    """The package's ``__getattr__``, for what its ``__all__`` lists.
-
-    modules : of the package, in which a name is looked for in this order
-    """
+    """A package's ``__getattr__``, which looks for the names in its ``__all__`` in these of its modules, in order."""
 
     def find(name: str) -> Any:
-        # Others may be modules of the package, which Python then imports itself.
+        # A name that ``__all__`` lacks may be a module of the package, which Python then imports itself.
         for module in modules if name in sys.modules[package].__all__ else ():
             loaded = importlib.import_module(f"{package}.{module}")
             if name in vars(loaded):
@@ -28,7 +25,7 @@ def imported_later(package: str, *modules: str) -> Callable[[str], Any]:
 
 
 class _StandIn(ModuleType):
-    """A module's place until something of it is asked for. Not importlib's LazyLoader: for it, `import name` asks already."""
+    """Stands for a module until one of its attributes is used; importlib's LazyLoader loads at `import name`."""
 
     def __getattr__(self, attribute: str) -> Any:
         if sys.modules.get(self.__name__) is self:

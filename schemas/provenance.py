@@ -5,12 +5,11 @@ Every artefact carries the records of all that it descends from, so that the cha
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -20,10 +19,10 @@ import h5py
 import numpy as np
 
 from schemas.checks import parse_json
-from schemas.command_line import said
+from schemas.command_line import running_command
 from schemas.declaration import Schema
 from schemas.errors import ArtefactError
-from schemas.rasters import raster_text
+from schemas.rasters import raster_kind, read_raster
 
 CONVENTIONS = "CF-1.11"
 SIDECAR = "record.json"  # beside files that cannot carry a record themselves: rasters and tables
@@ -32,55 +31,37 @@ known_digests: dict[tuple[str, int, int], str] = {}
 
 
 def sha256(path: Path) -> str:
-    """The SHA-256 of a file, read in blocks, and once only while the file stays as it is."""
+    """The SHA-256 of a file, worked out once while the file stays as it is."""
     state = os.stat(path)
     key = (os.path.realpath(path), state.st_size, state.st_mtime_ns)
     if key not in known_digests:
-        digest = hashlib.sha256()
         with open(path, "rb") as stream:
-            while block := stream.read(1 << 22):
-                digest.update(block)
-        known_digests[key] = digest.hexdigest()
+            known_digests[key] = hashlib.file_digest(stream, "sha256").hexdigest()
     return known_digests[key]
 
 
 def changed_inputs() -> list[str]:
-    """The files hashed by this process that are not any more what they were."""
-    changed = []
-    for path, size, modified in known_digests:
-        try:
-            state = os.stat(path)
-        except OSError:
-            changed.append(path)
-            continue
-        if (state.st_size, state.st_mtime_ns) != (size, modified):
-            changed.append(path)
-    return changed
+    """The files that changed, or went, since this process hashed them."""
+    return [path for path, *state in known_digests if file_state(path) != state]
 
 
-@contextlib.contextmanager
-def run_by(command: tuple[str, str] | None) -> Iterator[None]:
-    """Within this block artefacts say that they are made by this command line, in this folder."""
-    token = said.set(command)
+def file_state(path: str | Path) -> list[int]:
+    """Size and time of change of a file, by which a change of its content shows; empty where there is no such file."""
     try:
-        yield
-    finally:
-        said.reset(token)
-
-
-def current_command() -> tuple[str, str] | None:
-    """(command line, folder) of the run, None where lunargr is used as a library."""
-    return said.get()
+        found = os.stat(path)
+    except OSError:
+        return []
+    return [found.st_size, found.st_mtime_ns]
 
 
 def describe_run(schema: Schema, config: Mapping[str, Any], inputs: Sequence[Path], seed: int | None) -> dict[str, Any]:
-    """The root attributes that say who makes an artefact now, and from what."""
+    """The root attributes of an artefact that is being made: by which command, and from which inputs."""
     about = {"title": schema.title, "lunargr_schema": schema.name, "schema_version": np.int32(schema.version)}
     return {"Conventions": CONVENTIONS} | about | _describe(schema.stage, config, inputs, seed)
 
 
 def raster_record(stage: str, config: Mapping[str, Any], inputs: Sequence[Path]) -> str:
-    """The same for a GeoTIFF or EXR, which holds it as one line of JSON: see ``schemas.rasters``."""
+    """The record of a GeoTIFF or EXR that is being made, as one line of JSON: see ``schemas.rasters``."""
     return pack_record({"lunargr_schema": stage} | _describe(stage, config, inputs, None))
 
 
@@ -92,7 +73,7 @@ def pack_record(root: Mapping[str, Any]) -> str:
 
 def _describe(stage: str, config: Mapping[str, Any], inputs: Sequence[Path], seed: int | None) -> dict[str, Any]:
     sources = [{"name": Path(p).name, "sha256": sha256(Path(p))} for p in inputs]
-    command, folder = current_command() or ("", "")
+    command, folder = running_command.get() or ("", "")
     ancestors: dict[str, dict[str, Any]] = {}
     for path, source in zip(inputs, sources, strict=True):
         own, earlier = read_record(Path(path))
@@ -101,7 +82,7 @@ def _describe(stage: str, config: Mapping[str, Any], inputs: Sequence[Path], see
             ancestors[source["sha256"]] = own
     return {
         "lunargr_version": version("lunargr"),
-        "history": f"{_now()} {command or 'lunargr ' + stage}",
+        "history": f"{datetime.datetime.now(datetime.UTC):%Y-%m-%dT%H:%M:%SZ} {command or 'lunargr ' + stage}",
         "command": command,
         "folder": folder,
         "config": json.dumps(config, default=str, sort_keys=True),
@@ -129,13 +110,16 @@ def read_record(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, 
         return None, {}
     record, ancestors = _unpack(root, path)
     if digests:
-        record["images"] = {"count": len(digests), "sha256": digest_of(d for pair in digests for d in pair if d)}
+        record["images"] = {"count": len(digests), "sha256": combine_digests(d for pair in digests for d in pair if d)}
     return record, ancestors
 
 
 def _read_raster(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, Any]]]:
-    """The same of a GeoTIFF or EXR that holds its record, or has it beside it."""
-    text = raster_text(path)
+    """The record of a raster or another file: a GeoTIFF or EXR may hold it, others have it in SIDECAR beside them."""
+    try:
+        text = read_raster(path).record if raster_kind(path) else ""
+    except ArtefactError:
+        text = ""
     if not text:
         return _read_sidecar(path), {}
     found = parse_json(text, f"{path}: its record")
@@ -144,6 +128,7 @@ def _read_raster(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str,
 
 
 def _unpack(root: Mapping[str, Any], path: object) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """The record in an artefact's root attributes, and those of its ancestors by SHA-256. Raises ArtefactError."""
     record = {
         "schema": str(root["lunargr_schema"]),
         "history": str(root.get("history", "")),
@@ -158,7 +143,7 @@ def _unpack(root: Mapping[str, Any], path: object) -> tuple[dict[str, Any], dict
 
 
 def _checked(path: object, record: Any, ancestors: Any) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Both, if :func:`chain` can follow them. Raises ArtefactError."""
+    """A record and those of its ancestors, if :func:`chain` can follow them. Raises ArtefactError."""
     if not (_is_record(record) and isinstance(ancestors, dict) and all(_is_record(r) for r in ancestors.values())):
         raise ArtefactError(
             f"{path}: expected records of the files it descends from in 'inputs' and 'provenance', found something else; "
@@ -189,25 +174,17 @@ def _is_record(record: Any) -> bool:
     )
 
 
-def digest_of(digests: Iterable[str]) -> str:
-    """One for many files: what ``sha256sum FILES | cut -c 1-64 | sha256sum`` prints."""
+def combine_digests(digests: Iterable[str]) -> str:
+    """One SHA-256 for many files, of theirs: what ``sha256sum FILES | cut -c 1-64 | sha256sum`` prints."""
     return hashlib.sha256("".join(f"{digest}\n" for digest in digests).encode()).hexdigest()
 
 
-def sidecar(stage: str, config: Mapping[str, Any], seed: int, files: Sequence[Path], images: Sequence[Path]) -> str:
-    """What SIDECAR holds in a folder of rasters and tables: their record, and which contents it is the record of."""
-    command, home = current_command() or ("", "")
-    record = {
-        "schema": stage,
-        "history": f"{_now()} {command or 'lunargr ' + stage}",
-        "command": command,
-        "folder": home,
-        "version": version("lunargr"),
-        "seed": seed,
-        "config": config,
-        "inputs": [],
-        "made_images": digest_of(sha256(path) for path in images),
-    }
+def folder_record(
+    stage: str, config: Mapping[str, Any], seed: int, files: Sequence[Path], images: Sequence[Path]
+) -> str:
+    """What SIDECAR holds in a folder of rasters and tables: their record, and the hash of each of these files."""
+    record, _ = _unpack({"lunargr_schema": stage} | _describe(stage, config, [], seed), "the run")
+    record |= {"config": config, "made_images": combine_digests(sha256(path) for path in images)}
     made = {path.name: sha256(path) for path in (*files, *images)}
     return json.dumps({"record": record, "files": made}, indent=1, default=str) + "\n"
 
@@ -219,10 +196,6 @@ def _read_sidecar(path: Path) -> dict[str, Any] | None:
         return found["record"] if good else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
-
-
-def _now() -> str:
-    return datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""GeoTIFF and EXR that hold the record of their run as one line of JSON, and what else they say of themselves."""
+"""The headers of GeoTIFF and EXR files: bands, tags, and the record of the run that made them, as one line of JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _EXR = (b"v/1\x01",)
 
 @dataclass(frozen=True)
 class Raster:
-    """bands : (name, unit, type) of each; shape : rows, columns; tags : what it says in words, the record left out"""
+    """The header of a raster. bands : (name, unit, type) of each; shape : rows, columns; tags : without the record"""
 
     kind: str
     shape: tuple[int, int]
@@ -34,18 +34,8 @@ def raster_kind(path: Path) -> str:
     return "GeoTIFF" if start in _TIFF else "EXR" if start in _EXR else ""
 
 
-def raster_text(path: Path) -> str:
-    """The record that a raster holds, '' where it holds none or cannot be read."""
-    if not raster_kind(path):
-        return ""
-    try:
-        return read_raster(path).record
-    except ArtefactError:
-        return ""
-
-
 def read_raster(path: Path) -> Raster:
-    """What a GeoTIFF or EXR says of itself. Raises ArtefactError."""
+    """The header of a GeoTIFF or EXR. Raises ArtefactError."""
     return _read_exr(path) if raster_kind(path) == "EXR" else _read_tiff(path)
 
 

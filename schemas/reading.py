@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,8 @@ from schemas.errors import ArtefactError
 from schemas.files.hdf5 import silence_hdf5
 
 
-def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5py.File:
-    """Open an artefact for reading after checking that it is what it should be.
-
-    ``need`` names optional variables that this caller cannot do without. Raises ArtefactError.
-    """
+def open_artefact(path: Path, schema: Schema) -> h5py.File:
+    """Open an artefact for reading, after checking that it is what it should be. Raises ArtefactError."""
     path = Path(path)
     file = _open_hdf5(path)
     try:
@@ -28,7 +24,7 @@ def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5
         for variable in schema.variables:
             if variable.name in file:
                 _check_variable(path, file, variable)
-            elif variable.required or variable.name in need:
+            elif variable.required:
                 raise ArtefactError(
                     f"{path}:/{variable.name}: expected a variable ({variable.description}), found none; "
                     f"write it again with 'lunargr {schema.stage}'."
@@ -51,7 +47,7 @@ def open_artefact(path: Path, schema: Schema, *, need: Sequence[str] = ()) -> h5
 
 
 def read_kind(path: Path) -> Schema:
-    """The schema that an artefact says it follows. Raises ArtefactError."""
+    """The schema that an artefact names as its own. Raises ArtefactError."""
     with _open_hdf5(Path(path)) as file:
         name = _attribute(path, file, "lunargr_schema")
     if name not in SCHEMAS:
@@ -60,6 +56,18 @@ def read_kind(path: Path) -> Schema:
             f"artefacts are: {', '.join(SCHEMAS)}."
         )
     return SCHEMAS[name]
+
+
+def is_artefact(path: Path) -> bool:
+    """Whether a file is HDF5 with ``lunargr_schema``, as ours are, or is named .h5 and too damaged to tell."""
+    silence_hdf5()
+    if not (path.is_file() and h5py.is_hdf5(path)):
+        return False
+    try:
+        with h5py.File(path, "r") as file:
+            return "lunargr_schema" in file.attrs
+    except OSError:
+        return path.suffix.lower() in (".h5", ".hdf5")
 
 
 def _open_hdf5(path: Path) -> h5py.File:
@@ -86,9 +94,9 @@ def _check_kind(path: Path, file: h5py.File, schema: Schema) -> None:
     if not found and schema.foreign_writers:
         return
     if found != schema.name:
-        what = f"a '{found}'" if found else "an HDF5 file without 'lunargr_schema'"
+        kind = f"a '{found}'" if found else "an HDF5 file without 'lunargr_schema'"
         raise ArtefactError(
-            f"{path}: expected a '{schema.name}' artefact (from 'lunargr {schema.stage}'), found {what}; check the order of the files."
+            f"{path}: expected a '{schema.name}' artefact (from 'lunargr {schema.stage}'), found {kind}; check the order of the files."
         )
     version = file.attrs.get("schema_version", schema.version)
     if np.shape(version) not in ((), (1,)) or np.ravel(version)[0] != schema.version:
@@ -128,9 +136,8 @@ def _check_variable(path: Path, file: h5py.File, variable: Variable) -> None:
     allowed = (variable.unit, *variable.unit_choices)
     if unit and unit not in allowed:
         expected = " or ".join(f"'{u}'" for u in dict.fromkeys(allowed))
-        stage = _text(file.attrs.get("lunargr_schema", "")) or "it"
-        writer = SCHEMAS[stage].stage if stage in SCHEMAS else None
-        advice = f"write it again with 'lunargr {writer}'." if writer else "mend the writer of the file."
+        ours = SCHEMAS.get(_text(file.attrs.get("lunargr_schema", "")))
+        advice = f"write it again with 'lunargr {ours.stage}'." if ours else "mend the writer of the file."
         raise ArtefactError(f"{where}: expected units {expected}, found '{unit}'; {advice}")
 
 
@@ -152,11 +159,10 @@ def _check_sizes(path: Path, file: h5py.File, schema: Schema) -> None:
 
 
 def _check_views(path: Path, file: h5py.File) -> None:
-    """HDF5 reads what a lost file held as fill values, without a word: such an artefact must not look whole."""
+    """Refuse views of files that are gone, where HDF5 would silently read fill values. Raises ArtefactError."""
     for data in file.values():
         if isinstance(data, h5py.Dataset) and data.is_virtual:
-            plan = data.id.get_create_plist()
-            for source in {plan.get_virtual_filename(k) for k in range(plan.get_virtual_count())}:
+            for source in {part.file_name for part in data.virtual_sources()}:
                 if not (path if source == "." else path.resolve().parent / source).is_file():
                     raise ArtefactError(
                         f"{path}:{data.name}: expected the file '{source}' that it is a view of, found none; "
@@ -169,9 +175,9 @@ def _text(value: Any) -> str:
 
 
 def unpack(data: h5py.Dataset, values: Any) -> np.ndarray:
-    """Values read from ``data``, as CF means them: fill values become NaN in floats, and packed numbers are scaled.
+    """Values read from ``data``, decoded as CF says: packed numbers are scaled, fill values of floats become NaN.
 
-    Flags and other integers without ``scale_factor`` or ``add_offset`` stay as they are.
+    Flags and other integers without ``scale_factor`` or ``add_offset`` stay as they are. values : any shape, kept
     """
     values = np.asarray(values)
     packed = "scale_factor" in data.attrs or "add_offset" in data.attrs

@@ -15,7 +15,7 @@ import numpy as np
 
 from schemas.declaration import STRING, Schema, Variable
 from schemas.errors import ConfigError, InputError
-from schemas.files.hdf5 import UNKNOWN, lost, silence_hdf5
+from schemas.files.hdf5 import UNKNOWN, release_errors, silence_hdf5
 from schemas.files.outputs import atomic_path, check_output, is_full_disk, terminate_as_exception
 from schemas.provenance import describe_run
 
@@ -50,9 +50,9 @@ class ArtefactWriter:
         self._root_attributes = describe_run(schema, config or {}, inputs, seed) | dict(attributes or {})
         self._stack = contextlib.ExitStack()
         self.file: h5py.File
-        # A dataset that is let go of writes what it still holds where no one hears of a failure: they all stay to the end.
+        # A dataset that is released writes what it still holds, and no one hears of a failure: all are kept to the end.
         self._kept: list[h5py.Dataset] = []
-        self._lost_before = len(lost)
+        self._errors_before = len(release_errors)
         self._failed = False
 
     def __enter__(self) -> ArtefactWriter:
@@ -76,9 +76,9 @@ class ArtefactWriter:
                     scale = self.file.create_dataset(name, (size,), h5py.string_dtype() if named else ">f4")
                     scale.make_scale(name if named else _BARE_DIMENSION % size)
                     scale.attrs["_Netcdf4Dimid"] = np.int32(order)
-            for name, size in self.sizes.items():
+            for name in self.sizes:
                 if name in self.schema:
-                    self._create(self.schema[name], size_of_scale=size)
+                    self._create(self.schema[name], scale=True)
         except BaseException:
             if self._stack.__exit__(*sys.exc_info()):
                 raise RuntimeError("an artefact's error was swallowed") from None
@@ -114,9 +114,9 @@ class ArtefactWriter:
                 self.file[dim].attrs["long_name"] = self.schema[f"{dim}_name"].description
 
     def _flush(self) -> BaseException | None:
-        """Write everything that HDF5 still holds; what went wrong, now or where a dataset was let go of."""
-        if len(lost) > self._lost_before:
-            return lost[self._lost_before]
+        """Write everything that HDF5 still holds; returns what went wrong, now or when a dataset was released."""
+        if len(release_errors) > self._errors_before:
+            return release_errors[self._errors_before]
         try:
             self.file.flush()
         except (OSError, RuntimeError) as error:
@@ -130,23 +130,19 @@ class ArtefactWriter:
         )
 
     def _close(self) -> None:
-        if len(lost) > self._lost_before:
-            # HDF5 would follow a pointer into what it failed to let go of, and take the process down.
+        if len(release_errors) > self._errors_before:
+            # HDF5 would follow a pointer into what it failed to release, and take the process down.
             _abandoned.append(self.file)
             return
         try:
             self.file.close()
         except (OSError, RuntimeError) as error:
             _abandoned.append(self.file)
-            if not self._failed:  # else what went wrong first is what there is to say
+            if not self._failed:  # else the first error is the one to report
                 raise self._not_whole(error) from None
 
     def _create(
-        self,
-        variable: Variable,
-        size_of_scale: int | None = None,
-        unit: str | None = None,
-        decimals: int | None = None,
+        self, variable: Variable, scale: bool = False, unit: str | None = None, decimals: int | None = None
     ) -> h5py.Dataset:
         shape = tuple(self.sizes[d] for d in variable.dims)
         options: dict[str, Any] = {}
@@ -155,7 +151,7 @@ class ArtefactWriter:
             if chunks is None and len(shape) >= 3:  # one record (a pair, a band) a chunk: random access stays fast
                 chunks = (1,) * (len(shape) - 2) + shape[-2:]
                 if decimals is not None:  # a smaller piece spans less and takes fewer bits
-                    chunks = (1,) * (len(shape) - 2) + tuple(_piece(edge) for edge in shape[-2:])
+                    chunks = (1,) * (len(shape) - 2) + tuple(_packed_edge(edge) for edge in shape[-2:])
             if chunks is not None:
                 options["chunks"] = tuple(min(c, s) for c, s in zip(chunks, shape, strict=True))
             if variable.compress:
@@ -170,12 +166,12 @@ class ArtefactWriter:
                 if decimals is not None and shape and 0 not in shape:
                     options |= {"scaleoffset": decimals, "fillvalue": UNKNOWN}
         data = self.file.create_dataset(variable.name, shape=shape, dtype=dtype, track_order=True, **options)
-        if size_of_scale is not None:
+        if scale:
             data.make_scale(variable.name)
             if variable.name in _STANDARD_NAMES:
                 data.attrs["standard_name"] = _STANDARD_NAMES[variable.name]
             data.attrs["_Netcdf4Dimid"] = np.int32(list(self.sizes).index(variable.name))
-        self._describe(data, variable, unit, scale=size_of_scale is not None)
+        self._describe(data, variable, unit, scale)
         self._kept.append(data)
         return data
 
@@ -197,8 +193,9 @@ class ArtefactWriter:
     def dataset(self, name: str, unit: str | None = None, decimals: int | None = None) -> h5py.Dataset:
         """The open dataset ``name``, created from its declaration on first use, for block-wise writing.
 
-        ``decimals`` keeps so many digits after the point, by HDF5's scale-offset filter, which every reader undoes: a
-        chunk takes as many bits a value as its range needs. Unknown values are then UNKNOWN, and never NaN.
+        ``decimals`` is how many digits after the point are kept, by HDF5's scale-offset filter, which every reader
+        undoes: a chunk takes as many bits a value as its range needs. Unknown values are then written as UNKNOWN, never
+        as NaN.
         """
         if name not in self.file:
             return self._create(self.schema[name], unit=unit, decimals=decimals)
@@ -214,7 +211,7 @@ class ArtefactWriter:
         return target
 
     def link(self, name: str, sources: Sequence[tuple[tuple[slice, ...], h5py.Dataset, tuple[slice, ...]]]) -> None:
-        """Make a variable a view of datasets in other files: (where it goes, whole dataset, what of it).
+        """Make a variable a view of datasets in other files: (target part, source dataset, source part) of each.
 
         The files are named relative to this one, and must stay; :func:`open_artefact` checks that they are there.
         """
@@ -240,6 +237,6 @@ class ArtefactWriter:
         data.attrs["GeoTransform"] = " ".join(repr(v) for v in (c, a, b, f, d, e))
 
 
-def _piece(edge: int) -> int:
-    """The edge of a packed chunk: 64 or the nearest above it that divides ``edge``."""
+def _packed_edge(edge: int) -> int:
+    """px, the edge of a chunk that keeps some decimals: ``edge`` over as many whole chunks of 64 px or more as fit."""
     return edge // (edge // 64) if edge > 64 and edge % (edge // 64) == 0 else edge

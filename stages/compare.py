@@ -1,6 +1,6 @@
 """compare: which of several trained models predicts best, and which differences are larger than their noise.
 
-Two sources of noise count: training (the same model from several seeds) and the ground (which tiles were held out).
+The noise has two sources: training (several seeds of the same model), and the choice of ground (of the tiles held out).
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ def run(
     progress: Progress = show_nothing,
 ) -> dict[str, Any]:
     """Compare the runs behind (evaluation, checkpoints) of every model; writes JSON and curves into the folder ``output``."""
-    output = Output.of(output)
+    output = Output.at(output)
     runs = [run for evaluation, checkpoints in files for run in read_runs(evaluation, checkpoints)]
     result = compare(runs, config)
     write_curves(runs, output.file / CURVES)

@@ -58,7 +58,7 @@ def run(
     Raises InputError for a file without the needed bands, ConfigError for conventions that have no conversion or would
     lose something, RegistryError for an unknown convention.
     """
-    output = Output.of(output)
+    output = Output.at(output)
     start, end = get_convention(config.source), get_convention(config.target)
     model_difference(start, end)
     check_output(output.file, [source], output.overwrite)

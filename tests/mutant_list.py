@@ -53,7 +53,7 @@ KNOWN = (
         "training starts at the best uniform surface of all parts of the split",
     ),
     Mutant(
-        "stages/network/uniform.py",
+        "stages/train/start.py",
         "            radiometry = fit_radiometry(reader, indices, model, start)",
         f"            radiometry = fit_radiometry(reader, {ALL}, model, start)",
         (f"{LEAKS}::test_test_pairs_change_nothing_of_a_checkpoint",),
@@ -61,8 +61,8 @@ KNOWN = (
     ),
     Mutant(
         "stages/train/stage.py",
-        "predictor, training.radiometry, reader, train, validation, extensions",
-        'predictor, training.radiometry, reader, train, reader.indices("test"), extensions',
+        "fit_deviations(training, train, validation)",
+        'fit_deviations(training, train, reader.indices("test"))',
         (f"{LEAKS}::test_test_pairs_change_nothing_of_a_checkpoint",),
         "the deviations' factor is chosen on test ground",
     ),
@@ -229,7 +229,7 @@ STAGES = (
         "the training loss is a sum and not a mean over pixels",
     ),
     Mutant(
-        "stages/network/steps.py",
+        "stages/train/steps.py",
         "    order = rng.permutation(train)\n",
         "    order = rng.permutation(train)[1:]\n",
         ("tests/test_train.py::test_an_epoch_shows_every_training_pair_once",),
@@ -317,8 +317,8 @@ STAGES = (
     ),
     Mutant(
         "stages/common/intervals.py",
-        "float(stats.t.ppf(0.5 + level / 2, freedom))",
-        "float(stats.norm.ppf(0.5 + level / 2))",
+        "float(special.stdtrit(freedom, 0.5 + LEVEL / 2))",
+        "float(special.ndtri(0.5 + LEVEL / 2))",
         ("tests/test_intervals.py::test_student_of_one_degree_is_cauchy",),
         "intervals take the normal quantile for Student's",
     ),

@@ -83,4 +83,4 @@ def test_a_verdict_without_numbers_is_still_a_page(tmp_path):
     page.write_page(tmp_path / "d.html", Answer("cannot_tell", note="too few pixels"), None, [])
     text = (tmp_path / "d.html").read_text()
     assert "Too few pixels." in text and "<h2>" not in text
-    assert common.percent(None, None, None) == "not scored" and common.number(math.pi, ".2f") == "3.14"
+    assert common.percent(None, None, None) == "not scored" and common.formatted(math.pi, ".2f") == "3.14"

@@ -9,7 +9,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("stages/physics", "stages/network", "stages/effects", "stages/render", "stages/simulate")
+PACKAGES = (
+    "schemas", "stages/common", "stages/physics", "stages/pairs", "stages/network", "stages/effects",
+    "stages/simulate", "stages/ingest", "stages/sample", "stages/project", "stages/train", "stages/infer",
+    "stages/render", "stages/export", "stages/merge",
+)  # fmt: skip
 ARRAYS = re.compile(r"\b(ndarray|NDArray|Tensor|ArrayLike|Floats|Floats32|Mask|Array)\b")
 # one axis: ..., a number, a letter or two, or a plain word for it; with what is added to it or multiplied by it
 AXIS = r"(?:\.\.\.|\d+|[A-Za-z]\w?|rows|columns|lines|samples|height|width|count|states|strips)(?: ?[-+/*]? ?\w+)?"

@@ -165,7 +165,7 @@ def test_schedulers_that_are_not_there(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     from lunargr_cli.fanout import engines
 
-    monkeypatch.setattr(engines, "ANSWER", 1.0)
+    monkeypatch.setattr(engines, "ANSWER_WITHIN", 1.0)
     for where in ("tcp://127.0.0.1:9", "local:none", "nonsense"):
         with pytest.raises(ConfigError, match="--scheduler: ") as caught, engines.open_dask(where, tmp_path):
             pass

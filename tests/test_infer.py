@@ -14,6 +14,7 @@ from rasterio.transform import Affine
 
 from schemas import ArtefactError, ConfigError
 from stages import infer, ingest, merge, train
+from stages.infer import windows
 from stages.network.predictor import load_predictor
 
 FULL = {"device": "cpu", "precision": "fp32"}
@@ -186,9 +187,9 @@ def test_shards_make_the_same_map(small_artefacts, checkpoint, reference, tmp_pa
 def test_windows_cover_every_pixel_once_blended():
     for length, window, stride, offset in [(100, 30, 20, 0), (100, 30, 30, 7), (10, 30, 15, 3), (97, 16, 5, 100)]:
         total = np.zeros(length)
-        for first, last in infer.axis_windows(length, window, stride, offset):
+        for first, last in windows.axis_windows(length, window, stride, offset):
             assert 0 <= first < last <= length
-            total[first:last] += infer.blend_weights(first, last, window - stride, length)
+            total[first:last] += windows.blend_weights(first, last, window - stride, length)
         assert (total > 0).all()
 
 
@@ -219,7 +220,7 @@ def test_a_dem_with_nothing_at_its_edges(checkpoint, tmp_path):
 
 def test_weights_of_neighbouring_windows_add_up_to_one():
     """Both fade over what they share, so that neither ends with a step; at the map's edges none fades."""
-    first, second = infer.blend_weights(0, 40, 10, 100), infer.blend_weights(30, 70, 10, 100)
+    first, second = windows.blend_weights(0, 40, 10, 100), windows.blend_weights(30, 70, 10, 100)
     np.testing.assert_allclose(first[30:] + second[:10], 1, rtol=1e-6)
     np.testing.assert_allclose(second[:10], (np.arange(10) + 0.5) / 10, rtol=1e-5)
     np.testing.assert_array_equal(first[:30], 1)

@@ -48,7 +48,7 @@ def test_pieces_however_small_give_the_same_scene(small_files, tmp_path, monkeyp
     for name, dem in (("a", small_files.dem), ("b", strips)):
         ingest.run(dem, small_files.images, tmp_path / f"{name}.h5", ingest.Config(gsd=gsd, crop=32, block=64))
         monkeypatch.setattr(elevation, "STRIP_PX", 100)
-        monkeypatch.setattr(elevation, "STRIPS", 384 * 4 * 100)
+        monkeypatch.setattr(elevation, "STRIP_CACHE", 384 * 4 * 100)
         monkeypatch.setattr(rasters, "LARGEST_WINDOW", 5000)
     with h5py.File(tmp_path / "a.h5") as a, h5py.File(tmp_path / "b.h5") as b:
         np.testing.assert_allclose(a["elevation"][...], b["elevation"][...], atol=1e-4, rtol=0)

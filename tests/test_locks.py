@@ -14,7 +14,7 @@ import pytest
 
 from schemas import ConfigError, atomic_path
 from schemas.files.companions import companions_of
-from schemas.files.locks import SILENCE, claim, host, lock_path, unlocked
+from schemas.files.locks import STALE_AFTER, claim, host, lock_path, unlocked
 
 
 def hold(path, seconds=60):
@@ -68,7 +68,7 @@ def test_a_lock_of_another_machine_holds_until_it_was_silent_for_long(tmp_path):
     with pytest.raises(ConfigError, match="on elsewhere"), claim(output):
         pass
     assert sorted(p.name for p in tmp_path.iterdir()) == [lock.name]
-    silent = time.time() - SILENCE - 5
+    silent = time.time() - STALE_AFTER - 5
     os.utime(lock, (silent, silent))
     with claim(output):
         assert json.loads(lock.read_text())["host"] == host()

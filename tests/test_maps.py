@@ -18,7 +18,6 @@ from stages import infer, train
 from stages.common.threads import one_thread_each, share_out
 from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.crop_sums import PIECE, convolution, sum_over_crops
-from stages.network.deviations import _likelihood
 from stages.network.losses import crop_errors, squared_error
 from stages.network.pixels import Pixels, fit_pixels
 from stages.network.predictor import load_predictor
@@ -27,6 +26,7 @@ from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import get_model, masked_radiance_factor, model_names
 from stages.physics.photometry.deviation import radiance_deviation
 from stages.train import stage
+from stages.train.deviations import _likelihood
 
 SMALL = {"widths": (4, 8), "epochs": 2, "batch": 16, "lr": 5e-3, "device": "cpu", "precision": "fp32"}
 
@@ -185,9 +185,9 @@ def test_a_crop_that_is_bright_as_a_whole_costs_little(rng):
 def test_coefficients_may_be_negative_unless_told_otherwise():
     start = torch.tensor([0.08, 0.02, -0.0084])
     free = CoefficientMaps(get_model("M2"), (), start, 0.1)
-    torch.testing.assert_close(free.stack(free.shifted(torch.zeros(1, 3, 2, 2)), 1)[0, :, 0, 0], start)
+    torch.testing.assert_close(free.stack(free.unbounded(torch.zeros(1, 3, 2, 2)), 1)[0, :, 0, 0], start)
     kept = CoefficientMaps(get_model("M2"), (), start.abs(), 0.1, positive=True)
-    down = kept.stack(kept.shifted(torch.full((1, 3, 2, 2), -1.0)), 1)
+    down = kept.stack(kept.unbounded(torch.full((1, 3, 2, 2), -1.0)), 1)
     assert -0.002 < down.min() < 0
 
 

@@ -184,7 +184,8 @@ def test_radiometry_is_gain_and_offset_and_leaves_calibrated_images_alone():
     radiometry = Radiometry(gain, offset, calibrated=False)
     torch.testing.assert_close(radiometry.gain(), gain)
     torch.testing.assert_close(radiometry.offset(), offset)
-    out = radiometry(torch.full((2, 1, 1), 0.1), torch.tensor([0, 1])) * radiometry.scale
+    crop_gain, crop_offset = radiometry.crop_gains(torch.tensor([0, 1]))
+    out = (crop_gain * torch.full((2, 1, 1), 0.1) + crop_offset) * radiometry.scale
     torch.testing.assert_close(out.flatten(), torch.tensor([13.0, 35.0]))
     iof = Radiometry(torch.ones(2), torch.zeros(2), calibrated=True)
     assert not any(p.requires_grad for p in iof.parameters())

@@ -9,8 +9,8 @@ import torch.distributed as dist
 from torch import nn
 
 from stages.network.layers import Dropout, dropout_threshold, kept_values, layer_keys
-from stages.network.processes import sum_gradients
 from stages.network.unet import UNet
+from stages.train.processes import sum_gradients
 
 SHARES = (5, 2)  # crops of each process: unequal, as the last of a batch may be
 

@@ -92,7 +92,7 @@ def test_stack_crops_every_image_that_covers_a_place(small_artefacts, tmp_path):
 
 def test_places_of_a_stack_lie_side_by_side_while_there_is_room():
     """On open ground no two crops overlap; where there are more places than room all are taken, as far apart as may be."""
-    from stages.sample.places import _apart
+    from stages.sample.places import _pick_apart
 
     rng = np.random.default_rng(1)
     row, col = rng.integers(0, 400, (2, 2000))
@@ -100,7 +100,7 @@ def test_places_of_a_stack_lie_side_by_side_while_there_is_room():
     row, col = row[first], col[first]
 
     def nearest(wanted):
-        chosen = np.flatnonzero(_apart(row, col, wanted, 48, rng))
+        chosen = np.flatnonzero(_pick_apart(row, col, wanted, 48, rng))
         assert len(chosen) == wanted
         apart = np.maximum(*(np.abs(v[chosen, None] - v[chosen]) for v in (row, col)))
         return apart[~np.eye(wanted, dtype=bool)].min()

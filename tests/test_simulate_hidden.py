@@ -154,4 +154,4 @@ def test_options_are_parsed_and_refused():
     with pytest.raises(ConfigError, match="twice"):
         hidden_from_option("echo+echo")
     for effect in CHOICES:
-        assert parse_hidden([{"effect": effect}])[0].effect == effect
+        assert list(parse_hidden([{"effect": effect}])) == [effect]

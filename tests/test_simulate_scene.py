@@ -12,8 +12,7 @@ import pytest
 import rasterio
 from rasterio.warp import Resampling, reproject
 
-from schemas import ConfigError, InputError, RegistryError, open_artefact
-from schemas.truth import TRUTH
+from schemas import TRUTH, ConfigError, InputError, RegistryError, open_artefact
 from stages.simulate import make_config, read_recipe, recipe_json, run, stage
 from stages.simulate import radiance as render_module
 
@@ -297,6 +296,6 @@ def test_command_prints_a_recipe_that_it_reads_back(tmp_path, capsys):
     (tmp_path / "recipe.json").write_text(text)
     config = make_config(read_recipe(tmp_path / "recipe.json"))
     assert (config.size_px, config.gsd, config.dem_gsd, config.images, config.seed) == (500, 2.0, 1.0, 5, 9)
-    assert [h.effect for h in config.hidden_effects()] == ["echo"]
+    assert list(config.hidden_effects()) == ["echo"]
     with pytest.raises(ConfigError, match="one of them"):
         command(print_recipe=True, size_px=100, extent_m=1000.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from stages.infer.parallel import in_order, side_by_side
+from stages.infer.parallel import in_order, run_in_threads
 from stages.infer.terrain import TerrainReader, valid_part
 from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.mapper import Mapper
@@ -119,13 +119,13 @@ def test_side_by_side_hands_over_everything_and_every_error():
             raise ValueError("nine")
 
     torch.set_num_threads(threads := torch.get_num_threads())
-    found = list(in_order(side_by_side([3, 0, 5, 2], work, 3)))
+    found = list(in_order(run_in_threads([3, 0, 5, 2], work, 3)))
     expected = [(0, 0), (0, 1), (0, 2), (0, None), (1, None), *((2, k) for k in range(5)), (2, None), (3, 0), (3, 1)]
     assert found == [*expected, (3, None)]
     with pytest.raises(ValueError, match="nine"):
-        list(side_by_side([1, 9, 4], work, 2))
+        list(run_in_threads([1, 9, 4], work, 2))
     assert torch.get_num_threads() == threads
-    jobs = side_by_side([1000] * 3, work, 2)
+    jobs = run_in_threads([1000] * 3, work, 2)
     next(jobs)
     jobs.close()  # an interruption: no thread stays behind
     import threading

@@ -19,14 +19,14 @@ from schemas import PAIRS, ArtefactError, ArtefactWriter, ConfigError, InputErro
 from schemas.files.outputs import Output
 from stages import ingest, project, sample, train
 from stages.network.predictor import load_predictor
-from stages.network.steps import order_steps
 from stages.network.unet import DROPOUT
-from stages.network.uniform import fit_radiometry, fit_uniform
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form
 from stages.physics.photometry import get_model
 from stages.train import stage
 from stages.train.epoch import evaluate_loss, learn_epoch
+from stages.train.start import fit_radiometry, fit_uniform
+from stages.train.steps import order_steps
 from stages.train.training import set_up
 
 SMALL = {

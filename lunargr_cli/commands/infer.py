@@ -61,13 +61,16 @@ def command(
 
     from lunargr_cli.console import Console
     from schemas.files.locks import scratch_path
+    from schemas.files.user_files import check_file
+    from schemas.reading import is_artefact
     from stages import infer
 
     console, to = Console(quiet), options.to_map(output, overwrite, geotiff, no_geotiff)
     interrupted = scheduler is not None or resume  # may have got as far as the GeoTIFF: its parts tell
     infer.check_files([terrain, checkpoint], replace(to, resume=interrupted), config)
     gridding = None
-    if infer.open_terrain(terrain):
+    check_file(terrain, "scene.h5 or a DEM")
+    if is_artefact(terrain):
         infer.check_body(terrain, body)
     else:
         from stages import ingest

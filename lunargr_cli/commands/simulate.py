@@ -103,7 +103,7 @@ def command(
     if json_file is not None:
         write_json(json_file, [dict(zip(columns, row, strict=True)) for row in rows])
     console.table(f"{config.extent / 1000:.2f} km scene in {output}", columns, rows)
-    planted = " + ".join(h.effect for h in summary.hidden) or "none"
+    planted = " + ".join(summary.hidden) or "none"
     console.say(
         f"{summary.craters} craters, DEM valid {100 * summary.dem_valid:.1f} %, planted: {planted} (recorded in {output / 'truth.h5'})"
     )

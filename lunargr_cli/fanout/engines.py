@@ -1,4 +1,4 @@
-"""Where parts are worked on: in this process, one after the other, or on the workers of a Dask cluster."""
+"""The engines that work on parts: this process, one part after the other, or the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from typing import Any, Protocol
 from lunargr_cli.options import check_scheduler
 from schemas.errors import ConfigError, InputError, LunargrError
 
-ANSWER = 10.0  # seconds in which a scheduler must answer
-WORKERS = 300.0  # seconds in which it must have a worker: a queue may have to start it
-DEATHS = 5  # workers that one part may take down before it is blamed
-ERRORS = 2  # times that a part is tried again after an error of the machine it ran on
+ANSWER_WITHIN = 10.0  # seconds in which a scheduler must answer
+WORKER_WITHIN = 300.0  # seconds in which it must have a worker: a queue may have to start it
+DEATHS = 5  # of workers on one part, before the part is blamed
+RETRIES = 2  # of a part after an error of the machine it ran on
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Engine(Protocol):
         """Do all tasks; a part's path as it is finished."""
 
 
-class Here:
+class ThisProcess:
     """One after the other, in this process."""
 
     def work(self, tasks: Sequence[Task]) -> Iterator[Path]:
@@ -52,7 +52,7 @@ class Here:
 
 @contextlib.contextmanager
 def open_dask(scheduler: str, folder: Path) -> Iterator[Engine]:
-    """``local:N`` workers of our own, or those of the scheduler at an address. Raises ConfigError, one line."""
+    """An engine with ``local:N`` workers of its own, or those of the scheduler at an address. Raises ConfigError."""
     try:
         import dask
         import distributed
@@ -86,10 +86,10 @@ def _settings(workers: int) -> dict[str, Any]:
     names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
     environment = {name: os.environ.get(name, threads) for name in names}
     return {
-        # Workers that are stopped with work in their hands, after an error in another's, would say so at length.
+        # Workers that are stopped during a part, after an error in another, would log that at length.
         "distributed.nanny.pre-spawn-environ": environment | {"DASK_LOGGING__DISTRIBUTED": "critical"},
         "distributed.scheduler.allowed-failures": DEATHS,
-        "distributed.comm.timeouts.connect": f"{ANSWER:g}s",
+        "distributed.comm.timeouts.connect": f"{ANSWER_WITHIN:g}s",
         "distributed.diagnostics.nvml": False,
     }
 
@@ -97,16 +97,16 @@ def _settings(workers: int) -> dict[str, Any]:
 def _connect(address: str) -> Any:
     import distributed
 
-    where = ConfigError(
+    silent = ConfigError(
         f"--scheduler: no Dask scheduler answers at '{address}'; expected local:N, or the address that 'dask scheduler' "
         "prints, such as tcp://10.0.0.1:8786."
     )
     try:
-        client = distributed.Client(address, timeout=f"{ANSWER:g}s")
+        client = distributed.Client(address, timeout=f"{ANSWER_WITHIN:g}s")
     except (OSError, TimeoutError, ValueError):
-        raise where from None
+        raise silent from None
     try:
-        client.wait_for_workers(1, timeout=float(os.environ.get("LUNARGR_WAIT_FOR_WORKERS", WORKERS)))
+        client.wait_for_workers(1, timeout=float(os.environ.get("LUNARGR_WAIT_FOR_WORKERS", WORKER_WITHIN)))
     except (OSError, TimeoutError):
         client.close()
         raise ConfigError(
@@ -121,17 +121,18 @@ class _Dask:
     name: str
 
     def work(self, tasks: Sequence[Task]) -> Iterator[Path]:
-        """As they come. A part whose worker dies is given to another; one that fails is not tried elsewhere."""
+        """Do all tasks; paths come as parts are finished. A part whose worker dies is given to another worker."""
         import distributed
 
-        from schemas.provenance import current_command, known_digests
+        from schemas.command_line import running_command
+        from schemas.provenance import known_digests
 
         if not tasks:
             return
         # Given along with every task: data scattered to workers would die with them.
-        common = version("lunargr"), dict(known_digests), current_command()
+        common = version("lunargr"), dict(known_digests), running_command.get()
         waiting = [
-            self.client.submit(_work, task, common, key=str(task.path), pure=False, retries=ERRORS) for task in tasks
+            self.client.submit(_work, task, common, key=str(task.path), pure=False, retries=RETRIES) for task in tasks
         ]
         paths: Mapping[Any, Path] = {future.key: task.path for future, task in zip(waiting, tasks, strict=True)}
         try:
@@ -158,9 +159,10 @@ class _Dask:
 
 
 def _work(task: Task, common: tuple[str, dict[Any, str], tuple[str, str] | None]) -> LunargrError | None:
-    """On a worker. A LunargrError is an answer: no other worker would find anything else."""
+    """Do a task on a worker. A LunargrError is returned and not raised: another worker would only find the same."""
+    from schemas.command_line import recording
     from schemas.files.locks import unlocked
-    from schemas.provenance import known_digests, run_by
+    from schemas.provenance import known_digests
 
     expected, digests, command = common
     if version("lunargr") != expected:
@@ -171,7 +173,7 @@ def _work(task: Task, common: tuple[str, dict[Any, str], tuple[str, str] | None]
     if task.path.exists():  # by a worker that was given up too early
         return None
     try:
-        with unlocked(), run_by(command):
+        with unlocked(), recording(command):
             task.function(task.path, **task.arguments)
     except LunargrError as error:
         return error

@@ -1,4 +1,4 @@
-"""The parts of one output: their folder, whose they are, and which are finished."""
+"""The parts of one output: their folder, the job that they belong to, and which of them are finished."""
 
 from __future__ import annotations
 
@@ -14,43 +14,45 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from lunargr_cli.fanout.engines import Engine, Here, Task, open_dask
+from lunargr_cli.fanout.engines import Engine, Task, ThisProcess, open_dask
 from schemas.errors import ConfigError, InputError
 from schemas.files.locks import claim
 from schemas.files.outputs import Output, check_output
-from schemas.provenance import sha256
+from schemas.provenance import file_state, sha256
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 
-PATIENCE = 20  # seconds
+PATIENCE = 20  # seconds until a new file must show on a network file system
 
 
 @dataclass
 class Job:
-    """One output and its parts; :meth:`fan` is what stages and commands have work done with."""
+    """One output and its parts."""
 
     folder: Path
     engine: Engine
     say: Say
     progress: Progress
-    again: bool  # an earlier run was interrupted
+    again: bool  # whether an earlier run of the same job was interrupted
 
     def fan(
-        self, what: str, function: Callable[..., Any], arguments: Sequence[Mapping[str, Any]], suffix: str = ".h5"
+        self, name: str, function: Callable[..., Any], arguments: Sequence[Mapping[str, Any]], suffix: str = ".h5"
     ) -> list[Path]:
-        """``function(path, **arguments)`` for every part that is not there yet; the parts in order.
+        """Have ``function(path, **arguments)`` write every part that is not there yet; returns the parts' paths in
+        order.
 
-        Raises what a part raises (LunargrError), and InputError where the machines for it fail.
+        name : of the parts' files and in messages. Raises a part's LunargrError, and InputError where the machines
+            fail.
         """
         count = len(arguments)
-        paths = [self.folder / f"{what}-{k + 1:05d}-of-{count:05d}{suffix}" for k in range(count)]
+        paths = [self.folder / f"{name}-{k + 1:05d}-of-{count:05d}{suffix}" for k in range(count)]
         todo = [Task(function, path, dict(a)) for path, a in zip(paths, arguments, strict=True) if not path.exists()]
         if len(todo) < count:
-            self.say(f"{what}: {count - len(todo)} of {count} parts are there already")
+            self.say(f"{name}: {count - len(todo)} of {count} parts are there already")
         done = count - len(todo)
-        self.progress(0, count, f"{what}, parts")
+        self.progress(0, count, f"{name}, parts")
         for _ in self.engine.work(todo):
             done += 1
-            self.progress(done, count, f"{what}, parts")
+            self.progress(done, count, f"{name}, parts")
         for path in paths:
             _await(path)
         return paths
@@ -58,7 +60,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Work:
-    """How a command works in parts. scheduler : None for this process; parts : how many, None for by size"""
+    """How parts are worked on. scheduler : None for this process; parts : their number, None for a suitable one"""
 
     scheduler: str | None = None
     parts: int | None = None
@@ -68,8 +70,10 @@ class Work:
 
 @dataclass(frozen=True)
 class Identity:
-    """What decides a result. inputs : known by their contents; sources : files too many to read for that, known by size
-    and time of change
+    """What the result of a job depends on: parts of an earlier run with the same identity are used.
+
+    inputs : files compared by their contents; sources : files compared by size and time of change, being too many to
+        read
     """
 
     stage: str
@@ -82,14 +86,14 @@ class Identity:
         for path in self.inputs:
             if not path.is_file():
                 raise InputError(f"{path}: no such file; check the path or run the stage that writes it.")
-        what = {
+        identity = {
             "stage": self.stage,
             "version": version("lunargr"),
             "options": dict(self.options),
             "inputs": [sha256(path) for path in self.inputs],
-            "sources": [_state(path) for path in self.sources],
+            "sources": [[str(path), *file_state(path)] for path in self.sources],
         }
-        return hashlib.sha256(json.dumps(what, sort_keys=True, default=str).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(identity, sort_keys=True, default=str).encode()).hexdigest()
 
 
 @contextlib.contextmanager
@@ -114,7 +118,7 @@ def open_job(output: Output, identity: Identity, work: Work) -> Iterator[Job]:
             raise ConfigError(f"{root}: cannot be made a folder ({error.strerror}); choose another --output.") from None
         for left in folder.glob(".*partial-*"):  # of killed workers
             left.unlink(missing_ok=True)
-        engine: Any = open_dask(work.scheduler, folder) if work.scheduler else contextlib.nullcontext(Here())
+        engine: Any = open_dask(work.scheduler, folder) if work.scheduler else contextlib.nullcontext(ThisProcess())
         with engine as working:
             yield Job(folder.resolve(), working, work.say, work.progress, again)
         shutil.rmtree(root, ignore_errors=True)
@@ -131,11 +135,3 @@ def _await(path: Path) -> None:
         f"{path}: a worker says that it wrote this part, but it is not here; "
         "--scheduler needs workers that see the same files under the same names."
     )
-
-
-def _state(path: Path) -> list[Any]:
-    try:
-        found = os.stat(path)
-    except OSError:
-        return [str(path)]
-    return [str(path), found.st_size, found.st_mtime_ns]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import math
 import shutil
@@ -21,8 +22,20 @@ from stages.common.progress import Progress
 BANDS_OF_DEM, BANDS_OF_MAP, BANDS_OF_ALBEDO, PAIRS, SAMPLES = 8, 8, 1, 512, 4
 
 
+def stage_part(path: Path, stage: str, inputs: Sequence[Path | None], config: Any) -> None:
+    """Write one shard of what a stage makes of its inputs."""
+    importlib.import_module(f"stages.{stage}").run(*inputs, Output(path, overwrite=True), config)
+
+
+def map_part(path: Path, scene: Path, checkpoint: Path, config: Any) -> None:
+    """Write one shard of svbrdf.h5; the whole map gets its GeoTIFF when the shards are merged."""
+    stage_part(path, "infer", [scene, checkpoint], config)
+    path.with_suffix(".tif").unlink(missing_ok=True)  # where one part is the whole
+
+
 def run_ingest(dem: Path, images: Path | None, output: Output, config: Any, work: Work) -> Any:
-    """The DEM's rows, then each image by itself on the grid that these give."""
+    """scene.h5 from shards of the DEM's rows, and then from shards of its images on the grid that these give."""
+    from schemas.reading import is_artefact
     from stages import ingest, merge
 
     dem, images = dem.resolve(), images and images.resolve()
@@ -30,17 +43,17 @@ def run_ingest(dem: Path, images: Path | None, output: Output, config: Any, work
     sources = ingest.source_files(images, config) if images else ()
     with _job(output, "ingest", config, inputs, sources, work) as job:
         grid = dem
-        if not ingest.is_artefact(dem):
+        if not is_artefact(dem):
             bands = ingest.count_bands(dem, config)
             cut = _cut(config, work.parts or math.ceil(bands / BANDS_OF_DEM), bands)
-            pieces = job.fan("dem", ingest_part, [{"dem": dem, "images": None, "config": c} for c in cut])
+            pieces = _fan(job, "dem", "ingest", [dem, None], cut)
             grid = job.folder / "grid.h5"
             if images is not None:
                 merge.run(pieces, Output(grid, overwrite=True), merge.Config(virtual=True, inputs=(dem,)))
         if images is not None:
             number = len(ingest.image_names(images, config))
             cut = _cut(replace(config, gsd=None), work.parts or number, number)
-            pieces = job.fan("images", ingest_part, [{"dem": grid, "images": images, "config": c} for c in cut])
+            pieces = _fan(job, "images", "ingest", [grid, images], cut)
             ingest.check_positions(pieces, images, config)
         merge.run(pieces, output, merge.Config(inputs=tuple(inputs)), progress=job.progress)
     found = ingest.summarise(output.file)
@@ -50,34 +63,20 @@ def run_ingest(dem: Path, images: Path | None, output: Output, config: Any, work
     return found
 
 
-def ingest_part(path: Path, dem: Path, images: Path | None, config: Any) -> None:
-    """Write one shard of scene.h5."""
-    from stages import ingest
-
-    ingest.run(dem, images, Output(path, overwrite=True), config)
-
-
 def run_sample(scene: Path, output: Output, config: Any, work: Work) -> Any:
-    """Every part chooses all places, which is quick, and cuts out its share of the crops."""
+    """crops.h5 from shards: each chooses all places, which is quick, and cuts out its share of the crops."""
     from stages import merge, sample
 
     scene = scene.resolve()
     with _job(output, "sample", config, [scene], (), work) as job:
         cut = _cut(config, work.parts or SAMPLES)
-        pieces = job.fan("crops", sample_part, [{"scene": scene, "config": c} for c in cut])
+        pieces = _fan(job, "crops", "sample", [scene], cut)
         merge.run(pieces, output, merge.Config(inputs=(scene,)), progress=job.progress)
     return sample.read_audit(output.file)
 
 
-def sample_part(path: Path, scene: Path, config: Any) -> None:
-    """Write one shard of crops.h5."""
-    from stages import sample
-
-    sample.run(scene, Output(path, overwrite=True), config)
-
-
 def run_project(crops: Path, output: Output, config: Any, work: Work) -> Any:
-    """pairs.h5 from shards that run side by side."""
+    """pairs.h5 from shards of the crops."""
     from stages import merge, project
 
     crops = crops.resolve()
@@ -87,20 +86,13 @@ def run_project(crops: Path, output: Output, config: Any, work: Work) -> Any:
     with _job(output, "project", config, [crops, scene], project.source_files(crops), work) as job:
         pairs = project.count_pairs(crops)
         cut = _cut(config, work.parts or math.ceil(pairs / PAIRS), pairs)
-        pieces = job.fan("pairs", project_part, [{"crops": crops, "config": c} for c in cut])
+        pieces = _fan(job, "pairs", "project", [crops], cut)
         merge.run(pieces, output, merge.Config(inputs=(crops, scene)), progress=job.progress)
     return project.summarise(output.file)
 
 
-def project_part(path: Path, crops: Path, config: Any) -> None:
-    """Write one shard of pairs.h5."""
-    from stages import project
-
-    project.run(crops, Output(path, overwrite=True), config)
-
-
 def run_infer(terrain: Path, checkpoint: Path, output: Output, config: Any, gridding: Any, work: Work) -> Any:
-    """gridding : the ingest.Config for a terrain that is a raster, None for a scene"""
+    """svbrdf.h5 from shards of the map's rows. gridding : ingest.Config for a raster, None for a scene"""
     from stages import infer, ingest
 
     terrain, checkpoint = terrain.resolve(), checkpoint.resolve()
@@ -114,13 +106,13 @@ def run_infer(terrain: Path, checkpoint: Path, output: Output, config: Any, grid
                 ingest.run(terrain, None, scene, gridding, progress=job.progress)
         bands = infer.count_bands(scene, config)
         cut = _cut(config, work.parts or math.ceil(bands / BANDS_OF_MAP), bands)
-        pieces = job.fan("map", infer_part, [{"scene": scene, "checkpoint": checkpoint, "config": c} for c in cut])
+        pieces = job.fan("map", map_part, [{"scene": scene, "checkpoint": checkpoint, "config": c} for c in cut])
         _merge_map(pieces, output, config, [terrain, checkpoint], job.progress)
     return infer.summarise(output.file, len(pieces))
 
 
 def _merge_map(pieces: list[Path], output: Output, config: Any, inputs: list[Path], progress: Progress) -> None:
-    """A map from its parts. An interrupted run may have got as far as the GeoTIFF."""
+    """Merge the shards of a map, over the GeoTIFF that an interrupted run may have written already."""
     from stages import merge
 
     if config.geotiff and (output.overwrite or output.resume):
@@ -128,16 +120,8 @@ def _merge_map(pieces: list[Path], output: Output, config: Any, inputs: list[Pat
     merge.run(pieces, output, merge.Config(inputs=tuple(inputs)), progress=progress)
 
 
-def infer_part(path: Path, scene: Path, checkpoint: Path, config: Any) -> None:
-    """Write one shard of svbrdf.h5; the whole map gets its GeoTIFF when they are merged."""
-    from stages import infer
-
-    infer.run(scene, checkpoint, Output(path, overwrite=True), config)
-    path.with_suffix(".tif").unlink(missing_ok=True)  # where one part is the whole
-
-
 def run_albedo(svbrdf: Path, scene: Path, output: Output, config: Any, work: Work) -> Any:
-    """What the images say of themselves once, then the map's rows."""
+    """A map with albedo: the images' calibration in one part, then shards of the map's rows."""
     from stages import albedo
 
     svbrdf, scene = svbrdf.resolve(), scene.resolve()
@@ -171,7 +155,7 @@ def albedo_part(path: Path, svbrdf: Path, scene: Path, config: Any, calibration:
 
 
 def run_evaluate(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Any, work: Work) -> Any:
-    """evaluation.h5 from shards that run side by side."""
+    """evaluation.h5 from shards of the pairs."""
     from stages import evaluate
 
     pairs, checkpoints = pairs.resolve(), [c.resolve() for c in checkpoints]
@@ -181,7 +165,7 @@ def run_evaluate(pairs: Path, checkpoints: Sequence[Path], output: Output, confi
 
 
 def run_diagnose(pairs: Path, checkpoint: Path | None, output: Output, config: Any, work: Work) -> dict[str, Any]:
-    """One part: a search uses a few hundred pairs and decides one thing after the other. Returns the JSON's content."""
+    """The whole diagnosis as one part, since its steps depend on each other. Returns the content of its JSON file."""
     if output.path is None:
         raise ConfigError("diagnose: expected --output with --scheduler (the part lies beside it), found none.")
     pairs, checkpoint = pairs.resolve(), checkpoint and checkpoint.resolve()
@@ -199,7 +183,7 @@ def run_diagnose(pairs: Path, checkpoint: Path | None, output: Output, config: A
 
 
 def diagnose_part(path: Path, pairs: Path, checkpoint: Path | None, config: Any) -> None:
-    """Diagnose where one engine runs a whole stage."""
+    """Write diagnosis.h5, and its JSON and page beside it."""
     from stages import diagnose
 
     json_file, report = path.with_suffix(".json"), path.with_suffix(".html")
@@ -209,6 +193,11 @@ def diagnose_part(path: Path, pairs: Path, checkpoint: Path | None, config: Any)
 def _cut(config: Any, count: int, most: int | None = None) -> list[Any]:
     count = max(1, count if most is None else min(count, most))
     return [replace(config, shard=(k, count)) for k in range(count)]
+
+
+def _fan(job: Job, name: str, stage: str, inputs: Sequence[Path | None], configs: Sequence[Any]) -> list[Path]:
+    """Have a stage run on its inputs once for each of the shards' configs; the parts in order."""
+    return job.fan(name, stage_part, [{"stage": stage, "inputs": inputs, "config": config} for config in configs])
 
 
 def _job(

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from schemas.artefacts.common import IMAGE_NOISE, LARGEST_COUNT, LARGEST_GSD, PLACE
-from schemas.declaration import STRING, Attribute, Schema, Variable, declare
+from schemas.artefacts.common import IMAGE_NOISE, LARGEST_COUNT, LARGEST_GSD, PLACE, column, text_column
+from schemas.declaration import Attribute, Schema, declare
+
+
+def _switch(name: str, description: str) -> Attribute:
+    return Attribute(name, description, True, "integer", 0, 1)
+
 
 CHECKPOINT = declare(
     Schema(
@@ -13,14 +18,12 @@ CHECKPOINT = declare(
         title="Weights, normalisation and history of a trained network",
         dims={"epoch": "training epochs", "frame": "source images"},
         variables=(
-            Variable("train_loss", ("epoch",), "f8", "1", "mean squared error on valid training pixels", minimum=0.0),
-            Variable(
-                "validation_loss", ("epoch",), "f8", "1", "mean squared error on valid validation pixels", minimum=0.0
-            ),
-            Variable("epoch_seconds", ("epoch",), "f8", "s", "wall time of the epoch", minimum=0.0),
-            Variable("image_id", ("frame",), STRING, "", "name of the source image"),
-            Variable("gain", ("frame",), "f8", "1", "measured = gain x I/F + offset; 1 for calibrated images"),
-            Variable("offset", ("frame",), "f8", "1", "measured = gain x I/F + offset; 0 for calibrated images"),
+            column("epoch", "train_loss", "1", "mean squared error on valid training pixels", minimum=0.0),
+            column("epoch", "validation_loss", "1", "mean squared error on valid validation pixels", minimum=0.0),
+            column("epoch", "epoch_seconds", "s", "wall time of the epoch", minimum=0.0),
+            text_column("frame", "image_id", "name of the source image"),
+            column("frame", "gain", "1", "measured = gain x I/F + offset; 1 for calibrated images"),
+            column("frame", "offset", "1", "measured = gain x I/F + offset; 0 for calibrated images"),
         ),
         attributes=(
             Attribute("model", "reflectance model whose coefficients the network predicts"),
@@ -31,22 +34,8 @@ CHECKPOINT = declare(
                 kind="json list",
             ),
             Attribute("globals", "JSON: the other coefficients, the same everywhere, by name", kind="json"),
-            Attribute(
-                "positive",
-                "1 = coefficients are kept nearly positive by LeakyReLU, 0 = within their bounds",
-                True,
-                "integer",
-                0,
-                1,
-            ),
-            Attribute(
-                "deviations",
-                "1 = the network also gives the logarithm of each map's standard deviation",
-                True,
-                "integer",
-                0,
-                1,
-            ),
+            _switch("positive", "1 = coefficients are kept nearly positive by LeakyReLU, 0 = within their bounds"),
+            _switch("deviations", "1 = the network also gives the logarithm of each map's standard deviation"),
             IMAGE_NOISE,
             Attribute(
                 "elevation_scale_m", "std of the crop-centred training elevations, m", True, "number", 1e-6, LARGEST_GSD

@@ -20,9 +20,37 @@ HEIGHTS = (-1e8, 1e8)  # m
 
 LARGEST_COUNT = 2**31 - 1
 
+
+def column(dim: str, name: str, unit: str, description: str, dtype: str = "f8", **checks: Any) -> Variable:
+    """A number for every entry of one dimension. checks : further fields of the Variable"""
+    return Variable(name, (dim,), dtype, unit, description, **checks)
+
+
+def text_column(dim: str, name: str, description: str, required: bool = True) -> Variable:
+    """A text for every entry of one dimension."""
+    return Variable(name, (dim,), STRING, "", description, required=required)
+
+
+def angle(dim: str, name: str, limit: float, description: str) -> Variable:
+    """A finite angle within +-``limit`` degrees for every entry of one dimension."""
+    return column(dim, name, "degree", description, minimum=-limit, maximum=limit, finite=True)
+
+
+def crop_map(name: str, dtype: str, unit: str, description: str, **checks: Any) -> Variable:
+    """A value for every pixel of every crop."""
+    return Variable(name, ("pair", "y", "x"), dtype, unit, description, **checks)
+
+
+def grid_map(name: str, dtype: str, unit: str, description: str, stacked_along: str = "", **checks: Any) -> Variable:
+    """A value for every pixel of a map, or of each map of a stack along a further dimension."""
+    first, depth = ((stacked_along,), (1,)) if stacked_along else ((), ())
+    chunks = (*depth, 256, 256)
+    return Variable(name, (*first, "y", "x"), dtype, unit, description, chunks=chunks, georeferenced=True, **checks)
+
+
 GRID = (
-    Variable("y", ("y",), "f8", "m", "grid northing of the pixel centre; rows run south", finite=True),
-    Variable("x", ("x",), "f8", "m", "grid easting of the pixel centre", finite=True),
+    column("y", "y", "m", "grid northing of the pixel centre; rows run south", finite=True),
+    column("x", "x", "m", "grid easting of the pixel centre", finite=True),
 )
 
 PLACE = (
@@ -31,68 +59,42 @@ PLACE = (
 )
 
 FRAMES = (
-    Variable("image_id", ("frame",), STRING, "", "name of the source image"),
-    Variable(
-        "solar_distance_au", ("frame",), "f8", "au", "distance of the Sun", required=False, minimum=0.05, maximum=100.0
-    ),
+    text_column("frame", "image_id", "name of the source image"),
+    column("frame", "solar_distance_au", "au", "distance of the Sun", required=False, minimum=0.05, maximum=100.0),
 )
 
-
-def angle(name: str, dim: str, limit: float, description: str) -> Variable:
-    """A finite angle within +-``limit`` degrees along one dimension."""
-    return Variable(name, (dim,), "f8", "degree", description, minimum=-limit, maximum=limit, finite=True)
-
-
-def crop_map(name: str, dtype: str, unit: str, description: str, **more: Any) -> Variable:
-    """A value for every pixel of every crop."""
-    return Variable(name, ("pair", "y", "x"), dtype, unit, description, **more)
-
-
-def grid_map(name: str, dtype: str, unit: str, description: str, of: str = "", **more: Any) -> Variable:
-    """A value for every pixel of a map; ``of`` names a dimension that such maps are stacked along."""
-    first, depth = ((of,), (1,)) if of else ((), ())
-    chunks = (*depth, 256, 256)
-    return Variable(name, (*first, "y", "x"), dtype, unit, description, chunks=chunks, georeferenced=True, **more)
-
-
 FRAME_TABLE = FRAMES + (
-    Variable("path", ("frame",), STRING, "", "image file, relative to this artefact where possible"),
-    Variable("camera", ("frame",), STRING, "", "camera model file, empty for map-projected images"),
-    Variable("start_time", ("frame",), STRING, "", "UTC"),
-    Variable("units", ("frame",), "u1", "1", "radiometric units of the image", flags=UNITS),
-    angle("subsolar_longitude_deg", "frame", 720.0, "east longitude of the sub-solar point"),
-    angle("subsolar_latitude_deg", "frame", 90.0, "latitude of the sub-solar point"),
-    angle("spacecraft_longitude_deg", "frame", 720.0, "east longitude below the camera"),
-    angle("spacecraft_latitude_deg", "frame", 90.0, "latitude below the camera"),
-    Variable(
+    text_column("frame", "path", "image file, relative to this artefact where possible"),
+    text_column("frame", "camera", "camera model file, empty for map-projected images"),
+    text_column("frame", "start_time", "UTC"),
+    column("frame", "units", "1", "radiometric units of the image", "u1", flags=UNITS),
+    angle("frame", "subsolar_longitude_deg", 720.0, "east longitude of the sub-solar point"),
+    angle("frame", "subsolar_latitude_deg", 90.0, "latitude of the sub-solar point"),
+    angle("frame", "spacecraft_longitude_deg", 720.0, "east longitude below the camera"),
+    angle("frame", "spacecraft_latitude_deg", 90.0, "latitude below the camera"),
+    column(
+        "frame",
         "spacecraft_altitude_m",
-        ("frame",),
-        "f8",
         "m",
         "camera height above the reference sphere",
         minimum=1.0,
         maximum=1e10,
         finite=True,
     ),
-    Variable("sha256", ("frame",), STRING, "", "SHA-256 of the image file when it was ingested", required=False),
-    Variable("camera_sha256", ("frame",), STRING, "", "SHA-256 of the camera model file, or empty", required=False),
+    text_column("frame", "sha256", "SHA-256 of the image file when it was ingested", required=False),
+    text_column("frame", "camera_sha256", "SHA-256 of the camera model file, or empty", required=False),
 )
 
+_ROW = "row of the crop centre on the scene grid: the crop spans row - size/2 .. row + size/2 - 1"
 PAIR_PLACE = (
-    angle("longitude_deg", "pair", 720.0, "east longitude of the crop centre"),
-    angle("latitude_deg", "pair", 90.0, "planetocentric latitude of the crop centre"),
-    Variable(
-        "row",
-        ("pair",),
-        "i4",
-        "1",
-        "row of the crop centre on the scene grid: the crop spans row - size/2 .. row + size/2 - 1",
-    ),
-    Variable("col", ("pair",), "i4", "1", "column of the crop centre on the scene grid"),
-    Variable("image_index", ("pair",), "i4", "1", "index into the frame dimension", index_of="frame"),
-    Variable("site", ("pair",), "i4", "1", "pairs with the same site show the same ground, pixel for pixel"),
-    Variable("tile", ("pair",), "i4", "1", "ground tile of the geographic split"),
-    Variable("split", ("pair",), "u1", "1", "which part of the geographic split", flags=SPLITS),
+    angle("pair", "longitude_deg", 720.0, "east longitude of the crop centre"),
+    angle("pair", "latitude_deg", 90.0, "planetocentric latitude of the crop centre"),
+    column("pair", "row", "1", _ROW, "i4"),
+    column("pair", "col", "1", "column of the crop centre on the scene grid", "i4"),
+    column("pair", "image_index", "1", "index into the frame dimension", "i4", index_of="frame"),
+    column("pair", "site", "1", "pairs with the same site show the same ground, pixel for pixel", "i4"),
+    column("pair", "tile", "1", "ground tile of the geographic split", "i4"),
+    column("pair", "split", "1", "which part of the geographic split", "u1", flags=SPLITS),
 )
 
 IMAGE_NOISE = Attribute(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from schemas.declaration import STRING, Attribute, Schema, Variable, declare
+from schemas.artefacts.common import column, text_column
+from schemas.declaration import Attribute, Schema, Variable, declare
 
 EVALUATION = declare(
     Schema(
@@ -18,15 +19,15 @@ EVALUATION = declare(
             "x": "crop columns",
         },
         variables=(
-            Variable("model_name", ("model",), STRING, "", "names of the compared models"),
-            Variable("pair_index", ("pair",), "i4", "1", "index of the crop in pairs.h5", minimum=0),
-            Variable("tile", ("pair",), "i4", "1", "ground tile, the independent unit of the intervals"),
-            Variable("valid_pixels", ("pair",), "i4", "1", "pixels that count", minimum=0),
+            text_column("model", "model_name", "names of the compared models"),
+            column("pair", "pair_index", "1", "index of the crop in pairs.h5", "i4", minimum=0),
+            column("pair", "tile", "1", "ground tile, the independent unit of the intervals", "i4"),
+            column("pair", "valid_pixels", "1", "pixels that count", "i4", minimum=0),
             Variable("mse", ("model", "pair"), "f8", "1", "mean squared error of the crop, mean over training runs"),
             Variable(
                 "ssim", ("model", "pair"), "f8", "1", "structural similarity of the crop, mean over training runs"
             ),
-            Variable("run_seed", ("run",), "i8", "1", "seed of each training run", required=False),
+            column("run", "run_seed", "1", "seed of each training run", "i8", required=False),
             Variable(
                 "run_mse",
                 ("run", "pair"),
@@ -52,6 +53,12 @@ EVALUATION = declare(
     )
 )
 
+
+def _value(name: str, dims: tuple[str, ...], unit: str, description: str) -> Variable:
+    """What one effect of the extended model holds, where the model has that effect."""
+    return Variable(name, dims, "f4", unit, description, required=False)
+
+
 DIAGNOSIS = declare(
     Schema(
         name="diagnosis",
@@ -68,47 +75,37 @@ DIAGNOSIS = declare(
             "term": "cosines of an albedo pattern, down and across a crop, in the order of the effect's coordinates",
         },
         variables=(
-            Variable("image_id", ("frame",), STRING, "", "name of the source image"),
-            Variable(
+            text_column("frame", "image_id", "name of the source image"),
+            _value(
                 "image_shift_px",
                 ("frame", "axis"),
-                "f4",
                 "px",
                 "misregistration: columns and rows by which the image shows ground further east and south",
-                required=False,
             ),
-            Variable(
+            _value(
                 "line_jitter_px",
                 ("frame", "mode"),
-                "f4",
                 "px",
                 "line_jitter: amplitudes of cosines 1..3 over the lines, east, then south",
-                required=False,
             ),
-            Variable(
+            _value(
                 "frame_field",
                 ("frame", "field_term"),
-                "f4",
                 "1",
                 "frame_field: amplitudes of low cosines over a crop, relative to the response",
-                required=False,
             ),
-            Variable("image_gain", ("frame",), "f4", "1", "image_gain: relative gain of the image", required=False),
-            Variable(
+            _value("image_gain", ("frame",), "1", "image_gain: relative gain of the image"),
+            _value(
                 "column_response",
                 ("column",),
-                "f4",
                 "1",
                 "column_pattern: response over the detector samples first..last, relative to 1",
-                required=False,
             ),
-            Variable(
+            _value(
                 "site_albedo",
                 ("site", "term"),
-                "f4",
                 "1",
                 "albedo_map: amplitudes of the cosines at each site, relative to its albedo; 0 for sites not looked at",
-                required=False,
             ),
         ),
         attributes=(

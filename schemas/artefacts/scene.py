@@ -11,6 +11,8 @@ from schemas.artefacts.common import (
     PLACE,
     SMALLEST_GSD,
     VALIDITY,
+    column,
+    crop_map,
     grid_map,
 )
 from schemas.declaration import Attribute, Schema, Variable, declare
@@ -31,7 +33,15 @@ SCENE = declare(
         + (
             grid_map("elevation", "f4", "m", "height above the reference sphere"),
             grid_map("dem_valid", "u1", "1", "1 = the DEM is valid", flags=VALIDITY, compress=True),
-            grid_map("valid", "u1", "1", "1 = both DEM and image are valid", flags=VALIDITY, compress=True, of="frame"),
+            grid_map(
+                "valid",
+                "u1",
+                "1",
+                "1 = both DEM and image are valid",
+                flags=VALIDITY,
+                compress=True,
+                stacked_along="frame",
+            ),
             grid_map(
                 "valid_position",
                 "u1",
@@ -39,7 +49,7 @@ SCENE = declare(
                 "1 = a crop centred here lies wholly in valid data",
                 flags=VALIDITY,
                 compress=True,
-                of="frame",
+                stacked_along="frame",
             ),
             Variable(
                 "frame_window",
@@ -49,9 +59,7 @@ SCENE = declare(
                 "row, column, height, width of the box that holds the image's valid pixels",
                 minimum=0,
             ),
-            Variable(
-                "valid_area_m2", ("frame",), "f8", "m2", "ground covered by valid positions", minimum=0.0, finite=True
-            ),
+            column("frame", "valid_area_m2", "m2", "ground covered by valid positions", minimum=0.0, finite=True),
         )
         + FRAME_TABLE,
         attributes=PLACE
@@ -73,9 +81,7 @@ CROPS = declare(
         stage="sample",
         title="Crop centres and DEM crops with a geographic split",
         dims={"pair": "one crop of one image", "y": "crop rows", "x": "crop columns", "frame": "source images"},
-        variables=(Variable("elevation", ("pair", "y", "x"), "f4", "m", "height above the reference sphere"),)
-        + PAIR_PLACE
-        + FRAME_TABLE,
+        variables=(crop_map("elevation", "f4", "m", "height above the reference sphere"),) + PAIR_PLACE + FRAME_TABLE,
         attributes=PLACE
         + (
             Attribute("scene", "the scene artefact, relative to this file"),

@@ -2,50 +2,45 @@
 
 from __future__ import annotations
 
-from schemas.artefacts.common import GRID, IMAGE_NOISE, PLACE, VALIDITY, grid_map
-from schemas.declaration import STRING, Attribute, Schema, Variable, declare
+from schemas.artefacts.common import GRID, IMAGE_NOISE, PLACE, VALIDITY, column, grid_map, text_column
+from schemas.declaration import Attribute, Schema, Variable, declare
 
 
 def _albedo_map(name: str, dtype: str, description: str) -> Variable:
     return grid_map(name, dtype, "1", description, required=False)
 
 
-def _of_images(name: str, dims: tuple[str, ...], dtype: str, unit: str, description: str) -> Variable:
-    return Variable(name, dims, dtype, unit, description, required=False)
+def _albedo_column(dim: str, name: str, unit: str, description: str) -> Variable:
+    return column(dim, name, unit, description, required=False)
 
 
+_INTERVAL = (
+    "half-width of the 68 % interval of an unseen image's pixel, in hypot(albedo_std / albedo, median image's own std)"
+)
+_SHADOW = "half-widths of the 68 and 95 % intervals in shadow, I/F over the sine of the Sun's elevation"
 _ALBEDO = (
     _albedo_map("albedo", "f4", "factor on the I/F of the coefficients; 1 where no photograph says otherwise"),
     _albedo_map("albedo_std", "f4", "standard deviation of the albedo"),
     _albedo_map("albedo_images", "u2", "images that the albedo of a pixel was made of"),
-    _of_images("albedo_image_id", ("frame",), STRING, "", "name of the image"),
-    _of_images("albedo_gain", ("frame",), "f8", "1", "measured = gain x I/F x albedo + offset"),
-    _of_images("albedo_offset", ("frame",), "f8", "1", "the same; 0 for calibrated images"),
-    _of_images("albedo_subsolar_longitude_deg", ("frame",), "f8", "degree", "east longitude of the sub-solar point"),
-    _of_images("albedo_subsolar_latitude_deg", ("frame",), "f8", "degree", "latitude of the sub-solar point"),
-    _of_images(
-        "albedo_band_px", ("band",), "f8", "px", "structure of the band is about so large, and larger in the last"
-    ),
-    _of_images("albedo_band_std", ("band",), "f8", "1", "std of log albedo beyond the coefficients, by band"),
-    _of_images(
-        "albedo_image_std", ("frame", "band"), "f8", "1", "std of each image's own error in log albedo, by band"
-    ),
-    _of_images("albedo_bin_cos_incidence", ("incidence_bin",), "f8", "1", "middle of the bin"),
-    _of_images(
-        "albedo_interval_68",
-        ("incidence_bin",),
+    text_column("frame", "albedo_image_id", "name of the image", required=False),
+    _albedo_column("frame", "albedo_gain", "1", "measured = gain x I/F x albedo + offset"),
+    _albedo_column("frame", "albedo_offset", "1", "the same; 0 for calibrated images"),
+    _albedo_column("frame", "albedo_subsolar_longitude_deg", "degree", "east longitude of the sub-solar point"),
+    _albedo_column("frame", "albedo_subsolar_latitude_deg", "degree", "latitude of the sub-solar point"),
+    _albedo_column("band", "albedo_band_px", "px", "structure of the band is about so large, and larger in the last"),
+    _albedo_column("band", "albedo_band_std", "1", "std of log albedo beyond the coefficients, by band"),
+    Variable(
+        "albedo_image_std",
+        ("frame", "band"),
         "f8",
         "1",
-        "half-width of the 68 % interval of an unseen image's pixel, in hypot(albedo_std / albedo, median image's own std)",
+        "std of each image's own error in log albedo, by band",
+        required=False,
     ),
-    _of_images("albedo_interval_95", ("incidence_bin",), "f8", "1", "the same of the 95 % interval"),
-    _of_images(
-        "albedo_interval_shadow",
-        ("level",),
-        "f8",
-        "1",
-        "half-widths of the 68 and 95 % intervals in shadow, I/F over the sine of the Sun's elevation",
-    ),
+    _albedo_column("incidence_bin", "albedo_bin_cos_incidence", "1", "middle of the bin"),
+    _albedo_column("incidence_bin", "albedo_interval_68", "1", _INTERVAL),
+    _albedo_column("incidence_bin", "albedo_interval_95", "1", "the same of the 95 % interval"),
+    _albedo_column("level", "albedo_interval_shadow", "1", _SHADOW),
 )
 
 SVBRDF = declare(
@@ -73,17 +68,17 @@ SVBRDF = declare(
                 "standard deviations of single pixels' coefficients, by name in map_name; the other coefficients are the "
                 "same everywhere",
                 required=False,
-                of="map",
+                stacked_along="map",
             ),
-            Variable("map_name", ("map",), STRING, "", "names of the coefficients that vary by place", required=False),
+            text_column("map", "map_name", "names of the coefficients that vary by place", required=False),
             grid_map(
                 "coefficients",
                 "f4",
                 "1",
                 "coefficients of the reflectance model, by name in coefficient_name",
-                of="coefficient",
+                stacked_along="coefficient",
             ),
-            Variable("coefficient_name", ("coefficient",), STRING, "", "names of the coefficients"),
+            text_column("coefficient", "coefficient_name", "names of the coefficients"),
             grid_map("elevation", "f4", "m", "height above the reference sphere"),
             grid_map("valid", "u1", "1", "1 = the map holds coefficients here", flags=VALIDITY, compress=True),
         )

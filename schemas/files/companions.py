@@ -1,7 +1,7 @@
 """Files that belong to an output, such as the GeoTIFF beside a map: a run that ends before the output is whole leaves none.
 
-Each is noted in the output's lock before it gets its name. Whoever lets go of the lock looks there, and so does whoever
-finds it as a killed run's.
+Each is written down in the output's lock before it gets its name. The run that holds the lock reads it there when it
+ends, and so does the next run, where a killed one left its lock behind.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ def companions_of(output: Path | None) -> Iterator[None]:
 
 
 def current_output() -> Path | None:
-    """Whose companions are being written."""
+    """The output whose companions are being written, None outside :func:`companions_of`."""
     return _output.get()
 
 
 def note_companion(lock: Path, path: Path, partial: Path) -> None:
-    """Write down, in its output's lock, that ``partial`` is about to get the name ``path``, unless it replaces a file."""
+    """Write into the output's lock that ``partial`` is about to be renamed to ``path``, unless that replaces a file."""
     if path.exists() or not lock.exists():
         return
     with open(lock, "a") as stream:
@@ -40,7 +40,7 @@ def note_companion(lock: Path, path: Path, partial: Path) -> None:
 
 
 def remove_companions(noted: str, output: Path) -> None:
-    """What the text of a lock notes, where the output is absent; not what somebody has put in its place since."""
+    """Remove the companions that a lock's text names, where the output is absent, but no file put in their place."""
     if output.exists():
         return
     for line in noted.splitlines()[1:]:
@@ -52,6 +52,6 @@ def remove_companions(noted: str, output: Path) -> None:
 
 
 def _identity(path: Path) -> list[int]:
-    """What a file keeps when it is renamed."""
+    """Inode, size and time of change, which a file keeps when it is renamed."""
     found = path.stat()
     return [found.st_ino, found.st_size, found.st_mtime_ns]

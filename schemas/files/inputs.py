@@ -1,7 +1,8 @@
-"""The files that a run reads, under every name that they have: no output may take the place of one of them.
+"""The files that a run reads, under every name that they have: no output may replace one of them.
 
-Beside the files that were named these are the files that they name: the images and camera models of an image table, of a
-scene or of crops, the scene of crops, the parts behind a virtual artefact, the sources of a VRT, the label of an image.
+These are the files that the user names, and the files that those name in turn: the images and camera models of an image
+table, of a scene or of crops, the scene of crops, the parts behind a virtual artefact, the sources of a VRT, the label
+of an image.
 """
 
 from __future__ import annotations
@@ -26,27 +27,23 @@ FILE_COLUMNS = ("path", "camera")
 
 
 class Inputs:
-    """A set of files, and what they name. Raises InputError for a link that leads to itself."""
+    """A set of files, and of all files that they name in turn. Raises InputError for a link that leads to itself."""
 
     def __init__(self, paths: Iterable[Path] = ()) -> None:
-        self._names: dict[Hashable, Path] = {}
+        self._files: dict[Hashable, Path] = {}
         self._folders: dict[str, dict[str, Path]] = {}
-        self.add(paths)
-
-    def add(self, paths: Iterable[Path]) -> None:
-        """Take in files, and what they link to or name as their own inputs."""
         waiting = [Path(p) for p in paths]
         while waiting:
             path = waiting.pop()
-            if _place(path) in self._names:
+            if _location(path) in self._files:
                 continue
             self.note(path)
             waiting += files_named_in(path)
 
     def note(self, path: Path) -> None:
         """Add one file, without what it names."""
-        for name in _names(path):
-            self._names.setdefault(name, path)
+        for name in _identities(path):
+            self._files.setdefault(name, path)
             if isinstance(name, str):
                 folder, _, base = name.rpartition(os.sep)
                 self._folders.setdefault(folder, {})[base] = path
@@ -54,34 +51,34 @@ class Inputs:
     def find(self, output: Path) -> Path | None:
         """The input that is this file: of the same path, behind the same link, or the same file under another name."""
         try:
-            return next((self._names[name] for name in _names(output) if name in self._names), None)
+            return next((self._files[name] for name in _identities(output) if name in self._files), None)
         except InputError:
-            return None  # a link that leads to itself is no input; whoever writes says it
+            return None  # a link that leads to itself is no input; the error comes when it is written
 
     def clash(self, output: Path) -> Path | None:
-        """The input that writing ``output`` would replace or remove: itself, or by its lock, its temporary files, its parts."""
+        """The input that writing ``output`` would replace or remove: this file, or its lock, temporary file or part."""
         if (found := self.find(output)) is not None:
             return found
-        folder, _, name = _place(output).rpartition(os.sep)
+        folder, _, name = _location(output).rpartition(os.sep)
         for base, path in self._folders.get(folder, {}).items():
             if is_beside(name, base):
                 return path
-        parts = f"{_place(output)}.parts"
+        parts = f"{_location(output)}.parts"
         for place, inside in self._folders.items():
             if place == parts or place.startswith(parts + os.sep):
                 return next(iter(inside.values()))
         return None
 
 
-def _place(path: Path) -> str:
-    """Where a name stands, whatever folders are links; the name itself may be one."""
+def _location(path: Path) -> str:
+    """The absolute path of a name, with links among its folders followed; the name itself may be a link."""
     path = Path(os.path.abspath(path))
     return os.path.join(os.path.realpath(path.parent), path.name)
 
 
-def _names(path: Path) -> list[Hashable]:
-    """Two files of one of these names are one file. Raises InputError."""
-    names: list[Hashable] = [_place(path), os.path.realpath(path)]
+def _identities(path: Path) -> list[Hashable]:
+    """What identifies a file: its location, where its links lead, and its inode. Raises InputError."""
+    names: list[Hashable] = [_location(path), os.path.realpath(path)]
     try:
         state = os.stat(path)
         names.append((state.st_dev, state.st_ino))
@@ -92,7 +89,7 @@ def _names(path: Path) -> list[Hashable]:
 
 
 def files_named_in(path: Path) -> tuple[Path, ...]:
-    """The other files that a file reads from. What cannot be read names none: whoever opens it says what is wrong."""
+    """The other files that a file depends on; none where it cannot be read, which is reported when it is opened."""
     try:
         state = path.stat()
     except OSError:
@@ -146,8 +143,7 @@ def _in_artefact(path: Path) -> Iterator[Path]:
                 named += map(_text, data[...])
         for data in file.values():
             if isinstance(data, h5py.Dataset) and data.is_virtual:
-                plan = data.id.get_create_plist()
-                named += {plan.get_virtual_filename(k) for k in range(plan.get_virtual_count())}
+                named += {part.file_name for part in data.virtual_sources()}
     folder = Path(os.path.realpath(path)).parent
     for name in named:
         if name and "\0" not in name:

@@ -1,8 +1,9 @@
-"""One run per output: a lock file beside it, made so that NFS and its like keep the promise."""
+"""One run per output: a lock file beside it, made in a way that is safe on NFS and other network file systems too."""
 
 from __future__ import annotations
 
 import contextlib
+import glob
 import json
 import os
 import shutil
@@ -18,11 +19,11 @@ from typing import Any
 from schemas.errors import ConfigError, InputError
 from schemas.files.companions import remove_companions
 
-# A process on another machine cannot be asked whether it lives: it touches its locks, and a lock that was not touched
-# for this long is that of a machine that went down.
-SILENCE = 600.0
+# A process on another machine cannot be asked whether it lives: it touches its locks every HEARTBEAT seconds, and a lock
+# that was not touched for STALE_AFTER seconds is that of a machine that went down.
 HEARTBEAT = 30.0
-YOUNG = 10.0  # seconds that a lock may be empty: its maker is about to write its name
+STALE_AFTER = 600.0
+EMPTY_FOR = 10.0  # seconds that a lock may be empty: its maker is about to write its name
 
 _held: dict[Path, int] = {}
 _guard = threading.Lock()
@@ -42,10 +43,10 @@ def partial_path(output: Path) -> Path:
 
 
 @contextlib.contextmanager
-def scratch_path(output: Path, what: str) -> Iterator[Path]:
-    """A file beside ``output`` that is only a step on the way to it; removed at the end, or by the next run."""
+def scratch_path(output: Path, purpose: str) -> Iterator[Path]:
+    """A temporary file beside ``output``, named after its purpose; removed at the end, or by the next run."""
     path = partial_path(output)
-    path = path.with_name(f"{path.stem}.{what}{path.suffix}")
+    path = path.with_name(f"{path.stem}.{purpose}{path.suffix}")
     try:
         yield path
     finally:
@@ -77,7 +78,8 @@ def unlocked() -> Iterator[None]:
 
 @contextlib.contextmanager
 def claim(output: Path) -> Iterator[None]:
-    """Hold the lock of an output; a process may claim it again within. Raises ConfigError where another run has it.
+    """Hold the lock of an output; the same process may claim it again inside. Raises ConfigError where another run has
+    it.
 
     What killed runs left beside the output under temporary names is removed, and so are its companions where it is absent.
     A missing folder is made, and goes again where nothing was written into it.
@@ -130,7 +132,7 @@ def _hold(lock: Path, output: Path) -> Iterator[None]:
 
 
 def _acquire(lock: Path, output: Path) -> str:
-    """Returns what the lock of a dead run said, which this one has taken over."""
+    """Make the lock; returns the text of the lock of a dead run that it replaces, '' where there was none."""
     noted = ""
     for _ in range(5):
         try:
@@ -138,7 +140,7 @@ def _acquire(lock: Path, output: Path) -> str:
         except FileExistsError:
             owner, seen = _read(lock)
             if owner is None:
-                continue  # let go of in this moment
+                continue  # released in this moment
             if not _is_stale(lock, owner):
                 raise ConfigError(_refusal(output, lock, owner)) from None
             _discard(lock, seen)
@@ -149,7 +151,7 @@ def _acquire(lock: Path, output: Path) -> str:
         own = {
             "host": host(),
             "pid": os.getpid(),
-            "began": _start_of(os.getpid()),
+            "began": _process_start(os.getpid()),
             "since": time.strftime("%Y-%m-%d %H:%M:%S"),
         }
         try:
@@ -187,13 +189,13 @@ def _read(lock: Path) -> tuple[dict[str, Any] | None, str]:
 
 def _is_stale(lock: Path, owner: dict[str, Any]) -> bool:
     if owner and owner["host"] == host():
-        began = _start_of(owner["pid"])
+        began = _process_start(owner["pid"])
         return began is None or (owner["began"] is not None and began != owner["began"])
-    return _age(lock) > (SILENCE if owner else YOUNG)
+    return _age(lock) > (STALE_AFTER if owner else EMPTY_FOR)
 
 
 def _age(lock: Path) -> float:
-    """Seconds since a lock was touched, by the clock of the file system that holds it."""
+    """Seconds since a lock was touched, by the clock of its file system."""
     probe = lock.with_name(f"{lock.name}-{uuid.uuid4().hex}")
     try:
         probe.touch()
@@ -219,8 +221,8 @@ def _discard(lock: Path, seen: str) -> None:
         aside.unlink(missing_ok=True)
 
 
-def _start_of(pid: int) -> float | None:
-    """When a process of this machine began (any unit), 0 where the system does not say, None where it is dead."""
+def _process_start(pid: int) -> float | None:
+    """When a process of this machine began (clock ticks), 0 where the system does not tell, None where it is dead."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -236,17 +238,12 @@ def _start_of(pid: int) -> float | None:
 
 def _remove_partials(output: Path) -> None:
     """Whoever holds the lock is the only one that writes: what lies there under temporary names is of killed runs."""
-    for left in output.parent.glob(f".{_plain(output.stem)}.partial-*{_plain(output.suffix)}"):
+    for left in output.parent.glob(f".{glob.escape(output.stem)}.partial-*{glob.escape(output.suffix)}"):
         with contextlib.suppress(OSError):
             if left.is_dir():
                 shutil.rmtree(left)
             else:
                 left.unlink()
-
-
-def _plain(name: str) -> str:
-    """A name for glob, taken literally."""
-    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
 
 
 _pulse: list[threading.Thread] = []

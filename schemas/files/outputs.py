@@ -29,17 +29,17 @@ _protected: ContextVar[Inputs | None] = ContextVar("protected", default=None)
 class Target:
     """A file, or a folder of files, that a run will write.
 
-    setting : with which the user chooses another place; what : how a message calls it
+    setting : with which the user chooses another place; name : in messages
     """
 
     path: Path
     setting: str = "output"
-    what: str = "the output"
+    name: str = "the output"
 
 
 @dataclass(frozen=True)
 class Output:
-    """Where a stage writes, and what it may replace.
+    """Where a stage writes, and whether it may replace what is there.
 
     path : the artefact, page or folder; None for stages that are asked for `json`, `figures` or `report` alone
     overwrite : whether what exists may be replaced; resume : whether to go on with what an interrupted run left
@@ -55,8 +55,8 @@ class Output:
     report: Path | None = None
 
     @classmethod
-    def of(cls, where: Output | Path | None) -> Output:
-        """A bare path is an output that replaces nothing."""
+    def at(cls, where: Output | Path | None) -> Output:
+        """The output at a bare path, which replaces nothing; an Output stays as it is."""
         return where if isinstance(where, Output) else cls(where)
 
     @property
@@ -74,7 +74,7 @@ class Output:
 
 @contextlib.contextmanager
 def protect(inputs: Iterable[Path]) -> Iterator[None]:
-    """Within this block no file is written in the place of one of these, or of one that they name, whoever writes it."""
+    """Within this block no file is written in the place of one of these, or of a file that one of them names."""
     token = _protected.set(Inputs(inputs))
     try:
         yield
@@ -94,25 +94,25 @@ def check_outputs(targets: Iterable[Target], inputs: Sequence[Path] = (), overwr
 
 
 def check_apart(targets: Iterable[Target], inputs: Sequence[Path] = ()) -> None:
-    """The half of :func:`check_outputs` that looks at inputs and outputs only, for folders too."""
+    """Refuse outputs in the place of an input or of each other; files or folders. Raises ConfigError."""
     known = [Inputs(inputs), *([given] if (given := _protected.get()) else [])]
     for target in targets:
         refuse_inputs(target, known)
-    others = Inputs()
+    earlier = Inputs()
     for target in targets:
-        if (twin := others.find(target.path)) is not None:
+        if (twin := earlier.find(target.path)) is not None:
             raise ConfigError(
-                f"{target.path}: {target.what} would replace {twin}, which this run also writes; choose another `{target.setting}`."
+                f"{target.path}: {target.name} would replace {twin}, which this run also writes; choose another `{target.setting}`."
             )
-        others.note(target.path)
+        earlier.note(target.path)
 
 
 def refuse_inputs(target: Target, known: Iterable[Inputs]) -> None:
-    """Raises ConfigError where writing ``target`` would replace or remove an input."""
+    """Refuse to write ``target`` where that would replace or remove an input. Raises ConfigError."""
     for inputs in known:
         if (source := inputs.clash(target.path)) is not None:
             same = "the input of the same name" if str(source) == str(target.path) else f"the input {source}"
-            raise ConfigError(f"{target.path}: {target.what} would replace {same}; choose another `{target.setting}`.")
+            raise ConfigError(f"{target.path}: {target.name} would replace {same}; choose another `{target.setting}`.")
 
 
 def check_output(path: Path, inputs: Sequence[Path] = (), overwrite: bool = False) -> None:
@@ -145,19 +145,32 @@ def _check_place(target: Target, overwrite: bool) -> None:
 
 
 def _check_writable(folder: Path, target: Target) -> None:
-    """The folder, or the one in which it will be made."""
+    """Refuse a folder in which no file can be made. Raises ConfigError."""
+    if can_write_in(folder):
+        return
+    there = _nearest_existing(folder)
+    why = "no permission, or a read-only file system" if there.is_dir() else f"{there} is a file"
+    problem = (
+        f"{folder}: cannot be made a folder" if there != folder.absolute() else f"{target.path}: cannot be written"
+    )
+    raise ConfigError(f"{problem} ({why}); choose another `{target.setting}`.")
+
+
+def can_write_in(folder: Path) -> bool:
+    """Whether files can be made in a folder, or in the nearest one above it that exists."""
+    there = _nearest_existing(folder)
+    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+
+
+def _nearest_existing(folder: Path) -> Path:
     there = Path(os.path.abspath(folder))
     while not there.exists() and there != there.parent:
         there = there.parent
-    if there.is_dir() and os.access(there, os.W_OK | os.X_OK):
-        return
-    why = "no permission, or a read-only file system" if there.is_dir() else f"{there} is a file"
-    what = f"{folder}: cannot be made a folder" if there != folder.absolute() else f"{target.path}: cannot be written"
-    raise ConfigError(f"{what} ({why}); choose another `{target.setting}`.")
+    return there
 
 
 def is_full_disk(error: BaseException | None) -> bool:
-    """HDF5 reports the system's error in words, and a failed close hides the failed write behind itself."""
+    """Whether a full disk or quota caused an error. HDF5 reports it in words, behind the error of a failed close."""
     while error is not None:
         text = str(error).lower()
         if getattr(error, "errno", None) in _FULL or any(f"errno = {number}," in text for number in _FULL):
@@ -170,19 +183,28 @@ def is_full_disk(error: BaseException | None) -> bool:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path`` that becomes ``path`` when the block ends well and vanishes when it does not.
+    """A temporary name beside ``path``, renamed to ``path`` when the block ends well and removed when it does not.
 
-    Also turns a full disk into one clear line (InputError), and refuses an output that another run is writing
-    (ConfigError).
+    Raises InputError where the disk is full, ConfigError for an input's place and for an output of another run.
     """
     path = Path(path)
     partial = partial_path(path)
     _refuse_protected(path)
-    with claim(path), _whole_or_absent(path, partial):
-        yield partial
-        if (output := current_output()) is not None and output != path:
-            note_companion(lock_path(output), path, partial)
-        os.replace(partial, path)
+    with claim(path):
+        try:
+            yield partial
+            if (output := current_output()) is not None and output != path:
+                note_companion(lock_path(output), path, partial)
+            os.replace(partial, path)
+        except BaseException as error:
+            with contextlib.suppress(OSError):
+                partial.unlink()
+            if is_full_disk(error):
+                raise InputError(
+                    f"{path}: the disk is full or over quota; nothing half-written is left. "
+                    "Free some space and run the command again."
+                ) from None
+            raise
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -198,9 +220,9 @@ def _refuse_protected(path: Path) -> None:
 
 @contextlib.contextmanager
 def atomic_folder(folder: Path, last: str) -> Iterator[Path]:
-    """A temporary folder within ``folder`` whose files get their places there when the block ends well, ``last`` after all.
+    """A temporary folder whose files move into ``folder`` when the block ends well, the file ``last`` after all others.
 
-    When it does not, nothing is left and nothing was replaced.
+    When it does not end well, nothing is left and nothing was replaced.
     """
     with claim(folder / last):
         staging = partial_path(folder / last)
@@ -212,25 +234,10 @@ def atomic_folder(folder: Path, last: str) -> Iterator[Path]:
                 _refuse_protected(folder / name)
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(staging / name, folder / name)
-        except LunargrError as error:  # says the place that the user knows
+        except LunargrError as error:  # names the folder that the user knows
             raise type(error)(str(error).replace(str(staging), str(folder))) from None
         finally:
             shutil.rmtree(staging, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _whole_or_absent(path: Path, partial: Path) -> Iterator[None]:
-    try:
-        yield
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
-        if is_full_disk(error):
-            raise InputError(
-                f"{path}: the disk is full or over quota; nothing half-written is left. "
-                "Free some space and run the command again."
-            ) from None
-        raise
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""The user's own files: regular ones only, and text of a size that can be text."""
+"""Reading the user's own text and JSON files, and refusing expected is no regular file."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ from schemas.errors import InputError
 LARGEST_TEXT = 1 << 30  # bytes: PDS indices have hundreds of megabytes
 
 
-def check_file(path: Path, what: str) -> None:
-    """Refuse what is missing, a folder, a device or a pipe, before anything is read of it. Raises InputError."""
+def check_file(path: Path, expected: str) -> None:
+    """Refuse what is no regular file, before it is read. expected : what it should be, in words. Raises InputError."""
     path = Path(path)
     if path.is_dir():
-        raise InputError(f"{path}: expected {what}, found a folder; name the file in it.")
+        raise InputError(f"{path}: expected {expected}, found a folder; name the file in it.")
     if not path.exists():
-        raise InputError(f"{path}: no such file; expected {what}. Check the path.")
+        raise InputError(f"{path}: no such file; expected {expected}. Check the path.")
     if not path.is_file():
-        raise InputError(f"{path}: expected {what}, found a device or a pipe; write it to a file and name that.")
+        raise InputError(f"{path}: expected {expected}, found a device or a pipe; write it to a file and name that.")
 
 
-def read_text(path: Path, what: str, encoding: str = "utf-8-sig") -> str:
-    """The text of a file. Raises InputError."""
-    check_file(path, what)
+def read_text(path: Path, expected: str, encoding: str = "utf-8-sig") -> str:
+    """The text of a file. expected : what it should hold, for error lines. Raises InputError."""
+    check_file(path, expected)
     try:
         if path.stat().st_size > LARGEST_TEXT:
             raise InputError(
-                f"{path}: expected {what}, found a file of more than {LARGEST_TEXT >> 20} MiB; is it the right one?"
+                f"{path}: expected {expected}, found a file of more than {LARGEST_TEXT >> 20} MiB; is it the right one?"
             )
         return path.read_text(encoding=encoding)
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path}: expected {what}, found something else than UTF-8 text (byte {error.start}); convert it (iconv -t utf-8)."
+            f"{path}: expected {expected}, found something else than UTF-8 text (byte {error.start}); convert it (iconv -t utf-8)."
         ) from None
     except OSError as error:
         raise InputError(
-            f"{path}: expected {what}, cannot be read ({error.strerror}); check its permissions."
+            f"{path}: expected {expected}, cannot be read ({error.strerror}); check its permissions."
         ) from None
 
 
-def read_json(path: Path, what: str) -> Any:
-    """What a JSON file holds. Raises InputError."""
-    return parse_json(read_text(path, what), f"{path}: expected {what}", InputError, "mend the file")
+def read_json(path: Path, expected: str) -> Any:
+    """The content of a JSON file. expected : what it should hold, for error lines. Raises InputError."""
+    return parse_json(read_text(path, expected), f"{path}: expected {expected}", InputError, "mend the file")

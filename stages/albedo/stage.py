@@ -94,7 +94,7 @@ def run(
     progress: Progress = show_nothing,
 ) -> Summary:
     """Write the map with albedo. Raises LunargrError."""
-    return _run(svbrdf, scene, None, Output.of(output), config, progress)
+    return _run(svbrdf, scene, None, Output.at(output), config, progress)
 
 
 def run_part(svbrdf: Path, scene: Path, calibration: Path, output: Path, config: Config) -> Summary:

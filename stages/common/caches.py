@@ -1,4 +1,4 @@
-"""Where compiled functions and fonts are kept when neither the installation nor the home folder can be written."""
+"""Folders for compiled functions and fonts, where neither the installation nor the home folder can be written."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import tempfile
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 
+from schemas.files.outputs import can_write_in
+
 PACKAGE = Path(__file__).resolve().parent.parent
 
 
@@ -15,27 +17,19 @@ def choose_caches(environment: MutableMapping[str, str] = os.environ, package: P
     """Set NUMBA_CACHE_DIR and MPLCONFIGDIR to a folder of this user's where numba and matplotlib would find none.
 
     numba keeps what it compiles beside the source or in the user's cache folder, and stops with "no locator available"
-    where it can write neither; matplotlib warns. To be read before they are imported.
+    where it can write to neither; matplotlib warns. To be called before they are imported.
     """
     home = _cache_home(environment)
-    if "NUMBA_CACHE_DIR" not in environment and not _writable(package) and not _writable(home):
+    if "NUMBA_CACHE_DIR" not in environment and not can_write_in(package) and not can_write_in(home):
         environment["NUMBA_CACHE_DIR"] = str(_temporary() / "numba")
     settings = Path(environment.get("XDG_CONFIG_HOME") or home.parent / ".config")
-    if "MPLCONFIGDIR" not in environment and not (_writable(settings) and _writable(home)):
+    if "MPLCONFIGDIR" not in environment and not (can_write_in(settings) and can_write_in(home)):
         environment["MPLCONFIGDIR"] = str(_temporary() / "matplotlib")
 
 
 def _cache_home(environment: Mapping[str, str]) -> Path:
     home = environment.get("HOME") or os.path.expanduser("~")
     return Path(environment.get("XDG_CACHE_HOME") or os.path.join(home, ".cache"))
-
-
-def _writable(folder: Path) -> bool:
-    """Whether files can be made in a folder, or in the nearest one above it that is there."""
-    there = folder.absolute()
-    while not there.exists() and there != there.parent:
-        there = there.parent
-    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
 
 
 def _temporary() -> Path:

@@ -1,9 +1,9 @@
 """95 % intervals over ground: delete-one-unit jackknife of ratios with Student's t, and the spread over training runs.
 
-Pairs on one ground tile share terrain and images, so tiles and not pairs are the independent witnesses. All that is
-compared is a ratio of sums over tiles: a mean squared error (squared errors over pixels), a gain (errors of one model
-over those of another, paired tile by tile), a share of matches (hits over matches). With the ratio R of all units and
-R_k of all but unit k, on a scale f that takes out skewness (errors: -R^(-1/2); gains: logarithm; shares: logit):
+Pairs on one ground tile share terrain and images, so tiles and not pairs are independent. Everything compared is a
+ratio of sums over tiles: a mean squared error (squared errors over pixels), a gain (errors of one model over those of
+another, paired tile by tile), a share of matches (hits over matches). With the ratio R of all units and R_k of all but
+unit k, on a scale f that takes out skewness (errors: -R^(-1/2); gains: logarithm; shares: logit):
 
     variance = (n - 1)/n sum (f(R_k) - f(R))^2                                       Tukey (1958), Ann. Math. Stat. 29, 614
 
@@ -46,7 +46,7 @@ class Interval:
 
 @dataclass(frozen=True)
 class Scale:
-    """Where a ratio is nearly normal: there, back again, and the bounds (low, high) between which it exists."""
+    """A transformation that makes a ratio nearly normal, its inverse, and the bounds between which it exists."""
 
     to: Callable[[NDArray], NDArray]
     back: Callable[[float], float]
@@ -72,15 +72,15 @@ def ratio_interval(total: NDArray, weight: NDArray, unit: NDArray, scale: Scale 
 
     total : (N,) or (runs, N); weight : likewise, or (N,) for all runs; unit : (N,) labels of pieces of ground. Entries
     that are not finite do not count.
-    The value is the ratio of the means over runs. Where a ratio does not exist on ``scale`` it stays as it is.
+    The value is the ratio of the means over runs. Where a ratio lies outside the bounds of ``scale``, none is used.
     """
     totals, weights = _per_unit(total, weight, unit)
     if not totals.size:
         return Interval(math.nan, math.nan, math.nan)
     value = float(_ratio(totals.mean(0).sum(), weights.mean(0).sum()))
     runs = _ratio(totals.sum(axis=1), weights.sum(axis=1))
-    asked = np.concatenate([_without_one(totals.mean(0), weights.mean(0)), runs])
-    if not bool(((asked > scale.low) & (asked < scale.high)).all()):
+    ratios = np.concatenate([_without_one(totals.mean(0), weights.mean(0)), runs])
+    if not bool(((ratios > scale.low) & (ratios < scale.high)).all()):
         scale = PLAIN
     parts = [_ground_variance(totals.mean(0), weights.mean(0), scale)]
     if len(totals) > 1:
@@ -113,14 +113,14 @@ def ground_variance(total: NDArray, weight: NDArray, unit: NDArray, scale: Scale
 
 
 def run_variance(values: Sequence[float] | NDArray) -> Variance:
-    """Variance of the mean of independent training runs; freedom 0 for one run."""
+    """Variance of the mean of independent training runs, from (runs,) values; freedom 0 for one run."""
     if len(values) < 2:
         return Variance(math.nan, 0.0)
     return Variance(float(np.var(values, ddof=1)) / len(values), len(values) - 1.0)
 
 
 def effective_units(weights: NDArray) -> float:
-    """How many units of equal weight tell as much: (sum w)^2 / sum w^2."""
+    """The number of units of equal weight with the same information: (sum w)^2 / sum w^2. weights : (units,)"""
     return float(np.square(weights.sum()) / np.square(weights).sum())
 
 
@@ -134,9 +134,9 @@ def join(parts: Sequence[Variance]) -> Variance:
     return Variance(value, value**2 / below if below > 0 else max(part.freedom for part in parts))
 
 
-def student_quantile(freedom: float, level: float = LEVEL) -> float:
-    """Half width of the central interval of Student's t that holds ``level``."""
-    return float(special.stdtrit(freedom, 0.5 + level / 2))
+def student_quantile(freedom: float) -> float:
+    """Half width of the central 95 % interval of Student's t."""
+    return float(special.stdtrit(freedom, 0.5 + LEVEL / 2))
 
 
 def two_sided_p(t: float, freedom: float) -> float:
@@ -177,8 +177,8 @@ def _ground_variance(totals: NDArray, weights: NDArray, scale: Scale) -> Varianc
     count = len(weights)
     if count < 2:
         return Variance(math.nan, 0.0)
-    without, of_all = scale.to(_without_one(totals, weights)), scale.to(_ratio(totals.sum(), weights.sum()))
-    spread = np.square(without - of_all).sum() * (count - 1) / count
+    without_one, whole = scale.to(_without_one(totals, weights)), scale.to(_ratio(totals.sum(), weights.sum()))
+    spread = np.square(without_one - whole).sum() * (count - 1) / count
     return Variance(float(spread), max(1.0, effective_units(weights) - 1))
 
 

@@ -1,4 +1,4 @@
-"""Freed memory that goes back to the system: what glibc keeps in pieces adds up where work comes in large portions."""
+"""What glibc does with freed memory: returned to the system between large pieces of work, or kept while training."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 
 
 def return_freed_memory() -> None:
-    """Give back the whole pages among the pieces that lie free in glibc's heap; for once a portion, not once a block."""
+    """Return the free pages of glibc's heap to the system. Slow: for once a window, not once a block."""
     with contextlib.suppress(OSError, AttributeError):  # another C library, which has no such call
         ctypes.CDLL(None).malloc_trim(0)
 
@@ -20,7 +20,7 @@ def keep_freed_memory() -> None:
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError):
-        return  # another C library, which has no such knob
+        return  # another C library, which has no such call
     m_trim_threshold, m_top_pad, m_mmap_threshold, m_arena_max = -1, -2, -3, -8
     mallopt(m_arena_max, 1)  # other threads' own arenas map large blocks anew each time
     mallopt(m_mmap_threshold, 1 << 30)

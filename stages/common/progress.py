@@ -1,16 +1,16 @@
-"""How a stage tells whoever started it what it does and how far it is."""
+"""Messages and progress of a stage, for its caller."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-Say = Callable[[str], None]  # a line for the person who waits
-Progress = Callable[[int, int, str], None]  # how many are done, of how many, of what
+Say = Callable[[str], None]  # takes a line of text
+Progress = Callable[[int, int, str], None]  # takes how many are done, of how many, and of what
 
 
 def say_nothing(line: str) -> None:
-    """For callers who want no messages."""
+    """A Say that drops messages."""
 
 
 def show_nothing(done: int, total: int, what: str) -> None:
-    """For callers who want no progress."""
+    """A Progress that shows none."""

@@ -1,4 +1,4 @@
-"""Sharing out work over crops or rows to kernels that do not hold Python's lock, with the same result on any number of threads."""
+"""Running kernels that release Python's lock in several threads, with the same result on any number of them."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ _here = threading.local()  # whether this thread works on a share already
 
 @contextlib.contextmanager
 def one_thread_each() -> Iterator[None]:
-    """Inside, PyTorch's own operators run on one thread each, and work is shared out to as many as PyTorch had.
+    """Within this block PyTorch's own operators run on one thread each, and :func:`share_out` on as many as PyTorch
+    had.
 
-    An operator that is split over several threads adds up in another order, or ends its vectors elsewhere. Pieces of a
-    fixed size, each worked on by one thread, come out alike however many threads there are.
+    An operator that is split over several threads adds in another order, or ends its vectors elsewhere. Pieces of a
+    fixed size, each worked on by one thread, give the same result on any number of threads.
     """
     global _workers
     threads, before = torch.get_num_threads(), _workers
@@ -35,12 +36,12 @@ def one_thread_each() -> Iterator[None]:
 
 
 def in_pieces() -> bool:
-    """Whether operators run on one thread each, so that batches should be cut into pieces and shared out."""
+    """Whether we are inside :func:`one_thread_each`, where batches are to be cut into pieces and shared out."""
     return _workers is not None
 
 
 def share_out(kernel: Callable[..., None], count: int, *arguments: Any) -> None:
-    """kernel(first, last, *arguments) over ``count`` crops or rows, on as many threads as PyTorch uses."""
+    """Call kernel(first, last, *arguments) on ranges of ``count`` crops or rows, in as many threads as PyTorch uses."""
     threads = min(_workers or torch.get_num_threads(), count)
     if threads <= 1 or getattr(_here, "busy", False):
         kernel(0, count, *arguments)
@@ -53,9 +54,9 @@ def share_out(kernel: Callable[..., None], count: int, *arguments: Any) -> None:
 
 
 def _work(alone: bool, kernel: Callable[..., None], *arguments: Any) -> None:
-    if alone and torch.get_num_threads() != 1:  # PyTorch counts for every thread anew
+    if alone and torch.get_num_threads() != 1:  # PyTorch's number of threads is one of each thread
         torch.set_num_threads(1)
-    _here.busy = True  # what is shared out in turn stays here: waiting for this very pool would last for ever
+    _here.busy = True  # a share is not shared out again: it would wait for its own pool for ever
     try:
         kernel(*arguments)
     finally:

@@ -55,7 +55,7 @@ def run(
     progress: Progress = show_nothing,
 ) -> Result:
     """Diagnose the pairs; write what is asked for. Raises ArtefactError, ConfigError, RegistryError."""
-    output = Output.of(output)
+    output = Output.at(output)
     if config.most_causes < 1 or config.most_pairs < 1 or config.most_images < 1:
         raise ConfigError("diagnose: expected counts of at least 1 for causes, images and pairs.")
     inputs = [p for p in (pairs, checkpoint) if p is not None]

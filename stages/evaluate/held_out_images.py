@@ -82,7 +82,7 @@ def run(
     maps : of `lunargr albedo`, such as those of all folds; a pair is scored on the first that its image did not make.
     Raises LunargrError.
     """
-    output = Output.of(output)
+    output = Output.at(output)
     reports = [output.file.with_suffix(".json"), *([output.json] if output.json else [])]
     for path in (output.file, *reports):
         check_output(path, [pairs, *maps], output.overwrite)

@@ -67,7 +67,7 @@ def run(
         rows, scores, scale, _ = evaluate_pairs(task, keep=kept.put, progress=progress)
         return rows, scores, scale
 
-    return _run(pairs, checkpoints, Output.of(output), config, compare)
+    return _run(pairs, checkpoints, Output.at(output), config, compare)
 
 
 def run_in_parts(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Config, fan: Fan) -> dict[str, Any]:
@@ -102,7 +102,7 @@ def _run(
 
 def _check_outputs(files: Files) -> None:
     output, (beside, *others) = files.output, files.reports
-    targets = [Target(output.file), Target(beside, what=f"the JSON beside {output.file.name}")]
+    targets = [Target(output.file), Target(beside, name=f"the JSON beside {output.file.name}")]
     targets += [Target(report, "json") for report in others]
     if output.figures is not None:
         targets += [Target(output.figures / name, "figures") for name in FIGURES]

@@ -8,7 +8,7 @@ from schemas.later import imported_later
 from stages.export.config import Config
 
 if TYPE_CHECKING:
-    from stages.export.onnx_file import Summary, run
+    from stages.export.onnx_file import run
 
 __getattr__ = imported_later(__name__, "onnx_file")
-__all__ = ["Config", "Summary", "run"]
+__all__ = ["Config", "run"]

@@ -1,4 +1,4 @@
-"""The page beside an exported network: what it takes and gives, what it was trained on, where it must not be trusted."""
+"""The model card beside an exported network: inputs and outputs, training data, limits."""
 
 from __future__ import annotations
 
@@ -12,12 +12,23 @@ from stages.network.predictor import Predictor
 
 
 def model_card(
-    name: str, checkpoint: str, predictor: Predictor, told: Mapping[str, str], losses: Mapping[str, NDArray], best: int
+    name: str,
+    checkpoint: str,
+    predictor: Predictor,
+    attributes: Mapping[str, str],
+    losses: Mapping[str, NDArray],
+    best: int,
 ) -> str:
-    """Markdown. losses : train_loss and validation_loss by epoch; best : the epoch whose weights these are, from 1"""
+    """The card in Markdown.
+
+    attributes : of the checkpoint; losses : train_loss and validation_loss, (epochs,) each; best : epoch of the
+    weights, from 1
+    """
     model, stride = predictor.model, predictor.net.stride
     rows = "\n".join(f"| {k} | `{p.name}` | {p.unit} | {p.description} |" for k, p in enumerate(model.parameters))
-    inputs = ", ".join(f"`{i['name']}` (SHA-256 `{i['sha256'][:16]}...`)" for i in json.loads(told.get("inputs", "[]")))
+    files = json.loads(attributes.get("inputs", "[]"))
+    inputs = ", ".join(f"`{i['name']}` (SHA-256 `{i['sha256'][:16]}...`)" for i in files)
+    history = attributes.get("history", "").strip().splitlines() or ["?"]
     found = float(losses["validation_loss"][best - 1]) if 0 < best <= len(losses["validation_loss"]) else float("nan")
     error = f"{found:.4g}" if np.isfinite(found) else "not recorded"
     return f"""# {name}
@@ -43,7 +54,7 @@ those pixels as context, on windows that begin at multiples of {stride}. Holes m
 ## Where it comes from
 
 - Exported from `{checkpoint}`, epoch {best} of {len(losses["train_loss"])}; mean squared error on validation pixels {error} (I/F squared).
-- Trained on {inputs or "inputs that were not recorded"} with lunargr {told.get("lunargr_version", "?")}: `{told.get("history", "").strip().splitlines()[-1] if told.get("history", "").strip() else "?"}`
+- Trained on {inputs or "inputs that were not recorded"} with lunargr {attributes.get("lunargr_version", "?")}: `{history[-1]}`
 - Images in {"I/F" if predictor.image_units == "iof" else "DN, with a gain and an offset per image"}.
 
 ## Limits

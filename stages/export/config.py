@@ -1,4 +1,4 @@
-"""What export is asked for."""
+"""The settings of export."""
 
 from __future__ import annotations
 

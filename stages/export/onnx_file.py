@@ -7,7 +7,6 @@ import json
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,14 +48,14 @@ class _Exported(torch.nn.Module):
     def forward(self, elevation: Tensor) -> Tensor:
         keys = elevation.new_empty(0, dtype=torch.int64)
         features = self.net.plain_features(scale_elevation(elevation, self.elevation_scale), keys)
-        return self.maps.stack(self.maps.shifted(self.net.read_out(features)), dim=1)
+        return self.maps.stack(self.maps.unbounded(self.net.read_out(features)), dim=1)
 
 
 def run(
     checkpoint: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Summary:
     """Write ``output`` (.onnx) and its card beside it (.md). Raises LunargrError."""
-    output = Output.of(output)
+    output = Output.at(output)
     path = output.file
     if path.suffix.lower() != ".onnx":
         raise ConfigError(f"{path}: expected a name that ends in .onnx; choose another `output`.")
@@ -67,20 +66,28 @@ def run(
         check_output(made, [checkpoint], output.overwrite)
     predictor = load_predictor(checkpoint)
     with open_artefact(checkpoint, CHECKPOINT) as file:
-        told = {k: str(file.attrs[k]) for k in ("history", "lunargr_version", "config", "inputs") if k in file.attrs}
+        attributes = {
+            k: str(file.attrs[k]) for k in ("history", "lunargr_version", "config", "inputs") if k in file.attrs
+        }
         losses = {k: file[k][...] for k in ("train_loss", "validation_loss")}
         best = int(file.attrs["best_epoch"])
-    data = to_onnx(predictor, config.opset, told)
+    data = to_onnx(predictor, config.opset, attributes)
     names = tuple(p.name for p in predictor.model.parameters)
     with companions_of(path), atomic_path(path) as partial, atomic_path(card) as text:
         partial.write_bytes(data)
-        text.write_text(model_card(path.name, checkpoint.name, predictor, told, losses, best), encoding="utf-8")
+        text.write_text(model_card(path.name, checkpoint.name, predictor, attributes, losses, best), encoding="utf-8")
     return Summary(predictor.model.name, names, predictor.net.stride, len(data), card)
 
 
-def to_onnx(predictor: Predictor, opset: int, told: dict[str, str]) -> bytes:
-    """The network as an ONNX file; what must be known to use it stands in its metadata. Raises ConfigError."""
-    onnx = _library()
+def to_onnx(predictor: Predictor, opset: int, attributes: dict[str, str]) -> bytes:
+    """The network as an ONNX file, whose metadata hold what one must know to use it. Raises ConfigError.
+
+    attributes : of the checkpoint, by name
+    """
+    try:
+        import onnx
+    except ImportError:
+        raise ConfigError("export: expected the package 'onnx', found none; pip install 'lunargr[onnx]'.") from None
     stride = predictor.net.stride
     axes = {0: "batch", 1: "height", 2: "width"}
     buffer = io.BytesIO()
@@ -104,16 +111,8 @@ def to_onnx(predictor: Predictor, opset: int, told: dict[str, str]) -> bytes:
         "gsd_m": f"{predictor.gsd:g}",
         "height_and_width_are_multiples_of": str(stride),
         "context_px": str(predictor.net.reach),
-        **{f"checkpoint_{name}": text for name, text in told.items()},
+        **{f"checkpoint_{name}": text for name, text in attributes.items()},
     }
     onnx.helper.set_model_props(model, facts)
     onnx.checker.check_model(model)
     return model.SerializeToString()
-
-
-def _library() -> Any:
-    try:
-        import onnx
-    except ImportError:
-        raise ConfigError("export: expected the package 'onnx', found none; pip install 'lunargr[onnx]'.") from None
-    return onnx

@@ -1,26 +1,17 @@
-"""Stage infer. stage: from files to files; windows: where the map is cut; terrain: the DEM in rows; working: threads; writing: the map."""
+"""infer: coefficient maps for a DEM.
+
+stage: from files to files; windows: where the map is cut; terrain: the DEM in rows; parallel: threads; writing: the map
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from schemas.later import imported_later
-from stages.infer.config import Config, Summary
+from stages.infer.config import Config
 
 if TYPE_CHECKING:
-    from stages.infer.stage import check_body, check_files, count_bands, open_terrain, run, summarise
-    from stages.infer.windows import axis_windows, blend_weights
+    from stages.infer.stage import check_body, check_files, count_bands, run, summarise
 
-__getattr__ = imported_later(__name__, "stage", "windows")
-__all__ = [
-    "Config",
-    "Summary",
-    "axis_windows",
-    "blend_weights",
-    "check_body",
-    "check_files",
-    "count_bands",
-    "open_terrain",
-    "run",
-    "summarise",
-]
+__getattr__ = imported_later(__name__, "stage")
+__all__ = ["Config", "check_body", "check_files", "count_bands", "run", "summarise"]

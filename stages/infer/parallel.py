@@ -1,4 +1,4 @@
-"""Windows worked on side by side, their strips handed over as they are made."""
+"""Windows predicted in several threads, whose strips come out as they are made."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ Job = TypeVar("Job")
 Item = TypeVar("Item")
 
 
-def side_by_side(
+def run_in_threads(
     jobs: Sequence[Job], work: Callable[[Job], Iterator[Item]], together: int
 ) -> Iterator[tuple[int, Item | None]]:
-    """(the job's number, what ``work`` yields of it), and (number, None) after its last; in order within a job only.
+    """Yield (job number, item) for all that ``work`` yields, and (job number, None) after a job's last item.
 
-    ``together`` threads, no more than PyTorch may use, have one of its threads each. What they make waits for the
-    caller, two pieces a thread at most. An error in one ends all; so does leaving the loop, after the strips that are being worked on.
+    The items of one job come in order, those of different jobs in any. ``together`` threads work, but no more than
+    PyTorch may use, and each of PyTorch's operators runs on one. At most two items a thread wait for the caller. An
+    error in one thread ends all, and so does leaving the loop, once the items that are being made are done.
     """
     threads = torch.get_num_threads()
     together = max(1, min(together, threads, len(jobs)))
@@ -28,15 +29,15 @@ def side_by_side(
     stop = threading.Event()
     left = deque(enumerate(jobs))
 
-    def hand_over(what: tuple[int, Item | None] | BaseException) -> None:
+    def hand_over(result: tuple[int, Item | None] | BaseException) -> None:
         while not stop.is_set():
             try:
-                made.put(what, timeout=0.1)
+                made.put(result, timeout=0.1)
                 return
             except queue.Full:
                 continue
 
-    def go() -> None:
+    def take_jobs() -> None:
         try:
             while not stop.is_set():
                 try:
@@ -52,17 +53,17 @@ def side_by_side(
             hand_over(error)
 
     torch.set_num_threads(1)  # a convolution shared out among threads adds up in another order, which bf16 shows
-    workers = [threading.Thread(target=go, name=f"strips {k}", daemon=True) for k in range(together)]
+    workers = [threading.Thread(target=take_jobs, name=f"strips {k}", daemon=True) for k in range(together)]
     try:
         for worker in workers:
             worker.start()
         finished = 0
         while finished < len(jobs):
-            what = made.get()
-            if isinstance(what, BaseException):
-                raise what
-            finished += what[1] is None
-            yield what
+            result = made.get()
+            if isinstance(result, BaseException):
+                raise result
+            finished += result[1] is None
+            yield result
     finally:
         stop.set()
         for worker in workers:
@@ -72,7 +73,7 @@ def side_by_side(
 
 
 def in_order(found: Iterator[tuple[int, Item | None]]) -> Iterator[tuple[int, Item | None]]:
-    """The same, all of a job before anything of the next."""
+    """What :func:`run_in_threads` yields, with all items of a job before those of the next."""
     waiting: dict[int, list[Item | None]] = {}
     current = 0
     for number, item in found:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import h5py
@@ -17,35 +17,37 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from schemas import (
-    SCENE,
-    SVBRDF,
-    ArtefactError,
-    ArtefactWriter,
-    ConfigError,
-    atomic_path,
-    open_artefact,
-    read_strings,
-)
+from schemas import SCENE, SVBRDF, ArtefactWriter, ConfigError, atomic_path, open_artefact, read_strings
 from schemas.files.companions import companions_of
-from schemas.files.hdf5 import silence_hdf5
 from schemas.files.outputs import Output, Target, check_apart, check_outputs
 from stages.common.memory import keep_freed_memory, return_freed_memory
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.infer.config import Config, Summary
-from stages.infer.parallel import in_order, side_by_side
+from stages.infer.config import Config
+from stages.infer.parallel import in_order, run_in_threads
 from stages.infer.terrain import TerrainReader, valid_part
-from stages.infer.windows import Box, axis_windows, own_rows, swaths_of, window_and_stride, windows_of
-from stages.infer.writing import Blend, Outputs
+from stages.infer.windows import Box, axis_windows, cut_swaths, list_windows, shard_rows, window_and_stride
+from stages.infer.writing import Blend, MapWriter
 from stages.network.mapper import Mapper
 from stages.network.precision import check_precision, choose_inference_precision
 from stages.network.predictor import choose_device, load_predictor
 from stages.pairs.holes import fill_holes
 from stages.physics.maps.geotiff import MapTiff, band_names, map_tags
-from stages.physics.maps.grid import check_same_body, read_grid
+from stages.physics.maps.grid import Grid, check_same_body, read_grid
 
+SAMPLE = 256  # px, edge of the terrain by which the precision is chosen
 QUANTITY = "radiance factor I/F = pi r, including cos(incidence)"
-GSD_TOLERANCE = 0.05  # relative; beyond it the network would meet terrain at a scale it never saw
+GSD_TOLERANCE = 0.05  # relative; beyond it terrain has another scale than the network was trained at
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Ranges of the coefficients, for the table at the end: name -> (mean, std, 1 %, 99 %)."""
+
+    grid: Grid
+    model: str
+    valid_share: float
+    windows: int
+    coefficients: dict[str, tuple[float, float, float, float]]
 
 
 def run(
@@ -57,7 +59,7 @@ def run(
     progress: Progress = show_nothing,
 ) -> Summary:
     """Write ``svbrdf.h5`` and, if wanted, a cloud-optimised GeoTIFF. Raises ConfigError, ArtefactError."""
-    output = Output.of(output)
+    output = Output.at(output)
     window_and_stride(config)
     check_precision(config.precision)
     check_files([scene, checkpoint], output, config)
@@ -73,7 +75,7 @@ def run(
                 "ingest the DEM at that `gsd` or add `any_gsd`."
             )
         if precision == "auto":
-            precision = choose_inference_precision(predictor, _sample_of(file), device)
+            precision = choose_inference_precision(predictor, _read_sample(file), device)
         names = [p.name for p in predictor.model.parameters]
         maps = list(predictor.maps.maps) if predictor.maps.channels > len(predictor.maps.maps) else []
         sizes = {"coefficient": len(names), "map": len(maps), "y": grid.height, "x": grid.width}
@@ -150,16 +152,16 @@ def _predict(
     config: Config,
     progress: Progress,
 ) -> int:
-    """Run the network over all windows of the shard's rows; the number of windows."""
+    """Run the network over all windows of the shard's rows; returns the number of windows."""
     elevation, dem_valid = file["elevation"], file["dem_valid"]
-    own = own_rows(elevation.shape[0], config)
+    own = shard_rows(elevation.shape[0], config)
     if config.shard[1] > 1:
         writer.file.attrs["shard_rows"] = np.array(own, np.int64)
     window, stride = window_and_stride(config)
     if config.window is None and config.stride is None:
-        boxes = swaths_of(elevation.shape, config, mapper.together)
+        boxes = cut_swaths(elevation.shape, config, mapper.together)
     else:
-        boxes = windows_of(elevation.shape, config)
+        boxes = list_windows(elevation.shape, config)
 
     def work(box: Box) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
         part = valid_part(dem_valid, box)
@@ -168,9 +170,9 @@ def _predict(
                 yield row, part[1], values
         return_freed_memory()  # or what windows of other sizes leave behind would grow with the map
 
-    outputs = Outputs(writer, elevation, dem_valid, own, picture)
+    outputs = MapWriter(writer, elevation, dem_valid, own, picture)
     blend = Blend(outputs, window - stride, own) if window > stride else None
-    found = side_by_side(boxes, work, mapper.together)
+    found = run_in_threads(boxes, work, mapper.together)
     rows, done = sum(box[2] for box in boxes), 0
     begun = -1
     for number, strip in in_order(found) if blend else found:
@@ -195,11 +197,11 @@ def _predict(
     return len(boxes)
 
 
-def _sample_of(scene: h5py.File, size: int = 256) -> NDArray[np.float32]:
+def _read_sample(scene: h5py.File) -> NDArray[np.float32]:
     """A window of terrain from the middle of a scene, holes filled."""
     height, width = scene["elevation"].shape
-    r0, c0 = max(0, (height - size) // 2), max(0, (width - size) // 2)
-    part = np.s_[r0 : r0 + size, c0 : c0 + size]
+    r0, c0 = max(0, (height - SAMPLE) // 2), max(0, (width - SAMPLE) // 2)
+    part = np.s_[r0 : r0 + SAMPLE, c0 : c0 + SAMPLE]
     return fill_holes(scene["elevation"][part], scene["dem_valid"][part].astype(bool))
 
 
@@ -225,19 +227,3 @@ def check_body(scene: Path, body: str | None) -> None:
     """Refuse a body that a scene contradicts. Raises GeometryError."""
     with open_artefact(scene, SCENE) as file:
         check_same_body(scene, float(file.attrs["body_radius_m"]), body)
-
-
-def open_terrain(path: Path) -> bool:
-    """Whether ``path`` is one of our HDF5 artefacts (otherwise a raster DEM)."""
-    silence_hdf5()
-    if not path.exists():
-        raise ArtefactError(f"{path}: no such file; expected scene.h5 or a DEM.")
-    return bool(h5py.is_hdf5(path)) and _names_schema(path)
-
-
-def _names_schema(path: Path) -> bool:
-    try:
-        with h5py.File(path, "r") as file:
-            return "lunargr_schema" in file.attrs
-    except OSError:
-        return path.suffix.lower() in (".h5", ".hdf5")  # damaged: let open_artefact or the raster's reader say so

@@ -9,22 +9,22 @@ from numpy.typing import NDArray
 
 from stages.pairs.holes import FILL_REACH, fill_holes
 
-STEP = 8  # px, of the edges of what is worked on
-READ = 1024  # rows read at once: what filling holes needs around them is read again with the next
+STEP = 8  # px; the box around what is valid begins and ends at multiples of it
+READ = 1024  # rows read at once: the surroundings that filling holes needs are read again with the next
 
 
 class TerrainReader:
-    """elevation (H, W) m and dem_valid (H, W), arrays or HDF5 datasets; keeps the last block that it has read."""
+    """Reads windows of a DEM. elevation : (H, W) m, dem_valid : (H, W), arrays or HDF5 datasets"""
 
     def __init__(self, elevation: Any, dem_valid: Any) -> None:
         self.elevation, self.valid = elevation, dem_valid
         self._box = (0, 0, 0, 0)
-        self._block = np.empty((0, 0), np.float32)
+        self._block = np.empty((0, 0), np.float32)  # the last that was read
 
     def __call__(self, first: int, last: int, left: int, right: int) -> NDArray[np.float32]:
         """Rows ``first`` .. ``last``, columns ``left`` .. ``right``, (last - first, right - left) float32 in m."""
         height, width = self.elevation.shape
-        # Beyond the map stands its last row or column: a network's input is continued to whole strides.
+        # Beyond the map its last row or column is repeated: the network's input has whole strides.
         a, b = min(max(first, 0), height - 1), min(max(last, 1), height)
         c, d = min(max(left, 0), width - 1), min(max(right, 1), width)
         found = self._filled(a, b, c, d)

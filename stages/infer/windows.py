@@ -1,4 +1,4 @@
-"""Where a map is cut. Every window has all the context that the network sees: the map is the same wherever the cuts fall."""
+"""The windows of a map. Each is predicted with all the context that the network sees: their edges leave no trace."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import ConfigError
+from stages.common.shards import shard_range
 from stages.infer.config import Config
 from stages.physics.maps.window import Box
 
-BAND = 1024  # rows, by which shards share a map out
+BAND = 1024  # rows; shards hold whole bands of a map
 # Context costs a wide window little, and one that runs from north to south nothing but at its ends. Memory follows the width.
 WIDEST, TALLEST, SHORTEST = 4096, 8192, 512
 CHUNK = 256  # px of the artefact's chunks, which are best written whole
 
 
 def window_and_stride(config: Config) -> tuple[int, int]:
-    """Those of the lattice that shards follow. Raises ConfigError."""
+    """px, window and stride of the lattice whose rows of windows shards share. Raises ConfigError."""
     window = BAND if config.window is None else config.window
     stride = window if config.stride is None else config.stride  # windows carry their context: they need no overlap
     if window < 16 or not 1 <= stride <= window:
@@ -54,34 +55,33 @@ def blend_weights(first: int, last: int, overlap: int, length: int) -> NDArray[n
     return np.maximum(weight, 1e-4)
 
 
-def own_rows(height: int, config: Config) -> tuple[int, int]:
+def shard_rows(height: int, config: Config) -> tuple[int, int]:
     """Rows that a shard writes: from its first window's start to the next shard's."""
     window, stride = window_and_stride(config)
     rows = axis_windows(height, window, stride, config.offset)
-    index, count = config.shard
-    first, last = (len(rows) * k // count for k in (index, index + 1))
+    first, last = shard_range(len(rows), config.shard)
     starts = [0, *(a for a, _ in rows[1:]), height]
     return starts[first], starts[last]
 
 
-def windows_of(shape: tuple[int, int], config: Config) -> list[Box]:
-    """The windows as asked for, row by row: all that touch the shard's rows, whole."""
+def list_windows(shape: tuple[int, int], config: Config) -> list[Box]:
+    """The windows that the settings ask for, row by row: all that touch the shard's rows, whole."""
     window, stride = window_and_stride(config)
-    first, last = own_rows(shape[0], config)
+    first, last = shard_rows(shape[0], config)
     rows, columns = (axis_windows(length, window, stride, config.offset) for length in shape)
     return [(a, c, b - a, d - c) for a, b in rows if b > first and a < last for c, d in columns]
 
 
-def swaths_of(shape: tuple[int, int], config: Config, together: int) -> list[Box]:
-    """Wide and tall windows without overlap that cover the shard's rows, at least ``together`` where the map is large enough."""
-    first, last = own_rows(shape[0], config)
+def cut_swaths(shape: tuple[int, int], config: Config, together: int) -> list[Box]:
+    """Windows without overlap over the shard's rows, as large as memory allows. together : threads to keep busy"""
+    first, last = shard_rows(shape[0], config)
     if last <= first:
         return []
     if config.offset:
         columns = axis_windows(shape[1], WIDEST, WIDEST, config.offset)
     else:
         columns = _even(0, shape[1], WIDEST)
-    share = together // math.gcd(together, len(columns))  # pieces that give every thread as many windows
+    share = together // math.gcd(together, len(columns))  # with multiples of it every thread gets as many windows
     pieces = -(-(last - first) // (TALLEST * share)) * share
     tallest = max(SHORTEST, -(-(last - first) // pieces))
     return [(a, c, b - a, d - c) for a, b in _even(first, last, tallest) for c, d in columns]

@@ -13,10 +13,11 @@ from stages.infer.windows import CHUNK, WIDEST, Box, blend_weights
 from stages.physics.maps.geotiff import MapTiff
 
 
-class Outputs:
-    """The fields of a map in its artefact, and the DEM that they are made of. own : (first, last) row
+class MapWriter:
+    """Writes parts of a map to its artefact, and copies the DEM there.
 
-    tiff : gets coefficients and deviations too
+    elevation, dem_valid : (H, W), the scene's; own : (first, last + 1) row of the shard; tiff : gets what is predicted
+        too
     """
 
     def __init__(
@@ -33,7 +34,7 @@ class Outputs:
         self._end = own[1]
 
     def copy_elevation(self) -> bool:
-        """Some chunks of the next row; whether there were any: the network works on while some strips are written."""
+        """Copy some chunks; returns whether there were any left. Between strips, while the network works on."""
         for row, col in self._to_copy:
             part = np.s_[row : min(self._end, row + CHUNK), col : col + WIDEST]
             self.copied[part] = self.elevation[part]
@@ -41,7 +42,10 @@ class Outputs:
         return False
 
     def put(self, row: int, col: int, values: NDArray[np.float32], known: NDArray[np.bool_] | None = None) -> None:
-        """values : (channels, n, w), coefficients and deviations, which are changed; ``known`` : (n, w), where there is something to write besides a valid DEM"""
+        """Write a strip: coefficients and deviations where the DEM is valid, NaN elsewhere.
+
+        values : (channels, n, w), changed in place; known : (n, w), where there are values at all, everywhere if None
+        """
         part = np.s_[row : row + values.shape[1], col : col + values.shape[2]]
         mask = self.dem_valid[part].astype(bool)
         if known is not None:
@@ -59,7 +63,7 @@ class Outputs:
 class Blend:
     """Weighted sums of overlapping windows that come row by row; only the rows that more windows may touch are kept."""
 
-    def __init__(self, outputs: Outputs, overlap: int, own: tuple[int, int]) -> None:
+    def __init__(self, outputs: MapWriter, overlap: int, own: tuple[int, int]) -> None:
         self.outputs, self.overlap, self.own = outputs, overlap, own
         _, self.height, self.width = outputs.coefficients.shape
         self.total = np.zeros((outputs.channels, 0, self.width), np.float32)
@@ -67,7 +71,7 @@ class Blend:
         self.top = own[0]
 
     def begin(self, box: Box) -> None:
-        """What lies above a window gets no more contributions: it is written and let go of."""
+        """Make room for a window, and write the rows above it, to which no window contributes any more."""
         row, _, height, _ = box
         if row > self.top:
             self.flush(row)

@@ -1,4 +1,7 @@
-"""Stage ingest. stage: from files to files; plan: the grid; elevation: the DEM on it; validity: what the images see; config: the options."""
+"""ingest: a DEM on a metric grid, and the ground that images show of it.
+
+stage: from files to files; plan: the choice of the grid; elevation: the DEM on it; validity: masks of the images
+"""
 
 from __future__ import annotations
 
@@ -8,26 +11,7 @@ from schemas.later import imported_later
 from stages.ingest.config import Config
 
 if TYPE_CHECKING:
-    from stages.ingest.stage import (
-        Summary,
-        check_positions,
-        count_bands,
-        image_names,
-        is_artefact,
-        run,
-        source_files,
-        summarise,
-    )
+    from stages.ingest.stage import check_positions, count_bands, image_names, run, source_files, summarise
 
 __getattr__ = imported_later(__name__, "stage")
-__all__ = [
-    "Config",
-    "Summary",
-    "check_positions",
-    "count_bands",
-    "image_names",
-    "is_artefact",
-    "run",
-    "source_files",
-    "summarise",
-]
+__all__ = ["Config", "check_positions", "count_bands", "image_names", "run", "source_files", "summarise"]

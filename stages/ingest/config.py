@@ -1,4 +1,4 @@
-"""What ingest is asked for."""
+"""The settings of ingest."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Config:
-    """gsd : m, None for the DEM's own; crop : px; block : px, the unit of streaming."""
+    """gsd : m, None for the DEM's own; crop : px; block : px, edge of what is worked on at a time; skip_outside : leave
+    out images beside the DEM instead of refusing them; shard : index and count
+    """
 
     gsd: float | None = None
     crop: int = 128

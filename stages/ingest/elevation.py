@@ -12,20 +12,16 @@ from numpy.typing import NDArray
 from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
-from schemas import (
-    ArtefactError,
-    ArtefactWriter,
-    InputError,
-)
+from schemas import ArtefactError, ArtefactWriter, InputError
 from stages.common.progress import Progress
 from stages.ingest.config import Config
 from stages.ingest.plan import Plan
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid
 
-STRIP_PX = 4096  # a raster whose blocks are wider is one in strips
-STRIPS = 96 << 20  # bytes of strips that stay in GDAL's cache
-LOWEST = 16  # rows of such a piece
+STRIP_PX = 4096  # a raster with wider blocks than this is stored in strips
+STRIP_CACHE = 96 << 20  # bytes of strips that stay in GDAL's cache
+LOWEST_PIECE = 16  # rows
 MINIMUM_COVERAGE = 0.5  # share of a coarse pixel that must be valid before its mean counts
 
 
@@ -48,7 +44,7 @@ def area_mean(fine: NDArray, factor: int) -> NDArray[np.float32]:
 def write_elevation(
     dem: Path, dataset: DatasetReader, plan: Plan, config: Config, writer: ArtefactWriter, progress: Progress
 ) -> tuple[int, float, float]:
-    """Resample the DEM onto the grid, piece by piece; valid pixels, lowest and highest elevation, m."""
+    """Resample the DEM onto the grid in pieces; returns the number of valid pixels, least and largest elevation, m."""
     grid = plan.grid
     elevation, dem_valid = writer.dataset("elevation"), writer.dataset("dem_valid")
     first, last = writer.file.attrs.get("shard_rows", (0, grid.height))
@@ -61,7 +57,7 @@ def write_elevation(
         else:
             values, valid = rasters.warp(dataset, grid.window(row, col, height, width), plan.resampling)
             values[~valid] = np.nan
-            if plan.radius_is_elevation:
+            if plan.holds_radii:
                 values = (values.astype(np.float64) - grid.radius).astype(np.float32)
         good = np.isfinite(values)
         elevation[row : row + height, col : col + width] = values
@@ -76,15 +72,16 @@ def write_elevation(
 
 
 def _pieces(dataset: DatasetReader, grid: Grid, config: Config) -> Iterator[tuple[int, int, int, int]]:
-    """(row, col, height, width) of what is worked on at a time; no piece reaches over a multiple of ``config.block``.
+    """(row, col, height, width) of the pieces that are worked on at a time; none crosses a multiple of
+    ``config.block``.
 
-    A DEM stored in strips as wide as itself is worked on in low pieces: GDAL's cache can then hold their strips until the
-    last piece of the row is done, where it would otherwise read the whole DEM again for every piece.
+    A DEM that is stored in wide strips is cut into low pieces: GDAL's cache then holds the strips until the last piece
+    of the row is done. With higher pieces it would read the strips again for each of them.
     """
     height, (_, strip) = config.block, dataset.block_shapes[0]
     if strip > STRIP_PX:
-        rows_of_dem = STRIPS // (strip * np.dtype(dataset.dtypes[0]).itemsize)
-        height = min(height, max(LOWEST, int(rows_of_dem * grid.height / dataset.height)))
+        rows_of_dem = STRIP_CACHE // (strip * np.dtype(dataset.dtypes[0]).itemsize)
+        height = min(height, max(LOWEST_PIECE, int(rows_of_dem * grid.height / dataset.height)))
     for top in range(0, grid.height, config.block):
         rows = min(config.block, grid.height - top)
         for row in range(0, rows, height):
@@ -93,23 +90,23 @@ def _pieces(dataset: DatasetReader, grid: Grid, config: Config) -> Iterator[tupl
 
 
 def _read_means(dataset: DatasetReader, plan: Plan, n: int, piece: tuple[int, int, int, int]) -> NDArray[np.float32]:
-    """Means of n x n pixels over a piece of the grid; however large n is, only so much is read at a time."""
+    """Means of n x n pixels over a piece of the grid, read in parts that fit the memory however large n is."""
     row, col, height, width = piece
     values = np.empty((height, width), np.float32)
     step = max(1, rasters.LARGEST_WINDOW // (width * n * n))
     for r in range(0, height, step):
         h = min(step, height - r)
         block = rasters.read_window(dataset, Window(col * n, (row + r) * n, width * n, h * n))
-        if plan.radius_is_elevation:
+        if plan.holds_radii:
             block -= plan.grid.radius
         values[r : r + h] = area_mean(block, n)
     return values
 
 
-def take_elevation(
+def reuse_elevation(
     scene: Path, file: h5py.File, view: bool, writer: ArtefactWriter, progress: Progress
 ) -> tuple[int, float, float]:
-    """The elevations of another scene; a shard, of which there may be hundreds, only looks into it."""
+    """Copy the elevations of another scene, or, as a ``view``, link to them: shards, which may be hundreds, do that."""
     for name in ("elevation", "dem_valid"):
         whole = (slice(None), slice(None))
         if view:

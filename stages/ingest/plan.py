@@ -1,4 +1,4 @@
-"""Which grid a DEM is worked on, and how its pixels get there."""
+"""The choice of the working grid, and of how the DEM is resampled onto it."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from rasterio.transform import Affine
 from rasterio.warp import Resampling, calculate_default_transform
 from rasterio.windows import Window
 
-from schemas import (
-    ConfigError,
-    GeometryError,
-    InputError,
-)
+from schemas import ConfigError, GeometryError, InputError
 from stages.common.progress import Progress, show_nothing
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, local_metric_crs
 
 # A map whose pixels are within this of square and of the working GSD counts as metric: no resampling, only means.
 METRIC_TOLERANCE = 0.01
-LARGEST_REACH = math.radians(30)  # a local stereographic map's scale is 7 % too large there
+LARGEST_REACH = math.radians(30)  # from the centre: a local stereographic map's scale is 7 % too large there
 ANY_RELIEF = 0.006  # of the radius: Olympus Mons; Vesta's and Phobos' shapes go beyond, their DEMs' datum does not
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How the DEM reaches its grid: an integer ``factor``, or None for a reprojection."""
+    """How the DEM is brought onto its grid.
+
+    factor : DEM pixels along a grid pixel, of which means are taken; None for a reprojection
+    holds_radii : whether the DEM holds distances from the body's centre instead of heights
+    """
 
     grid: Grid
     factor: int | None
     resampling: Resampling
-    radius_is_elevation: bool
+    holds_radii: bool
 
 
 def plan_grid(
@@ -57,7 +57,8 @@ def plan_grid(
         )
     holds_radii = _holds_radii(dem, dataset, radius, progress)
     t = dataset.transform
-    if dataset.crs.is_projected and t.b == t.d == 0 and t.a > 0 > t.e and _is_metre(dataset):
+    north_up = t.b == t.d == 0 and t.a > 0 > t.e
+    if dataset.crs.is_projected and north_up and abs(dataset.crs.linear_units_factor[1] - 1) < 1e-6:  # metres
         step = abs(t.a)
         factor = max(1, round(wanted / step))
         # At the centre and near the corners: an equirectangular map is true on one parallel only.
@@ -106,12 +107,8 @@ def plan_grid(
     )
 
 
-def _is_metre(dataset: DatasetReader) -> bool:
-    return abs((dataset.crs.linear_units_factor[1] if dataset.crs.is_projected else 0) - 1) < 1e-6
-
-
 def _holds_radii(dem: Path, dataset: DatasetReader, radius: float, progress: Progress) -> bool:
-    """Whether the DEM counts from the body's centre; and whether its numbers can be metres at all."""
+    """Whether the DEM holds radii from the body's centre. Raises InputError where its numbers cannot be metres."""
     size = 256
     windows = [
         Window(c, r, min(size, dataset.width - c), min(size, dataset.height - r))
@@ -120,7 +117,7 @@ def _holds_radii(dem: Path, dataset: DatasetReader, radius: float, progress: Pro
     ]
     samples = [rasters.read_window(dataset, w) for w in windows]
     finite = np.concatenate([s[np.isfinite(s)] for s in samples])
-    if not finite.size:  # what little there is tells heights from radii
+    if not finite.size:  # a DEM of mostly nodata: the first values anywhere tell heights from radii
         samples = [_first_elevations(dem, dataset, progress)]
         finite = samples[0][np.isfinite(samples[0])]
     middle = float(np.median(finite))
@@ -162,7 +159,7 @@ def _first_elevations(dem: Path, dataset: DatasetReader, progress: Progress) -> 
     for r in range(down):
         progress(r, down, "rows of blocks without elevations")
         for c in range(across):
-            # a sparse GeoTIFF leaves out blocks of nodata: a DEM of these is looked through in seconds
+            # a sparse GeoTIFF leaves out blocks of nodata: these need not be read
             if dataset.driver == "GTiff" and not dataset.get_tag_item(f"BLOCK_OFFSET_{c}_{r}", "TIFF", bidx=1):
                 continue
             window = Window(

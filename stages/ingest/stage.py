@@ -26,13 +26,14 @@ from schemas import (
     open_artefact,
     read_config,
 )
-from schemas.files.hdf5 import silence_hdf5
 from schemas.files.outputs import Output
+from schemas.reading import is_artefact
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.shards import shard_range
 from stages.ingest.config import Config
-from stages.ingest.elevation import take_elevation, write_elevation
+from stages.ingest.elevation import reuse_elevation, write_elevation
 from stages.ingest.plan import plan_grid
-from stages.ingest.validity import check_frames, with_digests, write_validity
+from stages.ingest.validity import check_frames, hash_files, write_validity
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.images.table import Frame, load_frames, read_frames, write_frames
 from stages.physics.maps import rasters
@@ -43,7 +44,7 @@ LARGEST_CROP = 8192  # px: what a network can see at once, and more
 
 @dataclass(frozen=True)
 class Summary:
-    """What ingest found, for the table at the end. ``blank``: the images of which no pixel is valid on the DEM."""
+    """What ingest found, for the table at the end. blank : images without a valid pixel on the DEM"""
 
     grid: Grid
     dem_valid_share: float
@@ -68,20 +69,20 @@ def run(
     dem : a raster, or a scene whose grid and elevations are taken as they are. Shards are cut in two steps: of a raster
     without images, its rows; of a scene with images, the images.
     """
-    output = Output.of(output)
+    output = Output.at(output)
     if config.crop < 16 or config.crop % 2 or config.crop > LARGEST_CROP:
         raise ConfigError(f"`crop`: expected an even number of pixels, 16 .. {LARGEST_CROP}; found {config.crop}.")
     body = find_body(config.body)
     frames = read_frames(images, body) if images else []
-    named = [p for f in frames for p in (f.path, f.camera) if p is not None]
-    check_output(output.file, [dem, *([images] if images else []), *named], output.overwrite)
-    index, count = config.shard
+    check_output(output.file, [dem, *([images] if images else []), *_files(frames)], output.overwrite)
+    alone = config.shard[1] == 1
     with _open_terrain(dem, images, config, body, progress) as terrain:
         if frames and config.crop > min(terrain.grid.height, terrain.grid.width):
             raise _no_positions(images, config, terrain.grid.gsd)
-        first, last = (len(frames) * k // count for k in (index, index + 1))
-        mine, skipped = check_frames(frames[first:last], terrain.grid, config.skip_outside)
-        if frames and not mine and count == 1:
+        mine, skipped = check_frames(
+            frames[slice(*shard_range(len(frames), config.shard))], terrain.grid, config.skip_outside
+        )
+        if frames and not mine and alone:
             raise InputError(
                 "no image touches the DEM; check that images and DEM show the same place (longitudes, body, CRS)."
             )
@@ -104,20 +105,20 @@ def run(
             elevation = terrain.file or writer.file
             areas = [
                 write_validity(
-                    f, k, terrain.grid, (low, high), elevation, writer, config, _of_all(progress, k, len(mine))
+                    f, k, terrain.grid, (low, high), elevation, writer, config, _overall(progress, k, len(mine))
                 )
                 for k, f in enumerate(mine)
             ]
             progress(len(mine), len(mine), "image masks")
-            if frames and count == 1 and not any(areas):
+            if frames and alone and not any(areas):
                 raise _no_positions(images, config, terrain.grid.gsd)
             writer.write("valid_area_m2", np.array(areas))
-            write_frames(writer, [with_digests(frame) for frame in mine])
+            write_frames(writer, [hash_files(frame) for frame in mine])
     return summarise(output.file, tuple(skipped))
 
 
-def _of_all(progress: Progress, index: int, count: int) -> Progress:
-    """Of one image among ``count``: progress over all of them."""
+def _overall(progress: Progress, index: int, count: int) -> Progress:
+    """What one image among ``count`` reports its progress to, as a share of all of them."""
     return lambda done, total, what: progress(1000 * index + 1000 * done // max(1, total), 1000 * count, what)
 
 
@@ -141,22 +142,25 @@ def summarise(scene: Path, skipped: tuple[str, ...] = ()) -> Summary:
 
 @dataclass(frozen=True)
 class Terrain:
-    """Where the scene's elevations come from. ``write`` gives the number of valid pixels, and the extremes."""
+    """The source of the scene's elevations.
+
+    write : writes them; returns the number of valid pixels, the least and the largest elevation, m
+    """
 
     grid: Grid
     config: dict[str, Any]
     attributes: dict[str, Any]
     write: Callable[[ArtefactWriter, Progress | None], tuple[int, float, float]]
-    file: h5py.File | None = None  # where they can be read at once; views cannot be, while they are written
+    file: h5py.File | None = None  # to read them from while the output is written, where they are only linked there
 
 
 @contextlib.contextmanager
 def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, progress: Progress) -> Iterator[Terrain]:
-    index, count = config.shard
+    count = config.shard[1]
     if is_artefact(dem):
         if images is None:
             raise ConfigError(f"{dem}: a scene already; add `images`, or give a DEM that GDAL reads.")
-        with open_artefact(dem, SCENE, need=()) as file:
+        with open_artefact(dem, SCENE) as file:
             grid = read_grid(file, dem)
             if abs(grid.radius - body.radius) > 1e-6 * body.radius:
                 raise ConfigError(f"{dem}: its body has a radius of {grid.radius:g} m; give the same `body`.")
@@ -166,7 +170,7 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, pr
             stored = read_config(file) | {k: v for k, v in asdict(config).items() if k in own}
             names = ("gsd_m", "body_radius_m", "elevation_source")
             yield Terrain(
-                grid, stored, {k: file.attrs[k] for k in names}, partial(take_elevation, dem, file, count > 1), file
+                grid, stored, {k: file.attrs[k] for k in names}, partial(reuse_elevation, dem, file, count > 1), file
             )
         return
     if images is not None and count > 1:
@@ -181,7 +185,7 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, pr
         attributes = {"gsd_m": plan.grid.gsd, "body_radius_m": body.radius, "elevation_source": dem.name}
         if count > 1:
             bands = math.ceil(plan.grid.height / config.block)
-            rows = [min(plan.grid.height, config.block * (bands * k // count)) for k in (index, index + 1)]
+            rows = [min(plan.grid.height, config.block * band) for band in shard_range(bands, config.shard)]
             attributes["shard_rows"] = np.array(rows, np.int64)
         stored = asdict(config) | {"resampled": plan.factor is None}
         yield Terrain(plan.grid, stored, attributes, partial(write_elevation, dem, dataset, plan, config))
@@ -202,11 +206,15 @@ def image_names(images: Path, config: Config) -> list[str]:
 
 def source_files(images: Path, config: Config) -> list[Path]:
     """The images and camera models that a table names."""
-    return [p for f in read_frames(images, find_body(config.body)) for p in (f.path, f.camera) if p is not None]
+    return _files(read_frames(images, find_body(config.body)))
+
+
+def _files(frames: Sequence[Frame]) -> list[Path]:
+    return [p for f in frames for p in (f.path, f.camera) if p is not None]
 
 
 def check_positions(parts: Sequence[Path], images: Path, config: Config) -> None:
-    """What one run checks at its end, for shards: that any crop fits anywhere. Raises GeometryError."""
+    """Refuse shards of a scene in which no crop fits anywhere, as one run does at its end. Raises GeometryError."""
     gsd = math.nan
     for part in parts:
         with open_artefact(part, SCENE) as file:
@@ -221,18 +229,6 @@ def _no_positions(images: Path | None, config: Config, gsd: float) -> GeometryEr
         f"{images}: a crop of {config.crop} px ({config.crop * gsd:g} m) is larger than any valid region of any image; "
         "choose a smaller `crop` or a finer `gsd`."
     )
-
-
-def is_artefact(path: Path) -> bool:
-    """Whether a file is one of our own and not a raster."""
-    silence_hdf5()
-    if not (path.is_file() and h5py.is_hdf5(path)):
-        return False
-    try:
-        with h5py.File(path, "r") as file:
-            return "lunargr_schema" in file.attrs
-    except OSError:  # damaged: whoever opens it as a raster says so
-        return False
 
 
 def _write_grid(writer: ArtefactWriter, grid: Grid) -> None:

@@ -1,4 +1,4 @@
-"""Which images see which ground, and where their crops may be centred."""
+"""Masks of the ground that each image shows, and of the places where its crops may be centred."""
 
 from __future__ import annotations
 
@@ -9,11 +9,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 
-from schemas import (
-    ArtefactWriter,
-    GeometryError,
-    InputError,
-)
+from schemas import ArtefactWriter, GeometryError, InputError
 from schemas.provenance import sha256
 from stages.common.progress import Progress
 from stages.ingest.config import Config
@@ -25,10 +21,10 @@ from stages.physics.maps.positions import blocks, valid_positions
 
 
 def check_frames(frames: Sequence[Frame], grid: Grid, skip_outside: bool) -> tuple[list[Frame], list[str]]:
-    """Every image must be readable, lie on the DEM and be lit. Raises InputError or GeometryError."""
+    """The images that touch the DEM, and the names of the others, which without ``skip_outside`` raise InputError."""
     kept, skipped = [], []
     for frame in frames:
-        # The DEM is not read yet: camera images are looked for at the heights that relief can have on any body.
+        # The DEM is not read yet: the ground that a camera image can show is sought within any body's relief.
         relief = ANY_RELIEF * grid.radius
         with open_source(frame, grid, None, (-relief, relief)) as source:
             if source.box() is None:
@@ -55,22 +51,23 @@ def write_validity(
     """Write the masks of the image with this index; returns the ground area of its valid positions, m2."""
     valid, position = writer.dataset("valid"), writer.dataset("valid_position")
     dem_valid = dem["dem_valid"]
-    used: tuple[int, int, int, int] | None = None
     with open_source(frame, grid, dem["elevation"], heights) as source:
         row0, col0, height, width = source.box() or (0, 0, 0, 0)
+        rows, cols = np.zeros(height, bool), np.zeros(width, bool)  # whether they hold any valid pixel
         todo = list(blocks(height, width, config.block))
         for number, (r, c, h, w) in enumerate(todo):
             progress(number, len(todo), f"image masks ({frame.image_id})")
-            r, c = row0 + r, col0 + c
-            seen = source.read(r, c, h, w).valid & dem_valid[r : r + h, c : c + w].astype(bool)
+            part = np.s_[row0 + r : row0 + r + h, col0 + c : col0 + c + w]
+            seen = source.read(row0 + r, col0 + c, h, w).valid & dem_valid[part].astype(bool)
             if seen.any():
-                valid[index, r : r + h, c : c + w] = seen
-                rows, cols = np.flatnonzero(seen.any(1)), np.flatnonzero(seen.any(0))
-                used = _union(used, (r + rows[0], c + cols[0], r + rows[-1] + 1, c + cols[-1] + 1))
-    if used is None:
+                valid[(index, *part)] = seen
+                rows[r : r + h] |= seen.any(axis=1)
+                cols[c : c + w] |= seen.any(axis=0)
+    if not rows.any():
         writer.dataset("frame_window")[index] = (row0, col0, 0, 0)
         return 0.0
-    r0, c0, r1, c1 = used
+    r0, r1 = row0 + int(rows.argmax()), row0 + height - int(rows[::-1].argmax())
+    c0, c1 = col0 + int(cols.argmax()), col0 + width - int(cols[::-1].argmax())
     writer.dataset("frame_window")[index] = (r0, c0, r1 - r0, c1 - c0)
     area = 0.0
     for r, c, h, w in blocks(r1 - r0, c1 - c0, config.block):
@@ -84,20 +81,14 @@ def write_validity(
     return area
 
 
-def with_digests(frame: Frame) -> Frame:
-    """What the files held that the masks were made from. Raises InputError."""
+def hash_files(frame: Frame) -> Frame:
+    """The frame with the SHA-256 of the files that its masks were made from. Raises InputError."""
     try:
         return replace(frame, sha256=sha256(frame.path), camera_sha256=sha256(frame.camera) if frame.camera else "")
     except OSError as error:
         raise InputError(
             f"{error.filename}: image '{frame.image_id}' cannot be read any more ({error.strerror}); bring it back."
         ) from None
-
-
-def _union(box: tuple[int, int, int, int] | None, other: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    if box is None:
-        return other
-    return min(box[0], other[0]), min(box[1], other[1]), max(box[2], other[2]), max(box[3], other[3])
 
 
 def _check_sun(frame: Frame, grid: Grid, row: float, col: float) -> None:

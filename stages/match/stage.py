@@ -28,7 +28,7 @@ def run(
 
     output : the JSON and the folder of pictures, where they are wanted; a bare path is the JSON's
     """
-    output = Output.of(output)
+    output = Output.at(output)
     json_file, figures = output.json or output.path, output.figures
     if config.count < 1:
         raise ConfigError(f"`count`: expected at least 1, found {config.count}.")

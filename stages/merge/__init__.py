@@ -1,4 +1,4 @@
-"""Stage merge. stage: from files to files; parts: what is joined, and what it must have in common; joining: each variable."""
+"""merge: one artefact from its parts. stage: from files to files; parts: checks of the parts; joining: of variables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What merge is asked for."""
+"""The settings of merge."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Config:
-    """virtual : large variables stay in the parts, which the output then needs; inputs : what the whole says it was made
-    from, in place of its parts
+    """virtual : leave large variables in the parts, which the output then needs; inputs : recorded as what the whole
+    was made from, in place of its parts
     """
 
     virtual: bool = False

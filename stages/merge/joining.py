@@ -1,4 +1,4 @@
-"""How the variables of the parts become those of the whole: end to end, row by row, as views, or taken once."""
+"""Joining the variables of the parts: end to end, row by row, as views of the parts, or copied from one."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from stages.merge.parts import ROWS, Parts, moved
 
 PATHS = ("path", "camera")
 BUFFER = 1 << 26  # bytes that are copied at a time
+BLOCK_ROWS = 256  # rows of a map that are copied at a time
 
 
 def join_variable(parts: Parts, name: str, writer: ArtefactWriter, virtual: bool) -> None:
@@ -38,7 +39,7 @@ def join_variable(parts: Parts, name: str, writer: ArtefactWriter, virtual: bool
     elif dims[-2:] == ("y", "x"):
         _copy_rows(first[name], target, 0, target.shape[-2])
     elif name not in PATHS and (target.shape == () or 0 not in target.shape):
-        target[...] = _known(files, name)
+        target[...] = _common_values(files, name)
 
 
 def join_paths(parts: Parts, merged: h5py.File, output: Path) -> None:
@@ -52,7 +53,7 @@ def join_paths(parts: Parts, merged: h5py.File, output: Path) -> None:
 
 
 def _view(parts: Parts, name: str, along: int | None, by_rows: bool) -> list[Any]:
-    """Where each piece of a view comes from; empty where the variable is copied."""
+    """The pieces of a view, as ArtefactWriter.link takes them; empty where the variable is copied instead."""
     files, source = parts.files, parts.files[0][name]
     if source.ndim < 2 or source.dtype.kind not in "iufb" or not any(f[name].size for f in files):
         return []
@@ -105,9 +106,9 @@ def _concatenate(files: Sequence[h5py.File], name: str, target: h5py.Dataset, ax
 
 
 def _move_chunks(source: h5py.Dataset, target: h5py.Dataset, axis: int, place: int) -> bool:
-    """Copy what is stored, as it is stored, where both files cut the variable alike: masks stay sparse and deflated.
+    """Copy chunks as they are stored, where both files have the same layout; returns whether they have.
 
-    Chunks that nobody wrote stay unwritten. False where it cannot be done.
+    Masks stay deflated, and chunks that were never written stay absent.
     """
     alike = source.chunks is not None and source.chunks == target.chunks and source.dtype == target.dtype
     if not alike or source.chunks[axis] != 1 or source.compression != target.compression:
@@ -124,8 +125,8 @@ def _move_chunks(source: h5py.Dataset, target: h5py.Dataset, axis: int, place: i
     return True
 
 
-def _known(files: Sequence[h5py.File], name: str) -> Any:
-    """What the parts have in common; NaN where one part knows nothing (an image that it did not register) gives way."""
+def _common_values(files: Sequence[h5py.File], name: str) -> Any:
+    """The values that the parts have in common; where one has NaN (an image that it did not register), another's."""
     values = files[0][name][...]
     for file in files[1:]:
         if values.dtype.kind == "f" and name in file and file[name].shape == values.shape:
@@ -133,15 +134,15 @@ def _known(files: Sequence[h5py.File], name: str) -> Any:
     return values
 
 
-def _overlay(files: Sequence[h5py.File], name: str, target: h5py.Dataset, rows: int = 256) -> None:
-    """Each part's own rows; where parts do not say which these are, what any part knows (others hold NaN, or 0)."""
+def _overlay(files: Sequence[h5py.File], name: str, target: h5py.Dataset) -> None:
+    """Each part's own rows; without ``shard_rows``, whatever part has a value there (the others have NaN, or 0)."""
     if all(ROWS in file.attrs for file in files):
         for file in files:
             _copy_rows(file[name], target, *(int(v) for v in file.attrs[ROWS]))
         return
     height = target.shape[-2]
-    for first in range(0, height, rows):
-        part = (..., slice(first, min(height, first + rows)), slice(None))
+    for first in range(0, height, BLOCK_ROWS):
+        part = (..., slice(first, min(height, first + BLOCK_ROWS)), slice(None))
         joined = files[0][name][part]
         for file in files[1:]:
             other = file[name][part]
@@ -151,7 +152,7 @@ def _overlay(files: Sequence[h5py.File], name: str, target: h5py.Dataset, rows: 
         target[part] = joined
 
 
-def _copy_rows(source: h5py.Dataset, target: h5py.Dataset, first: int, last: int, rows: int = 256) -> None:
-    for row in range(first - first % rows, last, rows):
-        part = (..., slice(max(first, row), min(last, row + rows)), slice(None))
+def _copy_rows(source: h5py.Dataset, target: h5py.Dataset, first: int, last: int) -> None:
+    for row in range(first - first % BLOCK_ROWS, last, BLOCK_ROWS):
+        part = (..., slice(max(first, row), min(last, row + BLOCK_ROWS)), slice(None))
         target[part] = source[part]

@@ -30,12 +30,12 @@ def run(
 
     The GeoTIFF of a map is written too, if its parts want one.
     """
-    output = Output.of(output)
+    output = Output.at(output)
     with open_parts(parts) as opened:
         made_with = read_config(opened.files[0]) | {"shard": [0, 1]}
         as_geotiff = opened.schema.name in MAPS and made_with.get("geotiff", True)
         _check_output(opened, output, as_geotiff)
-        record, inputs = _provenance(opened, output.file, config)
+        provenance, inputs = _provenance(opened, output.file, config)
         seed = int(opened.files[0].attrs.get("seed", -1))
         with ArtefactWriter(
             output.file,
@@ -44,7 +44,7 @@ def run(
             config=made_with,
             inputs=inputs,
             seed=None if seed < 0 else seed,
-            attributes=opened.attributes(output.file) | record,
+            attributes=opened.attributes(output.file) | provenance,
             overwrite=output.overwrite,
         ) as writer:
             if "crs" in opened.files[0]:
@@ -65,19 +65,19 @@ def _check_output(parts: Parts, output: Output, as_geotiff: bool) -> None:
     foreign = [path for path in parts.paths if f"{output.file.name}.parts" not in path.parts]
     targets = [Target(output.file)]
     if as_geotiff:
-        targets.append(Target(output.geotiff_path, what=f"the GeoTIFF of {output.file.name}"))
+        targets.append(Target(output.geotiff_path, name=f"the GeoTIFF of {output.file.name}"))
     check_outputs(targets, foreign, output.overwrite)
 
 
 def _provenance(parts: Parts, output: Path, config: Config) -> tuple[dict[str, Any], list[Path]]:
-    """What the whole says of how it was made: root attributes, and inputs."""
+    """How the whole was made: root attributes that say so, and the inputs to record."""
     if config.inputs is not None:
         return {}, list(config.inputs)
     if not parts.of_one_run:
         return {}, parts.paths
     # The whole is what that run in one piece would have made, from the same inputs.
     first = parts.files[0].attrs
-    told = {k: first[k] for k in ("inputs", "provenance", "folder") if k in first}
-    told["command"] = whole_command(str(first.get("command", "")), output)
-    told["parts"] = json.dumps([path.name for path in parts.paths])
-    return told, []
+    attributes = {k: first[k] for k in ("inputs", "provenance", "folder") if k in first}
+    attributes["command"] = whole_command(str(first.get("command", "")), output)
+    attributes["parts"] = json.dumps([path.name for path in parts.paths])
+    return attributes, []

@@ -1,1 +1,1 @@
-"""Networks: the U-Net, its input normalisation and the losses."""
+"""The network: U-Net, coefficient maps, losses, checkpoints, and prediction of maps in strips."""

@@ -1,8 +1,9 @@
-"""Names and shapes that a checkpoint must hold for its network, checked before any memory of their size is taken."""
+"""Checks of the names and shapes in a checkpoint against its network, before memory of their size is allocated."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,24 +14,30 @@ from schemas.errors import ArtefactError
 from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.unet import UNet
 
-WIDEST, DEEPEST = 65536, 12  # channels of a stage, stages: beyond any network, and short of any machine's memory
+WIDEST, DEEPEST = 65536, 12  # most channels of a stage, and most stages
+
+
+def are_widths(widths: Sequence[Any]) -> bool:
+    """Whether a network can have these channels by stage."""
+    return 2 <= len(widths) <= DEEPEST and all(type(w) is int and 1 <= w <= WIDEST for w in widths)
+
+
+def are_dropouts(shares: Sequence[Any]) -> bool:
+    """Whether a network can drop these shares by stage."""
+    return len(shares) > 0 and all(type(p) in (int, float) and 0 <= p < 1 for p in shares)
 
 
 def read_layout(path: Path, config: dict[str, Any], model: str) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """(widths, dropout) of the network that a checkpoint's options name. Raises ArtefactError."""
+    """(widths, dropout) of the network, from the options in a checkpoint. Raises ArtefactError."""
     widths, dropout, name = config.get("widths"), config.get("dropout"), config.get("model", model)
     where = f"{path}: root attribute 'config'"
     if not isinstance(name, str) or name.lower() != model.lower():
         raise ArtefactError(f"{where}: expected the model '{model}' of the file, found '{name}'; train again.")
-    if not (
-        isinstance(widths, list)
-        and 2 <= len(widths) <= DEEPEST
-        and all(type(w) is int and 1 <= w <= WIDEST for w in widths)
-    ):
+    if not (isinstance(widths, list) and are_widths(widths)):
         raise ArtefactError(
             f"{where}: expected 'widths' of 2 .. {DEEPEST} stages, each of 1 .. {WIDEST} channels, found {str(widths)[:80]}; train again."
         )
-    if not (isinstance(dropout, list) and dropout and all(type(p) in (int, float) and 0 <= p < 1 for p in dropout)):
+    if not (isinstance(dropout, list) and are_dropouts(dropout)):
         raise ArtefactError(f"{where}: expected 'dropout' of shares 0 .. 1, found {str(dropout)[:80]}; train again.")
     return tuple(widths), tuple(dropout)
 
@@ -38,7 +45,7 @@ def read_layout(path: Path, config: dict[str, Any], model: str) -> tuple[tuple[i
 def check_weights(
     path: Path, group: Any, maps: CoefficientMaps, widths: tuple[int, ...], dropout: tuple[float, ...]
 ) -> None:
-    """Names, shapes and kinds of the stored arrays against the network's. Raises ArtefactError."""
+    """Refuse stored arrays whose names, shapes or kinds are not the network's. Raises ArtefactError."""
     with torch.device("meta"):
         net = UNet(maps.channels, widths, dropout)
     states = {"net": net.state_dict(), "maps": maps.state_dict()}

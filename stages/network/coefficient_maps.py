@@ -1,4 +1,4 @@
-"""The parameters of a reflectance model from a network's output: some as maps, the others the same everywhere."""
+"""From a network's output to the parameters of a reflectance model: some as maps, the others the same everywhere."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class CoefficientMaps(nn.Module):
         self.names = [p.name for p in model.parameters]
         self.maps = model.choose_maps(maps)
         self.rest = tuple(name for name in self.names if name not in self.maps)
-        raw = dict(zip(self.names, self._unbounded(start), strict=True))
+        raw = dict(zip(self.names, self._unbound(start), strict=True))
         self.start: Tensor
         self.rest_start: Tensor
         shifts = [float(raw[n]) for n in self.maps]
@@ -46,7 +46,7 @@ class CoefficientMaps(nn.Module):
         self.register_buffer("rest_start", torch.tensor([float(raw[n]) for n in self.rest]))
         self.rest_shift = nn.Parameter(torch.zeros(len(self.rest)), requires_grad=bool(self.rest))
 
-    def _unbounded(self, start: Tensor) -> Tensor:
+    def _unbound(self, start: Tensor) -> Tensor:
         if self.positive:
             return torch.where(start >= 0, start, start / SLOPE)
         return self.model.unconstrain(start, dim=0)
@@ -55,27 +55,30 @@ class CoefficientMaps(nn.Module):
         return leaky_relu(raw, SLOPE) if self.positive else self.model.constrain(raw, dim, names)
 
     def everywhere(self) -> dict[str, Tensor]:
-        """The parameters that no map holds, by name, each ()."""
+        """The parameters that are the same everywhere, by name, each ()."""
         values = self._bounded(self.rest_start + self.rest_shift * self.output_scale, 0, self.rest)
         return dict(zip(self.rest, values.unbind(0), strict=True))
 
-    def shifted(self, output: Tensor) -> Tensor:
-        """(B, channels, H, W) of the network -> the same scaled and shifted to the start, float32."""
+    def unbounded(self, output: Tensor) -> Tensor:
+        """The network's output (B, channels, H, W), scaled and shifted to the start: maps before their bounds."""
         return output.float() * self.output_scale + self.start[:, None, None]
 
-    def combine(self, shifted: Tensor, everywhere: Sequence[Tensor]) -> Tensor | dict[str, Tensor]:
-        """Maps (B, channels, H, W) and the values of the others, each broadcasting to (B, H, W) -> what ``formation.chain.form`` takes."""
-        bounded = self._bounded(shifted.narrow(1, 0, len(self.maps)), 1, self.maps)
+    def combine(self, unbounded: Tensor, everywhere: Sequence[Tensor]) -> Tensor | dict[str, Tensor]:
+        """The coefficients as ``formation.chain.form`` takes them.
+
+        unbounded : (B, channels, H, W); everywhere : the values of the other parameters, each broadcasting to (B, H, W)
+        """
+        bounded = self._bounded(unbounded.narrow(1, 0, len(self.maps)), 1, self.maps)
         if not self.rest:
             return bounded
         return dict(zip((*self.maps, *self.rest), (*bounded.unbind(1), *everywhere), strict=True))
 
-    def stack(self, shifted: Tensor, dim: int) -> Tensor:
+    def stack(self, unbounded: Tensor, dim: int) -> Tensor:
         """All parameters along ``dim``, in the model's order.
 
-        shifted : (B, channels, H, W) with dim 1, or alike; returns (B, C, H, W)
+        unbounded : (B, channels, H, W) with dim 1, or alike; returns (B, C, H, W)
         """
-        bounded = self._bounded(shifted.narrow(dim, 0, len(self.maps)), dim, self.maps)
+        bounded = self._bounded(unbounded.narrow(dim, 0, len(self.maps)), dim, self.maps)
         if not self.rest:
             return bounded
         maps = dict(zip(self.maps, bounded.unbind(dim), strict=True))
@@ -83,14 +86,14 @@ class CoefficientMaps(nn.Module):
         found = maps | {name: value.to(like.dtype).expand_as(like) for name, value in self.everywhere().items()}
         return torch.stack([found[name] for name in self.names], dim=dim)
 
-    def deviations(self, shifted: Tensor, dim: int) -> Tensor:
+    def deviations(self, unbounded: Tensor, dim: int) -> Tensor:
         """Standard deviations of the maps along ``dim``, in the maps' order; at most half of a parameter's range.
 
-        shifted : (B, channels, H, W) with dim 1, or alike; returns (B, M, H, W)
+        unbounded : (B, channels, H, W) with dim 1, or alike; returns (B, M, H, W)
         """
         count = len(self.maps)
         half = [(p.upper - p.lower) / 2 for p in self.model.parameters if p.name in self.maps]
-        shape = [1] * shifted.ndim
+        shape = [1] * unbounded.ndim
         shape[dim] = count
-        limit = torch.tensor(half, dtype=shifted.dtype, device=shifted.device).view(shape)
-        return torch.minimum(shifted.narrow(dim, count, self.channels - count).exp(), limit)
+        limit = torch.tensor(half, dtype=unbounded.dtype, device=unbounded.device).view(shape)
+        return torch.minimum(unbounded.narrow(dim, count, self.channels - count).exp(), limit)

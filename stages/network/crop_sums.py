@@ -5,8 +5,8 @@ Only inside ``stages.common.threads.one_thread_each``, on the CPU; elsewhere the
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -16,14 +16,25 @@ from stages.common.threads import in_pieces, share_out
 from stages.network.cpu.training_kernels import channels_last, empty
 
 PIECE = 4  # crops
+Found = TypeVar("Found")
 
 
-def _pieces(count: int) -> list[tuple[int, int]]:
-    return [(first, min(count, first + PIECE)) for first in range(0, count, PIECE)]
+def _cut(x: Tensor) -> bool:
+    return in_pieces() and x.device.type == "cpu"
 
 
-def _cut(*tensors: Tensor) -> bool:
-    return in_pieces() and tensors[0].device.type == "cpu"
+def _each_piece(count: int, work: Callable[[int, int], Found]) -> list[Found]:
+    """What ``work(first, last)`` gives for the pieces of ``count`` crops, in order; the pieces are shared out."""
+    pieces = [(first, min(count, first + PIECE)) for first in range(0, count, PIECE)]
+    found: dict[int, Found] = {}
+
+    def run(start: int, stop: int) -> None:
+        with torch.autocast("cpu", enabled=False):
+            for k in range(start, stop):
+                found[k] = work(*pieces[k])
+
+    share_out(run, len(pieces))
+    return [found[k] for k in range(len(pieces))]
 
 
 def convolution(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
@@ -45,14 +56,12 @@ class _Convolution(torch.autograd.Function):
         ctx.biased = bias is not None
         rows, columns = (x.shape[k] - weight.shape[k] + 1 for k in (2, 3))
         out = empty(len(x), len(weight), rows, columns, x.dtype)
-        pieces = _pieces(len(x))
 
-        def work(first: int, last: int) -> None:
-            with torch.no_grad(), torch.autocast("cpu", enabled=False):
-                for a, b in pieces[first:last]:
-                    out[a:b] = functional.conv2d(x[a:b], weight, bias)
+        @torch.no_grad()
+        def work(a: int, b: int) -> None:
+            out[a:b] = functional.conv2d(x[a:b], weight, bias)
 
-        share_out(work, len(pieces))
+        _each_piece(len(x), work)
         return out
 
     @staticmethod
@@ -61,26 +70,23 @@ class _Convolution(torch.autograd.Function):
         dy = channels_last(gradients[0])
         wanted = [ctx.needs_input_grad[0], ctx.needs_input_grad[1], ctx.biased and ctx.needs_input_grad[2]]
         dx = torch.empty_like(x) if wanted[0] else None
-        pieces = _pieces(len(x))
-        parts: list[tuple[Tensor, Tensor | None]] = [(weight, None)] * len(pieces)
 
-        def work(first: int, last: int) -> None:
-            with torch.no_grad(), torch.autocast("cpu", enabled=False):
-                for k, (a, b) in enumerate(pieces[first:last], start=first):
-                    along, own, own_bias = torch.ops.aten.convolution_backward(
-                        dy[a:b], x[a:b], weight, [len(weight)], [1, 1], [0, 0], [1, 1], False, [0, 0], 1, wanted
-                    )
-                    if dx is not None:
-                        dx[a:b] = along
-                    parts[k] = own, own_bias
+        @torch.no_grad()
+        def work(a: int, b: int) -> tuple[Tensor, Tensor]:
+            own_dx, own_dweight, own_dbias = torch.ops.aten.convolution_backward(
+                dy[a:b], x[a:b], weight, [len(weight)], [1, 1], [0, 0], [1, 1], False, [0, 0], 1, wanted
+            )
+            if dx is not None:
+                dx[a:b] = own_dx
+            return own_dweight, own_dbias
 
-        share_out(work, len(pieces))
-        dweight = _sum([p[0] for p in parts]) if wanted[1] else None
-        dbias = _sum([p[1] for p in parts if p[1] is not None]) if wanted[2] else None
+        dweights, dbiases = zip(*_each_piece(len(x), work), strict=True)
+        dweight = _sum(dweights) if wanted[1] else None
+        dbias = _sum(dbiases) if wanted[2] else None
         return dx, dweight, dbias
 
 
-def _sum(parts: list[Tensor]) -> Tensor:
+def _sum(parts: Sequence[Tensor]) -> Tensor:
     """In order, in float32 at least."""
     total = parts[0].float()
     for part in parts[1:]:
@@ -92,15 +98,15 @@ Objective = Callable[..., tuple[Tensor, Tensor]]
 
 
 def sum_over_crops(objective: Objective, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-    """The sums over all crops of what ``objective(first, last, *tensors of these crops)`` gives: to minimise, and to report.
+    """Two sums over all crops, one to minimise and one to report, of ``objective(first, last, *tensors of these crops)``.
 
     tensors : (B, ...) each; only the first sum has a gradient in them
     """
     count = len(tensors[0])
-    if not _cut(*tensors):
+    if not _cut(tensors[0]):
         return objective(0, count, *tensors)
-    value, told = _SumOverCrops.apply(objective, *tensors)
-    return value, told
+    value, reported = _SumOverCrops.apply(objective, *tensors)
+    return value, reported
 
 
 class _SumOverCrops(torch.autograd.Function):
@@ -108,20 +114,12 @@ class _SumOverCrops(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, objective: Objective, *tensors: Tensor) -> tuple[Tensor, Tensor]:
-        pieces = _pieces(len(tensors[0]))
-        found: list[Any] = [None] * len(pieces)
-
-        def work(first: int, last: int) -> None:
-            for k, (a, b) in enumerate(pieces[first:last], start=first):
-                found[k] = _piece(objective, a, b, tensors)
-
-        share_out(work, len(pieces))
-        ctx.gradients = [
-            None if parts[0] is None else torch.cat(parts) for parts in zip(*(f[2] for f in found), strict=True)
-        ]
-        told = _sum([f[1] for f in found])
-        ctx.mark_non_differentiable(told)
-        return _sum([f[0] for f in found]), told
+        found = _each_piece(len(tensors[0]), lambda first, last: _piece(objective, first, last, tensors))
+        values, reports, gradients = zip(*found, strict=True)
+        ctx.gradients = [None if parts[0] is None else torch.cat(parts) for parts in zip(*gradients, strict=True)]
+        reported = _sum(reports)
+        ctx.mark_non_differentiable(reported)
+        return _sum(values), reported
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
@@ -130,9 +128,9 @@ class _SumOverCrops(torch.autograd.Function):
 
 def _piece(objective: Objective, a: int, b: int, tensors: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, list]:
     learning = any(t.requires_grad for t in tensors)
-    with torch.set_grad_enabled(learning), torch.autocast("cpu", enabled=False):
+    with torch.set_grad_enabled(learning):
         own = [t[a:b].detach().requires_grad_(t.requires_grad) for t in tensors]
-        value, told = objective(a, b, *own)
+        value, reported = objective(a, b, *own)
         learned = [t for t in own if t.requires_grad]
         slopes = iter(torch.autograd.grad(value, learned, allow_unused=True) if learned else ())
-    return value.detach(), told.detach(), [next(slopes) if t.requires_grad else None for t in own]
+    return value.detach(), reported.detach(), [next(slopes) if t.requires_grad else None for t in own]

@@ -1,4 +1,4 @@
-"""Layers whose result does not depend on how a batch is split over processes: batch statistics and dropout."""
+"""Batch normalisation and dropout whose results do not depend on how a batch is split over processes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ SLOPE = 0.01  # of LeakyReLU below zero
 _WORD = 0xFFFFFFFF
 
 
-def shared() -> bool:
-    """Whether several processes work on one batch."""
+def is_distributed() -> bool:
+    """Whether several processes share every batch."""
     return dist.is_available() and dist.is_initialized() and dist.get_world_size() > 1
 
 
@@ -26,14 +26,14 @@ class BatchNorm(nn.BatchNorm2d):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) normalised by the statistics of the batch over all processes."""
-        if not (self.training and shared()):
+        if not (self.training and is_distributed()):
             return super().forward(x)
         y, mean, variance, count = _SharedNorm.apply(x, self.weight, self.bias, self.eps)
-        self.note(mean, variance, count)
+        self.update_running(mean, variance, count)
         return y
 
     @torch.no_grad()
-    def note(self, mean: Tensor, variance: Tensor, count: Tensor) -> None:
+    def update_running(self, mean: Tensor, variance: Tensor, count: Tensor) -> None:
         """Update the running statistics with those of a batch (float64).
 
         mean, variance : (C,); count : (), values per channel

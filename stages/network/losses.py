@@ -32,10 +32,12 @@ class _SquaredError(torch.autograd.Function):
 
 
 def crop_errors(predicted: Tensor, measured: Tensor, valid: Tensor, brightness: float) -> tuple[Tensor, Tensor]:
-    """Sums over crops (B, H, W): of squared errors less the part that each crop's own gain would explain, and of all.
+    """Sums over crops (B, H, W): of squared errors less most of the part that a gain of the crop would explain, and of
+    all.
 
-    ``brightness`` of that part is kept, so that the overall level stays known. Albedo that terrain does not show changes
-    whole crops together: this is what generalised least squares makes of errors with a common factor per crop.
+    ``brightness`` is the share of that part that stays, so that the overall level remains determined. Albedo that
+    terrain does not show changes whole crops together: generalised least squares weights errors with a common factor
+    per crop so.
     """
     if brightness == 1:
         error = squared_error(predicted, measured, valid)
@@ -50,7 +52,7 @@ def crop_errors(predicted: Tensor, measured: Tensor, valid: Tensor, brightness: 
 class Radiometry(nn.Module):
     """measured = gain x I/F + offset, per image; the identity for calibrated images.
 
-    Gains keep their geometric mean: the scale of all of them together cannot be told from the albedo's.
+    Gains keep their geometric mean: a factor on all of them cannot be distinguished from one on the albedo.
     """
 
     def __init__(self, gain: Tensor, offset: Tensor, calibrated: bool) -> None:
@@ -70,14 +72,7 @@ class Radiometry(nn.Module):
         """(F,) of each image."""
         return self.scale * self.shift
 
-    def of_crops(self, frame: Tensor) -> tuple[Tensor, Tensor]:
-        """Gain and offset over ``scale``, (B, 1, 1) each, of crops from frames (B,)."""
+    def crop_gains(self, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """Gain and offset, (B, 1, 1) each, of crops from frames (B,), over ``scale``: residuals then read like I/F."""
         gain = (self.log_gain - self.log_gain.mean()).exp()
         return gain[frame, None, None], self.shift[frame, None, None]
-
-    def forward(self, radiance_factor: Tensor, frame: Tensor) -> Tensor:
-        """I/F (B, H, W) of frames (B,) -> measured units over ``scale``: residuals then read like I/F."""
-        if self.calibrated:
-            return radiance_factor
-        gain, offset = self.of_crops(frame)
-        return gain * radiance_factor + offset

@@ -14,7 +14,7 @@ from stages.network.strips import Rows, StripUNet
 
 STRIP = 128  # rows of terrain that the network takes at once
 ROWS = 256  # rows of a map that are handed over at once, from a multiple of it on
-TOGETHER = 16  # bytes of a value x windows side by side: under 2 GB where windows are 4096 px wide
+TOGETHER = 16  # bytes of a value x windows at once: under 2 GB where windows are 4096 px wide
 
 Terrain = Callable[[int, int, int, int], NDArray]
 
@@ -22,7 +22,7 @@ Terrain = Callable[[int, int, int, int], NDArray]
 class Mapper:
     """Coefficients of any part of a map, with all the context that the network can see.
 
-    precision : fp32 or bf16; threads : how many would work with it side by side, of which ``together`` do
+    precision : fp32 or bf16; threads : that could use it at once; ``together`` of them can, as memory allows
     deviations : whether the standard deviations of the maps come after the coefficients
     """
 
@@ -87,7 +87,7 @@ class Mapper:
     def _complete(self, raw: Tensor) -> NDArray[np.float32]:
         """(channels, n, w) of the network -> coefficients, and deviations where wanted."""
         maps = self.predictor.maps
-        # PyTorch's exponentials differ in the last bit where a row ends, which hangs on the window: double has bits to spare
-        exact = maps.shifted(raw).double()
+        # PyTorch's exponentials differ in the last bit at the end of a row, so by window: double has bits to spare
+        exact = maps.unbounded(raw).double()
         found = maps.stack(exact, dim=0)
         return (torch.cat([found, maps.deviations(exact, dim=0)]) if self.deviations else found).float().cpu().numpy()

@@ -19,32 +19,32 @@ from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
 
 MAXIMUM_PAIRS = 512  # enough for a handful of numbers
 MAXIMUM_PIXELS = 30_000
+BATCH = 32  # pairs
+STEP = 1e-5  # of central differences, which in double precision are then exact to about 1e-9
 
 
-def batches_of(
-    reader: PairReader, indices: NDArray[np.int64], size: int = 32
-) -> Iterator[tuple[NDArray[np.int64], Batch]]:
+def sample_batches(reader: PairReader, indices: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], Batch]]:
     """(pairs, their batch) of evenly chosen pairs, at most about MAXIMUM_PAIRS of them.
 
     indices : (n,), of pairs
     """
     step = max(1, len(indices) // MAXIMUM_PAIRS)
     chosen = indices[::step]
-    for first in range(0, len(chosen), size):
-        yield chosen[first : first + size], reader.batch(chosen[first : first + size])
+    for first in range(0, len(chosen), BATCH):
+        yield chosen[first : first + BATCH], reader.batch(chosen[first : first + BATCH])
 
 
 @dataclass(frozen=True)
 class Pixels:
     """Valid pixels of many images, (N,) float64 each: cosines, the share of the Sun that lights them, and I/F.
 
-    more : (N, ...) float64, whatever else was asked for; pair : (N,) int64, the pairs that the pixels are of
+    extra : (N, ...) float64, further fields of the caller's; pair : (N,) int64, the pairs that the pixels are of
     """
 
     angles: Angles
     light: Tensor
     image: Tensor
-    more: tuple[Tensor, ...] = ()
+    extra: tuple[Tensor, ...] = ()
     pair: Tensor | None = None
 
 
@@ -52,18 +52,18 @@ def sample_pixels(
     reader: PairReader,
     indices: NDArray[np.int64],
     radiometry: Radiometry,
-    more: Callable[[Batch], Sequence[Tensor]] = lambda batch: (),
+    extra: Callable[[Batch], Sequence[Tensor]] = lambda batch: (),
 ) -> Pixels:
     """Valid pixels on a regular lattice over every crop, about MAXIMUM_PIXELS, with images in I/F by their radiometry.
 
-    more : further fields of a batch, (B, ..., H, W) each
+    extra : gives further fields of a batch, (B, ..., H, W) each
     """
     crops = min(len(indices), MAXIMUM_PAIRS)
     step = max(1, math.ceil(math.sqrt(crops * reader.size[0] * reader.size[1] / MAXIMUM_PIXELS)))
     part = np.s_[..., step // 2 :: step, step // 2 :: step]
     gain, offset = (value().detach().cpu() for value in (radiometry.gain, radiometry.offset))
     found: list[list[Tensor]] = []
-    for pairs, batch in batches_of(reader, indices):
+    for pairs, batch in sample_batches(reader, indices):
         o = batch.observation
         seen = facets.angles_and_light(
             o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius
@@ -72,7 +72,7 @@ def sample_pixels(
         angles, light = seen
         image = (batch.image - offset[o.frame, None, None]) / gain[o.frame, None, None]
         pair = torch.from_numpy(pairs)[:, None, None].expand(image.shape)
-        fields = (pair, angles.cos_incidence, angles.cos_emission, angles.cos_phase, light, image, *more(batch))
+        fields = (pair, angles.cos_incidence, angles.cos_emission, angles.cos_phase, light, image, *extra(batch))
         valid = batch.valid[part]
         found.append([field[part].movedim((-2, -1), (1, 2))[valid].double() for field in fields])
     pair, mu0, mu, phase, light, image, *rest = (torch.cat(parts) for parts in zip(*found, strict=True))
@@ -88,11 +88,13 @@ def fit_pixels(
 ) -> Tensor:
     """One set of parameters (C,) within the model's bounds, by Levenberg-Marquardt from its defaults.
 
-    What the pixels do not tell stays at its default: leaving it costs a millionth of the images' power per unit of the
-    unbounded parameter. That also keeps the fit from wandering along valleys, in which rounding would choose the place.
+    A parameter that the pixels do not determine stays at its default: to leave it costs a millionth of the images'
+    power per unit of the unbounded parameter. That also holds the fit where the misfit is flat, and rounding would
+    choose the place.
 
     free : the parameters that may leave their defaults; all where empty
-    frame : (N,) int64, the images of which the pixels are, where each has an unknown gain and offset: the best in every round
+    frame : (N,) int64, the image of each pixel, where images have unknown gains and offsets: the best are taken in
+        every round
     """
     names = [p.name for p in model.parameters]
     free = free or names
@@ -110,7 +112,7 @@ def fit_pixels(
     gain, error = _residual(render(raw), pixels.image, frame)
     loss = error.square().sum()
     for _ in range(rounds):
-        # products and sums instead of BLAS, whose sums hang on where arrays lie in memory
+        # products and sums instead of BLAS, whose sums depend on where arrays lie in memory
         columns = _slopes(render, raw) * gain
         normal = torch.stack([(columns * c).sum(dim=1) for c in columns]) + tie * torch.eye(len(raw))
         slope = (columns * error).sum(dim=1) - tie * (raw - home)
@@ -142,12 +144,12 @@ def _residual(rendered: Tensor, image: Tensor, frame: Tensor | None) -> tuple[Te
 
     (mean, x), (_, y) = centred(rendered), centred(image)
     variance, covariance = (torch.bincount(frame, x * other) / count for other in (x, y))
-    told = variance > 1e-12 * mean.square()  # a constant rendering says nothing of a gain
-    gain = torch.where(told, covariance / torch.where(told, variance, 1), 0)[frame]
+    known = variance > 1e-12 * mean.square()  # a constant rendering does not determine a gain
+    gain = torch.where(known, covariance / torch.where(known, variance, 1), 0)[frame]
     return gain, y - gain * x
 
 
-def _slopes(render: Callable[[Tensor], Tensor], raw: Tensor, step: float = 1e-5) -> Tensor:
-    """(C, N) by central differences: in double precision exact to about 1e-9."""
-    shifts = step * torch.eye(len(raw), dtype=raw.dtype)
-    return torch.stack([(render(raw + shift) - render(raw - shift)) / (2 * step) for shift in shifts])
+def _slopes(render: Callable[[Tensor], Tensor], raw: Tensor) -> Tensor:
+    """(C, N) by central differences."""
+    shifts = STEP * torch.eye(len(raw), dtype=raw.dtype)
+    return torch.stack([(render(raw + shift) - render(raw - shift)) / (2 * STEP) for shift in shifts])

@@ -1,4 +1,4 @@
-"""A trained network and all that is needed to use it, from and to checkpoint.h5."""
+"""A trained network with all that is needed to use it, and how it is read from checkpoint.h5."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ class Predictor(torch.nn.Module):
         self.offset: dict[str, float] = {}
         self.image_units = "iof"
         self.gsd = float("nan")
-        self.image_noise = float("nan")  # of the images, I/F: what errors of the maps do not explain
+        self.image_noise = float("nan")  # I/F, of the images, beside errors of the maps
 
     def forward(self, elevation: Tensor, keys: Tensor | None = None) -> Tensor:
         """(B, H, W) m -> (B, C, H, W) coefficients; ``keys`` as in :class:`UNet`."""
-        return self.maps.stack(self.shifted(elevation, keys), dim=1)
+        return self.maps.stack(self.unbounded(elevation, keys), dim=1)
 
-    def shifted(self, elevation: Tensor, keys: Tensor | None = None) -> Tensor:
-        """(B, H, W) m -> (B, M, H, W), the maps before their bounds: see :class:`CoefficientMaps`."""
+    def unbounded(self, elevation: Tensor, keys: Tensor | None = None) -> Tensor:
+        """(B, H, W) m -> (B, channels, H, W), the maps before their bounds: see :class:`CoefficientMaps`."""
         x = scale_elevation(elevation, self.elevation_scale)
         if elevation.device.type == "cpu":
             x = x.to(memory_format=torch.channels_last)
-        return self.maps.shifted(self.net(x, keys))
+        return self.maps.unbounded(self.net(x, keys))
 
     def _whole_strides(self, elevation: Tensor) -> Tensor:
         stride = self.net.stride
@@ -66,17 +66,17 @@ class Predictor(torch.nn.Module):
 
         ``photometry.deviation.radiance_deviation`` makes the image's of them; ``image_noise`` comes on top.
         """
-        shifted = self._evaluated(elevation)
-        deviations = self.maps.deviations(shifted, dim=1)
-        return self.maps.stack(shifted, dim=1), dict(zip(self.maps.maps, deviations.unbind(1), strict=True))
+        unbounded = self._evaluated(elevation)
+        deviations = self.maps.deviations(unbounded, dim=1)
+        return self.maps.stack(unbounded, dim=1), dict(zip(self.maps.maps, deviations.unbind(1), strict=True))
 
     def _evaluated(self, elevation: Tensor) -> Tensor:
-        """(B, H, W) m -> :meth:`shifted` in evaluation mode."""
-        was = self.training
+        """(B, H, W) m -> :meth:`unbounded` in evaluation mode."""
+        training = self.training
         self.eval()
         height, width = elevation.shape[-2:]
-        out = self.shifted(self._whole_strides(elevation))[..., :height, :width]
-        self.train(was)
+        out = self.unbounded(self._whole_strides(elevation))[..., :height, :width]
+        self.train(training)
         return out
 
 
@@ -107,14 +107,6 @@ def write_state(group: h5py.Group, state: Mapping[str, Tensor]) -> None:
 def read_state(group: h5py.Group) -> dict[str, Tensor]:
     """The inverse of :func:`write_state`."""
     return {name: torch.from_numpy(np.array(data[...])) for name, data in group.items()}
-
-
-def first_misfit(error: BaseException) -> str:
-    """What PyTorch says of the first weight that does not fit; its own first line only names a class."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
-    text = lines[1] if len(lines) > 1 else lines[0]
-    text = text.replace(" in state_dict", "")
-    return text if len(text) <= 160 else f"{text[:157]}..."
 
 
 def load_predictor(path: Path, device: torch.device | str = "cpu", model: str | None = None) -> Predictor:

@@ -1,7 +1,7 @@
-"""A trained U-Net over a map from north to south, strip by strip: every layer keeps the last rows that its next ones still need.
+"""A trained U-Net over a map from north to south, strip by strip: every layer keeps the rows that it still needs.
 
-Each layer takes rows from the one before it as they are asked for. No row is worked on twice, however far the network sees,
-and memory follows the width of what is asked for, not its height.
+Each layer takes rows from the one before it as the next one asks for them. No row is computed twice, however far the
+network sees, and memory grows with the width of the map, not with its height.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class StripUNet:
     def __init__(self, net: UNet, elevation_scale: float, dtype: torch.dtype) -> None:
         down, up = ([self._folded(block, dtype) for block in blocks] for blocks in (net.down, reversed(net.up)))
         entry = _fuse(net.down[0][0], net.down[0][1])  # type: ignore[index]
-        down[0][0] = partial(_see_heights, entry.weight / elevation_scale, entry.bias, dtype)
+        down[0][0] = partial(_convolve_heights, entry.weight / elevation_scale, entry.bias, dtype)
         self.down, self.up = down, up
         self.rise = [self._kernel(conv, dtype) for conv in reversed(net.rise)]
         self.head = self._kernel(net.head, dtype)
@@ -51,7 +51,7 @@ class StripUNet:
     def run(self, heights: Rows) -> Iterator[Tensor]:
         """Raw coefficients (1, C, n, W) of heights (1, 1, n, W) in m, whose rows and columns are multiples of ``stride``.
 
-        Edges are continued. The pieces that come out are not those that go in.
+        Edges are continued. The pieces that come out have other heights than those that go in.
         """
         return map(lambda piece: self.head(piece[0]), self._level(0, heights))
 
@@ -60,10 +60,10 @@ class StripUNet:
         rows = _two_layers(self.down[level], rows)
         if level == len(self.down) - 1:
             return rows
-        beside = _Beside()
-        below = self._level(level + 1, _through(_Pool(), map(beside.keep, rows)))
+        skip = _Skip()
+        below = self._level(level + 1, _through(_Pool(), map(skip.keep, rows)))
         raised = _through(_Convolve(self.rise[level]), map(_upsample, below))
-        return _two_layers(self.up[level], map(beside.join, raised))
+        return _two_layers(self.up[level], map(skip.join, raised))
 
 
 def _fuse(conv: nn.Module, norm: nn.Module) -> nn.Conv2d:
@@ -71,7 +71,7 @@ def _fuse(conv: nn.Module, norm: nn.Module) -> nn.Conv2d:
     return fuse_conv_bn_eval(conv, norm)
 
 
-def _see_heights(weight: Tensor, bias: Tensor | None, dtype: torch.dtype, x: Tensor) -> Tensor:
+def _convolve_heights(weight: Tensor, bias: Tensor | None, dtype: torch.dtype, x: Tensor) -> Tensor:
     """The network's first layer, (1, 1, n + 2, W + 2) m -> (1, C, n, W): see :class:`unet.HeightConv`. weight : 1/m
 
     Differences to the middle pixel are taken first: the height itself then leaves no rounding, and the same ground gives
@@ -87,7 +87,7 @@ def _see_heights(weight: Tensor, bias: Tensor | None, dtype: torch.dtype, x: Ten
 
 
 def _through(layer: Callable[[Piece], Piece | None], rows: Rows) -> Rows:
-    """What a layer makes of rows, where it knows any. ``map`` holds on to nothing, as a generator's own variables would."""
+    """The rows that a layer gives, without empty pieces; a generator would keep tensors alive in its variables."""
     return filter(None, map(layer, rows))
 
 
@@ -98,7 +98,7 @@ def _two_layers(kernels: Sequence[Kernel], rows: Rows) -> Rows:
 
 
 class _Convolve:
-    """A 3 x 3 convolution, edges continued: a row is known when the one below it is."""
+    """A 3 x 3 convolution, edges continued: a row comes out when the one below it came in."""
 
     def __init__(self, kernel: Kernel) -> None:
         self.kernel, self._above = kernel, torch.empty(0)
@@ -147,8 +147,8 @@ def _upsample(piece: Piece) -> Piece:
     return functional.interpolate(piece[0], scale_factor=2.0, mode="nearest"), piece[1]
 
 
-class _Beside:
-    """Rows of the way down, which wait for those that are raised to their level."""
+class _Skip:
+    """The skip connection of a level: keeps rows of the way down until the upsampled ones reach them."""
 
     def __init__(self) -> None:
         self._waiting: deque[Tensor] = deque()

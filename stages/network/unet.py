@@ -19,8 +19,8 @@ DROPOUT = (0.1, 0.1, 0.2, 0.2, 0.3)
 class HeightConv(nn.Conv2d):
     """A convolution whose kernels sum to zero: it sees height differences and never the height itself.
 
-    Lunar-G2R subtracts each crop's mean instead, so that the same ground gets another input in every window and the map
-    shows squares at their borders. With this layer the mean of a window cannot matter, to the last bit but rounding.
+    Lunar-G2R subtracts each crop's mean instead: the same ground then has another input in every window, and the map
+    shows squares at their borders. With this layer the mean of a window does not matter, but for rounding.
     """
 
     def __init__(self, inputs: int, outputs: int) -> None:
@@ -33,7 +33,7 @@ class HeightConv(nn.Conv2d):
 
         x : (B, 1, H, W); returns (B, C, H, W)
         """
-        # bfloat16 keeps three digits of a height, which would leave little of a slope: float32, whatever the rest is in.
+        # In float32 whatever the rest is in: bfloat16 keeps three digits of a height, too few for a slope.
         with torch.autocast(x.device.type, enabled=False):
             weight = self.weight - self.weight.mean(dim=(2, 3), keepdim=True)
             return convolution(functional.pad(x.float(), (1, 1, 1, 1), mode="replicate"), weight)
@@ -125,7 +125,7 @@ class UNet(nn.Module):
         return down + up + self.stride
 
     def forward(self, x: Tensor, keys: Tensor | None = None) -> Tensor:
-        """``keys`` (B,) int64: what each crop's dropout hangs on; drawn where None."""
+        """x : (B, 1, H, W), scaled heights; keys : (B,) int64, of each crop's dropout, drawn where None."""
         return self.read_out(self.features(x, keys))
 
     def read_out(self, features: Tensor) -> Tensor:
@@ -133,7 +133,7 @@ class UNet(nn.Module):
         return convolution(features, self.head.weight, self.head.bias)
 
     def features(self, x: Tensor, keys: Tensor | None = None) -> Tensor:
-        """What the last layer sees, (B, F, H, W) with F the first of the widths."""
+        """The input of the last layer, (B, F, H, W) with F the first of the widths."""
         if keys is None:
             keys = draw_keys(len(x), x.device) if self.training else x.new_empty(0, dtype=torch.int64)
         # The fused form has no gradient in evaluation mode.

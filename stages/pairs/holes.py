@@ -1,11 +1,11 @@
-"""Holes of a DEM filled from their surroundings, so that a network can read it."""
+"""Filling holes of a DEM from their surroundings, as a network needs it."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-# px. The largest is beyond the network's reach: what no square fills takes the window's mean and reaches no valid pixel.
+# px. Holes that no square fills take the window's mean: the largest square reaches farther than the network sees.
 FILL_RADII = (2, 8, 32, 128)
 FILL_REACH = sum(FILL_RADII)
 FILL_STEP = 2.0**-10  # m

@@ -28,7 +28,7 @@ from stages.physics.formation.chain import Observation
 
 @dataclass
 class Batch:
-    """What one step works on: ``image`` and ``valid`` are (B, H, W), float32 and bool."""
+    """The pairs that one step works on. image : (B, H, W) float32; valid : (B, H, W) bool"""
 
     observation: Observation
     image: Tensor
@@ -37,17 +37,9 @@ class Batch:
     def to(self, device: torch.device) -> Batch:
         """The same on another device; the observation is moved in place."""
         o = self.observation
-        for name in (
-            "elevation",
-            "sun_direction",
-            "camera_position",
-            "sun_horizon",
-            "detector_sample",
-            "detector_line",
-            "frame",
-        ):
-            value = getattr(o, name)
-            setattr(o, name, None if value is None else value.to(device, non_blocking=True))
+        for name, value in vars(o).items():
+            if isinstance(value, Tensor):
+                setattr(o, name, value.to(device, non_blocking=True))
         return Batch(o, self.image.to(device, non_blocking=True), self.valid.to(device, non_blocking=True))
 
 
@@ -56,10 +48,10 @@ DETECTOR = ("detector_sample", "detector_line")
 
 
 class PairReader:
-    """Random access to pairs.h5, whoever wrote it and however it is laid out.
+    """Random access to pairs.h5, whichever program wrote it and however it is laid out.
 
     split, tile, frame, site : (n,) arrays; image_ids : one per frame; units : 'iof' or 'dn'; gsd, body_radius : m
-    threads : that read and decode one batch; detector : whether observations say where on the sensor a pixel was seen
+    threads : how many read and decode a batch; detector : whether observations hold each pixel's place on the sensor
     """
 
     def __init__(self, path: Path, threads: int = 1, detector: bool = True) -> None:
@@ -108,7 +100,7 @@ class PairReader:
         self.close()
 
     def _check_any_valid(self) -> None:
-        """One valid pixel anywhere is enough: of good files one pair is read. Raises ArtefactError."""
+        """Refuse a file without a valid pixel; of good files only the first pair is read. Raises ArtefactError."""
         for index in range(self.count):
             if _validity(self._read(["valid", "image", "elevation"], [index])).any():
                 return
@@ -122,7 +114,7 @@ class PairReader:
         return np.flatnonzero(self.split == dict(SPLITS)[part])
 
     def _read(self, names: Sequence[str], indices: Sequence[int] | NDArray) -> dict[str, NDArray]:
-        """Variables of some pairs, (B, H, W): float32 with NaN where unknown, or flags; shared out over the threads."""
+        """Variables of some pairs, (B, H, W) each: float32 with NaN where unknown, or flags. All threads read."""
         wanted = np.asarray(indices, dtype=np.int64)
         parts = np.array_split(np.arange(len(wanted)), min(self._threads, max(1, len(wanted) // 4)))
         out, jobs = {}, []
@@ -149,7 +141,7 @@ class PairReader:
         return torch.from_numpy(_without_holes(self._read(["elevation"], indices)["elevation"]))
 
     def observation(self, indices: Sequence[int] | NDArray) -> Observation:
-        """Everything about these pairs but their images."""
+        """The terrain, Sun and camera of these pairs. indices : (B,)"""
         names = [n for n in self._records if n not in ("image", "valid")]
         return self._observation(self._read(names, indices), indices)
 
@@ -183,7 +175,7 @@ class PairReader:
         return torch.from_numpy(_validity(self._read(["valid", "image", "elevation"], indices)))
 
     def batch(self, indices: Sequence[int] | NDArray, symmetries: NDArray | None = None) -> Batch:
-        """A batch, each pair under its own symmetry of the square where given."""
+        """A batch. indices : (B,); symmetries : (B,), of the square (0 .. 7), under which each pair is turned"""
         found = self._read(list(self._records), indices)
         valid = torch.from_numpy(_validity(found))
         image = torch.from_numpy(_replace_unknown(found["image"], 0.0))

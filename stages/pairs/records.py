@@ -1,7 +1,8 @@
-"""Random access to the crops of a pairs file: chunks read and decoded here where they are plain, by HDF5 where not.
+"""Random access to the crops of a pairs file: chunks of simple layouts are read and decoded here, others by HDF5.
 
-HDF5 takes a millisecond for the chunks of one pair, most of it spent decoding scale-offset chunks byte by byte and finding
-the chunk in its index. Here the index is read once, and whole batches are decoded from the mapped file without Python's lock.
+HDF5 takes a millisecond for the chunks of one pair, most of it to decode scale-offset chunks byte by byte and to find
+the chunk in its index. Here the index is read once, and whole batches are decoded from the mapped file without Python's
+lock.
 """
 
 from __future__ import annotations
@@ -20,11 +21,10 @@ from numpy.typing import NDArray
 
 from schemas.reading import unpack
 
-_HEADER = (
-    21  # bytes before the codes of a scale-offset chunk: their width, the size of the minimum, the minimum, padding
-)
-_SLACK = 8  # bytes that decoding may look at behind a chunk
-_KEPT = 1 << 25  # bytes that stay mapped: what was read long ago would look like memory in use
+# bytes before the codes of a scale-offset chunk: their width, the size of the minimum, the minimum, padding
+_HEADER = 21
+_SLACK = 8  # bytes behind a chunk that decoding may read
+_KEPT = 1 << 25  # bytes that stay mapped: what was read long ago would count as memory in use
 _DEFLATE, _SHUFFLE, _SCALE_OFFSET = h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_SCALEOFFSET
 _MIN_INDEX = 64  # records; for fewer, reading a large file's whole index costs more than HDF5 does
 
@@ -40,7 +40,7 @@ class Mapping:
         self._touched = 0
 
     def touch(self, end: int, count: int) -> None:
-        """Before ``count`` bytes up to ``end`` are read. Raises OSError where the file became shorter."""
+        """To be called before ``count`` bytes up to ``end`` are read. Raises OSError where the file became shorter."""
         if end > len(self.bytes) or end > os.fstat(self._fd).st_size:
             raise OSError("it ends early")
         self._touched += count
@@ -52,15 +52,16 @@ class Mapping:
         """Let go of the file."""
         self.bytes = np.empty(0, np.uint8)
         os.close(self._fd)
-        with contextlib.suppress(BufferError):  # somebody still looks at it: it is closed with the last of them
+        with contextlib.suppress(BufferError):  # an array still refers to it: it is closed with the last of these
             self._map.close()
 
 
 class Records:
     """A variable (record, y, x) of an open file, by record.
 
-    fast : whether records are read without HDF5: float32 chunks, plain or by scale-offset with decimals, byte chunks, plain
-    or deflated, and contiguous data, all of little-endian numbers without CF packing
+    kind : how they are stored; all but 'hdf5' are read without HDF5: float32 chunks, 'plain' or 'packed' by
+    scale-offset with decimals; byte chunks, 'plain' or 'deflated'; 'contiguous' data; little-endian numbers without CF
+    packing
     """
 
     def __init__(self, data: h5py.Dataset, mapping: Mapping) -> None:
@@ -74,7 +75,6 @@ class Records:
         self._decimals, self._code_fill = 0, np.float32(np.nan)
         self._has_fill = False
         self.kind = self._find_kind()
-        self.fast = self.kind != "hdf5"
         declared = data.attrs.get("_FillValue")
         self._fill = np.float32(np.nan if declared is None else np.ravel(declared)[0])
         if self._code_fill == self._fill:
@@ -82,8 +82,10 @@ class Records:
 
     def _find_kind(self) -> str:
         data = self.data
-        plain = data.dtype in (np.dtype("<f4"), np.dtype("u1")) and not {"scale_factor", "add_offset"} & set(data.attrs)
-        if not plain or data.is_virtual or data.external or data.file.userblock_size or 0 in data.shape:
+        simple = data.dtype in (np.dtype("<f4"), np.dtype("u1")) and not {"scale_factor", "add_offset"} & set(
+            data.attrs
+        )
+        if not simple or data.is_virtual or data.external or data.file.userblock_size or 0 in data.shape:
             return "hdf5"
         creation = data.id.get_create_plist()
         filters = [creation.get_filter(k) for k in range(creation.get_nfilters())]
@@ -99,9 +101,8 @@ class Records:
             return "deflated"
         # Integers, and floats without decimals, are packed by other rules.
         if data.dtype.kind == "f" and names == [_SCALE_OFFSET] and filters[0][2][0] == h5py.h5z.SO_FLOAT_DSCALE:
-            settings = np.array(
-                filters[0][2], np.uint32
-            )  # kind, decimals, values, class, size, sign, order, fill?, fill
+            # kind, decimals, values, class, size, sign, order, whether there is a fill value, fill value
+            settings = np.array(filters[0][2], np.uint32)
             self._decimals = int(settings[1:2].view(np.int32)[0])
             self._has_fill = bool(settings[7])
             self._code_fill = settings[8:9].view(np.float32)[0]
@@ -109,9 +110,9 @@ class Records:
         return "hdf5"
 
     def prepare(self, count: int) -> None:
-        """Make ready for ``count`` more records, from the thread that opened the file."""
+        """Announce that ``count`` more records will be read; from the thread that opened the file."""
         self._asked += count
-        if not self.fast or self._offset is not None or self._asked < min(_MIN_INDEX, len(self.data)):
+        if self.kind == "hdf5" or self._offset is not None or self._asked < min(_MIN_INDEX, len(self.data)):
             return
         records = len(self.data)
         if self.kind == "contiguous":

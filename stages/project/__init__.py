@@ -8,21 +8,9 @@ from schemas.later import imported_later
 from stages.project.config import Config
 
 if TYPE_CHECKING:
-    from stages.project.geometry import Geometry, crop_geometry
     from stages.project.inputs import count_pairs, scene_of, source_files
     from stages.project.stage import run
-    from stages.project.summary import Registered, Summary, summarise
+    from stages.project.summary import Registered, summarise
 
-__getattr__ = imported_later(__name__, "stage", "geometry", "inputs", "summary")
-__all__ = [
-    "Config",
-    "Geometry",
-    "Registered",
-    "Summary",
-    "count_pairs",
-    "crop_geometry",
-    "run",
-    "scene_of",
-    "source_files",
-    "summarise",
-]
+__getattr__ = imported_later(__name__, "stage", "inputs", "summary")
+__all__ = ["Config", "Registered", "count_pairs", "run", "scene_of", "source_files", "summarise"]

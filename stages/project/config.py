@@ -1,4 +1,4 @@
-"""What project is asked for."""
+"""The settings of project."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from schemas.errors import ConfigError
 
 @dataclass(frozen=True)
 class Config:
-    """scene : overrides the scene that crops.h5 names; register : None, or the freest form of displacement that may be taken
-    off ('constant', 'affine', 'field'); max_shift : px searched; exact : keep float32 as it is instead of the digits that
-    matter.
+    """scene : in place of the one that crops.h5 names; register : the freest form of displacement that may be taken off
+    ('constant', 'affine', 'field'), None for no registration; max_shift : px, largest that is searched; exact : write
+    all digits of float32 instead of those that matter.
     """
 
     scene: str | None = None

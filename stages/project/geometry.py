@@ -1,4 +1,4 @@
-"""Where the Sun and the camera stand, seen from the crops."""
+"""Directions from the crops to the Sun and the camera."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ class Geometry:
 
     sun: NDArray[np.float64]
     camera: NDArray[np.float64]
-    convergence_deg: NDArray[np.float64]
 
 
 def crop_geometry(
@@ -30,11 +29,11 @@ def crop_geometry(
     to_sun /= np.linalg.norm(to_sun, axis=1, keepdims=True)
     sun = np.einsum("nij,nj->ni", local.axes, to_sun)
     camera = np.einsum("nij,nj->ni", local.axes, camera_position - centre)
-    return Geometry(sun, camera, local.convergence_deg)
+    return Geometry(sun, camera)
 
 
 def check_directions(frame: Frame, geometry: Geometry) -> None:
-    """Sun and camera must stand above every crop's horizon plane. Raises GeometryError."""
+    """Refuse a Sun or a camera below the horizontal plane of a crop. Raises GeometryError."""
     if geometry.sun[:, 2].min() <= 0:
         raise GeometryError(
             f"image '{frame.image_id}': the Sun is below the horizon at {int((geometry.sun[:, 2] <= 0).sum())} crop centres; "

@@ -15,7 +15,7 @@ import numpy as np
 
 from schemas import CROPS, SCENE, ArtefactError, InputError, open_artefact
 from schemas.files.user_files import check_file
-from schemas.provenance import sha256
+from schemas.provenance import file_state, sha256
 from stages.physics.horizon.scene import Overview, make_overview
 from stages.physics.images.table import Frame, load_frames
 from stages.physics.maps.grid import Grid, read_grid
@@ -48,7 +48,7 @@ def open_scene(crops: Path, file: h5py.File, config: Config) -> Iterator[Scene]:
 
 
 def check_sources(crops: Path, frames: list[Frame]) -> None:
-    """The images and cameras must be those that the scene's masks were made from. Raises InputError."""
+    """Refuse images and cameras that are not those that the scene's masks were made from. Raises InputError."""
     for frame in frames:
         for path, known in ((frame.path, frame.sha256), (frame.camera, frame.camera_sha256)):
             if path is None or not known:
@@ -62,7 +62,7 @@ def check_sources(crops: Path, frames: list[Frame]) -> None:
 
 
 def check_places(crops: Path, file: h5py.File, shape: tuple[int, int]) -> None:
-    """Crops are square, even, and lie on the scene. Raises ArtefactError."""
+    """Refuse crops that are not square, of an even size, and on the scene. Raises ArtefactError."""
     height, width = file["elevation"].shape[1:]
     if height != width or height % 2:
         raise ArtefactError(
@@ -104,17 +104,16 @@ def source_files(crops: Path) -> list[Path]:
     return [p for f in frames for p in (f.path, f.camera) if p is not None]
 
 
-_kept: dict[tuple[Any, ...], Overview] = {}
+_overviews: dict[tuple[Any, ...], Overview] = {}
 
 
 def overview_of(scene: Path, elevation: h5py.Dataset) -> Overview:
-    """The far terrain, which takes a look at the whole DEM: the parts that one process works on share it."""
-    state = os.stat(scene)
-    key = (os.path.realpath(scene), state.st_size, state.st_mtime_ns)
-    if key not in _kept:
-        _kept.clear()
-        _kept[key] = make_overview(elevation, max(1, math.ceil(max(elevation.shape) / OVERVIEW_PX)))
-    return _kept[key]
+    """The far terrain. It is made of the whole DEM, and shared by all parts that one process works on."""
+    key = (os.path.realpath(scene), *file_state(scene))
+    if key not in _overviews:
+        _overviews.clear()
+        _overviews[key] = make_overview(elevation, max(1, math.ceil(max(elevation.shape) / OVERVIEW_PX)))
+    return _overviews[key]
 
 
 def overview_extremes(elevation: h5py.Dataset, overview: Overview) -> tuple[float, float]:

@@ -1,10 +1,10 @@
-"""Registration of the images that pairs are made of, and what pairs.h5 keeps of it."""
+"""Registration of the images of pairs, and what pairs.h5 records of it."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import h5py
 import numpy as np
@@ -19,8 +19,8 @@ from stages.project.summary import Registered
 
 
 def register(frame: Frame, index: int, source: Source, crops: h5py.File, scene: Scene, config: Config) -> Registered:
-    """Register one image by blocks about all of its crops, whatever the shard: every shard takes off the same."""
-    # here: it renders with torch, whose import would be most of the time that small crops take
+    """Register one image by blocks about all of its crops, also those of other shards: all shards find the same."""
+    # imported here: it renders with torch, whose import would take most of the time of a small run
     from stages.physics.images.register_frame import choose_blocks, register_frame
 
     began = time.monotonic()
@@ -60,37 +60,22 @@ def combined_share(registered: Sequence[Registered]) -> tuple[float, float, int]
     return mean, math.sqrt(max(1.0, excess) / float(weight.sum())), len(share)
 
 
+FRAME_VARIABLES: dict[str, Callable[[Field], float]] = {
+    "shift_col_px": lambda field: field.mean[0],
+    "shift_row_px": lambda field: field.mean[1],
+    "shift_sigma_px": lambda field: field.sigma,
+    "shift_correlation": lambda field: field.correlation,
+    "shift_scatter_px": lambda field: field.scatter,
+    "shift_freedom": lambda field: field.freedom,
+    "shift_held_out": lambda field: field.held_out,
+    "relief_share": lambda field: field.share,
+    "relief_share_error": lambda field: field.share_error,
+}
+
+
 def write_registration(writer: ArtefactWriter, frames: Sequence[Frame], registered: Sequence[Registered]) -> None:
-    """One value per image of what was taken off, NaN for images that stay where they were."""
-    columns = {name: np.full(len(frames), np.nan) for name in FRAME_VARIABLES}
-    place = {frame.image_id: k for k, frame in enumerate(frames)}
-    for entry in registered:
-        field = entry.field
-        if field.accepted:
-            values = (
-                *field.mean,
-                field.sigma,
-                field.correlation,
-                field.scatter,
-                field.freedom,
-                field.held_out,
-                field.share,
-                field.share_error,
-            )
-            for name, value in zip(FRAME_VARIABLES, values, strict=True):
-                columns[name][place[entry.image_id]] = value
-    for name, column in columns.items():
-        writer.write(name, column)
-
-
-FRAME_VARIABLES = (
-    "shift_col_px",
-    "shift_row_px",
-    "shift_sigma_px",
-    "shift_correlation",
-    "shift_scatter_px",
-    "shift_freedom",
-    "shift_held_out",
-    "relief_share",
-    "relief_share_error",
-)
+    """One value per image and variable of what was taken off, NaN for images that stay where they were."""
+    fields = {entry.image_id: entry.field for entry in registered if entry.field.accepted}
+    for name, value in FRAME_VARIABLES.items():
+        column = [value(fields[f.image_id]) if f.image_id in fields else math.nan for f in frames]
+        writer.write(name, np.array(column, float))

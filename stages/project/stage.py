@@ -1,4 +1,4 @@
-"""The stage itself: image by image, crop by crop."""
+"""project: pairs.h5, image by image and crop by crop."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from schemas import CROPS, PAIRS, ArtefactWriter, InputError, check_output, open_artefact
 from schemas.files.outputs import Output
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.shards import shard_range
 from stages.physics.horizon.scene import horizon_in_scene
 from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
@@ -26,20 +27,20 @@ from stages.project.register import displacement_at, register, write_registratio
 from stages.project.summary import Registered, Summary
 from stages.project.writing import Pair, PairDatasets, Tally, kept_decimals
 
-OF_THE_CROP = ("longitude_deg", "latitude_deg", "row", "col", "image_index", "site", "tile", "split")
+CROP_COLUMNS = ("longitude_deg", "latitude_deg", "row", "col", "image_index", "site", "tile", "split")
 
 
 def run(
     crops: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Summary:
     """Write ``pairs.h5``. Raises ArtefactError, ConfigError, InputError or GeometryError; then nothing is written."""
-    output = Output.of(output)
+    output = Output.at(output)
     config.check()
     check_output(output.file, [crops, scene_of(crops, config)], output.overwrite)
     with open_artefact(crops, CROPS) as file, open_scene(crops, file, config) as scene:
         frames = load_frames(file, crops)
         total, size = file["elevation"].shape[:2]
-        part = slice(*(total * k // config.shard[1] for k in (config.shard[0], config.shard[0] + 1)))
+        part = slice(*shard_range(total, config.shard))
         check_sources(crops, [frames[k] for k in sorted({int(k) for k in file["image_index"][part]})])
         check_places(crops, file, scene.elevation.shape)
         units = _units(crops, file, frames, part)
@@ -58,7 +59,7 @@ def run(
 
 @dataclass(frozen=True)
 class Crops:
-    """The crops of one shard. part : its rows of crops.h5; row, col, image_index : (n,)"""
+    """The crops of one shard. part : its rows of crops.h5"""
 
     file: h5py.File
     part: slice
@@ -79,8 +80,8 @@ class Crops:
 
 @dataclass(frozen=True)
 class View:
-    """What one image shows of its crops. rows, cols : (m,) of their middles; mean : (m,) m; local : their frames;
-    field : what registration takes off, None without
+    """One image and its m crops. rows, cols : (m,) of their middles; mean : (m,) m, their mean elevations; local :
+    their frames; field : the displacement that registration takes off, None without registration
     """
 
     source: Source
@@ -109,7 +110,7 @@ def _project(
     progress: Progress,
 ) -> Summary:
     decimals = {} if config.exact else kept_decimals(frames, units, scene.grid.gsd)
-    # of the whole table, not of this shard's images: the parts of one whole hold the same variables
+    # by the whole table, not this shard's images: all parts of one whole hold the same variables
     rays = any(f.camera for f in frames)
     datasets = PairDatasets(writer, "1" if units == "iof" else "dn", decimals, rays, config.register is not None)
     tally, registered = Tally(), list[Registered]()
@@ -137,7 +138,7 @@ def _project(
                 datasets.put(k, pair)
                 tally.add(pair)
     progress(total, total, "pairs")
-    for name in OF_THE_CROP:
+    for name in CROP_COLUMNS:
         writer.write(name, crops.column(name))
     writer.write("image_id", [f.image_id for f in frames])
     writer.write("solar_distance_au", np.array([f.solar_distance_au for f in frames]))
@@ -176,7 +177,7 @@ def _pair(view: View, place: int, heights: NDArray[np.float32], scene: Scene) ->
         horizon=angle,
         sun=sun,
         camera=camera,
-        convergence_deg=float(view.geometry.convergence_deg[place]),
+        convergence_deg=float(view.local.convergence_deg[place]),
         displacement=displacement,
         ortho=pixels.ortho,
     )

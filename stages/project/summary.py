@@ -1,13 +1,13 @@
-"""What pairs hold, in one line."""
+"""The summary of pairs, for the line at the end."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas import PAIRS, open_artefact
 from schemas.reading import unpack
@@ -17,7 +17,7 @@ from stages.physics.images.registration import Shift
 
 @dataclass(frozen=True)
 class Registered:
-    """How one image lay against its rendering: the displacement that was taken off, and each block's own answer."""
+    """The registration of one image: the displacement that was taken off, and the shift of each block."""
 
     image_id: str
     field: Field
@@ -38,7 +38,7 @@ class Summary:
 
 
 def summarise(pairs: Path) -> Summary:
-    """What pairs hold, for the line at the end: of a file that was put together from parts."""
+    """The summary of a file that was merged from parts."""
     with open_artefact(pairs, PAIRS) as file:
         sun, camera = file["sun_direction_enu"][...], file["camera_position_enu"][...]
         seen = shadowed = total = 0
@@ -47,10 +47,11 @@ def summarise(pairs: Path) -> Summary:
             angle = unpack(file["sun_horizon_deg"], file["sun_horizon_deg"][k]).astype(np.float64)
             above = np.radians(angle) > math.asin(sun[k, 2])
             seen, shadowed, total = seen + int(valid.sum()), shadowed + int((valid & above).sum()), total + valid.size
-    incidence = np.degrees(np.arccos(sun[:, 2]))
-    emission = np.degrees(np.arccos(camera[:, 2] / np.linalg.norm(camera, axis=1)))
-
-    def extremes(angles: NDArray[np.float64]) -> tuple[float, float]:
-        return (float(angles.min()), float(angles.max())) if len(angles) else (math.nan, math.nan)
-
+    incidence = np.degrees(np.arccos(sun[:, 2])).tolist()
+    emission = np.degrees(np.arccos(camera[:, 2] / np.linalg.norm(camera, axis=1))).tolist()
     return Summary(len(sun), seen / max(1, total), extremes(incidence), extremes(emission), shadowed / max(1, seen))
+
+
+def extremes(angles: Sequence[float]) -> tuple[float, float]:
+    """The least and the largest, NaN where there are none."""
+    return min(angles, default=math.nan), max(angles, default=math.nan)

@@ -1,4 +1,4 @@
-"""What project writes, pair by pair: with the digits that matter, and counted for the line at the end."""
+"""Writing pairs one by one, with the decimals that matter, and counting them for the line at the end."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from schemas import ArtefactWriter, InputError
 from stages.physics.images.orthorectify import Ortho
 from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
-from stages.project.summary import Registered, Summary
+from stages.project.summary import Registered, Summary, extremes
 
-# Digits after the point, which pairs.h5 keeps; docs/scaling.md says what they do to a rendering.
+# Digits after the point that pairs.h5 keeps; for their effect on a rendering see docs/scaling.md.
 IOF_DECIMALS, COUNT_DECIMALS, HORIZON_DECIMALS = 5, 1, 1
 RAY_DECIMALS = {"detector_line": 2, "detector_sample": 2, "emission_deg": 2, "phase_deg": 3}
 ALWAYS = ("valid", "sun_direction_enu", "camera_position_enu", "convergence_deg")
@@ -74,14 +74,14 @@ class PairDatasets:
 
 
 def _put_known(target: h5py.Dataset, k: int, values: NDArray) -> None:
-    """One pair's values, unknown ones as the dataset writes them: a NaN among rounded values would spoil its chunk."""
+    """Write one pair's values, unknown ones as the fill value: a NaN among packed values would spoil its chunk."""
     known = np.isfinite(values)
     target[k] = values if known.all() else np.where(known, values, target.fillvalue)
 
 
 @dataclass
 class Tally:
-    """What has been written so far."""
+    """Counts of what has been written so far."""
 
     pairs: int = 0
     valid: int = 0
@@ -99,11 +99,7 @@ class Tally:
         self.emission.append(math.degrees(math.acos(pair.camera[2] / np.linalg.norm(pair.camera))))
 
     def summary(self, size: int, registered: tuple[Registered, ...]) -> Summary:
-        """size : px, of a crop's side"""
-
-        def extremes(angles: list[float]) -> tuple[float, float]:
-            return min(angles, default=math.nan), max(angles, default=math.nan)
-
+        """Of all that was counted. size : px, of a crop's side"""
         return Summary(
             self.pairs,
             self.valid / max(1, self.pairs * size * size),
@@ -117,7 +113,7 @@ class Tally:
 def kept_decimals(frames: list[Frame], units: str, gsd: float) -> dict[str, int | None]:
     """Digits after the point: elevations in steps of at most gsd / 400, images of 1e-5 of I/F or a tenth of a count.
 
-    Counts that are not whole numbers in the images keep all their digits: nobody knows how large they are.
+    Counts that are not whole numbers in the images keep all their digits, since their scale is not known.
     """
     image: int | None = IOF_DECIMALS if units == "iof" else COUNT_DECIMALS
     if units == "dn":

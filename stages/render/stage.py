@@ -21,12 +21,12 @@ def run(
 
     output : NAME.exr writes NAME.exr, NAME.png and, for ortho views, NAME.tif; NAME.tif and NAME.png leave the EXR out
     """
-    output = Output.of(output)
+    output = Output.at(output)
     path = output.file
     check(config)
     body = find_body("moon" if config.body is None else config.body)
     files = output_files(path, config.view)
-    targets = [Target(p, what="the output" if p == path else f"{p.suffix} beside {path.name}") for p in files]
+    targets = [Target(p, name="the output" if p == path else f"{p.suffix} beside {path.name}") for p in files]
     check_outputs(targets, inputs(source, config), output.overwrite)
     with companions_of(path), open_source(source, config, body) as surface:
         relief = surface.height_range()

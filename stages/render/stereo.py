@@ -48,7 +48,7 @@ def run_stereo(
 
     config : what is rendered, size and field of view; its Sun and camera are drawn here
     """
-    output = Output.of(output)
+    output = Output.at(output)
     folder = output.file
     _check(config, stereo)
     manifest = folder / "manifest.json"

@@ -41,7 +41,7 @@ def run_trajectory(
 
     An output that is resumed leaves alone what is there already; a shard is every n-th view.
     """
-    output = Output.of(output)
+    output = Output.at(output)
     folder, (index, count) = output.file, config.shard
     if config.camera:
         raise ConfigError("`trajectory`: expected no `camera`; each row places its own pinhole camera.")

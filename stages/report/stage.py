@@ -62,7 +62,7 @@ def run(
     `lunargr view` to link to, in any order; `view.html` beside the output is linked, too
     Raises ConfigError, ArtefactError, InputError.
     """
-    output = Output.of(output)
+    output = Output.at(output)
     if not files:
         raise ConfigError("report: expected at least one file, found none; give the artefacts of a run.")
     check_output(output.file, files, output.overwrite)

@@ -1,4 +1,4 @@
-"""sample: crops and a geographic split. stage: all of it; places: where crops are; audit: what ground the parts have."""
+"""sample: crops and a geographic split. stage: from files to files; places: crop centres; audit: of the split."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from schemas.later import imported_later
 from stages.sample.config import Config
 
 if TYPE_CHECKING:
-    from stages.sample.audit import Part, audit, read_audit
+    from stages.sample.audit import audit, read_audit
     from stages.sample.stage import run
 
 __getattr__ = imported_later(__name__, "stage", "audit")
-__all__ = ["Config", "Part", "audit", "read_audit", "run"]
+__all__ = ["Config", "audit", "read_audit", "run"]

@@ -1,4 +1,4 @@
-"""How much ground each part of the split has, and that it shares none with another."""
+"""The audit of the split: the ground of each part, and how much of it another part shares (which should be none)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stages.physics.maps.positions import blocks
 
 @dataclass(frozen=True)
 class Part:
-    """One part of the split, for the audit."""
+    """One part of the split: how much it holds, and how much of its ground another part has as well."""
 
     name: str
     pairs: int
@@ -28,7 +28,10 @@ class Part:
 
 
 def audit(chosen: NDArray, tiles: Tiles, grid: Grid, crop: int) -> list[Part]:
-    """Count pairs, images, tiles and ground per part, and the ground that a part shares with another."""
+    """Count pairs, images, tiles and ground per part, and the ground that a part shares with another.
+
+    chosen : (n,) of places.CHOSEN, the crops' centres; crop : px
+    """
     size = max(2048, 4 * crop)
     half = crop // 2
     ground, shared = np.zeros(3), np.zeros(3)
@@ -65,6 +68,6 @@ def audit(chosen: NDArray, tiles: Tiles, grid: Grid, crop: int) -> list[Part]:
 
 
 def read_audit(crops: Path) -> list[Part]:
-    """The audit of the split, of all shards, as it stands in the file."""
+    """The audit that a file holds, which is that of all shards."""
     with open_artefact(crops, CROPS) as file:
         return [Part(**part) for part in json.loads(file.attrs["split_audit"])]

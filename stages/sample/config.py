@@ -1,4 +1,4 @@
-"""What sample is asked for."""
+"""The settings of sample."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Config:
-    """count : crops in all (sites with ``stack``); density : crops per km2 of an image; tile_m : None for automatic."""
+    """crop : px, None for the scene's; count : crops in all (sites with ``stack``); density : crops per km2 of an
+    image;
+    stack : whether every image of a place is taken; tile_m : edge of a ground tile, None for automatic
+    """
 
     crop: int | None = None
     count: int | None = None

@@ -1,6 +1,7 @@
-"""Where crops are centred: drawn within each image, each part of the split by its share.
+"""The choice of crop centres: drawn at random within each image, for each part of the split by its share.
 
-Places of a stack are drawn in the scene, side by side as long as there is room: crops that share ground are one witness of it.
+With ``stack`` places are drawn in the scene, for all images, and apart while there is room: crops on the same ground
+would measure it twice.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ MOST_CANDIDATES = 200_000
 CHOSEN = np.dtype([("frame", "i4"), ("row", "i4"), ("col", "i4"), ("site", "i4"), ("tile", "i4"), ("split", "u1")])
 
 
-def choose(
+def choose_places(
     positions: PositionMasks,
     tiles: Tiles,
     frames: int,
@@ -44,8 +45,8 @@ def choose(
     take = np.zeros_like(counts)
     for index, k in np.ndindex(len(layers), 3):
         if wanted[index, k]:
-            take[index, k] = _spread(
-                rng, counts[index, k], _drawn(int(wanted[index, k]), int(counts[index, k].sum()), config)
+            take[index, k] = _draw_counts(
+                rng, counts[index, k], _count_candidates(int(wanted[index, k]), int(counts[index, k].sum()), config)
             )
     for number, block in enumerate(positions.blocks):
         progress(len(positions.blocks) + number, 2 * len(positions.blocks), "choosing positions")
@@ -62,14 +63,14 @@ def choose(
                 picked.append((layer, k, row + block[0], col + block[1], block, here))
     progress(2 * len(positions.blocks), 2 * len(positions.blocks), "choosing positions")
     if config.stack:
-        picked = _side_by_side(picked, wanted[0], positions.crop, rng)
+        picked = _keep_apart(picked, wanted[0], positions.crop, rng)
     return _records(picked, positions, tiles, config.stack)
 
 
 def _allowed_parts(
     positions: PositionMasks, tiles: Tiles, layer: int, here: list[int], block: tuple[int, int, int, int]
 ) -> NDArray[np.int8]:
-    """Part of the split of every position of a block, -1 where no crop may be centred. Layer -1: any image."""
+    """Part of the split of every position of a block, -1 where no crop may be centred. layer : an image, -1 for any"""
     row, col, h, w = block
     mask = np.zeros((h, w), bool)
     for frame in here if layer < 0 else [layer]:
@@ -79,7 +80,7 @@ def _allowed_parts(
 
 
 def _allocate(available: NDArray, frames: int, grid: Grid, config: Config) -> NDArray[np.int64]:
-    """Crops per layer and part: each part its share, within a part in proportion to the layer's valid area."""
+    """Crops per layer and part of the split: each part gets its share, and in it each layer by its valid area."""
     area = available * grid.gsd**2 / 1e6
     if config.density is not None:
         wanted = np.ceil(area * config.density)
@@ -95,8 +96,8 @@ def _allocate(available: NDArray, frames: int, grid: Grid, config: Config) -> ND
     return np.minimum(wanted, available).astype(np.int64)
 
 
-def _spread(rng: np.random.Generator, counts: NDArray[np.int64], wanted: int) -> NDArray[np.int64]:
-    """How many of ``wanted`` draws without replacement fall into each block."""
+def _draw_counts(rng: np.random.Generator, counts: NDArray[np.int64], wanted: int) -> NDArray[np.int64]:
+    """How many of ``wanted`` draws without replacement fall into each block. counts : (blocks,) positions in each"""
     if counts.sum() < 1_000_000_000:
         return rng.multivariate_hypergeometric(counts, wanted, method="marginals")
     result, left, remaining = np.zeros_like(counts), wanted, int(counts.sum())
@@ -106,28 +107,28 @@ def _spread(rng: np.random.Generator, counts: NDArray[np.int64], wanted: int) ->
     return result
 
 
-def _drawn(wanted: int, available: int, config: Config) -> int:
-    """Positions to draw for so many places."""
+def _count_candidates(wanted: int, available: int, config: Config) -> int:
+    """How many positions to draw for that many places: more for a stack, whose places are kept apart."""
     return min(available, max(wanted, min(CANDIDATES * wanted, MOST_CANDIDATES))) if config.stack else wanted
 
 
-def _side_by_side(picked: list, wanted: NDArray[np.int64], crop: int, rng: np.random.Generator) -> list:
-    """Of the candidates those whose crops share least ground, as many as are wanted of each part of the split."""
+def _keep_apart(picked: list, wanted: NDArray[np.int64], crop: int, rng: np.random.Generator) -> list:
+    """As many of the candidates as are wanted of each part of the split, those first whose crops share no ground."""
     kept = []
     for k in range(3):
         mine = [p for p in picked if p[1] == k]
         if not mine:
             continue
         row, col = (np.concatenate([p[j] for p in mine]) for j in (2, 3))
-        chosen = _apart(row, col, int(wanted[k]), crop, rng)
+        chosen = _pick_apart(row, col, int(wanted[k]), crop, rng)
         ends = np.cumsum([len(p[2]) for p in mine])[:-1]
         for part, here in zip(mine, np.split(chosen, ends), strict=True):
             kept.append((*part[:2], part[2][here], part[3][here], *part[4:]))
     return kept
 
 
-def _apart(row: NDArray, col: NDArray, wanted: int, crop: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Which places to take: in random order, first those that share no ground, then at half that distance, and so on."""
+def _pick_apart(row: NDArray, col: NDArray, wanted: int, crop: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Which places to take, (n,): in random order, at least a crop apart, then at least half of that, and so on."""
     order, distance = rng.permutation(len(row)), crop
     taken: list[int] = []
     chosen = np.zeros(len(row), bool)

@@ -1,9 +1,9 @@
 """sample: crop centres per image and a geographic split in which no pixel of ground is shared.
 
-The scene is divided into square ground tiles, each given to one part of the split. This split hangs on the scene, `tile_m`,
-`split` and `seed` only, so that whatever is sampled from a scene, by image or as a stack, in crops of any size, learns from
-the same ground and is tested on the same. A training crop may lie across tiles of its part; a validation or test crop lies
-in one tile, so that tiles share no ground either and their errors are independent.
+The scene is divided into square ground tiles, each given to one part of the split. The split depends on the scene,
+`tile_m`, `split` and `seed` only: whatever is sampled from a scene, by image or as a stack, in crops of any size,
+trains on the same ground and is tested on the same. A training crop may lie across tiles of its part; a validation or
+test crop lies in one tile, so that tiles share no ground either and their errors are independent.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ from schemas import CROPS, SCENE, ArtefactWriter, ConfigError, GeometryError, ch
 from schemas.files.outputs import Output
 from schemas.provenance import sha256
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.shards import shard_range
 from stages.physics.images.table import Frame, load_frames, relative_path, write_frames
 from stages.physics.maps.grid import Grid, read_grid
 from stages.physics.maps.ground_tiles import PositionMasks, Tiles, bounds_deg, split_tiles, tile_edge
 from stages.sample.audit import Part, audit
 from stages.sample.config import Config
-from stages.sample.places import choose
+from stages.sample.places import choose_places
 
 LARGEST = 1e9  # m of a tile, crops per km2
-MOST_CROPS = 2**31 - 1  # what an index of a pair can count
+MOST_CROPS = 2**31 - 1  # an index of a pair is an int32
 
 
 @dataclass(frozen=True)
 class Scene:
-    """An open scene. crop : px"""
+    """An open scene, and the edge of the crops, px."""
 
     path: Path
     file: h5py.File
@@ -47,7 +48,7 @@ def run(
     scene: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> list[Part]:
     """Write ``crops.h5`` and return the audit of the split. Raises ConfigError or GeometryError."""
-    output = Output.of(output)
+    output = Output.at(output)
     _check(config)
     check_output(output.file, [scene], output.overwrite)
     with open_artefact(scene, SCENE) as file:
@@ -57,7 +58,7 @@ def run(
         edge = tile_edge(grid, positions, config.split, config.tile_m)
         tiles = split_tiles(positions, grid, edge, config.split, config.seed, progress)
         rng = np.random.default_rng(config.seed)
-        chosen = choose(positions, tiles, len(opened.frames), grid, config, rng, progress)
+        chosen = choose_places(positions, tiles, len(opened.frames), grid, config, rng, progress)
         if not len(chosen):
             raise GeometryError(
                 f"{scene}: no crop of {crop} px fits into a tile of {edge * grid.gsd:g} m and valid data; choose a smaller `crop` or other `tile_m`."
@@ -105,8 +106,7 @@ def _write(
 ) -> None:
     """The crops of this shard. chosen : the centres of all shards"""
     grid, crop, half = scene.grid, scene.crop, scene.crop // 2
-    first, last = (len(chosen) * k // config.shard[1] for k in (config.shard[0], config.shard[0] + 1))
-    mine = chosen[first:last]
+    mine = chosen[slice(*shard_range(len(chosen), config.shard))]
     attributes = {
         "gsd_m": grid.gsd,
         "body_radius_m": grid.radius,

@@ -27,6 +27,7 @@ FLOOR, WALL = 0.10, 1.70  # radius of the flat floor; slope of the wall, in dept
 WORN_OUT = 0.38  # K at which a crater no longer counts: a fresh bowl is then about 0.03 D deep
 REACH = 4.0  # radii that topography extends to
 EJECTA_REACH = 9.0  # radii that bright ejecta of young craters extends to
+STATES, SAMPLES = 40, 320  # of the table of worn profiles
 YOUNG = 0.12  # share of the lifetime during which ejecta stays bright
 
 
@@ -82,7 +83,7 @@ def populate(
     left, bottom, right, top = bounds
     sizes = []
     n_transition = float(cumulative_density(transition, density, transition))
-    # the margin outside grows with the size, so that small craters are not drawn where nobody sees them
+    # the margin outside grows with the size, so that small craters are not drawn where they cannot be seen
     edges = np.geomspace(smallest, largest, 25)
     xs, ys = [], []
     for low, high in itertools.pairwise(edges):
@@ -164,10 +165,10 @@ def fresh_profile(r: NDArray) -> NDArray:
 
 
 @lru_cache(maxsize=1)
-def profile_table(states: int = 40, samples: int = 320) -> tuple[Floats32, float]:
-    """Profiles worn by diffusion: (states, samples) heights over diameter, and the spacing in radii.
+def profile_table() -> tuple[Floats32, float]:
+    """Profiles worn by diffusion: (STATES, SAMPLES) heights over diameter, and the spacing in radii.
 
-    State k has K = kappa t / R^2 = WORN_OUT (k / (states - 1))^2, plus a little that even fresh rims have. The
+    State k has K = kappa t / R^2 = WORN_OUT (k / (STATES - 1))^2, plus a little that even fresh rims have. The
     axisymmetric heat kernel is applied in the transform domain (Hankel transform of order 0).
     """
     from scipy.special import j0
@@ -178,12 +179,12 @@ def profile_table(states: int = 40, samples: int = 320) -> tuple[Floats32, float
     q = (np.arange(1200) + 0.5) * 0.05
     kernel = j0(np.outer(q, r))
     spectrum = kernel @ (h * r) * (r[1] - r[0])
-    target = np.arange(samples) * (REACH / (samples - 1))
+    target = np.arange(SAMPLES) * (REACH / (SAMPLES - 1))
     back = j0(np.outer(target, q)) * q * 0.05
-    wear = WORN_OUT * (np.arange(states) / (states - 1)) ** 2 + 0.0012
+    wear = WORN_OUT * (np.arange(STATES) / (STATES - 1)) ** 2 + 0.0012
     table = np.stack([back @ (spectrum * np.exp(-q * q * k)) for k in wear])
     edge = np.clip((REACH - target) / 0.8, 0, 1)
-    return (table * edge * edge * (3 - 2 * edge)).astype(np.float32), REACH / (samples - 1)
+    return (table * edge * edge * (3 - 2 * edge)).astype(np.float32), REACH / (SAMPLES - 1)
 
 
 @njit(parallel=True, fastmath=True, cache=True)

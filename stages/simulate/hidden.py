@@ -1,8 +1,8 @@
-"""What the pipeline is not told: physical effects planted in the images, the table or the DEM, recorded in truth.h5.
+"""Hidden effects: planted in the images, the image table or the DEM, and recorded in truth.h5 only.
 
-Defined physically here, on the fine grid and in the sensor's own terms, apart from the templates of ``stages/effects``:
-a diagnosis that names them has not been handed its own formula. Ids and signs follow the catalogue of ``diagnose``
-(an error is truth minus what is given).
+They are defined physically here, on the fine grid and in the sensor's own terms, apart from the templates of
+``stages/effects``: a diagnosis that names them has not been given its own formula. Names and signs follow the catalogue
+of ``diagnose`` (an error is truth minus what is given).
 """
 
 from __future__ import annotations
@@ -10,12 +10,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from schemas.errors import ConfigError, RegistryError
 
-# effect -> parameter -> (default, lowest, highest, unit, what)
+# effect -> parameter -> (default, lowest, highest, unit, description)
 CHOICES: dict[str, dict[str, tuple[float, float, float, str, str]]] = {
     "dark_bias": {"iof": (0.004, -0.05, 0.05, "1", "stray light or dark current left in every pixel, I/F")},
     "nonlinearity": {"quadratic": (-0.6, -3.0, 3.0, "1", "I -> I (1 + q I): a full well that fills up")},
@@ -45,34 +44,25 @@ CHOICES: dict[str, dict[str, tuple[float, float, float, str, str]]] = {
     "dem_scale": {"relative": (0.06, -0.5, 0.5, "1", "true heights / given heights - 1")},
     "dem_smoothing": {"sigma2_px2": (2.0, 0.0, 30.0, "px2", "variance by which the given DEM is smoother, DEM pixels")},
 }
-SEPARATOR = ","
 
 
-@dataclass(frozen=True)
-class Hidden:
-    """One planted effect with all its parameters."""
-
-    effect: str
-    parameters: dict[str, float]
-
-    def __getitem__(self, name: str) -> float:
-        return self.parameters[name]
+Hidden = dict[str, dict[str, float]]  # planted effects in the recipe's order, with all their parameters
 
 
-def parse_hidden(items: Iterable[Mapping[str, Any]]) -> list[Hidden]:
+def parse_hidden(entries: Iterable[Mapping[str, Any]]) -> Hidden:
     """Check recipe entries such as {"effect": "dark_bias", "iof": 0.004}. Raises ConfigError or RegistryError."""
-    result: list[Hidden] = []
-    for item in items:
-        if not isinstance(item, Mapping) or "effect" not in item:
+    hidden: Hidden = {}
+    for entry in entries:
+        if not isinstance(entry, Mapping) or "effect" not in entry:
             raise ConfigError(
-                f'recipe: \'hidden\': expected entries like {{"effect": "dark_bias", "iof": 0.004}}, found {json.dumps(item)}; mend it.'
+                f'recipe: \'hidden\': expected entries like {{"effect": "dark_bias", "iof": 0.004}}, found {json.dumps(entry)}; mend it.'
             )
-        effect = str(item["effect"])
+        effect = str(entry["effect"])
         if effect not in CHOICES:
             raise RegistryError.unknown("hidden effect", effect, [*CHOICES, "none"])
         known = CHOICES[effect]
-        parameters = {name: spec[0] for name, spec in known.items()}
-        for name, value in item.items():
+        parameters = {name: default for name, (default, *_) in known.items()}
+        for name, value in entry.items():
             if name == "effect":
                 continue
             if name not in known:
@@ -85,10 +75,10 @@ def parse_hidden(items: Iterable[Mapping[str, Any]]) -> list[Hidden]:
             if not low <= number <= high:
                 raise ConfigError(f"`hidden` {effect}: expected {name} in {low:g}..{high:g}, found {value}.")
             parameters[name] = number
-        if any(h.effect == effect for h in result):
+        if effect in hidden:
             raise ConfigError(f"`hidden`: expected each effect once, found '{effect}' twice.")
-        result.append(Hidden(effect, parameters))
-    return result
+        hidden[effect] = parameters
+    return hidden
 
 
 def hidden_from_option(text: str) -> list[dict[str, Any]]:
@@ -99,16 +89,11 @@ def hidden_from_option(text: str) -> list[dict[str, Any]]:
     for part in text.split("+"):
         name, _, rest = part.strip().partition(":")
         entry: dict[str, Any] = {"effect": name}
-        for pair in filter(None, rest.split(SEPARATOR)):
+        for pair in filter(None, rest.split(",")):
             key, equals, value = pair.partition("=")
             if not equals:
-                raise ConfigError(f"`hidden`: expected EFFECT:NAME=VALUE{SEPARATOR}..., found '{part}'.")
+                raise ConfigError(f"`hidden`: expected EFFECT:NAME=VALUE,..., found '{part}'.")
             entry[key.strip()] = value
         entries.append(entry)
     parse_hidden(entries)
     return entries
-
-
-def find(effects: Iterable[Hidden], name: str) -> Hidden | None:
-    """The hidden effect of that name, None where it is not hidden."""
-    return next((h for h in effects if h.effect == name), None)

@@ -153,7 +153,7 @@ def _strip(config: Config, heading_deg: float, rng: np.random.Generator) -> Stri
     width = edge * float(rng.uniform(*config.swath))
     room = max(0.0, 1.12 * edge - width) / 2
     length = edge * float(rng.uniform(0.85, 1.3))
-    slack = max(0.0, 0.12 * edge)
+    slack = 0.12 * edge
     return Strip(float(rng.uniform(-room, room)), float(rng.uniform(-slack, slack)), heading_deg % 360.0, width, length)
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import erf
 
 from stages.common.arrays import Floats32
 from stages.physics.formation import chain as formation
@@ -17,7 +18,7 @@ from stages.physics.horizon import horizon
 from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
 from stages.physics.maps.grid import Grid
 from stages.physics.photometry import masked_radiance_factor
-from stages.simulate.hidden import Hidden, find
+from stages.simulate.hidden import Hidden
 from stages.simulate.orbits import Pass
 from stages.simulate.reflectance import Truth
 
@@ -46,9 +47,7 @@ class View:
     camera_position: NDArray[np.float64]
 
 
-def radiance(
-    scene: Scene, view: View, window: tuple[int, int, int, int], wanted: NDArray, hidden: list[Hidden]
-) -> Floats32:
+def radiance(scene: Scene, view: View, window: tuple[int, int, int, int], wanted: NDArray, hidden: Hidden) -> Floats32:
     """I/F (H, W) of the window (row, col, height, width), 0 in shadow; blocks without a ``wanted`` pixel stay 0.
 
     wanted : (H, W) bool
@@ -60,7 +59,7 @@ def radiance(
     azimuth = math.atan2(to_sun[0], to_sun[1])
     elevation_angle = math.atan2(to_sun[2], math.hypot(to_sun[0], to_sun[1]))
     skyline = _horizon(scene, window, azimuth, elevation_angle)
-    penumbra = find(hidden, "penumbra")
+    penumbra = hidden.get("penumbra")
     sun_radius = math.radians(penumbra["radius_deg"]) if penumbra else SUN_RADIUS
     blocks = [
         (r, c, min(BLOCK, height - r), min(BLOCK, width - c))
@@ -74,7 +73,7 @@ def radiance(
             part = skyline[r : r + h, c : c + w]
             out[r : r + h, c : c + w] = _block(scene, view, row + r, col + c, part, sun_radius, hidden)
 
-    # blocks side by side, each in one thread: they fit the cache, and nobody waits at every operation
+    # a block a thread: blocks fit the cache, and threads do not wait for each other at every operation
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -103,7 +102,7 @@ def _horizon(scene: Scene, window: tuple[int, int, int, int], azimuth: float, su
 
 
 def _block(
-    scene: Scene, view: View, row: int, col: int, skyline: Floats32, sun_radius: float, hidden: list[Hidden]
+    scene: Scene, view: View, row: int, col: int, skyline: Floats32, sun_radius: float, hidden: Hidden
 ) -> Floats32:
     """The chain on one block; one pixel around it keeps slopes central."""
     height, width = skyline.shape
@@ -136,20 +135,20 @@ def _block(
     for name, values in maps.items():
         parameters[name] = torch.from_numpy(np.pad(values, 1, mode="edge"))[None]
     lit = masked_radiance_factor(scene.truth.model, parameters, state.angles)
-    surge, slope = find(hidden, "opposition_surge"), find(hidden, "phase_slope")
+    surge, slope = hidden.get("opposition_surge"), hidden.get("phase_slope")
     if surge:
         tangent = torch.tan(state.angles.phase / 2)
         lit = lit * (1 + surge["B0"] / (1 + tangent / surge["h"]))
     if slope:
         lit = lit * torch.exp(-slope["per_radian"] * state.angles.phase)
     result = lit * visible
-    shine = find(hidden, "earthshine")
+    shine = hidden.get("earthshine")
     if shine:
         result = result + _earthshine(state, shine)
     return result[0, 1:-1, 1:-1].numpy()
 
 
-def _earthshine(state: formation.State, shine: Hidden) -> torch.Tensor:
+def _earthshine(state: formation.State, shine: dict[str, float]) -> torch.Tensor:
     """Lambertian light of a second, weak source without shadows."""
     elevation, azimuth = math.radians(shine["elevation_deg"]), math.radians(shine["azimuth_deg"])
     east, north = math.cos(elevation) * math.sin(azimuth), math.cos(elevation) * math.cos(azimuth)
@@ -167,7 +166,6 @@ def point_spread(step: float, image_gsd: float, sigma_px: float, extra_sigma2_px
     fine = (np.arange(64) + 0.5) / 64 - 0.5  # each tap is the mean over a DEM pixel
     t = x[:, None] + fine
     if sigma > 1e-6:
-        erf = np.vectorize(math.erf)
         kernel = 0.5 * (erf((t + half) / (sigma * math.sqrt(2))) - erf((t - half) / (sigma * math.sqrt(2))))
     else:
         kernel = (np.abs(t) <= half).astype(float)

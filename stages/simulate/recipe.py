@@ -66,10 +66,10 @@ class Config:
     read_noise: float = 60.0  # electrons
     registration_error: float = 0.0  # standard deviation of the planted shift of each image
 
-    # what the pipeline is not told
+    # hidden effects, which truth.h5 alone records
     hidden: list[dict[str, Any]] = field(default_factory=lambda: [{"effect": "dark_bias"}])
 
-    def hidden_effects(self) -> list[Hidden]:
+    def hidden_effects(self) -> Hidden:
         """The hidden effects with their parameters."""
         return parse_hidden(self.hidden)
 
@@ -150,7 +150,8 @@ def make_config(values: dict[str, Any], where: str = "recipe") -> Config:
 
 
 def _coerce(value: Any, like: Any) -> Any:
-    if isinstance(like, bool) or isinstance(value, bool):
+    """A recipe's value as the type of the default ``like``. Raises TypeError, ValueError."""
+    if isinstance(value, bool):
         raise TypeError
     if isinstance(like, int):
         if isinstance(value, str) or not math.isfinite(value) or int(value) != value:
@@ -166,46 +167,31 @@ def _coerce(value: Any, like: Any) -> Any:
         return (low, high)
     if isinstance(like, dict):
         return {str(k): float(v) for k, v in value.items()}
-    if isinstance(like, list):
-        if not isinstance(value, list):
-            raise TypeError
-        return value
-    if not isinstance(value, str):
+    if not isinstance(value, type(like)):  # lists and texts
         raise TypeError
     return value
 
 
 def _check(config: Config, where: str) -> None:
     for key in (*_POSITIVE, *_NOT_NEGATIVE, "base_elevation"):
-        most = _MOST.get(key, LARGEST)
-        if abs(getattr(config, key)) > most:
-            raise ConfigError(f"{where}: '{key}': expected at most {most:g}, found {getattr(config, key):g}; mend it.")
-    for key in _POSITIVE:
-        if not getattr(config, key) > 0:
-            raise ConfigError(f"{where}: '{key}': expected a number above 0, found {getattr(config, key):g}; mend it.")
-    for key in _NOT_NEGATIVE:
-        if getattr(config, key) < 0:
-            raise ConfigError(
-                f"{where}: '{key}': expected a number of at least 0, found {getattr(config, key):g}; mend it."
-            )
+        value, most = getattr(config, key), _MOST.get(key, LARGEST)
+        _require(abs(value) <= most, where, key, f"at most {most:g}", f"{value:g}")
+        _require(value > 0 or key not in _POSITIVE, where, key, "a number above 0", f"{value:g}")
+        _require(value >= 0 or key == "base_elevation", where, key, "a number of at least 0", f"{value:g}")
     for key, (low, high) in _RANGES.items():
         first, last = getattr(config, key)
-        if not low <= first <= last <= high:
-            raise ConfigError(
-                f"{where}: '{key}': expected low <= high within {low:g}..{high:g}, found {first:g}, {last:g}; mend it."
-            )
-    for key, (first, last) in _COUNTS.items():
-        if not first <= getattr(config, key) <= last:
-            raise ConfigError(f"{where}: '{key}': expected {first} .. {last}, found {getattr(config, key)}; mend it.")
+        expected = f"low <= high within {low:g}..{high:g}"
+        _require(low <= first <= last <= high, where, key, expected, f"{first:g}, {last:g}")
+    for key, (least, most) in _COUNTS.items():
+        value = getattr(config, key)
+        _require(least <= value <= most, where, key, f"{least} .. {most}", str(value))
     if config.dem_size > LARGEST_DEM:
         raise ConfigError(
             f"{where}: 'size_px': expected at most {LARGEST_DEM // config.factor} pixels at {config.factor} DEM pixels a pixel, "
             f"found {config.size_px}."
         )
-    if config.units not in ("iof", "dn"):
-        raise ConfigError(f"{where}: 'units': expected 'iof' or 'dn', found '{config.units}'; mend it.")
-    if not 0 <= config.oblique_share <= 1:
-        raise ConfigError(f"{where}: 'oblique_share': expected 0..1, found {config.oblique_share:g}; mend it.")
+    _require(config.units in ("iof", "dn"), where, "units", "'iof' or 'dn'", f"'{config.units}'")
+    _require(0 <= config.oblique_share <= 1, where, "oblique_share", "0..1", f"{config.oblique_share:g}")
     if abs(config.latitude_deg) > 89 or abs(config.longitude_deg) > 360:
         raise ConfigError(
             f"{where}: expected a place with |latitude| <= 89, found {config.longitude_deg:g}, {config.latitude_deg:g}; mend it."
@@ -224,9 +210,14 @@ def _check(config: Config, where: str) -> None:
     config.hidden_effects()
 
 
+def _require(good: bool, where: str, key: str, expected: str, found: str) -> None:
+    if not good:
+        raise ConfigError(f"{where}: '{key}': expected {expected}, found {found}; mend it.")
+
+
 def read_recipe(path: Path) -> dict[str, Any]:
     """The keys of a recipe file. Raises InputError."""
-    from schemas.files.user_files import read_json
+    from schemas.files.user_files import read_json  # here: it loads h5py, which the command's help does without
 
     values = read_json(path, "a recipe in JSON ('lunargr simulate' with `print_recipe` writes one)")
     if not isinstance(values, dict):

@@ -7,7 +7,6 @@ Follows the ground: young walls, rims and near ejecta are bright (not yet space-
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
@@ -27,14 +26,6 @@ PRESETS = {"hapke": {"w": 0.32, "theta": math.radians(16.0)}, "lunar_lambert": {
 FAR_CRATERS = ((2.3, 2.1), (3.1, 5.3))
 
 
-@dataclass(frozen=True)
-class Albedo:
-    """Natural logarithms of the albedo's factors, (H, W): what follows the ground and what does not."""
-
-    geometry: Floats32
-    free: Floats32
-
-
 @njit(parallel=True, fastmath=True, cache=True)
 def _far_rays(out, x0, y0, step, sx, sy, edge, seed):
     height, width = out.shape
@@ -50,8 +41,11 @@ def _far_rays(out, x0, y0, step, sx, sy, edge, seed):
             out[r, c] += np.float32(min(1.0, value))
 
 
-def albedo(config: Config, ground: Ground, row: int, col: int) -> Albedo:
-    """The albedo of a block that carries MARGIN pixels around it; ``row``, ``col`` are of its first inner pixel."""
+def log_albedo(config: Config, ground: Ground, row: int) -> tuple[Floats32, Floats32]:
+    """Natural logarithms of the albedo's two factors, (H, W) each: what follows the ground, and what does not.
+
+    ground : rows of the scene with MARGIN pixels around them; row : the first of these rows
+    """
     step = config.dem_gsd
     inner = (slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
     elevation = ground.elevation
@@ -70,7 +64,7 @@ def albedo(config: Config, ground: Ground, row: int, col: int) -> Albedo:
     geometry = 0.34 * ground.freshness[inner] + 0.24 * wasting - 0.05 * np.tanh(bend / 0.25)
 
     shape = centre.shape
-    x0 = -config.extent / 2 + (col + 0.5) * step
+    x0 = -config.extent / 2 + 0.5 * step
     y0 = config.extent / 2 - (row + 0.5) * step
     seed = config.seed * 11 + 5
     patches = fractal(shape, x0, y0, step, longest=3200.0, shortest=120.0, hurst=1.0, seed=seed)
@@ -80,9 +74,8 @@ def albedo(config: Config, ground: Ground, row: int, col: int) -> Albedo:
         sx, sy = config.extent * distance * math.sin(azimuth), config.extent * distance * math.cos(azimuth)
         _far_rays(far, x0, y0, step, sx, sy, max(config.extent, 5000.0), seed + 20 + number)
     free = 0.10 * np.tanh(1.3 * patches) + 0.018 * texture + 0.16 * far + 0.26 * np.tanh(ground.rays[inner])
-    return Albedo(
-        (config.geometry_contrast * geometry).astype(np.float32), (config.free_contrast * free).astype(np.float32)
-    )
+    factors = config.geometry_contrast * geometry, config.free_contrast * free
+    return factors[0].astype(np.float32), factors[1].astype(np.float32)
 
 
 class Truth:

@@ -14,7 +14,7 @@ from rasterio.transform import Affine
 
 from stages.common.arrays import Floats, Floats32
 from stages.physics.maps.grid import Grid
-from stages.simulate.hidden import Hidden, find
+from stages.simulate.hidden import Hidden
 from stages.simulate.orbits import Pass, Strip
 from stages.simulate.recipe import Config
 
@@ -37,16 +37,14 @@ class Detector:
     electrons: float
 
 
-def make_detector(
-    config: Config, shot: Pass, hidden: list[Hidden], mean_iof: float, rng: np.random.Generator
-) -> Detector:
+def make_detector(config: Config, shot: Pass, hidden: Hidden, mean_iof: float, rng: np.random.Generator) -> Detector:
     """Draw the detector of one image; mean_iof : I/F of level ground, which auto-exposure aims at."""
     shift_rms, jitter, response = config.registration_error, 0.0, 1.0
-    if effect := find(hidden, "misregistration"):
+    if effect := hidden.get("misregistration"):
         shift_rms = math.hypot(shift_rms, effect["rms_px"] * shot.gsd / math.sqrt(2))
-    if effect := find(hidden, "line_jitter"):
+    if effect := hidden.get("line_jitter"):
         jitter = effect["rms_px"] * shot.gsd * math.sqrt(2)
-    if effect := find(hidden, "image_gain"):
+    if effect := hidden.get("image_gain"):
         response = 1 + effect["rms"] * float(rng.normal())
     gain, offset = 1.0, 0.0
     if config.units == "dn":  # 12 bits, auto-exposed, with a pedestal
@@ -193,26 +191,26 @@ def respond(
     lattice: Lattice,
     shot: Pass,
     detector: Detector,
-    hidden: list[Hidden],
+    hidden: Hidden,
 ) -> Floats32:
     """The hidden detector effects, in the order of the hardware: echo, dark signal, columns, gain, response, clipping.
 
     image, echo : (H, W), I/F
     """
-    if (effect := find(hidden, "echo")) and echo is not None:
+    if (effect := hidden.get("echo")) and echo is not None:
         image = image + np.float32(effect["fraction"]) * echo
-    if effect := find(hidden, "dark_bias"):
+    if effect := hidden.get("dark_bias"):
         image = image + np.float32(effect["iof"])
-    if effect := find(hidden, "column_pattern"):
+    if effect := hidden.get("column_pattern"):
         _, across = shot.strip.along_across(lattice.x, lattice.y)
         t = across / shot.strip.width
         a, b, c = detector.column_phases
         pattern = np.cos(2 * math.pi * t + a) + 0.7 * np.cos(4 * math.pi * t + b) + 0.5 * np.cos(8 * math.pi * t + c)
         image = image * (1 + effect["rms"] * pattern / math.sqrt(0.5 * (1 + 0.49 + 0.25))).astype(np.float32)
     image = image * np.float32(detector.response)
-    if effect := find(hidden, "nonlinearity"):
+    if effect := hidden.get("nonlinearity"):
         image = image * (1 + np.float32(effect["quadratic"]) * image)
-    if effect := find(hidden, "saturation"):
+    if effect := hidden.get("saturation"):
         image = np.minimum(image, np.float32(effect["iof"]))
     return image
 

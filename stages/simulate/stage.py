@@ -1,4 +1,4 @@
-"""The stage: make the ground, then each image, then the truth. Blocks of rows throughout."""
+"""simulate: the ground, then each image, then the truth, all in blocks of rows."""
 
 from __future__ import annotations
 
@@ -8,24 +8,25 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from schemas.files.outputs import Output, Target, atomic_folder, atomic_path, check_outputs
-from schemas.provenance import SIDECAR, sidecar
+from schemas.provenance import SIDECAR, folder_record
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.images.table import ASTRONOMICAL_UNIT
 from stages.physics.maps.grid import Grid, local_metric_crs, unit_vectors
 from stages.simulate import sensor
-from stages.simulate.hidden import Hidden, find
+from stages.simulate.hidden import Hidden
 from stages.simulate.orbits import RADIUS, Pass, plan_passes
 from stages.simulate.radiance import Scene, View, blur, point_spread, radiance
 from stages.simulate.recipe import Config
-from stages.simulate.reflectance import MARGIN, Truth, albedo
+from stages.simulate.reflectance import MARGIN, Truth, log_albedo
 from stages.simulate.terrain import Terrain
-from stages.simulate.write import NODATA_FLOAT, ImageFile, ImageTruth, geotiff, table_row, write_table, write_truth
+from stages.simulate.write import NODATA_FLOAT, ImageFile, ImageTruth, open_geotiff, table_row, write_table, write_truth
 
 GROUND_ROWS = 512  # DEM rows made at once
 IN_MEMORY = 6e8  # bytes of truth kept in memory; more is mapped from a temporary file
@@ -41,7 +42,7 @@ class Summary:
     covered: list[float]  # share of the scene that each image covers
     dem_valid: float  # share of the DEM with data
     craters: int
-    hidden: list[Hidden]
+    hidden: Hidden
 
 
 def run(output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing) -> Summary:
@@ -49,7 +50,7 @@ def run(output: Output | Path, config: Config, say: Say = say_nothing, progress:
 
     Raises ConfigError where files exist that may not be replaced.
     """
-    output = Output.of(output)
+    output = Output.at(output)
     folder = output.file
     hidden = config.hidden_effects()
     truth = Truth(config)
@@ -67,7 +68,7 @@ def _make_scene(
     config: Config,
     shots: Sequence[Pass],
     names: Sequence[str],
-    hidden: list[Hidden],
+    hidden: Hidden,
     truth: Truth,
     progress: Progress,
 ) -> Summary:
@@ -91,7 +92,8 @@ def _make_scene(
     write_table(folder / "images.csv", rows)
     files = [folder / name for name in ("dem.tif", "images.csv", "truth.tif")]
     with atomic_path(folder / SIDECAR) as partial:
-        partial.write_text(sidecar("simulate", asdict(config), config.seed, files, [folder / name for name in names]))
+        images_made = [folder / name for name in names]
+        partial.write_text(folder_record("simulate", asdict(config), config.seed, files, images_made))
     return Summary(folder, images, covered, dem_valid, len(terrain.craters), hidden)
 
 
@@ -119,15 +121,13 @@ def _make_ground(config: Config, terrain: Terrain, scene: Scene, progress: Progr
         progress(first, size, "terrain rows")
         count = min(GROUND_ROWS, size - first)
         ground = terrain.block(first - MARGIN, -MARGIN, count + 2 * MARGIN, size + 2 * MARGIN)
-        logs = albedo(config, ground, first, 0)
         rows = slice(first, first + count)
         scene.elevation[rows] = ground.elevation[MARGIN:-MARGIN, MARGIN:-MARGIN]
-        scene.log_geometry[rows] = logs.geometry
-        scene.log_free[rows] = logs.free
+        scene.log_geometry[rows], scene.log_free[rows] = log_albedo(config, ground, first)
     progress(size, size, "terrain rows")
 
 
-def _write_dem(path: Path, config: Config, scene: Scene, hidden: list[Hidden]) -> float:
+def _write_dem(path: Path, config: Config, scene: Scene, hidden: Hidden) -> float:
     """The DEM that the pipeline is given: the truth with its error, holes and ragged edge. Returns its valid share."""
     rng = np.random.default_rng([config.seed, 4])
     size, half, step = config.dem_size, config.extent / 2, config.dem_gsd
@@ -137,7 +137,7 @@ def _write_dem(path: Path, config: Config, scene: Scene, hidden: list[Hidden]) -
     ]
     phases = rng.uniform(0, 2 * np.pi, 4)
     x = (np.arange(size) + 0.5) * step - half
-    scale, smooth = find(hidden, "dem_scale"), find(hidden, "dem_smoothing")
+    scale, smooth = hidden.get("dem_scale"), hidden.get("dem_smoothing")
     relative = 1 + scale["relative"] if scale else 1.0
     kernel = point_spread(1.0, 1.0, 0.0, smooth["sigma2_px2"]) if smooth else None
     reach = len(kernel) // 2 if kernel is not None else 0
@@ -145,7 +145,7 @@ def _write_dem(path: Path, config: Config, scene: Scene, hidden: list[Hidden]) -
     valid = 0
     with (
         atomic_path(path) as partial,
-        geotiff(partial, scene.grid, "float32", NODATA_FLOAT, compress="deflate", zlevel=1, predictor=3) as file,
+        open_geotiff(partial, scene.grid, "float32", NODATA_FLOAT) as file,
     ):
         for first in range(0, size, GROUND_ROWS):
             count = min(GROUND_ROWS, size - first)
@@ -191,11 +191,11 @@ class Exposure:
     kernel: NDArray[np.float32]
     reach: int
     detector: sensor.Detector
-    hidden: list[Hidden]
+    hidden: Hidden
 
 
 def _make_image(
-    path: Path, config: Config, scene: Scene, shot: Pass, number: int, hidden: list[Hidden]
+    path: Path, config: Config, scene: Scene, shot: Pass, number: int, hidden: Hidden
 ) -> tuple[ImageTruth, float]:
     """Render, blur, resample, expose and write one image, in bands of rows."""
     rng = np.random.default_rng([config.seed, 6, number])
@@ -206,11 +206,11 @@ def _make_image(
         unit_vectors(shot.spacecraft_longitude_deg, shot.spacecraft_latitude_deg) * (RADIUS + shot.spacecraft_altitude),
     )
     image = sensor.image_grid(config, scene.grid, shot, number)
-    extra = find(hidden, "psf_blur")
+    extra = hidden.get("psf_blur")
     kernel = point_spread(step, shot.gsd, config.psf_sigma_px, extra["sigma2_px2"] if extra else 0.0)
     expected = expected_iof(scene, shot)
     detector = sensor.make_detector(config, shot, hidden, expected, rng)
-    echo = find(hidden, "echo")
+    echo = hidden.get("echo")
     reach = len(kernel) // 2 + 4 + (int(echo["lag_px"] * shot.gsd / step) + 2 if echo else 0)
     exposure = Exposure(config, scene, view, kernel, reach, detector, hidden)
     band = int(max(64, min(image.height, WINDOW_PIXELS * (step / shot.gsd) ** 2 / image.width)))
@@ -248,7 +248,7 @@ def _signal(exposure: Exposure, lattice: sensor.Lattice, inside: NDArray[np.bool
     light = blur(radiance(scene, view, window, wanted, hidden), exposure.kernel)
     signal = sensor.resample(light, row, col, window)
     late = None
-    if echo := find(hidden, "echo"):
+    if echo := hidden.get("echo"):
         # lines run across the track: the echo of what was read ``lag`` pixels earlier
         lag = echo["lag_px"] * view.shot.gsd / scene.grid.gsd
         heading = np.radians(view.shot.strip.heading_deg)
@@ -260,17 +260,13 @@ def _wanted(row: NDArray, col: NDArray, window: tuple[int, int, int, int], reach
     """Which DEM pixels of a window the image needs, on a coarse mesh grown by the reach of the optics."""
     mesh = 32
     height, width = -(-window[2] // mesh), -(-window[3] // mesh)
-    cells = np.zeros((height, width), bool)
+    cells = np.zeros((height, width), np.uint8)
     # cut off, not floored, which takes NumPy ten times as long: below 0 either ends in the first cell
     r = np.clip(((row - window[0]) / mesh).astype(np.int32), 0, height - 1)
     c = np.clip(((col - window[1]) / mesh).astype(np.int32), 0, width - 1)
-    cells[r, c] = True
-    grow = -(-reach // mesh)
-    padded = np.pad(cells, grow)
-    grown = np.zeros_like(cells)
-    for dr in range(2 * grow + 1):
-        for dc in range(2 * grow + 1):
-            grown |= padded[dr : dr + height, dc : dc + width]
+    cells[r, c] = 1
+    grow = 2 * -(-reach // mesh) + 1
+    grown = cv2.dilate(cells, np.ones((grow, grow), np.uint8)) > 0
     return np.repeat(np.repeat(grown, mesh, 0), mesh, 1)[: window[2], : window[3]]
 
 

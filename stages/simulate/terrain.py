@@ -6,21 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from stages.common.arrays import Floats32
+from stages.common.arrays import Floats, Floats32
 from stages.simulate.craters import Craters, populate, stamp
 from stages.simulate.noise import fractal
 from stages.simulate.recipe import Config
-
-
-@dataclass(frozen=True)
-class Boulders:
-    """x, y, diameter : (n,) m"""
-
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    diameter: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -58,18 +48,21 @@ class Terrain:
             shape, x0, y0, step, longest=c.relief_wavelength, shortest=3 * step, hurst=c.hurst, seed=c.seed * 7 + 1
         )
         elevation += np.float32(c.relief) * relief
-        _add_boulders(elevation, x0, y0, step, self.boulders.x, self.boulders.y, self.boulders.diameter)
+        _add_boulders(elevation, x0, y0, step, *self.boulders)
         elevation += np.float32(c.base_elevation)
         return Ground(elevation, freshness, rays)
 
 
-def scatter_boulders(config: Config, craters: Craters, rng: np.random.Generator) -> Boulders:
-    """Boulders around young craters and a few anywhere, 1.2 to 5 DEM pixels across, cumulative slope -3.5."""
+def scatter_boulders(config: Config, craters: Craters, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+    """x, y and diameter, (n,) m each, of boulders around young craters and a few anywhere.
+
+    They are 1.2 to 5 DEM pixels across, with a cumulative slope of -3.5.
+    """
     half = config.extent / 2
     area = (config.extent / 1000) ** 2
     total = rng.poisson(config.boulders_per_km2 * area)
     young = (craters.age < 0.08) & (craters.diameter > 40 * config.dem_gsd)
-    near = min(total, int(0.8 * total)) if young.any() else 0
+    near = int(0.8 * total) if young.any() else 0
     x, y = rng.uniform(-half, half, total), rng.uniform(-half, half, total)
     if near:
         pick = rng.choice(
@@ -80,7 +73,7 @@ def scatter_boulders(config: Config, craters: Craters, rng: np.random.Generator)
         x[:near] = craters.x[pick] + distance * np.sin(azimuth)
         y[:near] = craters.y[pick] + distance * np.cos(azimuth)
     diameter = np.minimum(1.2 * config.dem_gsd * rng.random(total) ** (-1 / 3.5), 5 * config.dem_gsd)
-    return Boulders(x, y, diameter)
+    return x, y, diameter
 
 
 @njit(cache=True)

@@ -21,7 +21,7 @@ from stages.common.arrays import Floats32
 from stages.physics.formation.geometry import Angles
 from stages.physics.maps.geotiff import MapTiff
 from stages.physics.maps.grid import Grid
-from stages.simulate.hidden import CHOICES, Hidden, find
+from stages.simulate.hidden import CHOICES, Hidden
 from stages.simulate.orbits import Pass, direction, sub_point
 from stages.simulate.radiance import Scene
 from stages.simulate.recipe import Config
@@ -46,17 +46,15 @@ COLUMNS = (
 )
 
 
-def geotiff(
-    path: Path, grid: Grid, dtype: str, nodata: float, count: int = 1, **options: Any
-) -> rasterio.io.DatasetWriter:
-    """A tiled GeoTIFF open for writing."""
+def open_geotiff(path: Path, grid: Grid, dtype: str, nodata: float) -> rasterio.io.DatasetWriter:
+    """A tiled, deflated GeoTIFF of one band, open for writing."""
     return rasterio.open(
         path,
         "w",
         driver="GTiff",
         width=grid.width,
         height=grid.height,
-        count=count,
+        count=1,
         dtype=dtype,
         nodata=nodata,
         crs=grid.crs,
@@ -65,7 +63,9 @@ def geotiff(
         blockxsize=256,
         blockysize=256,
         bigtiff="IF_SAFER",
-        **options,
+        compress="deflate",
+        zlevel=1,
+        predictor=3 if dtype == "float32" else 2,
     )
 
 
@@ -78,9 +78,7 @@ class ImageFile:
         dtype, nodata = ("uint16", NODATA_DN) if units == "dn" else ("int16", NODATA_INT16)
         if units == "iof" and not packed:
             dtype, nodata = "float32", NODATA_FLOAT
-        self.file = geotiff(
-            path, grid, dtype, nodata, compress="deflate", zlevel=1, predictor=3 if dtype == "float32" else 2
-        )
+        self.file = open_geotiff(path, grid, dtype, nodata)
         if dtype == "int16":
             self.file.scales, self.file.offsets = (IOF_STEP,), (0.0,)
         self.file.set_band_description(1, "DN" if units == "dn" else "radiance factor I/F")
@@ -100,10 +98,10 @@ class ImageFile:
         self.file.write(data, 1, window=window)
 
 
-def table_row(config: Config, shot: Pass, path: str, hidden: list[Hidden]) -> dict[str, Any]:
-    """What the table tells of an image: the truth, but for a planted error of the Sun's place."""
+def table_row(config: Config, shot: Pass, path: str, hidden: Hidden) -> dict[str, Any]:
+    """An image's row of images.csv: the truth, but for a planted error of the Sun's direction."""
     lon, lat = shot.sun.longitude_deg, shot.sun.latitude_deg
-    azimuth, elevation = find(hidden, "sun_azimuth"), find(hidden, "sun_elevation")
+    azimuth, elevation = hidden.get("sun_azimuth"), hidden.get("sun_elevation")
     if azimuth or elevation:
         zenith, towards = direction(config.longitude_deg, config.latitude_deg, lon, lat)
         given_zenith = zenith + (elevation["error_deg"] if elevation else 0.0)
@@ -133,7 +131,7 @@ def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
 
 @dataclasses.dataclass
 class ImageTruth:
-    """What truth.h5 keeps of one image."""
+    """What truth.h5 records of one image."""
 
     shot: Pass
     detector: Detector
@@ -148,12 +146,10 @@ def write_truth(
     working: Grid,
     craters: Any,
     images: Sequence[ImageTruth],
-    hidden: list[Hidden],
+    hidden: Hidden,
 ) -> None:
     """truth.h5 and, beside it, truth.tif with the mapped coefficients and the standard I/F."""
     names = scene.truth.mapped
-    left, _, right, top = working.bounds()
-    half_x, half_y = (left + right) / 2, top - working.height * working.gsd / 2
     inside = (np.abs(craters.x) < config.extent / 2) & (np.abs(craters.y) < config.extent / 2)
     kept = craters.select(inside)
     sizes = {
@@ -165,10 +161,10 @@ def write_truth(
     }
     described = [
         {
-            "effect": h.effect,
-            "parameters": {k: {"value": v, "unit": CHOICES[h.effect][k][3]} for k, v in h.parameters.items()},
+            "effect": effect,
+            "parameters": {k: {"value": v, "unit": CHOICES[effect][k][3]} for k, v in parameters.items()},
         }
-        for h in hidden
+        for effect, parameters in hidden.items()
     ]
     attributes = {
         "gsd_m": working.gsd,
@@ -192,10 +188,8 @@ def write_truth(
         atomic_path(raster) as partial,
     ):
         out.write_crs(working.crs_wkt, working.transform)
-        x, _ = working.xy(np.zeros(working.width), np.arange(working.width))
-        _, y = working.xy(np.arange(working.height), np.zeros(working.height))
-        out.write("x", x)
-        out.write("y", y)
+        out.write("x", working.xy(0, np.arange(working.width))[0])
+        out.write("y", working.xy(np.arange(working.height), 0)[1])
         out.write("coefficient_name", names)
         bands = [*names, "standard_iof"]
         tags = {"model": scene.truth.model.name, "quantity": "I/F", TIFF_TAG: pack_record(out.file.attrs)}
@@ -203,8 +197,8 @@ def write_truth(
             for first in range(0, working.height, 256):
                 _write_truth_rows(out, tif, config, scene, first, min(256, working.height - first))
         _write_images(out, images)
-        out.write("crater_x", kept.x + half_x)
-        out.write("crater_y", kept.y + half_y)
+        out.write("crater_x", kept.x)
+        out.write("crater_y", kept.y)
         out.write("crater_diameter", kept.diameter)
         out.write("crater_age", kept.age)
 

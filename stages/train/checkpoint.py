@@ -1,4 +1,4 @@
-"""checkpoint.h5: the weights, and all that is needed to use them."""
+"""Writing checkpoint.h5."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from schemas import CHECKPOINT, ArtefactWriter
 from schemas.files.outputs import Output
 from stages.network.predictor import write_state
-from stages.network.resume import History
 from stages.train.config import Config
+from stages.train.resume import History
 from stages.train.training import Training
 
 
@@ -55,7 +55,7 @@ def write_checkpoint(output: Output, config: Config, training: Training, history
         for key in ("train_loss", "validation_loss", "epoch_seconds"):
             writer.write(key, np.array(getattr(history, key)))
         writer.write("image_id", reader.image_ids)
-        # An image without training pairs has no gain of its own: NaN says so.
+        # NaN for an image without training pairs, whose gain is not known.
         for key in ("gain", "offset"):
             writer.write(key, np.where(known, getattr(radiometry, key)().detach().cpu().numpy(), np.nan))
         write_state(writer.file.create_group("weights", track_order=True), predictor.state_dict())

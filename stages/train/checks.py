@@ -1,4 +1,4 @@
-"""What is refused before anything is learned."""
+"""Checks of the settings and of the pairs, before training begins."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 from schemas import ConfigError, InputError
 from stages.common.progress import Say
-from stages.network.checkpoint_layout import DEEPEST, WIDEST
+from stages.network.checkpoint_layout import DEEPEST, WIDEST, are_dropouts, are_widths
 from stages.network.precision import check_precision
 from stages.network.predictor import choose_device
 from stages.pairs.reader import PairReader
@@ -23,13 +23,13 @@ def check(config: Config) -> None:
     if config.schedule not in ("constant", "cosine"):
         raise ConfigError(f"`schedule`: expected 'constant' or 'cosine', found '{config.schedule}'.")
     check_precision(config.precision)
-    if not 2 <= len(config.widths) <= DEEPEST or not 1 <= min(config.widths) <= max(config.widths) <= WIDEST:
+    if not are_widths(config.widths):
         raise ConfigError(
             f"`widths`: expected 2 .. {DEEPEST} stages of 1 .. {WIDEST} channels, found {'-'.join(map(str, config.widths))}."
         )
     if not 0 <= config.brightness <= 1:
         raise ConfigError(f"`brightness`: expected a number from 0 to 1, found {config.brightness}.")
-    if not config.dropout or not all(0 <= share < 1 for share in config.dropout):
+    if not are_dropouts(config.dropout):
         raise ConfigError(f"`dropout`: expected shares from 0 to below 1, found {config.dropout}.")
     model = get_model(config.model)
     model.choose_maps(config.maps)

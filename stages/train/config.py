@@ -1,4 +1,4 @@
-"""What train is asked for."""
+"""The settings of train."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One pass over the pairs: learning from them, or looking at them."""
+"""One pass over the pairs, in training or in validation."""
 
 from __future__ import annotations
 
@@ -13,23 +13,26 @@ from schemas import InputError
 from stages.common.progress import Progress, show_nothing
 from stages.network.crop_sums import sum_over_crops
 from stages.network.losses import crop_errors
-from stages.network.processes import mean_over_ranks, sum_gradients, sum_over_ranks
-from stages.network.steps import learning_rate, order_steps, prefetch
 from stages.pairs.reader import Batch
 from stages.physics.formation.chain import form
 from stages.train.config import Config
+from stages.train.processes import mean_over_ranks, sum_gradients, sum_over_ranks
+from stages.train.steps import learning_rate, order_steps, prefetch
 from stages.train.training import Training
 
-CHECK_EVERY = 16  # batches: looking at the loss makes a GPU wait
-BACKWARD = 3  # work of learning from a batch over that of looking at it: what progress counts
+CHECK_EVERY = 16  # batches: reading the loss makes a GPU wait
+BACKWARD = 3  # time of a training step over that of a validation step, for the progress
 
 
 def learn_epoch(
     training: Training, train: NDArray[np.int64], config: Config, epoch: int, progress: Progress = show_nothing
 ) -> float:
-    """One pass over the training pairs; the mean squared error on the way. Raises InputError where it is not finite."""
+    """One pass over the training pairs; returns their mean squared error. Raises InputError where it is not finite.
+
+    train : (n,), indices of pairs
+    """
     rank, ranks, device = training.rank, training.ranks, training.device
-    # All randomness of an epoch hangs on (seed, epoch): a resumed run draws what an uninterrupted one would.
+    # All randomness of an epoch depends on (seed, epoch): a resumed run draws what an uninterrupted one would.
     rng = np.random.default_rng([config.seed, epoch])
     torch.manual_seed(hash((config.seed, epoch)) % 2**31)
     training.predictor.train()
@@ -63,26 +66,24 @@ def learn_epoch(
 
 
 def _errors(training: Training, batch: Batch, brightness: float, keys: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Sums over a batch: what is to be minimised, and the squared errors."""
+    """Sums over a batch, () each: what is minimised, and squared errors. keys : (B,), for dropout, in training only"""
     predictor, radiometry = training.predictor, training.radiometry
     maps = predictor.maps
-    with torch.autocast(
-        training.device.type, torch.bfloat16, enabled=training.precision == "bf16" and keys is not None
-    ):
-        shifted = predictor.shifted(batch.observation.elevation, keys)
-    crops = len(shifted)
-    rest = [value.expand(crops, 1, 1) for value in maps.everywhere().values()]
+    short = training.precision == "bf16" and keys is not None
+    with torch.autocast(training.device.type, torch.bfloat16, enabled=short):
+        unbounded = predictor.unbounded(batch.observation.elevation, keys)
+    everywhere = [value.expand(len(unbounded), 1, 1) for value in maps.everywhere().values()]
     frame = batch.observation.frame
     assert frame is not None
 
-    def objective(first: int, last: int, shifted: Tensor, gain: Tensor, offset: Tensor, *rest: Tensor):
-        coefficients = maps.combine(shifted, rest)
+    def objective(first: int, last: int, unbounded: Tensor, gain: Tensor, offset: Tensor, *everywhere: Tensor):
+        coefficients = maps.combine(unbounded, everywhere)
         rendered = form(batch.observation.part(first, last), maps.model, coefficients, training.extensions)
         measured = batch.image[first:last] / radiometry.scale
         predicted = rendered if radiometry.calibrated else gain * rendered + offset
         return crop_errors(predicted, measured, batch.valid[first:last], brightness)
 
-    return sum_over_crops(objective, shifted, *radiometry.of_crops(frame), *rest)
+    return sum_over_crops(objective, unbounded, *radiometry.crop_gains(frame), *everywhere)
 
 
 @torch.no_grad()
@@ -93,9 +94,9 @@ def evaluate_loss(
     brightness: float = 1.0,
     progress: Progress = show_nothing,
 ) -> tuple[float, float]:
-    """Mean squared error and mean of what is minimised over the valid pixels of some pairs, in evaluation mode.
+    """Mean squared error, and mean of what is minimised, over the valid pixels of some pairs, in evaluation mode.
 
-    NaN where there are no pairs.
+    indices : (n,), of pairs; returns NaN where there are none
     """
     training.predictor.eval()
     totals, pixels = [0.0, 0.0], 0.0
@@ -112,8 +113,11 @@ def evaluate_loss(
     return means[0], means[1]
 
 
-def of_all(progress: Progress, epoch: int, epochs: int, work: tuple[int, int], before: int = 0) -> Progress:
-    """Report work on the whole training. work : of training and of validation in an epoch; before : done in this one"""
+def overall(progress: Progress, epoch: int, epochs: int, work: tuple[int, int], before: int = 0) -> Progress:
+    """What a part of an epoch reports its progress to, as a share of the whole training.
+
+    work : of training and of validation in an epoch; before : done in this epoch already
+    """
     first, total = epoch * sum(work) + before, epochs * sum(work)
     each = 1 if before else BACKWARD
     return lambda done, _, what: progress(first + each * done, total, what)

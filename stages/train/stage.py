@@ -15,24 +15,23 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from torch import Tensor
 
 from schemas.files.outputs import Output, Target, check_apart, check_outputs
 from schemas.provenance import sha256
 from stages.common.memory import keep_freed_memory
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.common.threads import one_thread_each
-from stages.network.deviations import fit_deviations
 from stages.network.predictor import choose_device
-from stages.network.processes import join_group
-from stages.network.resume import History, restore, save, snapshot
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import Extension
 from stages.train.checkpoint import write_checkpoint
 from stages.train.checks import check, check_pairs
 from stages.train.config import Config
-from stages.train.epoch import BACKWARD, evaluate_loss, learn_epoch, of_all
-from stages.train.training import go_back, introduction, set_up
+from stages.train.deviations import fit_deviations
+from stages.train.epoch import BACKWARD, evaluate_loss, learn_epoch, overall
+from stages.train.processes import join_group
+from stages.train.resume import History, Weights, copy_weights, load_weights, restore, save
+from stages.train.training import describe, set_up
 
 
 @dataclass(frozen=True)
@@ -50,14 +49,14 @@ def run(
 ) -> Summary:
     """Write ``checkpoint.h5``: the weights of the best validation epoch. Raises ConfigError, InputError, ArtefactError.
 
-    After every epoch the whole state goes to a file beside the output, from which ``resume`` goes on to the same result.
+    After every epoch the whole state is written beside the output; ``resume`` goes on from it to the same result.
     """
-    output = Output.of(output)
+    output = Output.at(output)
     check(config)
     sidecar = output.file.with_name(f"{output.file.stem}.resume.h5")
     inputs = [pairs, *([Path(config.extend)] if config.extend else [])]
     check_outputs([Target(output.file)], inputs, output.overwrite)
-    check_apart([Target(output.file), Target(sidecar, what=f"the state of the unfinished {output.file.name}")], inputs)
+    check_apart([Target(output.file), Target(sidecar, name=f"the state of the unfinished {output.file.name}")], inputs)
     rank, ranks = join_group()
     device = choose_device(config.device)
     if device.type == "cuda" and ranks > 1:
@@ -65,52 +64,42 @@ def run(
     keep_freed_memory()
     extensions = _load_extensions(config.extend, pairs, say)
     if extensions and config.augment:
-        # an effect may belong to a direction on the ground, which turning crops would lose
+        # an effect may depend on a direction on the ground, which is lost when crops are turned
         say("crops are not turned or mirrored: the extended model may hold effects bound to an azimuth")
         config = replace(config, augment=False)
     with one_thread_each(), PairReader(pairs, detector=bool(extensions)) as reader:
         check_pairs(reader, config, say)
         training = set_up(reader, config, extensions, device, rank, ranks)
-        history, best = History(), dict[str, Tensor]()
-        # A constant rate may go on for longer; what a cosine did in its first epochs hangs on how many there are.
+        history, best = History(), Weights()
+        # A constant rate may go on for more epochs than before; a cosine's first epochs already depend on their number.
         epochs = config.epochs if config.schedule == "cosine" else None
         identity = json.dumps(
             asdict(config) | {"device": None, "epochs": epochs, "pairs": sha256(pairs), "ranks": ranks}, sort_keys=True
         )
         if output.resume and sidecar.exists():
-            training.precision = restore(
-                sidecar,
-                identity,
-                training.predictor,
-                training.radiometry,
-                training.optimizer,
-                history,
-                best,
-                device,
-            )
+            history, best = restore(sidecar, identity, training)
             say(f"resumed after epoch {len(history.train_loss)}/{config.epochs}")
         if rank == 0:
-            say(introduction(training))
+            say(describe(training))
         speed = math.nan
         train, validation = reader.indices("train"), reader.indices("validation")
         work = BACKWARD * math.ceil(len(train) / config.batch), math.ceil(len(validation[rank::ranks]) / config.batch)
         for epoch in range(len(history.train_loss), config.epochs):
             began = time.monotonic()
-            train_loss = learn_epoch(training, train, config, epoch, of_all(progress, epoch, config.epochs, work))
+            train_loss = learn_epoch(training, train, config, epoch, overall(progress, epoch, config.epochs, work))
             training_seconds = time.monotonic() - began
-            shown = of_all(progress, epoch, config.epochs, work, work[0])
+            shown = overall(progress, epoch, config.epochs, work, work[0])
             validation_loss, objective = evaluate_loss(training, validation, config.batch, config.brightness, shown)
             history.train_loss.append(train_loss)
             history.validation_loss.append(validation_loss)
-            # chosen by what is minimised: the level of a few crops of validation ground would choose by chance
+            # the least objective, not error, is the best: the brightness of a few crops would choose by chance
             history.objective.append(objective if math.isfinite(objective) else train_loss)
             history.epoch_seconds.append(time.monotonic() - began)
             if history.objective[-1] <= min(history.objective):
                 history.best_epoch = epoch
-                best = snapshot(training.predictor, training.radiometry)
+                best = copy_weights(training)
             if rank == 0:
-                predictor, radiometry, optimizer = training.predictor, training.radiometry, training.optimizer
-                save(sidecar, identity, predictor, radiometry, optimizer, history, best, training.precision)
+                save(sidecar, identity, training, history, best)
                 speed = len(train) / training_seconds
                 left = (config.epochs - epoch - 1) * history.epoch_seconds[-1]
                 say(
@@ -118,10 +107,8 @@ def run(
                     f"{' *' if history.best_epoch == epoch else '  '} {speed:6.1f} pairs/s  {left / 60:5.1f} min left"
                 )
         if rank == 0:
-            go_back(training, best)
-            fit_deviations(
-                training.predictor, training.radiometry, reader, train, validation, extensions=training.extensions
-            )
+            load_weights(training, best)
+            fit_deviations(training, train, validation)
             write_checkpoint(output, config, training, history)
             sidecar.unlink(missing_ok=True)
     if ranks > 1:

@@ -1,4 +1,4 @@
-"""What every step of training works with: the network at the best uniform surface, and how it goes on from there."""
+"""What every step of training works with: network, radiometry and optimizer, set up for the first step."""
 
 from __future__ import annotations
 
@@ -12,16 +12,20 @@ from stages.network.losses import Radiometry
 from stages.network.precision import choose_precision
 from stages.network.predictor import Predictor
 from stages.network.unet import UNet
-from stages.network.uniform import elevation_scale, fit_start
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import Extension
 from stages.physics.photometry import get_model
 from stages.train.config import Config
+from stages.train.start import elevation_scale, fit_start
 
 
 @dataclass
 class Training:
-    """What every step works with and changes. rank, ranks : this process among those that share every batch."""
+    """What every step of training works with and changes.
+
+    start : the uniform surface that training begins at, by coefficient; rank, ranks : this process among those that
+    share every batch
+    """
 
     reader: PairReader
     predictor: Predictor
@@ -33,6 +37,11 @@ class Training:
     start: dict[str, float]
     rank: int = 0
     ranks: int = 1
+
+    @property
+    def modules(self) -> dict[str, torch.nn.Module]:
+        """All that has weights, by the names that files give them."""
+        return {"predictor": self.predictor, "radiometry": self.radiometry}
 
     @property
     def learned(self) -> list[Tensor]:
@@ -65,14 +74,8 @@ def set_up(
     return Training(reader, predictor, radiometry, optimizer, extensions, device, precision, named, rank, ranks)
 
 
-def go_back(training: Training, state: dict[str, Tensor]) -> None:
-    """Go back to a snapshot."""
-    for name, module in (("predictor", training.predictor), ("radiometry", training.radiometry)):
-        module.load_state_dict({k.split("/", 1)[1]: v for k, v in state.items() if k.startswith(f"{name}/")})
-
-
-def introduction(training: Training) -> str:
-    """What is about to be learned, in a line."""
+def describe(training: Training) -> str:
+    """A line on what is about to be learned, on which machine."""
     predictor, reader = training.predictor, training.reader
     maps = predictor.maps
     where = f"maps of {', '.join(maps.maps)}" + (f", global {', '.join(maps.rest)}" if maps.rest else "")

@@ -40,7 +40,7 @@ def run(
     progress: Progress = show_nothing,
 ) -> Summary:
     """Write the page of ``source`` (svbrdf.h5), with photographs of ``pairs`` where given. Raises LunargrError."""
-    output = Output.of(output)
+    output = Output.at(output)
     path = output.file
     _check(config, path)
     check_output(path, [source, *([pairs] if pairs else [])], output.overwrite)

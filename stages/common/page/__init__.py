@@ -1,7 +1,7 @@
-"""The page that `report` and `diagnose` write: one HTML file without scripts and with no link to the network, light and dark.
+"""The page that `report` and `diagnose` write: one HTML file without scripts or links to the network, light and dark.
 
-``parts.html.j2`` holds the parts, ``page.html.j2`` the whole, ``style.css`` the look. Functions here return finished,
-escaped HTML.
+``parts.html.j2`` holds the parts, ``page.html.j2`` the whole, ``style.css`` the style. Functions here return escaped
+HTML.
 """
 
 from __future__ import annotations

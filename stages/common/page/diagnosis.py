@@ -1,5 +1,5 @@
-"""A diagnosis in the order of its story, for the page of `diagnose` and for `report`: what differs, how much of it is what,
-what each named cause takes away, what got no name and why, and which image would settle the rest.
+"""The chapters of a diagnosis, for the page of `diagnose` and for `report`: what differs, how much of it is what, what
+each named cause takes away, what was not named and why, and which image would settle the rest.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 from markupsafe import Markup
 
 from stages.common import page
-from stages.common.page.sentences import Sentence, compared, counted, listed
+from stages.common.page.sentences import Sentence, compared, counted, listed, words
 
 BUDGET = {
     "named": "the causes that were named",
@@ -32,7 +32,7 @@ SAME = (
 
 @dataclass(frozen=True)
 class About:
-    """What the catalogue says of an effect. separate : the image that would tell it from others"""
+    """An effect's entry in the catalogue. separate : the image that would tell it from others"""
 
     title: str
     mechanism: str
@@ -44,15 +44,15 @@ Chapter = tuple[str, list[Markup]]
 
 
 def conclusions(result: dict[str, Any]) -> list[Sentence]:
-    """What the simulation lacks, what naming it is worth, and what these data could not tell."""
-    known = result.get("verdict", "")
-    said = str(result.get("sentence") or VERDICTS.get(known, known) or "The diagnosis holds no verdict.")
-    if known == "named" and not result.get("sentence"):
-        said = f"The simulation lacks {listed([c['effect'] for c in result.get('causes', [])])}."
+    """Sentences on what the simulation lacks, how much better it is with it, and what these data could not tell."""
+    verdict = result.get("verdict", "")
+    sentence = str(result.get("sentence") or VERDICTS.get(verdict, verdict) or "The diagnosis holds no verdict.")
+    if verdict == "named" and not result.get("sentence"):
+        sentence = f"The simulation lacks {listed([c['effect'] for c in result.get('causes', [])])}."
     data = result.get("data") or {}
     if data.get("pairs"):
-        said = f"Diagnosis of {data['pairs']:,} pairs of {counted(data.get('sites', 0), 'place')}: {said}"
-    found = [(said, "")]
+        sentence = f"Diagnosis of {data['pairs']:,} pairs of {counted(data.get('sites', 0), 'place')}: {sentence}"
+    found = [(sentence, "")]
     held_out = result.get("held_out") or {}
     if result.get("causes") and held_out.get("gain_percent") is not None:
         on = f"{held_out['pairs']:,} unseen pairs" if held_out.get("pairs") else "unseen pairs"
@@ -60,15 +60,8 @@ def conclusions(result: dict[str, Any]) -> list[Sentence]:
             on += f" of {counted(held_out['sites'], 'place')}"
         found.append(compared("With what was named, the simulation", "the simulation without it", held_out, on))
     if result.get("blind"):
-        found.append((f"These data could not show, whether it is there or not: {listed(result['blind'])}.", ""))
+        found.append((_blind_sentence(result["blind"]), ""))
     return found
-
-
-VERDICTS = {
-    "nothing_significant": "Nothing significant is missing from the simulation.",
-    "unexplained": "Something is missing from the simulation that nothing in the catalogue explains.",
-    "cannot_tell": "These data cannot tell whether something is missing from the simulation.",
-}
 
 
 def chapters(
@@ -76,7 +69,7 @@ def chapters(
     about: Callable[[str], About] | None = None,
     drawn: Mapping[str, Sequence[Markup]] | None = None,
 ) -> list[Chapter]:
-    """Titles and parts. about : of an effect by name; drawn : pictures by the chapter that they belong to.
+    """Titles and parts. about : gives an effect's entry by name; drawn : pictures by the chapter that they belong to.
 
     Every key of ``result`` but the verdict may be missing: other versions leave some out.
     """
@@ -92,15 +85,19 @@ def chapters(
     return [(title, parts) for title, parts in found if parts]
 
 
+def _blind_sentence(effects: list[str]) -> str:
+    return f"These data could not show, whether it is there or not: {listed(effects)}."
+
+
 def _budget(budget: dict[str, float | None]) -> list[Markup]:
     shares = [(BUDGET.get(name, words(name)), 100 * share) for name, share in budget.items() if share is not None]
     if not shares:
         return []
-    said = (
+    note = (
         "Shares of the variance of the relative residual under the nominal model. What the images of a place have in common is "
         "albedo and relief that the model has not; a part of it may be a cause that these data cannot tell from ground."
     )
-    return [page.budget(shares), page.paragraph(said, "soft")]
+    return [page.budget(shares), page.paragraph(note, "soft")]
 
 
 def _causes(causes: Sequence[dict[str, Any]], about: Callable[[str], About] | None) -> list[Markup]:
@@ -122,9 +119,9 @@ def _cause(cause: dict[str, Any]) -> list[str]:
     values = []
     for name, v in cause.get("parameters", {}).items():
         unit = "" if v.get("unit", "1") == "1" else f" {v['unit']}"
-        value = f"{name} = {number(v['value'], '.3g')} +- {number(v['error'], '.1g')}{unit}"
+        value = f"{name} = {formatted(v['value'], '.3g')} +- {formatted(v['error'], '.1g')}{unit}"
         values.append(value.replace(" ", "\u00a0"))
-    before, after = (number(cause.get(f"residual_rms_{k}"), ".4f") for k in ("before", "after"))
+    before, after = (formatted(cause.get(f"residual_rms_{k}"), ".4f") for k in ("before", "after"))
     others = [words(name) for name in cause.get("group", []) if name != cause["effect"]]
     gain = [cause.get(k) for k in ("held_out_gain_percent", "held_out_low", "held_out_high")]
     return [
@@ -132,7 +129,7 @@ def _cause(cause: dict[str, Any]) -> list[str]:
         "; ".join(values) or "-",
         f"{before} to {after}",
         percent(*gain),
-        number(cause.get("p_family_wise"), ".2g"),
+        formatted(cause.get("p_family_wise"), ".2g"),
         ", ".join(others) or "-",
     ]
 
@@ -140,7 +137,7 @@ def _cause(cause: dict[str, Any]) -> list[str]:
 def _rejected(result: dict[str, Any]) -> list[Markup]:
     parts = []
     rows = [
-        [words(r["effect"]), number(r.get("gain_nats"), ".0f"), str(r.get("why", "-"))]
+        [words(r["effect"]), formatted(r.get("gain_nats"), ".0f"), str(r.get("why", "-"))]
         for r in result.get("rejected") or []
     ]
     if rows:
@@ -166,20 +163,14 @@ def _unsettled(result: dict[str, Any], about: Callable[[str], About] | None) -> 
     if about is not None:
         rows += [[f"whether there is {words(n)}", about(n).separate or "-"] for n in blind]
     elif blind:
-        said = f"These data could not show, whether it is there or not: {listed(blind)}."
-        parts.append(page.paragraph(said))
+        parts.append(page.paragraph(_blind_sentence(blind)))
     if rows:
         parts.insert(0, page.table("", ["what is open", "what would tell"], rows))
     return parts
 
 
-def words(name: str) -> str:
-    """'sun_azimuth' as 'sun azimuth'"""
-    return name.replace("_", " ")
-
-
-def number(value: float | None, form: str) -> str:
-    """A number as text, "-" where there is none."""
+def formatted(value: float | None, form: str) -> str:
+    """A number in Python's format, "-" where there is none."""
     return "-" if value is None else format(value, form)
 
 

@@ -1,4 +1,4 @@
-"""Arrays to pictures inside a page: PNG data URIs, colour bars, and charts as SVG in the page's own text colour."""
+"""Arrays to pictures inside a page: images as data URIs, colour bars, charts as SVG in the page's text colour."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import cv2
 import h5py
 import numpy as np
 
-LONGEST = 900  # px: larger maps are thinned
+LONGEST = 900  # px: of larger maps only every k-th pixel is drawn
 INK = "#010203"  # stands for the page's text colour until the SVG is written
 
 
@@ -25,17 +25,19 @@ def read_thinned(data: h5py.Dataset, *leading: int, longest: int = LONGEST) -> t
 
 
 def data_uri(picture: np.ndarray) -> str:
-    """(H, W, 3 or 4) uint8, RGB(A) -> PNG data URI."""
-    code = cv2.COLOR_RGBA2BGRA if picture.shape[2] == 4 else cv2.COLOR_RGB2BGR
-    _, encoded = cv2.imencode(".png", cv2.cvtColor(picture, code), [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    return uri_of(encoded.tobytes(), "image/png")
+    """A PNG as data URI. picture : (H, W, 3), RGB, or (H, W, 4), RGBA, uint8"""
+    return _encoded(picture, "png", cv2.IMWRITE_PNG_COMPRESSION, 9)
 
 
 def photo_uri(picture: np.ndarray, quality: int = 85) -> str:
-    """(H, W, 3 or 4) uint8, RGB(A) -> WebP data URI: for maps and photographs, a tenth of a PNG."""
+    """A WebP as data URI, a tenth of a PNG for photographs. picture : (H, W, 3), RGB, or (H, W, 4), RGBA, uint8"""
+    return _encoded(picture, "webp", cv2.IMWRITE_WEBP_QUALITY, quality)
+
+
+def _encoded(picture: np.ndarray, kind: str, option: int, value: int) -> str:
     code = cv2.COLOR_RGBA2BGRA if picture.shape[2] == 4 else cv2.COLOR_RGB2BGR
-    _, encoded = cv2.imencode(".webp", cv2.cvtColor(picture, code), [cv2.IMWRITE_WEBP_QUALITY, quality])
-    return uri_of(encoded.tobytes(), "image/webp")
+    _, encoded = cv2.imencode(f".{kind}", cv2.cvtColor(picture, code), [option, value])
+    return uri_of(encoded.tobytes(), f"image/{kind}")
 
 
 def uri_of(content: bytes, kind: str) -> str:
@@ -44,7 +46,7 @@ def uri_of(content: bytes, kind: str) -> str:
 
 
 def limits(values: np.ndarray, tail: float = 0.5) -> tuple[float, float]:
-    """Low and high percentiles of the finite values; never equal."""
+    """Low and high percentiles of the finite values, never equal. values : any shape; tail : percent beyond each"""
     known = values[np.isfinite(values)]
     if not len(known):
         return 0.0, 1.0
@@ -85,7 +87,7 @@ def gradient(colours: str) -> str:
 
 
 def number(value: float) -> str:
-    """A number as a person writes it."""
+    """A number with three significant digits, or whole from 100 on."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
@@ -121,6 +123,6 @@ def chart_svg(figure: Any, salt: str) -> str:
     svg = stream.getvalue()
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r' xmlns(:xlink)?="[^"]*"', "", svg)  # HTML knows SVG without being told
+    svg = re.sub(r' xmlns(:xlink)?="[^"]*"', "", svg)  # HTML needs no namespace for SVG
     svg = re.sub(r'(id="|href="#|url\(#)', rf"\g<1>{salt}-", svg)
     return svg.replace(INK, "currentColor").replace("<text", '<text fill="currentColor"')

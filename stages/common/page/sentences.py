@@ -1,4 +1,4 @@
-"""Sentences that are no stronger than their interval allows."""
+"""Sentences that claim no more than their interval allows."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ Sentence = tuple[str, str]  # text, '' | 'good' | 'bad'
 
 
 def verdict(gain: dict[str, Any]) -> str:
-    """What a paired interval says."""
+    """'better', 'worse', 'no difference' or 'unknown', by the 95 % interval of a gain."""
     low, high = gain.get("gain_percent_low"), gain.get("gain_percent_high")
     if low is None or high is None:
         return "unknown"
@@ -23,12 +23,17 @@ def bounds(gain: dict[str, Any]) -> str:
 
 def listed(names: list[str]) -> str:
     """'a, b and c', as words."""
-    words = [name.replace("_", " ") for name in names]
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else "nothing"
+    spoken = [words(name) for name in names]
+    return spoken[0] if len(spoken) == 1 else f"{', '.join(spoken[:-1])} and {spoken[-1]}" if spoken else "nothing"
+
+
+def words(name: str) -> str:
+    """'sun_azimuth' as 'sun azimuth'"""
+    return name.replace("_", " ")
 
 
 def compared(ours: str, other: str, gain: dict[str, Any], on: str) -> Sentence:
-    """What a gain over another model says. on : what it rests on"""
+    """A sentence on a gain over another model. on : the data that it comes from"""
     value, word = float(gain["gain_percent"]), verdict(gain)
     tail = f"gain {value:+.1f} % ({bounds(gain)}; {on})"
     if word == "no difference":
@@ -40,6 +45,6 @@ def compared(ours: str, other: str, gain: dict[str, Any], on: str) -> Sentence:
     return f"{ours} has a squared error {-value:.1f} % higher than {other}; {tail}.", "bad"
 
 
-def counted(number: int, what: str) -> str:
+def counted(number: int, noun: str) -> str:
     """'1 place', '1,200 places'"""
-    return f"{number:,} {what}{'s' * (number != 1)}"
+    return f"{number:,} {noun}{'s' * (number != 1)}"

@@ -13,7 +13,7 @@ from torch import Tensor
 from stages.common.threads import share_out
 from stages.network.cpu import training_kernels as kernels
 from stages.network.cpu.training_kernels import channels_last, empty, pixels_of, rows_of
-from stages.network.layers import BatchNorm, Dropout, dropout_threshold, layer_keys, shared
+from stages.network.layers import BatchNorm, Dropout, dropout_threshold, is_distributed, layer_keys
 
 _NO_KEYS = np.zeros((1, 2), np.uint32)
 
@@ -50,7 +50,7 @@ def norm_act(
         shift = norm.bias.detach() + (bias.detach() - norm.running_mean) * scale
         return _apply(x, scale, shift, dropping, pad, _stored_as(x))
     y, mean, variance, count = _NormAct.apply(x, norm.weight, norm.bias, norm.eps, dropping, pad, _stored_as(x))
-    norm.note(mean + bias.detach(), variance, count)
+    norm.update_running(mean + bias.detach(), variance, count)
     return y
 
 
@@ -63,7 +63,7 @@ def _apply(x: Tensor, scale: Tensor, shift: Tensor, dropping: tuple, pad: int, d
 
 
 def _over_processes(values: Tensor) -> Tensor:
-    if shared():
+    if is_distributed():
         dist.all_reduce(values)
     return values
 
@@ -78,7 +78,7 @@ class _NormAct(torch.autograd.Function):
         crops, channels, height, width = x.shape
         pivot = x[0, :, 0, 0].double()  # sums about a value near the mean keep their digits
         parts = np.empty((crops, 2, channels))
-        share_out(kernels.add_up, crops, rows_of(x), _row(pivot, width), parts)
+        share_out(kernels.sum_moments, crops, rows_of(x), _row(pivot, width), parts)
         one, two = torch.from_numpy(parts.sum(axis=0))
         own = float(crops * height * width)
         about_zero = torch.cat([one + own * pivot, two + 2 * pivot * one + own * pivot * pivot, torch.tensor([own])])
@@ -104,12 +104,12 @@ class _NormAct(torch.autograd.Function):
         source, target = rows_of(x), rows_of(dx)
         rows = [_row(v, width) for v in (scale, shift, mean, inverse)]
         parts = np.empty((crops, 2, channels))
-        share_out(kernels.add_up_gradients, crops, source, dy, target, *rows, *dropping, pad, channels, parts)
+        share_out(kernels.sum_gradients, crops, source, dy, target, *rows, *dropping, pad, channels, parts)
         own = torch.from_numpy(parts.sum(axis=0))
         first, second = _over_processes(own.clone()) / count
         linear = -scale * second * inverse
         constant = -scale * first - linear * mean
-        share_out(kernels.give_back, crops, source, target, *(_row(v, width) for v in (scale, constant, linear)))
+        share_out(kernels.input_gradient, crops, source, target, *(_row(v, width) for v in (scale, constant, linear)))
         return dx, own[1].float(), own[0].float(), None, None, None, None
 
 

@@ -1,4 +1,5 @@
-"""What stands between convolutions, on the CPU, in as few passes over memory as can be: numba kernels without Python's lock.
+"""The layers between convolutions, on the CPU, in as few passes over memory as possible: numba kernels without Python's
+lock.
 
 PyTorch's own operators take one pass each for normalisation, activation, dropout and padding, forward and back, which costs
 twice the convolutions. Arrays are (crops, rows, columns * channels) with channels fastest, float32 or bfloat16 as uint16.
@@ -113,7 +114,7 @@ def _drop(line, r, low, high, threshold, factor):
 
 
 @njit(nogil=True, cache=True)
-def add_up(first, last, x, pivot, sums):
+def sum_moments(first, last, x, pivot, sums):
     """sums[n] = sums over a crop of (x - pivot) and of its square; pivot : (W * C,), sums : (B, 2, C) float64"""
     channels, length = sums.shape[2], x.shape[2]
     one, two = np.empty(length, np.float32), np.empty(length, np.float32)
@@ -176,7 +177,7 @@ def _write(line, target, r, rows, pad, channels):
 
 @register_jitable
 def _gather(line, field, r, rows, pad, channels):
-    """The transpose of :func:`_write`: what a row's values are worth, with what their copies at the edges are worth."""
+    """The transpose of :func:`_write`: the gradient in a row's values, with that in their copies at the edges."""
     begin, end = pad * channels, pad * channels + line.size
     inner = field[r + pad, begin:end]
     for j in range(line.size):
@@ -199,7 +200,7 @@ def _gather(line, field, r, rows, pad, channels):
 
 
 @njit(nogil=True, cache=True)
-def add_up_gradients(first, last, x, dy, g, scale, shift, mean, inverse, keys, threshold, factor, pad, channels, sums):
+def sum_gradients(first, last, x, dy, g, scale, shift, mean, inverse, keys, threshold, factor, pad, channels, sums):
     """g = dL/d(normalised x * weight + bias); sums[n] = sums over a crop of g and of g * normalised x."""
     rows, length = x.shape[1], x.shape[2]
     line, one, two = np.empty(length, np.float32), np.empty(length, np.float32), np.empty(length, np.float32)
@@ -222,8 +223,8 @@ def add_up_gradients(first, last, x, dy, g, scale, shift, mean, inverse, keys, t
 
 
 @njit(nogil=True, cache=True)
-def give_back(first, last, x, g, scale, constant, linear):
-    """g becomes dL/dx = scale * g + constant + linear * x: the last two are what mean and spread take with them."""
+def input_gradient(first, last, x, g, scale, constant, linear):
+    """g becomes dL/dx = scale * g + constant + linear * x, with two terms from the batch's mean and variance."""
     rows, length = x.shape[1], x.shape[2]
     for n in range(first, last):
         for r in range(rows):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.network.losses import Radiometry
-from stages.network.pixels import Pixels, batches_of, fit_pixels, sample_pixels
+from stages.network.pixels import Pixels, fit_pixels, sample_batches, sample_pixels
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form
 from stages.physics.photometry import ReflectanceModel, get_model, masked_radiance_factor
@@ -23,7 +23,7 @@ def _uniform(values: Tensor) -> Tensor:
 def fit_start(
     reader: PairReader, indices: NDArray[np.int64], model: ReflectanceModel, positive: bool = False
 ) -> tuple[Tensor, Radiometry]:
-    """Uniform coefficients (C,) and the radiometry that go with them.
+    """Uniform coefficients (C,), and the radiometry that goes with them. indices : (n,), of pairs
 
     Gains are first fitted against the reference surface, then in turn with the coefficients: a surface of another
     shape would give images of steep and of flat ground gains that do not belong together.
@@ -54,7 +54,7 @@ def fit_radiometry(
         uniform = torch.tensor([p.default for p in model.parameters])
     defaults = _uniform(uniform)
     moments = torch.zeros(frames, 5, dtype=torch.float64)  # n, sum x, sum y, sum xx, sum xy
-    for _, batch in batches_of(reader, indices):
+    for _, batch in sample_batches(reader, indices):
         x = form(batch.observation, model, defaults).double() * batch.valid
         y = batch.image.double() * batch.valid
         terms = torch.stack([batch.valid.double(), x, y, x * x, x * y], dim=1).sum(dim=(2, 3))
@@ -64,7 +64,7 @@ def fit_radiometry(
     mean_x, mean_y = sx / n.clamp(min=1), sy / n.clamp(min=1)
     variance = sxx / n.clamp(min=1) - mean_x**2
     gain = (sxy / n.clamp(min=1) - mean_x * mean_y) / variance.clamp(min=1e-12)
-    # A gain below a fifth of brightness over I/F means that texture, not shading, rules the image: start from the ratio.
+    # A gain below a fifth of brightness over I/F: the image shows texture more than shading, and the ratio is taken.
     ratio = mean_y / mean_x.clamp(min=1e-6)
     gain = torch.where(gain > 0.2 * ratio, gain, ratio)
     offset = mean_y - gain * mean_x
@@ -96,7 +96,7 @@ def _normal_equations(model: ReflectanceModel, pixels: Pixels) -> tuple[Tensor, 
     names = [p.name for p in model.parameters]
     units = [dict(zip(names, unit, strict=True)) for unit in torch.eye(len(names), dtype=torch.float64)]
     columns = torch.stack([masked_radiance_factor(model, unit, pixels.angles) * pixels.light for unit in units])
-    # products and sums instead of BLAS, whose sums hang on where arrays lie in memory
+    # products and sums instead of BLAS, whose sums depend on where arrays lie in memory
     gram = torch.stack([(columns * column).sum(dim=1) for column in columns])
     return gram, (columns * pixels.image).sum(dim=1)
 

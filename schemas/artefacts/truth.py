@@ -1,16 +1,13 @@
-"""What `lunargr simulate` knows and does not tell the pipeline."""
+"""truth.h5: what `lunargr simulate` made, for comparison with what the pipeline finds."""
 
 from __future__ import annotations
 
-from schemas.declaration import STRING, Attribute, Schema, Variable, declare
-
-
-def _map(name: str, description: str) -> Variable:
-    return Variable(name, ("y", "x"), "f4", "1", description, chunks=(256, 256), georeferenced=True)
+from schemas.artefacts.common import column, grid_map, text_column
+from schemas.declaration import Attribute, Schema, Variable, declare
 
 
 def _frame(name: str, unit: str, description: str) -> Variable:
-    return Variable(name, ("frame",), "f8", unit, description)
+    return column("frame", name, unit, description)
 
 
 TRUTH = declare(
@@ -27,32 +24,24 @@ TRUTH = declare(
             "crater": "craters, largest first",
         },
         variables=(
-            Variable("y", ("y",), "f8", "m", "grid northing of the pixel centre; rows run south"),
-            Variable("x", ("x",), "f8", "m", "grid easting of the pixel centre"),
-            Variable(
-                "elevation",
-                ("y", "x"),
-                "f4",
-                "m",
-                "true height above the reference sphere, without the DEM's errors and holes",
-                chunks=(256, 256),
-                georeferenced=True,
+            column("y", "y", "m", "grid northing of the pixel centre; rows run south"),
+            column("x", "x", "m", "grid easting of the pixel centre"),
+            grid_map(
+                "elevation", "f4", "m", "true height above the reference sphere, without the DEM's errors and holes"
             ),
-            Variable(
+            grid_map(
                 "coefficients",
-                ("coefficient", "y", "x"),
                 "f4",
                 "1",
                 "parameters of the truth's reflectance model, by name in coefficient_name",
-                chunks=(1, 256, 256),
-                georeferenced=True,
+                stacked_along="coefficient",
             ),
-            Variable("coefficient_name", ("coefficient",), STRING, "", "names of the parameters"),
-            _map("standard_iof", "I/F of level ground at incidence 30, emission 0, phase 30 deg"),
-            _map("log_albedo_geometry", "ln of the albedo factor that follows the terrain"),
-            _map("log_albedo_free", "ln of the albedo factor that does not: rays, patches, texture"),
-            Variable("image_id", ("frame",), STRING, "", "name of the image"),
-            Variable("start_time", ("frame",), STRING, "", "UTC"),
+            text_column("coefficient", "coefficient_name", "names of the parameters"),
+            grid_map("standard_iof", "f4", "1", "I/F of level ground at incidence 30, emission 0, phase 30 deg"),
+            grid_map("log_albedo_geometry", "f4", "1", "ln of the albedo factor that follows the terrain"),
+            grid_map("log_albedo_free", "f4", "1", "ln of the albedo factor that does not: rays, patches, texture"),
+            text_column("frame", "image_id", "name of the image"),
+            text_column("frame", "start_time", "UTC"),
             _frame("subsolar_longitude_deg", "degree", "true east longitude of the sub-solar point"),
             _frame("subsolar_latitude_deg", "degree", "true latitude of the sub-solar point"),
             _frame("solar_distance_au", "au", "distance of the Sun"),
@@ -69,10 +58,10 @@ TRUTH = declare(
             _frame("shift_north", "m", "the same, grid north"),
             _frame("noise_iof", "1", "standard deviation of the noise at the image's mean signal, I/F"),
             _frame("mean_iof", "1", "mean signal without noise, I/F"),
-            Variable("crater_x", ("crater",), "f8", "m", "grid easting of the centre"),
-            Variable("crater_y", ("crater",), "f8", "m", "grid northing of the centre"),
-            Variable("crater_diameter", ("crater",), "f4", "m", "rim-to-rim diameter when fresh"),
-            Variable("crater_age", ("crater",), "f4", "1", "0 = fresh, 1 = worn out: share of its size's lifetime"),
+            column("crater", "crater_x", "m", "grid easting of the centre"),
+            column("crater", "crater_y", "m", "grid northing of the centre"),
+            column("crater", "crater_diameter", "m", "rim-to-rim diameter when fresh", "f4"),
+            column("crater", "crater_age", "1", "0 = fresh, 1 = worn out: share of its size's lifetime", "f4"),
         ),
         attributes=(
             Attribute("gsd_m", "ground sample distance of the working grid, m", True, "number", 0.0),

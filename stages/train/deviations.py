@@ -5,16 +5,15 @@ A residual is taken for the sum of independent errors: of each map, by its effec
     var(measured - rendered) = sum over maps of (dI/dc sigma_c)^2 + noise^2,
 
 where ln sigma_c is linear in the trained network's last features (Gaussian likelihood, the maps held fixed: a last layer
-fitted afterwards costs maps nothing). What terrain does not show rules these errors, and neighbouring pixels share it: the
-deviations are those of single pixels, means over many are hardly better known. One factor for all is then chosen on
-validation ground, which the maps never saw, such that 95 % of the pixels of a ground tile lie within 1.96 standard
-deviations when the factor is chosen on the other tiles.
+fitted afterwards costs the maps nothing). Most of these errors come from what terrain does not show, which neighbouring
+pixels share: the deviations are those of single pixels, and means over many pixels are hardly better known. One factor
+for all is then chosen on validation ground, which the maps never saw, such that 95 % of the pixels of a ground tile lie
+within 1.96 standard deviations when the factor is chosen on the other tiles.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -22,13 +21,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.common.intervals import unseen_quantile
-from stages.network.losses import Radiometry
 from stages.network.normalisation import scale_elevation
 from stages.network.pixels import Pixels, sample_pixels
 from stages.network.predictor import Predictor
-from stages.pairs.reader import Batch, PairReader
-from stages.physics.formation.chain import Extension, form
+from stages.pairs.reader import Batch
+from stages.physics.formation.chain import form
 from stages.physics.photometry import masked_radiance_factor
+from stages.train.training import Training
 
 STEP = 1e-4  # of a parameter's range, for its effect on the image
 RIDGE = 1e-3  # on the features' weights: deviations of ground unlike any other stay near the mean
@@ -36,25 +35,18 @@ WIDTH_95 = 1.959964  # standard deviations within which a Gaussian has 95 %
 ROUNDS = 60
 
 
-def fit_deviations(
-    predictor: Predictor,
-    radiometry: Radiometry,
-    reader: PairReader,
-    train: NDArray[np.int64],
-    validation: NDArray[np.int64],
-    extensions: Sequence[Extension] = (),
-) -> None:
-    """Write the last layer of the deviations, and ``image_noise``, into a trained predictor.
+def fit_deviations(training: Training, train: NDArray[np.int64], validation: NDArray[np.int64]) -> None:
+    """Write the last layer of the deviations, and ``image_noise``, into the trained predictor.
 
     train, validation : (n,), indices of pairs
     """
-    predictor.eval()
-    residual, effects, features, tile = _residuals(predictor, radiometry, reader, train, extensions)
+    predictor = training.predictor.eval()
+    residual, effects, features, tile = _residuals(training, train)
     middle, spread = features.mean(dim=0), features.std(dim=0).clamp(min=1e-6)
     weights, constants, noise = _likelihood(residual, effects, (features - middle) / spread)
     if len(validation):
-        residual, effects, features, tile = _residuals(predictor, radiometry, reader, validation, extensions)
-    deviation = _deviation(effects, (features - middle) / spread, weights, constants, noise)
+        residual, effects, features, tile = _residuals(training, validation)
+    deviation = _variance(effects, (features - middle) / spread, weights, constants, noise).sqrt()
     factor = unseen_quantile((residual / deviation).abs().numpy(), tile, 0.95) / WIDTH_95
     maps, head = predictor.maps, predictor.net.head
     count = len(maps.maps)
@@ -68,34 +60,24 @@ def fit_deviations(
 
 
 @torch.no_grad()
-def _residuals(
-    predictor: Predictor,
-    radiometry: Radiometry,
-    reader: PairReader,
-    indices: NDArray[np.int64],
-    extensions: Sequence[Extension],
-) -> tuple[Tensor, Tensor, Tensor, NDArray[np.int64]]:
+def _residuals(training: Training, indices: NDArray[np.int64]) -> tuple[Tensor, Tensor, Tensor, NDArray[np.int64]]:
     """Of some pixels: residuals (N,), I/F; effects of the maps on them (N, M), I/F per unit; the last features (N, F);
     ground tiles (N,).
     """
-    maps, model = predictor.maps, predictor.model
+    predictor, maps, model = training.predictor, training.predictor.maps, training.predictor.model
     device = maps.start.device
 
-    def more(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+    def predict(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         x = scale_elevation(batch.observation.elevation.to(device), predictor.elevation_scale)
         features = predictor.net.features(x)
-        coefficients = maps.stack(maps.shifted(predictor.net.read_out(features)), dim=1).cpu()
-        return features.float().cpu(), coefficients, form(batch.observation, model, coefficients, extensions)
+        coefficients = maps.stack(maps.unbounded(predictor.net.read_out(features)), dim=1).cpu()
+        return features.float().cpu(), coefficients, form(batch.observation, model, coefficients, training.extensions)
 
-    pixels = sample_pixels(reader, indices, radiometry, more)
-    features, coefficients, rendered = pixels.more
+    pixels = sample_pixels(training.reader, indices, training.radiometry, predict)
+    features, coefficients, rendered = pixels.extra
     assert pixels.pair is not None
-    return (
-        pixels.image - rendered,
-        _effects(predictor, pixels, coefficients),
-        features,
-        reader.tile[pixels.pair.numpy()],
-    )
+    tile = training.reader.tile[pixels.pair.numpy()]
+    return pixels.image - rendered, _effects(predictor, pixels, coefficients), features, tile
 
 
 def _effects(predictor: Predictor, pixels: Pixels, coefficients: Tensor) -> Tensor:
@@ -113,13 +95,9 @@ def _effects(predictor: Predictor, pixels: Pixels, coefficients: Tensor) -> Tens
 
 
 def _variance(effects: Tensor, features: Tensor, weights: Tensor, constants: Tensor, noise: Tensor) -> Tensor:
-    # products and sums instead of BLAS, whose sums hang on where arrays lie in memory
+    # products and sums instead of BLAS, whose sums depend on where arrays lie in memory
     logarithm = (features[:, None] * weights).sum(dim=2) + constants
     return (effects * logarithm.exp()).square().sum(dim=1) + (2 * noise).exp()
-
-
-def _deviation(effects: Tensor, features: Tensor, weights: Tensor, constants: Tensor, noise: Tensor) -> Tensor:
-    return _variance(effects, features, weights, constants, noise).sqrt()
 
 
 def _likelihood(residual: Tensor, effects: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:

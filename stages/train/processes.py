@@ -1,4 +1,4 @@
-"""Several processes that train one network together, started by ``torchrun``; alone, everything here is the identity."""
+"""Several processes that train one network together, started by ``torchrun``; a single one needs none of this."""
 
 from __future__ import annotations
 
@@ -43,7 +43,5 @@ def sum_over_ranks(values: Tensor, ranks: int) -> Tensor:
 
 def mean_over_ranks(total: float, weight: float, ranks: int, device: torch.device) -> float:
     """Weighted mean over all processes; NaN without weight."""
-    sums = torch.tensor([total, weight], dtype=torch.float64, device=device)
-    if ranks > 1:
-        dist.all_reduce(sums)
+    sums = sum_over_ranks(torch.tensor([total, weight], dtype=torch.float64, device=device), ranks)
     return float(sums[0] / sums[1]) if sums[1] > 0 else math.nan

@@ -1,4 +1,4 @@
-"""The steps of an epoch: which pairs in which order, read ahead, and with what learning rate."""
+"""The steps of an epoch: their pairs, their order, their learning rate, and reading them ahead."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WARM_UP = 20  # steps over which a cosine schedule rises
 
 
 def learning_rate(highest: float, schedule: str, step: int, steps: int) -> float:
-    """Of one step of a training run: constant, or a cosine after a short rise."""
+    """The learning rate of one step of a training run: constant, or a cosine after a short rise."""
     if schedule == "constant":
         return highest
     return highest * min(1, (step + 1) / WARM_UP) * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps)))
@@ -30,7 +30,7 @@ def order_steps(
 ) -> tuple[list[tuple[NDArray, NDArray | None]], list[Tensor]]:
     """The batches of one epoch for this process: (pair indices, symmetries), and the crops' keys for dropout.
 
-    Every process gets as many batches; what a crop meets does not depend on the process that works on it.
+    Every process gets the same number of batches; a crop's symmetry and dropout do not depend on its process.
 
     train : (n,), indices of pairs
     """
@@ -59,11 +59,7 @@ def prefetch(
         for indices, turns in steps:
             following = pool.submit(reader.batch, indices, turns)
             if waiting is not None:
-                yield _arrive(waiting.result(), device)
+                yield waiting.result().to(device)
             waiting = following
         if waiting is not None:
-            yield _arrive(waiting.result(), device)
-
-
-def _arrive(batch: Batch, device: torch.device) -> Batch:
-    return batch if device.type == "cpu" else batch.to(device)
+            yield waiting.result().to(device)
