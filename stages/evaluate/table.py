@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from stages.common.intervals import ERROR, gain_interval, ratio_interval
-from stages.evaluate.core import Scores
 from stages.evaluate.metrics import psnr
 from stages.evaluate.rows import TITLES, freedom
+from stages.evaluate.scores import Scores
 
 PAIRED = ("learned", "learned_gain_offset", "learned_extended", "learned_extended_gain_offset")
 # Rows that are compared like for like: they know nothing of the scored crops, or two numbers of each.
