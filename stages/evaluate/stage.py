@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from schemas import EVALUATION, ArtefactWriter, write_json
 from schemas.files.companions import companions_of
 from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.evaluate.checks import check, check_runs, limitations, read_seed, select
+from stages.evaluate.checks import check, check_runs, limitations, read_seed, report_files, select
 from stages.evaluate.config import Config
 from stages.evaluate.parts import Fan, Kept, first_runs, score_in_parts
 from stages.evaluate.rows import Row
@@ -41,12 +40,6 @@ class Files:
     def inputs(self) -> list[Path]:
         """What no output may replace."""
         return [self.pairs, *self.checkpoints, *([Path(self.extend)] if self.extend else [])]
-
-    @property
-    def reports(self) -> list[Path]:
-        """The JSON beside the output, and where it was asked for."""
-        beside, wanted = self.output.file.with_suffix(".json"), self.output.json
-        return [beside] if wanted is None or os.path.realpath(wanted) == os.path.realpath(beside) else [beside, wanted]
 
 
 def run(
@@ -90,7 +83,7 @@ def _run(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Confi
 
 
 def _check_outputs(files: Files) -> None:
-    output, (beside, *others) = files.output, files.reports
+    output, (beside, *others) = files.output, report_files(files.output)
     targets = [Target(output.file), Target(beside, what=f"the JSON beside {output.file.name}")]
     targets += [Target(report, "json") for report in others]
     if output.figures is not None:
@@ -129,7 +122,7 @@ def _write(
         artefact.file.attrs["split"] = config.split
         artefact.file.attrs["metrics"] = json.dumps(result)
         with companions_of(files.output.file):
-            for report in files.reports:
+            for report in report_files(files.output):
                 write_json(report, result)
     return rows, scores, scale, result
 
