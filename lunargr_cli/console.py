@@ -71,7 +71,7 @@ def say_error(message: str) -> None:
     print(f"lunargr: {harmless(' '.join(message.split()))}", file=sys.stderr)
 
 
-def say_effort() -> None:
+def say_resources() -> None:
     """Time and memory of this process and the parts that it had done, on standard error."""
     import resource
 
@@ -155,7 +155,7 @@ class Console:
             self._bar = False
 
 
-def own_streams(verbose: bool = False) -> None:
+def set_up_streams(verbose: bool = False) -> None:
     """Standard output and error for our lines alone, also where the shell closed them.
 
     PROJ, libtiff, HDF5 and others print on the error stream from C, Python's libraries by warnings and loggers. What they

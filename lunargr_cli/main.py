@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import typer
 
 from lunargr_cli import INTERRUPTED, commands, quiet_interruptions, signals, stop
-from lunargr_cli.console import flush_out, own_streams, say_effort, say_error, write_out
+from lunargr_cli.console import flush_out, say_error, say_resources, set_up_streams, write_out
 from lunargr_cli.options import check_numbers
 from lunargr_cli.paths import guarded
 from lunargr_cli.spelling import running, spell
@@ -43,7 +43,7 @@ def _command_line() -> str:
     return shlex.join(words)
 
 
-def _checked(command: Callable[..., None]) -> Callable[..., None]:
+def _check_call(command: Callable[..., None]) -> Callable[..., None]:
     """The command, which no number that is not finite reaches, and whose errors name its options."""
 
     @functools.wraps(command)
@@ -73,7 +73,7 @@ def _plain(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode()
 
 
-def _alone(command: Callable[..., None], shared: bool) -> Callable[..., None]:
+def _lock_output(command: Callable[..., None], shared: bool) -> Callable[..., None]:
     """The command, its inputs safe from its outputs, and holding the lock of its output from its first step on.
 
     shared : several runs may write into the output, a folder, at once
@@ -133,7 +133,7 @@ for _module in sorted(
     (importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)),
     key=lambda module: module.ORDER,
 ):
-    _command = _checked(_alone(_module.command, getattr(_module, "SHARED_OUTPUT", False)))
+    _command = _check_call(_lock_output(_module.command, getattr(_module, "SHARED_OUTPUT", False)))
     # Named, the first sentence is wrapped in the list of commands; left to click, it is cut off.
     _summary = " ".join((_module.command.__doc__ or "").split()).split(". ")[0].rstrip(".")
     app.command(name=_module.NAME, cls=getattr(_module, "CLASS", None), short_help=_summary)(_command)
@@ -153,7 +153,7 @@ def main() -> None:
     words = sys.argv[1:]
     verbose = take_verbose(words)
     sys.argv[1:] = words
-    own_streams(verbose)
+    set_up_streams(verbose)
     for number in (signal.SIGINT, signal.SIGTERM):  # a Slurm time limit or `kill` unwinds like Ctrl-C
         signal.signal(number, stop)
     quiet_interruptions()
@@ -165,7 +165,7 @@ def main() -> None:
         finally:
             flush_out()
             if verbose:
-                say_effort()
+                say_resources()
     except BaseException as error:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is left to tidy while Python ends
         # What an interruption breaks may say something else: a library that was just being imported, for one.
@@ -175,7 +175,7 @@ def main() -> None:
             os._exit(130)
         if isinstance(error, BrokenPipeError):  # `lunargr inspect file | head`
             os._exit(141)
-        if isinstance(error, Exception) and (line := _line(error)):
+        if isinstance(error, Exception) and (line := _in_one_line(error)):
             say_error(line)
             with contextlib.suppress(OSError, ValueError):
                 sys.stdout.flush()
@@ -186,19 +186,13 @@ def main() -> None:
         gc.freeze()  # Python would look through everything once more while it ends: a quarter of a short command's time
 
 
-def _line(error: Exception) -> str | None:
-    """What to say in one line, None where the error is a bug."""
-    if isinstance(error, LunargrError):
-        return str(error)
-    return _lost_input(error)
-
-
-def _lost_input(error: Exception) -> str | None:
-    """What to say where the libraries fail because an input went away, or was written over, under a stage's hands."""
+def _in_one_line(error: Exception) -> str | None:
+    """What to say of an error, also of a library's where an input was lost while it was read; None where it is a bug."""
     from schemas.provenance import changed_inputs
 
-    lost = changed_inputs()
-    if not lost:
+    if isinstance(error, LunargrError):
+        return str(error)
+    if not (lost := changed_inputs()):
         return None
     return (
         f"{lost[0]}: gone, or changed, while it was being read ({type(error).__name__}: {error}); nothing half-written is left. "

@@ -6,16 +6,14 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import typer
 
 from lunargr_cli.paths import Writes
 from lunargr_cli.spelling import option_of
 from schemas.errors import ConfigError
-
-if TYPE_CHECKING:
-    from schemas.files.outputs import Output
+from schemas.files.outputs import Output
 
 Number = TypeVar("Number", int, float)
 
@@ -40,10 +38,13 @@ def check_scheduler(text: str | None) -> str | None:
 Config = TypeVar("Config")
 
 
-def configure(config: type[Config], options: Mapping[str, Any], **more: Any) -> Config:
-    """A stage's Config from the options of a command that bear its fields' names. more : what is made of other options"""
+def configure(config: type[Config], options: Mapping[str, Any], **converted: Any) -> Config:
+    """A stage's Config from the options of a command that bear its fields' names.
+
+    converted : fields by name whose options are written in another form
+    """
     names = {field.name for field in dataclasses.fields(config)}  # type: ignore[arg-type]
-    return config(**{name: value for name, value in options.items() if name in names} | more)
+    return config(**{name: value for name, value in options.items() if name in names} | converted)
 
 
 OutputFile = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True), Writes.FILE]
@@ -137,7 +138,7 @@ def read_numbers(option: str, text: str, kind: type[Number]) -> tuple[Number, ..
         raise ConfigError(f"{option}: expected numbers like 8-16-32, found '{text}'.") from None
 
 
-def dashed(numbers: Iterable[float]) -> str:
+def join_numbers(numbers: Iterable[float]) -> str:
     """(16, 32, 64) -> '16-32-64', as :func:`read_numbers` reads it."""
     return "-".join(f"{number:g}" for number in numbers)
 
@@ -147,10 +148,8 @@ def read_names(text: str | None) -> tuple[str, ...]:
     return tuple(name.strip() for name in (text or "").split(",") if name.strip())
 
 
-def to_map(output: Path, overwrite: bool, geotiff: Path | None, no_geotiff: bool) -> Output:
+def make_map_output(output: Path, overwrite: bool, geotiff: Path | None, no_geotiff: bool) -> Output:
     """Where a map and its GeoTIFF go. Raises ConfigError."""
-    from schemas.files.outputs import Output
-
     if geotiff and no_geotiff:
         raise ConfigError(f"--geotiff {geotiff} and --no-geotiff: expected one of them, found both.")
     return Output(output, overwrite, geotiff=geotiff)

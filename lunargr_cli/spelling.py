@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextvars import ContextVar
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 running: ContextVar[Callable[..., None] | None] = ContextVar("running", default=None)  # the command of this process
 
 
-def option_of(command: Callable[..., None], name: str) -> str:
+def option_of(command: Callable[..., None] | None, name: str) -> str:
     """The option that sets a parameter of a command; within Annotated typer keeps the first spelling as the default."""
-    return option_among(get_type_hints(command, include_extras=True), name)
-
-
-def option_among(hints: Mapping[str, Any], name: str) -> str:
-    """:func:`option_of` from the types of the command's parameters."""
+    hints = get_type_hints(command, include_extras=True) if command else {}
     for mark in getattr(hints.get(name), "__metadata__", ()):
         for spelled in (getattr(mark, "default", None), *(getattr(mark, "param_decls", None) or ())):
             if isinstance(spelled, str) and spelled.startswith("--"):
@@ -26,8 +22,5 @@ def option_among(hints: Mapping[str, Any], name: str) -> str:
 
 def spell(message: str) -> str:
     """A message of a stage with its settings as options of the command that runs."""
-    if "`" not in message:
-        return message
     command = running.get()
-    hints = get_type_hints(command, include_extras=True) if command else {}
-    return re.sub("`([a-z][a-z0-9_]*)`", lambda found: option_among(hints, found[1]), message)
+    return re.sub("`([a-z][a-z0-9_]*)`", lambda found: option_of(command, found[1]), message)

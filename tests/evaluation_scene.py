@@ -32,7 +32,8 @@ class Scene:
     frame: np.ndarray
     a: np.ndarray
     noise: float
-    frame_names: list[str] = field(default_factory=list)
+    image_ids: list[str] = field(default_factory=list)
+    units: str = "iof"
 
     @property
     def site(self) -> np.ndarray:
@@ -100,6 +101,7 @@ class KnowsTheTruth:
     """A predictor that returns the planted coefficients: its error is the noise."""
 
     image_units = "iof"
+    image_noise = float("nan")  # predicts no standard deviations
 
     def __init__(self, model: str = "M2") -> None:
         self.model = get_model(model)
@@ -117,7 +119,7 @@ def write_pairs(path, scene: Scene, units: str = "1"):
     from schemas import PAIRS, ArtefactWriter
 
     count, height, width = scene.images.shape
-    sizes = {"pair": count, "y": height, "x": width, "enu": 3, "frame": len(scene.frame_names)}
+    sizes = {"pair": count, "y": height, "x": width, "enu": 3, "frame": len(scene.image_ids)}
     places = {"gsd_m": GSD, "body_radius_m": RADIUS}
     with ArtefactWriter(path, PAIRS, sizes, attributes=places, seed=0) as out:
         out.write("elevation", np.where(scene.mask, scene.elevation, np.nan))
@@ -132,7 +134,7 @@ def write_pairs(path, scene: Scene, units: str = "1"):
         out.write("site", np.arange(count))
         out.write("tile", scene.tile)
         out.write("split", scene.split)
-        out.write("image_id", scene.frame_names)
+        out.write("image_id", scene.image_ids)
     return path
 
 

@@ -89,7 +89,7 @@ KNOWN = (
         "the intervals of gains are not paired",
     ),
     Mutant(
-        "stages/evaluate/comparison.py",
+        "stages/evaluate/task.py",
         "    unit, name = choose_units(tile, site)\n    frames",
         "    unit, name = np.arange(len(tile)), 'tile'\n    frames",
         ("tests/test_evaluate.py::test_tiles_are_the_witnesses_and_rows_are_paired_by_them",),
@@ -110,7 +110,7 @@ KNOWN = (
         "curvature has the wrong sign",
     ),
     Mutant(
-        "stages/evaluate/core.py",
+        "stages/evaluate/scores.py",
         "ssim(*crop, data_range=ranges[b])",
         "ssim(*crop, data_range=1.0)",
         ("tests/test_evaluate.py::test_ssim_takes_the_range_of_the_measured_crop",),
@@ -292,7 +292,7 @@ STAGES = (
         "PSNR is twice as large",
     ),
     Mutant(
-        "stages/evaluate/core.py",
+        "stages/evaluate/scores.py",
         "crop_range(batch.image, batch.usable)",
         "crop_range(batch.image, batch.usable | True)",
         ("tests/test_evaluate.py::test_ssim_takes_the_range_of_the_measured_crop",),

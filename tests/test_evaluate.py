@@ -11,13 +11,13 @@ import torch
 from evaluation_scene import A, B, C, KnowsTheTruth, make_scene
 
 from stages.common.intervals import ERROR, LOG, ratio_interval
-from stages.evaluate import fit
-from stages.evaluate.comparison import Task, evaluate_pairs
+from stages.evaluate import least_squares
 from stages.evaluate.config import Config
 from stages.evaluate.fitting import choose_fit_pairs, sample_pixels
 from stages.evaluate.metrics import ssim
 from stages.evaluate.renderers import Constant, Renderer, read_batch, unit_images
 from stages.evaluate.rows import HAPKE_FREE
+from stages.evaluate.task import Task, score_here, summarise
 from stages.physics.photometry import get_model
 
 REQUIRED = {
@@ -41,9 +41,9 @@ def whole(scene):
 def _evaluate(scene, units="iof", predictor=None, **options):
     wanted = np.flatnonzero(scene.split == 2)
     predictors = predictor if isinstance(predictor, list) else [predictor or KnowsTheTruth()]
-    config = Config(batch=7, **options)
-    rows, scores, scale, result = evaluate_pairs(Task(scene, predictors, wanted, scene.frame_names, units, config))
-    return result, rows, scores, scale
+    task = Task(replace(scene, units=units), predictors, wanted, Config(batch=7, **options))
+    rows, scores, scale = score_here(task)
+    return summarise(task, scores, scale), rows, scores, scale
 
 
 def test_the_true_coefficients_leave_only_the_noise(scene, whole):
@@ -101,12 +101,12 @@ def test_lunar_lambert_gets_the_least_squares_albedo(scene, whole):
 def test_a_model_that_is_not_linear_reaches_the_same_optimum(scene):
     train = np.flatnonzero(scene.split == 0)
     model = get_model("M2")
-    gram = fit.FrameGram(3, 4)
+    gram = least_squares.FrameGram(3, 4)
     batch = read_batch(scene, train, 1.0)
     gram.add(unit_images(model, batch), batch.image, batch.usable, batch.frame)
-    exact = fit.solve_coefficients(gram.gram)
+    exact = least_squares.solve_coefficients(gram.gram)
     sample = sample_pixels(batch, 10**6, np.random.default_rng(0))
-    assert fit.fit_nonlinear(model, sample, calibrated=True) == pytest.approx(exact, abs=1e-6)
+    assert least_squares.fit_nonlinear(model, sample, calibrated=True) == pytest.approx(exact, abs=1e-6)
 
 
 def test_nonlinear_fit_finds_planted_hapke_parameters(scene):
@@ -116,7 +116,7 @@ def test_nonlinear_fit_finds_planted_hapke_parameters(scene):
     batch = read_batch(scene, np.flatnonzero(scene.split == 0), 1.0)
     batch.image = Renderer("planted", model, Constant(planted)).radiance_factor(batch)
     sample = sample_pixels(batch, 100, np.random.default_rng(0))
-    found = fit.fit_nonlinear(model, sample, calibrated=True)
+    found = least_squares.fit_nonlinear(model, sample, calibrated=True)
     batch.memo.clear()
     refit = Renderer("refit", model, Constant(found)).radiance_factor(batch)
     spread = float(batch.image[batch.usable].std())
@@ -126,14 +126,14 @@ def test_nonlinear_fit_finds_planted_hapke_parameters(scene):
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_a_nonlinear_fit_is_the_same_to_the_last_bit_wherever_its_pixels_lie(scene, calibrated, monkeypatch):
     """BLAS adds up in another order where arrays begin elsewhere in memory, and a flat valley makes much of it."""
-    monkeypatch.setattr(fit, "ROUNDS", 30)
+    monkeypatch.setattr(least_squares, "ROUNDS", 30)
     model = get_model("hapke")
     batch = read_batch(scene, np.flatnonzero(scene.split == 0), 1.0)
     sample = sample_pixels(batch, 200, np.random.default_rng(0))
-    found = fit.fit_nonlinear(model, sample, calibrated, HAPKE_FREE)
+    found = least_squares.fit_nonlinear(model, sample, calibrated, HAPKE_FREE)
     for places in (1, 3):
         moved = {name: torch.cat([value[:places], value])[places:] for name, value in vars(sample).items()}
-        again = fit.fit_nonlinear(model, fit.PixelSample(**moved), calibrated, HAPKE_FREE)
+        again = least_squares.fit_nonlinear(model, least_squares.PixelSample(**moved), calibrated, HAPKE_FREE)
         np.testing.assert_array_equal(again, found)
     default = np.array([p.default for p in model.parameters])
     assert (np.abs(found - default) > 1e-3).sum() >= 2
@@ -165,7 +165,7 @@ def test_every_model_gets_the_nuisances_that_suit_it_best(scene):
     _, rows, _, scale = _evaluate(film, "dn")
     batch = read_batch(film, np.flatnonzero(film.split == 0), scale)
     for row in rows:
-        if row.how is not None:
+        if row.matching is not None:
             continue
         rendered = row.renderer.image(batch)
         for f in range(4):
@@ -179,12 +179,12 @@ def test_the_shared_set_of_dn_frames_beats_any_neighbour(scene):
     film = _uncalibrated(scene, np.array([600.0, 1200.0, 800.0, 1000.0]), np.array([9.0, 30.0, 0.0, 5.0]))
     model = get_model("M2")
     batch = read_batch(film, np.flatnonzero(film.split == 0), 255.0)
-    gram = fit.FrameGram(3, 4)
+    gram = least_squares.FrameGram(3, 4)
     gram.add(unit_images(model, batch), batch.image, batch.usable, batch.frame)
-    solved = fit.solve_uncalibrated(gram.gram, np.array([A, B, C]))
+    solved = least_squares.solve_uncalibrated(gram.gram, np.array([A, B, C]))
 
     def loss(coefficients):
-        gain, offset = fit.solve_gain_offset(gram.gram, coefficients)
+        gain, offset = least_squares.solve_gain_offset(gram.gram, coefficients)
         total = 0.0
         for f in range(4):
             v = np.concatenate([-gain[f] * coefficients, [-offset[f], 1.0]])

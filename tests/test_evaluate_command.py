@@ -12,7 +12,7 @@ from evaluation_scene import make_scene, run_command, write_pairs
 
 from schemas import EVALUATION, open_artefact
 from stages import train
-from stages.evaluate import fit
+from stages.evaluate import least_squares
 
 WIDTHS = (4, 8, 8)
 
@@ -20,7 +20,7 @@ WIDTHS = (4, 8, 8)
 @pytest.fixture(autouse=True)
 def short_fits(monkeypatch):
     """Of Hapke's law to ground that is not Hapke's: how far a fit gets is judged in test_evaluate.py."""
-    monkeypatch.setattr(fit, "ROUNDS", 15)
+    monkeypatch.setattr(least_squares, "ROUNDS", 15)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_extend_scores_the_extended_model_in_further_rows(tmp_path):
     effect = {"effect": "dark_bias", "values": {"iof": bias}, "tables": {}, "survey": Survey().to_json()}
     content = {"report": "{}", "extension": json.dumps([effect])}
     with ArtefactWriter(tmp_path / "diagnosis.h5", DIAGNOSIS, {"frame": 4}, attributes=content, seed=0) as out:
-        out.write("image_id", scene.frame_names)
+        out.write("image_id", scene.image_ids)
     found = {}
     for name, more in (("clean", ()), ("biased", ("--extend", tmp_path / "diagnosis.h5"))):
         files = (tmp_path / f"{name}.h5", tmp_path / "checkpoint.h5", "-o", tmp_path / f"{name}_evaluation.h5")

@@ -14,9 +14,9 @@ import torch
 from evaluation_scene import KnowsTheTruth, make_scene, write_pairs
 
 from stages import train
-from stages.evaluate.comparison import Task, evaluate_pairs
 from stages.evaluate.config import Config
 from stages.evaluate.renderers import read_batch
+from stages.evaluate.task import Task, score_here
 from stages.pairs.reader import PairReader
 from stages.train.epoch import evaluate_loss, learn_epoch
 from stages.train.training import set_up
@@ -124,8 +124,8 @@ def test_baselines_are_fitted_on_training_pairs_alone(units):
     spoiled.images[spoiled.split != 0] *= np.linspace(0.3, 0.9, 16, dtype=np.float32)
     fitted = []
     for s in (scene, spoiled):
-        task = Task(s, [KnowsTheTruth()], np.flatnonzero(s.split == TEST), s.frame_names, units, Config(batch=7))
-        rows, _, scale, _ = evaluate_pairs(task)
+        s = dataclasses.replace(s, units=units)
+        rows, _, scale = score_here(Task(s, [KnowsTheTruth()], np.flatnonzero(s.split == TEST), Config(batch=7)))
         fitted.append((rows, scale))
     assert fitted[0][1] == fitted[1][1]
     batch = read_batch(scene, np.flatnonzero(scene.split == 0), fitted[0][1])

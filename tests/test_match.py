@@ -15,7 +15,7 @@ from stages.match.base import Matches, Models, get_matcher, matcher_names, mutua
 from stages.match.comparisons import choose
 from stages.match.consistency import summarise
 from stages.match.daisy import Field, dense_descriptors
-from stages.match.pictures import fit_size, inside, to_grey
+from stages.match.pictures import drop_unknown, fit_size, to_grey
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def test_unknown_pixels_are_no_place_for_a_match():
     image[:, :64] = np.nan
     _, known = to_grey(image, (0.0, 1.0))
     points = np.array([[100.0, 200.0], [400.0, 200.0]])
-    kept = inside(Matches(points, points), known)
+    kept = drop_unknown(Matches(points, points), known)
     assert kept.measured.tolist() == [[400.0, 200.0]]
 
 

@@ -11,7 +11,7 @@ from typing import get_type_hints
 import pytest
 
 from lunargr_cli import commands, spelling
-from lunargr_cli.options import dashed, parse_shard, read_names
+from lunargr_cli.options import join_numbers, parse_shard, read_names
 
 MODULES = {
     m.name: importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)
@@ -24,7 +24,7 @@ CONFIGS = {
 }  # fmt: skip
 # How commands write what a Config holds as a tuple.
 WRITTEN = {
-    "widths": dashed, "dropout": dashed, "shard": lambda shard: None if shard == parse_shard(None) else shard,
+    "widths": join_numbers, "dropout": join_numbers, "shard": lambda shard: None if shard == parse_shard(None) else shard,
     "maps": lambda names: None if names == read_names(None) else names, "only": lambda rows: None if rows == () else rows,
     "leave_out": lambda names: None if names == () else names, "free": ",".join,
     "size_px": lambda size: ",".join(map(str, size)), "parameters": lambda values: values or None,

@@ -8,7 +8,9 @@ from typing import Annotated
 import typer
 
 from lunargr_cli import options
+from lunargr_cli.console import Console
 from schemas.errors import ConfigError
+from stages import albedo
 from stages.albedo import Config
 
 NAME, ORDER = "albedo", 61
@@ -48,12 +50,9 @@ def command(
     The albedo multiplies the I/F of the map. Where photographs agree it is theirs; where they do not, and where there are
     none, it is 1 and the map stays as the terrain gave it. Rendering, evaluation and GeoTIFF take it into account.
     """
-    made = {"leave_out": options.read_names(leave_out), "fold": _fold(fold), "geotiff": not no_geotiff}
-    config = options.configure(Config, locals(), **made, shard=options.parse_shard(shard))
-    from lunargr_cli.console import Console
-    from stages import albedo
-
-    console, to = Console(quiet), options.to_map(output, overwrite, geotiff, no_geotiff)
+    converted = {"leave_out": options.read_names(leave_out), "fold": _fold(fold), "geotiff": not no_geotiff}
+    config = options.configure(Config, locals(), **converted, shard=options.parse_shard(shard))
+    console, to = Console(quiet), options.make_map_output(output, overwrite, geotiff, no_geotiff)
     if options.in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_albedo

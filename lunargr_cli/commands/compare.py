@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import json
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from lunargr_cli import options
+from lunargr_cli.console import Console
 from lunargr_cli.paths import Writes
+from schemas import CHECKPOINT, EVALUATION, SPLITS, Schema
+from schemas.errors import ConfigError
+from schemas.files.outputs import Output, Target, check_outputs
+from stages import evaluate, train
 from stages.train import Config
-
-if TYPE_CHECKING:
-    from lunargr_cli.console import Console
 
 NAME, ORDER = "compare", 72
 
@@ -35,7 +38,7 @@ def command(
     batch: options.Batch = Config.batch,
     lr: options.LearningRate = Config.lr,
     schedule: options.Schedule = Config.schedule,
-    widths: options.Widths = options.dashed(Config.widths),
+    widths: options.Widths = options.join_numbers(Config.widths),
     precision: options.TrainingPrecision = Config.precision,
     split: Annotated[
         str, typer.Option("--split", help="Where models are compared: validation (as in the paper) or test.")
@@ -51,10 +54,7 @@ def command(
     With --resume, runs that the folder already holds are kept and an interrupted one goes on where it stopped.
     """
     common = options.configure(Config, locals(), widths=options.read_numbers("--widths", widths, int))
-    from lunargr_cli.console import Console
-    from schemas import SPLITS, ConfigError
-    from schemas.files.outputs import Output, Target, check_outputs
-    from stages import compare, train
+    from stages import compare
 
     console = Console(quiet)
     names = _models(models)
@@ -68,11 +68,11 @@ def command(
     for number, run in enumerate(runs):
         for seed, checkpoint in enumerate(run.checkpoints):
             config = replace(common, model=run.model, seed=seed)
-            if not (resume and checkpoint.exists() and _same(checkpoint, config, pairs)):
+            if not (resume and checkpoint.exists() and _was_trained_with(checkpoint, config, pairs)):
                 console.say(f"training {run.model}, seed {seed} ({number * seeds + seed + 1} of {seeds * len(names)})")
                 to = Output(checkpoint, overwrite or resume, resume)
                 train.run(pairs, to, config, console.say, console.progress)
-        if not (resume and run.evaluation.exists() and _made_from(run.evaluation, [pairs, *run.checkpoints])):
+        if not (resume and run.evaluation.exists() and _was_scored_on(run.evaluation, [pairs, *run.checkpoints])):
             _evaluate(pairs, run, device, console)
     result = compare.run([(run.evaluation, run.checkpoints) for run in runs], Output(output, json=json_file))
     console.table(
@@ -108,7 +108,7 @@ class _Runs:
 
 
 def _models(text: str) -> list[str]:
-    from schemas import ConfigError
+    """Names of at least two models from 'M1,M2'. Raises ConfigError, RegistryError."""
     from stages.physics.photometry import get_model
 
     names = list(dict.fromkeys(get_model(name).name for name in options.read_names(text)))
@@ -118,34 +118,29 @@ def _models(text: str) -> list[str]:
 
 
 def _evaluate(pairs: Path, run: _Runs, device: str, console: Console) -> None:
-    from schemas.files.outputs import Output
-    from stages import evaluate
-
     config = evaluate.Config(split=run.split, renderings=False, device=device, only=("learned",))
     evaluate.run(pairs, run.checkpoints, Output(run.evaluation, overwrite=True), config, console.say, console.progress)
 
 
-def _same(checkpoint: Path, config: Any, pairs: Path) -> bool:
+def _was_trained_with(checkpoint: Path, config: Config, pairs: Path) -> bool:
     """Whether a finished checkpoint came from these options and these pairs."""
-    import json
-    from dataclasses import asdict
-
-    from schemas import CHECKPOINT, open_artefact, read_config
     from schemas.provenance import sha256
 
-    with open_artefact(checkpoint, CHECKPOINT) as file:
-        found, inputs = read_config(file), json.loads(str(file.attrs["inputs"]))
+    found, inputs = _read_origin(checkpoint, CHECKPOINT)
     wanted = json.loads(json.dumps(asdict(config)))
-    return all(found.get(k) == wanted[k] for k in wanted if k != "device") and inputs[0]["sha256"] == sha256(pairs)
+    return all(found.get(k) == wanted[k] for k in wanted if k != "device") and inputs[0] == sha256(pairs)
 
 
-def _made_from(evaluation: Path, inputs: list[Path]) -> bool:
+def _was_scored_on(evaluation: Path, inputs: list[Path]) -> bool:
     """Whether a finished evaluation is one of these very files."""
-    import json
-
-    from schemas import EVALUATION, open_artefact
     from schemas.provenance import sha256
 
-    with open_artefact(evaluation, EVALUATION) as file:
-        found = json.loads(str(file.attrs["inputs"]))
-    return [entry["sha256"] for entry in found] == [sha256(path) for path in inputs]
+    return _read_origin(evaluation, EVALUATION)[1] == [sha256(path) for path in inputs]
+
+
+def _read_origin(path: Path, schema: Schema) -> tuple[dict[str, Any], list[str]]:
+    """The options that an artefact was made with, and the SHA-256 of its inputs."""
+    from schemas import open_artefact, read_config
+
+    with open_artefact(path, schema) as file:
+        return read_config(file), [entry["sha256"] for entry in json.loads(str(file.attrs["inputs"]))]

@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
-from lunargr_cli.options import OutputFile, Overwrite, Quiet
+from lunargr_cli.console import Console
+from lunargr_cli.options import OutputFile, Overwrite, Quiet, read_names
+from schemas.files.outputs import Output
 
 NAME, ORDER = "convert", 86
 
@@ -36,9 +38,6 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Write coefficient maps in another program's convention; 'lunargr models --conventions' lists them."""
-    from lunargr_cli.console import Console
-    from lunargr_cli.options import read_names
-    from schemas.files.outputs import Output
     from stages import convert
 
     console = Console(quiet)

@@ -10,6 +10,9 @@ import typer
 from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import MOST, Json, Overwrite, Quiet, Scheduler, Seed, configure, read_names
 from lunargr_cli.paths import Writes
+from schemas.errors import ConfigError
+from schemas.files.outputs import Output
+from stages import diagnose
 from stages.diagnose import Config
 
 NAME, ORDER = "diagnose", 80
@@ -55,17 +58,13 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Name the physical causes of the difference between measured and simulated images."""
-    from schemas import ConfigError
-    from schemas.files.outputs import Output
-
     console = Console(quiet)
     to = Output(output, overwrite, json=json_file, report=report)
     if list_effects:
-        _list(console)
+        _list_effects()
         return
     if pairs is None:
         raise ConfigError("diagnose: expected a file of pairs, found none; give pairs.h5, or --list.")
-    from stages import diagnose
     from stages.diagnose.result.answer import describe
 
     config = configure(Config, locals(), free=read_names(free))
@@ -86,24 +85,25 @@ def command(
         )
         for c in answer["causes"]
     ]
+    if quiet:
+        return
     if rows:
         console.table("causes", ("effect", "parameters", "gain on held-out ground", "equally good"), rows)
-    if answer["budget"] and not quiet:
+    if answer["budget"]:
         shares = ", ".join(f"{name.replace('_', ' ')} {100 * share:.0f} %" for name, share in answer["budget"].items())
         write_out(f"Variance of the residual: {shares}.")
-    for r in answer["rejected"] if not quiet else ():
+    for r in answer["rejected"]:
         write_out(f"Not named: {r['effect']}, since {r['why']}.")
-    if not quiet:
-        write_out(f"{answer['verdict']}: {answer['sentence']}")
-        if answer["blind"] and answer["verdict"] != "cannot_tell":
-            write_out(f"These data could not show: {', '.join(answer['blind'])}.")
+    write_out(f"{answer['verdict']}: {answer['sentence']}")
+    if answer["blind"] and answer["verdict"] != "cannot_tell":
+        write_out(f"These data could not show: {', '.join(answer['blind'])}.")
 
 
 def _percent(value: float | None, low: float | None, high: float | None) -> str:
     return "-" if value is None or low is None or high is None else f"{value:.2g} % ({low:.2g} .. {high:.2g})"
 
 
-def _list(console) -> None:
+def _list_effects() -> None:
     from stages.effects import effect_names, get_effect
 
     for name in effect_names():

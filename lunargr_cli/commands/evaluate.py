@@ -8,7 +8,10 @@ from typing import Annotated
 import typer
 
 from lunargr_cli import options
+from lunargr_cli.console import Console
 from lunargr_cli.paths import Writes
+from schemas.files.outputs import Output
+from stages import evaluate
 from stages.evaluate import Config
 
 NAME, ORDER = "evaluate", 70
@@ -72,18 +75,13 @@ def command(
     model from several seeds make the learned rows means over training runs, whose spread is part of the intervals.
     """
     config = options.configure(Config, locals(), only=tuple(only or ()), extend=str(extend) if extend else None)
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
-    from stages import evaluate
     from stages.evaluate.coverage import coverage_lines
     from stages.evaluate.table import basis, gain_lines, result_lines
 
     console = Console(quiet)
     to = Output(output, overwrite, json=json_file, figures=figures)
     if held_out_images:
-        from lunargr_cli.held_out import show_held_out_images
-
-        show_held_out_images(console, pairs, checkpoints, to, split, seed)
+        _score_held_out_images(console, pairs, checkpoints, to, split, seed)
         return
     if scheduler is not None or resume:
         from lunargr_cli.fanout.job import Work
@@ -108,3 +106,23 @@ def command(
     if result["lpips_unavailable"]:
         console.say(f"LPIPS is not available: {result['lpips_unavailable']}.")
     console.say(f"written: {output}, {output.with_suffix('.json')}" + (f", {figures}/" if figures else ""))
+
+
+def _score_held_out_images(
+    console: Console, pairs: Path, maps: list[Path], output: Output, split: str, seed: int
+) -> None:
+    """Score maps with albedo on images that did not make it. Raises LunargrError."""
+    from stages.evaluate.coverage import coverage_lines
+    from stages.evaluate.held_out_images import Config, image_lines, result_lines, run
+
+    result = run(pairs, maps, output, Config(split, seed), console.say, console.progress)
+    suns = result["nearest_used_sun_deg"]
+    title = (
+        f"{result['claim']}: {result['pairs']} crops of split '{split}', {result['tiles']} ground tiles, "
+        f"Suns {suns['least']:.1f} to {suns['most']:.1f} deg from the nearest one used"
+    )
+    console.table(title, *result_lines(result))
+    console.table("by image", *image_lines(result))
+    if result["coverage_percent"] is not None:
+        console.table("pixels within the intervals, percent", *coverage_lines(result["coverage_percent"]))
+    console.say(f"written: {output.file}, {output.file.with_suffix('.json')}")

@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
+from lunargr_cli.console import Console
 from lunargr_cli.options import OutputFile, Overwrite, Quiet
+from schemas.files.outputs import Output
+from stages import export
 from stages.export import Config
 
 NAME, ORDER = "export", 62
@@ -21,10 +24,6 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Write a trained network as ONNX for maps of any size, with a model card (.md) beside it."""
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
-    from stages import export
-
     made = export.run(checkpoint, Output(output, overwrite), Config(opset))
     Console(quiet).say(
         f"{output}: {made.model}, coefficients {', '.join(made.coefficients)}, sizes in multiples of {made.stride} px, "

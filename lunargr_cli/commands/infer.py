@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from lunargr_cli import options
+from lunargr_cli.console import Console
+from schemas.files.locks import scratch_path
+from schemas.files.user_files import check_file
+from schemas.reading import is_artefact
+from stages import infer, ingest
 from stages.infer import Config
 
 NAME, ORDER = "infer", 60
@@ -56,16 +63,7 @@ def command(
 ) -> None:
     """Predict georeferenced maps of reflectance coefficients for a DEM of any size."""
     config = options.configure(Config, locals(), shard=options.parse_shard(shard), geotiff=not no_geotiff)
-    import contextlib
-    from dataclasses import replace
-
-    from lunargr_cli.console import Console
-    from schemas.files.locks import scratch_path
-    from schemas.files.user_files import check_file
-    from schemas.reading import is_artefact
-    from stages import infer
-
-    console, to = Console(quiet), options.to_map(output, overwrite, geotiff, no_geotiff)
+    console, to = Console(quiet), options.make_map_output(output, overwrite, geotiff, no_geotiff)
     interrupted = scheduler is not None or resume  # may have got as far as the GeoTIFF: its parts tell
     infer.check_files([terrain, checkpoint], replace(to, resume=interrupted), config)
     gridding = None
@@ -73,7 +71,6 @@ def command(
     if is_artefact(terrain):
         infer.check_body(terrain, body)
     else:
-        from stages import ingest
         from stages.network.predictor import load_predictor
 
         gsd = None if any_gsd else load_predictor(checkpoint).gsd

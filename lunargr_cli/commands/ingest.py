@@ -8,6 +8,9 @@ from typing import Annotated
 import typer
 
 from lunargr_cli import options
+from lunargr_cli.console import Console
+from schemas.files.outputs import Output
+from stages import ingest
 from stages.ingest import Config
 
 NAME, ORDER = "ingest", 20
@@ -44,10 +47,6 @@ def command(
 ) -> None:
     """Bring a DEM to a metric grid and find where crops of each image may be centred."""
     config = options.configure(Config, locals(), shard=options.parse_shard(shard))
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
-    from stages import ingest
-
     console, to = Console(quiet), Output(output, overwrite)
     if options.in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.job import Work

@@ -12,6 +12,7 @@ import typer
 from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json, Overwrite
 from schemas.errors import ArtefactError
+from schemas.files.outputs import write_json
 
 if TYPE_CHECKING:
     from schemas.provenance import Step
@@ -26,7 +27,6 @@ def command(
     overwrite: Overwrite = False,
 ) -> None:
     """Say what an artefact is, who made it and from what; check it against its schema."""
-    from schemas import write_json
     from schemas.provenance import chain
     from schemas.rasters import raster_kind
 

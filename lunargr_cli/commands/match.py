@@ -7,8 +7,11 @@ from typing import Annotated
 
 import typer
 
+from lunargr_cli.console import Console
 from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Seed, configure
 from lunargr_cli.paths import Writes
+from schemas.files.outputs import Output
+from stages import match
 from stages.match import Config
 
 NAME, ORDER = "match", 71
@@ -53,16 +56,12 @@ def command(
     beside Hapke matched to each crop's range, as in the Lunar-G2R paper.
     """
     config = configure(Config, locals(), matchers=tuple(matchers or Config.matchers))
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
-    from stages import match
     from stages.match.stage import result_lines
 
     console = Console(quiet)
     to = Output(overwrite=overwrite, json=json_file, figures=figures)
     result = match.run(files, to, config, console.say, console.progress)
-    columns, cells = result_lines(result)
     extent = f"{result['crops']} picture(s) of 512 x 384 on {result['tiles']} ground tile(s)"
-    console.table(f"matching consistency over {extent}", columns, cells)
+    console.table(f"matching consistency over {extent}", *result_lines(result))
     if figures is not None:
         console.say(f"written: {figures}/")

@@ -7,8 +7,11 @@ from typing import Annotated
 
 import typer
 
+from lunargr_cli.console import Console
 from lunargr_cli.options import Overwrite, Quiet
 from lunargr_cli.paths import Writes
+from schemas.files.outputs import Output
+from stages import merge
 from stages.merge import Config
 
 NAME, ORDER = "merge", 89
@@ -26,10 +29,6 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Join the parts that shards wrote into the artefact that one run would have written."""
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
-    from stages import merge
-
     console = Console(quiet)
     schema = merge.run(parts, Output(output, overwrite), Config(virtual), console.say, console.progress)
     console.say(f"{output}: {len(parts)} parts of '{schema.name}' merged")

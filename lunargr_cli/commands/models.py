@@ -8,6 +8,8 @@ import typer
 
 from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json, Overwrite
+from schemas.files.outputs import write_json
+from schemas.later import import_when_used
 
 NAME, ORDER = "models", 85
 
@@ -25,15 +27,11 @@ def command(
     overwrite: Overwrite = False,
 ) -> None:
     """List the reflectance models: parameters, bounds, units, defaults, reference, reciprocal or not."""
-    from schemas.later import import_when_used
-
     import_when_used("torch")  # half of this command's time; what is listed here needs none of it
     from stages.physics.photometry import catalogue, get_model
 
     chosen = None if name is None else get_model(name)
     if json_file is not None:
-        from schemas import write_json
-
         write_json(json_file, catalogue.as_dict())
     if markdown:
         write_out(catalogue.markdown())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,18 +12,20 @@ import typer
 import typer.core
 
 from lunargr_cli import options
+from lunargr_cli.console import Console
 from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
+from schemas.files.outputs import Output, atomic_path
+from stages import project
 from stages.project import Config
 
 if TYPE_CHECKING:
-    from lunargr_cli.console import Console
     from stages.project import Registered
 
 NAME, ORDER = "project", 40
 
 
-class CLASS(typer.core.TyperCommand):
+class RegisterTakesNoValue(typer.core.TyperCommand):
     """``--register`` alone means ``--register constant``: typer knows no option whose value may be left out."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -33,6 +36,9 @@ class CLASS(typer.core.TyperCommand):
             if word == "--register" and not _is_value(args[k + 1 : k + 2]):
                 full.append("constant")
         return super().parse_args(ctx, full)
+
+
+CLASS = RegisterTakesNoValue
 
 
 def _is_value(following: list[str]) -> bool:
@@ -75,15 +81,9 @@ def command(
 ) -> None:
     """Orthorectify the images onto the crops; add the Sun, the camera and the terrain's horizon."""
     config = options.configure(Config, locals(), scene=str(scene) if scene else None, shard=options.parse_shard(shard))
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output, Target, check_outputs
-    from stages import project
-
     console, to = Console(quiet), Output(output, overwrite)
-    if blocks_csv is not None:
-        if register is None:
-            raise typer.BadParameter("needs --register", param_hint="--shifts")
-        check_outputs([Target(output), Target(blocks_csv, "blocks_csv")], [crops], overwrite)
+    if blocks_csv is not None and register is None:
+        raise typer.BadParameter("needs --register", param_hint="--shifts")
     if options.in_parts(scheduler, resume, parts, shard):
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_project
@@ -141,10 +141,6 @@ def _say_registered(console: Console, registered: Sequence[Registered]) -> None:
 
 def _write_blocks(path: Path, registered: Sequence[Registered]) -> None:
     """One row per block: where it is on the scene's grid, and what it said."""
-    import csv
-
-    from schemas.files.outputs import atomic_path
-
     with atomic_path(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         out = csv.writer(file)
         out.writerow(["image_id", "row", "col", "dx_px", "dy_px", "sigma_px", "correlation", "lead", "refused"])

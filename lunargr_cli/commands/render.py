@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from lunargr_cli.console import Console
 from lunargr_cli.options import BodyOption, Json, Overwrite, Quiet, Resume, Seed, Shard, configure, parse_shard
 from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
-from stages.render import Config, StereoConfig
-
-if TYPE_CHECKING:
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
-    from stages.render import Summary
+from schemas.files.outputs import Output, write_json
+from stages import render
+from stages.render import Config, StereoConfig, Summary
 
 NAME, ORDER = "render", 60
 CONVERGENCE = ",".join(f"{edge:g}" for edge in StereoConfig.convergence_deg)
@@ -179,7 +177,7 @@ def command(
         raise ConfigError("render: expected a reflectance map (svbrdf.h5) or --dem DEM, one of the two.")
     if parameters and dem is None:
         raise ConfigError("--parameters: expected together with --dem; an svbrdf.h5 holds its own coefficients.")
-    told = {
+    converted = {
         "view": "pinhole" if camera or trajectory else view,
         "position": _numbers(position, "--position", (3,)),
         "look_at": _numbers(look_at, "--look-at", (2, 3)),
@@ -191,11 +189,7 @@ def command(
         "extend": str(extend) if extend else None,
         "shard": parse_shard(shard),
     }
-    config = configure(Config, locals(), **told)
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
-    from stages import render
-
+    config = configure(Config, locals(), **converted)
     console, to = Console(quiet), Output(output, overwrite, resume, json=json_file)
     if stereo is None and altitude is not None:
         raise ConfigError("--altitude: expected together with --stereo; a single view has its height in --position.")
@@ -255,8 +249,6 @@ def _row(result: Summary) -> tuple[str, ...]:
 
 
 def _write_json(path: Path, results: list[Summary]) -> None:
-    from schemas import write_json
-
     def finite(value: float) -> float | None:
         return value if math.isfinite(value) else None
 
@@ -279,6 +271,7 @@ def _write_json(path: Path, results: list[Summary]) -> None:
 
 
 def _numbers(text: str | None, option: str, counts: tuple[int, ...]) -> tuple[float, ...] | None:
+    """'3.6,25.8' -> (3.6, 25.8), as many numbers as one of ``counts``; None -> None. Raises ConfigError."""
     if text is None:
         return None
     try:
@@ -293,21 +286,20 @@ def _numbers(text: str | None, option: str, counts: tuple[int, ...]) -> tuple[fl
 
 
 def _size(text: str) -> tuple[int, int]:
+    """'640,480' or '640x480' -> (640, 480). Raises ConfigError."""
     width, _, height = text.replace("x", ",").partition(",")
-    good = all(edge.strip().isdecimal() and len(edge.strip()) <= 10 and int(edge) > 0 for edge in (width, height))
-    if not good:
+    if not all(edge.strip().isdecimal() and len(edge.strip()) <= 10 and int(edge) > 0 for edge in (width, height)):
         raise ConfigError(f"--size: expected W,H in pixels, found '{text}'.")
     return int(width), int(height)
 
 
 def _parameters(items: list[str]) -> dict[str, float]:
+    """['w=0.25,b=0.3'] -> {'w': 0.25, 'b': 0.3}. Raises ConfigError."""
     result: dict[str, float] = {}
     for item in (part for text in items for part in text.split(",") if part.strip()):
-        name, equals, value = item.partition("=")
+        name, _, value = item.partition("=")
         try:
             result[name.strip()] = float(value)
         except ValueError:
             raise ConfigError(f"--parameters: expected NAME=VALUE with a number, found '{item}'.") from None
-        if not equals:
-            raise ConfigError(f"--parameters: expected NAME=VALUE, found '{item}'.")
     return result

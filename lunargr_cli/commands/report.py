@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
+from lunargr_cli.console import Console
 from lunargr_cli.options import OutputFile, Overwrite, Quiet
+from schemas.files.outputs import Output
+from stages import report
 from stages.report import Config
 
 NAME, ORDER = "report", 85
@@ -28,10 +31,6 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Put maps, tables, curves and pictures of a run on one HTML page that needs nothing else, in light or dark."""
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
-    from stages import report
-
     console = Console(quiet)
     titles = report.run(files, Output(output, overwrite), Config(title), console.say, console.progress)
     console.say(f"{output}: {', '.join(titles)}")

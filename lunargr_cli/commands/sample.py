@@ -8,7 +8,10 @@ from typing import Annotated
 import typer
 
 from lunargr_cli import options
+from lunargr_cli.console import Console
 from schemas.errors import ConfigError
+from schemas.files.outputs import Output
+from stages import sample
 from stages.sample import Config
 
 NAME, ORDER = "sample", 30
@@ -56,10 +59,6 @@ def command(
 ) -> None:
     """Choose crop centres per image and split them by ground tile, with no ground shared between the parts."""
     config = options.configure(Config, locals(), split=_shares(split), shard=options.parse_shard(shard))
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
-    from stages import sample
-
     console, to = Console(quiet), Output(output, overwrite)
     if options.in_parts(scheduler, False, parts, shard):
         from lunargr_cli.fanout.job import Work

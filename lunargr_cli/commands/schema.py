@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.console import Console, write_out
+from schemas import SCHEMAS, get_schema
 
 NAME, ORDER = "schema", 91
 
@@ -15,8 +16,6 @@ def command(
     name: Annotated[str | None, typer.Argument(help="scene, crops, pairs, ...; nothing lists them all.")] = None,
 ) -> None:
     """Print what an artefact holds: dimensions, variables, units, attributes."""
-    from schemas import SCHEMAS, get_schema
-
     console = Console()
     if name is None:
         rows = [(s.name, f"lunargr {s.stage}", s.title) for s in SCHEMAS.values()]

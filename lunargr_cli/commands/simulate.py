@@ -11,6 +11,7 @@ from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json, Overwrite, Quiet
 from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
+from schemas.files.outputs import Output, write_json
 from stages import simulate
 from stages.simulate import Config
 
@@ -68,9 +69,6 @@ def command(
     if print_recipe:
         write_out(simulate.recipe_json(config))
         return
-    from schemas import write_json
-    from schemas.files.outputs import Output
-
     console = Console(quiet)
     summary = simulate.run(Output(output, overwrite), config, console.say, console.progress)
     rows = [

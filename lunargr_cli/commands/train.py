@@ -8,6 +8,9 @@ from typing import Annotated
 import typer
 
 from lunargr_cli import options
+from lunargr_cli.console import Console
+from schemas.files.outputs import Output
+from stages import train
 from stages.train import Config
 
 NAME, ORDER = "train", 50
@@ -33,10 +36,10 @@ def command(
     batch: options.Batch = Config.batch,
     lr: options.LearningRate = Config.lr,
     schedule: options.Schedule = Config.schedule,
-    widths: options.Widths = options.dashed(Config.widths),
+    widths: options.Widths = options.join_numbers(Config.widths),
     dropout: Annotated[
         str, typer.Option("--dropout", help="Dropout of each stage, or one for all; Lunar-G2R: 0.1-0.1-0.2-0.2-0.3.")
-    ] = options.dashed(Config.dropout),
+    ] = options.join_numbers(Config.dropout),
     brightness: Annotated[
         float,
         typer.Option(
@@ -64,10 +67,6 @@ def command(
         "dropout": options.read_numbers("--dropout", dropout, float),
     }
     config = options.configure(Config, locals(), **texts, **numbers)
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
-    from stages import train
-
     console = Console(quiet)
     found = train.run(pairs, Output(output, overwrite, resume), config, console.say, console.progress)
     best = found.history.best_epoch

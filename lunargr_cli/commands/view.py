@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
+from lunargr_cli.console import Console
 from lunargr_cli.options import OutputFile, Overwrite, Quiet, configure
+from schemas.files.outputs import Output
+from stages import view
 from stages.view import Config
 
 NAME, ORDER = "view", 61
@@ -42,10 +45,6 @@ def command(
     lunargr view svbrdf.h5 --pairs pairs.h5 -o view.html
     """
     config = configure(Config, locals())
-    from lunargr_cli.console import Console
-    from schemas.files.outputs import Output
-    from stages import view
-
     console = Console(quiet)
     made = view.run(source, pairs, Output(output, overwrite), config, console.say, console.progress)
     smaller = f", means of {made.factor} x {made.factor} px" if made.factor > 1 else ""

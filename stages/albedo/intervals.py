@@ -77,7 +77,7 @@ def _unseen_widths(residual: Floats32, place: NDArray[np.intp], image: NDArray[n
 
 def _widths(residual: Floats32, place: NDArray[np.intp], image: NDArray[np.intp], bins: int) -> Floats:
     """(2, bins) quantiles of residuals, those of the neighbours where a bin has too few; arguments as above."""
-    result = np.tile(np.quantile(residual, SHARES)[:, None], bins)
+    result = np.tile(np.quantile(residual.astype(float), SHARES)[:, None], bins)
     enough = [k for k in range(bins) if _is_enough(image[place == k])]
     if enough:
         quantiles = [np.quantile(residual[place == k], SHARES) for k in enough]

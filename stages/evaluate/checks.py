@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from schemas import CHECKPOINT, SPLITS, ArtefactError, ConfigError, RegistryError, open_artefact, read_config
+from schemas.files.outputs import Output
 from stages.effects.extension import check_ground
 from stages.evaluate.config import Config
 from stages.evaluate.rows import layout
-from stages.network.predictor import Predictor
+from stages.evaluate.task import Task
 from stages.pairs.reader import PairReader
 
 
@@ -29,18 +31,27 @@ def check(config: Config) -> None:
             raise RegistryError.unknown("row of the evaluation", name, known)
 
 
-def check_runs(checkpoints: Sequence[Path], predictors: Sequence[Predictor], reader: PairReader) -> None:
-    """Several checkpoints are training runs of one model from different seeds, in the units of the pairs."""
+def report_files(output: Output) -> list[Path]:
+    """The JSON beside the output, and where it was asked for."""
+    beside, wanted = output.file.with_suffix(".json"), output.json
+    return [beside] if wanted is None or os.path.realpath(wanted) == os.path.realpath(beside) else [beside, wanted]
+
+
+def check_runs(checkpoints: Sequence[Path], task: Task) -> None:
+    """Several checkpoints are training runs of one model from different seeds, in the units of the pairs.
+
+    Raises ArtefactError, ConfigError.
+    """
     seeds: dict[int, Path] = {}
-    for path, predictor in zip(checkpoints, predictors, strict=True):
-        if reader.units == "iof" and predictor.image_units == "dn":
+    for path, predictor in zip(checkpoints, task.predictors, strict=True):
+        if task.calibrated and predictor.image_units == "dn":
             raise ArtefactError(
-                f"{path}: expected a checkpoint trained on I/F images as in {reader.path.name}, found one trained on "
+                f"{path}: expected a checkpoint trained on I/F images as in {task.reader.path.name}, found one trained on "
                 "DN, whose brightness scale is arbitrary; train on these pairs."
             )
-        if predictor.model.name != predictors[0].model.name:
+        if predictor.model.name != task.predictors[0].model.name:
             raise ConfigError(
-                f"{path}: expected another training run of {predictors[0].model.name} as in {checkpoints[0].name}, found "
+                f"{path}: expected another training run of {task.predictors[0].model.name} as in {checkpoints[0].name}, found "
                 f"{predictor.model.name}; 'lunargr compare' compares models."
             )
         seed = read_seed(path)
@@ -59,7 +70,7 @@ def read_seed(checkpoint: Path) -> int:
 
 
 def select(reader: PairReader, split: str) -> np.ndarray:
-    """Indices of the split's pairs. Raises ArtefactError where there are none, or none to fit the baselines on."""
+    """Indices of the split's pairs, (N,). Raises ArtefactError where there are none, or none to fit the baselines on."""
     counts = ", ".join(f"{name} {int((reader.split == value).sum())}" for name, value in SPLITS)
     for part, purpose in ((split, "to evaluate"), ("train", "to fit the baselines on")):
         if not len(reader.indices(part)):
@@ -69,15 +80,16 @@ def select(reader: PairReader, split: str) -> np.ndarray:
     return reader.indices(split)
 
 
-def notes(checkpoint: Path, predictor: Predictor, reader: PairReader, config: Config) -> list[str]:
+def limitations(checkpoint: Path, task: Task) -> list[str]:
     """What limits the comparison without forbidding it."""
+    predictor, reader, extend = task.predictors[0], task.reader, task.config.extend
     found = []
     if abs(predictor.gsd / reader.gsd - 1) > 0.01:
         found.append(f"the checkpoint was trained at {predictor.gsd:g} m per pixel, these pairs have {reader.gsd:g} m")
     with open_artefact(checkpoint, CHECKPOINT) as file:
         trained_with = read_config(file).get("extend")
-    if trained_with and not config.extend:
+    if trained_with and not extend:
         found.append(f"the checkpoint was trained with the effects of '{Path(trained_with).name}': add `extend`")
     if read_config(reader.file).get("register"):
         found.append("the images were registered on ground of every part of the split, the scored one included")
-    return found + (check_ground(Path(config.extend), reader.path) if config.extend else [])
+    return found + (check_ground(Path(extend), reader.path) if extend else [])

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from schemas import CHECKPOINT, atomic_path, open_artefact
-from stages.evaluate.core import Scores
-from stages.evaluate.renderers import Batch, Reader, read_batch
+from stages.evaluate.renderers import Batch, read_batch
 from stages.evaluate.rows import TITLES, Row
+from stages.evaluate.scores import Scores
+from stages.evaluate.task import Task
 
 DPI = 130
 COLOURS = {
@@ -27,36 +28,25 @@ DRAWN = (
 
 
 def write_figures(
-    folder: Path,
-    reader: Reader,
-    rows: list[Row],
-    indices: np.ndarray,
-    scores: Scores,
-    scale: float,
-    result: dict[str, Any],
-    checkpoint: Path,
-) -> list[Path]:
-    """Write all figures as PNG into ``folder`` and return their paths."""
+    folder: Path, task: Task, rows: list[Row], scores: Scores, scale: float, result: dict[str, Any], checkpoint: Path
+) -> None:
+    """Write all figures as PNG into ``folder``. rows, scores : one for each name; scale : full range of DN"""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    written = []
-
     def save(figure: Any, name: str) -> None:
         with atomic_path(folder / name) as partial:
             figure.savefig(partial, dpi=DPI, bbox_inches="tight", facecolor="white")
         plt.close(figure)
-        written.append(folder / name)
 
     save(training_curves(checkpoint), "training_curves.png")
     save(error_chart(result), "errors.png")
     units = "I/F" if result["image_units"] == "iof" else "share of the DN range"
     for label, position in exemplary_crops(scores).items():
-        batch = read_batch(reader, indices[position : position + 1], scale)
+        batch = read_batch(task.reader, task.wanted[position : position + 1], scale)
         save(crop_figure(batch, rows, scores, position, label, units), f"crop_{label}.png")
-    return written
 
 
 def exemplary_crops(scores: Scores) -> dict[str, int]:
@@ -117,7 +107,7 @@ def crop_figure(batch: Batch, rows: list[Row], scores: Scores, position: int, la
     usable = batch.usable[0].numpy()
     measured = np.where(usable, batch.image[0].numpy(), np.nan)
     low, high = np.nanpercentile(measured, (0.5, 99.5))
-    learned = np.where(usable, measured - rows[0].renderer.image(batch, rows[0].how)[0].numpy(), np.nan)
+    learned = np.where(usable, measured - rows[0].renderer.image(batch, rows[0].matching)[0].numpy(), np.nan)
     spread = float(np.nanpercentile(np.abs(learned), 99)) or 1e-6
     drawn = [k for k, row in enumerate(rows) if k == 0 or row.name in DRAWN]
     columns = len(drawn) + 1
@@ -129,7 +119,7 @@ def crop_figure(batch: Batch, rows: list[Row], scores: Scores, position: int, la
     axes[1, 0].set_title("elevation", fontsize=8)
     for column, k in enumerate(drawn, start=1):
         row = rows[k]
-        rendered = np.where(usable, row.renderer.image(batch, row.how)[0].numpy(), np.nan)
+        rendered = np.where(usable, row.renderer.image(batch, row.matching)[0].numpy(), np.nan)
         axes[0, column].imshow(rendered, cmap=greys, vmin=low, vmax=high)
         axes[0, column].set_title(row.name.replace("_", " "), fontsize=8, wrap=True)
         residual = axes[1, column].imshow(measured - rendered, cmap=differences, vmin=-spread, vmax=spread)

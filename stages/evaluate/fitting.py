@@ -8,9 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-import stages.evaluate.fit as fit
-from stages.evaluate.renderers import Batch, Constant, Reader, Renderer, batches, read_batch, unit_images
+from stages.evaluate.least_squares import (
+    FrameGram,
+    PixelSample,
+    fit_nonlinear,
+    sample_gram,
+    solve_coefficients,
+    solve_gain_offset,
+    solve_uncalibrated,
+)
+from stages.evaluate.renderers import Batch, Constant, Renderer, batches, read_batch, unit_images
 from stages.evaluate.rows import HAPKE_FREE, Row
+from stages.pairs.reader import PairReader
 from stages.physics.formation.radiometry import full_scale
 
 SAMPLE_PIXELS = 100_000  # for sets that are fitted to a random sample
@@ -21,10 +30,11 @@ LEVENBERG_PIXELS = 20_000  # of these, for models that are not linear: a handful
 class Fitting:
     """What free parameters are fitted on.
 
-    train, orphans : indices of pairs; frames : how many images there are; scale : full range of DN; size : pairs at a time
+    train : indices of train pairs; orphans : indices of scored pairs of images that no train pair shows
+    frames : how many images there are; scale : full range of DN, 1 for calibrated images; size : pairs at a time
     """
 
-    reader: Reader
+    reader: PairReader
     train: np.ndarray
     orphans: np.ndarray
     frames: int
@@ -39,12 +49,12 @@ class Fitting:
         return len(self.train) if self.calibrated else 2 * len(self.train) + len(self.orphans)
 
 
-def choose_fit_pairs(reader: Reader, wanted: np.ndarray, limit: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Train pairs to fit on, and pairs of ``wanted`` in frames that no train pair shows. Sorted indices.
+def choose_fit_pairs(reader: PairReader, wanted: np.ndarray, limit: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Train pairs to fit on, and pairs of ``wanted`` in images that no train pair shows; indices (n,) each, sorted.
 
     At most ``limit`` of each (0: all), drawn in proportion to the frames' pairs.
     """
-    split, frame = np.asarray(reader.split), np.asarray(reader.frame)
+    split, frame = reader.split, reader.frame
     train = np.flatnonzero(split == 0)
     orphans = wanted[~np.isin(frame[wanted], frame[train])]
     return _thin(train, frame, limit, seed), _thin(orphans, frame, limit, seed)
@@ -71,7 +81,7 @@ def fit_rows(data: Fitting, rows: Sequence[Row], tick: Callable[[int], None] = l
     _fit_sets(data, renderers, tick)
     if data.calibrated:
         return
-    grams = {r.name: (fit.FrameGram(1, data.frames), fit.FrameGram(1, data.frames)) for r in renderers}
+    grams = {r.name: (FrameGram(1, data.frames), FrameGram(1, data.frames)) for r in renderers}
     for part, indices in enumerate((data.train, data.orphans)):
         for chosen in batches(indices, data.size):
             batch = read_batch(data.reader, chosen, data.scale)
@@ -83,20 +93,20 @@ def fit_rows(data: Fitting, rows: Sequence[Row], tick: Callable[[int], None] = l
         known, own = grams[renderer.name]
         use_own = (known.pixels == 0)[:, None, None]
         joined = np.where(use_own, own.gram, known.gram)
-        renderer.gain, renderer.offset = fit.solve_gain_offset(joined, np.ones(1))
+        renderer.gain, renderer.offset = solve_gain_offset(joined, np.ones(1))
 
 
 def _fit_sets(data: Fitting, renderers: Sequence[Renderer], tick: Callable[[int], None]) -> None:
     """One coefficient set for all ground for every renderer that has one."""
     frames, calibrated = data.frames, data.calibrated
-    of = {r.name: r for r in renderers}
-    shared = [of[name] for name in ("global", "global_extended") if name in of]
+    by_name = {r.name: r for r in renderers}
+    shared = [by_name[name] for name in ("global", "global_extended") if name in by_name]
     exact = bool(shared) and shared[0].model.linear
-    sampled = ({"kernels", "hapke_fitted"} & set(of)) or (shared and not exact)
-    albedo = of.get("lunar_lambert") if calibrated else None  # of uncalibrated images the gains carry it
-    gram = fit.FrameGram(len(shared[0].model.parameters), frames) if exact else None
-    albedo_gram = fit.FrameGram(1, frames)
-    samples: list[fit.PixelSample] = []
+    sampled = ({"kernels", "hapke_fitted"} & set(by_name)) or (shared and not exact)
+    albedo = by_name.get("lunar_lambert") if calibrated else None  # of uncalibrated images the gains carry it
+    gram = FrameGram(len(shared[0].model.parameters), frames) if exact else None
+    albedo_gram = FrameGram(1, frames)
+    samples: list[PixelSample] = []
     rng = np.random.default_rng(data.seed)
     per_crop = max(1, SAMPLE_PIXELS // max(1, len(data.train)))
     for chosen in batches(data.train, data.size) if exact or sampled or albedo else ():
@@ -109,42 +119,40 @@ def _fit_sets(data: Fitting, renderers: Sequence[Renderer], tick: Callable[[int]
             samples.append(sample_pixels(batch, per_crop, rng))
         tick(len(chosen))
     if albedo is not None:
-        albedo.scale = float(fit.solve_coefficients(albedo_gram.gram)[0])
+        albedo.scale = float(solve_coefficients(albedo_gram.gram)[0])
     sample = _join(samples) if samples else None
     if gram is not None:
         found = Constant(_solve_linear(gram.gram, shared[0], calibrated))
     elif shared and sample is not None:
         thin = sample.thin(LEVENBERG_PIXELS)
-        found = Constant(fit.fit_nonlinear(shared[0].model, thin, calibrated))
+        found = Constant(fit_nonlinear(shared[0].model, thin, calibrated))
     for renderer in shared:
         renderer.coefficients = found
-    if "kernels" in of and sample is not None:
-        grams = fit.sample_gram(of["kernels"].model, sample, frames)
-        of["kernels"].coefficients = Constant(_solve_linear(grams, of["kernels"], calibrated))
-    if "hapke_fitted" in of and sample is not None:
-        hapke, thin = of["hapke_fitted"], sample.thin(LEVENBERG_PIXELS)
-        hapke.coefficients = Constant(fit.fit_nonlinear(hapke.model, thin, calibrated, HAPKE_FREE))
+    if "kernels" in by_name and sample is not None:
+        grams = sample_gram(by_name["kernels"].model, sample, frames)
+        by_name["kernels"].coefficients = Constant(_solve_linear(grams, by_name["kernels"], calibrated))
+    if "hapke_fitted" in by_name and sample is not None:
+        hapke, thin = by_name["hapke_fitted"], sample.thin(LEVENBERG_PIXELS)
+        hapke.coefficients = Constant(fit_nonlinear(hapke.model, thin, calibrated, HAPKE_FREE))
 
 
 def _solve_linear(gram: np.ndarray, renderer: Renderer, calibrated: bool) -> np.ndarray:
     if calibrated:
-        return fit.solve_coefficients(gram)
-    return fit.solve_uncalibrated(gram, np.array([p.default for p in renderer.model.parameters]))
+        return solve_coefficients(gram)
+    return solve_uncalibrated(gram, np.array([p.default for p in renderer.model.parameters]))
 
 
-def dn_scale(reader: Reader, indices: np.ndarray, size: int) -> float:
-    """Full DN range of the images from their largest valid value."""
+def dn_scale(reader: PairReader, indices: np.ndarray, size: int) -> float:
+    """Full DN range of the images from the largest valid value of the pairs ``indices``, read ``size`` at a time."""
     largest = 0.0
-    indices = np.unique(indices)
-    for start in range(0, len(indices), size):
-        chosen = indices[start : start + size]
-        valid = torch.as_tensor(reader.valid(chosen)).bool()
+    for chosen in batches(np.unique(indices), size):
+        valid = reader.valid(chosen)
         if valid.any():
-            largest = max(largest, float(torch.as_tensor(reader.image(chosen))[valid].max()))
+            largest = max(largest, float(reader.image(chosen)[valid].max()))
     return full_scale(largest)
 
 
-def sample_pixels(batch: Batch, per_crop: int, rng: np.random.Generator) -> fit.PixelSample:
+def sample_pixels(batch: Batch, per_crop: int, rng: np.random.Generator) -> PixelSample:
     """Up to ``per_crop`` usable pixels of every crop."""
     state = batch.state
     visibility = torch.ones_like(batch.image) if state.sun_visibility is None else state.sun_visibility
@@ -162,7 +170,7 @@ def sample_pixels(batch: Batch, per_crop: int, rng: np.random.Generator) -> fit.
 
     angles = state.angles
     frame = torch.as_tensor(batch.frame.astype(np.int64))[:, None, None]
-    return fit.PixelSample(
+    return PixelSample(
         take(angles.cos_incidence),
         take(angles.cos_emission),
         take(angles.cos_phase),
@@ -172,6 +180,6 @@ def sample_pixels(batch: Batch, per_crop: int, rng: np.random.Generator) -> fit.
     )
 
 
-def _join(samples: list[fit.PixelSample]) -> fit.PixelSample:
-    names = fit.PixelSample.__dataclass_fields__
-    return fit.PixelSample(**{n: torch.cat([getattr(s, n) for s in samples]) for n in names})
+def _join(samples: list[PixelSample]) -> PixelSample:
+    names = PixelSample.__dataclass_fields__
+    return PixelSample(**{n: torch.cat([getattr(s, n) for s in samples]) for n in names})

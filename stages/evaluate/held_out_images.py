@@ -10,7 +10,7 @@ import contextlib
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,10 @@ from schemas.reading import read_strings
 from stages.common.arrays import Floats
 from stages.common.intervals import ERROR, choose_units, gain_interval, ratio_interval
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.evaluate.checks import report_files
 from stages.evaluate.coverage import BANDS_DEG, count_within, shares
 from stages.evaluate.metrics import ssim
+from stages.evaluate.table import finite, gain_entry
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form, illuminate
 from stages.physics.formation.radiometry import crop_range, match_crops
@@ -50,8 +52,8 @@ class Config:
 
 
 @dataclass
-class Map:
-    """An open map with albedo. used : images that made it; suns : (n, 3) body-fixed unit vectors of theirs"""
+class AlbedoMap:
+    """An open map with albedo. used : images that made it; suns : (n, 3) body-fixed unit vectors towards their Suns"""
 
     path: Path
     file: h5py.File
@@ -59,14 +61,19 @@ class Map:
     suns: Floats
     error: AlbedoError
 
-    def crop(self, row: int, col: int, size: tuple[int, int]) -> tuple[torch.Tensor, torch.Tensor, NDArray]:
-        """(coefficients (1, C, h, w), albedo (1, h, w), elevation), NaN where unknown."""
-        top, left = row - size[0] // 2, col - size[1] // 2
-        part = np.s_[top : top + size[0], left : left + size[1]]
-        file = self.file
-        coefficients = torch.from_numpy(file["coefficients"][:, *part])[None]
-        albedo = torch.from_numpy(file["albedo"][part])[None]
-        return coefficients, albedo, file["elevation"][part]
+    def render(self, reader: PairReader, k: int) -> list[torch.Tensor]:
+        """I/F of pair ``k`` without and with albedo, (1, h, w) each, NaN where unknown."""
+        part = _part(reader, k)
+        coefficients = torch.from_numpy(self.file["coefficients"][:, *part])[None]
+        with torch.no_grad():
+            terrain = form(reader.observation([k]), get_model(str(self.file.attrs["model"])), coefficients).double()
+        return [terrain, terrain * torch.from_numpy(self.file["albedo"][part])[None]]
+
+
+def _part(reader: PairReader, k: int) -> tuple[slice, slice]:
+    """Rows and columns of the map that pair ``k`` shows."""
+    top, left = (int(reader.file[name][k]) - size // 2 for name, size in zip(("row", "col"), reader.size, strict=True))
+    return np.s_[top : top + reader.size[0], left : left + reader.size[1]]
 
 
 def run(
@@ -83,24 +90,30 @@ def run(
     Raises LunargrError.
     """
     output = Output.at(output)
-    reports = [output.file.with_suffix(".json"), *([output.json] if output.json else [])]
+    reports = report_files(output)
     for path in (output.file, *reports):
         check_output(path, [pairs, *maps], output.overwrite)
     with PairReader(pairs) as reader, contextlib.ExitStack() as stack:
         opened = [_open(path, reader, stack) for path in maps]
         chosen = _choose(reader, opened, config.split)
         sizes = {"model": len(ROWS), "pair": len(chosen), "y": reader.size[0], "x": reader.size[1]}
-        inputs = [pairs, *maps]
-        settings = {"split": config.split, "seed": config.seed, "held_out_images": True}
+        settings = asdict(config) | {"held_out_images": True}
         with ArtefactWriter(
-            output.file, EVALUATION, sizes, config=settings, inputs=inputs, seed=config.seed, overwrite=output.overwrite
+            output.file,
+            EVALUATION,
+            sizes,
+            config=settings,
+            inputs=[pairs, *maps],
+            seed=config.seed,
+            overwrite=output.overwrite,
         ) as writer:
             scores = _score(reader, opened, chosen, writer, progress)
             result = _conclude(reader, opened, chosen, scores, config)
             result |= {"pairs_file": pairs.name, "maps": [path.name for path in maps]}
             writer.write("model_name", ROWS)
-            writer.write("pair_index", np.array([k for k, _ in chosen]))
-            writer.write("tile", reader.tile[[k for k, _ in chosen]])
+            numbers = [k for k, _ in chosen]
+            writer.write("pair_index", numbers)
+            writer.write("tile", reader.tile[numbers])
             writer.write("valid_pixels", scores["pixels"])
             writer.write("mse", scores["squares"] / np.maximum(scores["pixels"], 1))
             writer.write("ssim", scores["ssim"])
@@ -112,7 +125,7 @@ def run(
     return result
 
 
-def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> Map:
+def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> AlbedoMap:
     """A map with albedo on the ground of the pairs. Raises ArtefactError."""
     file = stack.enter_context(open_artefact(path, SVBRDF))
     if "albedo" not in file:
@@ -125,32 +138,28 @@ def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> Map:
         raise ArtefactError(
             f"{path}: expected albedo_std and albedo_image_std beside the albedo, found none; run 'lunargr albedo' again."
         )
-    found = Map(path, file, read_strings(file, "albedo_image_id"), suns, error)
     for name in ("row", "col"):
         if name not in reader.file:
             raise ArtefactError(
                 f"{reader.path}:/{name}: expected where on the map a pair lies, found nothing; project again."
             )
-    row, col = int(reader.file["row"][0]), int(reader.file["col"][0])
-    height = found.crop(row, col, reader.size)[2]
-    mine = reader.file["elevation"][0]
-    same = height.shape == mine.shape and not np.nanmax(np.abs(height - mine), initial=0.0) > SAME_GROUND * reader.gsd
+    of_map, of_pair = file["elevation"][_part(reader, 0)], reader.file["elevation"][0]
+    same = of_map.shape == of_pair.shape
+    same = same and not np.nanmax(np.abs(of_map - of_pair), initial=0.0) > SAME_GROUND * reader.gsd
     if not same or abs(float(file.attrs["gsd_m"]) - reader.gsd) > 1e-6 * reader.gsd:
         raise ArtefactError(
             f"{path}: expected a map of the scene of {reader.path}, found other ground at its first pair."
         )
-    return found
+    return AlbedoMap(path, file, read_strings(file, "albedo_image_id"), suns, error)
 
 
-def _choose(reader: PairReader, maps: Sequence[Map], split: str) -> list[tuple[int, int]]:
+def _choose(reader: PairReader, maps: Sequence[AlbedoMap], split: str) -> list[tuple[int, int]]:
     """(pair, map) of what may be scored. Raises ArtefactError where every image made the albedo."""
     chosen = []
     for k in reader.indices(split):
         name = reader.image_ids[reader.frame[k]]
-        for number, one in enumerate(maps):
-            if name not in one.used:
-                chosen.append((int(k), number))
-                break
+        unseen = [number for number, albedo_map in enumerate(maps) if name not in albedo_map.used]
+        chosen += [(int(k), number) for number in unseen[:1]]
     if not chosen:
         raise ArtefactError(
             f"{maps[0].path}: expected pairs of split '{split}' whose image did not make the albedo, found none; "
@@ -160,10 +169,17 @@ def _choose(reader: PairReader, maps: Sequence[Map], split: str) -> list[tuple[i
 
 
 def _score(
-    reader: PairReader, maps: Sequence[Map], chosen: Sequence[tuple[int, int]], writer: ArtefactWriter, progress: Any
+    reader: PairReader,
+    maps: Sequence[AlbedoMap],
+    chosen: Sequence[tuple[int, int]],
+    writer: ArtefactWriter,
+    progress: Any,
 ) -> dict[str, NDArray]:
-    """Sums of squares (rows, pairs), pixels, ssim, nearest Suns (rad); ``within`` (3, bands, pairs): pixels
-    by incidence, and of those the ones within the 68 and the 95 % intervals.
+    """Scores of the chosen (pair, map) by name, and the measured and rendered crops into ``writer``.
+
+    squares : (rows, pairs) sums of squared errors; ssim : (rows, pairs); pixels : (pairs,) valid ones
+    sun : (pairs,) rad, from the pair's Sun to the nearest of those whose images made the albedo
+    within : (3, bands, pairs), see ``coverage.count_within``
     """
     count = len(chosen)
     found: dict[str, NDArray] = {
@@ -174,21 +190,20 @@ def _score(
         "sun": np.zeros(count),
     }
     measured_out, rendered_out = writer.dataset("measured"), writer.dataset("rendered")
-    scales: dict[tuple[int, int], list[tuple[float, float]]] = {}
+    scales: dict[tuple[int, int], list[tuple[float, float]]] = {}  # of images in DN, by (image, map)
     for n, (k, number) in enumerate(chosen):
         progress(n, count, "held-out crops")
-        one = maps[number]
-        if reader.units == "dn" and (int(reader.frame[k]), number) not in scales:
-            scales[int(reader.frame[k]), number] = _image_scales(reader, one, int(reader.frame[k]))
-        pictures = _pictures(reader, one, k)
+        albedo_map, frame = maps[number], int(reader.frame[k])
+        pictures = albedo_map.render(reader, k)
         measured, valid = reader.image([k]).double(), reader.valid([k])
         valid &= torch.isfinite(pictures[1]) & torch.isfinite(pictures[0])
         if reader.units == "dn":
-            gains = scales[int(reader.frame[k]), number]
-            pictures = [p * gain + offset for p, (gain, offset) in zip(pictures, gains, strict=True)]
+            if (frame, number) not in scales:
+                scales[frame, number] = _image_scales(reader, albedo_map, frame)
+            pictures = [p * gain + offset for p, (gain, offset) in zip(pictures, scales[frame, number], strict=True)]
         pictures += [match_crops(torch.nan_to_num(p), measured, valid, "gain_offset") for p in pictures]
         mask = valid[0].numpy()
-        found["pixels"][n], found["sun"][n] = mask.sum(), _nearest_sun(reader, one, k)
+        found["pixels"][n], found["sun"][n] = mask.sum(), _nearest_sun(reader, albedo_map.suns, k)
         measured_out[n] = np.where(mask, measured[0].numpy(), np.nan)
         spread = float(crop_range(measured, valid)[0])
         for row, picture in enumerate(pictures):
@@ -198,35 +213,25 @@ def _score(
             found["ssim"][row, n] = ssim(measured[0].numpy(), np.nan_to_num(values), mask, data_range=spread)
         if reader.units == "iof":
             away = np.abs(pictures[1][0].numpy() - measured[0].numpy())
-            widths, incidence = _intervals(reader, one, k, pictures[1][0].numpy())
+            widths, incidence = _intervals(reader, albedo_map.error, k, pictures[1][0].numpy())
             away[~mask] = np.nan
             found["within"][:, :, n] = count_within(away, widths, incidence)
     return found
 
 
-def _pictures(reader: PairReader, one: Map, k: int) -> list[torch.Tensor]:
-    """I/F of the map without and with albedo, (1, h, w)."""
-    row, col = int(reader.file["row"][k]), int(reader.file["col"][k])
-    coefficients, albedo, _ = one.crop(row, col, reader.size)
-    with torch.no_grad():
-        terrain = form(reader.observation([k]), get_model(str(one.file.attrs["model"])), coefficients).double()
-    return [terrain, terrain * albedo]
-
-
-def _intervals(reader: PairReader, one: Map, k: int, rendered: NDArray) -> tuple[list[NDArray], NDArray]:
+def _intervals(reader: PairReader, error: AlbedoError, k: int, rendered: NDArray) -> tuple[list[NDArray], NDArray]:
     """Half-widths (h, w), I/F, of the 68 and 95 % intervals of an unseen image about ``rendered``; incidence (h, w), rad."""
-    row, col = int(reader.file["row"][k]), int(reader.file["col"][k])
-    height, width = reader.size
     state = illuminate(reader.observation([k]))
     cosine = state.angles.cos_incidence[0].numpy()
     visible = np.ones_like(cosine) if state.sun_visibility is None else state.sun_visibility[0].numpy()
     shadow = np.where(cosine > 0, 1 - visible, 1) > SHADOWED
     sine = max(0.0, float(reader.file["sun_direction_enu"][k][2]))
-    widths = one.error.half_widths(row - height // 2, col - width // 2, rendered, cosine, shadow, sine)
+    rows, cols = _part(reader, k)
+    widths = error.half_widths(rows.start, cols.start, rendered, cosine, shadow, sine)
     return widths, np.arccos(np.clip(cosine, -1.0, 1.0))
 
 
-def _image_scales(reader: PairReader, one: Map, frame: int) -> list[tuple[float, float]]:
+def _image_scales(reader: PairReader, albedo_map: AlbedoMap, frame: int) -> list[tuple[float, float]]:
     """Gain and offset of an image in DN for both renderings, by least squares on its train pairs (all pairs if none)."""
     mine = np.flatnonzero(reader.frame == frame)
     train = np.intersect1d(mine, reader.indices("train"))
@@ -234,7 +239,7 @@ def _image_scales(reader: PairReader, one: Map, frame: int) -> list[tuple[float,
     fitted = fitted[:: max(1, len(fitted) // FIT_PAIRS)]
     columns: list[list[Floats]] = [[], [], []]
     for k in fitted:
-        pictures = _pictures(reader, one, int(k))
+        pictures = albedo_map.render(reader, int(k))
         valid = reader.valid([k]) & torch.isfinite(pictures[0]) & torch.isfinite(pictures[1])
         for column, picture in zip(columns, [*pictures, reader.image([k]).double()], strict=True):
             column.append(picture[valid].numpy())
@@ -247,8 +252,8 @@ def _image_scales(reader: PairReader, one: Map, frame: int) -> list[tuple[float,
     return scales
 
 
-def _nearest_sun(reader: PairReader, one: Map, k: int) -> float:
-    """Angle between a pair's Sun and the nearest of those whose images made the albedo, rad."""
+def _nearest_sun(reader: PairReader, suns: Floats, k: int) -> float:
+    """Angle between a pair's Sun and the nearest of ``suns`` (n, 3), body-fixed unit vectors; rad."""
     file = reader.file
     east, north, up = (float(v) for v in file["sun_direction_enu"][k])
     turn = math.radians(float(file["convergence_deg"][k])) if "convergence_deg" in file else 0.0
@@ -259,12 +264,12 @@ def _nearest_sun(reader: PairReader, one: Map, k: int) -> float:
     to_east = unit_vectors(lon + 90.0, 0.0)
     to_north = np.cross(zenith, to_east)
     sun = up * zenith + level * (math.sin(azimuth) * to_east + math.cos(azimuth) * to_north)
-    return float(np.arccos(np.clip(one.suns @ sun, -1.0, 1.0)).min())
+    return float(np.arccos(np.clip(suns @ sun, -1.0, 1.0)).min())
 
 
 def _conclude(
     reader: PairReader,
-    maps: Sequence[Map],
+    maps: Sequence[AlbedoMap],
     chosen: Sequence[tuple[int, int]],
     scores: dict[str, NDArray],
     config: Config,
@@ -278,18 +283,12 @@ def _conclude(
     models = {}
     for k, name in enumerate(ROWS):
         mse = ratio_interval(scores["squares"][k], pixels, unit, ERROR)
-        models[name] = {"mse": mse.value, "mse_low": _known(mse.low), "mse_high": _known(mse.high)}
-        models[name]["ssim"] = _known(float(np.nanmean(scores["ssim"][k])))
+        models[name] = {"mse": mse.value, "mse_low": finite(mse.low), "mse_high": finite(mse.high)}
+        models[name]["ssim"] = finite(float(np.nanmean(scores["ssim"][k])))
     gains = {}
     for ours, other in ((1, 0), (3, 2)):
         gain = gain_interval(scores["squares"][ours], scores["squares"][other], unit)
-        gains[ROWS[ours]] = {
-            ROWS[other]: {
-                "gain_percent": gain.value,
-                "gain_percent_low": _known(gain.low),
-                "gain_percent_high": _known(gain.high),
-            }
-        }
+        gains[ROWS[ours]] = {ROWS[other]: gain_entry(gain)}
     suns = np.degrees(scores["sun"])
     images = []
     for frame in np.unique(reader.frame[numbers]):
@@ -312,12 +311,8 @@ def _conclude(
         "image_units": reader.units,
         "nearest_used_sun_deg": {"least": float(suns.min()), "mean": float(suns.mean()), "most": float(suns.max())},
         "coverage_percent": None if reader.units == "dn" else shares(scores["within"].sum(axis=2)),
-        "used_images": [one.used for one in maps],
+        "used_images": [albedo_map.used for albedo_map in maps],
     }
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:

@@ -14,13 +14,12 @@ import numpy as np
 from schemas import write_json
 from schemas.files.hdf5 import silence_hdf5
 from schemas.files.outputs import atomic_path
-from stages.evaluate.comparison import Task, load_predictors, make_task
 from stages.evaluate.config import Config
-from stages.evaluate.core import PER_ROW, Scores, score
 from stages.evaluate.fitting import fit_rows
-from stages.evaluate.perceptual import Perceptual
 from stages.evaluate.renderers import Constant
 from stages.evaluate.rows import Row
+from stages.evaluate.scores import PER_ROW, Scores, score
+from stages.evaluate.task import Task, make_task
 from stages.pairs.reader import PairReader
 
 # (what, function, its arguments for every part, suffix) -> the parts that function(path, **arguments) wrote, in order
@@ -48,7 +47,7 @@ class Kept:
 def score_in_parts(
     task: Task, pairs: Path, checkpoints: Sequence[Path], fan: Fan, kept: Kept
 ) -> tuple[list[Row], Scores, float]:
-    """Fit once, then score some crops in every part. Returns rows, their scores, and the scale of DN."""
+    """Fit once, then score some crops in every part. Returns rows, their scores, and the full range of DN."""
     config = task.config
     if config.extend:
         config = replace(config, extend=str(Path(config.extend).resolve()))
@@ -65,9 +64,9 @@ def score_in_parts(
 
 
 def write_fit(path: Path, pairs: Path, checkpoints: Sequence[Path], config: Config, wanted: np.ndarray) -> None:
-    """Fit what is free and write it as JSON: numbers survive that to the last bit."""
+    """Fit what is free and write it as JSON: numbers survive that to the last bit. wanted : indices of the scored pairs (N,)"""
     with PairReader(pairs) as reader:
-        task = make_task(reader, load_predictors(checkpoints, config), wanted, config)
+        task = make_task(reader, checkpoints, wanted, config)
         rows, fitting = task.rows(), task.fitting()
         fit_rows(fitting, rows)
     numbers = {
@@ -85,7 +84,7 @@ def write_fit(path: Path, pairs: Path, checkpoints: Sequence[Path], config: Conf
 
 
 def read_fit(path: Path, rows: Sequence[Row]) -> float:
-    """Set the renderers of ``rows`` to what was fitted; returns the DN scale."""
+    """Set the renderers of ``rows`` to what was fitted; returns the full range of DN."""
     found = json.loads(path.read_text())
     for row in rows:
         renderer, numbers = row.renderer, found["renderers"][row.renderer.name]
@@ -107,10 +106,10 @@ def write_scores(
     wanted: np.ndarray,
     renderings: bool,
 ) -> None:
-    """Score every row on the crops ``wanted``."""
+    """Score every row on the crops ``wanted`` (n,) and write the scores and the crops; fitted : from :func:`write_fit`."""
     silence_hdf5()
     with PairReader(pairs) as reader, atomic_path(path) as partial, h5py.File(partial, "w") as file:
-        rows = make_task(reader, load_predictors(checkpoints, config), wanted, config).rows()
+        rows = make_task(reader, checkpoints, wanted, config).rows()
         scale = read_fit(fitted, rows)
         shape, first = (len(wanted), *reader.size), first_runs(rows)
         chunks = (1, *reader.size)
@@ -118,8 +117,7 @@ def write_scores(
         rendered: h5py.Dataset | None = None
         if renderings:
             rendered = file.create_dataset("rendered", (len(first), *shape), "f4", chunks=(1, *chunks))
-        keep = Kept(measured, rendered, first).put
-        scores = score(reader, rows, wanted, scale, config.batch, Perceptual(), keep, lambda count: None)
+        scores = score(reader, rows, wanted, scale, config.batch, Kept(measured, rendered, first).put)
         for name in (*PER_ROW, *COUNTS):
             file[name] = getattr(scores, name)
 

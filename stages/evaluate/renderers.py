@@ -5,50 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from schemas.errors import ArtefactError
+from stages.network.predictor import Predictor
+from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import Extension, Observation, State, expose, form, illuminate
 from stages.physics.formation.radiometry import match_crops
-from stages.physics.photometry import ReflectanceModel, get_model, masked_radiance_factor
+from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
 from stages.physics.photometry.deviation import radiance_deviation
-
-
-class Reader(Protocol):
-    """What evaluate needs of a pairs file (``stages.pairs.reader.PairReader``)."""
-
-    split: np.ndarray
-    tile: np.ndarray
-    site: np.ndarray
-    frame: np.ndarray
-
-    def observation(self, indices: np.ndarray) -> Observation:
-        """Everything about these pairs but their images."""
-
-    def image(self, indices: np.ndarray) -> Tensor:
-        """(B, H, W) measured."""
-
-    def valid(self, indices: np.ndarray) -> Tensor:
-        """(B, H, W) bool."""
-
-
-class Predictor(Protocol):
-    """What evaluate needs of a checkpoint (``stages.network.predictor``)."""
-
-    model: ReflectanceModel
-
-    def coefficients(self, elevation: Tensor) -> Tensor:
-        """(B, H, W) m -> (B, C, H, W)."""
-
-    def coefficients_and_deviations(self, elevation: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """(B, H, W) m -> (B, C, H, W), and standard deviations (B, H, W) by name."""
-
-    def parameters(self) -> Iterator[Tensor]:
-        """Its weights; they tell the device."""
 
 
 @dataclass
@@ -56,7 +25,8 @@ class Batch:
     """A batch of crops as measured.
 
     state : geometry and illumination, which all models without extensions share
-    image : (B, H, W) float32, I/F or share of the full DN range; usable : (B, H, W) bool; frame : (B,)
+    image : (B, H, W) float32, I/F or share of the full DN range; usable : (B, H, W) bool
+    frame : (B,) index of the image that each crop is cut from; memo : results that several rows of the table share
     """
 
     observation: Observation
@@ -67,15 +37,14 @@ class Batch:
     memo: dict[str, Any] = field(default_factory=dict)
 
 
-def read_batch(reader: Reader, indices: np.ndarray, scale: float) -> Batch:
+def read_batch(reader: PairReader, indices: np.ndarray, scale: float) -> Batch:
     """Crops ``indices`` in ascending order; a pixel is usable where image and photometric geometry are known."""
     observation = reader.observation(indices)
-    image = torch.as_tensor(reader.image(indices)).to(torch.float32) / scale
+    image = reader.image(indices).to(torch.float32) / scale
     state = illuminate(observation)
     angles = state.angles
     known = torch.isfinite(image) & torch.isfinite(angles.cos_incidence) & torch.isfinite(angles.cos_emission)
-    usable = torch.as_tensor(reader.valid(indices)).bool() & known
-    return Batch(observation, state, image, usable, np.asarray(reader.frame)[np.asarray(indices)])
+    return Batch(observation, state, image, reader.valid(indices) & known, reader.frame[indices])
 
 
 def batches(indices: np.ndarray, size: int) -> Iterator[np.ndarray]:
@@ -86,9 +55,11 @@ def batches(indices: np.ndarray, size: int) -> Iterator[np.ndarray]:
 
 @dataclass
 class Renderer:
-    """One compared model, with gain and offset per frame (1 and 0 for calibrated images).
+    """One compared model.
 
     coefficients : batch -> tensor that broadcasts to (B, C, H, W), in the order of ``model.parameters``
+    scale : factor on the I/F, 1 where no albedo is fitted
+    gain, offset : (F,) of every image in DN; None: 1 and 0
     spread : batch -> standard deviation of a photograph's pixel about the rendering, (B, H, W) I/F; None where not known
     """
 
@@ -126,15 +97,18 @@ class Renderer:
         batch.memo[self.name] = rendered
         return rendered
 
-    def image(self, batch: Batch, how: str | None = None) -> Tensor:
-        """The rendered crops on the scale of the images, matched per crop where ``how`` names a matching."""
+    def image(self, batch: Batch, matching: str | None = None) -> Tensor:
+        """The rendered crops (B, H, W) on the scale of the images, each brought near the measured one by ``matching``.
+
+        matching : 'gain', 'gain_offset' or 'minmax' as in ``match_crops``; None: as rendered
+        """
         rendered = self.radiance_factor(batch)
         gain, offset = self._per_crop(self.gain, batch, 1.0), self._per_crop(self.offset, batch, 0.0)
         rendered = rendered * gain
-        if how == "gain":  # a gain of the light: the sensor's offset stays out of it
-            return match_crops(rendered, batch.image - offset, batch.usable, how) + offset
+        if matching == "gain":  # a gain of the light: the sensor's offset stays out of it
+            return match_crops(rendered, batch.image - offset, batch.usable, matching) + offset
         rendered = rendered + offset
-        return rendered if how is None else match_crops(rendered, batch.image, batch.usable, how)
+        return rendered if matching is None else match_crops(rendered, batch.image, batch.usable, matching)
 
     @staticmethod
     def _per_crop(values: np.ndarray | None, batch: Batch, default: float) -> Tensor:
@@ -170,38 +144,30 @@ class Constant:
         return torch.as_tensor(self.values, dtype=torch.float32)[None, :, None, None]
 
 
-def learned(predictor: Predictor) -> tuple[Callable[[Batch], Tensor], Callable[[Batch], Tensor] | None]:
-    """The network's coefficients from the crop's elevation, and the spread of photographs that it predicts (``Renderer``).
+def predict(predictor: Predictor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+    """The network's coefficients (B, C, H, W) from the crops' elevation, and their standard deviations (B, H, W) by name.
 
-    Computed once per batch; a checkpoint without deviations has no spread.
+    Computed once per batch; a checkpoint without deviations gives none.
     """
-    device = next((p.device for p in predictor.parameters()), torch.device("cpu"))
-    noise = float(getattr(predictor, "image_noise", math.nan))
     key = f"coefficients of {id(predictor)}"
-
-    def look(batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        if key not in batch.memo:
-            elevation = batch.observation.elevation.to(device)
-            with torch.no_grad():
-                if math.isnan(noise):
-                    coefficients, deviations = predictor.coefficients(elevation), dict[str, Tensor]()
-                else:
-                    coefficients, deviations = predictor.coefficients_and_deviations(elevation)
-            batch.memo[key] = coefficients.float().cpu(), {k: v.float().cpu() for k, v in deviations.items()}
-        return batch.memo[key]
-
-    def spread(batch: Batch) -> Tensor:
-        coefficients, deviations = look(batch)
-        values = predictor.model.unpack(coefficients, dim=1)
-        found = radiance_deviation(predictor.model, values, deviations, batch.state.angles)
-        if batch.state.sun_visibility is not None:
-            found = found * batch.state.sun_visibility
-        return found.square().add(noise**2).sqrt()
-
-    return lambda batch: look(batch)[0], None if math.isnan(noise) else spread
+    if key not in batch.memo:
+        device = next((p.device for p in predictor.parameters()), torch.device("cpu"))
+        elevation = batch.observation.elevation.to(device)
+        deviations: dict[str, Tensor] = {}
+        with torch.no_grad():
+            if math.isnan(predictor.image_noise):
+                coefficients = predictor.coefficients(elevation)
+            else:
+                coefficients, deviations = predictor.coefficients_and_deviations(elevation)
+        batch.memo[key] = coefficients.float().cpu(), {k: v.float().cpu() for k, v in deviations.items()}
+    return batch.memo[key]
 
 
-def published(name: str) -> tuple[ReflectanceModel, np.ndarray]:
-    """A registered model and its default parameters."""
-    model = get_model(name)
-    return model, np.array([p.default for p in model.parameters])
+def predict_spread(predictor: Predictor, batch: Batch) -> Tensor:
+    """Standard deviation of photographs about the rendering, (B, H, W) I/F: ``Renderer.spread``."""
+    coefficients, deviations = predict(predictor, batch)
+    values = predictor.model.unpack(coefficients, dim=1)
+    std = radiance_deviation(predictor.model, values, deviations, batch.state.angles)
+    if batch.state.sun_visibility is not None:
+        std = std * batch.state.sun_visibility
+    return std.square().add(predictor.image_noise**2).sqrt()

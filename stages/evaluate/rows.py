@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from torch import Tensor
 
-from stages.evaluate.renderers import Constant, Predictor, Renderer, learned, published
+from stages.evaluate.renderers import Batch, Constant, Renderer, predict, predict_spread
+from stages.network.predictor import Predictor
 from stages.physics.formation.chain import Extension
+from stages.physics.photometry import ReflectanceModel, get_model
 
 # Of Hapke's law: coherent backscatter and porosity stay off, as in the published lunar sets.
 HAPKE_FREE = ("w", "b", "c", "Bs0", "hs", "theta")
@@ -33,21 +38,21 @@ TITLES = {
     "hapke_gain": "Hapke, gain per crop",
     "hapke_gain_offset": "Hapke, gain + offset per crop",
 }
-# (rows, renderer): each is scored as it is and with the crop's own least-squares gain and offset
-EXTENDED = ("learned_extended", "global_extended")
+EXTENDED = ("learned_extended", "global_extended")  # rows with the diagnosed effects
+# Renderers that are scored as they are and with the crop's own least-squares gain and offset.
 SOURCES = ("learned", *EXTENDED, "global", "kernels", "hapke_fitted", "lunar_lambert")
 
 
 @dataclass
 class Row:
-    """A line of the table: a renderer and how its crops are matched to the measured ones.
+    """A line of the table: a renderer and how its crops are matched to the measured ones (``Renderer.image``).
 
     Several training runs make several lines of one name; ``run`` counts them.
     """
 
     name: str
     renderer: Renderer
-    how: str | None = None
+    matching: str | None = None
     run: int = 0
 
 
@@ -68,33 +73,40 @@ def layout(extended: bool) -> list[tuple[str, str, str | None]]:
 
 def freedom(name: str) -> str:
     """What a row takes from the scored crop itself: 'none', 'gain', 'gain_offset' or 'minmax'."""
-    return next(how or "none" for row, _, how in layout(True) if row == name)
+    return next(matching or "none" for row, _, matching in layout(True) if row == name)
 
 
 def make_renderers(predictors: Sequence[Predictor], extensions: Sequence[Extension]) -> dict[str, Renderer]:
     """Everything that is compared, before anything is fitted; a network's from its second training run on as NAME:RUN."""
     model = predictors[0].model
-    start = Constant(np.array([p.default for p in model.parameters]))
+    effects = tuple(extensions)
     made = []
     for run, predictor in enumerate(predictors):
-        network, spread = learned(predictor)
+        network = partial(_predict_coefficients, predictor)
+        spread = None if math.isnan(predictor.image_noise) else partial(predict_spread, predictor)
         made.append(Renderer(run_name("learned", run), model, network, spread=spread))
-        made.append(Renderer(run_name("learned_extended", run), model, network, tuple(extensions)))
-    made.append(Renderer("global", model, start))
-    made.append(Renderer("global_extended", model, start, tuple(extensions)))
+        made.append(Renderer(run_name("learned_extended", run), model, network, effects))
+    made.append(Renderer("global", model, _defaults(model)))
+    made.append(Renderer("global_extended", model, _defaults(model), effects))
     for name in ("kernels", "hapke", "lunar_lambert"):
-        baseline, values = published(name)
-        made.append(Renderer(name, baseline, Constant(values)))
-        if name == "hapke":
-            made.append(Renderer("hapke_fitted", baseline, Constant(values)))
+        made.append(Renderer(name, get_model(name), _defaults(get_model(name))))
+    made.append(Renderer("hapke_fitted", get_model("hapke"), _defaults(get_model("hapke"))))
     return {renderer.name: renderer for renderer in made}
+
+
+def _predict_coefficients(predictor: Predictor, batch: Batch) -> Tensor:
+    return predict(predictor, batch)[0]
+
+
+def _defaults(model: ReflectanceModel) -> Constant:
+    return Constant(np.array([p.default for p in model.parameters]))
 
 
 def make_rows(renderers: dict[str, Renderer], runs: int, extended: bool, only: Sequence[str] = ()) -> list[Row]:
     """The rows (or those in ``only``), a learned one for each training run."""
     return [
-        Row(name, renderers[run_name(source, run)], how, run)
-        for name, source, how in layout(extended)
+        Row(name, renderers[run_name(source, run)], matching, run)
+        for name, source, matching in layout(extended)
         for run in range(runs if source.startswith("learned") else 1)
         if not only or name in only
     ]

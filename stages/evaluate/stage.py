@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,19 +12,19 @@ from schemas import EVALUATION, ArtefactWriter, write_json
 from schemas.files.companions import companions_of
 from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.evaluate.checks import check, check_runs, notes, read_seed, select
-from stages.evaluate.comparison import Task, evaluate_pairs, load_predictors, make_task, summarise
+from stages.evaluate.checks import check, check_runs, limitations, read_seed, report_files, select
 from stages.evaluate.config import Config
-from stages.evaluate.core import Scores
 from stages.evaluate.parts import Fan, Kept, first_runs, score_in_parts
 from stages.evaluate.rows import Row
+from stages.evaluate.scores import Scores
+from stages.evaluate.task import Task, make_task, score_here, summarise
 from stages.pairs.reader import PairReader
 
 RENDERINGS_LIMIT = 512 * 2**20  # bytes of rendered crops that are kept without being asked for
 FIGURES = ("training_curves.png", "errors.png", "crop_best.png", "crop_median.png", "crop_worst.png")
 
-# How the crops are scored: rows of the table, their scores, the scale of DN
-Compare = Callable[[Task, Kept], tuple[list[Row], Scores, float]]
+# How the crops are scored: rows of the table, their scores, the full range of DN
+Score = Callable[[Task, Kept], tuple[list[Row], Scores, float]]
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ class Files:
     """What is read and written."""
 
     pairs: Path
-    checkpoints: list[Path]
+    checkpoints: Sequence[Path]
     extend: str | None
     output: Output
 
@@ -41,12 +40,6 @@ class Files:
     def inputs(self) -> list[Path]:
         """What no output may replace."""
         return [self.pairs, *self.checkpoints, *([Path(self.extend)] if self.extend else [])]
-
-    @property
-    def reports(self) -> list[Path]:
-        """The JSON beside the output, and where it was asked for."""
-        beside, wanted = self.output.file.with_suffix(".json"), self.output.json
-        return [beside] if wanted is None or os.path.realpath(wanted) == os.path.realpath(beside) else [beside, wanted]
 
 
 def run(
@@ -62,46 +55,35 @@ def run(
     Writes the evaluation artefact, the JSON beside it, and figures where asked.
     Raises ConfigError or ArtefactError before anything is written.
     """
-
-    def compare(task: Task, kept: Kept) -> tuple[list[Row], Scores, float]:
-        rows, scores, scale, _ = evaluate_pairs(task, keep=kept.put, progress=progress)
-        return rows, scores, scale
-
-    return _run(pairs, checkpoints, Output.at(output), config, compare)
+    several = [checkpoints] if isinstance(checkpoints, Path) else list(checkpoints)
+    return _run(pairs, several, Output.at(output), config, lambda task, kept: score_here(task, kept.put, progress))
 
 
 def run_in_parts(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Config, fan: Fan) -> dict[str, Any]:
     """:func:`run` with the crops scored in parts, wherever ``fan`` has them worked on."""
-
-    def compare(task: Task, kept: Kept) -> tuple[list[Row], Scores, float]:
-        return score_in_parts(task, pairs, checkpoints, fan, kept)
-
-    return _run(pairs, checkpoints, output, config, compare)
+    return _run(
+        pairs, checkpoints, output, config, lambda task, kept: score_in_parts(task, pairs, checkpoints, fan, kept)
+    )
 
 
-def _run(
-    pairs: Path, checkpoints: Path | Sequence[Path], output: Output, config: Config, compare: Compare
-) -> dict[str, Any]:
-    several = [checkpoints] if isinstance(checkpoints, Path) else list(checkpoints)
-    files = Files(pairs, several, config.extend, output)
+def _run(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Config, score: Score) -> dict[str, Any]:
+    files = Files(pairs, checkpoints, config.extend, output)
     _check_outputs(files)
     check(config)
     with PairReader(pairs) as reader:
-        wanted, predictors = select(reader, config.split), load_predictors(several, config)
-        check_runs(several, predictors, reader)
-        limits = notes(several[0], predictors[0], reader, config)
-        task = make_task(reader, predictors, wanted, config)
-        rows, scores, scale, result = _write(task, files, limits, compare)
+        task = make_task(reader, checkpoints, select(reader, config.split), config)
+        check_runs(checkpoints, task)
+        rows, scores, scale, result = _write(task, files, limitations(checkpoints[0], task), score)
         if output.figures is not None:
             from stages.evaluate.figures import write_figures
 
-            first, means = [rows[k] for k in first_runs(rows)], scores.mean_over_runs()
-            write_figures(output.figures, reader, first, task.wanted, means, scale, result, several[0])
+            first = [rows[k] for k in first_runs(rows)]
+            write_figures(output.figures, task, first, scores.mean_over_runs(), scale, result, checkpoints[0])
     return result
 
 
 def _check_outputs(files: Files) -> None:
-    output, (beside, *others) = files.output, files.reports
+    output, (beside, *others) = files.output, report_files(files.output)
     targets = [Target(output.file), Target(beside, name=f"the JSON beside {output.file.name}")]
     targets += [Target(report, "json") for report in others]
     if output.figures is not None:
@@ -110,11 +92,11 @@ def _check_outputs(files: Files) -> None:
 
 
 def _write(
-    task: Task, files: Files, limits: list[str], compare: Compare
+    task: Task, files: Files, warnings: list[str], score: Score
 ) -> tuple[list[Row], Scores, float, dict[str, Any]]:
-    """Score, and write the artefact and the JSON. limits : said beside the result"""
+    """Score, and write the artefact and the JSON. warnings : what the result holds beside its own"""
     config, count = task.config, len(task.wanted)
-    height, width = task.reader.size  # type: ignore[attr-defined]
+    height, width = task.reader.size
     first = first_runs(task.rows())
     size = len(first) * count * height * width * 4
     renderings = size <= RENDERINGS_LIMIT if config.renderings is None else config.renderings
@@ -130,17 +112,17 @@ def _write(
         overwrite=files.output.overwrite,
     ) as artefact:
         kept = Kept(artefact.dataset("measured"), artefact.dataset("rendered") if renderings else None, first)
-        rows, scores, scale = compare(task, kept)
+        rows, scores, scale = score(task, kept)
         result = summarise(task, scores, scale)
         names = [path.name for path in files.checkpoints]
         seeds = [read_seed(path) for path in files.checkpoints]
         result |= {"pairs_file": files.pairs.name, "checkpoint": names[0], "checkpoints": names, "seeds": seeds}
-        result |= {"config": settings, "warnings": limits + result["warnings"]}
+        result |= {"config": settings, "warnings": warnings + result["warnings"]}
         _write_scores(artefact, task, scores, seeds)
         artefact.file.attrs["split"] = config.split
         artefact.file.attrs["metrics"] = json.dumps(result)
         with companions_of(files.output.file):
-            for report in files.reports:
+            for report in report_files(files.output):
                 write_json(report, result)
     return rows, scores, scale, result
 

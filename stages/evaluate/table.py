@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from stages.common.intervals import ERROR, gain_interval, ratio_interval
-from stages.evaluate.core import Scores
+from stages.common.intervals import ERROR, Interval, gain_interval, ratio_interval
+from stages.common.page.sentences import verdict
 from stages.evaluate.metrics import psnr
 from stages.evaluate.rows import TITLES, freedom
+from stages.evaluate.scores import Scores
 
 PAIRED = ("learned", "learned_gain_offset", "learned_extended", "learned_extended_gain_offset")
 # Rows that are compared like for like: they know nothing of the scored crops, or two numbers of each.
@@ -53,7 +54,7 @@ def metric_table(scores: Scores, unit: np.ndarray) -> dict[str, dict[str, Any]]:
             if metric != "ssim_range_1":
                 found = ratio_interval(values, crops, unit)
                 row[f"{metric}_low"], row[f"{metric}_high"] = found.low, found.high
-        numbers: dict[str, Any] = {key: _number(value) for key, value in row.items()}
+        numbers: dict[str, Any] = {key: finite(value) for key, value in row.items()}
         table[name] = numbers | {"freedom": freedom(name), "mse_runs": runs.tolist()}
     return table
 
@@ -65,13 +66,17 @@ def gain_table(scores: Scores, unit: np.ndarray) -> dict[str, dict[str, dict[str
     for ours in (n for n in PAIRED if n in names):
         table[ours] = {}
         for other in (n for n in names if n != ours):
-            gain = gain_interval(scores.runs(ours), scores.runs(other), unit)
-            table[ours][other] = {
-                "gain_percent": _number(gain.value),
-                "gain_percent_low": _number(gain.low),
-                "gain_percent_high": _number(gain.high),
-            }
+            table[ours][other] = gain_entry(gain_interval(scores.runs(ours), scores.runs(other), unit))
     return table
+
+
+def gain_entry(gain: Interval) -> dict[str, float | None]:
+    """A gain as the JSON holds it."""
+    return {
+        "gain_percent": finite(gain.value),
+        "gain_percent_low": finite(gain.low),
+        "gain_percent_high": finite(gain.high),
+    }
 
 
 def strongest_baselines(models: dict[str, dict[str, Any]]) -> dict[str, str]:
@@ -95,13 +100,13 @@ def conclude(result: dict[str, Any]) -> list[str]:
                 continue
             name = "the learned reflectance" + (" with the diagnosed effects" if "extended" in ours else "")
             sentences.append(
-                f"{words}, {name} {_claim(gain)} the strongest baseline, {rival} ({TITLES[rival]}); {extent(result, gain)}."
+                f"{words}, {name} {_claim(gain)} the strongest baseline, {rival} ({TITLES[rival]}); {_evidence(result, gain)}."
             )
     return sentences
 
 
 def _claim(gain: dict[str, float | None]) -> str:
-    word = verdict(gain["gain_percent_low"], gain["gain_percent_high"])
+    word = verdict(gain)
     size = abs(gain["gain_percent"] or 0.0)
     if word == "better":
         return f"has a squared error {size:.1f} % lower than"
@@ -110,7 +115,7 @@ def _claim(gain: dict[str, float | None]) -> str:
     return "cannot be told apart from"
 
 
-def extent(result: dict[str, Any], gain: dict[str, float | None]) -> str:
+def _evidence(result: dict[str, Any], gain: dict[str, float | None]) -> str:
     """What a gain rests on: its interval, pairs, tiles or sites, training runs."""
     low, high = gain["gain_percent_low"], gain["gain_percent_high"]
     bounds = "no interval" if low is None or high is None else f"95 %: {low:+.1f} .. {high:+.1f} %"
@@ -126,19 +131,13 @@ def basis(result: dict[str, Any]) -> str:
     return f"{result['pairs']} pairs, {ground}, {runs} training run{'s' * (runs != 1)}"
 
 
-def verdict(low: float | None, high: float | None) -> str:
-    """What a paired interval says in one word or two."""
-    if low is None or high is None:
-        return "unknown"
-    return "better" if low > 0 else "worse" if high < 0 else "no difference"
-
-
 def _mean(values: np.ndarray) -> float:
     known = values[np.isfinite(values)]
     return float(known.mean()) if len(known) else float("nan")
 
 
-def _number(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """A number as JSON can hold it: None for NaN and infinity."""
     return value if math.isfinite(value) else None
 
 
@@ -147,12 +146,11 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     columns = ["model", "MSE", "95 % interval", "+- runs", "MSE/crop", "RMSE", "PSNR", "PSNR crop", "SSIM", "LPIPS"]
     cells = []
     for name, row in result["models"].items():
-        bounds = bounds_text(row)
         cells.append(
             [
                 name,
                 f"{row['mse']:.3e}",
-                bounds,
+                _bounds_text(row),
                 "-" if row["mse_run_std"] is None else f"{row['mse_run_std']:.1e}",
                 f"{row['mse_crop_sum']:.3f}",
                 f"{row['rmse']:.4f}",
@@ -165,7 +163,7 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     return columns, cells
 
 
-def bounds_text(row: dict[str, Any]) -> str:
+def _bounds_text(row: dict[str, Any]) -> str:
     """The interval of a row's MSE; so few tiles may scatter so much that nothing bounds it from above."""
     if row["mse_low"] is None:
         return "-"
@@ -173,23 +171,23 @@ def bounds_text(row: dict[str, Any]) -> str:
 
 
 def gain_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """What the learned model gains over each baseline of the same freedom; an interval that holds 0 is no difference."""
+    """Columns and cells of the table of what the learned model gains over each baseline of the same freedom; an interval that holds 0 is no difference."""
     columns = ["model", "against", "lower MSE by", "95 % interval", "verdict"]
     cells = []
     for ours, others in result["gains"].items():
         for other, gain in others.items():
-            if not comparable(result, ours, other):
+            if not _comparable(result, ours, other):
                 continue
             if gain["gain_percent"] is None:
                 cells.append([ours, other, "-", "-", "-"])
                 continue
             low, high = gain["gain_percent_low"], gain["gain_percent_high"]
             bounds = "-" if low is None or high is None else f"{low:+.1f} .. {high:+.1f} %"
-            cells.append([ours, other, f"{gain['gain_percent']:+.1f} %", bounds, verdict(low, high)])
+            cells.append([ours, other, f"{gain['gain_percent']:+.1f} %", bounds, verdict(gain)])
     return columns, cells
 
 
-def comparable(result: dict[str, Any], ours: str, other: str) -> bool:
+def _comparable(result: dict[str, Any], ours: str, other: str) -> bool:
     """Rows of the same freedom, and the paper's comparison: free against matched by range. Not a network with itself."""
     if other.startswith("learned"):
         return ours.startswith("learned_extended") and other == ours.replace("_extended", "")

@@ -49,7 +49,7 @@ class Matcher(ABC):
 
     @abstractmethod
     def match(self, measured: np.ndarray, rendered: np.ndarray) -> Matches:
-        """Correspondences between two (H, W) uint8 pictures."""
+        """Corresponding points of two (H, W) uint8 pictures."""
 
 
 _MATCHERS: dict[str, type[Matcher]] = {}

@@ -42,7 +42,10 @@ def is_artefact(path: Path) -> bool:
 
 
 def comparisons(files: list[Path], split: str, count: int, seed: int, device: str) -> tuple[int, Iterator[Comparison]]:
-    """(number of comparisons, the comparisons): chosen by what the files are. Raises LunargrError."""
+    """How many comparisons the files hold, and the comparisons; which kind they are follows from the files. Raises LunargrError.
+
+    split, count, seed : which crops of a pairs file or an evaluation; device : of the network
+    """
     first, *others = files
     if not is_artefact(first):
         return 1, iter([from_images(first, others)])
@@ -71,19 +74,20 @@ def from_images(measured: Path, rendered: list[Path]) -> Comparison:
 
 
 def choose(fraction_known: np.ndarray, tile: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Up to ``count`` random crops among those that are known (nearly) everywhere, or the best known ones.
+    """Up to ``count`` random crops among those that are known (nearly) everywhere, or the best known ones; sorted indices.
 
     As many from every ground tile as from any other, as far as they go: intervals live on the number of tiles.
+    fraction_known, tile : (N,), of every crop
     """
     whole = np.flatnonzero(fraction_known >= 0.99)
     if len(whole) < count:
         return np.sort(np.argsort(-fraction_known, kind="stable")[:count])
     drawn = np.random.default_rng(seed).permutation(whole)
-    turn = np.zeros(len(drawn), int)  # how many of its tile were drawn before
+    drawn_before = np.zeros(len(drawn), int)  # of its tile
     for name in np.unique(tile[drawn]):
         mine = tile[drawn] == name
-        turn[mine] = np.arange(mine.sum())
-    return np.sort(drawn[np.argsort(turn, kind="stable")[:count]])
+        drawn_before[mine] = np.arange(mine.sum())
+    return np.sort(drawn[np.argsort(drawn_before, kind="stable")[:count]])
 
 
 def from_evaluation(path: Path, count: int, seed: int) -> tuple[int, Iterator[Comparison]]:
@@ -121,7 +125,7 @@ def from_pairs(
     if split not in dict(SPLITS):
         raise ConfigError(f"`split`: expected one of {', '.join(dict(SPLITS))}, found '{split}'.")
     predictor = load_predictor(checkpoint, choose_device(device))
-    where = next(predictor.parameters()).device
+    on_device = next(predictor.parameters()).device
     with PairReader(pairs) as reader:
         indices = reader.indices(split)
         if not len(indices):
@@ -138,7 +142,9 @@ def from_pairs(
                 observation, valid = reader.observation([k]), reader.valid([k])
                 measured = reader.image([k])
                 learned = form(
-                    observation, predictor.model, predictor.coefficients(observation.elevation.to(where)).float().cpu()
+                    observation,
+                    predictor.model,
+                    predictor.coefficients(observation.elevation.to(on_device)).float().cpu(),
                 )
                 if units == "dn":  # unknown gain and offset: the crop's own, for both alike
                     learned = match_crops(learned, measured, valid, "gain_offset")

@@ -13,7 +13,7 @@ from stages.match.base import Matcher, Matches, Models, mutual_nearest
 
 
 def load_network(factory: str, path: Path, *arguments: Any) -> Any:
-    """An OpenCV object from an ONNX file. Raises ConfigError (OpenCV too old) or InputError (unusable file)."""
+    """An OpenCV object from an ONNX file, made by cv2.``factory``. Raises ConfigError (OpenCV too old), InputError (unusable file)."""
     if not hasattr(cv2, factory):
         raise ConfigError(
             f"matcher: expected an OpenCV with {factory}, found {cv2.__version__}; install opencv-contrib-python-headless 5."
@@ -35,8 +35,7 @@ class NetworkMatcher(Matcher):
     """Features from one network, matched by LightGlue where its file is given, else by reciprocal nearest neighbours."""
 
     needs_models = True
-    factory: str
-    lightglue_arguments: tuple[Any, ...] = ()
+    factory: str  # OpenCV's name of what makes the detector
 
     def __init__(self, models: Models) -> None:
         super().__init__(models)
@@ -49,11 +48,10 @@ class NetworkMatcher(Matcher):
         self.lightglue = self._load_lightglue(models.lightglue) if models.lightglue is not None else None
 
     def _load_lightglue(self, path: Path) -> Any:
-        return load_network("LightGlueMatcher_create", path, *self.lightglue_arguments)
+        return load_network("LightGlueMatcher_create", path)
 
     def match(self, measured: np.ndarray, rendered: np.ndarray) -> Matches:
-        features = [self._detect(picture) for picture in (measured, rendered)]
-        (points, descriptors), (other_points, other_descriptors) = features
+        (points, descriptors), (other_points, other_descriptors) = self._detect(measured), self._detect(rendered)
         if self.lightglue is None:
             here, there = mutual_nearest(descriptors, other_descriptors)
         else:

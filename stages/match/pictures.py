@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
+import warnings
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import OpenImageIO as oiio
+import rasterio
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from schemas.errors import InputError
 from stages.match.base import Matches
@@ -19,21 +24,11 @@ def read_picture(path: Path) -> np.ndarray:
     """The first band of an image file that OpenImageIO or GDAL reads, (H, W) float32, NaN where nodata."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give an image file.")
-    import rasterio
-    from rasterio.errors import RasterioError
-
     if path.suffix.lower() != ".exr":
-        try:
-            import warnings
-
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-                with rasterio.open(path) as source:
-                    return source.read(1, masked=True).astype(np.float32).filled(np.nan)
-        except RasterioError:
-            pass
-    import OpenImageIO as oiio
-
+        with contextlib.suppress(RasterioError), warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(path) as source:
+                return source.read(1, masked=True).astype(np.float32).filled(np.nan)
     image = oiio.ImageBuf(str(path))
     pixels = image.get_pixels(oiio.FLOAT) if image.initialized and not image.has_error else None
     if pixels is None or pixels.size == 0:
@@ -44,7 +39,7 @@ def read_picture(path: Path) -> np.ndarray:
 
 
 def fit_size(image: np.ndarray) -> np.ndarray:
-    """Enlarge or shrink to cover 512 x 384, then cut out the middle; the same for every image of one size.
+    """(H, W) -> (384, 512): enlarged or shrunk to cover it, of which the middle is cut out; alike for images of one size.
 
     A square crop becomes 512 x 512 and loses its upper and lower 64 rows, as pictures do on their way into MASt3R.
     """
@@ -58,7 +53,7 @@ def fit_size(image: np.ndarray) -> np.ndarray:
 
 
 def stretch_limits(image: np.ndarray) -> tuple[float, float]:
-    """Grey levels of black and white: the 0.5 and 99.5 % quantiles of the valid pixels."""
+    """Values shown black and white: the 0.5 and 99.5 % quantiles of the known pixels of an image (H, W)."""
     known = image[np.isfinite(image)]
     if not len(known):
         return 0.0, 1.0
@@ -67,7 +62,10 @@ def stretch_limits(image: np.ndarray) -> tuple[float, float]:
 
 
 def to_grey(image: np.ndarray, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """(512 x 384 uint8 picture, bool mask of pixels that are known); unknown pixels take the mean grey."""
+    """An image (H, W) at 512 x 384: uint8 grey levels, and where it is known; unknown pixels take the mean grey.
+
+    limits : the values shown black and white
+    """
     known = np.isfinite(image)
     filled = np.where(known, image, image[known].mean() if known.any() else 0.0)
     low, high = limits
@@ -75,8 +73,8 @@ def to_grey(image: np.ndarray, limits: tuple[float, float]) -> tuple[np.ndarray,
     return grey, fit_size(known.astype(np.float32)) > 0.999
 
 
-def inside(matches: Matches, known: np.ndarray) -> Matches:
-    """The matches whose both ends lie on known pixels."""
+def drop_unknown(matches: Matches, known: np.ndarray) -> Matches:
+    """The matches whose both ends lie on pixels that are ``known``, (H, W) bool."""
     keep = np.ones(len(matches.measured), bool)
     for points in (matches.measured, matches.rendered):
         x = np.clip(points[:, 0].round().astype(int), 0, known.shape[1] - 1)

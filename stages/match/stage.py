@@ -12,7 +12,7 @@ from stages.match.base import Matches, Models, get_matcher
 from stages.match.comparisons import comparisons
 from stages.match.config import Config
 from stages.match.consistency import summarise
-from stages.match.pictures import inside, match_figure, stretch_limits, to_grey
+from stages.match.pictures import HEIGHT, WIDTH, drop_unknown, match_figure, stretch_limits, to_grey
 
 FIGURES = 4  # comparisons that are drawn
 
@@ -34,7 +34,7 @@ def run(
         raise ConfigError(f"`count`: expected at least 1, found {config.count}.")
     targets = [] if json_file is None else [Target(json_file, "json")]
     if figures is not None:
-        names = (figures / _picture(m, k) for m in config.matchers for k in range(FIGURES))
+        names = (figures / _figure_name(m, k) for m in config.matchers for k in range(FIGURES))
         targets += [Target(path, "figures") for path in dict.fromkeys(names)]
     networks = [path for path in (config.features_model, config.lightglue_model) if path is not None]
     check_outputs(targets, [*files, *networks], output.overwrite)
@@ -53,17 +53,17 @@ def run(
             pictures[name], also_known = to_grey(image, limits if comparison.common_scale else stretch_limits(image))
             known = known & also_known
         for matcher in matchers:
-            found = {name: inside(matcher.match(measured, picture), known) for name, picture in pictures.items()}
+            found = {name: drop_unknown(matcher.match(measured, picture), known) for name, picture in pictures.items()}
             for name, matches in found.items():
                 collected[matcher.name].setdefault(name, []).append(matches)
             if figures is not None and number < FIGURES:
                 _save(
                     match_figure(measured, pictures, found, f"{comparison.label}, {matcher.title}"),
-                    figures / _picture(matcher.name, number),
+                    figures / _figure_name(matcher.name, number),
                 )
         progress(number + 1, total, "match")
     result = {
-        "size_px": [512, 384],
+        "size_px": [WIDTH, HEIGHT],
         "crops": total,
         "tiles": len(set(ground)),
         "files": [f.name for f in files],
@@ -76,7 +76,7 @@ def run(
     return result
 
 
-def _picture(matcher: str, number: int) -> str:
+def _figure_name(matcher: str, number: int) -> str:
     return f"match_{matcher}_{number + 1}.png"
 
 
@@ -86,10 +86,6 @@ def _save(figure: Any, path: Path) -> None:
     with atomic_path(path) as partial:
         figure.savefig(partial, dpi=110, facecolor="white")
     plt.close(figure)
-
-
-def _shift(row: dict[str, Any]) -> tuple[float, float]:
-    return row["median_shift_right_px"], row["median_shift_down_px"]
 
 
 def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
@@ -102,21 +98,16 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         low, high = row[f"{key}_low"], row[f"{key}_high"]
         return f"{row[key]:.1f}" + ("" if low is None else f" ({low:.1f} .. {high:.1f})")
 
+    def shift(row: dict[str, Any]) -> str:
+        right, down = row["median_shift_right_px"], row["median_shift_down_px"]
+        return "-" if right is None else f"{right:+.1f}, {down:+.1f}"
+
     cells = [
         [matcher, name, str(row["matches"]), *(share(row, t) for t in (1, 3, 5))]
         + ["-" if row[k] is None else f"{row[k]:.2f}" for k in ("mean_error_px", "median_error_px")]
-        + ["-" if row["median_shift_right_px"] is None else "{:+.1f}, {:+.1f}".format(*_shift(row))]
+        + [shift(row)]
         for matcher, rows in result["matchers"].items()
         for name, row in rows.items()
     ]
-    return [
-        "matcher",
-        "rendering",
-        "matches",
-        "< 1 px, %",
-        "< 3 px, %",
-        "< 5 px, %",
-        "mean, px",
-        "median, px",
-        "shift, px",
-    ], cells
+    shares = ["< 1 px, %", "< 3 px, %", "< 5 px, %"]
+    return ["matcher", "rendering", "matches", *shares, "mean, px", "median, px", "shift, px"], cells

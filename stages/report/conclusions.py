@@ -23,8 +23,8 @@ def basis(result: dict[str, Any]) -> str:
     ground = counted(result["tiles"], "ground tile")
     if result.get("interval_unit") == "site" and "sites" in result:
         ground = f"{counted(result['sites'], 'site')} of one ground tile"
-    said = f"{result['pairs']:,} pairs on {ground}"
-    return f"{said}, {counted(result['training_runs'], 'training run')}" if "training_runs" in result else said
+    pairs = f"{result['pairs']:,} pairs on {ground}"
+    return f"{pairs}, {counted(result['training_runs'], 'training run')}" if "training_runs" in result else pairs
 
 
 def learned(file: h5py.File) -> list[Sentence]:
@@ -33,18 +33,13 @@ def learned(file: h5py.File) -> list[Sentence]:
     maps = json.loads(str(file.attrs["maps"])) if "maps" in file.attrs else names
     model = get_model(str(file.attrs["model"]))
     rest = len(names) - len(maps)
-    other = (
-        f"; {counted(rest, 'other coefficient')} {'have' if rest > 1 else 'has'} one value for all ground"
-        if rest
-        else ""
+    text = (
+        f"Learned from heights and {counted(len(file['image_id']), 'image')}: {listed(maps)} of the model {model.name} "
+        f"({model.title}), place by place"
     )
-    return [
-        (
-            f"Learned from heights and {counted(len(file['image_id']), 'image')}: {listed(maps)} of the model {model.name} "
-            f"({model.title}), place by place{other}.",
-            "",
-        )
-    ]
+    if rest:
+        text += f"; {counted(rest, 'other coefficient')} {'have' if rest > 1 else 'has'} one value for all ground"
+    return [(f"{text}.", "")]
 
 
 def evaluation(result: dict[str, Any]) -> list[Sentence]:

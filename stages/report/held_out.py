@@ -7,6 +7,7 @@ from typing import Any
 from markupsafe import Markup
 
 from stages.common import page
+from stages.common.page.diagnosis import formatted as cell
 from stages.common.page.sentences import bounds, verdict
 from stages.report.conclusions import basis
 
@@ -24,12 +25,12 @@ def held_out_images(result: dict[str, Any]) -> page.Section:
     unit = "I/F" if result["image_units"] == "iof" else "DN"
     rows = []
     for name, row in result["models"].items():
-        interval = "-" if row["mse_low"] is None else f"{row['mse_low']:.2e} .. {_number(row['mse_high'], '.2e')}"
+        interval = "-" if row["mse_low"] is None else f"{row['mse_low']:.2e} .. {cell(row['mse_high'], '.2e')}"
         gain = next(iter(result["gains"].get(name, {}).values()), None)
-        said = "-"
+        lowered = "-"
         if gain and gain["gain_percent"] is not None:
-            said = f"{gain['gain_percent']:+.1f} ({bounds(gain)}): {verdict(gain)}"
-        rows.append([TITLES.get(name, name), f"{row['mse']:.3e}", interval, _number(row.get("ssim"), ".3f"), said])
+            lowered = f"{gain['gain_percent']:+.1f} ({bounds(gain)}): {verdict(gain)}"
+        rows.append([TITLES.get(name, name), f"{row['mse']:.3e}", interval, cell(row.get("ssim"), ".3f"), lowered])
     section.add(
         page.paragraph(
             f"Claim: {result['claim']}. Other photographs of the same ground made the albedo; no scored image had a part in "
@@ -42,14 +43,11 @@ def held_out_images(result: dict[str, Any]) -> page.Section:
         section.add(_coverage(coverage))
     images = [
         [
-            image["image_id"],
-            str(image["crops"]),
-            f"{image['nearest_used_sun_deg']:.1f}",
-            f"{image['mse_terrain']:.3e}",
-            f"{image['mse_albedo']:.3e}",
+            image["image_id"], str(image["crops"]), f"{image['nearest_used_sun_deg']:.1f}",
+            f"{image['mse_terrain']:.3e}", f"{image['mse_albedo']:.3e}",
         ]
         for image in result.get("images", [])
-    ]
+    ]  # fmt: skip
     if images:
         header = ["unseen image", "crops", "nearest Sun used, deg", "MSE from terrain", "MSE with albedo"]
         section.add(page.table("By image", header, images))
@@ -58,13 +56,9 @@ def held_out_images(result: dict[str, Any]) -> page.Section:
 
 def _coverage(coverage: dict[str, Any]) -> Markup:
     """How many pixels the error bars hold, in all and by incidence where that was counted."""
-    rows = [["all", _number(coverage.get("68"), ".1f"), _number(coverage.get("95"), ".1f")]]
+    rows = [["all", cell(coverage.get("68"), ".1f"), cell(coverage.get("95"), ".1f")]]
     for band in coverage.get("by_incidence", []):
         name = f"{band['incidence_low_deg']:g} to {band['incidence_high_deg']:g}"
-        rows.append([name, _number(band["68"], ".1f"), _number(band["95"], ".1f")])
+        rows.append([name, cell(band["68"], ".1f"), cell(band["95"], ".1f")])
     columns = ["incidence, deg", "within the 68 % interval, %", "within the 95 % interval, %"]
     return page.table("Error bars: share of the pixels of unseen images", columns, rows)
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)

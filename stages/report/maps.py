@@ -57,7 +57,7 @@ def svbrdf(file: h5py.File) -> page.Section:
 
 
 def _longest(file: h5py.File) -> int:
-    """px of a map: together they stay a light page, however many coefficients a model has."""
+    """px along the longer side of each map: the page stays light, however many coefficients a model has."""
     count = len(file["coefficients"]) + sum(name in file for name in ALBEDO)
     count += len(file["coefficients_std"]) if "coefficients_std" in file else 0
     return round(LONGEST * min(1.0, math.sqrt(MANY / count)))
@@ -91,13 +91,15 @@ def _map(file: h5py.File, values: np.ndarray, title: str, unit: str, colours: st
     """One map with statistics, colour bar, scale bar and north arrow."""
     low, high = pictures.limits(values, 1.0)
     present = values[np.isfinite(values)]
-    said = f"mean {present.mean():.4g}, standard deviation {present.std():.2g}" if len(present) else "no valid pixel"
+    statistics = "no valid pixel"
+    if len(present):
+        statistics = f"mean {present.mean():.4g}, standard deviation {present.std():.2g}"
     extent = file["valid"].shape[1] * float(file.attrs["gsd_m"])
     length = round_length(extent / 4)
     label = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
     return page.picture(
         pictures.photo_uri(pictures.coloured(values, low, high, colours)),
-        f"{title}{f', {_unit(unit)}' if _unit(unit) else ''}: {said}. Colours end at the 1st and 99th percentile.",
+        f"{title}{f', {_unit(unit)}' if _unit(unit) else ''}: {statistics}. Colours end at the 1st and 99th percentile.",
         alt=title,
         below=page.scale_bar(100 * length / extent, label) + page.colour_bar(low, high, colours, _unit(unit)),
     )

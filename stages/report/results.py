@@ -1,4 +1,4 @@
-"""Evaluation, matching and model comparison: one function per result, from numbers to a section."""
+"""Evaluation, matching, model comparison and diagnosis: one function per result, from numbers to a section."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from markupsafe import Markup
 
 from stages.common import page
 from stages.common.page import pictures
+from stages.common.page.diagnosis import chapters, conclusions, words
+from stages.common.page.diagnosis import formatted as cell
 from stages.common.page.sentences import bounds, verdict
 from stages.report.conclusions import basis
 
@@ -28,14 +30,6 @@ EXAMPLES = (
 )  # fmt: skip
 
 
-def _words(name: str) -> str:
-    return name.replace("_", " ")
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
-
-
 def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
     """The table of models, what the learned one gains, and example crops where the file kept renderings."""
     section = page.Section("Evaluation on unseen ground")
@@ -44,9 +38,9 @@ def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
     rows = [
         [
             titles.get(name, name), f"{m['mse']:.3e}",
-            "-" if m["mse_low"] is None else f"{m['mse_low']:.2e} .. {_cell(m['mse_high'], '.2e')}",
-            _cell(m.get("mse_run_std"), ".1e"), _cell(m["mse_crop_sum"], ".3f"), _cell(m["psnr"], ".2f"), _cell(m["psnr_crop_range"], ".2f"),
-            _cell(m["ssim"], ".3f"), _cell(m["lpips"], ".3f"),
+            "-" if m["mse_low"] is None else f"{m['mse_low']:.2e} .. {cell(m['mse_high'], '.2e')}",
+            cell(m.get("mse_run_std"), ".1e"), cell(m["mse_crop_sum"], ".3f"), cell(m["psnr"], ".2f"), cell(m["psnr_crop_range"], ".2f"),
+            cell(m["ssim"], ".3f"), cell(m["lpips"], ".3f"),
         ]
         for name, m in models.items()
     ]  # fmt: skip
@@ -66,24 +60,16 @@ def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
     )
     rows = [
         [
-            ours.replace("_", " "),
-            other.replace("_", " "),
-            _cell(gain["gain_percent"], "+.1f"),
-            bounds(gain),
+            words(ours), words(other), cell(gain["gain_percent"], "+.1f"), bounds(gain),
             verdict(gain).replace(" ", "\u00a0"),
         ]
         for ours, others in result["gains"].items()
         for other, gain in others.items()
         if _like_for_like(models, ours, other)
-    ]
+    ]  # fmt: skip
     if rows:
-        section.add(
-            page.table(
-                f"What the learned reflectance gains: {basis(result)}",
-                ["model", "against", "MSE lowered by, %", "interval", "verdict"],
-                rows,
-            )
-        )
+        header = ["model", "against", "MSE lowered by, %", "interval", "verdict"]
+        section.add(page.table(f"What the learned reflectance gains: {basis(result)}", header, rows))
     for note in result.get("warnings", []):
         section.add(page.paragraph(f"Note: {note}.", "soft"))
     if result.get("lpips_unavailable"):
@@ -110,7 +96,7 @@ def _errors(result: dict[str, Any]) -> str:
         if row["mse_low"] is not None and row["mse_high"] is not None:
             axes.plot(np.sqrt([row["mse_low"], row["mse_high"]]), [k, k], color=colour, linewidth=3, alpha=0.5)
         axes.plot(row["rmse"], k, "o", color=colour, markersize=6)
-    axes.set_yticks(range(len(names)), [n.replace("_", " ") for n in names], fontsize=8)
+    axes.set_yticks(range(len(names)), [words(n) for n in names], fontsize=8)
     axes.invert_yaxis()
     values = [m["rmse"] for m in result["models"].values() if m["rmse"] > 0]
     if values and max(values) > 8 * min(values):
@@ -136,7 +122,7 @@ def _examples(file: h5py.File, names: list[str], unit: str) -> list[Markup]:
         for m in shown:
             above = pictures.data_uri(pictures.coloured(rendered[m], low, high, "gray"))
             below = pictures.data_uri(pictures.coloured(measured - rendered[m], -spread, spread, "RdBu_r"))
-            text = _words(names[m])
+            text = words(names[m])
             caption = f"{text}: rms {math.sqrt(file['mse'][m, k]):.4f}"
             figures.append(page.picture_pair(above, below, f"residual of {text}", caption))
         bars = [
@@ -156,33 +142,21 @@ def matching(result: dict[str, Any]) -> page.Section:
         for name, m in renderings.items():
             shift = m.get("median_shift_right_px")
             rows.append(
-                [matcher, name.replace("_", " "), str(m["matches"])]
-                + [_cell(m[f"within_{t}_px_percent"], ".1f") for t in (1, 3, 5)]
-                + [_cell(m["mean_error_px"], ".2f"), _cell(m["median_error_px"], ".2f")]
+                [matcher, words(name), str(m["matches"])]
+                + [cell(m[f"within_{t}_px_percent"], ".1f") for t in (1, 3, 5)]
+                + [cell(m["mean_error_px"], ".2f"), cell(m["median_error_px"], ".2f")]
                 + ["-" if shift is None else f"{shift:+.1f}, {m['median_shift_down_px']:+.1f}"]
             )
-    header = [
-        "matcher",
-        "rendering",
-        "matches",
-        "within 1 px, %",
-        "3 px, %",
-        "5 px, %",
-        "mean, px",
-        "median, px",
-        "shift, px",
-    ]
+    shares = ["within 1 px, %", "3 px, %", "5 px, %"]
+    header = ["matcher", "rendering", "matches", *shares, "mean, px", "median, px", "shift, px"]
+    width, height = result["size_px"]
+    title = f"{result['crops']} pictures at {width} x {height} px on {result.get('tiles', 1)} ground tiles"
     section.add(
         page.paragraph(
             "Measured and rendered images show the same ground, so every match should end where it began. "
             "A median shift far from zero is misregistration, which no reflectance can mend."
         ),
-        page.table(
-            f"{result['crops']} pictures at {result['size_px'][0]} x {result['size_px'][1]} px on "
-            f"{result.get('tiles', 1)} ground tiles",
-            header,
-            rows,
-        ),
+        page.table(title, header, rows),
     )
     return section
 
@@ -192,37 +166,32 @@ def comparison(result: dict[str, Any]) -> page.Section:
     section = page.Section("Comparison of reflectance models")
     rows = [
         [
-            name, _cell(m["mse_crop_sum"], ".4f"), _cell(m["mse_crop_sum_seed_std"], ".4f"), _cell(m["mse"], ".4e"),
-            "-" if m["mse_low"] is None else f"{m['mse_low']:.3e} .. {_cell(m['mse_high'], '.3e')}",
-            ", ".join(map(str, m["best_epoch"])), _cell(m["paper_mse_crop_sum"], ".2f"),
+            name, cell(m["mse_crop_sum"], ".4f"), cell(m["mse_crop_sum_seed_std"], ".4f"), cell(m["mse"], ".4e"),
+            "-" if m["mse_low"] is None else f"{m['mse_low']:.3e} .. {cell(m['mse_high'], '.3e')}",
+            ", ".join(map(str, m["best_epoch"])), cell(m["paper_mse_crop_sum"], ".2f"),
         ]
         for name, m in result["models"].items()
     ]  # fmt: skip
-    header = [
-        "model",
-        "MSE per crop",
-        "spread of seeds",
-        "MSE",
-        "95 % over tiles and seeds",
-        "best epochs",
-        "paper's MSE per crop",
-    ]
-    section.add(
-        page.table(
-            f"{result['crops']} crops, {result['tiles']} ground tiles, {result.get('seeds', 1)} training runs each",
-            header,
-            rows,
-            0,
-        )
-    )
-    words = {True: "yes", False: "no", None: "needs two seeds and two tiles"}
+    header = ["model", "MSE per crop", "spread of seeds", "MSE", "95 % over tiles and seeds", "best epochs"]
+    title = f"{result['crops']} crops, {result['tiles']} ground tiles, {result.get('seeds', 1)} training runs each"
+    section.add(page.table(title, [*header, "paper's MSE per crop"], rows, 0))
+    answers = {True: "yes", False: "no", None: "needs two seeds and two tiles"}
     rows = [
         [
-            f"{p['better']} < {p['worse']}", f"{p['difference_percent']:.1f}", _cell(p["noise_of_seeds"], ".1e"),
-            _cell(p["noise_of_tiles"], ".1e"), _cell(p["p_adjusted"], ".3f"), words[p["larger_than_noise"]],
+            f"{p['better']} < {p['worse']}", f"{p['difference_percent']:.1f}", cell(p["noise_of_seeds"], ".1e"),
+            cell(p["noise_of_tiles"], ".1e"), cell(p["p_adjusted"], ".3f"), answers[p["larger_than_noise"]],
         ]
         for p in result["differences"]
     ]  # fmt: skip
     header = ["pair", "difference, %", "noise of seeds", "noise of tiles", "p (Holm)", "larger than its noise"]
     section.add(page.table("Which differences are larger than their noise", header, rows))
+    return section
+
+
+def diagnosis(result: dict[str, Any]) -> page.Section:
+    """What the simulation gets wrong: the chapters of the diagnosis's own page, without its pictures."""
+    section = page.Section("Diagnosis")
+    section.add(*(page.paragraph(text) for text, _ in conclusions(result)))
+    for title, parts in chapters(result):
+        section.add(page.heading(title), *parts)
     return section

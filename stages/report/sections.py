@@ -50,7 +50,7 @@ def scene(file: h5py.File) -> page.Section:
             ]
         ),
     )
-    units = dict((value, name) for name, value in UNITS)
+    units = {value: name for name, value in UNITS}
     columns = [
         file[n][...] for n in ("units", "subsolar_longitude_deg", "subsolar_latitude_deg", "spacecraft_altitude_m")
     ]
@@ -62,16 +62,8 @@ def scene(file: h5py.File) -> page.Section:
             read_strings(file, "image_id"), times, *columns, area, strict=True
         )
     ]
-    header = [
-        "image",
-        "time (UTC)",
-        "units",
-        "sub-solar lon, deg",
-        "sub-solar lat, deg",
-        "altitude, km",
-        "crops fit on, km2",
-    ]
-    section.add(page.table("Images", header, rows))
+    header = ["image", "time (UTC)", "units", "sub-solar lon, deg", "sub-solar lat, deg", "altitude, km"]
+    section.add(page.table("Images", [*header, "crops fit on, km2"], rows))
     return section
 
 
@@ -103,7 +95,7 @@ def pairs(file: h5py.File) -> page.Section:
             ["part", "pairs", "images", "tiles", "Sun from zenith, deg", "view from nadir, deg"],
             rows,
         ),
-        page.chart(_where(file, split), "Crop centres, coloured by part of the split"),
+        page.chart(_chart_of_places(file, split), "Crop centres, coloured by part of the split"),
     )
     chosen = np.linspace(0, len(split) - 1, min(8, len(split))).astype(int)
     figures = []
@@ -117,14 +109,15 @@ def pairs(file: h5py.File) -> page.Section:
     return section
 
 
-def _where(file: h5py.File, split: np.ndarray) -> str:
+def _chart_of_places(file: h5py.File, split: np.ndarray) -> str:
+    """SVG of the crops' centres. split : (N,)"""
     figure, axes = pictures.new_chart(6.2, 3.9)
     longitude, latitude = file["longitude_deg"][...], file["latitude_deg"][...]
     for name, value in SPLITS:
         mine = np.flatnonzero(split == value)
         mine = mine[:: max(1, len(mine) // 1500)]
-        look = {"color": SPLIT_COLOURS[name], "markersize": 3, "label": name, "alpha": 0.8}
-        axes.plot(longitude[mine], latitude[mine], ".", rasterized=True, **look)  # as shapes, a third of the page
+        style = {"color": SPLIT_COLOURS[name], "markersize": 3, "label": name, "alpha": 0.8}
+        axes.plot(longitude[mine], latitude[mine], ".", rasterized=True, **style)  # as shapes, a third of the page
     axes.set(xlabel="east longitude, deg", ylabel="latitude, deg")
     axes.set_aspect(1 / max(0.05, np.cos(np.radians(np.mean(latitude)))), adjustable="datalim")
     axes.legend(frameon=False, markerscale=3, fontsize=8)

@@ -7,9 +7,11 @@ import os
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
+import cv2
+import numpy as np
 from markupsafe import Markup
 
 from schemas import ConfigError, InputError, atomic_path, check_output, open_artefact, read_kind
@@ -22,7 +24,6 @@ from stages.common.page.sentences import Sentence
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.report import conclusions, maps, results, sections
 from stages.report.config import Config
-from stages.report.diagnosis import diagnosis
 from stages.report.held_out import held_out_images
 
 BUILDERS = {
@@ -38,7 +39,7 @@ ORDER = ("scene", "pairs", "checkpoint", "svbrdf", "evaluation", "held_out", "ma
 FIRST = ("checkpoint", "evaluation", "svbrdf", "held_out", "diagnosis")
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 LARGEST_PICTURE = 12 * 2**20  # bytes
-HEAVY, WIDEST = 300_000, 1400  # bytes, px: pictures above are made lighter
+HEAVY, WIDEST = 300_000, 1400  # bytes, px: larger pictures are scaled down and written as WebP
 # What is seen on the pictures that commands write, by the beginning of their names.
 CAPTIONS = {
     "match_": "Matches between a measured crop (left) and the rendered ones, coloured by how far each ends from where it began",
@@ -47,6 +48,14 @@ CAPTIONS = {
     "training_curves": "Loss on training and validation pairs",
     "render": "The map as 'lunargr render' lights it",
 }
+
+
+class Part(NamedTuple):
+    """What one file gives. kind : one of ORDER; sentences : for the first screen"""
+
+    kind: str
+    section: page.Section
+    sentences: list[Sentence]
 
 
 def run(
@@ -66,7 +75,7 @@ def run(
     if not files:
         raise ConfigError("report: expected at least one file, found none; give the artefacts of a run.")
     check_output(output.file, files, output.overwrite)
-    found: list[tuple[str, page.Section, list[Sentence]]] = []
+    found: list[Part] = []
     shown: list[Path] = []
     linked: list[Path] = []
     details: list[Markup] = []
@@ -90,8 +99,8 @@ def run(
             ) from None
         if part is not None:
             found.append(part)
-    found.sort(key=lambda part: ORDER.index(part[0]))
-    chapters = [section for _, section, _ in found]
+    found.sort(key=lambda part: ORDER.index(part.kind))
+    chapters = [part.section for part in found]
     first = next((path for path in shown if path.stem.startswith("render")), None)
     rest = [path for path in shown if path != first]
     if rest:
@@ -111,9 +120,6 @@ def run(
     return [s.title for s in chapters]
 
 
-Part = tuple[str, page.Section, list[Sentence]]  # kind, section, what it says on the first screen
-
-
 def _head(found: Sequence[Part], linked: Sequence[Path], output: Path) -> list[Markup]:
     """The first screen: a way to the page that relights the map, and conclusions, each once."""
     beside = output.with_name("view.html")
@@ -123,7 +129,7 @@ def _head(found: Sequence[Part], linked: Sequence[Path], output: Path) -> list[M
     for path in linked:
         address = quote(os.path.relpath(path, output.parent).replace(os.sep, "/"))
         head.append(page.link(address, f"Move the Sun and the camera over this map: {path.name}"))
-    sentences = [s for kind in FIRST for part, _, found_there in found if part == kind for s in found_there]
+    sentences = [s for kind in FIRST for part in found if part.kind == kind for s in part.sentences]
     return [*head, page.conclusions(dict.fromkeys(sentences))] if sentences else head
 
 
@@ -138,7 +144,7 @@ def _artefact(path: Path, details: list[Markup], seen: list[Any]) -> Part | None
             return _result(result, file)
         if schema.name in BUILDERS:
             sentences = SENTENCES[schema.name](file) if schema.name in SENTENCES else []
-            return schema.name, BUILDERS[schema.name](file), sentences
+            return Part(schema.name, BUILDERS[schema.name](file), sentences)
     return None
 
 
@@ -155,18 +161,18 @@ def _json(path: Path, details: list[Markup], seen: list[Any]) -> Part | None:
 
 
 def _result(result: dict[str, Any], file: Any) -> Part | None:
-    """The section of a result, told by its keys; ``file`` holds its crops where there is one."""
+    """The section of a result, which its keys tell apart. file : the artefact, which may hold crops"""
     keys = set(result)
     if {"matchers", "size_px"} <= keys:
-        return "match", results.matching(result), []
+        return Part("match", results.matching(result), [])
     if {"models", "differences"} <= keys:
-        return "compare", results.comparison(result), []
+        return Part("compare", results.comparison(result), [])
     if "verdict" in keys:
-        return "diagnosis", diagnosis(result), diagnosed(result)
+        return Part("diagnosis", results.diagnosis(result), diagnosed(result))
     if {"models", "gains", "claim"} <= keys:
-        return "held_out", held_out_images(result), conclusions.held_out_images(result)
+        return Part("held_out", held_out_images(result), conclusions.held_out_images(result))
     if {"models", "gains"} <= keys:
-        return "evaluation", results.evaluation(result, file), conclusions.evaluation(result)
+        return Part("evaluation", results.evaluation(result, file), conclusions.evaluation(result))
     return None
 
 
@@ -186,16 +192,13 @@ def _figure(path: Path) -> Markup:
             f"{path}: expected a picture below {LARGEST_PICTURE // 2**20} MiB, found {len(content) / 2**20:.0f} MiB; "
             "make a smaller preview."
         )
-    if content[:4] not in (b"\x89PNG",) and content[:2] != b"\xff\xd8":
+    if not content.startswith((b"\x89PNG", b"\xff\xd8")):
         raise InputError(f"{path}: expected a PNG or JPEG picture, found another kind of file.")
-    return page.picture(_light(content, path), _caption(path))
+    return page.picture(_picture_uri(content, path), _caption(path))
 
 
-def _light(content: bytes, path: Path) -> str:
+def _picture_uri(content: bytes, path: Path) -> str:
     """A picture as data URI, large ones smaller and as WebP, so that the page stays light."""
-    import cv2
-    import numpy as np
-
     if len(content) <= HEAVY:
         return pictures.uri_of(content, PICTURES[path.suffix.lower()])
     picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR_RGB)
@@ -208,9 +211,9 @@ def _light(content: bytes, path: Path) -> str:
 
 def _caption(path: Path) -> str:
     """What is seen, where a command of lunargr named the picture; and its name."""
-    said = next((text for start, text in CAPTIONS.items() if path.stem.startswith(start)), None)
+    caption = next((text for start, text in CAPTIONS.items() if path.stem.startswith(start)), None)
     name = path.stem.replace("_", " ")
-    return name if said is None else f"{said} ({name})"
+    return name if caption is None else f"{caption} ({name})"
 
 
 def _origin(path: Path, file: Any) -> Markup:

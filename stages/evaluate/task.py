@@ -14,35 +14,34 @@ from stages.common.intervals import FEWEST_UNITS, choose_units
 from stages.common.progress import Progress, show_nothing
 from stages.effects import load_extension
 from stages.evaluate.config import Config
-from stages.evaluate.core import Scores, score
 from stages.evaluate.coverage import shares
 from stages.evaluate.fitting import Fitting, choose_fit_pairs, dn_scale, fit_rows
 from stages.evaluate.perceptual import Perceptual
-from stages.evaluate.renderers import Predictor, Reader
 from stages.evaluate.rows import TITLES, Row, make_renderers, make_rows
+from stages.evaluate.scores import Scores, score
 from stages.evaluate.table import conclude, gain_table, metric_table, strongest_baselines
-from stages.network.predictor import Predictor as Network
-from stages.network.predictor import choose_device, load_predictor
+from stages.network.predictor import Predictor, choose_device, load_predictor
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import Extension
 
 
 @dataclass
 class Task:
-    """What is compared on what: several predictors are training runs of one model; ``wanted`` are indices of pairs."""
+    """What is compared on what.
 
-    reader: Reader
+    predictors : training runs of one model; wanted : indices of the scored pairs (N,)
+    """
+
+    reader: PairReader
     predictors: Sequence[Predictor]
     wanted: np.ndarray
-    frame_names: Sequence[str]
-    units: str
     config: Config
     extensions: Sequence[Extension] = ()
 
     @property
     def calibrated(self) -> bool:
         """Whether the images are in I/F."""
-        return self.units == "iof"
+        return self.reader.units == "iof"
 
     def rows(self) -> list[Row]:
         """The rows of the table that are scored, with their renderers."""
@@ -50,7 +49,7 @@ class Task:
         return make_rows(renderers, len(self.predictors), bool(self.extensions), self.config.only)
 
     def fit_pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Train pairs to fit on; pairs of uncalibrated images that no train pair shows."""
+        """Train pairs to fit on; pairs of uncalibrated images that no train pair shows. Indices (n,) each."""
         train, orphans = choose_fit_pairs(self.reader, self.wanted, self.config.fit_pairs, self.config.seed)
         return train, np.empty(0, int) if self.calibrated else orphans
 
@@ -59,28 +58,23 @@ class Task:
         train, orphans = self.fit_pairs()
         size, used = self.config.batch, np.concatenate([train, orphans, self.wanted])
         scale = 1.0 if self.calibrated else dn_scale(self.reader, used, size)
-        frames = len(self.frame_names)
+        frames = len(self.reader.image_ids)
         return Fitting(self.reader, train, orphans, frames, self.calibrated, scale, size, self.config.seed)
 
 
-def load_predictors(checkpoints: Sequence[Path], config: Config) -> list[Network]:
-    """One for each training run. Raises LunargrError."""
-    return [load_predictor(path, choose_device(config.device)) for path in checkpoints]
-
-
-def make_task(reader: PairReader, predictors: Sequence[Network], wanted: np.ndarray, config: Config) -> Task:
-    """The comparison of training runs of one model on pairs. Raises LunargrError."""
+def make_task(reader: PairReader, checkpoints: Sequence[Path], wanted: np.ndarray, config: Config) -> Task:
+    """The comparison of training runs of one model on the pairs ``wanted`` (N,). Raises LunargrError."""
+    predictors = [load_predictor(path, choose_device(config.device)) for path in checkpoints]
     extensions = load_extension(Path(config.extend), reader.image_ids) if config.extend else []
-    return Task(reader, predictors, wanted, reader.image_ids, reader.units, config, extensions)
+    return Task(reader, predictors, wanted, config, extensions)
 
 
-def evaluate_pairs(
+def score_here(
     task: Task,
-    *,
     keep: Callable[[int, np.ndarray, list[np.ndarray]], Any] | None = None,
     progress: Progress = show_nothing,
-) -> tuple[list[Row], Scores, float, dict[str, Any]]:
-    """The pure comparison: (rows, scores of every training run, DN scale, what the JSON holds)."""
+) -> tuple[list[Row], Scores, float]:
+    """Fit and score in this process: the rows, the scores of every training run, the full range of DN. keep : see ``score``"""
     done, total = 0, 0
 
     def tick(count: int) -> None:
@@ -93,19 +87,18 @@ def evaluate_pairs(
     progress(0, total, "evaluate")
     rows = task.rows()
     fit_rows(fitting, rows, tick)
-    scores = score(task.reader, rows, task.wanted, fitting.scale, fitting.size, Perceptual(), keep, tick)
-    return rows, scores, fitting.scale, summarise(task, scores, fitting.scale)
+    return rows, score(task.reader, rows, task.wanted, fitting.scale, fitting.size, keep, tick), fitting.scale
 
 
 def summarise(task: Task, scores: Scores, scale: float) -> dict[str, Any]:
-    """What the JSON holds."""
+    """What the JSON holds. scale : full range of DN"""
     train, orphans = task.fit_pairs()
     perceptual = Perceptual()
     if not scores.pixels.any():
         raise ArtefactError(f"split '{task.config.split}': expected valid pixels, found none; project the pairs again.")
-    tile, site = (np.asarray(v)[task.wanted] for v in (task.reader.tile, task.reader.site))
+    tile, site = task.reader.tile[task.wanted], task.reader.site[task.wanted]
     unit, name = choose_units(tile, site)
-    frames = np.asarray(task.reader.frame)
+    frames = task.reader.frame
     models = metric_table(scores, unit)
     result: dict[str, Any] = {
         "split": task.config.split,
@@ -120,11 +113,11 @@ def summarise(task: Task, scores: Scores, scale: float) -> dict[str, Any]:
         "training_runs": len(task.predictors),
         "interval_unit": name,
         "intervals": "delete-one-unit jackknife, Student's t, 95 %",
-        "image_units": task.units,
+        "image_units": task.reader.units,
         "dn_full_range": None if task.calibrated else scale,
         "model": task.predictors[0].model.name,
         "fitted_on_pairs": len(train),
-        "frames_fitted_on_split": sorted({task.frame_names[f] for f in frames[orphans]}),
+        "frames_fitted_on_split": sorted({task.reader.image_ids[f] for f in frames[orphans]}),
         "coverage_percent": shares(scores.within.sum(axis=2)) if scores.within.any() else None,
         "lpips_unavailable": None if perceptual.available else perceptual.reason,
         "warnings": _warnings(name, len(np.unique(unit)), len(task.predictors), len(np.unique(frames[orphans]))),

@@ -11,8 +11,9 @@ import numpy as np
 from stages.evaluate.coverage import BANDS_DEG, count_within, gaussian_widths
 from stages.evaluate.metrics import psnr, squared_error, ssim
 from stages.evaluate.perceptual import Perceptual
-from stages.evaluate.renderers import Batch, Reader, batches, read_batch
+from stages.evaluate.renderers import Batch, batches, read_batch
 from stages.evaluate.rows import Row
+from stages.pairs.reader import PairReader
 from stages.physics.formation.radiometry import crop_range
 
 PER_ROW = ("squared_error", "ssim", "ssim_range_1", "lpips")
@@ -60,19 +61,21 @@ class Scores:
 
 
 def score(
-    reader: Reader,
+    reader: PairReader,
     rows: Sequence[Row],
     indices: np.ndarray,
     scale: float,
     size: int,
-    perceptual: Perceptual,
-    keep: Callable[[int, np.ndarray, list[np.ndarray]], Any] | None,
-    tick: Callable[[int], None],
+    keep: Callable[[int, np.ndarray, list[np.ndarray]], Any] | None = None,
+    tick: Callable[[int], None] = lambda count: None,
 ) -> Scores:
-    """Score every row on the crops ``indices``, batch by batch.
+    """Score every row on the crops ``indices`` (n,), ``size`` at a time.
 
+    scale : full range of DN, 1 for calibrated images
     keep : called with (position, measured (B, H, W), rendered of every row), NaN where not usable
+    tick : called with the number of crops of every batch that is done
     """
+    perceptual = Perceptual()
     m, n = len(rows), len(indices)
     scores = Scores(
         names=[r.name for r in rows],
@@ -94,7 +97,7 @@ def score(
         scores.data_range[where] = ranges
         images = []
         for k, row in enumerate(rows):
-            rendered = row.renderer.image(batch, row.how).numpy()
+            rendered = row.renderer.image(batch, row.matching).numpy()
             images.append(rendered)
             if row.name == "learned":
                 _count_within(scores.within[:, :, where], row, batch, rendered)
@@ -113,7 +116,10 @@ def score(
 
 
 def _count_within(counts: np.ndarray, row: Row, batch: Batch, rendered: np.ndarray) -> None:
-    """Add one training run's to ``counts`` (3, bands, B), where its network predicts deviations."""
+    """Add one training run's pixels to ``counts`` (3, bands, B), where its network predicts deviations.
+
+    rendered : (B, H, W)
+    """
     std = row.renderer.deviation(batch)
     if std is None:
         return
