@@ -175,9 +175,9 @@ def test_pieces_hold_their_own_lines(rng):
     line = line[np.abs(line % 14 - 7) < 6.4]
     sample = rng.uniform(0, 16, line.size)
     points = camera.image_to_ground(line, sample)
-    found = camera.ground_to_piece(points, camera.piece(line))
+    found = camera.ground_to_framelet(points, camera.framelet(line))
     np.testing.assert_allclose(found, [line, sample], atol=1e-6)
-    following = camera.ground_to_piece(points, np.minimum(camera.piece(line) + 5, 29))
+    following = camera.ground_to_framelet(points, np.minimum(camera.framelet(line) + 5, 29))
     assert np.all((following[0] % 14 >= 0.5 - 1e-9) & (following[0] % 14 <= 13.5 + 1e-9))
 
 

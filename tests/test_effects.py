@@ -12,7 +12,7 @@ from schemas import RegistryError
 from stages.effects import Survey, effect_names, fields, get_effect
 from stages.effects.filters import gaussian
 from stages.physics.formation.chain import Observation, form
-from stages.physics.formation.displaced import displace, sampled
+from stages.physics.formation.resampling import displace, displace_anywhere
 from stages.physics.photometry import get_model
 
 CATALOGUE = [
@@ -200,10 +200,12 @@ def test_a_ramp_is_displaced_by_what_is_asked_for(alike):
 
 def test_the_compiled_displacement_is_the_plain_one(rng):
     image, east, south = (torch.from_numpy(rng.normal(size=(3, 20, 31))).float() for _ in range(3))
-    assert torch.allclose(displace(image, 9 * east, 9 * south), sampled(image, 9 * east, 9 * south), atol=2e-5)
+    assert torch.allclose(
+        displace(image, 9 * east, 9 * south), displace_anywhere(image, 9 * east, 9 * south), atol=2e-5
+    )
     shift = torch.tensor([0.3, -7.6, 40.0])[:, None, None]
     far = shift.expand_as(image)
-    assert torch.allclose(displace(image, shift, 2 * shift), sampled(image, far, 2 * far), atol=2e-5)
+    assert torch.allclose(displace(image, shift, 2 * shift), displace_anywhere(image, far, 2 * far), atol=2e-5)
     moved = torch.full((3, 1, 1), 0.3, requires_grad=True)
     displace(image, moved.expand_as(image), moved).square().sum().backward()
     slope = moved.grad.clone()

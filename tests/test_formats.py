@@ -17,7 +17,7 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 
 from schemas.errors import InputError
-from stages.physics.images.labels import parse_pvl, read_label
+from stages.physics.images.labels import find_block, find_value, parse_pvl, read_label
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, local_metric_crs, sphere_crs
 
@@ -163,7 +163,7 @@ def test_pds3_with_attached_label(tmp_path):
     values = read_all(tmp_path / "a.img")
     assert np.isnan(values[3, 4])
     assert values[15, 31] == 511
-    assert read_label(tmp_path / "a.img").lookup("lines") == 16
+    assert find_value(read_label(tmp_path / "a.img"), "lines") == 16
 
 
 def test_pds4_label_and_image(tmp_path):
@@ -185,7 +185,7 @@ def test_pvl_in_its_spellings():
         "label",
     )
     assert label["A"] == 1 and label["B"] == [1, 2.5, "three"]
-    assert label.find("G")["C"] == "text" and label.lookup("d") == ["X", "Y"]
+    assert find_block(label, "G")["C"] == "text" and find_value(label, "d") == {"X", "Y"}
     assert label["LONG"] == "data/ab.cub"
     for broken in ("END_GROUP = G\nEND", "A 1\nEND"):
         with pytest.raises(InputError, match="expected a PVL label"):

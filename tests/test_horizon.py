@@ -21,7 +21,6 @@ def _strips(request, monkeypatch):
         monkeypatch.setattr(shadow, "SMALL", 0)
         monkeypatch.setattr(hulls, "SMALL", 0)
         monkeypatch.setattr(shadow, "LINES", 37)
-        monkeypatch.setattr(shadow, "LINES_TURNED", 41)
         monkeypatch.setattr(hulls, "LINES", 38)
 
 

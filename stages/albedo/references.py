@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.common.arrays import Floats32
+from stages.physics.bodies.ephemeris import AU
 from stages.physics.horizon.scene import Overview, horizon_in_scene
 from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
-from stages.physics.images.table import ASTRONOMICAL_UNIT, Frame
+from stages.physics.images.table import Frame
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import Grid
 from stages.physics.maps.window import Box, Window
@@ -104,7 +105,7 @@ class References(contextlib.AbstractContextManager):
             return None
         frame, surface = self.frames[k], self.surface
         position = frame.sun_position()
-        sun = Sun(position, SUN_RADIUS * ASTRONOMICAL_UNIT / float(np.linalg.norm(position)))
+        sun = Sun(position, SUN_RADIUS * AU / float(np.linalg.norm(position)))
         camera = frame.camera_position(surface.grid.radius)
         if pixels.ortho is not None:
             camera = pixels.ortho.camera_position

@@ -12,7 +12,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.effects.fields import detector_axes
 from stages.physics.formation.chain import Observation, State
-from stages.physics.formation.displaced import displace
+from stages.physics.formation.resampling import displace
 from stages.physics.photometry import Parameter
 
 CLEAR_LAG = 4  # px, from which on an echo is no matter of the point spread function

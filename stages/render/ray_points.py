@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.common.arrays import Floats
-from stages.physics.terrain.ground import slope_difference
+from stages.physics.terrain.block_geometry import slope_difference
 from stages.render.chart import chart_gradient
 from stages.render.raycast import HeightField, Hits, turn
 

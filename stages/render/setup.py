@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
 from schemas.provenance import raster_record
+from stages.physics.bodies.ephemeris import AU
 from stages.physics.bodies.spheres import Body
 from stages.physics.cameras import Camera
 from stages.physics.images.frame_geometry import open_camera_for
-from stages.physics.images.table import ASTRONOMICAL_UNIT
 from stages.physics.light.earth import EARTH_DISTANCE
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import check_same_body
-from stages.physics.terrain.further_light import Bounce, Earthshine, Hidden, Horizon
+from stages.physics.terrain.further_light import BelowHorizon, Bounce, Earthshine, Horizon
 from stages.physics.terrain.shading import Light
 from stages.physics.terrain.sun import Sun, check_sun_is_up, elevation_range, find_sun, place_over
 from stages.physics.terrain.sun_visibility import SunHorizon
@@ -44,14 +44,14 @@ def make_light(
     """The light over a surface; a camera model that knows its Sun stands in for a Sun that nobody named."""
     known = camera.sun_position(np.array([camera.lines / 2])) if camera is not None and config.camera else None
     if known is not None and all(getattr(config, name) is None for name in SUN):
-        sun = Sun(known[0], SUN_RADIUS * ASTRONOMICAL_UNIT / float(np.linalg.norm(known[0])))
+        sun = Sun(known[0], SUN_RADIUS * AU / float(np.linalg.norm(known[0])))
     else:
         sun = _named_sun(surface, config, body)
     span = relief[1] - relief[0]
     earthshine = _earthshine(surface, config, body, sun, span) if config.earthshine else None
     horizon: Horizon | None = None
     if earthshine is not None and elevation_range(sun, surface.grid)[1] < 0:
-        horizon = Hidden()  # by night the Earth shines alone
+        horizon = BelowHorizon()  # by night the Earth shines alone
     else:
         check_sun_is_up(sun, surface.grid, span)
         horizon = SunHorizon(surface.elevation, surface.grid, sun, span) if config.shadows else None

@@ -17,7 +17,7 @@ from rasterio.windows import Window
 from schemas.files.outputs import Output, Target, atomic_folder, atomic_path, check_outputs
 from schemas.provenance import SIDECAR, folder_record
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.physics.images.table import ASTRONOMICAL_UNIT
+from stages.physics.bodies.ephemeris import AU
 from stages.physics.maps.grid import Grid, local_metric_crs, unit_vectors
 from stages.simulate import sensor
 from stages.simulate.hidden import Hidden
@@ -202,7 +202,7 @@ def _make_image(
     step = config.dem_gsd
     view = View(
         shot,
-        unit_vectors(shot.sun.longitude_deg, shot.sun.latitude_deg) * shot.sun.distance_au * ASTRONOMICAL_UNIT,
+        unit_vectors(shot.sun.longitude_deg, shot.sun.latitude_deg) * shot.sun.distance_au * AU,
         unit_vectors(shot.spacecraft_longitude_deg, shot.spacecraft_latitude_deg) * (RADIUS + shot.spacecraft_altitude),
     )
     image = sensor.image_grid(config, scene.grid, shot, number)

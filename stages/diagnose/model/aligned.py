@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from stages.effects.filters import gradients
-from stages.physics.formation.displaced import displace
+from stages.physics.formation.resampling import displace
 
 
 def aligned(image: Tensor, valid: Tensor, east: Tensor, south: Tensor) -> tuple[Tensor, Tensor]:

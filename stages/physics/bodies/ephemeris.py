@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -47,8 +48,8 @@ class SubsolarPoint(NamedTuple):
 
 # --- time -----------------------------------------------------------------------------------------------------------
 
-_CALENDAR = re.compile(r"^(\d{4})-(\d{2})-(\d{2})(?:[T ](\d{1,2}):(\d{2})(?::(\d{2}(?:\.\d*)?))?)?$")
-_DAY_OF_YEAR = re.compile(r"^(\d{4})-(\d{3})(?:[T ](\d{1,2}):(\d{2})(?::(\d{2}(?:\.\d*)?))?)?$")
+# year, month and day or day of year, hour, minute, second
+_UTC = re.compile(r"^(\d{4})-(?:(\d{2})-(\d{2})|(\d{3}))(?:[T ](\d{1,2}):(\d{2})(?::(\d{2}(?:\.\d*)?))?)?$")
 
 
 def parse_utc(time_utc: str | datetime, where: str = "time") -> Time:
@@ -65,71 +66,67 @@ def parse_utc(time_utc: str | datetime, where: str = "time") -> Time:
             time_utc = time_utc.astimezone(UTC).replace(tzinfo=None)
         return Time(time_utc, scale="utc")
     text = str(time_utc).strip().strip('"')
-    bare = re.sub(r"(?:Z|\s*UTC|\+00:?00)$", "", text)
-    if match := _CALENDAR.match(bare):
-        year, month, day, hour, minute, second = match.groups()
-        value, form = f"{year}-{month}-{day}T{hour or '00'}:{minute or '00'}:{second or '00'}", "isot"
-    elif match := _DAY_OF_YEAR.match(bare):
-        year, day, hour, minute, second = match.groups()
-        value, form = f"{year}:{day}:{hour or '00'}:{minute or '00'}:{second or '00'}", "yday"
-    else:
+    match = _UTC.match(re.sub(r"(?:Z|\s*UTC|\+00:?00)$", "", text))
+    if match is None:
         raise InputError(f"{where}: expected a UTC time such as 2010-11-09T13:06:40.356, found '{text}'; write it so.")
+    year, month, day, day_of_year, hour, minute, second = match.groups("00")
+    clock = f"{hour}:{minute}:{second}".rstrip(".")
     try:
-        return Time(value.rstrip("."), format=form, scale="utc")
+        if match[4]:
+            return Time(f"{year}:{day_of_year}:{clock}", format="yday", scale="utc")
+        return Time(f"{year}-{month}-{day}T{clock}", format="isot", scale="utc")
     except ValueError:
         raise InputError(f"{where}: expected a UTC time that exists, found '{text}'; mend it.") from None
 
 
 def utc_to_et(time_utc: str | datetime) -> float:
     """Ephemeris time (seconds of TDB since J2000), which ISDs and SPICE count in."""
-    time = parse_utc(time_utc).tdb
-    return float(((time.jd1 - J2000) + time.jd2) * 86400.0)
+    return _days(parse_utc(time_utc).tdb) * DAY
 
 
 def et_to_utc(ephemeris_time: float) -> str:
     """The UTC time, ISO 8601 with milliseconds and ``Z``, of seconds of TDB since J2000."""
     from astropy.time import Time
 
-    return str(Time(J2000, ephemeris_time / 86400.0, format="jd", scale="tdb").utc.isot) + "Z"
-
-
-def body_name(body: str | Body) -> str:
-    """The name in lower case."""
-    return (body.name if isinstance(body, Body) else str(body)).strip().lower()
+    return str(Time(J2000, ephemeris_time / DAY, format="jd", scale="tdb").utc.isot) + "Z"
 
 
 # --- the Sun --------------------------------------------------------------------------------------------------------
 
 
 def subsolar_point(time_utc: str | datetime, body: str | Body = "moon") -> SubsolarPoint:
-    """Where the Sun is overhead on ``body`` at that UTC time; how well is said at the top of this file.
+    """The point of ``body`` over which the Sun stands at that UTC time; for its accuracy see the top of this file.
 
     The Sun's direction is the apparent one (light time and aberration), which is where its light comes from.
     Raises InputError for a time that cannot be read, GeometryError for a body that neither the built-in ephemeris nor
     the kernels of ``LUNARGR_SPICE_KERNELS`` know.
     """
-    sun = _apparent_place("sun", str(time_utc), body_name(body), os.environ.get(KERNELS_VARIABLE, ""))
-    distance = float(np.linalg.norm(sun))
-    longitude = math.degrees(math.atan2(sun[1], sun[0]))
-    latitude = math.degrees(math.asin(sun[2] / distance))
-    return SubsolarPoint(longitude, latitude, distance / AU)
+    longitude_deg, latitude_deg, distance = place_of(_apparent_position("sun", time_utc, body))
+    return SubsolarPoint(longitude_deg, latitude_deg, distance / AU)
+
+
+def place_of(position: Floats) -> tuple[float, float, float]:
+    """East longitude -180..180 and ocentric latitude, deg, and distance from the centre of a position (3,)."""
+    distance = float(np.linalg.norm(position))
+    longitude = math.degrees(math.atan2(position[1], position[0]))
+    return longitude, math.degrees(math.asin(position[2] / distance)), distance
 
 
 def earth_position(time_utc: str | datetime, body: str | Body = "moon") -> Floats:
-    """(3,) the Earth's apparent place over ``body`` at that UTC time, body-fixed, m.
+    """(3,) the Earth's apparent position over ``body`` at that UTC time, body-fixed, m.
 
     Raises as :func:`subsolar_point` does. Over the Moon the direction is good to 0.01 deg.
     """
-    return np.array(
-        _apparent_place("earth", str(time_utc), body_name(body), os.environ.get(KERNELS_VARIABLE, "")), float
+    return np.array(_apparent_position("earth", time_utc, body), float)
+
+
+def _apparent_position(target: str, time_utc: str | datetime, body: str | Body) -> Floats:
+    """(3,) of the Sun or the Earth, with light time and aberration, body-fixed, m; not to be written to."""
+    name = (body.name if isinstance(body, Body) else body).strip().lower()
+    kernels = os.environ.get(KERNELS_VARIABLE, "")
+    return (
+        _from_kernels(target, str(time_utc), name, kernels) if kernels else _from_astropy(target, str(time_utc), name)
     )
-
-
-@lru_cache(maxsize=4096)
-def _apparent_place(target: str, time_utc: str, body: str, kernels: str) -> Floats:
-    """(3,) of the Sun or the Earth, with light time and aberration, body-fixed, m."""
-    find = _place_from_kernels if kernels else _place_from_astropy
-    return find(target, time_utc, body, kernels)
 
 
 # Satellites turn one face to their planet: where that face looks is where the planet is. Mean distances, m (NASA fact
@@ -158,10 +155,15 @@ PLUTO = (
 )
 
 
-def _place_from_astropy(target: str, time_utc: str, body: str, _kernels: str) -> Floats:
-    if body not in ORIENTATIONS:
-        raise _unknown(body)
+@lru_cache(maxsize=4096)
+def _from_astropy(target: str, time_utc: str, body: str) -> Floats:
     from astropy.time import TimeDelta
+
+    if body not in ORIENTATIONS:
+        raise GeometryError(
+            f"body '{body}': the Sun's place is known without kernels for {', '.join(sorted(ORIENTATIONS))}; give the sub-solar point, "
+            f"or SPICE kernels in the environment variable {KERNELS_VARIABLE} (with 'lunargr[spice]')."
+        )
 
     time = parse_utc(time_utc).tdb
     place, velocity = _state(body, time)
@@ -179,24 +181,24 @@ def _state(body: str, time: Time) -> tuple[Floats, Floats]:
     if body in SATELLITES:
         planet, distance = SATELLITES[body]
         place, velocity = _builtin(planet, time)
-        days, step = _days(time), 1e-3
-        before, now, after = (
-            -distance * ORIENTATIONS[body].rotation(days + k * step)[0] for k in (-1, 0, 1)
-        )  # row 0 of the rotation is the prime meridian's direction
-        return place + now, velocity + (after - before) / (2 * step * DAY)
+        # row 0 of the rotation is the prime meridian's direction
+        offset, motion = _moving(lambda days: -distance * ORIENTATIONS[body].rotation(days)[0], _days(time), 1e-3)
+        return place + offset, velocity + motion
     if body in ("pluto", "charon"):
-        days, step = _days(time), 10.0
-        before, now, after = (_pluto((days + k * step) / CENTURY) * AU for k in (-1, 0, 1))
-        return _beside_the_sun(now, (after - before) / (2 * step * DAY), time)
-    if body in ELEMENTS:
-        position, velocity = small_body_state(body, J2000 + _days(time))
-        return _beside_the_sun(position * AU, velocity * AU / DAY, time)
-    return _builtin(body, time)
+        position, motion = _moving(lambda days: _pluto(days / CENTURY) * AU, _days(time), 10.0)
+    elif body in ELEMENTS:
+        position, motion = small_body_state(body, J2000 + _days(time))
+        position, motion = position * AU, motion * AU / DAY
+    else:
+        return _builtin(body, time)
+    place, velocity = _builtin("sun", time)
+    return place + position, velocity + motion
 
 
-def _beside_the_sun(position: Floats, velocity: Floats, time: Time) -> tuple[Floats, Floats]:
-    place, motion = _builtin("sun", time)
-    return place + position, motion + velocity
+def _moving(position: Callable[[float], Floats], days: float, step: float) -> tuple[Floats, Floats]:
+    """(3,) position, m, and velocity, m/s, at ``days``, by central differences over ``step`` days."""
+    before, now, after = (position(days + k * step) for k in (-1, 0, 1))
+    return now, (after - before) / (2 * step * DAY)
 
 
 def _pluto(centuries: float) -> Floats:
@@ -209,6 +211,7 @@ def _pluto(centuries: float) -> Floats:
 
 
 def _builtin(name: str, time: Time) -> tuple[Floats, Floats]:
+    """Barycentric position, m, and velocity, m/s, ICRF, of the Sun, a planet or the Moon."""
     from astropy.coordinates import get_body_barycentric_posvel
 
     position, velocity = get_body_barycentric_posvel(name, time, ephemeris="builtin")
@@ -216,10 +219,12 @@ def _builtin(name: str, time: Time) -> tuple[Floats, Floats]:
 
 
 def _days(time: Time) -> float:
+    """Days of TDB since J2000 of a time in TDB."""
     return float((time.jd1 - J2000) + time.jd2)
 
 
-def _place_from_kernels(target: str, time_utc: str, body: str, kernels: str) -> Floats:
+@lru_cache(maxsize=4096)
+def _from_kernels(target: str, time_utc: str, body: str, kernels: str) -> Floats:
     """From the user's SPICE kernels; the mean-Earth frame of the Moon where they define it."""
     try:
         import spiceypy
@@ -259,10 +264,3 @@ def _furnish(kernels: str) -> None:
             raise InputError(f"{KERNELS_VARIABLE}: no such file '{path}'.")
         if path:
             spiceypy.furnsh(path)
-
-
-def _unknown(name: str) -> GeometryError:
-    return GeometryError(
-        f"body '{name}': the Sun's place is known without kernels for {', '.join(sorted(ORIENTATIONS))}; give the sub-solar point, "
-        f"or SPICE kernels in the environment variable {KERNELS_VARIABLE} (with 'lunargr[spice]')."
-    )

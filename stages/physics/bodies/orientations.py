@@ -43,15 +43,17 @@ class Orientation:
             ra += d_ra * math.sin(angle)
             dec += d_dec * math.cos(angle)
             w += d_w * math.sin(angle)
-        return _about_z(w) @ _about_x(90.0 - dec) @ _about_z(90.0 + ra)
+        return about_z(w) @ about_x(90.0 - dec) @ about_z(90.0 + ra)
 
 
-def _about_z(angle_deg: float) -> NDArray[np.float64]:
+def about_z(angle_deg: float) -> NDArray[np.float64]:
+    """(3, 3), from one set of axes to another that is turned about their common z axis."""
     c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _about_x(angle_deg: float) -> NDArray[np.float64]:
+def about_x(angle_deg: float) -> NDArray[np.float64]:
+    """(3, 3), from one set of axes to another that is turned about their common x axis."""
     c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
 

@@ -1,7 +1,7 @@
-"""Where asteroids and dwarf planets are: published osculating elements, carried to other times by integration.
+"""Positions of asteroids and dwarf planets: published osculating elements, integrated to other times.
 
 A two-body orbit would be off by a tenth of a degree within a few years; here the Sun and the planets (ERFA's plan94)
-pull. Over fifteen years the heliocentric direction stays within 0.0002 deg of elements published for other epochs
+attract them. Over fifteen years the heliocentric direction stays within 0.0002 deg of elements published for other epochs
 (tests/test_ephemeris_bodies.py).
 """
 
@@ -16,14 +16,14 @@ import numpy as np
 
 from schemas.errors import InputError
 from stages.common.arrays import Floats
+from stages.physics.bodies.orientations import about_x, about_z
 
 GAUSS = 0.01720209895  # au^1.5 / day: the Gaussian gravitational constant
-OBLIQUITY = math.radians(84381.448 / 3600)  # of the ecliptic of J2000 that orbital elements refer to (IAU 1976)
-J2000 = 2451545.0
+OBLIQUITY_DEG = 84381.448 / 3600  # of the ecliptic of J2000 that orbital elements refer to (IAU 1976)
 # Sun's mass over that of Mercury, Venus, Earth with Moon, Mars, Jupiter, Saturn, Uranus, Neptune (IAU 2009)
 MASSES = np.array([6023600.0, 408523.71, 328900.56, 3098703.59, 1047.3486, 3497.898, 22902.98, 19412.24])
 STRETCH = 512.0  # days that are integrated and kept at a time
-SPAN = 40000.0  # days from the elements' epoch; beyond them the elements' digits count
+SPAN = 40000.0  # days from the elements' epoch; farther away the last digits of the elements matter
 
 
 @dataclass(frozen=True)
@@ -56,23 +56,8 @@ class Elements:
         root = math.sqrt(1 - e * e)
         rate = n / (1 - e * c)
         plane = np.array([[a * (c - e), a * root * s, 0.0], [-a * s * rate, a * root * c * rate, 0.0]])
-        turn = (
-            _about_x(-OBLIQUITY)
-            @ _about_z(-math.radians(self.node))
-            @ _about_x(-math.radians(self.inclination))
-            @ _about_z(-math.radians(self.perihelion))
-        )
+        turn = about_x(-OBLIQUITY_DEG) @ about_z(-self.node) @ about_x(-self.inclination) @ about_z(-self.perihelion)
         return np.asarray((plane @ turn.T).ravel(), float)
-
-
-def _about_z(angle: float) -> Floats:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _about_x(angle: float) -> Floats:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
 
 
 # Epochs near the missions that mapped them.
@@ -127,13 +112,19 @@ def _stretch(name: str, number: int) -> tuple[Floats, Any]:
     state = ELEMENTS[name].state() if first else _stretch(name, number - 1 if forward else number + 1)[0]
     epoch = ELEMENTS[name].epoch
     solved = solve_ivp(
-        lambda days, y: _pull(epoch, days, y), (start, end), state, "DOP853", rtol=1e-11, atol=1e-12, dense_output=True
+        lambda days, y: _derivative(epoch, days, y),
+        (start, end),
+        state,
+        "DOP853",
+        rtol=1e-11,
+        atol=1e-12,
+        dense_output=True,
     )
     return solved.y[:, -1], solved.sol
 
 
-def _pull(epoch: float, days: float, state: Floats) -> Floats:
-    """Velocity and acceleration, heliocentric: the planets pull at the body and at the Sun that it is counted from."""
+def _derivative(epoch: float, days: float, state: Floats) -> Floats:
+    """(6,) heliocentric velocity, au/day, and acceleration, au/day^2, of body and Sun among the planets."""
     import erfa
 
     place = state[:3]

@@ -1,4 +1,4 @@
-"""What a camera is: rays out of its pixels, and places on its detector.
+"""The interface of every camera: from pixels to rays, and from points on the ground to pixels.
 
 Image coordinates here are CSM's: (line, sample), the first pixel's centre at (0.5, 0.5), its outer corner at (0, 0).
 ``grid.CSM_CENTRE`` converts to array indices. Body-fixed (``mcmf``) vectors are in metres.
@@ -43,7 +43,7 @@ class Camera(ABC):
     def ground_to_image(self, points: ArrayLike) -> tuple[Floats, Floats]:
         """(line, sample) of body-fixed points (..., 3), m; NaN where no line of the image looks that way.
 
-        Places beside the detector have coordinates outside it: see :meth:`inside`.
+        Points that fall beside the detector get coordinates outside it: see :meth:`inside`.
         """
 
     def sun_position(self, line: ArrayLike) -> Floats | None:
@@ -51,7 +51,7 @@ class Camera(ABC):
         return None
 
     def ephemeris_time(self, line: ArrayLike) -> Floats | None:
-        """Seconds of TDB since J2000 of each line; None where the model holds no time.
+        """When each line was taken, s of TDB since J2000; None where the model holds no time.
 
         line : (...,) px; returns the same shape
         """
@@ -62,23 +62,25 @@ class Camera(ABC):
         line = np.asarray(line, float)
         return self.rays(line, np.full(line.shape, self.samples / 2) if sample is None else sample)[0]
 
-    def piece(self, line: ArrayLike) -> NDArray[np.int64] | None:
-        """Which exposure took each line, where the image is pieced together of several that overlap on the ground.
+    def framelet(self, line: ArrayLike) -> NDArray[np.int64] | None:
+        """Number of the framelet that holds each line, None for a camera whose image is one exposure or one strip.
 
-        None for an image in one piece, over which places move steadily as they do over the ground.
+        Framelets overlap on the ground, so that neighbouring lines of two framelets need not be neighbours there.
 
         line : (...,) px; returns the same shape
         """
         return None
 
-    def ground_to_piece(self, points: ArrayLike, piece: ArrayLike) -> tuple[Floats, Floats]:
-        """As :meth:`ground_to_image`, in a given exposure (indices that broadcast with the points); lines are held
-        where that exposure's own pixels are, so that its neighbours in the image do not mix in.
+    def ground_to_framelet(self, points: ArrayLike, framelet: ArrayLike) -> tuple[Floats, Floats]:
+        """As :meth:`ground_to_image`, but within given framelets: lines are clipped to the framelet's own pixel centres, so
+        that interpolation does not reach into the next one.
+
+        points : (..., 3); framelet : numbers that broadcast with them
         """
         return self.ground_to_image(points)
 
     def edge_lines(self, count: int) -> Floats:
-        """Image lines (n,) between whose places on the ground the image lies: ``count`` or more, first and last among them."""
+        """(n,) image lines, ``count`` or more from first to last, whose ground outlines that of the image."""
         return np.linspace(0.0, self.lines, count)
 
     def inside(self, line: ArrayLike, sample: ArrayLike) -> NDArray[np.bool_]:
@@ -94,7 +96,8 @@ class Camera(ABC):
     ) -> Floats:
         """(..., 3) body-fixed points where the pixels' rays meet the body's ellipsoid raised by ``height`` metres.
 
-        missing : what a ray that passes the body gives: ``nan``, ``nearest`` (the ray's point closest to the
+        line, sample, height : broadcastable
+        missing : what a ray that misses the body gives: ``nan``, ``nearest`` (the ray's point closest to the
             body, as CSM cameras answer) or ``error`` (GeometryError)
         """
         origin, direction = self.rays(line, sample)
@@ -115,9 +118,9 @@ class Camera(ABC):
 def meet_ellipsoid(
     origin: Floats, direction: Floats, equatorial: ArrayLike, polar: ArrayLike
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """First points (..., 3) of rays on an ellipsoid of revolution, and whether each ray meets it ahead of the camera.
+    """Where rays first meet an ellipsoid of revolution, (..., 3), and whether each does so ahead of the camera, (...,).
 
-    A ray that passes by gives its point closest to the ellipsoid.
+    origin, direction : (..., 3); equatorial, polar : semi-axes. A ray that misses gives its point closest to the ellipsoid.
     """
     stretch = (np.asarray(equatorial, float) / np.asarray(polar, float)) ** 2
     weight = np.stack(np.broadcast_arrays(np.ones_like(stretch), np.ones_like(stretch), stretch), axis=-1)
@@ -140,7 +143,7 @@ _CAMERAS: dict[str, type[Camera]] = {}
 
 
 def register(cls: type[Camera]) -> type[Camera]:
-    """Class decorator: make a camera known under its kind and under the names that it answers to."""
+    """Class decorator: register a camera under its kind and its ``answers_to``."""
     for name in {cls.kind, *cls.answers_to}:
         _CAMERAS[name.lower()] = cls
     return cls

@@ -156,7 +156,7 @@ def _each(model, k, x, y, forward, out_x, out_y):
 def undistort_arrays(model: int, k: NDArray, dx: NDArray, dy: NDArray) -> tuple[NDArray, NDArray]:
     """:func:`undistort` for arrays.
 
-    dx, dy : (n,) mm or px, as the model counts; k : (m,) its coefficients; returns (n,) each
+    dx, dy : (...,) mm; k : (m,) coefficients of the model; returns (...,) each
     """
     return _arrays(model, k, dx, dy, False)
 
@@ -164,7 +164,7 @@ def undistort_arrays(model: int, k: NDArray, dx: NDArray, dy: NDArray) -> tuple[
 def distort_arrays(model: int, k: NDArray, ux: NDArray, uy: NDArray) -> tuple[NDArray, NDArray]:
     """:func:`distort` for arrays.
 
-    ux, uy : (n,) mm or px, as the model counts; k : (m,) its coefficients; returns (n,) each
+    ux, uy : (...,) mm; k : (m,) coefficients of the model; returns (...,) each
     """
     return _arrays(model, k, ux, uy, True)
 

@@ -1,4 +1,4 @@
-"""Reading values out of a camera's document with one-line errors; shared by our own JSON cameras and ISDs."""
+"""Reading checked values out of a camera's JSON document, an ISD or our own."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from stages.physics.bodies.spheres import find_body
 
 LARGEST_IMAGE = 100_000_000  # lines, samples: longer than any strip from orbit
 ROTATION_TOLERANCE = 1e-6
-LOWEST_CAMERA, FARTHEST_CAMERA = 0.5, 1e13  # of the radius (bodies are far from round), m
-QUATERNION_TOLERANCE = 1e-3  # tables keep 8 digits; further off is not a rotation
+LOWEST_CAMERA = 0.5  # of the radius from the centre: small bodies are far from round
+FARTHEST_CAMERA = 1e13  # m from the centre
+QUATERNION_TOLERANCE = 1e-3  # of their length; tables keep 8 digits
 
 
 def value(document: Mapping[str, Any], key: str, where: str) -> Any:
@@ -67,12 +68,11 @@ def array(document: Mapping[str, Any], key: str, where: str, shape: tuple[int, .
 
 
 def has(document: Mapping[str, Any], key: str) -> bool:
-    """Whether a dotted key is there."""
-    here: Any = document
-    for part in key.split("."):
-        if not isinstance(here, Mapping) or part not in here:
-            return False
-        here = here[part]
+    """Whether there is a value under ``key``, which may go down with dots."""
+    try:
+        value(document, key, "")
+    except InputError:
+        return False
     return True
 
 
@@ -105,7 +105,7 @@ def rotation(document: Mapping[str, Any], key: str, where: str) -> Floats:
 
 
 def check_quaternions(quaternions: Floats, where: str) -> Floats:
-    """Unit quaternions (..., 4), normalised; refuses what is not a rotation. Raises GeometryError."""
+    """Unit quaternions (..., 4), normalised. Raises GeometryError for those whose length is not near 1."""
     length = np.linalg.norm(quaternions, axis=-1)
     bad = np.abs(length - 1) > QUATERNION_TOLERANCE
     if bad.any():
@@ -127,8 +127,8 @@ def quaternion_matrix(quaternions: Floats) -> Floats:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def own_camera(document: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """What the JSON of our own frame cameras has in common: size, principal point, place, rotation and body.
+def frame_camera(document: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Arguments common to our own frame cameras: size, principal point, position, rotation and body.
 
     Raises InputError or GeometryError.
     """
@@ -152,7 +152,7 @@ def own_camera(document: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def one_or_two(document: Mapping[str, Any], key: str, where: str, what: str) -> tuple[float, float]:
-    """A length along samples and lines above 0, given once or for each. Raises InputError or GeometryError."""
+    """Lengths above 0 along samples and lines, given as one or as two. Raises InputError or GeometryError."""
     found = np.atleast_1d(array(document, key, where))
     if found.size not in (1, 2) or (found <= 0).any():
         raise GeometryError(f"{where}: expected one or two {what} in '{key}', found {found}; mend the camera model.")
@@ -160,7 +160,7 @@ def one_or_two(document: Mapping[str, Any], key: str, where: str, what: str) -> 
 
 
 def body_axes(document: Mapping[str, Any], where: str) -> tuple[float, float]:
-    """The body of one of our own documents: ``body`` (name or metres), the Moon where absent."""
+    """Equatorial and polar semi-axis, m, of ``body`` (a name or a radius in metres; the Moon where absent)."""
     radius = find_body(str(document.get("body", "moon"))).radius
     return radius, radius
 

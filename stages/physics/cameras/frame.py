@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from stages.physics.cameras.base import Camera, Floats, register
 from stages.physics.cameras.isd import Detector, Exposure
-from stages.physics.cameras.tables import check_times
 
 
 @register
@@ -20,6 +19,7 @@ class Frame(Camera):
     """Lens, distortion and detector of an ISD at its centre time.
 
     centre : (3,) place of the camera, body-fixed, m; rotation : (3, 3), takes camera vectors to body-fixed ones
+    sun : (3,), body-fixed, m; time : s of TDB since J2000
     """
 
     kind: ClassVar[str] = "frame"
@@ -38,12 +38,7 @@ class Frame(Camera):
     def from_document(cls, document: Mapping[str, Any], where: str) -> Frame:
         exposure = Exposure.from_document(document, where)
         now = np.zeros(1)
-        for key, times in (
-            ("instrument_position", exposure.positions.times),
-            ("instrument_pointing", exposure.pointing.times),
-            ("body_rotation", exposure.body.times),
-        ):
-            check_times(where, key, times, 0.0, 0.0)
+        exposure.check_covers(0.0, 0.0, where)
         body = exposure.body.at(now)[0]
         camera = cls(
             lines=exposure.lines,
@@ -52,7 +47,7 @@ class Frame(Camera):
             detector=Detector.from_document(document, where),
             centre=body @ exposure.positions.at(now)[0],
             rotation=body @ exposure.pointing.at(now)[0].T,
-            sun=exposure.sun_body_fixed(now)[0],
+            sun=body @ exposure.sun.at(now)[0],
             time=exposure.centre_time,
         )
         origin, axis = camera.rays(camera.lines / 2, camera.samples / 2)

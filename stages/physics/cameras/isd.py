@@ -1,4 +1,4 @@
-"""What frame, push-frame and line-scan ISDs share: the detector, its optics and the tables around the exposure.
+"""The common parts of frame, push-frame and line-scan ISDs: the detector with its optics, and the tables over time.
 
 An ISD (image support data) is the JSON that ALE writes and CSM cameras read. Focal-plane lengths are in mm.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -19,7 +19,16 @@ from stages.common.arrays import Floats
 from stages.physics.cameras import document as read
 from stages.physics.cameras.base import meet_ellipsoid
 from stages.physics.cameras.distortion import distort, distort_arrays, read_distortion, undistort_arrays
-from stages.physics.cameras.tables import Rotations, States, read_rotations, read_states
+from stages.physics.cameras.tables import (
+    EvenTable,
+    Rotations,
+    States,
+    check_times,
+    even_pointing,
+    even_positions,
+    read_rotations,
+    read_states,
+)
 
 
 @dataclass(frozen=True)
@@ -38,7 +47,7 @@ class Detector:
     summing: tuple[float, float]
     distortion: int
     coefficients: Floats
-    sense: float = 1.0  # -1: the optical axis points out of the back, as :meth:`facing` finds out
+    sense: float = 1.0  # -1: the optical axis points out of the back of the camera, see :meth:`facing`
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any], where: str) -> Detector:
@@ -100,14 +109,37 @@ class Detector:
         sample = self.to_sample[0] + self.to_sample[1] * dx + self.to_sample[2] * dy + self.centre[1] - self.start[1]
         return line / self.summing[0], sample / self.summing[1]
 
+    @property
+    def optics(self) -> Optics:
+        """The same for numba kernels."""
+        offset = self.centre[0] - self.start[0], self.centre[1] - self.start[1]
+        axes = (self.to_line, self.to_sample)
+        return Optics(self.focal_length, self.sense, *axes, *offset, *self.summing, self.distortion, self.coefficients)
+
+
+class Optics(NamedTuple):
+    """A :class:`Detector` as numba kernels take it; offsets : px from the image's first pixel to the detector's centre"""
+
+    focal_length: float
+    sense: float
+    to_line: Floats
+    to_sample: Floats
+    line_offset: float
+    sample_offset: float
+    line_summing: float
+    sample_summing: float
+    distortion: int
+    coefficients: Floats
+
 
 @numba.njit(cache=True)
-def detector_place(x, y, z, focal, sense, to_line, to_sample, model, coefficients):
-    """Detector (line, sample) from the principal point of a camera vector; NaN behind the camera."""
-    if z * focal * sense <= 0:
+def detector_place(x, y, z, optics):
+    """Detector (line, sample) from the detector's centre of a camera vector; NaN behind the camera."""
+    if z * optics.focal_length * optics.sense <= 0:
         return math.nan, math.nan
-    scale = focal / z
-    dx, dy = distort(model, coefficients, x * scale, y * scale)
+    scale = optics.focal_length / z
+    dx, dy = distort(optics.distortion, optics.coefficients, x * scale, y * scale)
+    to_line, to_sample = optics.to_line, optics.to_sample
     return (
         to_line[0] + to_line[1] * dx + to_line[2] * dy,
         to_sample[0] + to_sample[1] * dx + to_sample[2] * dy,
@@ -116,7 +148,7 @@ def detector_place(x, y, z, focal, sense, to_line, to_sample, model, coefficient
 
 @dataclass(frozen=True)
 class Exposure:
-    """Everything of an ISD that is not the detector; times in s from ``centre_time`` (TDB since J2000)."""
+    """All of an ISD but the detector; times in s from ``centre_time`` (TDB since J2000)."""
 
     lines: int
     samples: int
@@ -129,13 +161,8 @@ class Exposure:
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any], where: str) -> Exposure:
-        unit = (
-            str(document.get("radii", {}).get("unit", "km")).lower()
-            if isinstance(document.get("radii"), Mapping)
-            else "km"
-        )
-        metres = 1000.0 if unit == "km" else 1.0
         major, minor = _pair(document, "radii.semimajor", "radii.semiminor", where)
+        metres = 1000.0 if str(document["radii"].get("unit", "km")).lower() == "km" else 1.0
         axes = major * metres, minor * metres
         if min(axes) <= 0:
             raise GeometryError(f"{where}: expected radii above 0, found {axes} m; correct the ISD.")
@@ -151,9 +178,21 @@ class Exposure:
             sun=read_states(document, "sun_position", where, centre),
         )
 
-    def sun_body_fixed(self, times: Floats) -> Floats:
-        """(n, 3) place of the Sun, body-fixed, m, at times (n,)."""
-        return (self.body.at(times) @ self.sun.at(times)[..., None])[..., 0]
+    def check_covers(self, first: float, last: float, where: str) -> None:
+        """Refuse tables that do not reach from the image's first to its last time, s. Raises InputError."""
+        for key, table in (
+            ("instrument_position", self.positions.times),
+            ("instrument_pointing", self.pointing.times),
+            ("body_rotation", self.body.times),
+        ):
+            check_times(where, key, table, first, last)
+
+    def even_tables(self) -> tuple[EvenTable, EvenTable, EvenTable]:
+        """Camera positions, m, pointing (quaternions, camera to body-fixed) and Sun positions, m, body-fixed."""
+        positions, sun = (
+            even_positions(states, self.positions.times, self.body) for states in (self.positions, self.sun)
+        )
+        return positions, even_pointing(self.pointing, self.body), sun
 
 
 def _pair(document: Mapping[str, Any], first: str, second: str, where: str) -> tuple[float, float]:

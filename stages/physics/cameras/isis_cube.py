@@ -6,8 +6,11 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from schemas.errors import InputError
-from stages.physics.images.labels import Block, isis_table, read_label
+from stages.physics.images.labels import Block, find_block, find_value, isis_table, read_label
 from stages.physics.maps.grid import CSM_CENTRE, ISIS_CENTRE
 
 ISIS_SHIFT = ISIS_CENTRE - CSM_CENTRE
@@ -25,13 +28,13 @@ def cube_document(path: Path) -> dict[str, Any]:
     label = read_label(path)
     if label is None:
         raise InputError(f"{where}: expected an ISIS label, found none.")
-    instrument = str(label.lookup("InstrumentId") or "none")
+    instrument = str(find_value(label, "InstrumentId") or "none")
     if instrument not in ("NACL", "NACR"):
         raise InputError(
             f"{where}: expected a cube of the LROC NAC to take the camera from, found instrument '{instrument}'; make an ISD "
             "with ALE (isd_generate CUBE, see docs/from_pds_to_pairs.md, step 3) and name that."
         )
-    keywords = label.find("NaifKeywords")
+    keywords = find_block(label, "NaifKeywords")
     if keywords is None:
         raise InputError(f"{where}: expected SPICE data attached to the cube, found none; run spiceinit on it first.")
     number = -85600 if instrument == "NACL" else -85610
@@ -66,7 +69,7 @@ def cube_document(path: Path) -> dict[str, Any]:
             "sample": kernel["BORESIGHT_SAMPLE"] - ISIS_SHIFT,
         },
         "starting_detector_line": 0,
-        "starting_detector_sample": float(label.lookup("SampleFirstPixel") or 0) + first_sample * summing,
+        "starting_detector_sample": float(find_value(label, "SampleFirstPixel") or 0) + first_sample * summing,
         "optical_distortion": {"lrolrocnac": {"coefficients": [kernel["OD_K"]]}},
         "radii": {"semimajor": radii[0], "semiminor": radii[2], "unit": "km"},
         "instrument_position": _states(path, label, "InstrumentPosition"),
@@ -91,7 +94,7 @@ _KERNEL = (
 
 
 def _required(block: Block, key: str, where: str) -> Any:
-    value = block.lookup(key)
+    value = find_value(block, key)
     if value is None:
         raise InputError(f"{where}: expected '{key}' in the cube's label, found none; run spiceinit on it again.")
     return value
@@ -113,11 +116,11 @@ def _preroll(keywords: Block, where: str) -> float:
 
 def _crop(label: Block, where: str) -> tuple[float, float, int, int]:
     """(line, sample) of the cube's corner in the whole image, and its lines and samples."""
-    size = label.find("Dimensions")
+    size = find_block(label, "Dimensions")
     if size is None:
         raise InputError(f"{where}: expected the cube's Dimensions, found none.")
     lines, samples = int(size["Lines"]), int(size["Samples"])
-    alpha = label.find("AlphaCube")
+    alpha = find_block(label, "AlphaCube")
     if alpha is None:
         return 0.0, 0.0, lines, samples
     if (alpha.get("BetaLines"), alpha.get("BetaSamples")) != (
@@ -127,16 +130,23 @@ def _crop(label: Block, where: str) -> tuple[float, float, int, int]:
         raise InputError(
             f"{where}: expected a cube at its image's full scale, found one reduced or enlarged; crop only."
         )
-    shift = ISIS_SHIFT  # ISIS puts the outer corner at 0.5
-    return float(alpha["AlphaStartingLine"]) - shift, float(alpha["AlphaStartingSample"]) - shift, lines, samples
+    # ISIS puts the outer corner at 0.5
+    first_line, first_sample = (float(alpha[f"AlphaStarting{axis}"]) - ISIS_SHIFT for axis in ("Line", "Sample"))
+    return first_line, first_sample, lines, samples
+
+
+def _table(path: Path, label: Block, name: str, fields: tuple[int, int]) -> NDArray[np.float64]:
+    """(records, fields) of a table with one or the other number of fields. Raises InputError."""
+    table = isis_table(path, label, name)
+    if table.shape[1] not in fields:
+        raise InputError(
+            f"{path}: expected {fields[0]} or {fields[1]} fields in table '{name}', found {table.shape[1]}; run spiceinit again."
+        )
+    return table
 
 
 def _states(path: Path, label: Block, name: str) -> dict[str, Any]:
-    table = isis_table(path, label, name)
-    if table.shape[1] not in (4, 7):
-        raise InputError(
-            f"{path}: expected 4 or 7 fields in table '{name}', found {table.shape[1]}; run spiceinit again."
-        )
+    table = _table(path, label, name, (4, 7))
     states: dict[str, Any] = {"positions": table[:, :3], "ephemeris_times": table[:, -1], "unit": "km"}
     if table.shape[1] == 7:
         states["velocities"] = table[:, 3:6]
@@ -144,14 +154,9 @@ def _states(path: Path, label: Block, name: str) -> dict[str, Any]:
 
 
 def _rotations(path: Path, label: Block, name: str) -> dict[str, Any]:
-    table = isis_table(path, label, name)
-    if table.shape[1] not in (5, 8):
-        raise InputError(
-            f"{path}: expected 5 or 8 fields in table '{name}', found {table.shape[1]}; run spiceinit again."
-        )
+    table = _table(path, label, name, (5, 8))
     rotations: dict[str, Any] = {"quaternions": table[:, :4], "ephemeris_times": table[:, -1]}
-    block = label.find("Table", name)
-    constant = block.get("ConstantRotation") if block is not None else None
+    constant = (find_block(label, "Table", name) or {}).get("ConstantRotation")
     if constant is not None:
         rotations["constant_rotation"] = constant
     return rotations

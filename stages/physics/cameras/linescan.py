@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numba
@@ -15,7 +15,7 @@ from schemas.errors import GeometryError, InputError
 from stages.physics.cameras import document as read
 from stages.physics.cameras.base import Camera, Floats, register
 from stages.physics.cameras.isd import Detector, Exposure, detector_place
-from stages.physics.cameras.tables import EvenTable, check_times, even_pointing, even_positions, lagrange
+from stages.physics.cameras.tables import EvenTable, lagrange
 
 ISD_FIRST_LINE = 0.5  # 'line_scan_rate' counts its lines from 0.5 where the image begins
 COARSE_NODES = (2048, 131072)
@@ -59,6 +59,7 @@ class LineScan(Camera):
             )
         if (rates[:, 2] > 0).any() and (rates[:, 2] < 0).any():
             raise InputError(f"{where}: expected 'line_scan_rate' to run one way in time, found both signs.")
+        positions, pointing, sun = exposure.even_tables()
         camera = cls(
             lines=exposure.lines,
             samples=exposure.samples,
@@ -68,21 +69,15 @@ class LineScan(Camera):
             line_starts=rates[:, 0] - ISD_FIRST_LINE,
             line_times=rates[:, 1].copy(),
             line_rates=rates[:, 2].copy(),
-            positions=even_positions(exposure.positions, exposure.positions.times, exposure.body),
-            pointing=even_pointing(exposure.pointing, exposure.body),
-            sun=even_positions(exposure.sun, exposure.positions.times, exposure.body),
+            positions=positions,
+            pointing=pointing,
+            sun=sun,
         )
-        ends = camera.times(np.array([0.0, camera.lines]))
-        for key, times in (
-            ("instrument_position", exposure.positions.times),
-            ("instrument_pointing", exposure.pointing.times),
-            ("body_rotation", exposure.body.times),
-        ):
-            check_times(where, key, times, float(ends.min()), float(ends.max()))
+        ends = camera.times([0.0, camera.lines])
+        exposure.check_covers(float(ends.min()), float(ends.max()), where)
         origin, axis = camera.rays(camera.lines / 2, camera.samples / 2)
-        object.__setattr__(camera, "detector", detector.facing(origin, axis, camera.semi_axes[0]))
-        object.__setattr__(camera, "_search", _Search.for_camera(camera, where))
-        return camera
+        camera = replace(camera, detector=detector.facing(origin, axis, camera.semi_axes[0]))
+        return replace(camera, _search=_Search.for_camera(camera, where))
 
     def times(self, line: ArrayLike) -> Floats:
         """Seconds from ``centre_time`` of image lines.
@@ -117,50 +112,24 @@ class LineScan(Camera):
         points = np.asarray(points, float)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         line, sample = np.empty(len(flat)), np.empty(len(flat))
-        d, s = self.detector, self._search
-        assert s is not None  # built with every camera
+        search = self._search
+        assert search is not None  # built with every camera
         _find(
-            flat,
-            s.coarse,
-            s.start,
-            s.step,
-            s.guess,
-            s.slope,
-            self.positions.values,
-            self.positions.start,
-            self.positions.step,
-            self.pointing.values,
-            self.pointing.start,
-            self.pointing.step,
-            d.focal_length,
-            d.sense,
-            d.to_line,
-            d.to_sample,
-            d.centre[0] - d.start[0],
-            d.centre[1] - d.start[1],
-            d.summing[1],
-            d.distortion,
-            d.coefficients,
-            self.line_starts,
-            self.line_times,
-            self.line_rates,
-            line,
-            sample,
-        )
+            flat, search.coarse, search.guess, search.slope, self.positions, self.pointing, self.detector.optics,
+            self.line_starts, self.line_times, self.line_rates, line, sample,
+        )  # fmt: skip
         return line.reshape(points.shape[:-1]), sample.reshape(points.shape[:-1])
 
 
 @dataclass(frozen=True)
 class _Search:
-    """What makes the search for a point's line fast: a table that needs no polynomials, and a first guess.
+    """Aids for the search of a point's line: a table that is interpolated linearly, and a first guess.
 
-    coarse : (n, 12) position and rows of the body-to-camera rotation at times start + k step
+    coarse : (n, 12) positions and rows of the body-to-camera rotations
     guess : (4,) time of a point = g0 + g1 x + g2 y + g3 z; slope : detector lines per second
     """
 
-    coarse: Floats
-    start: float
-    step: float
+    coarse: EvenTable
     guess: Floats
     slope: float
 
@@ -192,7 +161,7 @@ class _Search:
         half = 0.5 * abs(float(np.median(camera.line_rates)))
         middle = camera.times(line[k])
         rows = [
-            camera.detector.places(_into(camera.rotations(t), points[k] - camera.positions.at(t)))[0]
+            camera.detector.places(camera.rotations(t).T @ (points[k] - camera.positions.at(t)))[0]
             * camera.detector.summing[0]
             for t in (middle - half, middle + half)
         ]
@@ -202,12 +171,7 @@ class _Search:
                 f"{where}: expected a camera that moves over the ground, found none; check its tables of position and "
                 "pointing."
             )
-        return cls(np.ascontiguousarray(coarse), float(times[0]), float(times[1] - times[0]), guess, slope)
-
-
-def _into(rotation: Floats, vectors: Floats) -> Floats:
-    """Camera vectors of body-fixed ones."""
-    return (np.swapaxes(rotation, -1, -2) @ vectors[..., None])[..., 0]
+        return cls(EvenTable(float(times[0]), float(times[1] - times[0]), coarse), guess, slope)
 
 
 @numba.njit(cache=True)
@@ -220,32 +184,7 @@ def _line_of_time(time, line_starts, line_times, line_rates):
 
 @numba.njit(cache=True, parallel=True, fastmath=False)
 def _find(
-    points,
-    coarse,
-    start,
-    step,
-    guess,
-    slope,
-    positions,
-    position_start,
-    position_step,
-    pointing,
-    pointing_start,
-    pointing_step,
-    focal,
-    sense,
-    to_line,
-    to_sample,
-    line_offset,
-    sample_offset,
-    sample_summing,
-    model,
-    coefficients,
-    line_starts,
-    line_times,
-    line_rates,
-    out_line,
-    out_sample,
+    points, coarse, guess, slope, positions, pointing, optics, line_starts, line_times, line_rates, out_line, out_sample
 ):
     """For each point the time at which it lies on the detector's line.
 
@@ -253,13 +192,14 @@ def _find(
     themselves, so that the answer does not depend on the coarse table.
     """
     n = points.shape[0]
-    last = coarse.shape[0] - 1
+    start, step, entries = coarse
+    last = entries.shape[0] - 1
     first_time, last_time = start, start + last * step
     tolerance = 1e-5 * abs(slope * line_rates[0])  # of a line
     for chunk in numba.prange((n + CHUNK - 1) // CHUNK):
         place, turn = np.empty(3), np.empty(4)
-        # Neighbours are alike: what the guess was off by for the point before, how fast that one crossed the line, and
-        # how far it went sideways meanwhile.
+        # Start from the point before: the error of its first guess, how fast it crossed the line and how far it moved
+        # sideways meanwhile.
         correction, gradient, sideways = 0.0, slope, 0.0
         for i in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             px, py, pz = points[i, 0], points[i, 1], points[i, 2]
@@ -278,15 +218,15 @@ def _find(
                 j = min(max(int(x), 0), last - 1)
                 f = x - j
                 g = 1.0 - f
-                a, b = coarse[j], coarse[j + 1]
+                a, b = entries[j], entries[j + 1]
                 vx = px - (g * a[0] + f * b[0])
                 vy = py - (g * a[1] + f * b[1])
                 vz = pz - (g * a[2] + f * b[2])
                 cx = (g * a[3] + f * b[3]) * vx + (g * a[4] + f * b[4]) * vy + (g * a[5] + f * b[5]) * vz
                 cy = (g * a[6] + f * b[6]) * vx + (g * a[7] + f * b[7]) * vy + (g * a[8] + f * b[8]) * vz
                 cz = (g * a[9] + f * b[9]) * vx + (g * a[10] + f * b[10]) * vy + (g * a[11] + f * b[11]) * vz
-                row, column = detector_place(cx, cy, cz, focal, sense, to_line, to_sample, model, coefficients)
-                row += line_offset
+                row, column = detector_place(cx, cy, cz, optics)
+                row += optics.line_offset
                 if not math.isfinite(row):
                     break
                 if before_time == before_time and time != before_time:
@@ -306,8 +246,8 @@ def _find(
                 correction, gradient = 0.0, slope
                 continue
             for _ in range(8):
-                lagrange(positions, position_start, position_step, time, place)
-                lagrange(pointing, pointing_start, pointing_step, time, turn)
+                lagrange(positions, time, place)
+                lagrange(pointing, time, turn)
                 vx, vy, vz = px - place[0], py - place[1], pz - place[2]
                 w, qx, qy, qz = turn[0], -turn[1], -turn[2], -turn[3]
                 norm = w * w + qx * qx + qy * qy + qz * qz
@@ -317,14 +257,14 @@ def _find(
                 cx = vx + w * tx + qy * tz - qz * ty
                 cy = vy + w * ty + qz * tx - qx * tz
                 cz = vz + w * tz + qx * ty - qy * tx
-                row, column = detector_place(cx, cy, cz, focal, sense, to_line, to_sample, model, coefficients)
-                row += line_offset
+                row, column = detector_place(cx, cy, cz, optics)
+                row += optics.line_offset
                 time -= row / gradient
                 if not abs(row) > tolerance:
                     break
             if abs(row) <= tolerance:
                 correction = time - affine
                 out_line[i] = _line_of_time(time, line_starts, line_times, line_rates)
-                out_sample[i] = (column - sideways * row + sample_offset) / sample_summing
+                out_sample[i] = (column - sideways * row + optics.sample_offset) / optics.sample_summing
             else:
                 correction, gradient = 0.0, slope

@@ -40,7 +40,7 @@ class Pinhole(Camera):
     @classmethod
     def from_document(cls, document: Mapping[str, Any], where: str) -> Pinhole:
         focal = read.one_or_two(document, "focal_px", where, "focal lengths above 0 px")
-        return cls(focal_px=focal, **read.own_camera(document, where))
+        return cls(focal_px=focal, **read.frame_camera(document, where))
 
     def to_document(self) -> dict[str, Any]:
         """The JSON document that :meth:`from_document` reads."""

@@ -1,7 +1,7 @@
 """Push-frame camera from an ALE/CSM ISD (LROC WAC, THEMIS VIS, MARCI, CaSSIS, ...): an image of many narrow exposures.
 
 Every ``interframe_delay`` seconds the detector takes a framelet of a few lines; the image is the framelets one below
-the other. They overlap on the ground, so that a place may be seen in several: the one whose middle is nearest counts.
+the other. They overlap on the ground: of several that show a point, the one whose middle is nearest to it counts.
 Conventions are those of USGSCSM's push-frame model (github.com/DOI-USGS/usgscsm), except that here ``ground_to_image``
 is the inverse of ``image_to_ground`` for flipped framelets too.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numba
 import numpy as np
@@ -21,11 +21,10 @@ from schemas.errors import GeometryError, InputError
 from stages.physics.cameras import document as read
 from stages.physics.cameras.base import Camera, Floats, register
 from stages.physics.cameras.isd import Detector, Exposure, detector_place
-from stages.physics.cameras.tables import check_times, even_pointing, even_positions
 
 CHUNK = 8192  # points per parallel piece
-EDGE = 0.5  # lines beyond a framelet that its outermost pixels still stand for, where the next one leaves a gap
-STEPS = 64  # framelets looked at for a point that has no neighbour to start from
+EDGE = 0.5  # lines beyond a framelet that its outermost pixels cover where the next framelet leaves a gap
+STEPS = 64  # framelets tried for a point without a neighbour to start from
 
 
 @register
@@ -37,7 +36,7 @@ class PushFrame(Camera):
     suns : (n, 3), body-fixed, m; times : (n,), s of TDB since J2000, the middles of the exposures
     trimmed : lines of the detector's framelet left out at its top (and as many at its bottom)
     flipped : a framelet's first image line is its last on the detector
-    slope : lines that the ground moves on the detector from one framelet of the image to the next
+    slope : detector lines by which the ground moves from one framelet of the image to the next
     """
 
     kind: ClassVar[str] = "push-frame"
@@ -70,15 +69,11 @@ class PushFrame(Camera):
             )
         first = read.number(document, "starting_ephemeris_time", where) + duration / 2 - exposure.centre_time
         times = first + delay * np.arange(framelets)
-        for key, table in (
-            ("instrument_position", exposure.positions.times),
-            ("instrument_pointing", exposure.pointing.times),
-            ("body_rotation", exposure.body.times),
-        ):
-            check_times(where, key, table, float(times[0]), float(times[-1]))
+        exposure.check_covers(float(times[0]), float(times[-1]), where)
         if _flag(document, "framelet_order_reversed", where):
             times = times[::-1].copy()
-        quaternions = even_pointing(exposure.pointing, exposure.body).at(times)
+        positions, pointing, sun = exposure.even_tables()
+        quaternions = pointing.at(times)
         quaternions /= np.linalg.norm(quaternions, axis=-1, keepdims=True)
         camera = cls(
             lines=framelets * (height - 2 * trimmed),
@@ -88,9 +83,9 @@ class PushFrame(Camera):
             height=height - 2 * trimmed,
             trimmed=trimmed,
             flipped=_flag(document, "framelets_flipped", where),
-            centres=even_positions(exposure.positions, exposure.positions.times, exposure.body).at(times),
+            centres=positions.at(times),
             rotations=read.quaternion_matrix(quaternions),
-            suns=even_positions(exposure.sun, exposure.positions.times, exposure.body).at(times),
+            suns=sun.at(times),
             times=np.asarray(exposure.centre_time + times, np.float64),
         )
         middle = (framelets // 2 + 0.5) * camera.height
@@ -113,7 +108,7 @@ class PushFrame(Camera):
             )
         return slope
 
-    def piece(self, line: ArrayLike) -> NDArray[np.int64]:
+    def framelet(self, line: ArrayLike) -> NDArray[np.int64]:
         places = np.nan_to_num(np.asarray(line, float), nan=0.0) / self.height
         return np.clip(np.floor(places), 0, len(self.times) - 1).astype(np.int64)
 
@@ -123,62 +118,41 @@ class PushFrame(Camera):
 
     def rays(self, line: ArrayLike, sample: ArrayLike) -> tuple[Floats, Floats]:
         line, sample = np.broadcast_arrays(np.asarray(line, float), np.asarray(sample, float))
-        k = self.piece(line)
+        k = self.framelet(line)
         within = line - k * self.height
         row = (self.height - within if self.flipped else within) + self.trimmed
         camera = self.detector.directions(row, sample)
         return self.centres[k], (self.rotations[k] @ camera[..., None])[..., 0]
 
     def position(self, line: ArrayLike, sample: ArrayLike | None = None) -> Floats:
-        return self.centres[self.piece(line)]
+        return self.centres[self.framelet(line)]
 
     def sun_position(self, line: ArrayLike) -> Floats:
-        return self.suns[self.piece(line)]
+        return self.suns[self.framelet(line)]
 
     def ephemeris_time(self, line: ArrayLike) -> Floats:
-        return self.times[self.piece(line)]
+        return self.times[self.framelet(line)]
 
     def ground_to_image(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """As of every camera; NaN too where a place falls between two framelets, more than half a line from both.
+        """As :meth:`Camera.ground_to_image`; also NaN for points between two framelets, more than half a line from both.
 
         points : (..., 3) body-fixed, m; returns line and sample, (...,) px each
         """
         points = np.asarray(points, float)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         line, sample = np.empty(len(flat)), np.empty(len(flat))
-        d = self.detector
-        _find(
-            flat,
-            self.centres,
-            self.rotations,
-            self.slope,
-            float(self.height),
-            float(self.trimmed),
-            self.flipped,
-            d.focal_length,
-            d.sense,
-            d.to_line,
-            d.to_sample,
-            d.centre[0] - d.start[0],
-            d.centre[1] - d.start[1],
-            d.summing[0],
-            d.summing[1],
-            d.distortion,
-            d.coefficients,
-            line,
-            sample,
-        )
+        strip = _Strip(self.centres, self.rotations, self.slope, float(self.height), float(self.trimmed), self.flipped)
+        _find(flat, strip, self.detector.optics, line, sample)
         return line.reshape(points.shape[:-1]), sample.reshape(points.shape[:-1])
 
-    def ground_to_piece(self, points: ArrayLike, piece: ArrayLike) -> tuple[Floats, Floats]:
+    def ground_to_framelet(self, points: ArrayLike, framelet: ArrayLike) -> tuple[Floats, Floats]:
         points = np.asarray(points, float)
-        k = np.broadcast_to(np.asarray(piece), points.shape[:-1])
+        k = np.broadcast_to(np.asarray(framelet), points.shape[:-1])
         row, sample = self._in_framelet(self._camera_vectors(points, k))
         within = self.height - row if self.flipped else row
-        # half a line from the edge are the outermost pixels' centres: interpolation does not reach past them
-        return k * self.height + np.clip(
-            within, min(0.5, self.height / 2), max(self.height - 0.5, self.height / 2)
-        ), sample
+        # the outermost pixels' centres lie half a line from the edges: interpolation must not reach past them
+        within = np.clip(within, min(0.5, self.height / 2), max(self.height - 0.5, self.height / 2))
+        return k * self.height + within, sample
 
     def _camera_vectors(self, points: Floats, k: NDArray[np.int64]) -> Floats:
         return (np.swapaxes(self.rotations[k], -1, -2) @ (points - self.centres[k])[..., None])[..., 0]
@@ -213,11 +187,19 @@ def _flag(document: Mapping[str, Any], key: str, where: str) -> bool:
     return found
 
 
+class _Strip(NamedTuple):
+    """The framelets of a :class:`PushFrame` as numba kernels take them."""
+
+    centres: Floats
+    rotations: Floats
+    slope: float
+    height: float
+    trimmed: float
+    flipped: bool
+
+
 @numba.njit(cache=True)
-def _place_on_framelet(
-    point, k, centres, rotations, focal, sense, to_line, to_sample, line_offset, sample_offset, summing, sample_summing,
-    model, coefficients,
-):  # fmt: skip
+def _place_on_framelet(point, k, centres, rotations, optics):
     """(row, sample) of a point on the whole detector framelet at exposure k; NaN behind the camera or the body."""
     x, y, z = point[0] - centres[k, 0], point[1] - centres[k, 1], point[2] - centres[k, 2]
     rise = -(x * point[0] + y * point[1] + z * point[2])
@@ -228,23 +210,17 @@ def _place_on_framelet(
         r[0, 0] * x + r[1, 0] * y + r[2, 0] * z,
         r[0, 1] * x + r[1, 1] * y + r[2, 1] * z,
         r[0, 2] * x + r[1, 2] * y + r[2, 2] * z,
-        focal,
-        sense,
-        to_line,
-        to_sample,
-        model,
-        coefficients,
+        optics,
     )
-    return (row + line_offset) / summing, (column + sample_offset) / sample_summing
+    return (row + optics.line_offset) / optics.line_summing, (column + optics.sample_offset) / optics.sample_summing
 
 
 @numba.njit(cache=True, parallel=True)
-def _find(
-    points, centres, rotations, first_slope, height, trimmed, flipped, focal, sense, to_line, to_sample, line_offset,
-    sample_offset, summing, sample_summing, model, coefficients, out_line, out_sample,
-):  # fmt: skip
+def _find(points, strip, optics, out_line, out_sample):
     """For each point the framelet whose middle it is nearest to, by secant steps over whole framelets."""
+    centres, rotations = strip.centres, strip.rotations
     n, framelets = points.shape[0], centres.shape[0]
+    first_slope, height, trimmed = strip.slope, strip.height, strip.trimmed
     middle = trimmed + height / 2
     stride = max(1, framelets // STEPS)
     for chunk in numba.prange((n + CHUNK - 1) // CHUNK):
@@ -256,17 +232,11 @@ def _find(
                 continue
             row, column = math.nan, math.nan
             if k >= 0:
-                row, column = _place_on_framelet(
-                    p, k, centres, rotations, focal, sense, to_line, to_sample, line_offset, sample_offset, summing,
-                    sample_summing, model, coefficients,
-                )  # fmt: skip
+                row, column = _place_on_framelet(p, k, centres, rotations, optics)
             if not math.isfinite(row):
                 k, slope = -1, first_slope
                 for j in range(0, framelets, stride):
-                    r, c = _place_on_framelet(
-                        p, j, centres, rotations, focal, sense, to_line, to_sample, line_offset, sample_offset,
-                        summing, sample_summing, model, coefficients,
-                    )  # fmt: skip
+                    r, c = _place_on_framelet(p, j, centres, rotations, optics)
                     if math.isfinite(r) and not abs(r - middle) >= abs(row - middle):
                         k, row, column = j, r, c
                 if k < 0:
@@ -278,10 +248,7 @@ def _find(
                 j = int(min(max(k + step, 0.0), framelets - 1.0))
                 if j == k:
                     break
-                r, c = _place_on_framelet(
-                    p, j, centres, rotations, focal, sense, to_line, to_sample, line_offset, sample_offset, summing,
-                    sample_summing, model, coefficients,
-                )  # fmt: skip
+                r, c = _place_on_framelet(p, j, centres, rotations, optics)
                 if not math.isfinite(r) or abs(r - middle) >= abs(row - middle):
                     break
                 found = (r - row) / (j - k)
@@ -289,21 +256,20 @@ def _find(
                     slope = found
                 k, row, column = j, r, c
             moving = True
-            while moving:  # the neighbours have the last word: secant steps end a framelet off where two are as near
+            while (
+                moving
+            ):  # compare with the neighbours: secant steps may end one framelet off where two are about as near
                 moving = False
                 for j in (k - 1, k + 1):
                     if 0 <= j < framelets:
-                        r, c = _place_on_framelet(
-                            p, j, centres, rotations, focal, sense, to_line, to_sample, line_offset, sample_offset,
-                            summing, sample_summing, model, coefficients,
-                        )  # fmt: skip
+                        r, c = _place_on_framelet(p, j, centres, rotations, optics)
                         if abs(r - middle) < abs(row - middle):
                             k, row, column, moving = j, r, c, True
                             break
             within = row - trimmed
-            if flipped:
+            if strip.flipped:
                 within = height - within
-            # before the first framelet and after the last a place is beside the image, between two it is not seen
+            # before the first framelet and after the last a point lies outside the image, between two it is not seen
             if within < 0 and k > 0:
                 if within < -EDGE:
                     continue

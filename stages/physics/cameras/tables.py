@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 
 from schemas.errors import InputError
 from stages.common.arrays import Floats
@@ -24,7 +25,10 @@ _UNITS = {"m": 1.0, "km": 1000.0}
 
 @dataclass(frozen=True)
 class States:
-    """Positions over time in an inertial frame. times : (n,), s; positions : (n, 3), m; velocities likewise, m/s."""
+    """Positions over time in an inertial frame.
+
+    times : (n,), s; positions : (n, 3), m; velocities : (n, 3), m/s, or None where unknown
+    """
 
     times: Floats
     positions: Floats
@@ -36,7 +40,9 @@ class States:
         n = len(self.times)
         if n == 1:
             return np.broadcast_to(self.positions[0], times.shape + (3,)).copy()
-        velocities = _spline_slopes(self.times, self.positions) if self.velocities is None else self.velocities
+        velocities = self.velocities
+        if velocities is None:
+            velocities = CubicSpline(self.times, self.positions, bc_type="natural")(self.times, 1)
         i = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, n - 2)
         h = (self.times[i + 1] - self.times[i])[:, None]
         t = (times[:, None] - self.times[i][:, None]) / h
@@ -50,8 +56,10 @@ class States:
 
 @dataclass(frozen=True)
 class Rotations:
-    """Rotations over time. times : (n,), s; quaternions : (n, 4), scalar first, neighbours on the same side;
-    constant : (3, 3), applied after them.
+    """Rotations over time, from an inertial frame.
+
+    times : (n,), s; quaternions : (n, 4), scalar first, signs as :func:`align_signs` gives them
+    constant : (3, 3), applied after them
     """
 
     times: Floats
@@ -68,9 +76,8 @@ class Rotations:
         return self.constant @ read.quaternion_matrix(quaternions)
 
 
-@dataclass(frozen=True)
-class EvenTable:
-    """Values at evenly spaced times. values : (n, k); ``start`` and ``step`` in s."""
+class EvenTable(NamedTuple):
+    """Values at evenly spaced times, as numba kernels take them. values : (n, k); ``start`` and ``step`` in s."""
 
     start: float
     step: float
@@ -80,7 +87,7 @@ class EvenTable:
         """(..., k) at ``times`` by Lagrange polynomials."""
         times = np.asarray(times, float)
         out = np.empty((times.size, self.values.shape[1]))
-        _lagrange_each(self.values, self.start, self.step, np.ascontiguousarray(times).ravel(), out)
+        _lagrange_each(self, np.ascontiguousarray(times).ravel(), out)
         return out.reshape(times.shape + (-1,))
 
 
@@ -116,7 +123,7 @@ def read_rotations(document: Mapping[str, Any], key: str, where: str, origin: fl
     constant = np.eye(3)
     if read.has(document, f"{key}.constant_rotation"):
         constant = read.rotation(document, f"{key}.constant_rotation", where)
-    return Rotations(times - origin, one_side(quaternions), constant)
+    return Rotations(times - origin, align_signs(quaternions), constant)
 
 
 def _times(document: Mapping[str, Any], key: str, where: str) -> Floats:
@@ -128,7 +135,7 @@ def _times(document: Mapping[str, Any], key: str, where: str) -> Floats:
     return times
 
 
-def one_side(quaternions: Floats) -> Floats:
+def align_signs(quaternions: Floats) -> Floats:
     """The same rotations with signs such that neighbours are close: interpolation must not cross from q to -q.
 
     quaternions : (n, 4), scalar first
@@ -165,8 +172,8 @@ def matrix_quaternions(rotations: Floats) -> Floats:
     products = np.empty((len(m), 4, 4))  # 4 q q^T
     for k in range(4):
         products[:, k, k] = squares[:, k]
-    for i, j, sign in ((2, 1, 1), (0, 2, 2), (1, 0, 3)):
-        products[:, 0, sign] = products[:, sign, 0] = m[:, i, j] - m[:, j, i]
+    for i, j, axis in ((2, 1, 1), (0, 2, 2), (1, 0, 3)):
+        products[:, 0, axis] = products[:, axis, 0] = m[:, i, j] - m[:, j, i]
     for i, j in ((0, 1), (0, 2), (1, 2)):
         products[:, i + 1, j + 1] = products[:, j + 1, i + 1] = m[:, i, j] + m[:, j, i]
     rows = products[np.arange(len(m)), largest]
@@ -187,21 +194,22 @@ def even_positions(states: States, times: Floats, body: Rotations) -> EvenTable:
 
 def even_pointing(pointing: Rotations, body: Rotations) -> EvenTable:
     """Quaternions that take camera vectors to body-fixed ones, on an even grid of as many times as both tables hold."""
-    times = np.union1d(pointing.times, body.times) if len(body.times) > 1 else pointing.times
-    if len(pointing.times) == 1:
-        times = pointing.times
+    times = pointing.times
+    if len(times) > 1 and len(body.times) > 1:
+        times = np.union1d(times, body.times)
+    quaternions = matrix_quaternions(body.at(times) @ np.swapaxes(pointing.at(times), -1, -2))
     if len(times) == 1:
-        rotations = body.at(times) @ np.swapaxes(pointing.at(times), -1, -2)
-        return EvenTable(float(times[0]), 1.0, matrix_quaternions(rotations))
-    merged = one_side(matrix_quaternions(body.at(times) @ np.swapaxes(pointing.at(times), -1, -2)))
+        return EvenTable(float(times[0]), 1.0, quaternions)
     grid = np.linspace(times[0], times[-1], len(times))
-    return EvenTable(float(grid[0]), float(grid[1] - grid[0]), one_side(slerp(times, merged, grid)))
+    return EvenTable(
+        float(grid[0]), float(grid[1] - grid[0]), align_signs(slerp(times, align_signs(quaternions), grid))
+    )
 
 
 def check_times(where: str, key: str, times: Floats, first: float, last: float) -> None:
-    """Refuse image times outside a table, beyond what tables that were cut at the exposure leave out.
+    """Refuse a table that does not cover an image's times. Raises InputError.
 
-    Allowed is one step of the table, and at most a tenth of its span. Raises InputError.
+    Tables cut at the exposure may miss one step at either end, and at most a tenth of their span.
 
     times : (n,) s, of the table; first, last : s, of the image
     """
@@ -215,31 +223,17 @@ def check_times(where: str, key: str, times: Floats, first: float, last: float) 
         )
 
 
-def _spline_slopes(times: Floats, values: Floats) -> Floats:
-    """Slopes at the entries of the natural cubic spline: a tridiagonal system."""
-    n = len(times)
-    h = np.diff(times)
-    matrix, right = np.zeros((n, n)), np.zeros((n, values.shape[1]))
-    chord = np.diff(values, axis=0) / h[:, None]
-    matrix[0, :2], right[0] = (2, 1), 3 * chord[0]
-    matrix[-1, -2:], right[-1] = (1, 2), 3 * chord[-1]
-    for k in range(1, n - 1):
-        matrix[k, k - 1 : k + 2] = h[k], 2 * (h[k] + h[k - 1]), h[k - 1]
-        right[k] = 3 * (h[k] * chord[k - 1] + h[k - 1] * chord[k])
-    return np.asarray(np.linalg.solve(matrix, right), float)
-
-
 @numba.njit(cache=True)
-def lagrange(values, start, step, time, out):
-    """Write the Lagrange polynomial through the 2..8 nodes around ``time`` into ``out``; a single node is constant."""
+def lagrange(table, time, out):
+    """Write an EvenTable's values at ``time`` into ``out`` (k,): Lagrange polynomial of the 2..8 entries around it."""
+    start, step, values = table
     n, k = values.shape
     if n == 1:
         for c in range(k):
             out[c] = values[0, c]
         return
     x = (time - start) / step
-    index = int(x)
-    index = min(max(index, 0), n - 2)
+    index = min(max(int(x), 0), n - 2)
     tau = x - index
     half = min(4, index + 1, n - 1 - index)  # as many nodes before as after
     for c in range(k):
@@ -280,6 +274,6 @@ def lagrange(values, start, step, time, out):
 
 
 @numba.njit(cache=True)
-def _lagrange_each(values, start, step, times, out):
+def _lagrange_each(table, times, out):
     for i in range(times.size):
-        lagrange(values, start, step, times[i], out[i])
+        lagrange(table, times[i], out[i])

@@ -1,1 +1,1 @@
-"""How an image comes to be, from terrain to detector."""
+"""Image formation, from terrain to detector."""

@@ -1,4 +1,4 @@
-"""How an image comes to be: the ordered chain geometry -> illumination -> reflectance -> radiance -> sensor.
+"""Image formation: the ordered chain geometry -> illumination -> reflectance -> radiance -> sensor.
 
 Every step is differentiable in the coefficients and, where the chain is smooth, in elevation, Sun and camera.
 Extensions (``stages/effects``) act at the slot that they name; the order of the slots fixes their composition.
@@ -7,15 +7,15 @@ Extensions (``stages/effects``) act at the slot that they name; the order of the
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from stages.physics.formation import facets, geometry
-from stages.physics.formation.displaced import displace
 from stages.physics.formation.geometry import Angles
+from stages.physics.formation.resampling import displace
 from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
 from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
 
@@ -24,7 +24,7 @@ SLOTS = ("geometry", "illumination", "reflectance", "radiance", "sensor")
 
 @dataclass
 class Observation:
-    """What is known about a batch of crops before any reflectance is chosen.
+    """A batch of crops: all that rendering needs besides the reflectance.
 
     elevation : (B, H, W) float32, m
     sun_direction : (B, 3), unit, ENU along the crop's axes
@@ -50,23 +50,22 @@ class Observation:
         """Crops ``first`` .. ``last`` of the batch."""
         if first == 0 and last == len(self.elevation):
             return self
-        named = {f.name: getattr(self, f.name) for f in fields(self)}
-        cut: dict[str, Any] = {k: v[first:last] for k, v in named.items() if isinstance(v, Tensor)}
+        cut: dict[str, Any] = {k: v[first:last] for k, v in vars(self).items() if isinstance(v, Tensor)}
         return replace(self, **cut)
 
 
 @dataclass
 class State:
-    """What the chain has made so far; an extension changes what its slot may change.
+    """Intermediate results of the chain. What an extension sees, and what it may change, depends on its slot:
 
-    geometry      sees and may change: elevation, sun_horizon, camera_position, displacement (where the map projection
-                  looked: columns to the east, rows to the south, px, broadcastable to the image)
+    geometry      sees and may change: elevation, sun_horizon, camera_position, displacement (of the map projection: how far
+                  away it took each pixel from, columns to the east and rows to the south, px, broadcastable to the image)
     illumination  sees also slopes, view; may change: sun_direction, sun_horizon, sun_radius, further_light (functions
                   of the state, run once the directly lit radiance is known; each adds to it)
     reflectance   sees also angles, sun_visibility; may change: reflectance (I/F of a lit facet)
     radiance      may change: radiance (I/F that reaches the camera)
-    sensor        may change: image; sees measured, (B, H, W) with NaN where invalid, where a measurement is being explained:
-                  what repeats the light repeats what came in, shadows in their true places
+    sensor        may change: image; sees measured, the image to be explained, (B, H, W), NaN where invalid, or None: an
+                  echo repeats the light that truly came in, with shadows in their true places
     """
 
     observation: Observation
@@ -112,11 +111,11 @@ def form(
     """
     if not extensions:
         o = observation
-        known = facets.angles_and_light(
+        fast = facets.angles_and_light(
             o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius
         )
-        if known is not None:
-            return model.lit(coefficients, *known)
+        if fast is not None:
+            return model.lit(coefficients, *fast)
     state = illuminate(observation, extensions)
     parameters = model.unpack(coefficients, dim=1)
     state.reflectance = masked_radiance_factor(model, parameters, state.angles)
@@ -126,7 +125,7 @@ def form(
 def illuminate(observation: Observation, extensions: Sequence[Extension] = (), known: State | None = None) -> State:
     """The first half of the chain, which no coefficient enters: slopes, angles and the visible share of the Sun.
 
-    known : a state of the same observation; what the extensions leave as it is there is taken over, not computed again
+    known : a state of the same observation, whose slopes and angles are reused where the extensions do not change them
     """
     state = State(
         observation,

@@ -18,7 +18,7 @@ Powers = tuple[tuple[int, int], ...]  # (p, q) of every coefficient
 
 
 def fits(coefficients: Tensor, cos_incidence: Tensor, cos_phase: Tensor, light: Tensor) -> bool:
-    """Whether :func:`cosine_sum` can do it: float32 on the CPU, and no gradients but the coefficients'.
+    """Whether :func:`cosine_sum` takes these: float32 on the CPU, gradients in the coefficients alone.
 
     coefficients : (B, C, H, W); cos_incidence, cos_phase, light : (B, H, W)
     """
@@ -46,7 +46,7 @@ class _CosineSum(torch.autograd.Function):
     ) -> Tensor:
         known = tuple(t.contiguous() for t in (cos_incidence, cos_phase, light))
         ctx.save_for_backward(*known)
-        # The gradient comes in the coefficients' own memory format: changing it would be one more pass.
+        # The gradient gets the coefficients' own memory format: to change it would be one more pass over memory.
         ctx.powers, ctx.like = powers, torch.empty_like(coefficients, device="meta")
         image = torch.empty_like(known[-1])
         add_up, _ = _kernels(powers)
@@ -66,7 +66,7 @@ class _CosineSum(torch.autograd.Function):
 
 @cache
 def _kernels(powers: Powers) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Forward and back. The powers are constants to the compiler, which leaves one vectorised loop along a row."""
+    """Forward and backward. The powers are constants to the compiler, so that one vectorised loop along a row remains."""
     count = len(powers)
 
     @njit(nogil=True, cache=True)

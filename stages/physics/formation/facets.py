@@ -1,7 +1,8 @@
 """Angles and sunlight of every facet of a batch of crops, in one pass over its elevations.
 
-The same as ``geometry`` and ``light.sun_disc`` give, to rounding, for training and prediction on the CPU, where only coefficients
-have gradients: every operation of theirs is a pass over memory, and all of them cost more than a model and its gradient.
+To rounding the same as ``geometry`` and ``light.sun_disc`` give, for training and prediction on the CPU, where only
+coefficients have gradients. Each tensor operation there is a pass over memory; together they would cost more than a
+reflectance model and its gradient.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def angles_and_light(
 
     elevation : (B, H, W), m; sun_direction : (B, 3), unit, ENU; camera_position : (B, 3), m from the crop's centre;
     sun_horizon : (B, H, W), rad, or None
-    returns None where only the differentiable chain will do: gradients in these, float64, a GPU
+    returns None where the differentiable chain is needed: with gradients in these arguments, in float64, on a GPU
     """
     known = [t for t in (elevation, sun_direction, camera_position, sun_horizon) if t is not None]
     maps = [t for t in (elevation, sun_horizon) if t is not None]
@@ -93,7 +94,7 @@ def _angles_and_light(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _shade(light, edge, sun_elevation):
-    """Take the part of the Sun below the horizon away, along a row; few rows have pixels in half-shadow."""
+    """Take off the part of the Sun below the horizon, along a row of facets; few rows have pixels in penumbra."""
     one = np.float32(1)
     partly = 0
     for j in range(light.size):

@@ -4,33 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import torch
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @dataclass(frozen=True)
 class Angles:
-    """Incidence, emission and phase of every pixel, as cosines; the angles themselves come without acos.
+    """Incidence, emission and phase of every pixel, as cosines; the angles are worked out where a model asks for them.
 
-    cos_incidence, cos_emission, cos_phase : (...,) tensors
-    sin_phase : optional, |sun x view|; keeps small phase angles exact where acos would lose them
-
-    Models of I/F expect ``cos_incidence`` > 0 where the Sun is up; they return 0 elsewhere.
+    cos_incidence, cos_emission, cos_phase : (...,) tensors, negative where the Sun or the camera is behind the surface
+    incidence_given, emission_given, phase_given : (...,) rad, where the angles themselves are known, see :meth:`from_angles`
     """
 
-    cos_incidence: Tensor
-    cos_emission: Tensor
-    cos_phase: Tensor
-    incidence_given: Tensor | None = None
-    emission_given: Tensor | None = None
-    phase_given: Tensor | None = None
+    cos_incidence: torch.Tensor
+    cos_emission: torch.Tensor
+    cos_phase: torch.Tensor
+    incidence_given: torch.Tensor | None = None
+    emission_given: torch.Tensor | None = None
+    phase_given: torch.Tensor | None = None
 
     @classmethod
-    def from_angles(cls, incidence: Tensor, emission: Tensor, phase: Tensor) -> Angles:
+    def from_angles(cls, incidence: torch.Tensor, emission: torch.Tensor, phase: torch.Tensor) -> Angles:
         """From angles in radians, kept as given so that nothing is lost near phase 0.
 
         incidence, emission, phase : (...,) each, broadcastable
@@ -38,22 +32,22 @@ class Angles:
         return cls(incidence.cos(), emission.cos(), phase.cos(), incidence, emission, phase)
 
     @cached_property
-    def incidence(self) -> Tensor:
+    def incidence(self) -> torch.Tensor:
         """rad"""
         return safe_acos(self.cos_incidence) if self.incidence_given is None else self.incidence_given
 
     @cached_property
-    def emission(self) -> Tensor:
+    def emission(self) -> torch.Tensor:
         """rad"""
         return safe_acos(self.cos_emission) if self.emission_given is None else self.emission_given
 
     @cached_property
-    def phase(self) -> Tensor:
+    def phase(self) -> torch.Tensor:
         """rad"""
         return safe_acos(self.cos_phase) if self.phase_given is None else self.phase_given
 
 
-def safe_acos(cosine: Tensor) -> Tensor:
+def safe_acos(cosine: torch.Tensor) -> torch.Tensor:
     """acos with finite gradients at +-1: the argument keeps 1e-7 (float32) or 1e-14 (float64) away from them.
 
     cosine : (...,); returns the same shape, rad
@@ -62,7 +56,7 @@ def safe_acos(cosine: Tensor) -> Tensor:
     return torch.acos(cosine.clamp(-1 + margin, 1 - margin))
 
 
-def slopes(elevation: Tensor, gsd: float) -> tuple[Tensor, Tensor]:
+def slopes(elevation: torch.Tensor, gsd: float) -> tuple[torch.Tensor, torch.Tensor]:
     """(dz/deast, dz/dnorth) by second-order central differences, one-sided at the edges.
 
     elevation : (..., H, W), m, rows run south
@@ -78,7 +72,9 @@ def slopes(elevation: Tensor, gsd: float) -> tuple[Tensor, Tensor]:
     return east, north
 
 
-def crop_axes(height: int, width: int, gsd: float, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor]:
+def crop_axes(
+    height: int, width: int, gsd: float, device: torch.device | str = "cpu"
+) -> tuple[torch.Tensor, torch.Tensor]:
     """East (W,) and north (H,) of the pixel centres from the crop's centre, m.
 
     The centre is the corner shared by the four middle pixels for even sizes.
@@ -88,7 +84,9 @@ def crop_axes(height: int, width: int, gsd: float, device: torch.device | str = 
     return east, north
 
 
-def curvature_slopes(slope_east: Tensor, slope_north: Tensor, gsd: float, body_radius: float) -> tuple[Tensor, Tensor]:
+def curvature_slopes(
+    slope_east: torch.Tensor, slope_north: torch.Tensor, gsd: float, body_radius: float
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Tilt slopes on the sphere into the tangent plane at the crop's centre, where the Sun's direction is given.
 
     The surface falls away from that plane as d^2 / 2R, so its slope gains -d / R (1 deg per 30 km on the Moon).
@@ -100,7 +98,9 @@ def curvature_slopes(slope_east: Tensor, slope_north: Tensor, gsd: float, body_r
     return slope_east - east / body_radius, slope_north - north[:, None] / body_radius
 
 
-def view_vectors(elevation: Tensor, camera_position: Tensor, gsd: float) -> tuple[Tensor, Tensor, Tensor]:
+def view_vectors(
+    elevation: torch.Tensor, camera_position: torch.Tensor, gsd: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Unit vectors (east, north, up), each (B, H, W), from every pixel to the camera.
 
     elevation : (B, H, W), m; camera_position : (B, 3), m from the crop centre at the crop's mean elevation.
@@ -116,7 +116,10 @@ def view_vectors(elevation: Tensor, camera_position: Tensor, gsd: float) -> tupl
 
 
 def photometric_angles(
-    slope_east: Tensor, slope_north: Tensor, sun_direction: Tensor, view: tuple[Tensor, Tensor, Tensor]
+    slope_east: torch.Tensor,
+    slope_north: torch.Tensor,
+    sun_direction: torch.Tensor,
+    view: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
 ) -> Angles:
     """Angles of a surface with these slopes.
 

@@ -1,6 +1,6 @@
-"""Bringing a rendering onto a measured crop's scale, and the scale of uncalibrated images.
+"""Gain and offset between rendered and measured crops, and the full scale of uncalibrated images.
 
-Shared by every stage that compares rendered with measured images, so that each compares in the same way.
+Every stage that compares rendered with measured images uses these.
 """
 
 from __future__ import annotations

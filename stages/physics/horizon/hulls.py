@@ -2,8 +2,8 @@
 
 A point under the chord of two others can never be the horizon of anything behind it, so that a stack of hull points
 per line, which every row pushes to, holds all that matters, and the horizon is the point where the sight line touches.
-Like the cast shadow, the first ``NEAR`` rows are looked at along the pixel's own ray; beyond, what the two neighbouring
-lines see highest is looked at from the pixel's own height, and the two slopes are interpolated.
+As for the cast shadow, terrain within ``NEAR`` rows is sampled along the pixel's own ray. Beyond, the slopes from the
+pixel's own height to the highest points that the two neighbouring lines see are interpolated.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from stages.physics.horizon.sweeps import (
 )
 
 NEAR = 16  # rows
-NEAR_COLUMNS = 8  # rows within which crossings of columns are looked at too
+NEAR_COLUMNS = 8  # rows within which crossings of columns count too
 SPACING = 2  # columns from line to line
 WINDOW = 12  # rows to either side that can hide a sample from everything behind
 RING = 2 * WINDOW + 1
 LINES = 1024  # lines per strip
 BLOCK = 64  # columns per transposed block
 SMALL = 512 * 512  # px; smaller grids are swept by the calling thread alone
-NOWHERE = np.float32(1e30)  # row of a point that is not there
+NOWHERE = np.float32(1e30)  # row that stands for no point
 
 
 @numba.njit(fastmath=FLAGS, error_model="numpy")
@@ -99,7 +99,7 @@ def _push(hull, depth, s, heights, visible, chosen):
 
 @numba.njit(fastmath=FLAGS, error_model="numpy")
 def _find_tangents(hull, depth, s, heights, seen_s, seen_h):
-    """What each line sees highest from row s: along a hull, going outwards, slopes rise and then fall."""
+    """Row and height of the highest terrain that each line sees from row s: along a hull slopes rise, then fall."""
     for k in range(depth.size):
         p = depth[k] - 1
         if p < 0:
@@ -119,8 +119,7 @@ def _find_tangents(hull, depth, s, heights, seen_s, seen_h):
 
 @numba.njit(fastmath=FLAGS, error_model="numpy")
 def _horizon_rows(
-    z, z_row, z_step, z_column, out, out_row, out_step, out_column, start, stop, first, count, columns,
-    whole, fraction, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step, sinks,
+    z, z_row, z_step, z_column, out, out_row, out_step, out_column, start, stop, first, count, sweep, taps, sinks,
     hull, depth, samples, visible, chosen, observers, seen_s, seen_h, angle,
 ):  # fmt: skip
     """Sweep rows start..stop of one strip of lines; arguments as for the cast shadow's ``_shadow_rows``.
@@ -128,10 +127,11 @@ def _horizon_rows(
     hull : (rows, lines, 2) row and height of hull points, farthest first; depth : (lines,) points in use
     samples : (RING + 2, lines), the lines' heights over the last rows; the rest is scratch
     """
+    whole, fraction, columns = sweep.whole, sweep.fraction, sweep.columns
     one = np.float32(1.0)
     lines = depth.size
     for i in range(start, stop):
-        r = i - near
+        r = i - NEAR
         newest = r + WINDOW
         if newest >= 0:
             _sample_lines(
@@ -157,25 +157,25 @@ def _horizon_rows(
         here = z[z_row + z_step * i, j0 - z_column : j1 - z_column]
         best = angle[:n]
         best[:] = -np.inf
-        for tap in range(tap_distance.size):
-            ra, rb = i - tap_rows[tap, 0], i - tap_rows[tap, 1]
-            ca, cb = tap_columns[tap, 0], tap_columns[tap, 1]
+        for tap in range(taps.distance.size):
+            ra, rb = i - taps.rows[tap, 0], i - taps.rows[tap, 1]
+            ca, cb = taps.columns[tap, 0], taps.columns[tap, 1]
             if rb < 0:
                 break  # and so are all that follow
             lo = max(0, -(j0 + min(ca, cb)))
             hi = max(min(n, columns - j0 - max(ca, cb)), lo)
-            w = tap_weight[tap]
-            c = np.float32(here_sink - sink(sinks, i - tap_distance[tap]))
-            d = np.float32(1 / tap_distance[tap])
+            w = taps.weight[tap]
+            c = np.float32(here_sink - sink(sinks, i - taps.distance[tap]))
+            d = np.float32(1 / taps.distance[tap])
             a = z[z_row + z_step * ra, lo + j0 + ca - z_column : hi + j0 + ca - z_column]
             b = z[z_row + z_step * rb, lo + j0 + cb - z_column : hi + j0 + cb - z_column]
             low, mine = best[lo:hi], here[lo:hi]
-            if tap == 0 and shear != 0:
-                side = 1 if shear > 0 else -1
+            if tap == 0 and sweep.shear != 0:
+                side = 1 if sweep.shear > 0 else -1
                 above = z[z_row + z_step * ra, lo + j0 - z_column : hi + j0 - z_column]
                 corner = z[z_row + z_step * ra, lo + j0 + side - z_column : hi + j0 + side - z_column]
                 next_to = z[z_row + z_step * i, lo + j0 + side - z_column : hi + j0 + side - z_column]
-                half = np.float32(0.5 * abs(shear))
+                half = np.float32(0.5 * abs(sweep.shear))
                 for k in range(hi - lo):
                     h = (one - w) * a[k] + (w * b[k] + c) - mine[k]
                     bulge = half * ((next_to[k] + above[k]) - (mine[k] + corner[k]))
@@ -209,7 +209,7 @@ def _horizon_rows(
                     far = left_slope + g * (right_slope - left_slope)
                     if far > low[SPACING * k] and not (no_left and no_right):
                         low[SPACING * k] = far
-        scale, tilt = np.float32(1 / step), np.float32(-2 * sinks[0] * (i - sinks[1]) / step)
+        scale, tilt = np.float32(1 / sweep.step), np.float32(-2 * sinks[0] * (i - sinks[1]) / sweep.step)
         result = out[out_row + out_step * i, j0 - out_column : j1 - out_column]
         for k in range(n):
             slope = best[k] * scale + tilt
@@ -233,55 +233,49 @@ def _workspace(count, rows):
     )
 
 
-def _by_rows(
-    z, z_row, z_step, out, start, stop, columns, first_line, line_count, width,
-    whole, fraction, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step, sinks,
-):  # fmt: skip
-    """Sweep whose rows are the grid's rows, over some of its lines: straight from the grid."""
+def _by_rows(z, row, step, out, stop, first_line, line_count, width, sweep, taps, sinks):
+    """Sweep whose rows are the grid's rows, from ``row`` on in steps of ``step``: straight from the grid.
+
+    Rows 0..stop over ``line_count`` lines from ``first_line`` on, in strips of ``width`` lines.
+    """
     strips = (line_count + width - 1) // width
     for strip in numba.prange(strips):
         first = first_line + strip * width
         count = min(width, first_line + line_count - first)
         work = _workspace(count, stop)
         _horizon_rows(
-            z, z_row, z_step, 0, out, z_row, z_step, 0, start, stop, first, count, columns,
-            whole, fraction, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step,
-            sinks, *work,
+            z, row, step, 0, out, row, step, 0, 0, stop, first, count, sweep, taps, sinks, *work,
         )  # fmt: skip
 
 
-def _by_columns(
-    z, z_column, z_step, out, start, stop, columns, first_line, line_count, width,
-    whole, fraction, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step, sinks,
-):  # fmt: skip
-    """Sweep whose rows are the grid's columns: through blocks transposed into a buffer."""
+def _by_columns(z, column, step, out, stop, first_line, line_count, width, sweep, taps, sinks):
+    """Sweep whose rows are the grid's columns, from ``column`` on: through blocks transposed into a buffer."""
+    whole = sweep.whole
     strips = (line_count + width - 1) // width
     for strip in numba.prange(strips):
         first = first_line + strip * width
         count = min(width, first_line + line_count - first)
         work = _workspace(count, stop)
-        margin = near + 1
+        margin = NEAR + 1
         pitch = count + BLOCK + 3 * margin + 2 * SPACING + 24
         rows = np.empty((BLOCK + margin, pitch), dtype=np.float32)
         angle = np.empty((BLOCK, pitch), dtype=np.float32)
-        for begin in range(start, stop, BLOCK):
+        for begin in range(0, stop, BLOCK):
             end = min(begin + BLOCK, stop)
             from_row = max(begin - margin, 0)
             low, high = whole[from_row], whole[end - 1]
             if low > high:
                 low, high = high, low
             j0 = max(0, first - high - margin - 1)
-            j1 = min(columns, first + count + SPACING - low + margin + 1)
+            j1 = min(sweep.columns, first + count + SPACING - low + margin + 1)
             if j1 <= j0:
                 continue
-            transpose_in(z, z_column + z_step * from_row, z_step, end - from_row, j0, j1, rows)
+            transpose_in(z, column + step * from_row, step, end - from_row, j0, j1, rows)
             _horizon_rows(
-                rows, -from_row, 1, j0, angle, -begin, 1, j0, begin, end, first, count, columns,
-                whole, fraction, tap_rows, tap_columns, tap_weight, tap_distance, near, shear, step,
-                sinks, *work,
+                rows, -from_row, 1, j0, angle, -begin, 1, j0, begin, end, first, count, sweep, taps, sinks, *work,
             )  # fmt: skip
             transpose_out(
-                angle, j0, out, z_column, z_step, begin, end, whole, first, count,
+                angle, j0, out, column, step, begin, end, whole, first, count,
                 max(j0, first - high), min(j1, first + count - low),
             )  # fmt: skip
 
@@ -319,8 +313,6 @@ def sweep_horizon(
     bend = 0.0 if body_radius is None else 0.5 * sweep.step**2 / body_radius
     origin, step = (sweep.rows - 1, -1) if sweep.reverse else (0, 1)
     _KERNELS[sweep.by_columns, parallel](
-        grid, origin, step, out, 0, i1, sweep.columns, first_line, line_count, strip,
-        sweep.whole, sweep.fraction, taps.rows, taps.columns, taps.weight,
-        taps.distance, NEAR, sweep.shear, sweep.step, (bend, 0.5 * (sweep.rows - 1)),
+        grid, origin, step, out, i1, first_line, line_count, strip, sweep, taps, (bend, 0.5 * (sweep.rows - 1)),
     )  # fmt: skip
     return out[row : row + height, column : column + width]

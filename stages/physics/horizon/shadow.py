@@ -2,14 +2,13 @@
 
 Along each line the highest ray that grazes the terrain so far sinks by the Sun's slope from row to row. A pixel lies in
 shadow where that height, interpolated between its two lines, is above it. The interpolation is poorest close by, where
-the ray's foot and the lines' differ most: the first ``NEAR`` rows are therefore looked at along the pixel's own ray, and
-the lines carry only what lies beyond.
+the foot of the pixel's ray and those of the lines differ most: terrain within ``NEAR`` rows is therefore sampled along the
+pixel's own ray, and the lines carry only what lies beyond.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numba
 import numpy as np
@@ -29,11 +28,9 @@ from stages.physics.horizon.sweeps import (
 )
 
 NEAR = 4  # rows; 2 rows double the disagreement with a ray tracer, 8 halve it again
-LINES = 1024  # lines per strip of a sweep by rows: the rows in use then stay in the first-level cache
-LINES_TURNED = 1024  # and by columns, where blocks of the grid are transposed into a buffer
-BLOCK = (
-    128  # columns per transposed block: 8 cache lines of elevation, 2 of shadow; all stays in the second-level cache
-)
+LINES = 1024  # lines per strip: the rows in use then stay in the first-level cache
+# columns per transposed block: 8 cache lines of elevation, 2 of shadow; all stays in the second-level cache
+BLOCK = 128
 SMALL = 512 * 512  # px; smaller grids are swept by the calling thread alone
 
 
@@ -48,27 +45,28 @@ def _raise_to(top, a, b, wa, wb, c):
 
 @numba.njit(fastmath=FLAGS)
 def _shadow_rows(
-    z, z_row, z_step, z_column, out, out_row, out_step, out_column, start, stop, first, count, columns,
-    whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, drop, shear, sinks, top,
-    limit,
+    z, z_row, z_step, z_column, out, out_row, out_step, out_column, start, stop, first, count,
+    sweep, taps, drop, sinks, top, limit,
 ):  # fmt: skip
-    """Sweep rows start..stop of one strip of lines.
+    """Sweep rows start..stop of one strip of ``count`` lines from line ``first`` on.
 
     z[z_row + z_step * i, j - z_column] is pixel (i, j), and so for out. sinks : curvature, see ``sweeps.sink``
-    top : (count + 1,) highest ray over the lines as of row start - 1 - near, updated; limit : (count,) scratch
+    drop : m by which a ray towards the Sun sinks from row to row
+    top : (count + 1,) highest ray over the lines as of row start - 1 - NEAR, updated; limit : (count,) scratch
     """
+    whole, fraction, columns = sweep.whole, sweep.fraction, sweep.columns
     one = np.float32(1.0)
     fall = np.float32(drop)
     for i in range(start, stop):
-        r = i - near
+        r = i - NEAR
         if r >= 0:
             base = first - whole[r]  # column right of line k is base + k
             f = fraction[r]
             lo = min(max(0, (1 if f > 0 else 0) - base), count + 1)
             hi = max(min(count + 1, columns - base), lo)
-            u = crossing[r]
+            u = sweep.crossing[r]
             if u > 0:
-                cross = first - crossed[r]
+                cross = first - sweep.crossed[r]
                 left, right = min(max(0, -cross), count + 1), min(count + 1, columns - cross)
                 if right > left:
                     a = z[z_row + z_step * (r - 1), left + cross - z_column : right + cross - z_column]
@@ -97,31 +95,31 @@ def _shadow_rows(
         if r >= 0:
             f = fraction[i]
             at = j0 + whole[i] - first
-            c = np.float32(here_sink - near * drop)
+            c = np.float32(here_sink - NEAR * drop)
             left_top, right_top = top[at : at + n], top[at + 1 : at + 1 + n]
             for k in range(n):
                 m[k] = (one - f) * left_top[k] + (f * right_top[k] + c)
         else:
             m[:] = NOTHING
         here = z[z_row + z_step * i, j0 - z_column : j1 - z_column]
-        for tap in range(tap_distance.size):
-            ra, rb = i - tap_rows[tap, 0], i - tap_rows[tap, 1]
-            ca, cb = tap_columns[tap, 0], tap_columns[tap, 1]
+        for tap in range(taps.distance.size):
+            ra, rb = i - taps.rows[tap, 0], i - taps.rows[tap, 1]
+            ca, cb = taps.columns[tap, 0], taps.columns[tap, 1]
             if rb < 0:
                 continue
             lo = max(0, -(j0 + min(ca, cb)))
             hi = max(min(n, columns - j0 - max(ca, cb)), lo)
-            w = tap_weight[tap]
-            c = np.float32(here_sink - sink(sinks, i - tap_distance[tap]) - tap_distance[tap] * drop)
+            w, distance = taps.weight[tap], taps.distance[tap]
+            c = np.float32(here_sink - sink(sinks, i - distance) - distance * drop)
             a = z[z_row + z_step * ra, lo + j0 + ca - z_column : hi + j0 + ca - z_column]
             b = z[z_row + z_step * rb, lo + j0 + cb - z_column : hi + j0 + cb - z_column]
-            if tap == 0 and shear != 0:
+            if tap == 0 and sweep.shear != 0:
                 # the bilinear cell bulges over the chord by a quarter of its twist: seen from the pixel, twice that
-                side = 1 if shear > 0 else -1
+                side = 1 if sweep.shear > 0 else -1
                 above = z[z_row + z_step * ra, lo + j0 - z_column : hi + j0 - z_column]
                 corner = z[z_row + z_step * ra, lo + j0 + side - z_column : hi + j0 + side - z_column]
                 beside = z[z_row + z_step * i, lo + j0 + side - z_column : hi + j0 + side - z_column]
-                half = np.float32(0.5 * abs(shear))
+                half = np.float32(0.5 * abs(sweep.shear))
                 low, mine = m[lo:hi], here[lo:hi]
                 for k in range(hi - lo):
                     h = (one - w) * a[k] + (w * b[k] + c)
@@ -136,11 +134,8 @@ def _shadow_rows(
             result[k] = here[k] < m[k]
 
 
-def _by_rows(
-    z, z_row, z_step, out, out_row, out_step, start, stop, columns, first_line, line_count, state,
-    whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, drop, shear, sinks,
-):  # fmt: skip
-    """Sweep whose rows are the grid's rows: straight from the grid."""
+def _by_rows(z, row, step, out, first_line, line_count, state, sweep, taps, drop, sinks):
+    """Sweep whose rows are the grid's rows, from ``row`` on in steps of ``step``: straight from the grid."""
     strips, width = state.shape
     for strip in numba.prange(strips):
         first = first_line + strip * (width - 1)
@@ -148,9 +143,7 @@ def _by_rows(
         limit = np.empty(count, dtype=np.float32)
         top = state[strip, : count + 1]
         _shadow_rows(
-            z, z_row, z_step, 0, out, out_row, out_step, 0, start, stop, first, count, columns,
-            whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, drop, shear,
-            sinks, top, limit,
+            z, row, step, 0, out, row, step, 0, 0, sweep.rows, first, count, sweep, taps, drop, sinks, top, limit,
         )  # fmt: skip
 
 
@@ -190,67 +183,44 @@ def _turn_back(shade, packed, j0, out, column, step, begin, end, whole, first, c
             out[j, column + step * i] = shade[i - begin, j - j0]
 
 
-def _by_columns(
-    z, z_column, z_step, out, out_column, out_step, start, stop, columns, first_line, line_count, state,
-    whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, drop, shear, sinks,
-):  # fmt: skip
-    """Sweep whose rows are the grid's columns: through blocks transposed into a buffer."""
+def _by_columns(z, column, step, out, first_line, line_count, state, sweep, taps, drop, sinks):
+    """Sweep whose rows are the grid's columns, from ``column`` on: through blocks transposed into a buffer."""
+    whole = sweep.whole
     strips, width = state.shape
     for strip in numba.prange(strips):
         first = first_line + strip * (width - 1)
         count = min(width - 1, first_line + line_count - first)
         limit = np.empty(count, dtype=np.float32)
         top = state[strip, : count + 1]
-        margin = near + 1
+        margin = NEAR + 1
         pitch = count + BLOCK + 3 * margin + 24
         rows = np.empty((BLOCK + margin, pitch), dtype=np.float32)
         shade = np.empty((BLOCK, pitch), dtype=np.bool_)
         packed = np.empty((BLOCK // 8, pitch), dtype=np.uint64)
-        for begin in range(start, stop, BLOCK):
-            end = min(begin + BLOCK, stop)
+        for begin in range(0, sweep.rows, BLOCK):
+            end = min(begin + BLOCK, sweep.rows)
             from_row = max(begin - margin, 0)
             low, high = whole[from_row], whole[end - 1]
             if low > high:
                 low, high = high, low
             j0 = max(0, first - high - margin - 1)
-            j1 = min(columns, first + count + 1 - low + margin + 1)
+            j1 = min(sweep.columns, first + count + 1 - low + margin + 1)
             if j1 <= j0:
                 for k in range(count + 1):
                     top[k] -= np.float32(drop * (end - begin))
                 continue
-            transpose_in(z, z_column + z_step * from_row, z_step, end - from_row, j0, j1, rows)
+            transpose_in(z, column + step * from_row, step, end - from_row, j0, j1, rows)
             _shadow_rows(
-                rows, -from_row, 1, j0, shade, -begin, 1, j0, begin, end, first, count, columns,
-                whole, fraction, crossing, crossed, tap_rows, tap_columns, tap_weight, tap_distance, near, drop,
-                shear, sinks, top, limit,
+                rows, -from_row, 1, j0, shade, -begin, 1, j0, begin, end, first, count,
+                sweep, taps, drop, sinks, top, limit,
             )  # fmt: skip
             _turn_back(
-                shade, packed, j0, out, out_column, out_step, begin, end, whole, first, count,
+                shade, packed, j0, out, column, step, begin, end, whole, first, count,
                 max(j0, first - high), min(j1, first + count - low),
             )  # fmt: skip
 
 
 _KERNELS = compile_kernels(_by_rows, _by_columns)
-
-
-def _tables(
-    shape: tuple[int, int], gsd: PixelSize, azimuth: float, sun_elevation: float, body_radius: float | None
-) -> tuple[Sweep, tuple[Any, ...]]:
-    """The sweep and the arguments that every kernel call of it shares."""
-    sweep = Sweep.towards(azimuth, gsd, shape)
-    taps = Taps.near(sweep.shear, NEAR, NEAR)
-    drop = min(max(math.tan(sun_elevation), -1e9), 1e9) * sweep.step
-    bend = 0.0 if body_radius is None else 0.5 * sweep.step**2 / body_radius
-    return sweep, (
-        sweep.whole, sweep.fraction, sweep.crossing, sweep.crossed, taps.rows, taps.columns, taps.weight,
-        taps.distance, NEAR, drop, sweep.shear, (bend, 0.5 * (sweep.rows - 1)),
-    )  # fmt: skip
-
-
-def _state(sweep: Sweep, parallel: bool) -> NDArray[np.float32]:
-    """(strips, width + 1), m: the highest ray over every line so far."""
-    width = strip_width(sweep.line_count, LINES_TURNED if sweep.by_columns else LINES) if parallel else sweep.line_count
-    return np.full((-(-sweep.line_count // width), width + 1), NOTHING, dtype=np.float32)
 
 
 def sweep_shadow(
@@ -260,14 +230,19 @@ def sweep_shadow(
 
     grid : (H, W), m; returns (H, W)
     """
-    sweep, tables = _tables(grid.shape, gsd, azimuth, sun_elevation, body_radius)
+    sweep = Sweep.towards(azimuth, gsd, grid.shape)
+    taps = Taps.near(sweep.shear, NEAR, NEAR)
+    drop = min(max(math.tan(sun_elevation), -1e9), 1e9) * sweep.step
+    bend = 0.0 if body_radius is None else 0.5 * sweep.step**2 / body_radius
     out = np.empty(grid.shape, dtype=np.bool_)
     parallel = grid.size > SMALL
-    state = _state(sweep, parallel)
+    first_line, lines = sweep.first_line, sweep.line_count
+    width = strip_width(lines, LINES) if parallel else lines
+    # (strips, width + 1), m: the highest ray over every line so far
+    state = np.full((-(-lines // width), width + 1), NOTHING, dtype=np.float32)
     origin, step = (sweep.rows - 1, -1) if sweep.reverse else (0, 1)
-    target = out.view(np.uint8) if sweep.by_columns else out
     _KERNELS[sweep.by_columns, parallel](
-        grid, origin, step, target, origin, step, 0, sweep.rows, sweep.columns, sweep.first_line, sweep.line_count, state,
-        *tables,
+        grid, origin, step, out.view(np.uint8) if sweep.by_columns else out, first_line, lines, state,
+        sweep, taps, drop, (bend, 0.5 * (sweep.rows - 1)),
     )  # fmt: skip
     return out

@@ -4,16 +4,15 @@ A grid is swept from its Sun side, one grid row (or column, whichever the rays c
 Seen that way the ray of pixel (i, j) meets row i - 1 at column j + shear, |shear| <= 1. Rays are followed as *lines*:
 line l meets row i at column l - shear * i, so that pixel (i, j) lies between lines j + floor(shear * i) and the next.
 Where a line crosses grid rows and grid columns the surface is linear between two pixels for either way of splitting
-a cell into triangles and for the bilinear surface alike: those crossings are all that a sweep looks at.
+a cell into triangles and for the bilinear surface alike: a sweep uses those crossings only.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -24,9 +23,8 @@ PixelSize = float | tuple[float, float]  # m; a pair is (from row to row, from c
 NOTHING = np.float32(-1e30)  # height of "no terrain": finite, so that interpolation with it stays below everything
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """One sweep's orientation and, for every row, where lines and crossings are.
+class Sweep(NamedTuple):
+    """One sweep's orientation and, for every row, where lines and crossings are; numba kernels take it as it is.
 
     by_columns : rows of the sweep are the grid's columns
     reverse : row 0 of the sweep is the grid's last row (column)
@@ -104,8 +102,8 @@ def compile_kernels(by_rows: Callable[..., None], by_columns: Callable[..., None
     """(by columns, on all threads) -> the kernel of a sweep, cached on disk.
 
     Small grids are swept by the calling thread alone: no start-up cost, and safe in worker processes and threads.
-    Numba's cache tells functions apart by name and code, not by options: under one name the kernel for all threads
-    would be read back as the one for one thread. The second goes by another name.
+    Numba's cache on disk tells functions apart by name and code, not by options, so that the kernel for all threads
+    needs another name than the one for a single thread.
     """
     kernels = {}
     for columns, function in ((False, by_rows), (True, by_columns)):
@@ -116,11 +114,11 @@ def compile_kernels(by_rows: Callable[..., None], by_columns: Callable[..., None
     return kernels
 
 
-@dataclass(frozen=True)
-class Taps:
-    """The crossings of a pixel's own ray over its first rows, the same for all pixels of a sweep.
+class Taps(NamedTuple):
+    """Where a pixel's own ray crosses grid rows and columns near the pixel, the same for all pixels (i, j) of a sweep.
 
-    At distance u rows the surface stands at (1 - weight) z[i - rows[0], j + columns[0]] + weight z[i - rows[1], ...].
+    Tap t, ``distance[t]`` rows away, sees the height (1 - weight) z[i - rows[0], j + columns[0]] + weight z[i - rows[1],
+    j + columns[1]]; rows, columns : (n, 2), weight, distance : (n,), all of them at t.
     """
 
     rows: NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""Area means of an image over quadrilaterals: what a pixel of the ground is, from the pixels of the image that show it."""
+"""Area means of an image over the quadrilaterals that show the pixels of a ground grid."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ WINDOW_PX = 1 << 23  # image pixels in memory at a time
 def area_means(
     read_window: ReadWindow, size: tuple[int, int], line: Floats, sample: Floats, wanted: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """(h, w) means of the image over the quadrilaterals between corners, and whether all that contributed was valid.
+    """(h, w) means of the image over the quadrilaterals between corners, and whether every contributing pixel was valid.
 
     read_window : (line, sample, lines, samples) -> pixels, NaN = nodata; only asked for windows inside the image
     size : (lines, samples) of the image; line, sample : (h, w, 2, 2) corners, the image's first pixel from 0 to 1
-    Ground that spans much of the image is taken in parts, so that a window never holds more than WINDOW_PX.
+    wanted : (h, w), where a mean is wanted. Ground that spans much of the image is taken in halves, so that a window never
+    holds more than WINDOW_PX.
     """
     lines_all, samples_all = size
     height, width = wanted.shape
@@ -46,27 +47,17 @@ def area_means(
     spans = [
         np.hypot(np.diff(lines, axis=axis), np.diff(samples, axis=axis)).max(axis=(1, 2)) for axis in (1, 2)
     ]  # along rows' sides, along columns'
-    n_row, n_col = _count(spans[0]), _count(spans[1])
+    n_row, n_col = (_samples_per_side(span) for span in spans)
     pixels = read_window(l0, s0, l1 - l0, s1 - s0)
-    _average(
-        np.ascontiguousarray(pixels, np.float32),
-        line,
-        sample,
-        CSM_CENTRE + l0,
-        CSM_CENTRE + s0,
-        whole,
-        n_row,
-        n_col,
-        values,
-        complete,
-    )
+    first = CSM_CENTRE + l0, CSM_CENTRE + s0
+    _average(np.ascontiguousarray(pixels, np.float32), line, sample, *first, whole, n_row, n_col, values, complete)
     return values, complete
 
 
-def _count(size_px: Floats) -> int:
-    """Samples per side of a ground pixel that spans so many image pixels: one where it is small, else two to a pixel.
+def _samples_per_side(size_px: Floats) -> int:
+    """Samples along a side of ground pixels that span ``size_px`` (n,) image pixels: one, or two per image pixel.
 
-    Two to a pixel is the least that is exact for an image that is linear between its pixel centres.
+    Twice is the least that is exact for an image that is linear between its pixel centres.
     """
     largest = float(np.nanmax(size_px, initial=0.0))
     return 1 if largest <= 1.0 else min(MAX_SAMPLES, math.ceil(2 * largest - 0.1))

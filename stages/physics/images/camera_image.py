@@ -1,4 +1,4 @@
-"""Windows of a camera's own image, in the order of its detector: whatever GDAL reads, PNG and plain TIFF by OpenImageIO."""
+"""Windows of an image as its camera took it: PNG, JPEG, EXR and plain TIFF by OpenImageIO, everything else by GDAL."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def open_camera_image(path: Path, camera: Camera, what: str) -> Iterator[CameraI
 
 
 def _open_picture(path: Path) -> Any | None:
-    """An OpenImageIO reader, or None where GDAL knows more: tiles, nodata, scales, damaged files."""
+    """An OpenImageIO reader, or None where GDAL must read: other formats, tiles, nodata, scales, damaged files."""
     if path.suffix.lower() not in PICTURES or not path.is_file():
         return None
     import OpenImageIO as oiio
@@ -88,7 +88,7 @@ def _open_picture(path: Path) -> Any | None:
                 return None
     picture = oiio.ImageInput.open(str(path))
     if picture is None:
-        oiio.geterror()  # read, so that it is not reported at exit; GDAL will say what is wrong
+        oiio.geterror()  # clears it, or it would be printed at exit; GDAL will say what is wrong
         return None
     if picture.spec().tile_width or picture.spec().nchannels < 1:
         picture.close()

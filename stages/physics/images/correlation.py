@@ -1,8 +1,7 @@
-"""Where an image matches its rendering best, to the whole pixel: masked normalised cross-correlation of small structure.
+"""Correlation of an image with its rendering over whole-pixel shifts: masked, normalised, of small structure only.
 
-The correlation over all whole-pixel shifts is that of Padfield 2012 (IEEE Trans. Image Process. 21:2706): pixels that are
-unknown in either picture do not count. Both pictures are band-passed first: albedo and haze that vary slowly say nothing
-about the place.
+The method is that of Padfield 2012 (IEEE Trans. Image Process. 21:2706): pixels that are unknown in either picture do not
+count. Both are band-passed first, because slow changes (albedo, stray light) do not tell the place.
 """
 
 from __future__ import annotations
@@ -15,15 +14,15 @@ from numpy.typing import NDArray
 
 from stages.common.arrays import Floats, Mask
 
-# sigma of the mean that is taken off: albedo is strongest over long distances, shading over short ones
+# sigma of the mean that is subtracted: albedo is strongest over long distances, shading over short ones
 HIGH_PASS_PX = 4.0
 SMOOTH_PX = 0.7  # sigma of the blur that both get, against pixel noise and aliasing
-LEAST_OVERLAP = 0.1  # share of the window that must be known in both for a shift to be rated
-SUPPORT_PX = 12  # beyond this the band-pass sees nothing of a pixel's surroundings (3 sigma)
+LEAST_OVERLAP = 0.1  # share of the window that must be known in both at a shift
+SUPPORT_PX = 12  # radius of the band-pass (3 sigma)
 
 
 def small_structure(values: Floats, good: Mask) -> Floats:
-    """(H, W) values less their surroundings' mean, slightly smoothed, 0 where not good."""
+    """Values (H, W) minus the mean of their surroundings, slightly smoothed, 0 where not ``good`` (H, W)."""
     mask = good.astype(float)
     filled = np.where(good, values, 0.0)
     return np.where(good, _masked_mean(filled, mask, SMOOTH_PX) - _masked_mean(filled, mask, HIGH_PASS_PX), 0.0)
@@ -69,17 +68,17 @@ def masked_correlation(image: Floats, good_image: Mask, templates: Sequence[Floa
     return scores
 
 
-def combined_correlation(scores: Floats, among: Floats) -> Floats:
-    """Multiple correlation of the image with several templates, from its correlation with each and theirs among them.
+def combined_correlation(scores: Floats, mutual: Floats) -> Floats:
+    """(R, C) multiple correlation of the image with several templates together.
 
-    The sign is the first one's: a negative of the rendering is no match.
+    Its sign is that of the first template's coefficient: a negative of the rendering is no match.
 
-    scores : (n, R, C), of each template over the shifts; among : (n, n)
+    scores : (n, R, C) correlation with each template over the shifts; mutual : (n, n) of the templates with each other
     """
     if len(scores) == 1:
         return scores[0]
     stack = np.moveaxis(scores, 0, -1)
     known = (stack > -1).all(-1)
-    inverse = np.linalg.inv(among + 1e-6 * np.eye(len(scores)))
+    inverse = np.linalg.inv(mutual + 1e-6 * np.eye(len(scores)))
     square = np.einsum("...i,ij,...j->...", stack, inverse, stack)
     return np.where(known, np.sqrt(np.clip(square, 0, 1)) * np.sign(stack @ inverse[0]), -1.0)

@@ -1,8 +1,8 @@
-"""One image's displacement over the ground: how far from where it should be each place is shown.
+"""Displacement of an image over the ground: how far from its true position it shows each place.
 
-A displacement is a constant, linear over the ground, or a smooth field (uniform bicubic B-splines); beside it may stand a share
-of the relief displacement, which an image has that was projected onto a sphere instead of the terrain: ground that is h higher
-is shown h tan(emission) further away from the camera.
+A displacement is constant, linear over the ground, or a smooth field (uniform bicubic B-splines). A share of the relief
+displacement may come on top, which images have that were projected onto a sphere instead of the terrain: they show ground
+that is h higher h tan(emission) farther away from the camera.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
 from stages.common.arrays import Floats
-from stages.physics.maps.grid import Grid, unit_vectors
+from stages.physics.maps.grid import Grid, lonlat_of_points, unit_vectors
 
-FORMS = ("constant", "affine", "field")  # from the plainest on
-# (row, col, height m) -> (dx, dy) px that all of the relief displacement makes there
+FORMS = ("constant", "affine", "field")  # from the simplest to the most general
+# (row, col, height m) -> (dx, dy) px of the full relief displacement there
 Relief = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
 
 
@@ -26,8 +26,8 @@ Relief = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
 class Basis:
     """Basis functions over the ground whose weighted sum is a displacement: a constant, a plane, or cubic B-splines.
 
-    form : one of FORMS; origin : (row, col), the middle for 'affine', the first knot for 'field'
-    step : px, what the places are divided by, the distance of the knots; cells : (rows, cols) between the knots of a field
+    form : one of FORMS; origin : (row, col) of the middle for 'affine', of the first knot for 'field'
+    step : px per unit of the functions' coordinates: the distance of the knots; cells : (rows, cols) between a field's knots
     """
 
     form: str
@@ -37,11 +37,14 @@ class Basis:
 
     @property
     def size(self) -> int:
-        """Parts that it is made of."""
+        """Number of basis functions."""
         return {"constant": 1, "affine": 3}.get(self.form, (self.cells[0] + 3) * (self.cells[1] + 3))
 
     def matrix(self, row: Floats, col: Floats) -> Floats:
-        """(n, size) values of each part at n places."""
+        """(n, size) values of every basis function at n places.
+
+        row, col : (n,) px
+        """
         r, c = self._places(row, col)
         if self.form != "field":
             return np.stack([np.ones(r.shape), c, r], axis=1)[:, : self.size]
@@ -49,7 +52,7 @@ class Basis:
         return np.einsum("na,nb->nab", down, across).reshape(len(r), -1)
 
     def mixture(self, coefficients: Floats, row: Floats, col: Floats) -> Floats:
-        """The parts weighted by ``coefficients`` (size,), at places of any shape."""
+        """The basis functions weighted by ``coefficients`` (size,). row, col : px, of any shape; returns the same shape"""
         r, c = self._places(row, col)
         if self.form != "field":
             parts = (np.ones(r.shape), c, r)
@@ -59,7 +62,7 @@ class Basis:
         return map_coordinates(knots, places, order=3, prefilter=False, mode="nearest").reshape(r.shape)
 
     def bending(self) -> Floats:
-        """(size, size) how much a mixture bends, as a quadratic form: second differences of the knots both ways.
+        """(size, size) quadratic form of how much a mixture bends: second differences of the knots along rows and columns.
 
         Eilers & Marx 1996, Stat. Sci. 11:89. Displacements that are linear over the ground do not bend.
         """
@@ -76,7 +79,7 @@ class Basis:
 
     def _places(self, row: Floats, col: Floats) -> tuple[Floats, Floats]:
         r, c = (row - self.origin[0]) / self.step, (col - self.origin[1]) / self.step
-        if self.form == "field":  # beyond its ground a field stays as it was at the edge
+        if self.form == "field":  # beyond its edge a field stays constant
             r, c = np.clip(r, 0, self.cells[0]), np.clip(c, 0, self.cells[1])
         rows, cols = np.broadcast_arrays(r, c)
         return rows, cols
@@ -91,15 +94,15 @@ def _cubic(place: Floats, cells: int) -> Floats:
 
 @dataclass(frozen=True)
 class Field:
-    """One image's displacement over the ground, and what it rests on.
+    """Displacement of one image over the ground, and the evidence for it.
 
-    basis, coefficients : (2, size) px for dx and dy; share : of the relief displacement; share_error : its standard error,
-        NaN where no share was tried
+    coefficients : (2, size) px of the basis for dx and dy; share : of the relief displacement; share_error : its standard
+        error, NaN where no share was tried; reference : m, height that relief does not displace
     mean : (dx, dy) px over its blocks, without relief; freedom : parameters per axis that the data determine
-    used, regions : how many blocks it rests on and how many were tried; scatter : px, robust standard deviation of a block
-    sigma : px, standard error of the mean: over the blocks, and as much again as one block scatters, because albedo that
-        follows the terrain pulls all of them the same way (up to 1.4 times the scatter in simulated scenes)
-    correlation : median over the blocks used; held_out : share of held-out blocks' squared shifts that it takes away
+    used, regions : numbers of blocks fitted and tried; scatter : px, robust standard deviation of one block
+    sigma : px, standard error of the mean: that over the blocks, with one block's scatter added in quadrature, since
+        albedo that follows the terrain biases all blocks alike (by up to 1.4 times the scatter in simulated scenes)
+    correlation : median over the blocks used; held_out : share of held-out blocks' squared shifts that it explains
     refused : why it must not be applied, empty where it may be
     """
 
@@ -124,17 +127,20 @@ class Field:
         return not self.refused
 
     @property
-    def moves_apart(self) -> bool:
-        """Whether it differs over the ground."""
+    def varies(self) -> bool:
+        """Whether it differs from place to place."""
         return self.basis.form != "constant" or self.share != 0.0
 
     @property
     def form(self) -> str:
-        """What was fitted, in words."""
+        """The form of the fit, for people."""
         return self.basis.form + (" + relief" if self.share else "")
 
     def at(self, row: ArrayLike, col: ArrayLike, relief: tuple[Floats, Floats] | None = None) -> tuple[Floats, Floats]:
-        """(dx, dy), px, at places on the grid; zero where refused. relief : (dx, dy) px there of all the relief displacement."""
+        """(dx, dy), px, at places on the grid, 0 where refused.
+
+        row, col : px, broadcastable; relief : (dx, dy) px of the full relief displacement there
+        """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         if self.refused:
             return np.zeros(row.shape), np.zeros(row.shape)
@@ -143,10 +149,10 @@ class Field:
 
 
 def relief_displacement(grid: Grid, camera_position: Floats, reference: float) -> Relief:
-    """How an image of a frame camera that was projected onto the sphere at ``reference`` m shows places of other heights.
+    """Displacement of a frame camera's image that was projected onto the sphere at ``reference`` m, not the terrain.
 
-    The ray from the camera through the ground goes on to that sphere: the place is shown where it ends, h tan(emission)
-    away from the camera. camera_position : (3,) body-fixed, m. Rays that pass the sphere by displace nothing.
+    A place is shown where the ray from the camera through it meets that sphere, h tan(emission) farther away; where the
+    ray misses the sphere, the displacement is 0. camera_position : (3,) body-fixed, m
     """
     camera = np.asarray(camera_position, float)
     radius = grid.radius + reference
@@ -159,8 +165,7 @@ def relief_displacement(grid: Grid, camera_position: Floats, reference: float) -
         root = along**2 - (camera @ camera - radius**2)
         with np.errstate(invalid="ignore"):
             end = camera + (-along - np.sqrt(root))[..., None] * ray
-            lon = np.degrees(np.arctan2(end[..., 1], end[..., 0]))
-            lat = np.degrees(np.arcsin(end[..., 2] / np.linalg.norm(end, axis=-1)))
+            lon, lat = lonlat_of_points(end)
         known = np.isfinite(lon) & np.isfinite(lat)
         shown_row, shown_col = grid.rowcol_of_lonlat(np.where(known, lon, 0.0), np.where(known, lat, 0.0))
         dx, dy = np.where(known, shown_col - col, 0.0), np.where(known, shown_row - row, 0.0)

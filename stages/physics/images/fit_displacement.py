@@ -1,4 +1,4 @@
-"""One displacement of a whole image from the shifts of its blocks, as plain as held-out blocks allow."""
+"""Fit of one displacement to the shifts of an image's blocks, in the simplest form that cross-validation does not reject."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ LEAST_ACCEPTED = 0.2  # share of the blocks tried
 OUTLIER = 3.5  # standard deviations from the fit beyond which a block is left out
 LEAST_SIGMA_PX = 0.02  # resampling alone is no better
 MOST_CELLS = 8  # of a field's knots along its longer side
-STIFFNESS = tuple(4.0**k for k in range(-5, 6))  # of a field, against what the blocks say
-FOLDS = 8  # of ground that is held out
-COARSE_STEPS = 5  # in which no block is left out yet
+STIFFNESS = tuple(4.0**k for k in range(-5, 6))  # weights of a field's bending against the blocks' misfit
+FOLDS = 8  # of the cross-validation
+COARSE_STEPS = 5  # first iterations, which leave no block out yet
 
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Accepted blocks. row, col : (n,); seen : (n, 2) dx, dy; covariance : (n, 2, 2); relief : (n, 2) mean px or None.
+    """Accepted blocks. row, col : (n,); shift : (n, 2) dx, dy; covariance : (n, 2, 2); relief : (n, 2) mean px or None.
 
-    What relief does within a block was fitted beside its shift, and is not used: errors of the DEM pull it (on Apollo frames
-    the share came out .76 with it, .91 without, and held-out ground was explained worse).
+    The relief's share fitted within each block is not used: errors of the DEM bias it (on Apollo frames the share of the
+    image came out .76 with it, .91 without, and held-out ground was explained worse).
     """
 
     row: Floats
     col: Floats
-    seen: Floats
+    shift: Floats
     covariance: Floats
     relief: Floats | None
 
@@ -47,32 +47,34 @@ class _Blocks:
 
 @dataclass(frozen=True)
 class _Solution:
-    """theta : (2 size [+ 1],), dx's and dy's coefficients and the relief's share; covariance of it; off : (n, 2) px, what it
-    leaves; keep : (n,) bool, blocks that count; scatter : px; freedom : parameters per axis
-    design : (n, 2, p); rows, values : (2 n, p) and (2 n,) the weighted equations; held : (p, p) what holds theta besides them
+    """One least-squares fit of p = 2 size [+ 1] parameters.
+
+    theta : (p,) coefficients of dx and dy, and the relief's share; covariance : (p, p) of them
+    keep : (n,) blocks that are no outliers; scatter : px; freedom : parameters per axis
+    design : (n, 2, p); rows, values : (2 n, p) and (2 n,) weighted equations; penalty : (p, p) added to their normal matrix
     """
 
     theta: Floats
     covariance: Floats
-    off: Floats
     keep: Mask
     scatter: float
     freedom: float
     design: Floats
     rows: Floats
     values: Floats
-    held: Floats
+    penalty: Floats
 
 
 def fit_field(
     shifts: Sequence[Shift], row: ArrayLike, col: ArrayLike, form: str = "constant", reference: float | None = None
 ) -> Field:
-    """One displacement of a whole image from its blocks' shifts at (row, col) on the grid.
+    """One displacement of a whole image from the shifts of its blocks.
 
-    form : the freest of FORMS that may be taken. A freer one than 'constant', and relief displacement, is taken
-    where it predicts blocks that it was not fitted to better, by more than the standard error of that.
+    row, col : (n,) px, the blocks' middles on the grid
+    form : the most general of FORMS that may be taken. One beyond 'constant', and relief displacement, is taken where it
+    predicts held-out blocks better, by more than the standard error of that gain.
     reference : m, the height that relief does not displace; None where relief displacement is not to be tried
-    Blocks that disagree with the rest are left out; ``Field.refused`` says where the evidence is too poor.
+    Blocks that disagree with the rest are left out; where the evidence is too poor, ``Field.refused`` holds the reason.
     """
     if form not in FORMS:
         raise GeometryError(f"registration: expected 'constant', 'affine' or 'field', found '{form}'.")
@@ -91,7 +93,7 @@ def fit_field(
         row[good],
         col[good],
         np.array([(s.dx, s.dy) for s in kept]),
-        np.array([_covariance_of(s) for s in kept]),
+        np.array([s.place_covariance for s in kept]),
         np.array([s.relief for s in kept]) if reference is not None else None,
     )
     chosen = _choose(blocks, form, middle)
@@ -126,28 +128,24 @@ def fit_field(
     return field
 
 
-def _covariance_of(shift: Shift) -> Floats:
-    if shift.covariance is not None:
-        return shift.covariance[:2, :2]
-    return shift.sigma**2 * np.eye(2)
-
-
 # --- which form -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Candidate:
+    """One form. whole : its fit to all blocks; loss : (n,) of each block where it was held out"""
+
     basis: Basis
     relief: bool
     whole: _Solution | None
-    loss: Floats  # (n,) what each block, held out, is off by
+    loss: Floats
     share_error: float = math.nan
     held_out: float = math.nan
 
 
 def _choose(blocks: _Blocks, form: str, middle: tuple[float, float]) -> _Candidate:
-    """The plainest form that no freer one beats on held-out blocks by more than the standard error of its lead."""
-    squares = _squares(blocks)
+    """The simplest form that no more general one beats on held-out blocks by more than the standard error of its lead."""
+    folds = _deal_folds(blocks)
     constant = Basis("constant", middle)
     plain = _solve(blocks, constant, False, 0.0)
     if plain is None:
@@ -166,24 +164,24 @@ def _choose(blocks: _Blocks, form: str, middle: tuple[float, float]) -> _Candida
         for basis, stiffness in bases
         for relief in ((False, True) if blocks.relief is not None else (False,))
     ]
-    # blocks weigh alike for all forms: by what the closest of their fits that many blocks hold leaves
+    # one scale for all forms: the smallest scatter among the fits with at least four blocks per parameter
     scatters = [f.scatter for _, _, fits in tried for f in fits if f.freedom < number / 4]
     scale = np.hypot(blocks.sigma, min([plain.scatter, *scatters]))
-    best = _Candidate(constant, False, plain, _held_out(blocks, plain, squares, scale)[0])
+    best = _Candidate(constant, False, plain, _held_out(blocks, plain, folds, scale)[0])
     for basis, relief, fits in tried:
-        outcomes = [(*_held_out(blocks, fit, squares, scale), fit) for fit in fits]
+        outcomes = [(*_held_out(blocks, fit, folds, scale), fit) for fit in fits]
         if not outcomes:
             continue
         loss, shares, fit = min(outcomes, key=lambda outcome: float(outcome[0].mean()))
-        lead = _by_square(best.loss - loss, squares)
+        lead = np.bincount(folds, weights=best.loss - loss)
         if lead.sum() > math.sqrt(len(lead)) * lead.std(ddof=1):
             best = _Candidate(basis, relief, fit, loss, _jackknife(shares) if relief else math.nan)
-    zero = _loss(blocks.seen, scale)
+    zero = _loss(blocks.shift, scale)
     return replace(best, held_out=1 - float(best.loss.sum()) / max(1e-12, float(zero.sum())))
 
 
 def _field_basis(blocks: _Blocks) -> Basis:
-    """Square cells of knots over all blocks, as close as every second block along a row, and no more than MOST_CELLS."""
+    """Square cells between knots over all blocks: at least two blocks wide, and at most MOST_CELLS a side."""
     low = np.array([blocks.row.min(), blocks.col.min()])
     extent = np.array([np.ptp(blocks.row), np.ptp(blocks.col)])
     spacing = math.sqrt(float(extent[0] * extent[1]) / len(blocks.row))  # of blocks
@@ -193,8 +191,8 @@ def _field_basis(blocks: _Blocks) -> Basis:
     return Basis("field", (float(start[0]), float(start[1])), step, (int(cells[0]), int(cells[1])))
 
 
-def _squares(blocks: _Blocks) -> NDArray[np.int64]:
-    """(n,) to which of FOLDS parts of the ground each block belongs: squares of about two by two blocks, dealt at random."""
+def _deal_folds(blocks: _Blocks) -> NDArray[np.int64]:
+    """(n,) the fold of each block: squares of the ground of about two by two blocks are dealt to FOLDS folds at random."""
     extent = max(1.0, float(np.ptp(blocks.row)) * float(np.ptp(blocks.col)))
     side = 2 * math.sqrt(extent / len(blocks.row)) + 1
     place = np.stack([(blocks.row - blocks.row.min()) // side, (blocks.col - blocks.col.min()) // side], axis=1)
@@ -204,34 +202,30 @@ def _squares(blocks: _Blocks) -> NDArray[np.int64]:
     return np.asarray(dealt[square] % min(FOLDS, square.max() + 1))
 
 
-def _by_square(values: Floats, squares: NDArray[np.int64]) -> Floats:
-    return np.asarray(np.bincount(squares, weights=values, minlength=squares.max() + 1), float)
+def _held_out(blocks: _Blocks, fit: _Solution, folds: NDArray[np.int64], scale: Floats) -> tuple[Floats, Floats]:
+    """(n,) loss of each block under ``fit`` repeated without its fold, and (folds,) the relief's share each time.
 
-
-def _held_out(blocks: _Blocks, fit: _Solution, squares: NDArray[np.int64], scale: Floats) -> tuple[Floats, Floats]:
-    """(n,) the loss of each block under ``fit`` made again from the other squares, and the relief's share in each of these.
-
-    Which blocks are outliers stays as it was for all of them together.
+    Outliers stay those of the fit to all blocks.
     """
-    loss, shares = _loss(blocks.seen, scale), []
-    for square in range(squares.max() + 1):
-        out = squares == square
+    loss, shares = _loss(blocks.shift, scale), []
+    for fold in range(folds.max() + 1):
+        out = folds == fold
         rest = fit.rows[np.repeat(~out, 2)], fit.values[np.repeat(~out, 2)]
         if (fit.keep & ~out).sum() >= 3:
-            inverse = np.linalg.inv(rest[0].T @ rest[0] + fit.held)
+            inverse = np.linalg.inv(rest[0].T @ rest[0] + fit.penalty)
             theta = inverse @ (rest[0].T @ rest[1])
-            loss[out] = _loss((blocks.seen - fit.design @ theta)[out], scale[out])
+            loss[out] = _loss((blocks.shift - fit.design @ theta)[out], scale[out])
             shares.append(theta[-1])
     return loss, np.array(shares)
 
 
-def _loss(off: Floats, scale: Floats) -> Floats:
-    """Squared distance in standard deviations, no further than where a block counts as an outlier."""
-    return np.minimum((off**2).sum(axis=1) / scale**2, OUTLIER**2)
+def _loss(residual: Floats, scale: Floats) -> Floats:
+    """(n,) squared residuals (n, 2) in standard deviations ``scale`` (n,), at most that of an outlier."""
+    return np.minimum((residual**2).sum(axis=1) / scale**2, OUTLIER**2)
 
 
 def _jackknife(values: Floats) -> float:
-    """Standard error of what was estimated with each part of the ground left out once (Quenouille 1956)."""
+    """Standard error from estimates (n,) with each fold left out once (Quenouille 1956)."""
     n = len(values)
     return math.sqrt((n - 1) / n * float(((values - values.mean()) ** 2).sum())) if n > 1 else math.nan
 
@@ -239,52 +233,49 @@ def _jackknife(values: Floats) -> float:
 # --- one fit --------------------------------------------------------------------------------------------------------
 
 
-def _solve(blocks: _Blocks, basis: Basis, relief: bool, stiffness: float, used: Mask | None = None) -> _Solution | None:
+def _solve(blocks: _Blocks, basis: Basis, relief: bool, stiffness: float) -> _Solution | None:
     """Weighted least squares with outliers left out; None where too few blocks agree.
 
     A block weighs by its own covariance and by the scatter of all; it is an outlier beyond OUTLIER standard deviations.
-    Bad blocks may be a third: they first weigh little (Cauchy), and are left out once the rest agrees.
+    Up to a third of the blocks may be bad: at first they weigh little (Cauchy), later they are left out.
     """
     n, size = len(blocks.row), basis.size
-    used = np.ones(n, bool) if used is None else used
     design, bending = _design(blocks, basis, relief)
-    seen, free = blocks.seen, design.shape[2]
+    shift, free = blocks.shift, design.shape[2]
     least = 2 if basis.form == "constant" else 3
-    if used.sum() < min(least, n):
-        return None
-    floor = float(np.median(blocks.sigma[used]))
-    off = seen - np.median(seen[used], axis=0)
-    keep = used
+    floor = float(np.median(blocks.sigma))
+    residual = shift - np.median(shift, axis=0)
+    keep = np.ones(n, bool)
     for k in range(COARSE_STEPS + 15):
-        scatter = 1.4826 * float(np.median(np.abs(off[keep])))
-        distance = np.abs(off).max(axis=1) / np.hypot(blocks.sigma, max(scatter, floor))
-        weight = used / (1 + distance**2)
+        scatter = 1.4826 * float(np.median(np.abs(residual[keep])))
+        distance = np.abs(residual).max(axis=1) / np.hypot(blocks.sigma, max(scatter, floor))
+        weight = 1 / (1 + distance**2)
         before = keep
         if k >= COARSE_STEPS:
-            keep = used & (distance < OUTLIER)
+            keep = distance < OUTLIER
             weight = keep.astype(float)
             if keep.sum() < min(least, n):
                 return None
         excess = max(0.0, scatter**2 - floor**2) + LEAST_SIGMA_PX**2
         root = np.linalg.cholesky(np.linalg.inv(blocks.covariance + excess * np.eye(2)))
         root = np.swapaxes(root, 1, 2) * np.sqrt(weight)[:, None, None]
-        x, y = (root @ design).reshape(2 * n, free), (root @ seen[:, :, None]).reshape(2 * n)
+        x, y = (root @ design).reshape(2 * n, free), (root @ shift[:, :, None]).reshape(2 * n)
         normal = x.T @ x
-        held = bending * stiffness * np.trace(normal[:size, :size]) / size
-        held += 1e-9 * np.trace(normal) / free * np.eye(free)
-        inverse = np.linalg.inv(normal + held)
+        penalty = bending * stiffness * np.trace(normal[:size, :size]) / size
+        penalty += 1e-9 * np.trace(normal) / free * np.eye(free)
+        inverse = np.linalg.inv(normal + penalty)
         theta = inverse @ (x.T @ y)
-        last, off = off, seen - design @ theta
-        if k > COARSE_STEPS and (before == keep).all() and np.abs(off - last).max() < 1e-3:
+        last, residual = residual, shift - design @ theta
+        if k > COARSE_STEPS and (before == keep).all() and np.abs(residual - last).max() < 1e-3:
             break
     share = inverse @ normal
     freedom = (float(np.trace(share)) - relief) / 2
-    scatter = 1.4826 * float(np.median(np.abs(off[keep])))
-    return _Solution(theta, share @ inverse, off, keep, scatter, freedom, design, x, y, held)
+    scatter = 1.4826 * float(np.median(np.abs(residual[keep])))
+    return _Solution(theta, share @ inverse, keep, scatter, freedom, design, x, y, penalty)
 
 
 def _design(blocks: _Blocks, basis: Basis, relief: bool) -> tuple[Floats, Floats]:
-    """(n, 2, p) what dx and dy of each block are a mixture of, and (p, p) how the mixture bends."""
+    """(n, 2, p) design matrix of each block's dx and dy, and (p, p) the quadratic form of the bending."""
     size = basis.size
     parts = basis.matrix(blocks.row, blocks.col)
     design = np.zeros((len(parts), 2, 2 * size + relief))

@@ -1,11 +1,11 @@
-"""Labels of planetary products: PVL (PDS3, ISIS) as read by ``pvl``, PDS4 XML, the times they hold, tables of ISIS cubes."""
+"""Labels of planetary products (PVL of PDS3 and ISIS, PDS4 XML), the times that they hold, and tables of ISIS cubes."""
 
 from __future__ import annotations
 
 import re
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,83 +16,56 @@ from schemas.errors import InputError
 from stages.physics.bodies.ephemeris import et_to_utc, parse_utc
 
 HEAD = 262144  # bytes in which a label ends
+Block = Mapping[str, Any]  # a PVL object or group; keys as written, nested blocks under their kind
 
 
-class Block(dict[str, Any]):
-    """A PVL object or group: keys as written, in order; ``kind`` its name. Blocks of one name may stand side by side."""
+def walk(label: Block, kind: str = "root") -> Iterator[tuple[str, Block]]:
+    """(kind, block) of a label and of all blocks within it."""
+    yield kind, label
+    for inner, value in label.items():
+        if isinstance(value, dict):
+            yield from walk(value, inner)
 
-    def __init__(self, kind: str) -> None:
-        super().__init__()
-        self.kind = kind
-        self.blocks: list[Block] = []
 
-    def find(self, kind: str, name: str | None = None) -> Block | None:
-        """The first block of that kind (and ``Name``) at any depth; case does not matter."""
-        for block in self.walk():
-            if block.kind.lower() == kind.lower() and (name is None or str(block.get("Name", "")) == name):
-                return block
-        return None
+def find_block(label: Block, kind: str, name: str | None = None) -> Block | None:
+    """The first block of that kind (and ``Name``) at any depth, None where there is none; case does not matter."""
+    for found, block in walk(label):
+        if found.lower() == kind.lower() and (name is None or str(block.get("Name", "")) == name):
+            return block
+    return None
 
-    def walk(self) -> Iterator[Block]:
-        """Itself and all blocks within."""
-        yield self
-        for block in self.blocks:
-            yield from block.walk()
 
-    def lookup(self, key: str) -> Any:
-        """The first value under ``key`` at any depth, None where there is none; case does not matter."""
-        for block in self.walk():
-            for name, value in block.items():
-                if name.lower() == key.lower():
-                    return value
-        return None
+def find_value(label: Block, key: str) -> Any:
+    """The first value under ``key`` at any depth, None where there is none; case does not matter."""
+    for _, block in walk(label):
+        for name, value in block.items():
+            if name.lower() == key.lower() and not isinstance(value, dict):
+                return value
+    return None
 
 
 def parse_pvl(text: str, where: str) -> Block:
     """A PVL label up to its END; units are dropped. Raises InputError."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # pvl speaks of an optional package
+        warnings.simplefilter("ignore")  # pvl warns of a missing optional package
         import pvl
         from pvl.decoder import OmniDecoder
         from pvl.exceptions import LexerError, ParseError
 
-    class TimesAsWritten(OmniDecoder):
+    class PlainDecoder(OmniDecoder):
         def decode_datetime(self, value: str) -> str:
             raise ValueError(value)  # pvl then takes it for text: digits and time systems stay as they are
 
+        def decode_quantity(self, value: Any, unit: str) -> Any:
+            return value
+
     try:
-        module = pvl.loads(text, decoder=TimesAsWritten())
+        return pvl.loads(text, decoder=PlainDecoder())
     except (LexerError, ParseError, ValueError, RecursionError) as error:
         reason = " ".join(str(getattr(error, "msg", error)).split())[:120]
         raise InputError(
             f"{where}: expected a PVL label (KEY = value), found none that can be read ({reason})."
         ) from None
-    return _block("root", module)
-
-
-def _block(kind: str, items: Any) -> Block:
-    from pvl.collections import PVLAggregation
-
-    block = Block(kind)
-    for key, value in items.items():
-        if isinstance(value, PVLAggregation):
-            block.blocks.append(_block(str(key), value))
-        else:
-            block.setdefault(str(key), _plain(value))
-    return block
-
-
-def _plain(value: Any) -> Any:
-    """Numbers, text and lists of them: no units."""
-    from pvl.collections import Quantity
-
-    if isinstance(value, Quantity):
-        return _plain(value.value)
-    if isinstance(value, set | frozenset):
-        return sorted((_plain(v) for v in value), key=str)
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return value
 
 
 def read_label(path: Path) -> Block | None:
@@ -109,12 +82,12 @@ def read_label(path: Path) -> Block | None:
 
 def isis_table(path: Path, label: Block, name: str) -> NDArray[np.float64]:
     """(records, fields) of a table of doubles attached to an ISIS cube. Raises InputError."""
-    table = label.find("Table", name)
+    table = find_block(label, "Table", name)
     if table is None:
         raise InputError(
             f"{path}: expected the SPICE table '{name}' in the cube, found none; run spiceinit on it first."
         )
-    fields = [block for block in table.blocks if block.kind == "Field"]
+    fields = [block for kind, block in table.items() if kind == "Field"]
     if any(str(f.get("Type")).lower() != "double" or f.get("Size") != 1 for f in fields):
         raise InputError(f"{path}: expected table '{name}' to hold doubles, found other fields; run spiceinit again.")
     order = "<" if str(table.get("ByteOrder", "Lsb")).lower() == "lsb" else ">"
@@ -132,7 +105,9 @@ def isis_table(path: Path, label: Block, name: str) -> NDArray[np.float64]:
 # --- times ----------------------------------------------------------------------------------------------------------
 
 _LROC_ID = re.compile(r"(?<![A-Z0-9])M(\d{9,10})([LR]|[CMVU])[EC]?", re.IGNORECASE)
-LROC_EPOCH = 198632799.6  # ephemeris time of product number 0, s; the clock stayed within 0.6 s of it from 2009 to 2015
+LROC_EPOCH = (
+    198632799.6  # ephemeris time of product number 0, s; from 2009 to 2015 the clock stayed within 0.6 s of that
+)
 _TIME_KEYS = ("START_TIME", "StartTime", "IMAGE_TIME")
 
 
@@ -162,7 +137,7 @@ def label_time(path: Path) -> str | None:
             found = _pds4_time(candidate)
         else:
             label = read_label(candidate)
-            found = next((v for k in _TIME_KEYS if label is not None and (v := label.lookup(k))), None)
+            found = next((v for k in _TIME_KEYS if label is not None and (v := find_value(label, k))), None)
         if found is not None and str(found).upper() not in ("NULL", "UNK", "N/A"):
             parse_utc(str(found), f"{candidate}: start time")
             return str(found)

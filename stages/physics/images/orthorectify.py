@@ -19,19 +19,21 @@ from numpy.typing import NDArray
 from stages.common.arrays import Floats
 from stages.physics.cameras import Camera
 from stages.physics.images.area_means import ReadWindow, area_means
-from stages.physics.maps.grid import CSM_CENTRE, Grid, unit_vectors
+from stages.physics.maps.grid import CSM_CENTRE, Grid, lonlat_of_points, unit_vectors
 
-# (row, col) arrays -> (dx, dy) px along columns and rows, as registration finds them
+# (row, col) arrays -> (dx, dy), px along columns and rows
 Displacement = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]
 
 BLOCK = 256  # px a side of the ground that is worked on at a time
+OUTLINE = 33  # lines and samples, or more, that a footprint is taken from
+FARTHEST_PX = 2048  # from which terrain can hide a crop
 
 
 @dataclass(frozen=True)
 class Terrain:
-    """A piece of the scene that reaches beyond what is orthorectified, so that its surroundings can hide it.
+    """A piece of the scene: the ground to orthorectify, with the surroundings that can hide it.
 
-    elevation : (H, W), m above the sphere, NaN = unknown; ``grid`` : where it lies
+    elevation : (H, W), m above the sphere, NaN = unknown; grid : where it lies
     """
 
     elevation: NDArray
@@ -70,17 +72,16 @@ def orthorectify(
 
     read_window : (line, sample, lines, samples) -> pixels, NaN = nodata; only asked for windows inside the image
     sun_position : (3,) body-fixed, m; the camera model's own where None
-    displacement : what the image is off by: a pixel is looked up where the camera model believes (row + dy, col + dx)
-        to be, at the height that it has
+    displacement : of the image: pixel (row, col) is looked up where the camera model sees the place (row + dy, col + dx)
+        at the height of (row, col)
     """
     row, col, height, width = box
     pixels = np.meshgrid(np.arange(row, row + height), np.arange(col, col + width), indexing="ij")
     centres = _ground(terrain, *pixels)
     line, sample = camera.ground_to_image(centres if displacement is None else _ground(terrain, *pixels, displacement))
     seen = camera.inside(line, sample)
-    axes = _axes(terrain.grid, box)
     view, view_position = _view(camera, centres, line, sample, seen)
-    emission, hidden = _visibility(terrain, box, centres, view, axes)
+    emission, hidden = _visibility(terrain, box, centres, view)
     sun = _sun(camera, line, seen, sun_position)
     phase = np.full((height, width), np.nan)
     if sun is not None:
@@ -112,40 +113,34 @@ def orthorectify(
     )
 
 
-def footprint(
-    camera: Camera, grid: Grid, heights: tuple[float, float], edge: int = 33
-) -> tuple[int, int, int, int] | None:
+def footprint(camera: Camera, grid: Grid, heights: tuple[float, float]) -> tuple[int, int, int, int] | None:
     """(row, col, height, width) on ``grid`` that holds what the image shows at any of these heights, None for nothing.
 
     heights : lowest and highest elevation, m. Pixels that look past the body do not count.
     """
-    line, sample = (
-        v.ravel() for v in np.meshgrid(camera.edge_lines(edge), np.linspace(0, camera.samples, edge), indexing="ij")
-    )
-    rows, cols = [], []
-    for height in heights:
-        # above the grid's own sphere, which the camera model need not share
-        points = camera.image_to_ground(line, sample, height + grid.radius - camera.semi_axes[0])
-        points = points[np.isfinite(points).all(-1)]
-        if len(points):
-            lon = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
-            lat = np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=-1)))
-            r, c = grid.rowcol_of_lonlat(lon, lat)
-            good = np.isfinite(r) & np.isfinite(c)
-            rows.append(r[good])
-            cols.append(c[good])
-    if not rows or not np.concatenate(rows).size:
+    places = np.meshgrid(camera.edge_lines(OUTLINE), np.linspace(0, camera.samples, OUTLINE), indexing="ij")
+    # above the grid's own sphere, which the camera model need not share
+    points = np.stack([camera.image_to_ground(*places, h + grid.radius - camera.semi_axes[0]) for h in heights])
+    points = points[np.isfinite(points).all(-1)]
+    if not len(points):
         return None
-    row, col = np.concatenate(rows), np.concatenate(cols)
+    row, col = grid.rowcol_of_lonlat(*lonlat_of_points(points))
+    good = np.isfinite(row) & np.isfinite(col)
+    if not good.any():
+        return None
+    row, col = row[good], col[good]
     r0, c0 = max(0, math.floor(row.min()) - 1), max(0, math.floor(col.min()) - 1)
     r1, c1 = min(grid.height, math.ceil(row.max()) + 2), min(grid.width, math.ceil(col.max()) + 2)
     return (r0, c0, r1 - r0, c1 - c0) if r1 > r0 and c1 > c0 else None
 
 
-def reach_px(relief: float, emission: float, gsd: float, limit: int = 2048) -> int:
-    """How many pixels around a crop can hide it from a camera: relief / cot(emission), and one for the corners."""
+def reach_px(relief: float, emission: float, gsd: float) -> int:
+    """Pixels around a crop from which terrain can hide it from a camera: relief x tan(emission), and two for the corners.
+
+    relief : m; emission : rad; gsd : m
+    """
     slope = math.tan(min(emission, math.radians(89)))
-    return min(limit, math.ceil(relief * slope / gsd) + 2)
+    return min(FARTHEST_PX, math.ceil(relief * slope / gsd) + 2)
 
 
 # --- ground ---------------------------------------------------------------------------------------------------------
@@ -176,16 +171,10 @@ def bilinear(values: NDArray, row: NDArray, col: NDArray) -> Floats:
     return total
 
 
-def _axes(grid: Grid, box: tuple[int, int, int, int]) -> Floats:
-    """(3, 3) east, north, up along the grid's columns and rows at the middle of a box."""
-    row, col, height, width = box
-    return grid.local_frames(row + (height - 1) / 2, col + (width - 1) / 2).axes[0]
-
-
 def _view(
     camera: Camera, centres: Floats, line: Floats, sample: Floats, seen: NDArray[np.bool_]
 ) -> tuple[Floats, Floats]:
-    """(h, w, 3) unit vectors along the true rays towards the camera, and its place for the middle of the crop."""
+    """(h, w, 3) unit vectors along the true rays towards the camera, and its position (3,) for the middle of the crop."""
     known = np.isfinite(line) & np.isfinite(sample)
     at = np.where(known, line, camera.lines / 2)
     across = np.where(known, sample, camera.samples / 2)
@@ -198,18 +187,18 @@ def _view(
 
 
 def _visibility(
-    terrain: Terrain, box: tuple[int, int, int, int], centres: Floats, view: Floats, axes: Floats
+    terrain: Terrain, box: tuple[int, int, int, int], centres: Floats, view: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Emission angle (rad) from the terrain's normal, and whether something stands in the ray's way."""
+    """(h, w) emission angle, rad, and whether the facet faces away from the camera or other terrain hides it."""
     row, col, height, width = box
     z, grid = np.asarray(terrain.elevation, float), terrain.grid
-    normal = _normals(terrain, box)
-    cosine = (normal * view).sum(-1)
+    cosine = (_normals(terrain, box) * view).sum(-1)
     emission = np.arccos(np.clip(cosine, -1, 1))
-    # horizontal path of the ray over the grid, per pixel of the grid's own axes; curvature bends the ground away
+    # horizontal path of the ray along the grid's own axes; _march lets the ground fall away beneath it
     up = centres / np.linalg.norm(centres, axis=-1, keepdims=True)
     rise = (up * view).sum(-1)
     across = view - rise[..., None] * up
+    axes = grid.local_frames(row + (height - 1) / 2, col + (width - 1) / 2).axes[0]  # rows east, north, up
     east, north = across @ axes[0], across @ axes[1]
     level = np.hypot(east, north)
     hidden = np.zeros((height, width), bool)
@@ -217,19 +206,9 @@ def _visibility(
         known = np.isfinite(rise) & np.isfinite(z[row : row + height, col : col + width])
         slope = np.where(level > 1e-9, rise / level, np.inf)
         step_row, step_col = np.where(level > 1e-9, -north / level, 0.0), np.where(level > 1e-9, east / level, 0.0)
-    finite = z[np.isfinite(z)]
-    _march(
-        z,
-        row,
-        col,
-        np.where(known, slope, np.nan),
-        step_row,
-        step_col,
-        grid.gsd,
-        grid.radius,
-        float(finite.max()) if finite.size else 0.0,
-        hidden,
-    )
+    highest = float(z.max(where=np.isfinite(z), initial=-np.inf))
+    slope = np.where(known, slope, np.nan)
+    _march(z, row, col, slope, step_row, step_col, grid.gsd, grid.radius, highest, hidden)
     return emission, hidden | (known & (cosine <= 0))
 
 
@@ -284,6 +263,7 @@ def _march(z, row, col, slope, step_row, step_col, gsd, radius, highest, hidden)
 
 
 def _sun(camera: Camera, line: Floats, seen: NDArray[np.bool_], given: Floats | None) -> Floats | None:
+    """(3,) body-fixed, m: as given, else the camera model's own in the middle of what is seen, else None."""
     if given is not None:
         return np.asarray(given, float)
     middle = float(np.median(line[seen])) if seen.any() else camera.lines / 2
@@ -298,16 +278,15 @@ def _corners(
 ) -> tuple[Floats, Floats]:
     """(line, sample), each (h, w, 2, 2): CSM coordinates of every pixel's corners, by row and by column.
 
-    line : (h, w) of the pixels' centres. Where the image is pieced together, a pixel's corners are looked up in the
-    exposure that shows its centre: in the image the next exposure may lie anywhere.
+    line : (h, w) of the pixels' centres. A pixel's corners are looked up in the framelet that shows its centre: the
+    neighbouring framelet of the image may lie anywhere on the ground.
     """
     row, col, height, width = box
     r, c = np.meshgrid(np.arange(height + 1) + row - 0.5, np.arange(width + 1) + col - 0.5, indexing="ij")
     points = _ground(terrain, r, c, displacement)
-    piece = camera.piece(line)
-    if piece is not None:
-        return camera.ground_to_piece(
-            np.moveaxis(sliding_window_view(points, (2, 2), axis=(0, 1)), 2, -1), piece[..., None, None]
-        )
+    framelet = camera.framelet(line)
+    if framelet is not None:
+        corners = np.moveaxis(sliding_window_view(points, (2, 2), axis=(0, 1)), 2, -1)
+        return camera.ground_to_framelet(corners, framelet[..., None, None])
     found = camera.ground_to_image(points)
     return sliding_window_view(found[0], (2, 2)), sliding_window_view(found[1], (2, 2))

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from schemas.errors import InputError
-from stages.physics.images.labels import read_label
+from stages.physics.images.labels import read_label, walk
 
 
 def read_index(path: Path) -> list[dict[str, str]]:
@@ -18,10 +18,10 @@ def read_index(path: Path) -> list[dict[str, str]]:
     """
     label_path, table_path = _index_pair(path)
     label = read_label(label_path)
-    table = next((b for b in label.walk() if b.kind.upper().endswith("TABLE")), None) if label is not None else None
+    table = next((b for kind, b in walk(label or {}) if kind.upper().endswith("TABLE")), None)
     if table is None:
         raise InputError(f"{label_path}: expected the PDS3 label of an index table, found none in it.")
-    columns = [b for b in table.blocks if b.kind.upper() == "COLUMN"]
+    columns = [b for kind, b in table.items() if kind.upper() == "COLUMN"]
     try:
         spans = [(str(c["NAME"]).upper(), int(c["START_BYTE"]) - 1, int(c["BYTES"])) for c in columns]
     except (KeyError, TypeError, ValueError):
@@ -55,8 +55,8 @@ def _index_pair(path: Path) -> tuple[Path, Path]:
     return (path, other) if is_label else (other, path)
 
 
-# Our column -> what indices call it (LROC, MESSENGER MDIS; degrees, longitudes east, km), the factor to our unit and the
-# values that can be: archives fill what they do not know with -9999, 1E32 and the like.
+# Our column -> its name in indices (LROC, MESSENGER MDIS; degrees, longitudes east, km), the factor to our unit and the
+# possible values: archives fill unknown ones with -9999, 1E32 and the like.
 INDEX_COLUMNS: Mapping[str, tuple[str, float, float, float]] = {
     "subsolar_longitude_deg": ("SUB_SOLAR_LONGITUDE", 1.0, -360.0, 360.0),
     "subsolar_latitude_deg": ("SUB_SOLAR_LATITUDE", 1.0, -90.0, 90.0),
@@ -65,7 +65,7 @@ INDEX_COLUMNS: Mapping[str, tuple[str, float, float, float]] = {
     "spacecraft_latitude_deg": ("SUB_SPACECRAFT_LATITUDE", 1.0, -90.0, 90.0),
     "spacecraft_altitude_m": ("SPACECRAFT_ALTITUDE", 1000.0, 1.0, 1e11),
 }
-# LROC's and CTX's; HiRISE's. MESSENGER's indices split it into PATH_NAME and FILE_NAME.
+# of LROC and CTX, of HiRISE; MESSENGER's indices split it into PATH_NAME and FILE_NAME
 _FILE_COLUMNS = ("FILE_SPECIFICATION_NAME", "FILE_NAME_SPECIFICATION")
 _INDEX_TIMES = ("START_TIME", "IMAGE_TIME", "OBSERVATION_START_TIME")
 IMAGE_SUFFIXES = (".tif", ".tiff", ".cub", ".img", ".png", ".xml")
@@ -90,7 +90,7 @@ def index_images(path: Path) -> list[dict[str, str]]:
         first, last = (bisect_left(names, product.lower() + end) for end in ("", chr(0x10FFFF)))
         candidates = [nearby[name] for name in names[first:last]] if product else []
         image = next((p for s in IMAGE_SUFFIXES for p in candidates if p.suffix.lower() == s), None)
-        image = image or _below(folder, named, listings)
+        image = image or _find_in_archive(folder, named, listings)
         if image is None:
             continue
         camera = next((p for p in candidates if p.suffix.lower() == ".json"), None)
@@ -117,15 +117,18 @@ def index_images(path: Path) -> list[dict[str, str]]:
 
 
 def _index_file(row: Mapping[str, str]) -> str:
-    """Where a row says that its product is, relative to the volume or the archive."""
+    """Path of a row's product, relative to the volume or the archive."""
     named = next((row[k] for k in _FILE_COLUMNS if row.get(k)), "")
     if not named and row.get("FILE_NAME"):
         named = f"{row.get('PATH_NAME', '')}/{row['FILE_NAME']}"
     return named.replace("\\", "/").lstrip("/")  # some begin at the server's root
 
 
-def _below(folder: Path, named: str, listings: dict[Path, frozenset[str]]) -> Path | None:
-    """The named file under the index's folder or one above it, whatever part of the archive's tree was kept."""
+def _find_in_archive(folder: Path, named: str, listings: dict[Path, frozenset[str]]) -> Path | None:
+    """The named file under the index's folder or one above it, whichever part of the archive's tree is there.
+
+    listings : file names by folder, filled on the way
+    """
     parts = Path(named).parts
     for first in range(len(parts)):
         for parent in (folder, *list(folder.parents)[:4]):

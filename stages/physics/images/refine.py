@@ -1,9 +1,9 @@
-"""A shift to a fraction of a pixel by least squares, with the error that the residual's own spectrum gives it.
+"""Shifts to a fraction of a pixel by least squares, with errors from the autocovariance of the residuals.
 
 Gauss-Newton steps minimise the difference between the image and a gain and offset of the rendering, with the gradient of
 the rendering, which has no noise (Baker & Matthews 2004, Int. J. Comput. Vis. 56:221). Further templates (albedo that
-follows the terrain) are fitted beside the rendering: shading is a slope towards the Sun, so that bright rims and dark floors
-added to it look like the same shading a part of a pixel away.
+follows the terrain) are fitted together with the rendering: shading is a slope towards the Sun, so that bright rims or dark
+floors added to it look like the same shading a fraction of a pixel away.
 """
 
 from __future__ import annotations
@@ -21,13 +21,15 @@ from stages.common.arrays import Floats, Mask
 
 ITERATIONS = 30
 LEAST_PIXELS = 200  # that must stay usable while the image is moved under the template
-MEMORY_PX = 16  # residuals further apart than this are taken as independent
+MEMORY_PX = 16  # residuals farther apart are taken as independent
 
 
 @dataclass(frozen=True)
 class Refined:
-    """place : (dx, dy) px; share : of ``relief`` within the region, 0 without; covariance : (3, 3) of the three, inf for a
-    share that was not asked for; correlation : between image and rendering there. None of it finite where it did not settle.
+    """A shift to a fraction of a pixel; NOT_CONVERGED where the steps do not converge.
+
+    place : (dx, dy) px; share : of ``relief`` within the region, 0 without; correlation : between image and rendering
+    covariance : (3, 3) of dx, dy and share, inf for a share that was not asked for
     """
 
     place: tuple[float, float]
@@ -36,7 +38,7 @@ class Refined:
     correlation: float
 
 
-NOWHERE = Refined((math.nan, math.nan), 0.0, np.full((3, 3), math.inf), 0.0)
+NOT_CONVERGED = Refined((math.nan, math.nan), 0.0, np.full((3, 3), math.inf), 0.0)
 
 
 def refine(
@@ -47,37 +49,38 @@ def refine(
     start: tuple[float, float],
     relief: Floats | None = None,
 ) -> Refined:
-    """Where the image lies against ``templates[0]`` (and any mixture of the others), all (H, W), from ``start`` on.
+    """The image's shift against ``templates[0]``, plus any mixture of the others, from ``start`` = (dx, dy) px on.
 
-    spline : coefficients of the image's quintic spline; good : its known pixels; weight : (H, W) >= 0, 0 outside the region
-    relief : (2, H, W) px (dx, dy), a displacement pattern whose share within the region is found as well
+    spline : (H, W) coefficients of the image's quintic spline; good : (H, W) its known pixels; templates : (H, W) each
+    weight : (H, W) >= 0, 0 outside the region
+    relief : (2, H, W) px (dx, dy), a displacement pattern whose share within the region is fitted as well
     """
-    solid, whole = eroded(good, 7), eroded(weight > 0, 3)
+    solid, whole = erode(good, 7), erode(weight > 0, 3)
     dx, dy = start
     change, fit, region = np.full(2, np.inf), None, None
     for step in range(ITERATIONS):
-        moved = moved_image(spline, dx, dy)
+        moved = shift_spline(spline, dx, dy)
         cell = math.floor(dx), math.ceil(dx), math.floor(dy), math.ceil(dy)
         if region is None or region.cell != cell:
-            use = whole & _seen(solid, cell)
+            use = whole & _known_within(solid, cell)
             if use.sum() < LEAST_PIXELS:
-                return NOWHERE
+                return NOT_CONVERGED
             region = _Region.around(cell, use, templates, weight)
         fit = _linear_fit(moved, region, None)
         if fit is None:
-            return NOWHERE
+            return NOT_CONVERGED
         change = -fit.change[:2]
         change *= min(1.0, 1.0 / max(1e-12, float(np.abs(change).max())))
         dx, dy = dx + float(change[0]), dy + float(change[1])
         if np.abs(change).max() < 1e-4 and step >= 2:
             break
     if fit is None or region is None or np.abs(change).max() > 0.02:
-        return NOWHERE
+        return NOT_CONVERGED
     share, covariance = 0.0, np.full((3, 3), math.inf)
     if relief is not None:
         full = _linear_fit(moved, region, relief)
         if full is not None:
-            # at the place that was found the two shifts' own change is what the share draws with it
+            # adding the share changes the shift; what a fit without it would still change does not count
             dx, dy, share = dx - full.change[0] + fit.change[0], dy - full.change[1] + fit.change[1], -full.change[2]
             return Refined((dx, dy), share, full.covariance(region.use), fit.correlation)
     covariance[:2, :2] = fit.covariance(region.use)
@@ -86,10 +89,10 @@ def refine(
 
 @dataclass(frozen=True)
 class _Region:
-    """The pixels that count while the image is moved within one ``cell`` of whole pixels (dx from, to; dy from, to).
+    """The pixels that count while the image moves within one ``cell`` of whole pixels (least and largest dx, then dy).
 
-    design : (n, k) templates and a constant; east, south : (n, k) their slopes; weight : (n,); projector : (k, n), of the
-    weighted least-squares mixture
+    use : (H, W), n pixels; design : (n, k) templates and a constant; east, south : (n, k) their slopes; weight : (n,)
+    projector : (k, n), from pixels to the weighted least-squares mixture of the templates
     """
 
     cell: tuple[int, int, int, int]
@@ -110,14 +113,14 @@ class _Region:
         )
         w = np.take(weight, flat)
         weighted = design * w[:, None]
-        # all templates have one size, so that the normal equations are good enough
+        # all templates have one standard deviation, so that the normal equations are well conditioned
         normal = weighted.T @ design
         projector = np.linalg.solve(normal + 1e-10 * np.trace(normal) * np.eye(len(normal)), weighted.T)
         return cls(cell, use, design, east, south, w, projector)
 
 
 def _slope(values: Floats, axis: int) -> Floats:
-    """Central differences, px^-1; the outermost pixels, which never count, get 0."""
+    """(H, W) central differences per px; 0 at the outermost pixels, which never count."""
     out = np.zeros_like(values)
     if axis:
         out[:, 1:-1] = (values[:, 2:] - values[:, :-2]) / 2
@@ -128,8 +131,10 @@ def _slope(values: Floats, axis: int) -> Floats:
 
 @dataclass(frozen=True)
 class _Linear:
-    """One linearised fit: change (p,) of the displacement; ``columns`` (n, p) with all nuisances projected out and weighted;
-    inverse (p, p) of their normal matrix; residual (n,).
+    """One linearised fit of p parameters, dx, dy and the relief's share, to n pixels.
+
+    change : (p,) of the parameters; columns : (n, p) weighted design, orthogonal to the templates
+    inverse : (p, p) of its normal matrix; residual : (n,)
     """
 
     change: Floats
@@ -139,7 +144,10 @@ class _Linear:
     correlation: float
 
     def covariance(self, use: Mask) -> Floats:
-        """(p, p): neighbouring residuals are alike, so that their autocovariance says what a sum over them is worth."""
+        """(p, p) covariance of the parameters, with the autocovariance of the residuals: neighbouring ones are correlated.
+
+        use : (H, W), the n pixels
+        """
         height, width = use.shape
         shape = tuple(cv2.getOptimalDFTSize(n + MEMORY_PX) for n in (height, width))
 
@@ -164,7 +172,7 @@ class _Linear:
 
 
 def _linear_fit(moved: Floats, region: _Region, relief: Floats | None) -> _Linear | None:
-    """Displacement and strengths together: image[x + d + e] = fitted(x) leaves image[x + d] = fitted - slopes . e."""
+    """One Gauss-Newton step e from the shift d of ``moved``, to first order: image[x + d] = fitted(x) - slopes(x) . e."""
     w, design, flat = region.weight, region.design, moved[region.use]
     strength = region.projector @ flat
     residual = flat - design @ strength
@@ -202,10 +210,10 @@ def _linear_fit(moved: Floats, region: _Region, relief: Floats | None) -> _Linea
     )
 
 
-def moved_image(spline: Floats, dx: float, dy: float) -> Floats:
+def shift_spline(spline: Floats, dx: float, dy: float) -> Floats:
     """The image at (row + dy, col + dx) from the coefficients of its quintic spline.
 
-    A cubic convolution's phase depends on the fraction of a pixel: it drew shifts by up to 0.05 px.
+    The phase of a cubic convolution depends on the fraction of a pixel, which biased shifts by up to 0.05 px.
 
     spline : (H, W); dx, dy : px; returns (H, W)
     """
@@ -214,7 +222,7 @@ def moved_image(spline: Floats, dx: float, dy: float) -> Floats:
         weights = [_quintic(shift - whole - k) for k in range(-2, 4)]
         # taps reach from two before to three behind the whole pixel: correlate1d centres an even window on its fourth
         spline = correlate1d(spline, weights, axis=axis, mode="constant", origin=-1)
-        spline = displaced(spline, *((whole, 0) if axis else (0, whole)))
+        spline = shift_pixels(spline, *((whole, 0) if axis else (0, whole)))
     return spline
 
 
@@ -223,7 +231,7 @@ def _quintic(x: float) -> float:
     return sum((-1) ** k * math.comb(6, k) * max(0.0, x + 3 - k) ** 5 for k in range(7)) / 120
 
 
-def displaced(values: NDArray, columns: int, rows: int) -> NDArray:
+def shift_pixels(values: NDArray, columns: int, rows: int) -> NDArray:
     """values[row + rows, col + columns], zeros from outside.
 
     values : (H, W); returns (H, W)
@@ -236,16 +244,16 @@ def displaced(values: NDArray, columns: int, rows: int) -> NDArray:
     return out
 
 
-def _seen(solid: Mask, cell: tuple[int, int, int, int]) -> Mask:
-    """Where all pixels that a pixel moved within ``cell`` is made of are known."""
-    seen = np.ones(solid.shape, bool)
+def _known_within(solid: Mask, cell: tuple[int, int, int, int]) -> Mask:
+    """(H, W) whether all pixels to interpolate from are known wherever in ``cell`` the image is moved to."""
+    known = np.ones(solid.shape, bool)
     for column in set(cell[:2]):
         for row in set(cell[2:]):
-            seen &= displaced(solid, column, row)
-    return seen
+            known &= shift_pixels(solid, column, row)
+    return known
 
 
-def eroded(mask: Mask, size: int) -> Mask:
+def erode(mask: Mask, size: int) -> Mask:
     """The pixels of a mask whose ``size`` x ``size`` surroundings are in it.
 
     mask : (H, W); returns (H, W)

@@ -26,18 +26,18 @@ from stages.physics.maps.window import Window
 from stages.physics.photometry import get_model
 
 STEP_PX = 64  # from block to block
-TILE_PX = 128  # blocks within so much are read and rendered at one go
+TILE_PX = 128  # blocks within a square of this size are read and rendered together
 MOST_BLOCKS = 256
 SECOND_REACH_PX = 4.0
-# Shading alone matters here: gain and offset are free, and slow changes are taken off. How the surface darkens towards the
-# limb is free too, between these two: over oblique views another law shades as if the ground lay a part of a pixel away.
+# Only shading matters here: gain and offset are free, and slow changes are filtered out. Limb darkening is free too, between
+# these two models: in oblique views another law shades as if the ground lay a fraction of a pixel away.
 MODELS = ("lunar_lambert", "lommel_seeliger")
 
 
 def choose_blocks(row: NDArray, col: NDArray, crop: int, grid: Grid, count: int = MOST_BLOCKS) -> list[Box]:
-    """(row, col, height, width) of at most ``count`` blocks of a lattice that crops about (row, col) touch.
+    """(row, col, height, width) of the blocks of a lattice that crops centred at (row, col) touch, at most ``count``.
 
-    Always the same ones for the same crops, spread evenly where there would be more.
+    row, col : (n,) px; crop : px. Of more blocks, every so many are kept, the same ones for the same crops.
     """
     height, width = min(BLOCK_PX, grid.height), min(BLOCK_PX, grid.width)
     found: set[tuple[int, int]] = set()
@@ -56,9 +56,10 @@ def choose_blocks(row: NDArray, col: NDArray, crop: int, grid: Grid, count: int 
 
 @dataclass(frozen=True)
 class _Tile:
-    """A window of the grid with some blocks and their surroundings: what it should show, and what albedo may add to it.
+    """A window of the grid with some blocks and their surroundings, and its renderings, all (h, w).
 
-    box : (row, col, height, width) of the window; blocks : of the grid; renderings : by each of MODELS
+    box : (row, col, height, width) of the window; blocks : on the grid; renderings : by each of MODELS
+    weights : of the pixels in the registration, less in shadow
     """
 
     box: Box
@@ -78,11 +79,11 @@ def register_frame(
     form: str,
     max_shift: float,
 ) -> tuple[Field, list[Shift]]:
-    """How far ``source`` lies from its rendering, px of the grid, and what each block said.
+    """Displacement of ``source`` against its rendering, px of the grid, and the shift of each block.
 
-    elevation : (H, W) array or dataset; form : the freest of displacement.FORMS that may be taken
-    Done twice where the displacement changes over the ground: what the first fit leaves is found in the image that it has put right, where blocks are no longer smeared by
-    relief, and where the next crater along can no longer be taken for the right one.
+    elevation : (H, W) array or dataset; form : the most general of displacement.FORMS that may be taken
+    A displacement that varies over the ground is fitted twice: shifts that remain are measured in the corrected image, in
+    which relief does not distort the blocks and a neighbouring crater is too far away to be taken for the right one.
     """
     tiles = [
         _prepare_tile(frame, elevation, overview, grid, group, math.ceil(max_shift) + SUPPORT_PX)
@@ -95,11 +96,11 @@ def register_frame(
     def fit(shifts: list[Shift]) -> Field:
         return fit_field(shifts, middles[:, 0], middles[:, 1], form, None if relief is None else reference)
 
-    shifts = _capture(tiles, blocks, source, relief, None, max_shift)
+    shifts = _block_shifts(tiles, blocks, source, relief, None, max_shift)
     field = fit(shifts)
-    if field.accepted and field.moves_apart:
-        left = _capture(tiles, blocks, source, relief, field, min(max_shift, SECOND_REACH_PX))
-        again = [_added(field, r, c, s) for (r, c), s in zip(middles, left, strict=True)]
+    if field.accepted and field.varies:
+        rest = _block_shifts(tiles, blocks, source, relief, field, min(max_shift, SECOND_REACH_PX))
+        again = [_add_field(field, r, c, s) for (r, c), s in zip(middles, rest, strict=True)]
         better = fit(again)
         if better.accepted:
             return better, again
@@ -107,13 +108,13 @@ def register_frame(
 
 
 def _mean_height(*pieces: NDArray[np.float32]) -> float:
-    """Of known ground, m; 0 where there is none."""
+    """m, over all known ground; 0 where there is none."""
     known = [piece[np.isfinite(piece)] for piece in pieces]
     return float(np.concatenate(known).mean(dtype=float)) if any(k.size for k in known) else 0.0
 
 
 def _groups(blocks: Sequence[Box]) -> list[list[Box]]:
-    """Blocks that lie together, so that their surroundings are read and rendered once."""
+    """Neighbouring blocks together, so that their common surroundings are read and rendered once."""
     groups: dict[tuple[int, int], list[Box]] = {}
     for box in blocks:
         groups.setdefault((box[0] // TILE_PX, box[1] // TILE_PX), []).append(box)
@@ -128,12 +129,12 @@ def _prepare_tile(
     c1 = min(grid.width, max(b[1] + b[3] for b in blocks) + margin)
     z = np.asarray(elevation[r0:r1, c0:c1], np.float32)
     *renderings, lit = render_region(frame, z, elevation, overview, grid, r0, c0)
-    # Shadows lie where they do whatever the surface is like: they count, but their inside holds no structure.
+    # Shadow edges do not depend on the reflectance, so that shadows count; but their inside holds no structure.
     weights = np.where(lit > 0.05, 1.0, 0.5).astype(np.float32)
     return _Tile((r0, c0, r1 - r0, c1 - c0), tuple(blocks), z, tuple(r.astype(np.float32) for r in renderings), weights)
 
 
-def _capture(
+def _block_shifts(
     tiles: list[_Tile],
     blocks: Sequence[Box],
     source: Source,
@@ -141,14 +142,14 @@ def _capture(
     field: Field | None,
     reach: float,
 ) -> list[Shift]:
-    """The shifts of ``blocks`` in the image that ``field`` has put right."""
+    """The shifts of ``blocks`` in the image as corrected by ``field``."""
     found: dict[Box, Shift] = {}
     for tile in tiles:
-        found |= _capture_tile(tile, source, relief, field, reach)
+        found |= _tile_shifts(tile, source, relief, field, reach)
     return [found[box] for box in blocks]
 
 
-def _capture_tile(
+def _tile_shifts(
     tile: _Tile, source: Source, relief: Relief | None, field: Field | None, reach: float
 ) -> dict[Box, Shift]:
     row, col, height, width = tile.box
@@ -166,16 +167,18 @@ def _capture_tile(
     return {box: block_shift(pictures, (box[0] - row, box[1] - col, *box[2:]), reach) for box in tile.blocks}
 
 
-def _added(field: Field, row: float, col: float, left: Shift) -> Shift:
-    """The whole shift of a block, from the one that ``field`` has left."""
-    relief = np.array(left.relief[0]), np.array(left.relief[1])
+def _add_field(field: Field, row: float, col: float, rest: Shift) -> Shift:
+    """The whole shift of a block, from the ``rest`` in the image as corrected by ``field``."""
+    relief = np.array(rest.relief[0]), np.array(rest.relief[1])
     dx, dy = (float(v) for v in field.at(row, col, relief))
-    return replace(left, dx=left.dx + dx, dy=left.dy + dy, share=left.share + field.share)
+    return replace(rest, dx=rest.dx + dx, dy=rest.dy + dy, share=rest.share + field.share)
 
 
 def albedo_patterns(z: NDArray[np.float32], rendering: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """What albedo may follow, as it shows under the light of ``rendering``: height, curvature at three scales and its
-    size at two (rims and floors alike), steepness at two and its square; (H, W) each, NaN taken as level.
+    """Patterns that albedo may follow, times ``rendering`` (H, W): height, curvature at three scales, its absolute value
+    at two (rims and floors alike), steepness at two and its square.
+
+    z : (H, W) m, NaN taken as level; returns (H, W) each
     """
     filled = np.where(np.isfinite(z), z, np.nanmean(z) if np.isfinite(z).any() else 0.0).astype(float)
     curvature = [cv2.Laplacian(cv2.GaussianBlur(filled, (0, 0), sigma), cv2.CV_64F) for sigma in (0.5, 1.0, 3.0)]

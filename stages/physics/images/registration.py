@@ -1,7 +1,7 @@
-"""How far an image lies from its rendering: sub-pixel shifts by block, what they are worth, and when to believe none.
+"""Sub-pixel shifts of an image against its rendering, block by block, with their errors and the reasons to refuse them.
 
-Each block's shift is found in two steps: ``correlation`` says where to look, up to several pixels off; ``refine`` says where
-it is, to hundredths, and how well that is known. Both see only structure of up to a few tens of pixels.
+Each block's shift is found in two steps: ``correlation`` finds the best whole-pixel shift, up to several pixels; ``refine``
+finds it to hundredths of a pixel, with its error. Both see only structure of up to a few tens of pixels.
 
 Shifts are (dx, dy) in pixels along columns and rows: image[row + dy, col + dx] shows what rendering[row, col] shows.
 """
@@ -34,12 +34,12 @@ WORST_SIGMA_PX = 0.5
 
 @dataclass(frozen=True)
 class Shift:
-    """The shift of one block, how sure it is, and why it is refused where it is.
+    """The shift of one block with its error, and the reason where it is refused.
 
     dx, dy : px along columns and rows; sigma : px, standard error of the worse axis
-    correlation : between image and rendering at that shift, small structure only; lead : over the next best place
-    refused : why the shift is not to be believed, empty where it is
-    share : of the relief displacement within the block, where one was asked for; relief : (dx, dy) px, its mean there
+    correlation : of small structure in image and rendering at that shift; lead : over the best other place
+    refused : why the shift must not be used, empty where it may be
+    share : of the relief displacement within the block, where asked for; relief : (dx, dy) px, mean of all of it there
     covariance : (3, 3) of dx, dy, share
     """
 
@@ -60,14 +60,19 @@ class Shift:
 
     @property
     def quality(self) -> float:
-        """0 (worthless) to 1: the correlation, 0 where the shift is refused."""
+        """0 to 1: the correlation, 0 where the shift is refused."""
         return max(0.0, self.correlation) if self.accepted else 0.0
+
+    @property
+    def place_covariance(self) -> Floats:
+        """(2, 2) covariance of dx and dy, px^2."""
+        return np.diag([self.sigma**2] * 2) if self.covariance is None else self.covariance[:2, :2]
 
 
 class Shifts(NamedTuple):
     """Shifts on a lattice of R x C blocks: shifts (R, C, 2) px (dx, dy), errors (R, C, 2) px, quality (R, C) 0 to 1.
 
-    Where quality is 0 there is no shift to be believed: shift and error are NaN.
+    Where quality is 0 the shift is refused: shift and error are NaN.
     """
 
     shifts: Floats
@@ -77,10 +82,11 @@ class Shifts(NamedTuple):
 
 @dataclass(frozen=True)
 class Pictures:
-    """An image and what it should show, band-passed and ready to be compared block by block; all (H, W).
+    """An image and its templates, band-passed to be compared block by block; all (H, W).
 
-    templates : the rendering first, then what else the surface may show in place with it; weights : 0 where unknown
-    relief : (2, H, W) px (dx, dy), displacement per unit share, or None
+    spline : coefficients of the image's quintic spline; good_image, good : known pixels of image and templates
+    templates : the rendering first, then patterns that the surface may show besides; weights : 0 where unknown
+    relief : (2, H, W) px (dx, dy) of the full relief displacement, or None
     """
 
     image: Floats
@@ -103,19 +109,18 @@ def capture_shifts(
     """The shifts of ``image`` against ``rendering``, both (H, W), over blocks of ``block`` px; gain and offset are free.
 
     valid : (H, W) bool, pixels that count in both; NaN never count. reach : px, how far to search
-    patterns : (H, W) each, what else the surface may show in place with the rendering, in unknown strength
-    Blocks are laid from the upper left corner on; what is left over at the right and at the bottom makes no block of its own.
+    patterns : (H, W) each, what the surface may show besides the rendering, in unknown strength
+    Blocks are laid from the upper left corner on; a remainder at the right or at the bottom that is smaller makes no block.
     """
     pictures = prepare(image, rendering, valid, None, patterns)
     height, width = pictures.image.shape
     size = min(block, height), min(block, width)
     rows, cols = range(0, height - size[0] + 1, block), range(0, width - size[1] + 1, block)
     found = [[block_shift(pictures, (r, c, *size), reach) for c in cols] for r in rows]
-    believed = np.array([[s.accepted for s in line] for line in found])
+    refused = np.array([[not s.accepted for s in line] for line in found])
     shifts = np.array([[(s.dx, s.dy) for s in line] for line in found])
-    errors = np.array([[np.sqrt(np.diag(_covariance(s))[:2]) for s in line] for line in found])
-    for values in (shifts, errors):
-        values[~believed] = np.nan
+    errors = np.array([[np.sqrt(np.diag(s.place_covariance)) for s in line] for line in found])
+    shifts[refused] = errors[refused] = np.nan
     return Shifts(shifts, errors, np.array([[s.quality for s in line] for line in found]))
 
 
@@ -127,10 +132,10 @@ def prepare(
     patterns: Sequence[ArrayLike] = (),
     relief: Floats | None = None,
 ) -> Pictures:
-    """Band-pass an image, its rendering and what else it may show, once for all blocks. Raises GeometryError for shapes that differ.
+    """Band-pass an image, its rendering and further patterns, once for all blocks. Raises GeometryError for other shapes.
 
-    image, rendering, valid, weights, relief : (H, W), and so is each of the ``patterns``; NaN = unknown
-    weights : 0 or more, for example less in shadow; relief : displacement of the ground by height
+    image, rendering, valid, weights : (H, W), and so is each of the ``patterns``; NaN = unknown
+    weights : 0 or more, for example less in shadow; relief : (2, H, W) px (dx, dy) of the full relief displacement
     """
     image, rendering = np.asarray(image, float), np.asarray(rendering, float)
     if image.ndim != 2 or image.shape != rendering.shape:
@@ -148,10 +153,13 @@ def prepare(
 
 
 def block_shift(pictures: Pictures, box: Box, reach: float) -> Shift:
-    """The shift of one block, a (row, col, height, width) of the pictures. Never raises for poor evidence."""
+    """The shift of one block ``box`` = (row, col, height, width) of the pictures; refused where the evidence is poor.
+
+    reach : px, how far to search
+    """
     row, col, height, width = box
     far = math.ceil(reach)
-    # the image may be searched, and looked at, beyond the block: a shift must not cost overlap
+    # the image is read beyond the block too, so that a shift costs no overlap
     r0, c0 = max(0, row - far - 3), max(0, col - far - 3)
     part = np.s_[r0 : row + height + far + 3, c0 : col + width + far + 3]
     image, good_image = pictures.image[part], pictures.good_image[part]
@@ -164,9 +172,9 @@ def block_shift(pictures: Pictures, box: Box, reach: float) -> Shift:
         return replace(nothing, refused=f"only {count} pixels are valid")
     if not (image[good_image].std() > 0 and pictures.templates[0][part][good].std() > 0):
         return replace(nothing, refused="one of the two shows no structure")
-    templates = _independent([np.where(good, t[part], 0.0) for t in pictures.templates], good)
-    among = np.corrcoef([t[good] for t in templates]) if len(templates) > 1 else np.eye(1)
-    scores = combined_correlation(masked_correlation(image, good_image, templates, good, far), among)
+    templates = _orthogonal([np.where(good, t[part], 0.0) for t in pictures.templates], good)
+    mutual = np.corrcoef([t[good] for t in templates]) if len(templates) > 1 else np.eye(1)
+    scores = combined_correlation(masked_correlation(image, good_image, templates, good, far), mutual)
     peak = np.unravel_index(int(np.nanargmax(scores)), scores.shape)
     lag = np.arange(-far, far + 1)
     others = scores[(np.hypot(lag[:, None] - lag[peak[0]], lag - lag[peak[1]]) > NEAR_PX) & np.isfinite(scores)]
@@ -181,27 +189,24 @@ def block_shift(pictures: Pictures, box: Box, reach: float) -> Shift:
     best = refine(pictures.spline[part], good_image, templates, weight, start, relief)
     sigma = math.sqrt(max(0.0, float(np.diag(best.covariance)[:2].max())))
     found = Shift(*best.place, sigma, best.correlation, lead, "", best.share, mean, best.covariance)
-    return replace(found, refused=_why_not(found, start, reach))
+    return replace(found, refused=_reason_to_refuse(found, start, reach))
 
 
-def _independent(templates: list[Floats], good: Mask) -> list[Floats]:
-    """The rendering, and of each other template what it does not have in common with it, all of one size."""
+def _orthogonal(templates: list[Floats], good: Mask) -> list[Floats]:
+    """The rendering, and the other templates made orthogonal to it, all of one standard deviation."""
     first = templates[0]
     kept, size = [first], first[good].std()
     for extra in templates[1:]:
         before = float((extra**2).sum())
-        # what it has in common with the rendering stays with the rendering, whose strength has a sign to be checked
+        # the common part stays with the rendering, whose strength has a sign to be checked
         extra = extra - first * float((extra * first).sum()) / float((first * first).sum())
         if float((extra**2).sum()) > 1e-6 * before:
             kept.append(extra / extra[good].std() * size)
     return kept
 
 
-def _covariance(shift: Shift) -> Floats:
-    return np.full((3, 3), math.inf) if shift.covariance is None else shift.covariance
-
-
-def _why_not(found: Shift, start: tuple[float, float], reach: float) -> str:
+def _reason_to_refuse(found: Shift, start: tuple[float, float], reach: float) -> str:
+    """Empty where there is none. start : (dx, dy) px of the best whole-pixel shift"""
     if not (math.isfinite(found.dx) and math.isfinite(found.dy)):
         return "the search did not settle"
     if found.correlation < LEAST_CORRELATION:

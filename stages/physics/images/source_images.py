@@ -1,4 +1,4 @@
-"""Source images on a scene's grid, whether map-projected or as a camera took them: one way to ask for a window."""
+"""Source images on a scene's grid, read alike whether they are map-projected or as a camera took them."""
 
 from __future__ import annotations
 
@@ -38,8 +38,9 @@ from stages.physics.maps.window import Box
 
 @dataclass(frozen=True)
 class Pixels:
-    """A window of the scene's grid. values : (h, w) float32, NaN where not seen; valid : (h, w) bool;
-    ortho : the camera's side of it, None for map-projected images.
+    """A window of an image on the scene's grid.
+
+    values : (h, w) float32, NaN where not seen; valid : (h, w) bool; ortho : None for map-projected images
     """
 
     values: NDArray[np.float32]
@@ -54,10 +55,10 @@ class Source(Protocol):
         """(row, col, height, width) on the grid that holds all that the image shows, None where it lies elsewhere."""
 
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
-        """The image on a window of the grid, moved by what registration found."""
+        """The image on a window of the grid, corrected by the displacement ``field`` that registration found."""
 
     def relief(self, reference: float) -> Relief | None:
-        """How it would be displaced if it was projected onto the sphere at ``reference`` m, None where terrain was followed."""
+        """Relief displacement if projected onto the sphere at ``reference`` m; None where the terrain was followed."""
 
 
 @contextlib.contextmanager
@@ -96,7 +97,7 @@ class MapSource:
         if rasters.source_window(self.dataset, self.grid, margin=0) is None:
             return None
         image = self.dataset
-        own = Grid(image.crs.to_wkt(), image.transform, image.height, image.width, self.grid.radius)
+        own = rasters.grid_of(image, self.grid.radius)
         down, right = np.linspace(-0.5, image.height - 0.5, 33), np.linspace(-0.5, image.width - 0.5, 33)
         top, left = np.full(33, -0.5), np.full(33, -0.5)
         rows = np.concatenate([down, down, top, np.full(33, image.height - 0.5)])
@@ -128,9 +129,7 @@ class MapSource:
         dx, dy = field.at(r, c, relief)
         x, y = self.grid.xy(r + dy, c + dx)
         x, y = rasters.transform_points(self.grid, self.dataset, x.ravel(), y.ravel())
-        inverse = ~self.dataset.transform
-        sample = (inverse.a * x + inverse.b * y + inverse.c).reshape(r.shape)
-        line = (inverse.d * x + inverse.e * y + inverse.f).reshape(r.shape)
+        sample, line = (v.reshape(r.shape) for v in ~self.dataset.transform @ (x, y))
         lines, samples = sliding_window_view(line, (2, 2)), sliding_window_view(sample, (2, 2))
         return area_means(self._pixels, self.dataset.shape, lines, samples, np.ones((height, width), bool))
 
@@ -151,8 +150,9 @@ class MapSource:
 
 @dataclass(frozen=True)
 class CameraSource:
-    """An image as its camera took it, with as much of the scene's terrain as can hide a window from the camera.
+    """An image as its camera took it, orthorectified with the scene's terrain.
 
+    elevation : (H, W) array or dataset on ``grid``, m; heights : its least and largest value
     sun_position : (3,) body-fixed, m
     """
 
@@ -168,7 +168,7 @@ class CameraSource:
         return footprint(self.camera, self.grid, self.heights)
 
     def relief(self, reference: float) -> Relief | None:
-        """None: orthorectification has taken it off."""
+        """None: orthorectification follows the terrain."""
         return None
 
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
@@ -187,7 +187,7 @@ class CameraSource:
         return Pixels(ortho.image, ortho.valid, ortho)
 
     def _surroundings(self, row: int, col: int, height: int, width: int) -> tuple[int, int, int, int]:
-        """Rows and columns from which terrain can hide the box: itself, and what lies towards the camera."""
+        """First and last row and column of the box and of the terrain towards the camera that can hide it."""
         rows, cols = self.grid.height, self.grid.width
         inside = np.asarray(self.elevation[row : row + height, col : col + width], dtype=float)
         known = inside[np.isfinite(inside)]
@@ -203,7 +203,7 @@ class CameraSource:
         emission = math.acos(max(-1.0, min(1.0, float(up))))
         reach = reach_px(max(0.0, self.heights[1] - lowest), emission, self.grid.gsd)
         level = math.hypot(east, north) or 1.0
-        # the azimuth differs over the box, by little: one eighth to the sides
+        # the azimuth varies a little over the box: one eighth of the reach to the sides
         side = math.ceil(reach / 8) + 2
         towards_row, towards_col = -north / level * reach, east / level * reach
         r0 = row + min(0, math.floor(towards_row)) - side

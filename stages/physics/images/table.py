@@ -18,13 +18,11 @@ from schemas.errors import InputError
 from schemas.files.user_files import check_file, read_json, read_text
 from schemas.reading import read_strings
 from schemas.writing import ArtefactWriter
-from stages.physics.bodies.ephemeris import parse_utc
+from stages.physics.bodies.ephemeris import AU, parse_utc
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.images.frame_geometry import complete_row
 from stages.physics.images.pds_index import index_images
 from stages.physics.maps.grid import unit_vectors
-
-ASTRONOMICAL_UNIT = 149597870700.0  # m, IAU 2012
 
 _NUMBERS = {
     "subsolar_longitude_deg": (-360.0, 360.0),
@@ -38,7 +36,11 @@ _NUMBERS = {
 
 @dataclass(frozen=True)
 class Frame:
-    """One source image. ``units`` is 'iof' or 'dn'; ``camera`` is None for map-projected images; digests once it was read."""
+    """One source image.
+
+    units : 'iof' or 'dn'; camera : its camera model, None for map-projected images
+    sha256, camera_sha256 : digests of both files, empty before they are read
+    """
 
     image_id: str
     path: Path
@@ -55,12 +57,12 @@ class Frame:
     camera_sha256: str = ""
 
     def sun_position(self) -> np.ndarray:
-        """(3,) body-fixed, m."""
+        """(3,) body-fixed position of the Sun, m."""
         direction = unit_vectors(self.subsolar_longitude_deg, self.subsolar_latitude_deg)
-        return direction * self.solar_distance_au * ASTRONOMICAL_UNIT
+        return direction * self.solar_distance_au * AU
 
     def camera_position(self, radius: float) -> np.ndarray:
-        """(3,) body-fixed, m."""
+        """(3,) body-fixed position of the spacecraft, m, over a body of that radius, m."""
         direction = unit_vectors(self.spacecraft_longitude_deg, self.spacecraft_latitude_deg)
         return direction * (radius + self.spacecraft_altitude_m)
 
@@ -115,39 +117,31 @@ def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Fram
             raise InputError(
                 f"{where}: expected text without control characters in column '{key}', found {cell!r}; mend the table."
             )
+    where = f"{where} ({text['image_id']})"
     units = text.get("units", "").lower()
     if units not in ("iof", "dn"):
-        raise InputError(
-            f"{where} ({text['image_id']}): expected units 'iof' or 'dn', found '{units or 'nothing'}'; mend the table."
-        )
-    camera = text.get("camera", "")
-    text = complete_row(
-        text,
-        table.parent / text["path"],
-        table.parent / camera if camera else None,
-        body,
-        f"{where} ({text['image_id']})",
-    )
+        raise InputError(f"{where}: expected units 'iof' or 'dn', found '{units or 'nothing'}'; mend the table.")
+    image = table.parent / text["path"]
+    camera = table.parent / text["camera"] if text.get("camera") else None
+    text = complete_row(text, image, camera, body, where)
     if text.get("start_time"):
-        parse_utc(text["start_time"], f"{where} ({text['image_id']}): column 'start_time'")
+        parse_utc(text["start_time"], f"{where}: column 'start_time'")
     numbers: dict[str, Any] = {}
     for key, (low, high) in _NUMBERS.items():
         try:
             value = float(text.get(key, ""))
         except ValueError:
             raise InputError(
-                f"{where} ({text['image_id']}): expected a number in column '{key}', found '{text.get(key, '') or 'nothing'}'; mend the table."
+                f"{where}: expected a number in column '{key}', found '{text.get(key, '') or 'nothing'}'; mend the table."
             ) from None
         if not (math.isfinite(value) and low <= value <= high):
-            raise InputError(
-                f"{where} ({text['image_id']}): expected '{key}' in {low:g}..{high:g}, found {value:g}; mend the table."
-            )
+            raise InputError(f"{where}: expected '{key}' in {low:g}..{high:g}, found {value:g}; mend the table.")
         numbers[key] = value
     return Frame(
         image_id=text["image_id"],
-        path=(table.parent / text["path"]),
+        path=image,
         units=units,
-        camera=table.parent / camera if camera else None,
+        camera=camera,
         start_time=text.get("start_time", ""),
         **numbers,
     )

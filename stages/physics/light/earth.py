@@ -1,4 +1,4 @@
-"""The Earth as a light source for the Moon: how bright it is."""
+"""Irradiance of the Moon by the Earth."""
 
 from __future__ import annotations
 

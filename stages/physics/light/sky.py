@@ -1,4 +1,4 @@
-"""Light that does not come straight from the Sun: how much sky a facet sees, and what the terrain around it sends.
+"""Sky view of facets, and the light that they receive from the terrain around them.
 
 Both integrate over azimuths. In one azimuth a facet with normal n sees elevations above a, t = tan a, with the
 cosine-weighted share F(t) = nz / (1 + t^2) + nh (pi/2 - atan t - t / (1 + t^2)), nh the normal's component along the
@@ -26,7 +26,7 @@ CELLS_PER_DISTANCE = 32  # steps and cells grow with distance: a cell is seen un
 
 @dataclass(frozen=True)
 class Surroundings:
-    """The map around a window, as block means on the same cells: heights, m, and I/F (NaN = unknown).
+    """The map around a window, as block means of heights, m, and I/F (NaN = unknown) on the same cells.
 
     row, col : the window's first pixel on the map
     """
@@ -38,7 +38,7 @@ class Surroundings:
 
     @staticmethod
     def margin_px(overview: Overview) -> int:
-        """How far around the wanted pixels a window must reach at full resolution."""
+        """px around the wanted pixels that a window must reach at full resolution."""
         return overview.factor * CELLS_PER_DISTANCE
 
 
@@ -70,7 +70,7 @@ def terrain_light(
         levels = np.zeros((0, 4), np.int64)
         far_z = far_bright = np.zeros(1, np.float32)
         row = col = 0
-        limit, summit = math.hypot(*z.shape), _highest(z)
+        limit, summit = math.hypot(*z.shape), float(np.fmax.reduce(z, axis=None, initial=-np.inf))
     else:
         overview, row, col = surroundings.elevation, surroundings.row, surroundings.col
         cells = overview.factor << np.arange(len(overview.starts))
@@ -93,9 +93,9 @@ def terrain_light(
 def form_factors(
     elevation: ArrayLike, gsd: float, azimuths: int, distances: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], Floats32]:
-    """The matrix behind :func:`terrain_light` for a small grid that is its own mirror image beyond its edges.
+    """The matrix behind :func:`terrain_light`, for a small grid that beyond its edges continues as its own mirror image.
 
-    elevation : (H, W), m, without NaN; gsd : m; distances : (n,), px, where terrain is looked at, ascending
+    elevation : (H, W), m, without NaN; gsd : m; distances : (n,), px at which terrain is looked at, ascending
     returns compressed rows (H W + 1,), columns (m,) and shares (m,): light = matrix @ I/F, both flattened
     """
     z = np.ascontiguousarray(elevation, dtype=np.float32)
@@ -110,6 +110,7 @@ def form_factors(
 
 
 def _directions(azimuths: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """East and north components, (azimuths,) each, of evenly spaced directions."""
     if azimuths < 4:
         raise GeometryError(f"azimuths: expected at least 4, found {azimuths}.")
     angle = 2 * math.pi * (np.arange(azimuths) + 0.5) / azimuths
@@ -117,20 +118,11 @@ def _directions(azimuths: int) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 
 def _distances(limit: float) -> NDArray[np.float64]:
-    """px: every pixel at first, then in steps of a fixed share of the distance."""
+    """(n,) px at which terrain is looked at: every pixel at first, then in steps of a fixed share of the distance."""
     found = [1.0]
     while found[-1] < limit:
         found.append(found[-1] + max(1.0, found[-1] / CELLS_PER_DISTANCE))
     return np.array(found)
-
-
-@numba.njit(cache=True)
-def _highest(z):
-    best = np.float32(-np.inf)
-    for value in z.flat:
-        if value > best:
-            best = value
-    return best
 
 
 @numba.njit(inline="always")
@@ -238,7 +230,7 @@ def _mirrored(place, count):
 
 @numba.njit(cache=True, error_model="numpy")
 def _list_factors(z, gsd, east, north, distances, starts, places, shares):
-    """The march of ``_gather`` at one level, kept as entries of a matrix, one cell for each rise of the horizon."""
+    """March outwards as ``_gather`` does, at full resolution, and keep one entry of the matrix per rise of the horizon."""
     rows, columns = z.shape
     flat = z.ravel()
     starts[0] = 0

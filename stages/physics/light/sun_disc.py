@@ -1,4 +1,4 @@
-"""How much of the Sun stands above a straight horizon: cast shadows have soft edges."""
+"""Visible share of the Sun's disc above a straight horizon, which gives cast shadows their penumbra."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DARKENING = 0.6  # u of the limb darkening I = 1 - u (1 - mu) in visible light (
 
 
 def sun_visibility(sun_elevation: Tensor, horizon: Tensor, radius: float | Tensor = SUN_RADIUS) -> Tensor:
-    """Share of the Sun's light above a straight horizon, 0..1: penumbra makes cast shadows smooth.
+    """Share of the Sun's light above a straight horizon, 0..1.
 
     sun_elevation, horizon : rad, broadcastable
     """

@@ -9,18 +9,16 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import h5py
 import numpy as np
 import rasterio
-import rasterio.io
 import rasterio.shutil
 from numpy.typing import NDArray
 from rasterio._err import CPLE_BaseError  # what rasterio.shutil lets through
-from rasterio.crs import CRS
 from rasterio.errors import RasterioIOError
-from rasterio.transform import Affine
+from rasterio.io import DatasetReader, DatasetWriter
 from rasterio.windows import Window
 
 from schemas.provenance import pack_record
@@ -33,40 +31,26 @@ ALBEDO_BANDS = ("albedo", "albedo_std")
 BLOCK, STRIP, COLUMNS = 256, 512, 4096  # px
 
 
-class Placed(Protocol):
-    """Where a raster lies: a grid, or another raster that is open."""
-
-    @property
-    def crs(self) -> CRS | None:
-        """None where unknown."""
-
-    @property
-    def transform(self) -> Affine:
-        """GDAL's, pixel corners to map coordinates."""
-
-    @property
-    def height(self) -> int:
-        """px"""
-
-    @property
-    def width(self) -> int:
-        """px"""
-
-
 class MapTiff:
     """A GeoTIFF that is written as its map is made, with named bands; nodata NaN. Use as a context manager.
 
-    units : of the bands, or none. The map grows in a plain file beside ``path``, which GDAL's driver copies at the end with
-    overviews, means of what is known.
+    grid : where it lies, or an open raster on the same grid; units : of the bands, or none
+    Pixels are written to a plain file beside ``path``, which GDAL's COG driver copies at the end, with overviews that are
+    means of known pixels.
     """
 
     def __init__(
-        self, path: Path, grid: Placed, names: Sequence[str], tags: Mapping[str, Any], units: Sequence[str] = ()
+        self,
+        path: Path,
+        grid: Grid | DatasetReader,
+        names: Sequence[str],
+        tags: Mapping[str, Any],
+        units: Sequence[str] = (),
     ) -> None:
         self.path, self.grid, self.names, self.units = path, grid, list(names), list(units)
         self.tags = {"software": "lunargr"} | {key: str(value) for key, value in tags.items()}
         self._plain = path.with_name(f"{path.name}.plain.tif")
-        self._file: rasterio.io.DatasetWriter | None = None
+        self._file: DatasetWriter | None = None
 
     def __enter__(self) -> MapTiff:
         # Noise does not deflate: ZSTD's lowest level takes a third of the time of DEFLATE's and is as small.
@@ -85,7 +69,7 @@ class MapTiff:
         assert self._file is not None
         try:
             if kind is None:
-                with _told():
+                with _as_full_disk():
                     self._file.close()
                     rasterio.shutil.copy(
                         self._plain, self.path, driver="COG", COMPRESS="ZSTD", LEVEL=1, PREDICTOR="FLOATING_POINT",
@@ -93,20 +77,20 @@ class MapTiff:
                     )  # fmt: skip
             else:
                 with contextlib.suppress(OSError, RasterioIOError):
-                    # Room for what GDAL still holds: it would say of each tile that there is none.
+                    # makes room on a full disk for the tiles that GDAL still holds: it would complain about each
                     os.truncate(self._plain, 0)
                     self._file.close()
         finally:
             self._plain.unlink(missing_ok=True)
 
     def put(self, row: int, col: int, values: NDArray[np.float32]) -> None:
-        """values : (C, n, w) of the map, from a row and column on"""
+        """Write a window. values : (C, h, w); row, col : of its first pixel"""
         assert self._file is not None
-        with _told():
+        with _as_full_disk():
             self._file.write(values, window=Window(col, row, values.shape[2], values.shape[1]))
 
     def put_all(self, *fields: h5py.Dataset) -> None:
-        """fields : (C, H, W) or (H, W) each, band after band"""
+        """Write the whole map. fields : (C, H, W) or (H, W) each, band after band"""
         for row in range(0, self.grid.height, STRIP):
             for col in range(0, self.grid.width, COLUMNS):
                 part = np.s_[row : row + STRIP, col : col + COLUMNS]
@@ -115,8 +99,8 @@ class MapTiff:
 
 
 @contextlib.contextmanager
-def _told() -> Iterator[None]:
-    """GDAL says that it could not write, and not why: the disk is full, or what comes to the same."""
+def _as_full_disk() -> Iterator[None]:
+    """Raise OSError (no space left) where GDAL cannot write: it gives no reason, and a full disk is the usual one."""
     try:
         yield
     except (RasterioIOError, CPLE_BaseError) as error:
@@ -134,7 +118,7 @@ def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
 
 
 def map_tags(names: Sequence[str], root: Mapping[str, Any]) -> dict[str, str]:
-    """What the GeoTIFF of a map says of it. root : of its artefact"""
+    """Tags of a map's GeoTIFF. names : of its bands; root : root attributes of its artefact"""
     return {
         **{key: str(root[key]) for key in TAGS},
         "coefficients": json.dumps([n for n in names if not n.endswith("_std")]),

@@ -50,14 +50,14 @@ class Grid:
         return _parsed(self.crs_wkt)
 
     @property
-    def squash(self) -> float:
-        """:func:`latitude_squash` of its CRS."""
-        return _squash(self.crs_wkt)
+    def latitude_ratio(self) -> float:
+        """:func:`latitude_ratio` of its CRS."""
+        return _latitude_ratio(self.crs_wkt)
 
     @cached_property
     def _geographic(self) -> CRS:
         """Longitude and latitude of the kind that ``crs`` itself counts in."""
-        if self.squash == 1.0:
+        if self.latitude_ratio == 1.0:
             return sphere_crs(self.radius)
         return CRS.from_proj4(f"+proj=longlat {ellipsoid_of(self.crs)} +no_defs")
 
@@ -67,19 +67,20 @@ class Grid:
         return float(self.transform.a)
 
     def xy(self, row: ArrayLike, col: ArrayLike) -> tuple[Floats, Floats]:
-        """Map coordinates of (row, col) in our centre convention."""
+        """Map coordinates of pixel centres.
+
+        row, col : (...,) px, broadcastable; returns x and y, (...,) in the grid's unit
+        """
         row, col = np.asarray(row, float), np.asarray(col, float)
-        t = self.transform
-        u, v = col + GDAL_CENTRE, row + GDAL_CENTRE
-        return t.a * u + t.b * v + t.c, t.d * u + t.e * v + t.f
+        return self.transform @ (col + GDAL_CENTRE, row + GDAL_CENTRE)
 
     def rowcol(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
-        """(row, col), fractional, of map coordinates."""
-        inverse = ~self.transform
-        x, y = np.asarray(x, float), np.asarray(y, float)
-        col = inverse.a * x + inverse.b * y + inverse.c - GDAL_CENTRE
-        row = inverse.d * x + inverse.e * y + inverse.f - GDAL_CENTRE
-        return row, col
+        """(row, col), fractional, of map coordinates.
+
+        x, y : (...,) in the grid's unit, broadcastable; returns (...,) each
+        """
+        u, v = ~self.transform @ (np.asarray(x, float), np.asarray(y, float))
+        return v - GDAL_CENTRE, u - GDAL_CENTRE
 
     def lonlat(self, row: ArrayLike, col: ArrayLike) -> tuple[Floats, Floats]:
         """East longitude and planetocentric latitude, degrees.
@@ -95,11 +96,14 @@ class Grid:
         """
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         lon, lat = rasterio.warp.transform(self.crs, self._geographic, x.ravel(), y.ravel())
-        lat = _scaled_tangent(np.asarray(lat), self.squash)
+        lat = _scale_tangent(np.asarray(lat), self.latitude_ratio)
         return np.reshape(lon, x.shape), np.reshape(lat, x.shape)
 
     def rowcol_of_lonlat(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
-        """(row, col), fractional, of places given in degrees."""
+        """(row, col), fractional, of places given in degrees.
+
+        longitude_deg, latitude_deg : (...,), broadcastable; returns (...,) each
+        """
         return self.rowcol(*self.map_xy(longitude_deg, latitude_deg))
 
     def map_xy(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
@@ -108,7 +112,7 @@ class Grid:
         longitude_deg, latitude_deg : (...,), broadcastable; returns x and y, (...,) m each
         """
         lon, lat = np.broadcast_arrays(np.asarray(longitude_deg, float), np.asarray(latitude_deg, float))
-        lat_own = _scaled_tangent(lat.ravel(), 1 / self.squash)
+        lat_own = _scale_tangent(lat.ravel(), 1 / self.latitude_ratio)
         x, y = rasterio.warp.transform(self._geographic, self.crs, lon.ravel(), lat_own)
         return np.reshape(x, lon.shape), np.reshape(y, lon.shape)
 
@@ -133,9 +137,8 @@ class Grid:
         """
         row, col = np.broadcast_arrays(np.asarray(row, float), np.asarray(col, float))
         n = row.size
-        half = 0.5
-        rows = np.concatenate([row.ravel() + d for d in (0, -half, half, 0, 0)])
-        cols = np.concatenate([col.ravel() + d for d in (0, 0, 0, -half, half)])
+        rows = np.concatenate([row.ravel() + d for d in (0, -0.5, 0.5, 0, 0)])
+        cols = np.concatenate([col.ravel() + d for d in (0, 0, 0, -0.5, 0.5)])
         points = unit_vectors(*self.lonlat(rows, cols)).reshape(5, n, 3)
         up = points[0]
         towards_north = (points[1] - points[2]) * self.radius
@@ -156,7 +159,7 @@ class LocalFrames:
     """Local frames at n places.
 
     axes : (n, 3, 3), rows are grid-east, grid-north and up in body-fixed coordinates
-    pixel_size : (n, 2), true metres along a column step (rows) and a row step (columns)
+    pixel_size : (n, 2), true metres from row to row and from column to column
     convergence_deg : (n,), azimuth of true north clockwise from grid north
     """
 
@@ -176,9 +179,15 @@ def unit_vectors(longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> Floats:
     return np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat) + 0 * lon], axis=-1)
 
 
+def lonlat_of_points(points: Floats) -> tuple[Floats, Floats]:
+    """East longitude and planetocentric latitude, degrees, of body-fixed points (..., 3)."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    return np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z / np.linalg.norm(points, axis=-1)))
+
+
 @lru_cache(maxsize=256)
 def _parsed(wkt: str) -> CRS:
-    with rasterio.Env():  # GDAL's own words on it stay off the terminal
+    with rasterio.Env():  # keeps GDAL's own messages off the terminal
         return CRS.from_wkt(wkt)
 
 
@@ -189,7 +198,7 @@ def sphere_crs(radius: float) -> CRS:
 
 
 def local_metric_crs(longitude_deg: float, latitude_deg: float, radius: float) -> CRS:
-    """Oblique stereographic about a place: shapes are true (conformal), scale grows by (d / 2R)^2."""
+    """Oblique stereographic about a place: conformal, its scale grows by (d / 2R)^2 at distance d."""
     return _named(
         f"+proj=stere +lat_0={latitude_deg:.6f} +lon_0={longitude_deg:.6f} +k=1 +x_0=0 +y_0=0 +R={radius!r} +units=m +no_defs",
         radius,
@@ -209,20 +218,21 @@ def _named(proj: str, radius: float, projection: str = "") -> CRS:
 
 def crs_radius(crs: CRS) -> float | None:
     """Equatorial radius of a CRS's ellipsoid in metres, None where it names none."""
-    match = re.search(r"(?:SPHEROID|ELLIPSOID)\[\"[^\"]*\",\s*([0-9.eE+]+)", crs.to_wkt())
+    match = _ELLIPSOID.search(crs.to_wkt())
     return float(match.group(1)) if match else None
 
 
-def latitude_squash(crs: CRS) -> float:
-    """tan(planetocentric) / tan(planetographic latitude), (b/a)^2: 1 for spheres and where the CRS says 'ocentric'.
+def latitude_ratio(crs: CRS) -> float:
+    """tan(planetocentric latitude) over the tangent of the latitude that a CRS counts in: (b/a)^2 for planetographic ones.
 
-    PROJ leaves latitudes as they are between an ellipsoid and a sphere, which on Mars is 20 km in the middle latitudes.
+    1 for spheres and where the CRS says 'ocentric'. PROJ does not convert latitudes between an ellipsoid and a sphere, which
+    on Mars would be 20 km in the middle latitudes.
     """
-    return _squash(crs.to_wkt())
+    return _latitude_ratio(crs.to_wkt())
 
 
 @lru_cache(maxsize=256)
-def _squash(wkt: str) -> float:
+def _latitude_ratio(wkt: str) -> float:
     match = _ELLIPSOID.search(wkt)
     inverse = float(match.group(2)) if match else 0.0
     return 1.0 if inverse == 0 or "ocentric" in wkt.lower() else (1 - 1 / inverse) ** 2
@@ -236,7 +246,8 @@ def ellipsoid_of(crs: CRS) -> str:
     return f"+a={match.group(1)} +rf={match.group(2)}" if float(match.group(2)) else f"+R={match.group(1)}"
 
 
-def _scaled_tangent(latitude_deg: Floats, factor: float) -> Floats:
+def _scale_tangent(latitude_deg: Floats, factor: float) -> Floats:
+    """Latitudes, deg, whose tangents are ``factor`` times as large."""
     if factor == 1.0:
         return latitude_deg
     latitude = np.radians(latitude_deg)
@@ -262,7 +273,7 @@ def check_same_body(where: object, radius: float, body: str | None) -> None:
 
 def read_grid(file: h5py.File, path: object) -> Grid:
     """The grid of an artefact with a ``crs`` variable."""
-    attributes = file["crs"].attrs  # whose numbers were looked at when it was opened
+    attributes = file["crs"].attrs  # whose numbers were checked when the file was opened
     c, a, b, f, d, e = (float(v) for v in str(attributes["GeoTransform"]).split())
     wkt = str(attributes["crs_wkt"])
     try:

@@ -1,6 +1,6 @@
-"""The one geographic split of a scene: square ground tiles, dealt to training, validation and test by a hash.
+"""The geographic split of a scene: square ground tiles, dealt to training, validation and test by a hash.
 
-It hangs on the scene, `tile_m`, `split` and `seed` only, not on what is sampled: see `stages/sample`.
+It depends on the scene, `tile_m`, `split` and `seed` only, not on what is sampled: see `stages/sample`.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from stages.common.progress import Progress
 from stages.physics.maps.grid import Grid
 from stages.physics.maps.positions import blocks, valid_positions
 
-TEST_TILES = 20  # where --tile-m is left to us and the scene is large enough: intervals over fewer are wide
-WITH_ROOM = 0.8  # of the tiles, in which a crop fits: images end, elevations have holes
+TEST_TILES = 20  # aimed at without `tile_m`: confidence intervals over fewer are wide
+WITH_ROOM = 0.8  # expected share of tiles in which a crop fits: images end, elevations have holes
 SMALLEST_TILE, LARGEST_TILE = 1.125, 4  # of the scene's crops
 
 
@@ -34,7 +34,7 @@ class Tiles:
     part: NDArray[np.int8]
 
     def identity(self, ground_deg: tuple[float, float, float, float]) -> dict[str, Any]:
-        """What says that two samples split the same ground alike, kept in ``config`` and so in all that is made from it.
+        """Identity of the split, kept in ``config`` of all that is made from it, so that two samples can be compared.
 
         ground_deg : west, east, south, north
         """
@@ -42,21 +42,17 @@ class Tiles:
         return {"split_id": digest.hexdigest()[:16], "split_ground_deg": ground_deg}
 
     def allowed(self, row: NDArray, col: NDArray, crop: int) -> NDArray[np.int8]:
-        """Part of the split of crops centred at row (n, 1) and col (m,), -1 where a crop must not be.
+        """(n, m) part of the split of crops centred at row (n, 1) and col (m,), -1 where none may be.
 
-        A footprint that touches two parts, or two tiles where it is not for training.
+        A crop may not touch two parts, nor two tiles unless it is for training.
         """
         half = crop // 2
         r0, r1 = (row - half) // self.edge, (row + half - 1) // self.edge
         c0, c1 = (col - half) // self.edge, (col + half - 1) // self.edge
         rows, cols = self.part.shape
         # Centres near the scene's edge have no whole footprint and are not valid positions anyway.
-        r0, r1, c0, c1 = (
-            np.clip(r0, 0, rows - 1),
-            np.clip(r1, 0, rows - 1),
-            np.clip(c0, 0, cols - 1),
-            np.clip(c1, 0, cols - 1),
-        )
+        r0, r1 = (np.clip(r, 0, rows - 1) for r in (r0, r1))
+        c0, c1 = (np.clip(c, 0, cols - 1) for c in (c0, c1))
         corner = self.part[r0, c0]
         same = (corner == self.part[r0, c1]) & (corner == self.part[r1, c0]) & (corner == self.part[r1, c1])
         one_tile = (r0 == r1) & (c0 == c1)
@@ -123,7 +119,7 @@ def tile_edge(grid: Grid, positions: PositionMasks, shares: tuple[float, float, 
 
 
 def _scene_edge(positions: PositionMasks, shares: tuple[float, float, float]) -> int:
-    """As large as leaves TEST_TILES for testing, between SMALLEST_TILE and LARGEST_TILE; slivers at the edge avoided."""
+    """px, leaves TEST_TILES for testing, between SMALLEST_TILE and LARGEST_TILE; no slivers at the border."""
     crop, used = positions.scene_crop, positions.windows[positions.windows[:, 2] > 0]
     if not len(used):
         return LARGEST_TILE * crop
@@ -145,7 +141,7 @@ def split_tiles(
 ) -> Tiles:
     """Give every tile with valid ground to a part, in the order of a hash, so that the parts' ground is near their shares.
 
-    Tiles in which no crop of the scene's own size fits train only: they would not be tested on.
+    Tiles in which no crop of the scene's own size fits are for training only.
     """
     shape = (math.ceil(grid.height / edge), math.ceil(grid.width / edge))
     ground, room = np.zeros(shape), np.zeros(shape, bool)
@@ -164,7 +160,7 @@ def split_tiles(
         inside = ((r - before) // edge == (r + behind) // edge) & ((c - before) // edge == (c + behind) // edge)
         room[r[inside] // edge, c[inside] // edge] = True
     progress(len(positions.blocks), len(positions.blocks), "tiles")
-    if not room.any():  # tiles are smaller than the scene's crops: smaller ones will be asked for
+    if not room.any():  # the tiles are smaller than the scene's crops: smaller crops will be sampled
         room = ground > 0
     part = np.where(ground > 0, 0 if split[0] > 0 else -1, -1).astype(np.int8)
     shares = np.array(split)
@@ -180,7 +176,7 @@ def split_tiles(
 
 
 def _lot(seed: int, row: int, col: int) -> bytes:
-    """A tile's place in the draw: of its index and the seed, whatever is sampled and by which version of numpy."""
+    """Sort key of a tile in the draw, from its index and the seed alone: the same with every version of numpy."""
     return hashlib.sha256(f"{seed} {row} {col}".encode()).digest()
 
 

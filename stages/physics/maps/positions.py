@@ -1,4 +1,4 @@
-"""Where crops may lie on a grid, and the blocks in which large arrays are worked through."""
+"""Positions at which crops lie on valid pixels, and the blocks that large arrays are processed in."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ def blocks(height: int, width: int, size: int) -> Iterator[tuple[int, int, int, 
 def valid_positions(
     valid: Any, height: int, width: int, block: tuple[int, int, int, int], crop: int
 ) -> NDArray[np.bool_]:
-    """Where a crop may be centred: rows r - crop/2 .. r + crop/2 - 1 (columns alike) are valid, all of them.
+    """(height, width) of the block: whether a crop may be centred there, all of rows r - crop/2 .. r + crop/2 - 1 (columns
+    alike) being valid.
 
     valid : (H, W) array or dataset, read only around the block (row, col, height, width)
     """

@@ -1,4 +1,4 @@
-"""Opening the user's rasters (anything GDAL reads) and bringing windows of them onto a grid, nodata and all."""
+"""Opening the user's rasters (anything that GDAL reads) and resampling windows of them onto a grid."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from rasterio.crs import CRS
 from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
 from rasterio.io import DatasetReader
-from rasterio.transform import Affine
 from rasterio.warp import Resampling
 from rasterio.windows import Window
 
@@ -28,7 +27,7 @@ from schemas.files.hdf5 import silence_hdf5
 from schemas.files.user_files import check_file
 from stages.common.arrays import Mask
 from stages.common.memory import return_freed_memory
-from stages.physics.maps.grid import Grid, ellipsoid_of, latitude_squash
+from stages.physics.maps.grid import GDAL_CENTRE, Grid, ellipsoid_of, latitude_ratio
 
 # ISIS special pixels of 32-bit cubes (NULL, LRS, LIS, HIS, HRS) all lie beyond this; so do -3.4028e38 in its spellings.
 SPECIAL = 3.4e38
@@ -67,7 +66,7 @@ def open_raster(path: Path, what: str = "a raster") -> Iterator[DatasetReader]:
             f"{path}: cannot be read to the end ({_one_line(error)}); the file is damaged or truncated, fetch it again."
         ) from None
     finally:
-        return_freed_memory()  # the pieces that a raster's blocks leave would grow by 0.1 GB with every image
+        return_freed_memory()  # GDAL's blocks leave fragments, which would grow by 0.1 GB with every image
 
 
 def _check_numbers(path: Path, what: str, dataset: DatasetReader) -> None:
@@ -88,7 +87,7 @@ def _check_numbers(path: Path, what: str, dataset: DatasetReader) -> None:
 
 
 def check_single_band(path: Path, dataset: DatasetReader, what: str) -> None:
-    """Refuse rasters of several bands; masks (alpha) do not count. Raises InputError."""
+    """Refuse rasters of several bands, alpha bands aside. Raises InputError."""
     bands = sum(kind != ColorInterp.alpha for kind in dataset.colorinterp)
     if bands > 1:
         raise InputError(
@@ -96,23 +95,24 @@ def check_single_band(path: Path, dataset: DatasetReader, what: str) -> None:
         )
 
 
-_METRES = ("", "m", "metre", "metres", "meter", "meters")
+# m
+_UNITS = dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0)
+_UNITS |= dict.fromkeys(("km", "kilometre", "kilometer", "kilometers", "kilometres"), 1000.0)
+_UNITS |= dict.fromkeys(("ft", "foot", "feet"), 0.3048) | dict.fromkeys(("us survey foot", "us-ft"), 12 / 39.37)
 _VERTICAL = re.compile(
     r'(?:VERT_?CRS|VERT_CS|VERTICALCRS)\[.*?(?:LENGTHUNIT|UNIT)\["([^"]*)",\s*([0-9.eE+-]+)', re.DOTALL
 )
 
 
 def check_metres(path: Path, dataset: DatasetReader) -> None:
-    """Refuse elevations that say of themselves that they are in feet, kilometres or anything else. Raises InputError."""
+    """Refuse elevations whose file names another unit than the metre. Raises InputError."""
     unit = (dataset.units[0] or "").strip().lower()
     factor = 1.0
     if not unit and dataset.crs is not None and (vertical := _VERTICAL.search(dataset.crs.to_wkt())):
         unit, factor = vertical.group(1).lower(), float(vertical.group(2))
-    if unit in _METRES or (factor != 1.0 and abs(factor - 1) < 1e-9):
+    if _UNITS.get(unit) == 1.0 or (factor != 1.0 and abs(factor - 1) < 1e-9):
         return
-    known = {"km": 1000.0, "kilometre": 1000.0, "kilometer": 1000.0, "kilometers": 1000.0, "kilometres": 1000.0}
-    known |= {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 12 / 39.37, "us-ft": 12 / 39.37}
-    metres = factor if factor != 1.0 else known.get(unit)
+    metres = factor if factor != 1.0 else _UNITS.get(unit)
     advice = f"convert them (gdal_calc.py, 'A*{metres:g}')" if metres else "convert them, or set the unit that is true"
     raise InputError(
         f"{path}: expected elevations in metres, found the unit '{unit}'; {advice} and say so (gdal_edit.py -units m)."
@@ -155,9 +155,7 @@ def source_window(dataset: DatasetReader, grid: Grid, margin: int = 2) -> Window
     )
     x, y = grid.xy(rows, cols)
     x, y = transform_points(grid, dataset, x, y)
-    inverse = ~dataset.transform
-    u = inverse.a * x + inverse.b * y + inverse.c
-    v = inverse.d * x + inverse.e * y + inverse.f
+    u, v = ~dataset.transform @ (x, y)
     good = np.isfinite(u) & np.isfinite(v)
     if not good.any():
         return None
@@ -175,18 +173,21 @@ def transform_points(grid: Grid, dataset: DatasetReader, x: NDArray, y: NDArray)
 
     x, y : (n,) in the units of either CRS; returns (n,) each
     """
-    if grid.squash == latitude_squash(dataset.crs):
-        tx, ty = rasterio.warp.transform(grid.crs, dataset.crs, x, y)
-        tx, ty = np.asarray(tx), np.asarray(ty)
+    if grid.latitude_ratio == latitude_ratio(dataset.crs):
+        tx, ty = (np.asarray(v) for v in rasterio.warp.transform(grid.crs, dataset.crs, x, y))
     else:
-        own = Grid(dataset.crs.to_wkt(), Affine.identity(), dataset.height, dataset.width, grid.radius)
-        tx, ty = own.map_xy(*grid.map_lonlat(x, y))
+        tx, ty = grid_of(dataset, grid.radius).map_xy(*grid.map_lonlat(x, y))
     if dataset.crs.is_geographic:
         left = min(dataset.bounds.left, dataset.bounds.right)
         tx = (tx - left) % 360.0 + left
         # what lies just west of the raster must not wrap to its far east
         tx = np.where(tx - left > 360.0 - 0.05 * 360.0, tx - 360.0, tx)
     return tx, ty
+
+
+def grid_of(dataset: DatasetReader, radius: float) -> Grid:
+    """The grid of a raster on a body of that radius, m."""
+    return Grid(dataset.crs.to_wkt(), dataset.transform, dataset.height, dataset.width, radius)
 
 
 def warp(dataset: DatasetReader, grid: Grid, resampling: Resampling, band: int = 1) -> tuple[NDArray[np.float32], Mask]:
@@ -245,8 +246,8 @@ def _warp_halves(
 
 
 def _latitudes(dataset: DatasetReader, grid: Grid) -> dict[str, Any]:
-    """What GDAL must be told where raster and grid count latitudes in different ways: see latitude_squash."""
-    if latitude_squash(dataset.crs) == grid.squash:
+    """Arguments for GDAL's reprojection where raster and grid count latitudes in different ways: see latitude_ratio."""
+    if latitude_ratio(dataset.crs) == grid.latitude_ratio:
         return {}
     steps = []
     for crs, inverse in ((dataset.crs, True), (grid.crs, False)):
@@ -257,7 +258,7 @@ def _latitudes(dataset: DatasetReader, grid: Grid) -> dict[str, Any]:
             projection = f"+step +proj=unitconvert +xy_in={units[0]} +xy_out={units[1]}"
         else:
             projection = f"+step {'+inv ' if inverse else ''}{_plain(crs.to_proj4())}"
-        pair = [projection, geocentric] if latitude_squash(crs) != 1.0 else [projection]
+        pair = [projection, geocentric] if latitude_ratio(crs) != 1.0 else [projection]
         steps += pair if inverse else pair[::-1]
     # CRSs from PROJ strings count east first, as the pipeline does; those from files may not
     return {
@@ -272,21 +273,19 @@ def _plain(proj4: str) -> str:
 
 
 def choose_resampling(dataset: DatasetReader, grid: Grid) -> tuple[Resampling, float]:
-    """Area mean when coarsening, cubic otherwise; and the raster's own pixel size at the grid's centre, m."""
+    """Area mean when coarsening, bilinear otherwise; and the raster's own pixel size at the grid's centre, m."""
     size = pixel_size(dataset, grid.radius, *(np.ravel(v)[0] for v in grid.lonlat(grid.height / 2, grid.width / 2)))
     return (Resampling.average if grid.gsd > 1.05 * max(size) else Resampling.bilinear), max(size)
 
 
 def pixel_size(dataset: DatasetReader, radius: float, longitude_deg: float, latitude_deg: float) -> tuple[float, float]:
     """True size in metres of a raster's pixel (along columns, along rows) at a place on the body."""
-    own = Grid(dataset.crs.to_wkt(), dataset.transform, dataset.height, dataset.width, radius)
-    x, y = own.map_xy(np.array([longitude_deg]), np.array([latitude_deg]))
+    x, y = grid_of(dataset, radius).map_xy(np.array([longitude_deg]), np.array([latitude_deg]))
     u, v = ~dataset.transform @ (x[0], y[0])
     return pixel_size_at(dataset, radius, v, u)
 
 
 def pixel_size_at(dataset: DatasetReader, radius: float, row: float, col: float) -> tuple[float, float]:
     """True size in metres of the pixel at a GDAL (corner) row and column: (along columns, along rows)."""
-    grid = Grid(dataset.crs.to_wkt(), dataset.transform, dataset.height, dataset.width, radius)
-    north, east = grid.local_frames(row - 0.5, col - 0.5).pixel_size[0]
+    north, east = grid_of(dataset, radius).local_frames(row - GDAL_CENTRE, col - GDAL_CENTRE).pixel_size[0]
     return float(east), float(north)

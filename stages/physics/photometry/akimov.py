@@ -14,15 +14,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @register
@@ -48,7 +44,7 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
 }
 """
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         mu0, mu = angles.cos_incidence, angles.cos_emission
         double = mu0.dtype == torch.float64
         # Nearer to 0 the longitude is noise, and D = 1 to the same precision; at pi the disk function ends.

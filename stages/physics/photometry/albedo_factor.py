@@ -1,20 +1,16 @@
-"""A model whose I/F is multiplied by an albedo map, as one parameter more: what reads a map need not know of it.
+"""A model with one further parameter, an albedo factor of its I/F, so that maps with albedo are rendered like all others.
 
-It is in no registry: networks are not trained on it, `lunargr albedo` makes such maps.
+It is not registered: no network predicts it, `lunargr albedo` makes such maps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 FACTOR = Parameter("albedo_factor", "1", 0.0, 100.0, 1.0, "I/F relative to that of the other parameters")
 GLSL = """
@@ -36,10 +32,12 @@ class AlbedoFactor(ReflectanceModel):
         if model.glsl is not None:
             self.glsl = model.glsl.replace("float radiance_factor(", "float without_albedo(") + GLSL  # type: ignore[misc]
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         return self.model.radiance_factor(parameters, angles) * parameters[FACTOR.name]
 
-    def lit(self, coefficients: Tensor | Mapping[str, Tensor], angles: Angles, light: Tensor) -> Tensor:
+    def lit(
+        self, coefficients: torch.Tensor | Mapping[str, torch.Tensor], angles: Angles, light: torch.Tensor
+    ) -> torch.Tensor:
         if isinstance(coefficients, torch.Tensor):
             return self.model.lit(coefficients[:, :-1], angles, light) * coefficients[:, -1]
         rest = {name: value for name, value in coefficients.items() if name != FACTOR.name}

@@ -1,19 +1,16 @@
-"""What a reflectance model is: named, bounded, cited parameters and one differentiable formula for I/F."""
+"""The interface of every reflectance model: named, bounded, cited parameters and a differentiable formula for I/F."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 
 from schemas.errors import RegistryError
 from stages.physics.formation.geometry import Angles
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -40,11 +37,11 @@ class ReflectanceModel(ABC):
     reference: ClassVar[str]
     reciprocal: ClassVar[bool]
     parameters: ClassVar[tuple[Parameter, ...]]
-    # What a network predicts place by place unless told otherwise; the rest is fitted globally. Empty: every parameter.
+    # Parameters that a network predicts pixel by pixel by default; the rest is fitted globally. Empty: every parameter.
     default_maps: ClassVar[tuple[str, ...]] = ()
-    # I/F is a linear function of the parameters: a global set is then one least-squares solve.
+    # I/F is a linear function of the parameters, so that a global fit is one least-squares solve.
     linear: ClassVar[bool] = False
-    # The formula and its gradients are finite for any cosines in [-1, 1]: no need to keep them from 0 first.
+    # The formula and its gradients are finite for any cosines in [-1, 1], which need not be clamped away from 0 then.
     finite: ClassVar[bool] = False
     # The same formula in GLSL ES 3.00 for the page of `lunargr view`; None: it has no page. It defines
     #     float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g)
@@ -52,13 +49,13 @@ class ReflectanceModel(ABC):
     glsl: ClassVar[str | None] = None
 
     @abstractmethod
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         """I/F = pi r, including cos(incidence), wherever incidence and emission are below 90 deg.
 
         parameters : tensors that broadcast with the angles. Callers use :func:`evaluate`, which masks the rest.
         """
 
-    def constrain(self, raw: Tensor, dim: int, names: Sequence[str] | None = None) -> Tensor:
+    def constrain(self, raw: torch.Tensor, dim: int, names: Sequence[str] | None = None) -> torch.Tensor:
         """Network outputs -> parameters within their bounds (sigmoid between lower and upper).
 
         names : the parameters along ``dim``; all of them where None
@@ -67,7 +64,7 @@ class ReflectanceModel(ABC):
         low, high = self._bounds(raw, dim, names)
         return low + (high - low) * torch.sigmoid(raw)
 
-    def unconstrain(self, value: Tensor, dim: int, names: Sequence[str] | None = None) -> Tensor:
+    def unconstrain(self, value: torch.Tensor, dim: int, names: Sequence[str] | None = None) -> torch.Tensor:
         """Inverse of :meth:`constrain`, for starting a network at known coefficients.
 
         value : (..., C, ...) with the parameters along ``dim``
@@ -75,7 +72,7 @@ class ReflectanceModel(ABC):
         low, high = self._bounds(value, dim, names)
         return torch.logit(((value - low) / (high - low)).clamp(1e-6, 1 - 1e-6))
 
-    def _bounds(self, like: Tensor, dim: int, names: Sequence[str] | None) -> tuple[Tensor, Tensor]:
+    def _bounds(self, like: torch.Tensor, dim: int, names: Sequence[str] | None) -> tuple[torch.Tensor, torch.Tensor]:
         """Lower and upper bounds along ``dim``, on the device of ``like``."""
         chosen = [p for p in self.parameters if names is None or p.name in names]
         shape = [1] * like.ndim
@@ -85,7 +82,7 @@ class ReflectanceModel(ABC):
         return low, high
 
     def choose_maps(self, wanted: Sequence[str] = ()) -> tuple[str, ...]:
-        """The parameters to predict place by place, in the model's order; by default ``default_maps``, or all.
+        """The parameters to predict pixel by pixel, in the model's order; by default ``default_maps``, or all.
 
         Raises RegistryError for a name that is not a parameter.
         """
@@ -96,8 +93,8 @@ class ReflectanceModel(ABC):
         chosen = wanted or self.default_maps or names
         return tuple(name for name in names if name in chosen)
 
-    def unpack(self, coefficients: Tensor | Mapping[str, Tensor], dim: int) -> dict[str, Tensor]:
-        """A stack of coefficients -> parameters by name; the order is that of ``parameters``. Named ones stay as they are.
+    def unpack(self, coefficients: torch.Tensor | Mapping[str, torch.Tensor], dim: int) -> dict[str, torch.Tensor]:
+        """A stack of coefficients, in the order of ``parameters``, -> parameters by name. A mapping by name is copied.
 
         coefficients : (..., C, ...) with the parameters along ``dim``; returns each without that axis
         """
@@ -106,7 +103,9 @@ class ReflectanceModel(ABC):
         # unbind and not select: its backward is one stack, where select writes a full stack of zeros per parameter
         return dict(zip((p.name for p in self.parameters), coefficients.unbind(dim), strict=True))
 
-    def lit(self, coefficients: Tensor | Mapping[str, Tensor], angles: Angles, light: Tensor) -> Tensor:
+    def lit(
+        self, coefficients: torch.Tensor | Mapping[str, torch.Tensor], angles: Angles, light: torch.Tensor
+    ) -> torch.Tensor:
         """I/F of facets that receive the share ``light`` of the Sun, 0 where Sun or camera are behind them.
 
         coefficients : (B, C, H, W) or what broadcasts to it, in the order of ``parameters``, or by name, each broadcasting
@@ -123,7 +122,9 @@ def horizon_cosine(dtype: torch.dtype) -> float:
     return 1e-12 if dtype == torch.float64 else 1e-7
 
 
-def masked_radiance_factor(model: ReflectanceModel, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+def masked_radiance_factor(
+    model: ReflectanceModel, parameters: Mapping[str, torch.Tensor], angles: Angles
+) -> torch.Tensor:
     """I/F, exactly 0 (with zero gradient, never NaN) where the Sun or the camera is behind the surface.
 
     parameters : by name, each broadcasting with the angles (...,)

@@ -1,4 +1,4 @@
-"""What there is, for people: models, published sets and conventions as text, as data and as a page of the docs."""
+"""Catalogue of models, published parameter sets and conventions: as text, as data and as a page of the docs."""
 
 from __future__ import annotations
 

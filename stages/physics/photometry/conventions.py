@@ -1,9 +1,9 @@
-"""How other programs write the same parameters, and the way there and back.
+"""Parameters as other programs write them, converted to ours and back.
 
 A convention is named SYSTEM:MODEL, as in ``isis:HapkeHen``. It belongs to one model here and says for each of its own
-quantities the name and the unit. What it cannot hold (roughness in ASP's Hapke, an albedo in ISIS' Lunar-Lambert) is
-listed with the value that its formula implies; converting anything else into it loses something, and is refused unless
-asked for.
+quantities the name and the unit. Parameters that it has no place for (roughness in ASP's Hapke, an albedo in ISIS'
+Lunar-Lambert) are listed with the value that its formula implies; other values of them would be lost, so that such a
+conversion is refused unless an approximate one is asked for.
 
 Systems: ``lunargr`` (this package), ``isis`` (USGS ISIS photometric models), ``asp`` (Ames Stereo Pipeline ``sfs``),
 ``sato`` (Hapke parameter maps of Sato et al. 2014), ``g2r`` (.brdf textures of the Lunar-G2R reference implementation).
@@ -66,6 +66,15 @@ def _rename(pairs: Mapping[str, str]) -> tuple[Converter, Converter]:
     )
 
 
+def _theta_in_degrees(theirs: str, rest: tuple[Converter, Converter]) -> tuple[Converter, Converter]:
+    """The converters ``rest``, and the roughness, which another program keeps in degrees under the name ``theirs``."""
+    to_ours, from_ours = rest
+    return (
+        lambda t: {**to_ours(t), "theta": np.radians(t[theirs])},
+        lambda o: {**from_ours(o), theirs: np.degrees(o["theta"])},
+    )
+
+
 def _hapke_to(theirs: Maps, w: str, b: str, c: str, amplitude: str, width: str) -> dict[str, np.ndarray]:
     """The older notation: the backward lobe has weight c in 0..1, and b < 0 swaps the lobes."""
     asymmetry, weight = theirs[b], theirs[c]
@@ -113,8 +122,7 @@ def _texture(channels: Mapping[str, str], zero: tuple[str, ...] = ()) -> tuple[C
     return to_ours, from_ours
 
 
-_NO_CBOE = {"Bc0": 0.0, "phi": 0.0}
-_ISIS_RETURNS = "I/F"
+_NO_BACKSCATTER = {"Bc0": 0.0, "phi": 0.0}
 _conventions: list[Convention] = []
 
 
@@ -131,31 +139,19 @@ _add(
     "isis:HapkeHen",
     "Wh 1, Hg1 1, Hg2 1, Hh 1, B0 1, Theta degree",
     "hapke_h1981",
-    _ISIS_RETURNS,
+    "I/F",
     "ISIS photomet, HapkeHen: Hg2 = weight of the backward lobe, 0..1",
-    (
-        lambda t: {**_hapke_to(t, **_HEN), "theta": np.radians(t["Theta"])},
-        lambda o: {**_hapke_from(o, **_HEN), "Theta": np.degrees(o["theta"])},
-    ),
-    implied=_NO_CBOE,
+    _theta_in_degrees("Theta", (lambda t: _hapke_to(t, **_HEN), lambda o: _hapke_from(o, **_HEN))),
+    implied=_NO_BACKSCATTER,
 )
 _add(
     "isis:HapkeLeg",
     "Wh 1, Bh 1, Ch 1, Hh 1, B0 1, Theta degree",
     "hapke_legendre_h1981",
-    _ISIS_RETURNS,
+    "I/F",
     "ISIS photomet, HapkeLeg",
-    (
-        lambda t: {
-            **{o: t[k] for k, o in (("Wh", "w"), ("Bh", "b"), ("Ch", "c"), ("Hh", "hs"), ("B0", "Bs0"))},
-            "theta": np.radians(t["Theta"]),
-        },
-        lambda o: {
-            **{k: o[n] for k, n in (("Wh", "w"), ("Bh", "b"), ("Ch", "c"), ("Hh", "hs"), ("B0", "Bs0"))},
-            "Theta": np.degrees(o["theta"]),
-        },
-    ),
-    implied=_NO_CBOE,
+    _theta_in_degrees("Theta", _rename({"Wh": "w", "Bh": "b", "Ch": "c", "Hh": "hs", "B0": "Bs0"})),
+    implied=_NO_BACKSCATTER,
 )
 _add(
     "isis:LunarLambert",
@@ -182,7 +178,7 @@ _add(
     "r = I/F / pi",
     "ASP sfs, Hapke without roughness: c = (1 + Sato's c)/2",
     (lambda t: _hapke_to(t, **_ASP), lambda o: _hapke_from(o, **_ASP)),
-    implied={**_NO_CBOE, "theta": 0.0},
+    implied={**_NO_BACKSCATTER, "theta": 0.0},
 )
 _add(
     "asp:LunarLambert",
@@ -207,10 +203,7 @@ _add(
     "hapke",
     "I/F",
     "Sato et al. (2014), LROC WAC_HAPKEPARAMMAP and ISIS lrowacphomap: c = backward minus forward share, -1..1",
-    (
-        lambda t: {**{k: t[k] for k in t if k != "theta"}, "theta": np.radians(t["theta"])},
-        lambda o: {**{k: o[k] for k in o if k != "theta"}, "theta": np.degrees(o["theta"])},
-    ),
+    _theta_in_degrees("theta", _rename({name: name for name in ("w", "b", "c", "Bc0", "hc", "Bs0", "hs", "phi")})),
 )
 _G2R = "Lunar-G2R reference implementation, {}.brdf: channels before LeakyReLU(0.01), in the order of the file"
 for _name, _model, _channels, _zero in (
@@ -295,7 +288,7 @@ def convert_maps(
 
 
 def model_difference(start: Convention, end: Convention) -> dict[str, str]:
-    """What changes between two conventions' models: subject -> words; ConfigError if they cannot be converted at all."""
+    """Differences between two conventions' models: subject -> words. Raises ConfigError where no conversion is possible."""
     if start.model == end.model:
         return {}
     pair = frozenset((start.model, end.model))

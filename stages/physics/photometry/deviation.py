@@ -1,4 +1,4 @@
-"""From standard deviations of a model's parameters to that of its I/F, to first order, for independent errors:
+"""Standard deviation of I/F from those of a model's parameters, to first order and for independent errors:
 
 var(I/F) = sum over parameters of (dI/dp sigma_p)^2
 """
@@ -6,20 +6,16 @@ var(I/F) = sum over parameters of (dI/dp sigma_p)^2
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ReflectanceModel, masked_radiance_factor
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
 
 def radiance_deviation(
-    model: ReflectanceModel, values: Mapping[str, Tensor], deviations: Mapping[str, Tensor], angles: Angles
-) -> Tensor:
+    model: ReflectanceModel, values: Mapping[str, torch.Tensor], deviations: Mapping[str, torch.Tensor], angles: Angles
+) -> torch.Tensor:
     """Standard deviation of I/F in full sunlight, of the shape of the angles.
 
     values : all parameters by name; deviations : of some of them, each broadcasting to the angles
@@ -31,7 +27,7 @@ def radiance_deviation(
         above, below = ((values[name] + s).clamp(low, high) for s in (sigma, -sigma))
         change = masked_radiance_factor(model, {**values, name: above}, angles)
         change = change - masked_radiance_factor(model, {**values, name: below}, angles)
-        # at a bound the step is shorter than from -sigma to +sigma
+        # a bound shortens the step of 2 sigma
         share = 2 * sigma / (above - below).clamp(min=1e-12)
         variance = variance + (change * 0.5 * share).square()
     return variance.sqrt()

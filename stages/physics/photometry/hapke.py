@@ -28,16 +28,13 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
 from stages.physics.photometry.roughness import GLSL_ROUGH_SURFACE, rough_surface
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 # Defaults: Sato et al. (2014), 643 nm, mean over the Moon (set "sato2014_643nm" of `published.py`).
 OPTIONAL = (
@@ -88,7 +85,7 @@ float multiple_scattering(float x, float w) {
 }
 
 
-def henyey_greenstein(cos_phase: Tensor, b: Tensor, c: Tensor) -> Tensor:
+def henyey_greenstein(cos_phase: torch.Tensor, b: torch.Tensor, c: torch.Tensor) -> torch.Tensor:
     """Double Henyey-Greenstein phase function: (1 + c)/2 in the backward lobe (about g = 0), (1 - c)/2 forward.
 
     cos_phase : (...,); b, c : broadcastable with it
@@ -99,7 +96,7 @@ def henyey_greenstein(cos_phase: Tensor, b: Tensor, c: Tensor) -> Tensor:
     return (1 - b2) * 0.5 * ((1 + c) * backward + (1 - c) * forward)
 
 
-def shadow_hiding(tan_half_phase: Tensor, hs: Tensor) -> Tensor:
+def shadow_hiding(tan_half_phase: torch.Tensor, hs: torch.Tensor) -> torch.Tensor:
     """Bs(g) = 1 / (1 + tan(g/2) / hs).
 
     tan_half_phase : (...,); hs : 1, broadcastable with it
@@ -107,7 +104,7 @@ def shadow_hiding(tan_half_phase: Tensor, hs: Tensor) -> Tensor:
     return hs / (hs + tan_half_phase).clamp(min=1e-12)
 
 
-def coherent_backscatter(tan_half_phase: Tensor, hc: Tensor) -> Tensor:
+def coherent_backscatter(tan_half_phase: torch.Tensor, hc: torch.Tensor) -> torch.Tensor:
     """Bc(g) = [1 + (1 - exp(-x)) / x] / [2 (1 + x)^2], x = tan(g/2) / hc; 1 at g = 0.
 
     tan_half_phase : (...,); hc : 1, broadcastable with it
@@ -120,7 +117,7 @@ def coherent_backscatter(tan_half_phase: Tensor, hc: Tensor) -> Tensor:
     return (1 + mean) / (2 * (1 + x) ** 2)
 
 
-def porosity(phi: Tensor) -> Tensor:
+def porosity(phi: torch.Tensor) -> torch.Tensor:
     """K of the filling factor; 1 at phi = 0, where its one-sided slope is infinite and 0 is returned for it.
 
     phi : (...,), 0..1
@@ -129,7 +126,7 @@ def porosity(phi: Tensor) -> Tensor:
     return -torch.log1p(-y) / y
 
 
-def h_1981(x: Tensor, w: Tensor) -> Tensor:
+def h_1981(x: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
     """H(x) = (1 + 2 x) / (1 + 2 x sqrt(1 - w)) (Hapke 1981).
 
     x : (...,), a cosine; w : single-scattering albedo, broadcastable with it
@@ -138,7 +135,7 @@ def h_1981(x: Tensor, w: Tensor) -> Tensor:
     return (1 + 2 * x) / (1 + 2 * x * gamma)
 
 
-def h_2002(x: Tensor, w: Tensor) -> Tensor:
+def h_2002(x: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
     """H(x) = 1 / (1 - w x [r0 + (1 - 2 r0 x)/2 ln((1 + x)/x)]), r0 = (1 - sqrt(1-w)) / (1 + sqrt(1-w)) (Hapke 2002).
 
     x : (...,), a cosine; w : single-scattering albedo, broadcastable with it
@@ -165,13 +162,13 @@ class HapkeBase(ReflectanceModel):
             cls.glsl = GLSL_ROUGH_SURFACE + GLSL_H[cls.h_function] + cls.glsl_phase_function + GLSL_BODY
 
     @abstractmethod
-    def phase_function(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def phase_function(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         """p(g) of single scattering, 1 on average over the sphere.
 
         parameters : by name, each broadcasting with the angles (...,)
         """
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         w = parameters["w"]
         mu_x, mu_y, shadowing = rough_surface(angles, parameters["theta"])
         half = 0.5 * angles.phase
@@ -188,7 +185,7 @@ class HapkeBase(ReflectanceModel):
         return image * (1 + parameters["Bc0"] * coherent_backscatter(tangent, parameters["hc"]))
 
 
-def _is_off(amplitude: Tensor) -> bool:
+def _is_off(amplitude: torch.Tensor) -> bool:
     """A single 0 that nothing is learnt about: its term need not be computed."""
     return amplitude.numel() == 1 and not amplitude.requires_grad and float(amplitude) == 0.0
 
@@ -202,7 +199,7 @@ class HapkeHenyeyGreenstein(HapkeBase):
     )
     glsl_phase_function = GLSL_HENYEY_GREENSTEIN
 
-    def phase_function(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def phase_function(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         return henyey_greenstein(angles.cos_phase, parameters["b"], parameters["c"])
 
 

@@ -12,15 +12,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @register
@@ -54,7 +50,7 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
 }
 """
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         mu0, mu, cos_phase, phase = angles.cos_incidence, angles.cos_emission, angles.cos_phase, angles.phase
         gamma = parameters["gamma"]
         sin_phase = phase.sin()

@@ -10,14 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+
+import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, register
 from stages.physics.photometry.hapke import OPTIONAL, Hapke, HapkeBase
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 # Helfenstein and Veverka (1987), whole Moon; B0 = S(0) / (w p(0)) with S(0) = 0.71.
 _LUNAR = {"w": 0.21, "Bs0": 0.71 / (0.21 * 1.68), "hs": 0.07, "theta": math.radians(20)}
@@ -38,7 +36,7 @@ class HapkeLegendreBase(HapkeBase):
 float phase_function(float b, float c, float cos_g) { return 1.0 + b * cos_g + c * (1.5 * cos_g * cos_g - 0.5); }
 """
 
-    def phase_function(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def phase_function(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         cos_phase = angles.cos_phase
         return 1 + parameters["b"] * cos_phase + parameters["c"] * (1.5 * cos_phase * cos_phase - 0.5)
 

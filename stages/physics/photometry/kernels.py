@@ -1,4 +1,4 @@
-"""A sum of fixed kernels, linear in its coefficients: whatever smooth form a lunar reflectance has, to a few thousandths.
+"""A sum of fixed kernels, linear in its coefficients, which fits any smooth lunar reflectance to a few thousandths.
 
     I/F = sum of coefficient x kernel,  L = 2 mu0 / (mu0 + mu),  R = L under Hapke's roughness of 20 deg,
     s(w) = 1 / (1 + tan(g/2)/w)
@@ -8,8 +8,8 @@
 
 The idea is that of kernel-driven models of land (Roujean et al. 1992); the kernels are those of lunar laws: Lambert,
 Lommel-Seeliger, Hapke's roughness (1984) and shadow hiding (1986), and the polynomial M2, which it contains. They were
-chosen one after the other, from products of such factors, for what they gain with the laws of Hapke, McEwen and Akimov
-as `tests/hidden/laws.py` has them.
+selected one by one from products of such factors, each for how much it improved the fit to the laws of Hapke, McEwen and
+Akimov in `tests/hidden/laws.py`.
 """
 
 from __future__ import annotations
@@ -17,16 +17,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, horizon_cosine, register
 from stages.physics.photometry.roughness import GLSL_ROUGH_SURFACE, rough_surface
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 ROUGH = math.radians(20)
 KERNELS = (
@@ -75,15 +71,15 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {{
 """
     )
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         total = torch.zeros(())
         for (name, _, _), kernel in zip(KERNELS, _kernels(angles), strict=True):
             total = total + parameters[name] * kernel
         return total
 
 
-def _kernels(angles: Angles) -> list[Tensor]:
-    """The kernels at these angles, kept with them: a fit asks for them once for each coefficient."""
+def _kernels(angles: Angles) -> list[torch.Tensor]:
+    """The kernels at these angles, cached on them: a fit asks for them once for each coefficient."""
     kept = angles.__dict__.get("_kernels")
     if kept is None:
         kept = _evaluate(angles)
@@ -92,7 +88,7 @@ def _kernels(angles: Angles) -> list[Tensor]:
     return kept
 
 
-def _evaluate(angles: Angles) -> list[Tensor]:
+def _evaluate(angles: Angles) -> list[torch.Tensor]:
     floor = horizon_cosine(angles.cos_incidence.dtype)
     mu0, mu, cosine = angles.cos_incidence.clamp(min=floor), angles.cos_emission.clamp(min=floor), angles.cos_phase
     tangent = torch.tan((angles.phase / 2).clamp(max=math.pi / 2 - 1e-3))
@@ -117,6 +113,3 @@ def _evaluate(angles: Angles) -> list[Tensor]:
         cosine,
         torch.ones_like(mu0),
     ]
-
-
-__all__ = ["Kernels"]

@@ -8,13 +8,11 @@ The albedo is that of a perfectly diffuse surface: 1 reflects all light.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+
+import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, ReflectanceModel, register
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @register
@@ -29,5 +27,5 @@ class Lambert(ReflectanceModel):
     parameters = (ALBEDO,)
     glsl = "float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) { return p[0] * mu0; }"
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         return parameters["albedo"] * angles.cos_incidence

@@ -8,13 +8,11 @@ The factor 2 makes the albedo the normal albedo, as in ISIS; in Hapke's terms it
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+
+import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, ReflectanceModel, register
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @register
@@ -32,6 +30,6 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
 }
 """
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         mu0 = angles.cos_incidence
         return parameters["albedo"] * (2 * mu0 / (mu0 + angles.cos_emission))

@@ -10,22 +10,18 @@ with g in degrees. The defaults are the published sets for the NAC (broadband, 6
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
 
-if TYPE_CHECKING:
-    from torch import Tensor
 
-
-def _terms(rows: tuple[tuple[str, str, float, str], ...], spread: float) -> tuple[Parameter, ...]:
-    """Parameters whose bounds lie ``spread`` times their size about the published value."""
+def _terms(*rows: tuple[str, str, float, str]) -> tuple[Parameter, ...]:
+    """Parameters between 0 and twice the published value. rows : name, unit, value, term"""
     return tuple(
-        Parameter(name, unit, value - spread * abs(value), value + spread * abs(value), value, f"in the exponent: {of}")
-        for name, unit, value, of in rows
+        Parameter(name, unit, value - abs(value), value + abs(value), value, f"in the exponent: {term}")
+        for name, unit, value, term in rows
     )
 
 
@@ -37,13 +33,10 @@ class LrocEmpirical2014(ReflectanceModel):
     reference = "LROC team: ISIS lronacpho, algorithm LROC_Empirical, version 2014 (NAC_PHO_LROC_Empirical.0002)"
     reciprocal = False
     parameters = _terms(
-        (
-            ("A0", "1", -2.9811422, "constant"),
-            ("A1", "1/degree", -0.0112862, "phase"),
-            ("A2", "1", -0.8084603, "cos(e)"),
-            ("A3", "1", 1.3248888, "cos(i)"),
-        ),
-        1.0,
+        ("A0", "1", -2.9811422, "constant"),
+        ("A1", "1/degree", -0.0112862, "phase"),
+        ("A2", "1", -0.8084603, "cos(e)"),
+        ("A3", "1", 1.3248888, "cos(i)"),
     )
     glsl = """
 float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
@@ -51,7 +44,7 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
 }
 """
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         a0, a1, a2, a3 = (parameters[p.name] for p in self.parameters)
         return torch.exp(a0 + a1 * torch.rad2deg(angles.phase) + a2 * angles.cos_emission + a3 * angles.cos_incidence)
 
@@ -66,16 +59,13 @@ class LrocEmpirical2019(ReflectanceModel):
     reference = "LROC team: ISIS lronacpho, algorithm LROC_Empirical, version 2019 (NAC_PHO_LROC_Empirical.0003)"
     reciprocal = False
     parameters = _terms(
-        (
-            ("B0", "1", -1.479654495, "constant"),
-            ("B1", "1/degree^2", -0.000083528, "phase squared"),
-            ("B2", "1/degree", 0.012964707, "phase"),
-            ("B3", "1/degree^0.5", -0.237774774, "square root of phase"),
-            ("B4", "1", 0.556075496, "cos(e)"),
-            ("B5", "1", 0.663671460, "cos(i)"),
-            ("B6", "1", -0.439918609, "cos(i)^2"),
-        ),
-        1.0,
+        ("B0", "1", -1.479654495, "constant"),
+        ("B1", "1/degree^2", -0.000083528, "phase squared"),
+        ("B2", "1/degree", 0.012964707, "phase"),
+        ("B3", "1/degree^0.5", -0.237774774, "square root of phase"),
+        ("B4", "1", 0.556075496, "cos(e)"),
+        ("B5", "1", 0.663671460, "cos(i)"),
+        ("B6", "1", -0.439918609, "cos(i)^2"),
     )
     glsl = """
 float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
@@ -85,7 +75,7 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
 }
 """
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         b0, b1, b2, b3, b4, b5, b6 = (parameters[p.name] for p in self.parameters)
         mu0, mu = angles.cos_incidence, angles.cos_emission
         g = torch.rad2deg(angles.phase)

@@ -9,15 +9,11 @@ curve L(g) of the user's.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, register
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 # McEwen (1996): L(g) = 1 + A g + B g^2 + C g^3 with g in degrees; negative beyond 105 deg.
 MCEWEN = (1.0, -0.019, 2.42e-4, -1.46e-6)
@@ -31,7 +27,7 @@ float mixture(float share, float mu0, float mu) { return mu0 * (1.0 + share * (2
 """
 
 
-def lunar_share(phase: Tensor, coefficients: tuple = MCEWEN) -> Tensor:
+def lunar_share(phase: torch.Tensor, coefficients: tuple = MCEWEN) -> torch.Tensor:
     """L(g) = O + A g + B g^2 + C g^3, the weight of the Lommel-Seeliger term.
 
     phase : (...,) rad
@@ -42,7 +38,7 @@ def lunar_share(phase: Tensor, coefficients: tuple = MCEWEN) -> Tensor:
     return constant + g * (linear + g * (quadratic + g * cubic))
 
 
-def mixture(share: Tensor, angles: Angles) -> Tensor:
+def mixture(share: torch.Tensor, angles: Angles) -> torch.Tensor:
     """2 L cos(i) / (cos(i) + cos(e)) + (1 - L) cos(i).
 
     share : L, (...,) as the angles
@@ -72,7 +68,7 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {{
 """
     )
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         # The cubic makes I/F negative at large phase: 0 there, as in ISIS.
         return parameters["albedo"] * mixture(lunar_share(angles.phase), angles).clamp(min=0)
 
@@ -93,5 +89,5 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) { return
 """
     )
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         return parameters["albedo"] * mixture(parameters["L"], angles)

@@ -3,22 +3,18 @@
     I/F = albedo [ 2 L mu0/(mu0 + mu) + (1 - L) mu0 ] (exp(-C1 g) + C2),   L = O + A g + B g^2 + C g^3
 
 with g in degrees in L and in radians in the exponential, as there. With C1 = C2 = 0 and McEwen's O, A, B, C it is
-McEwen's law, which is negative beyond some 105 deg of phase: there the polynomial says nothing.
+McEwen's law, which is negative beyond some 105 deg of phase: the polynomial is not valid there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, register
 from stages.physics.photometry.lunar_lambert import GLSL_MIXTURE, MCEWEN, lunar_share, mixture
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @register
@@ -49,7 +45,7 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
 """
     )
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         share = lunar_share(angles.phase, tuple(parameters[k] for k in "OABC"))
         factor = torch.exp(-parameters["C1"] * angles.phase) + parameters["C2"]
         return parameters["albedo"] * mixture(share, angles) * factor

@@ -8,13 +8,11 @@ The albedo is the normal albedo; k rises with phase, and with k < 1 the law is i
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+
+import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import ALBEDO, Parameter, ReflectanceModel, register
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 @register
@@ -32,7 +30,7 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
 }
 """
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         mu0, mu = angles.cos_incidence, angles.cos_emission
         # one logarithm and one exponential, where mu0^k mu^(k-1) would take two powers
         return parameters["albedo"] * mu0 * ((mu0 * mu).log() * (parameters["k"] - 1)).exp()

@@ -15,15 +15,12 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import torch
 
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import Parameter, ReflectanceModel, register
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 
 class CosinePolynomial(ReflectanceModel):
@@ -49,14 +46,16 @@ class IncidencePhasePolynomial(CosinePolynomial):
             f"float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {{ return {' + '.join(terms)}; }}"
         )
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         terms = []
         for parameter, (p, q) in zip(self.parameters, self.powers, strict=True):
             factors = [parameters[parameter.name]] + p * [angles.cos_incidence] + q * [angles.cos_phase]
             terms.append(functools.reduce(operator.mul, factors))
         return functools.reduce(operator.add, terms)
 
-    def lit(self, coefficients: Tensor | Mapping[str, Tensor], angles: Angles, light: Tensor) -> Tensor:
+    def lit(
+        self, coefficients: torch.Tensor | Mapping[str, torch.Tensor], angles: Angles, light: torch.Tensor
+    ) -> torch.Tensor:
         # numba takes a quarter of a second to load, which `lunargr models` has no use for
         from stages.physics.formation.cosine_sums import cosine_sum, fits
 

@@ -1,4 +1,4 @@
-"""Between the names that a reflectance goes by. All models here give I/F.
+"""Conversions between the quantities that are called reflectance. All models here give I/F.
 
 bidirectional reflectance   r                 = I/F / pi               sr^-1   (ASP's Hapke, Hapke's books)
 radiance factor             I/F = RADF        = pi r                   1       (ISIS, PDS images, this package)
@@ -9,14 +9,12 @@ BRDF                        r / cos(i)        = I/F / (pi cos(i))      sr^-1   (
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
+import torch
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-Array = TypeVar("Array", float, np.ndarray, "Tensor")
+Array = TypeVar("Array", float, np.ndarray, "torch.Tensor")
 
 
 def to_bidirectional_reflectance(radiance_factor: Array) -> Array:

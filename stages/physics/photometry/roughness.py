@@ -17,14 +17,10 @@ mu0e and mue are the mu of whichever angle is incidence and emission.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import torch
 
 from stages.physics.formation.geometry import Angles
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 GLSL_ROUGH_SURFACE = """
 vec2 facets(float cot_angle, float cot_theta) {
@@ -52,7 +48,7 @@ vec3 rough_surface(float mu0, float mu, float cos_g, float theta) {
 """
 
 
-def roughness_factor(angles: Angles, theta: Tensor) -> Tensor:
+def roughness_factor(angles: Angles, theta: torch.Tensor) -> torch.Tensor:
     """Reflectance of rough over that of smooth Lommel-Seeliger ground; 1 where the Sun or the camera is below the facet.
 
     angles : (...,) each; theta : () or (...,), mean slope angle, rad; returns (...,)
@@ -63,7 +59,7 @@ def roughness_factor(angles: Angles, theta: Tensor) -> Tensor:
     return torch.where((mu0 > 1e-3) & (mu > 1e-3), factor, 1.0)
 
 
-def rough_surface(angles: Angles, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def rough_surface(angles: Angles, theta: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Effective cosines of the smaller and of the larger of incidence and emission, and S / mue.
 
     theta : mean slope angle, rad; 0 gives the true cosines and S = 1
@@ -107,7 +103,7 @@ def rough_surface(angles: Angles, theta: Tensor) -> tuple[Tensor, Tensor, Tensor
     return chi * mu_x, chi * mu_y, mu0 / (chi * eta_y * visible)
 
 
-def _facets(cot_angle: Tensor, cot_theta: Tensor) -> tuple[Tensor, Tensor]:
+def _facets(cot_angle: torch.Tensor, cot_theta: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """E1 = exp(-2/pi cot(theta) cot(x)) and E2 = exp(-cot^2(theta) cot^2(x) / pi); both are 0 beyond the clamp."""
     ratio = (cot_angle * cot_theta).clamp(max=60.0)
     return torch.exp(-2 / math.pi * ratio), torch.exp(-ratio * ratio / math.pi)

@@ -24,7 +24,6 @@ carry over.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import torch
 
@@ -32,11 +31,8 @@ from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import register
 from stages.physics.photometry.polynomial import CosinePolynomial, coefficient
 
-if TYPE_CHECKING:
-    from torch import Tensor
 
-
-def half_difference_cosines(angles: Angles) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def half_difference_cosines(angles: Angles) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """cos(theta_h), cos(theta_d), cos(phi_h), cos(phi_d) as in the module's text; finite for every input."""
     mu0, mu, cos_phase = angles.cos_incidence, angles.cos_emission, angles.cos_phase
     epsilon = torch.finfo(mu0.dtype).eps
@@ -73,7 +69,7 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
 }
 """
 
-    def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
+    def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         theta_h, theta_d, phi_h, phi_d = half_difference_cosines(angles)
         a, b, c, d = (parameters[p.name] for p in self.parameters)
         return a * theta_h + b * theta_d + c * phi_h + d * phi_d

@@ -17,7 +17,7 @@ from stages.physics.light.sky import Surroundings, terrain_light
 from stages.physics.maps.window import Window
 from stages.physics.photometry import masked_radiance_factor
 from stages.physics.photometry.quantities import to_reflectance_factor
-from stages.physics.terrain.ground import block_geometry
+from stages.physics.terrain.block_geometry import block_geometry
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.sun_visibility import SunHorizon, visible_share
 from stages.physics.terrain.surface import Surface
@@ -35,8 +35,8 @@ class Horizon(Protocol):
         """(height, width) rad; NaN where the elevation is."""
 
 
-class Hidden:
-    """The horizon of a source that stands below it everywhere."""
+class BelowHorizon:
+    """The horizon over a map that hides a source of light everywhere."""
 
     def window(self, _row: int, _col: int, height: int, width: int) -> Floats32:
         """(height, width), rad."""
@@ -45,7 +45,7 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Earthshine:
-    """The Earth's disc over a map: like a Sun of ``irradiance`` times the Sun's light. horizon : None = no shadows"""
+    """The Earth's disc over a map, as a Sun that is ``irradiance`` times as bright. horizon : None = no shadows"""
 
     disc: Sun
     horizon: SunHorizon | None
@@ -53,10 +53,7 @@ class Earthshine:
 
     @staticmethod
     def over(surface: Surface, sun: Sun, earth_position: Floats, relief: float, shadows: bool) -> Earthshine:
-        """The Earth at a place, body-fixed, m, lit by the Sun as it stands. relief : m, lowest to highest point.
-
-        earth_position : (3,)
-        """
+        """The Earth at ``earth_position`` (3,), body-fixed, m, as lit by ``sun``. relief : m, lowest to highest point"""
         grid = surface.grid
         middle = grid.local_frames((grid.height - 1) / 2, (grid.width - 1) / 2).up[0] * grid.radius
         distance = float(np.linalg.norm(earth_position - middle))
@@ -82,7 +79,7 @@ def diffuse_albedo(surface: Surface, window: Window) -> Floats32:
 
 
 class _LitGround:
-    """I/F of a map's sunlit facets as diffuse ones, cut out by slicing and worked out on the way; NaN where unknown."""
+    """I/F of a map's sunlit facets as diffuse ones, computed window by window on slicing; NaN where unknown."""
 
     def __init__(self, surface: Surface, sun: Sun, horizon: Horizon | None) -> None:
         self._surface, self._sun, self._horizon = surface, sun, horizon
@@ -101,15 +98,14 @@ class _LitGround:
         geometry = block_geometry(self._surface.grid, window.row, window.col, heights, self._sun.position, None)
         lit = diffuse_albedo(self._surface, window) * np.maximum(geometry.cos_incidence, 0)
         if self._horizon is not None:
-            elevation = np.arcsin(np.clip(geometry.sun[2], -1.0, 1.0))
-            lit = lit * visible_share(elevation, self._horizon.window(*window), self._sun.radius)
+            lit = lit * visible_share(geometry.sun_elevation, self._horizon.window(*window), self._sun.radius)
         return lit
 
 
 class Bounce:
-    """What sunlit terrain adds to the terrain that sees it, once, between diffuse facets of the map's own reflectance.
+    """Light from sunlit terrain to the terrain that sees it, one bounce between diffuse facets of the map's own albedo.
 
-    Near terrain is taken pixel by pixel, far terrain from means of the whole map, made once: memory stays flat.
+    Near terrain is taken pixel by pixel, far terrain from block means of the whole map, made once: memory stays bounded.
     """
 
     def __init__(self, surface: Surface, sun: Sun, horizon: Horizon | None) -> None:

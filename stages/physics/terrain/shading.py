@@ -15,31 +15,23 @@ from stages.physics.formation.geometry import Angles
 from stages.physics.maps.window import Window
 from stages.physics.photometry import masked_radiance_factor
 from stages.physics.photometry.deviation import radiance_deviation
+from stages.physics.terrain.block_geometry import BlockGeometry, block_geometry
 from stages.physics.terrain.further_light import Bounce, Earthshine, Horizon
-from stages.physics.terrain.ground import BlockGeometry, block_geometry
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.sun_visibility import visible_share
 from stages.physics.terrain.surface import SHADOWED, Surface
 
-BACKPLANES = (
-    "incidence_deg",
-    "emission_deg",
-    "phase_deg",
-    "shadow",
-    "depth",
-    "longitude_deg",
-    "latitude_deg",
-)
-TILE_PX = 128  # extensions were found on crops about this large, with a tangent plane each
+BACKPLANES = ("incidence_deg", "emission_deg", "phase_deg", "shadow", "depth", "longitude_deg", "latitude_deg")
+TILE_PX = 128  # extensions were fitted to crops about this large, each with its own tangent plane
 HALO_PX = 16
 STRAIGHT_ABOVE = 1e8  # m: from here every pixel of a tile is seen from straight above, to 1e-5 rad
 
 
 @dataclass(frozen=True)
 class Light:
-    """What lights a map, and where its light goes.
+    """The light on a map, and the position that it is seen from.
 
-    horizon : of the Sun, over the map (None: nothing casts shadows)
+    horizon : terrain horizon towards the Sun (None: nothing casts shadows)
     camera_position : (3,), body-fixed, m (None: straight above every pixel)
     earthshine, bounce : light besides the Sun's own
     """
@@ -52,8 +44,8 @@ class Light:
     bounce: Bounce | None = None
 
 
-class Floor:
-    """Clips the I/F of lit facets at 0, as the first step of the chain's reflectance; ``below`` (B, H, W) says where.
+class ClipNegative:
+    """Clips the I/F of lit facets at 0, as the first step of the chain's reflectance slot; ``below`` (B, H, W) says where.
 
     Fitted formulas, such as a polynomial's, fall below 0 near the terminator.
     """
@@ -69,8 +61,8 @@ class Floor:
         state.reflectance = state.reflectance.clamp(min=0)
 
 
-class Added:
-    """I/F that further light adds to the chain's radiance, (h, w)."""
+class AddRadiance:
+    """Adds I/F (h, w) of further light to the chain's radiance."""
 
     slot = "illumination"
 
@@ -78,7 +70,7 @@ class Added:
         self._radiance = torch.from_numpy(np.nan_to_num(radiance))[None]
 
     def apply(self, state: State) -> None:
-        """Have it added once the Sun's own light is known."""
+        """Register the addition, which runs once the Sun's own light is known."""
         state.further_light.append(self._add)
 
     def _add(self, state: State) -> None:
@@ -89,8 +81,8 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
     """``image`` (I/F) and the backplanes of a window, each (height, width), NaN where the map is unknown.
 
     ``clipped`` is 1 where the model gave I/F below 0, which is drawn as 0.
-    ``image_std`` is among them where the map knows its errors: of a photograph of the same view, pixel by pixel.
-    ``sky_view`` is among them where terrain lights terrain.
+    ``image_std``, where the map has errors, is the standard deviation of a photograph of the same view about the image.
+    ``sky_view`` is there where terrain lights terrain.
     """
     window, grid = Window(row, col, height, width), surface.grid
     elevation = surface.read_padded(*window, 1)
@@ -125,8 +117,7 @@ def _visible(horizon: Horizon | None, source: Sun, geometry: BlockGeometry, wind
     """(h, w) share of the source's disc that stands above the terrain."""
     if horizon is None:
         return np.ones((window.height, window.width), np.float32)
-    elevation = np.arcsin(np.clip(geometry.sun[2], -1.0, 1.0))
-    return visible_share(elevation, horizon.window(*window), source.radius)
+    return visible_share(geometry.sun_elevation, horizon.window(*window), source.radius)
 
 
 def _reflected(
@@ -165,7 +156,7 @@ def further_radiance(surface: Surface, light: Light, window: Window) -> tuple[Fl
 
 
 def image_deviation(surface: Surface, light: Light, window: Window, image: Floats32 | None = None) -> Floats32:
-    """Standard deviation of a photograph about a rendering of a map that knows its errors, NaN where the map is unknown.
+    """Standard deviation of a photograph about a rendering of a map that has errors, NaN where the map is unknown.
 
     image : (h, w) I/F of the window, where extensions have shaded it; returns (h, w), I/F
     """
@@ -182,9 +173,9 @@ def image_deviation(surface: Surface, light: Light, window: Window, image: Float
 def _deviation(
     surface: Surface, geometry: BlockGeometry, visible: Floats32, window: Window, image: Floats32
 ) -> Floats32:
-    """(h, w) I/F: errors of the coefficients, through the model, or of the albedo, and the images' own."""
+    """(h, w) I/F: errors of the albedo, or of the coefficients as the model passes them on, with those of the images."""
     if surface.albedo_error is not None:
-        # photographs have corrected the coefficients' errors: those of the albedo stand in their place
+        # the albedo was fitted to photographs, with these coefficients: its errors include theirs
         dark = _shadow(geometry, visible) > SHADOWED
         found, _ = surface.albedo_error.half_widths(
             window.row, window.col, image, geometry.cos_incidence, dark, np.clip(geometry.sun[2], 0.0, 1.0)
@@ -223,7 +214,7 @@ def form_window(
                 window.row + r, window.col + c, min(TILE_PX, window.height - r), min(TILE_PX, window.width - c)
             )
             wide = tile.padded(HALO_PX, shape)
-            more = [] if added is None else [Added(added[wide.within(around).part])]
+            more = [] if added is None else [AddRadiance(added[wide.within(around).part])]
             formed = _form_tile(surface, light, wide, [*light.extensions, *more])
             result[:, *tile.within(window).part] = formed[:, *tile.within(wide).part]
     return result[0], result[1]
@@ -260,12 +251,12 @@ def _form_tile(surface: Surface, light: Light, tile: Window, extensions: Sequenc
         frame=torch.full((1,), -1),
     )
     filled = torch.from_numpy(np.nan_to_num(coefficients).astype(np.float32))[None]
-    floor = Floor()
+    clip = ClipNegative()
     with torch.no_grad():
         whole = filled.expand(1, -1, height, width)
-        image = form(observation, surface.model, whole, [floor, *extensions])[0].numpy()
-    assert floor.below is not None
-    below = np.broadcast_to(floor.below[0].numpy(), image.shape)
+        image = form(observation, surface.model, whole, [clip, *extensions])[0].numpy()
+    assert clip.below is not None
+    below = np.broadcast_to(clip.below[0].numpy(), image.shape)
     return np.stack([np.where(known, image, np.nan), below & known]).astype(np.float32)
 
 

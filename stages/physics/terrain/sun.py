@@ -1,4 +1,4 @@
-"""The Sun's place for a rendered scene, from angles over the map, the sub-solar point or a time."""
+"""Position of the Sun for a rendered scene: from its azimuth and elevation, the sub-solar point or a time."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from schemas.errors import ConfigError, GeometryError
 from stages.common.arrays import Floats
+from stages.physics.bodies.ephemeris import AU, subsolar_point
 from stages.physics.bodies.spheres import Body
-from stages.physics.images.table import ASTRONOMICAL_UNIT
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import Grid, unit_vectors
 
 
 @dataclass(frozen=True)
 class Sun:
-    """position : (3,), body-fixed, m; radius : angular, rad"""
+    """A source of light. position : (3,), body-fixed, m; radius : angular, rad"""
 
     position: Floats
     radius: float
@@ -42,11 +42,11 @@ def sun_from_angles(azimuth_deg: float, elevation_deg: float, grid: Grid, distan
             if elevation_deg <= 0
             else f"`sun_elevation_deg`: expected degrees in 0..90, found {elevation_deg:g}."
         )
-    return Sun(place_over(grid, azimuth_deg, elevation_deg, distance_au * ASTRONOMICAL_UNIT), SUN_RADIUS / distance_au)
+    return Sun(place_over(grid, azimuth_deg, elevation_deg, distance_au * AU), SUN_RADIUS / distance_au)
 
 
 def place_over(grid: Grid, azimuth_deg: float, elevation_deg: float, distance: float) -> Floats:
-    """(3,) body-fixed, m: what stands at an azimuth (from true north) and elevation over the middle of a map, ``distance`` m off."""
+    """(3,) body-fixed, m, at an azimuth (from true north), elevation and distance, m, from the middle of a map."""
     frame = grid.local_frames((grid.height - 1) / 2, (grid.width - 1) / 2)
     # azimuth from true north -> from the grid's rows
     azimuth = math.radians(azimuth_deg + float(frame.convergence_deg[0]))
@@ -62,7 +62,7 @@ def sun_from_subsolar(longitude_deg: float, latitude_deg: float, distance_au: fl
     """The Sun over its sub-solar point. Raises GeometryError."""
     if not -90.0 <= latitude_deg <= 90.0:
         raise GeometryError(f"`subsolar_latitude_deg`: expected degrees in -90..90, found {latitude_deg:g}.")
-    return Sun(unit_vectors(longitude_deg, latitude_deg) * distance_au * ASTRONOMICAL_UNIT, SUN_RADIUS / distance_au)
+    return Sun(unit_vectors(longitude_deg, latitude_deg) * distance_au * AU, SUN_RADIUS / distance_au)
 
 
 def find_sun(
@@ -85,8 +85,6 @@ def find_sun(
             f"or `time`; found {'none' if not (angles or subsolar or time) else 'more than one'}."
         )
     if time is not None:
-        from stages.physics.bodies.ephemeris import subsolar_point
-
         point = subsolar_point(time, body)
         return sun_from_subsolar(point.longitude_deg, point.latitude_deg, point.distance_au)
     if subsolar:

@@ -24,7 +24,7 @@ NEAR_FACTOR = 4  # terrain within 256 px is always swept at full resolution
 
 
 def visible_share(sun_elevation: NDArray, horizon: NDArray, radius: float) -> NDArray[np.float32]:
-    """Share of the Sun above the horizon, 0..1, NaN where either is: the disc's formula only where the edge cuts it.
+    """Share of the Sun above the horizon, 0..1, NaN where either is; the disc's formula is used where the horizon cuts it.
 
     sun_elevation, horizon : same shape, rad; radius : of the Sun, rad
     """
@@ -58,7 +58,7 @@ class SunHorizon:
             self._reference = make_overview(elevation, factor)
 
     def _azimuth_is_even(self, relief: float) -> bool:
-        """Whether the azimuth at the middle displaces no shadow anywhere by more than a pixel."""
+        """Whether taking the azimuth at the middle of the map for all of it displaces no shadow by more than a pixel."""
         grid = self._grid
         middle, elevation = self._sun.over(grid, (grid.height - 1) / 2, (grid.width - 1) / 2)
         reach = min(relief / math.tan(max(elevation, math.radians(1.0))), max(grid.height, grid.width) * grid.gsd)

@@ -1,4 +1,4 @@
-"""What is rendered: a terrain on a metric grid and its reflectance, read window by window."""
+"""A terrain on a metric grid with its reflectance, read window by window."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 from numpy.typing import NDArray
+from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
 from schemas.artefacts import SCENE, SVBRDF
@@ -29,14 +30,14 @@ _UNEVEN = 0.01  # a raw DEM's pixels may differ in true width and height by this
 
 
 class Elevation:
-    """Windows of a DEM by slicing, NaN where unknown, so that a raster and an HDF5 variable look alike."""
+    """A DEM that is read by slicing, whether it is a raster or an HDF5 variable; m, NaN where unknown.
 
-    def __init__(self, source: object, radius_offset: float = 0.0) -> None:
+    source : HDF5 dataset or open raster; radius_offset : m, taken off a raster that holds radii
+    """
+
+    def __init__(self, source: h5py.Dataset | DatasetReader, radius_offset: float = 0.0) -> None:
         self._source, self._offset = source, radius_offset
-        if isinstance(source, h5py.Dataset):
-            self.shape: tuple[int, int] = source.shape
-        else:
-            self.shape = (source.height, source.width)  # type: ignore[attr-defined]
+        self.shape: tuple[int, int] = source.shape
         self.dtype = np.dtype(np.float32)
         self.ndim = 2
 
@@ -44,13 +45,13 @@ class Elevation:
         (r0, r1, rs), (c0, c1, cs) = (s.indices(n) for s, n in zip(key, self.shape, strict=True))
         if isinstance(self._source, h5py.Dataset):
             return np.asarray(self._source[r0:r1, c0:c1], np.float32)[::rs, ::cs]
-        block = read_window(self._source, Window(c0, r0, c1 - c0, r1 - r0))  # type: ignore[arg-type]
+        block = read_window(self._source, Window(c0, r0, c1 - c0, r1 - r0))
         return (block - self._offset).astype(np.float32)[::rs, ::cs]
 
 
 @dataclass(frozen=True)
 class AlbedoError:
-    """How far photographs lie from a map with albedo, as `lunargr albedo` found it.
+    """Errors of a map with albedo, as `lunargr albedo` found them from the residuals of photographs.
 
     albedo, std : (H, W) datasets; own : () relative standard deviation of a photograph's own error
     cos_incidence, interval : (B, 2) half-widths of the 68 and 95 % intervals, in standard deviations, by cos(incidence) (B,)
@@ -66,7 +67,7 @@ class AlbedoError:
 
     @staticmethod
     def read(file: h5py.File) -> AlbedoError | None:
-        """None where a map has no albedo or says nothing of its errors."""
+        """The errors that a map holds, None where it has no albedo or no errors of it."""
         if not all(name in file for name in ("albedo", "albedo_std", "albedo_image_std")):
             return None
         own = math.sqrt(float(np.median((file["albedo_image_std"][...] ** 2).sum(axis=1))))
@@ -99,8 +100,8 @@ class Surface:
     elevation : windows (h, w), m; coefficients : (C, H, W) dataset or None where ``uniform`` (C,) holds everywhere
     albedo : (H, W) dataset of the factor that is the last parameter of ``model``, None where the map has none
     deviations : (M, H, W) dataset, standard deviations of the coefficients ``mapped``, or None where unknown
-    image_noise : I/F, what else sets photographs apart from renderings
-    albedo_error : what is known of the albedo's errors, None where the map has none
+    image_noise : I/F, standard deviation of photographs about renderings that the coefficients do not explain
+    albedo_error : None where the map holds none
     """
 
     path: Path
@@ -166,84 +167,89 @@ def open_surface(path: Path, model: str | None, parameters: Mapping[str, float],
 
     Raises LunargrError.
     """
-    with contextlib.ExitStack() as stack:
-        if path.suffix.lower() in _HDF5_SUFFIXES:
-            kind = read_kind(path).name
-            if kind not in ("svbrdf", "scene"):
-                raise ArtefactError(
-                    f"{path}: expected an 'svbrdf' (from 'lunargr infer') or a 'scene' (from 'lunargr ingest'), found a '{kind}'; check the order of the files."
-                )
-            file = stack.enter_context(open_artefact(path, SVBRDF if kind == "svbrdf" else SCENE))
-            grid, elevation = read_grid(file, path), Elevation(file["elevation"])
-            if kind == "svbrdf":
-                if model is not None:
-                    raise ConfigError(
-                        f"`model`: {path.name} holds its own reflectance ({file.attrs['model']}); to render its terrain with another model give `dem` {path.name}."
-                    )
-                reflectance = stored_model(path, str(file.attrs["model"]))
-                _check_names(path, reflectance, read_strings(file, "coefficient_name"))
-                albedo = file.get("albedo")
-                if albedo is not None:
-                    reflectance = AlbedoFactor(reflectance)
-                empty = np.empty(0, np.float32)
-                surface = Surface(path, grid, elevation, reflectance, file["coefficients"], empty, albedo)
-                surface.albedo_error = AlbedoError.read(file)
-                if "coefficients_std" in file:
-                    surface.deviations = file["coefficients_std"]
-                    surface.mapped = tuple(read_strings(file, "map_name"))
-                    surface.image_noise = float(np.nan_to_num(file.attrs.get("image_noise", 0.0)))
-                yield surface
-                return
-        else:
-            dataset = stack.enter_context(open_raster(path, "a DEM, scene.h5 or svbrdf.h5"))
+    if path.suffix.lower() not in _HDF5_SUFFIXES:
+        with open_raster(path, "a DEM, scene.h5 or svbrdf.h5") as dataset:
             grid = _metric_grid(path, dataset, body)
-            sample = read_window(dataset, _middle(dataset))
-            finite = sample[np.isfinite(sample)]
-            # LOLA cubes keep radii, not heights
-            offset = body.radius if finite.size and abs(float(np.median(finite))) > 0.5 * body.radius else 0.0
-            elevation = Elevation(dataset, offset)
-        reflectance = _named_model(path, model)
-        yield Surface(path, grid, elevation, reflectance, None, _uniform(reflectance, parameters))
+            yield _uniform_surface(path, grid, _raw_elevation(dataset, body), model, parameters)
+        return
+    kind = read_kind(path).name
+    if kind not in ("svbrdf", "scene"):
+        raise ArtefactError(
+            f"{path}: expected an 'svbrdf' (from 'lunargr infer') or a 'scene' (from 'lunargr ingest'), found a '{kind}'; check the order of the files."
+        )
+    with open_artefact(path, SVBRDF if kind == "svbrdf" else SCENE) as file:
+        grid, elevation = read_grid(file, path), Elevation(file["elevation"])
+        if kind == "svbrdf":
+            yield _mapped_surface(path, file, grid, elevation, model)
+        else:
+            yield _uniform_surface(path, grid, elevation, model, parameters)
 
 
 @contextlib.contextmanager
 def open_terrain(path: Path, model: str | None, parameters: Mapping[str, float], body: Body) -> Iterator[Surface]:
     """Like :func:`open_surface`, but only the terrain of svbrdf.h5 is used."""
     if path.suffix.lower() in _HDF5_SUFFIXES and read_kind(path).name == "svbrdf":
-        reflectance = _named_model(path, model)
         with open_artefact(path, SVBRDF) as file:
-            grid = read_grid(file, path)
-            uniform = _uniform(reflectance, parameters)
-            yield Surface(path, grid, Elevation(file["elevation"]), reflectance, None, uniform)
+            yield _uniform_surface(path, read_grid(file, path), Elevation(file["elevation"]), model, parameters)
         return
     with open_surface(path, model, parameters, body) as surface:
         yield surface
 
 
-def stored_model(path: Path, name: str) -> ReflectanceModel:
-    """The model that a file names. Raises ArtefactError."""
+def _mapped_surface(path: Path, file: h5py.File, grid: Grid, elevation: Elevation, model: str | None) -> Surface:
+    """An svbrdf.h5 with its own model and maps. Raises ConfigError where another model is named, ArtefactError."""
+    name = str(file.attrs["model"])
+    if model is not None:
+        raise ConfigError(
+            f"`model`: {path.name} holds its own reflectance ({name}); to render its terrain with another model give `dem` {path.name}."
+        )
     try:
-        return get_model(name)
+        reflectance = get_model(name)
     except RegistryError as error:
         raise ArtefactError(f"{path}: root attribute 'model': {error}") from None
+    expected, found = [p.name for p in reflectance.parameters], read_strings(file, "coefficient_name")
+    if found != expected:
+        raise ArtefactError(
+            f"{path}:/coefficient_name: expected {', '.join(expected)} (model {reflectance.name}), found {', '.join(found)}; write it again with 'lunargr infer'."
+        )
+    albedo = file.get("albedo")
+    if albedo is not None:
+        reflectance = AlbedoFactor(reflectance)
+    surface = Surface(path, grid, elevation, reflectance, file["coefficients"], np.empty(0, np.float32), albedo)
+    surface.albedo_error = AlbedoError.read(file)
+    if "coefficients_std" in file:
+        surface.deviations = file["coefficients_std"]
+        surface.mapped = tuple(read_strings(file, "map_name"))
+        surface.image_noise = float(np.nan_to_num(file.attrs.get("image_noise", 0.0)))
+    return surface
+
+
+def _uniform_surface(
+    path: Path, grid: Grid, elevation: Elevation, model: str | None, parameters: Mapping[str, float]
+) -> Surface:
+    """A terrain with one model and one set of parameters everywhere."""
+    reflectance = _named_model(path, model)
+    return Surface(path, grid, elevation, reflectance, None, _uniform(reflectance, parameters))
+
+
+def _raw_elevation(dataset: DatasetReader, body: Body) -> Elevation:
+    """The heights of a raw DEM; LOLA cubes keep radii instead."""
+    size = min(512, dataset.height, dataset.width)
+    middle = Window((dataset.width - size) // 2, (dataset.height - size) // 2, size, size)
+    sample = read_window(dataset, middle)
+    finite = sample[np.isfinite(sample)]
+    holds_radii = finite.size and abs(float(np.median(finite))) > 0.5 * body.radius
+    return Elevation(dataset, body.radius if holds_radii else 0.0)
 
 
 def _named_model(path: Path, model: str | None) -> ReflectanceModel:
-    """The model that was asked for. Raises ConfigError where none was: a terrain has no reflectance of its own."""
+    """The registered model, since a terrain has no reflectance of its own. Raises ConfigError where none is named."""
     if model is None:
         raise ConfigError(
             f"{path}: holds a terrain and no reflectance; name one with `dem` {path} `model` NAME ('lunargr models' lists them), "
             "or render the svbrdf.h5 of 'lunargr infer'."
         )
     return get_model(model)
-
-
-def _check_names(path: Path, model: ReflectanceModel, found: list[str]) -> None:
-    expected = [p.name for p in model.parameters]
-    if found != expected:
-        raise ArtefactError(
-            f"{path}:/coefficient_name: expected {', '.join(expected)} (model {model.name}), found {', '.join(found)}; write it again with 'lunargr infer'."
-        )
 
 
 def _uniform(model: ReflectanceModel, parameters: Mapping[str, float]) -> NDArray[np.float32]:
@@ -260,12 +266,7 @@ def _uniform(model: ReflectanceModel, parameters: Mapping[str, float]) -> NDArra
     return np.array([parameters.get(p.name, p.default) for p in model.parameters], np.float32)
 
 
-def _middle(dataset) -> Window:
-    size = min(512, dataset.height, dataset.width)
-    return Window((dataset.width - size) // 2, (dataset.height - size) // 2, size, size)
-
-
-def _metric_grid(path: Path, dataset, body: Body) -> Grid:
+def _metric_grid(path: Path, dataset: DatasetReader, body: Body) -> Grid:
     """The grid of a raw DEM that can be rendered as it stands: north up, square metres."""
     crs = require_crs(str(path), dataset.crs, dataset.transform)
     check_single_band(path, dataset, "a DEM")

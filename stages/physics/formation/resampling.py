@@ -1,21 +1,22 @@
-"""Images moved by fractions of a pixel."""
+"""Images moved by fractions of a pixel, by the cubic of Catmull & Rom (Keys 1981)."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 from torch import Tensor
 
 
 def displace(image: Tensor, east: Tensor, south: Tensor) -> Tensor:
-    """The image as seen ``east`` columns and ``south`` rows further on, by the cubic of Catmull & Rom (Keys 1981), edges repeated.
+    """The image sampled ``east`` columns and ``south`` rows further on; beyond its edges the outermost pixels repeat.
 
-    It moves straight lines and parabolas exactly. Bilinear sampling would blur by up to a quarter of a squared pixel; the cubic
-    of ``torch.nn.functional.grid_sample`` moves a ramp by 0.14 px where 0.1 is asked for.
+    The cubic moves straight lines and parabolas exactly. Bilinear sampling would blur by up to a quarter of a squared pixel;
+    the cubic of ``torch.nn.functional.grid_sample`` moves a ramp by 0.14 px where 0.1 is asked for.
 
-    image : (B, H, W); east, south : px, broadcastable to it
+    image : (B, H, W); east, south : px, broadcastable to it; returns (B, H, W)
     """
     height, width = image.shape[-2:]
     if all(d.ndim < 2 or d.shape[-2:] == (1, 1) for d in (east, south)):  # rows and columns one after the other
@@ -27,11 +28,11 @@ def displace(image: Tensor, east: Tensor, south: Tensor) -> Tensor:
         moved = torch.empty(image.shape)
         _displace(_array(image), _array(east), _array(south), moved.numpy())
         return moved
-    return sampled(image, east, south)
+    return displace_anywhere(image, east, south)
 
 
-def sampled(image: Tensor, east: Tensor, south: Tensor) -> Tensor:
-    """The plain form of :func:`displace`, with gradients, of fields (B, H, W)."""
+def displace_anywhere(image: Tensor, east: Tensor, south: Tensor) -> Tensor:
+    """As :func:`displace`, on any device and with gradients, all (B, H, W)."""
     height, width = image.shape[-2:]
     right, x = _taps(torch.arange(width, dtype=image.dtype) + east, width)
     down, y = _taps(torch.arange(height, dtype=image.dtype)[:, None] + south, height)
@@ -66,21 +67,18 @@ def _taps(place: Tensor, count: int) -> tuple[list[Tensor], list[Tensor]]:
     first = place.detach().floor()
     t = place - first
     index = [(first.long() + k).clamp(0, count - 1) for k in (-1, 0, 1, 2)]
-    weights = [
+    return index, list(_catmull_rom(t))
+
+
+@register_jitable
+def _catmull_rom(t):
+    """Weights of four pixels at ``t`` of the way from the second to the third; tensors, or numbers in kernels."""
+    return (
         ((2 - t) * t - 1) * t / 2,
         ((3 * t - 5) * t * t + 2) / 2,
         ((4 - 3 * t) * t + 1) * t / 2,
         (t - 1) * t * t / 2,
-    ]
-    return index, weights
-
-
-@njit(cache=True, nogil=True)
-def _cubic(t, weights):  # pragma: no cover - compiled
-    weights[0] = ((2 - t) * t - 1) * t / 2
-    weights[1] = ((3 * t - 5) * t * t + 2) / 2
-    weights[2] = ((4 - 3 * t) * t + 1) * t / 2
-    weights[3] = (t - 1) * t * t / 2
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -92,8 +90,8 @@ def _displace(image, east, south, moved):  # pragma: no cover - compiled
             for j in range(width):
                 u, v = np.float32(j) + east[b, i, j], np.float32(i) + south[b, i, j]
                 column, row = np.floor(u), np.floor(v)
-                _cubic(u - column, x)
-                _cubic(v - row, y)
+                x[0], x[1], x[2], x[3] = _catmull_rom(u - column)
+                y[0], y[1], y[2], y[3] = _catmull_rom(v - row)
                 total = np.float32(0)
                 for k in range(4):
                     r = min(max(int(row) + k - 1, 0), height - 1)
@@ -102,6 +100,3 @@ def _displace(image, east, south, moved):  # pragma: no cover - compiled
                         along += x[n] * image[b, r, min(max(int(column) + n - 1, 0), width - 1)]
                     total += y[k] * along
                 moved[b, i, j] = total
-
-
-__all__ = ["displace", "sampled"]

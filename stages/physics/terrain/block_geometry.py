@@ -35,6 +35,11 @@ class BlockGeometry:
     longitude_deg: Floats32
     latitude_deg: Floats32
 
+    @property
+    def sun_elevation(self) -> Floats32:
+        """(h, w) rad above the local horizontal."""
+        return np.arcsin(np.clip(self.sun[2], -1.0, 1.0))
+
 
 def block_geometry(
     grid: Grid, row: int, col: int, elevation: Floats32, sun_position: Floats, camera_position: Floats | None
