@@ -23,8 +23,8 @@ from stages.common.arrays import Floats32
 DISPLAY_GAMMA = 2.2
 
 
-def _failed(path: Path, message: str) -> OSError | InputError:
-    """OpenImageIO reports a full disk like any other failure: an OSError lets atomic_path tell them apart."""
+def _write_error(path: Path, message: str) -> OSError | InputError:
+    """What to raise. OpenImageIO reports a full disk like any other failure: an OSError lets atomic_path tell them apart."""
     with contextlib.suppress(OSError):
         stat = os.statvfs(path.parent)
         if stat.f_bavail * stat.f_frsize < 1 << 20:
@@ -46,7 +46,7 @@ class ExrWriter:
         block = np.ascontiguousarray(np.stack([band[c] for c in self.channels], axis=-1), np.float32)
         rows = block.shape[0]
         if not self._output.write_scanlines(self._row, self._row + rows, 0, block):
-            raise _failed(self._path, self._output.geterror())
+            raise _write_error(self._path, self._output.geterror())
         self._row += rows
 
 
@@ -64,14 +64,16 @@ def write_exr(
             spec.attribute(f"lunargr:{key}", value if isinstance(value, (int, float)) else str(value))
         output = oiio.ImageOutput.create(str(partial))
         if output is None or not output.open(str(partial), spec):
-            raise _failed(path, output.geterror() if output else oiio.geterror())
+            raise _write_error(path, output.geterror() if output else oiio.geterror())
         try:
             yield ExrWriter(path, output, channels)
         except BaseException:
             output.close()
             raise
         if not output.close() or not _has_last_line(partial, height):
-            raise _failed(path, output.geterror() or "its last lines are not there: the disk is full or over quota")
+            raise _write_error(
+                path, output.geterror() or "its last lines are not there: the disk is full or over quota"
+            )
 
 
 def _has_last_line(path: Path, height: int) -> bool:
@@ -129,7 +131,7 @@ class Preview:
 def stretch(
     image: Floats32, limits: tuple[float, float] | None = None
 ) -> tuple[NDArray[np.uint8], tuple[float, float]]:
-    """A linear image as 8-bit grey for the eye, and the limits (black, white) that were used.
+    """A linear image (H, W) as 8-bit grey for the eye, and the limits (black, white) that were used.
 
     White is the 99.5th percentile, black a little under the 0.2th and never below 0 (0 where there are shadows), with
     display gamma.
@@ -155,7 +157,7 @@ def stretch(
 def write_png(path: Path, image: Floats32, limits: tuple[float, float] | None = None) -> tuple[float, float]:
     """A stretched 8-bit preview, transparent (and black beneath) where ``image`` is NaN; returns the limits used.
 
-    image : (H, W), I/F
+    image : (H, W), I/F; limits : as in :func:`stretch`
     """
     grey, limits = stretch(image, limits)
     alpha = np.isfinite(image).astype(np.uint8)
@@ -172,7 +174,7 @@ def write_png(path: Path, image: Floats32, limits: tuple[float, float] | None = 
             or not output.open(str(partial), spec)
             or not output.write_image(np.ascontiguousarray(pixels))
         ):
-            raise _failed(path, output.geterror() if output else oiio.geterror())
+            raise _write_error(path, output.geterror() if output else oiio.geterror())
         if not output.close() or b"IEND" not in partial.read_bytes()[-12:]:
-            raise _failed(path, output.geterror() or "its end is not there: the disk is full or over quota")
+            raise _write_error(path, output.geterror() or "its end is not there: the disk is full or over quota")
     return limits
