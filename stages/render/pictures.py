@@ -34,6 +34,14 @@ def _write_error(path: Path, message: str) -> OSError | InputError:
     )
 
 
+def _open_output(path: Path, partial: Path, spec: Any) -> Any:
+    """The open file ``partial`` that becomes ``path``. Raises OSError, InputError."""
+    output = oiio.ImageOutput.create(str(partial))
+    if output is None or not output.open(str(partial), spec):
+        raise _write_error(path, output.geterror() if output else oiio.geterror())
+    return output
+
+
 class ExrWriter:
     """Rows of a float32 EXR as they come; channels by name."""
 
@@ -62,9 +70,7 @@ def write_exr(
         spec.attribute("Software", "lunargr")
         for key, value in (metadata or {}).items():
             spec.attribute(f"lunargr:{key}", value if isinstance(value, (int, float)) else str(value))
-        output = oiio.ImageOutput.create(str(partial))
-        if output is None or not output.open(str(partial), spec):
-            raise _write_error(path, output.geterror() if output else oiio.geterror())
+        output = _open_output(path, partial, spec)
         try:
             yield ExrWriter(path, output, channels)
         except BaseException:
@@ -168,13 +174,9 @@ def write_png(path: Path, image: Floats32, limits: tuple[float, float] | None = 
         spec.channelnames = ("Y", "A")
         spec.alpha_channel = 1
         spec.attribute("oiio:UnassociatedAlpha", 1)
-        output = oiio.ImageOutput.create(str(partial))
-        if (
-            output is None
-            or not output.open(str(partial), spec)
-            or not output.write_image(np.ascontiguousarray(pixels))
-        ):
-            raise _write_error(path, output.geterror() if output else oiio.geterror())
+        output = _open_output(path, partial, spec)
+        if not output.write_image(np.ascontiguousarray(pixels)):
+            raise _write_error(path, output.geterror())
         if not output.close() or b"IEND" not in partial.read_bytes()[-12:]:
             raise _write_error(path, output.geterror() or "its end is not there: the disk is full or over quota")
     return limits
