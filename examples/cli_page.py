@@ -40,11 +40,8 @@ def section(name: str, command: Any) -> list[str]:
         if parameter.name == "help":
             continue
         names = ", ".join(f"`{o}`" for o in [*parameter.opts, *parameter.secondary_opts])
-        names = (
-            f"`{(parameter.metavar or parameter.name or '').upper()}`"
-            if parameter.param_type_name == "argument"
-            else names
-        )
+        if parameter.param_type_name == "argument":
+            names = f"`{(parameter.metavar or parameter.name or '').upper()}`"
         lines.append(f"| {names} | {default_of(parameter)} | {cell(getattr(parameter, 'help', '') or '')} |")
     return [*lines, ""]
 

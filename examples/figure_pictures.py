@@ -30,7 +30,7 @@ COMPARED = {
     "kernels_gain_offset": "lunar kernels",
     "hapke_gain_offset": "Hapke, published",
 }
-QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 88]
+QUALITY = 88  # of JPEG
 
 
 def typical_crop(evaluation: h5py.File) -> int:
@@ -41,7 +41,7 @@ def typical_crop(evaluation: h5py.File) -> int:
     return int(order[len(order) // 2])
 
 
-def relit(demo: Path, output: Path) -> None:
+def draw_relit(demo: Path, output: Path) -> None:
     """A test image, the same rendered with one reflectance and with the learned one, and the ground under another Sun."""
     with h5py.File(demo / "evaluation.h5") as evaluation, h5py.File(demo / "pairs.h5") as pairs:
         k = typical_crop(evaluation)
@@ -66,7 +66,7 @@ def relit(demo: Path, output: Path) -> None:
     save(figure, output)
 
 
-def differences(demo: Path, output: Path) -> None:
+def draw_differences(demo: Path, output: Path) -> None:
     """The same crop: measured, rendered by the compared models, and measured minus rendered, in I/F."""
     with h5py.File(demo / "evaluation.h5") as evaluation:
         k = typical_crop(evaluation)
@@ -74,16 +74,16 @@ def differences(demo: Path, output: Path) -> None:
     columns = [name for name in COMPARED if name in rendered]
     figure, axes = plt.subplots(2, len(columns) + 1, figsize=(2.2 * (len(columns) + 1), 4.7), layout="constrained")
     low, high = np.nanpercentile(measured, (0.3, 99.7))
-    left = {name: measured - rendered[name] for name in columns}
-    wide = float(np.nanpercentile(np.abs(np.stack(list(left.values()))), 98))
+    residual = {name: measured - rendered[name] for name in columns}
+    largest = float(np.nanpercentile(np.abs(np.stack(list(residual.values()))), 98))
     grey = axes[0, 0].imshow(measured, cmap="gray", vmin=low, vmax=high)
     axes[0, 0].set_title("measured", fontsize=10)
     for axis, name in zip(axes[0, 1:], columns, strict=True):
         axis.imshow(rendered[name], cmap="gray", vmin=low, vmax=high)
         axis.set_title(COMPARED[name], fontsize=10)
     for axis, name in zip(axes[1, 1:], columns, strict=True):
-        signed = axis.imshow(left[name], cmap="RdBu_r", vmin=-wide, vmax=wide)
-        axis.set_title(f"rms {np.sqrt(np.nanmean(left[name] ** 2)):.4f}", fontsize=10)
+        signed = axis.imshow(residual[name], cmap="RdBu_r", vmin=-largest, vmax=largest)
+        axis.set_title(f"rms {np.sqrt(np.nanmean(residual[name] ** 2)):.4f}", fontsize=10)
     for axis in axes.flat:
         axis.set_axis_off()
     figure.colorbar(grey, ax=axes[0, :], label="I/F", fraction=0.02)
@@ -98,35 +98,31 @@ def renderings(evaluation: h5py.File, k: int) -> dict[str, np.ndarray]:
 
 
 def save(figure, output: Path) -> None:
-    figure.savefig(output, dpi=110, facecolor="white", pil_kwargs={"quality": 88})
+    figure.savefig(output, dpi=110, facecolor="white", pil_kwargs={"quality": QUALITY})
     plt.close(figure)
 
 
-def smaller(source: Path, output: Path, width: int) -> None:
+def shrink(source: Path, output: Path, width: int) -> None:
     """A PNG as JPEG of at most ``width`` px."""
     picture = cv2.imread(str(source), cv2.IMREAD_COLOR)
     scale = min(1.0, width / picture.shape[1])
     size = (round(picture.shape[1] * scale), round(picture.shape[0] * scale))
-    cv2.imwrite(str(output), cv2.resize(picture, size, interpolation=cv2.INTER_AREA), QUALITY)
+    cv2.imwrite(
+        str(output), cv2.resize(picture, size, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+    )
 
 
 def main(root: Path) -> None:
     demo, images = root / "demo", root / "docs" / "images"
-    needed = (
-        "evaluation.h5",
-        "pairs.h5",
-        "render.tif",
-        "render.png",
-        "figures/match_daisy_1.png",
-    )
+    needed = ("evaluation.h5", "pairs.h5", "render.tif", "render.png", "figures/match_daisy_1.png")
     missing = [name for name in needed if not (demo / name).is_file()]
     if missing:
         print(f"pictures stay as they are: no demo/{missing[0]}; run make demo", file=sys.stderr)
         return
-    relit(demo, images / "demo_relit.jpg")
-    smaller(demo / "render.png", images / "demo_render.jpg", 900)
-    differences(demo, images / "demo_crop.jpg")
-    smaller(demo / "figures" / "match_daisy_1.png", images / "demo_match.jpg", 1000)
+    draw_relit(demo, images / "demo_relit.jpg")
+    shrink(demo / "render.png", images / "demo_render.jpg", 900)
+    draw_differences(demo, images / "demo_crop.jpg")
+    shrink(demo / "figures" / "match_daisy_1.png", images / "demo_match.jpg", 1000)
 
 
 if __name__ == "__main__":

@@ -62,11 +62,12 @@ def with_bounds(value: float, low: float | None, high: float | None, spread: flo
     return f"{text} ({low_text} .. {high_text})"
 
 
-def said(sentences: list[Sentence]) -> list[str]:
+def bullets(sentences: list[Sentence]) -> list[str]:
+    """Sentences as a list in Markdown."""
     return [f"- {text}" for text, _ in sentences]
 
 
-def rows_of(result: dict[str, Any], names: Iterable[str], prefix: str = "") -> list[list[str]]:
+def table_rows(result: dict[str, Any], names: Iterable[str], prefix: str = "") -> list[list[str]]:
     """Lines of an evaluation's table."""
     lines = []
     for name in names:
@@ -85,11 +86,11 @@ def evaluated(result: dict[str, Any], names: Iterable[str], more: list[list[str]
         f"Model {result['model']}, {conclusions.basis(result)}, none of it seen in training. MSE in {unit}; +- is the standard deviation of "
         "training runs, in brackets 95 % intervals."
     ]
-    rows = sorted(rows_of(result, names), key=lambda row: list(KNOWS.values()).index(row[1]))
+    rows = sorted(table_rows(result, names), key=lambda row: list(KNOWS.values()).index(row[1]))
     return (
         lines
         + table(["model", "what it may know", "MSE", "SSIM"], [*rows, *more])
-        + said(conclusions.evaluation(result))
+        + bullets(conclusions.evaluation(result))
         + covered(result)
     )
 
@@ -124,7 +125,7 @@ def paper_row(root: Path) -> list[list[str]]:
     except Absent:
         return []
     runs = f"M2 with the paper's network ({conclusions.basis(other)}): "
-    return rows_of(other, [name for name in other["models"] if name.startswith("learned")], runs)
+    return table_rows(other, [name for name in other["models"] if name.startswith("learned")], runs)
 
 
 def demo_rows(root: Path) -> list[str]:
@@ -142,7 +143,7 @@ def held_out(root: Path, name: str, command: str) -> list[str]:
     ]  # fmt: skip
     unit = "" if result.get("image_units") == "iof" else " MSE in DN squared."
     lines = [f"Claim: {result['claim']}; {conclusions.basis(result)}, {len(result['images'])} images.{unit}"]
-    lines += table(["map", "MSE", "SSIM"], rows) + said(conclusions.held_out_images(result))
+    lines += table(["map", "MSE", "SSIM"], rows) + bullets(conclusions.held_out_images(result))
     return lines + covered(result)
 
 
@@ -160,7 +161,7 @@ def matched(root: Path, name: str, command: str) -> list[str]:
 
 
 def diagnosed(root: Path, folder: str, command: str) -> list[str]:
-    return said(diagnosis_sentences(read(root, f"{folder}/diagnosis.json", command)))
+    return bullets(diagnosis_sentences(read(root, f"{folder}/diagnosis.json", command)))
 
 
 def apollo15(root: Path) -> list[str]:
@@ -199,10 +200,10 @@ def commands(_: Path) -> list[str]:
 def benchmark(root: Path, name: str) -> list[str]:
     """What a benchmark printed, word for word."""
     try:
-        said = (root / f"results/bench/{name}.txt").read_text().rstrip()
+        printed = (root / f"results/bench/{name}.txt").read_text().rstrip()
     except FileNotFoundError:
         raise Absent(f"results/bench/{name}.txt", f"make bench ONLY={name.removeprefix('bench_')}") from None
-    return ["```text", *said.splitlines(), "```"]
+    return ["```text", *printed.splitlines(), "```"]
 
 
 SIZES = (

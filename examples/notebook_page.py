@@ -25,11 +25,11 @@ KERNEL = {"kernelspec": {"display_name": "Python 3", "language": "python", "name
 
 @dataclass
 class Cell:
-    """``said`` and ``pictures`` (JPEG) are what running it left."""
+    """``printed`` and ``pictures`` (JPEG) are what running it left."""
 
     kind: str  # 'markdown' | 'code'
     text: str
-    said: str = ""
+    printed: str = ""
     pictures: list[bytes] = field(default_factory=list)
 
 
@@ -56,7 +56,7 @@ def run(cells: list[Cell]) -> dict[str, Any]:
             out = io.StringIO()
             with contextlib.redirect_stdout(out):
                 exec(compile(cell.text, str(SCRIPT), "exec"), names)
-            cell.said = out.getvalue().rstrip()
+            cell.printed = out.getvalue().rstrip()
             for number in plt.get_fignums():
                 picture = io.BytesIO()
                 plt.figure(number).savefig(picture, format="jpeg", dpi=DPI, pil_kwargs=JPEG)
@@ -73,8 +73,8 @@ def page(cells: list[Cell]) -> tuple[str, dict[str, bytes]]:
             lines += [cell.text, ""]
             continue
         lines += ["```python", cell.text, "```", ""]
-        if cell.said:
-            lines += ["```text", cell.said, "```", ""]
+        if cell.printed:
+            lines += ["```text", cell.printed, "```", ""]
         for picture in cell.pictures:
             name = f"relight_{len(pictures) + 1}.jpg"
             pictures[name] = picture
@@ -89,8 +89,8 @@ def notebook(cells: list[Cell]) -> str:
         entry: dict[str, Any] = {"cell_type": cell.kind, "id": f"cell-{number}", "metadata": {}, "source": cell.text}
         if cell.kind == "code":
             outputs: list[dict[str, Any]] = []
-            if cell.said:
-                outputs.append({"output_type": "stream", "name": "stdout", "text": f"{cell.said}\n"})
+            if cell.printed:
+                outputs.append({"output_type": "stream", "name": "stdout", "text": f"{cell.printed}\n"})
             for picture in cell.pictures:
                 data = {"image/jpeg": base64.b64encode(picture).decode()}
                 outputs.append({"output_type": "display_data", "metadata": {}, "data": data})

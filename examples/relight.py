@@ -45,8 +45,8 @@ shown = (
     ),
     (pair.sun_horizon_deg, "horizon towards the Sun, deg", {"cmap": "magma"}),
 )
-for axis, (data, title, look) in zip(axes, shown, strict=True):
-    data.plot.imshow(ax=axis, origin="upper", cbar_kwargs={"label": "", "shrink": 0.8}, **look)
+for axis, (data, title, style) in zip(axes, shown, strict=True):
+    data.plot.imshow(ax=axis, origin="upper", cbar_kwargs={"label": "", "shrink": 0.8}, **style)
     axis.set(title=title, xlabel="", ylabel="", aspect="equal")
 print(f"the Sun stands {elevation:.1f} deg high, {azimuth % 360:.1f} deg clockwise from north")
 

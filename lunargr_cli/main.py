@@ -6,7 +6,6 @@ import contextlib
 import functools
 import gc
 import importlib
-import inspect
 import os
 import pkgutil
 import shlex
@@ -43,23 +42,6 @@ def _command_line() -> str:
     return shlex.join(words)
 
 
-def _check_call(command: Callable[..., None]) -> Callable[..., None]:
-    """The command, which no number that is not finite reaches, and whose errors name its options."""
-
-    @functools.wraps(command)
-    def run(*arguments: Any, **options: Any) -> None:
-        before = running.set(command)
-        try:
-            check_numbers(command, inspect.signature(command).bind(*arguments, **options).arguments)
-            command(*arguments, **options)
-        except LunargrError as error:
-            raise type(error)(spell(str(error))) from None
-        finally:
-            running.reset(before)
-
-    return run
-
-
 def _folder() -> str:
     """The working folder. Raises InputError."""
     try:
@@ -73,20 +55,28 @@ def _plain(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode()
 
 
-def _lock_output(command: Callable[..., None], shared: bool) -> Callable[..., None]:
-    """The command, its inputs safe from its outputs, and holding the lock of its output from its first step on.
+def _with_safeguards(command: Callable[..., None], shared: bool) -> Callable[..., None]:
+    """The command with what every one of them needs around it.
 
+    No number reaches it that is not finite, its inputs are safe from its outputs, it holds the lock of its output from its
+    first step on, its command line is known to what it writes, and its errors name its options.
     shared : several runs may write into the output, a folder, at once
     """
 
     @functools.wraps(command)
-    def run(*arguments: Any, **options: Any) -> None:
-        made_by = _plain(_command_line()), _plain(_folder())
-        with recording(made_by), guarded(command, *arguments, **options), _lock(*arguments, **options):
-            command(*arguments, **options)
+    def run(**options: Any) -> None:
+        spelled = running.set(command)
+        try:
+            check_numbers(command, options)
+            made_by = _plain(_command_line()), _plain(_folder())
+            with recording(made_by), guarded(command, options), _lock(options.get("output")):
+                command(**options)
+        except LunargrError as error:
+            raise type(error)(spell(str(error))) from None
+        finally:
+            running.reset(spelled)
 
-    def _lock(*arguments: Any, **options: Any) -> contextlib.AbstractContextManager[None]:
-        output = inspect.signature(command).bind(*arguments, **options).arguments.get("output")
+    def _lock(output: Any) -> contextlib.AbstractContextManager[None]:
         # Under torchrun the first process alone writes.
         if shared or not isinstance(output, Path) or os.environ.get("RANK", "0") != "0":
             return contextlib.nullcontext()
@@ -133,7 +123,7 @@ for _module in sorted(
     (importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)),
     key=lambda module: module.ORDER,
 ):
-    _command = _check_call(_lock_output(_module.command, getattr(_module, "SHARED_OUTPUT", False)))
+    _command = _with_safeguards(_module.command, getattr(_module, "SHARED_OUTPUT", False))
     # Named, the first sentence is wrapped in the list of commands; left to click, it is cut off.
     _summary = " ".join((_module.command.__doc__ or "").split()).split(". ")[0].rstrip(".")
     app.command(name=_module.NAME, cls=getattr(_module, "CLASS", None), short_help=_summary)(_command)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import enum
-import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from schemas.errors import ConfigError
+from schemas.files.outputs import Target, check_apart, check_folder, check_outputs, protect
 
 
 class Writes(enum.Enum):
@@ -49,29 +49,24 @@ def files_of(command: Callable[..., None], arguments: Mapping[str, Any]) -> File
 
 
 @contextlib.contextmanager
-def guarded(command: Callable[..., None], *arguments: Any, **options: Any) -> Iterator[None]:
+def guarded(command: Callable[..., None], options: Mapping[str, Any]) -> Iterator[None]:
     """Refuse, before anything is done, outputs that cannot be written; within the block no input is replaced.
 
-    Raises ConfigError, InputError.
+    options : the command's parameters by name. Raises ConfigError, InputError.
     """
-    bound = inspect.signature(command).bind(*arguments, **options)
-    bound.apply_defaults()
-    files = files_of(command, bound.arguments)
+    files = files_of(command, options)
     if not files.written:
         yield
         return
-    from schemas.files.outputs import Target, check_apart, check_folder, check_outputs, protect
-
     for path in (*files.read, *(path for _, path, _ in files.written)):
         _check_name(path)
-    replace = bool(bound.arguments.get("overwrite") or bound.arguments.get("resume"))  # what is resumed, stages say
+    replace = bool(options.get("overwrite") or options.get("resume"))  # what is resumed, stages say
     with protect(files.read):
-        targets = [Target(path, name) for name, path, _ in files.written]
-        check_apart(targets)
-        kinds = [kind for _, _, kind in files.written]
-        check_outputs([t for t, k in zip(targets, kinds, strict=True) if k is Writes.FILE], overwrite=replace)
-        for target in (t for t, k in zip(targets, kinds, strict=True) if k is Writes.FOLDER):
-            check_folder(target)
+        check_apart([Target(path, name) for name, path, _ in files.written])
+        check_outputs((Target(p, name) for name, p, kind in files.written if kind is Writes.FILE), overwrite=replace)
+        for name, path, kind in files.written:
+            if kind is Writes.FOLDER:
+                check_folder(Target(path, name))
         yield
 
 

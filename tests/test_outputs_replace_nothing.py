@@ -193,6 +193,6 @@ def test_an_output_that_nobody_marked_cannot_replace_anything(tmp_path):
     result = tmp_path / "result.json"
     result.write_text("kept")
     arguments = {"source": tmp_path / "source", "result": result, "output": tmp_path / "o"}
-    with pytest.raises(ConfigError, match="would replace"), guarded(command, **arguments):
+    with pytest.raises(ConfigError, match="would replace"), guarded(command, arguments):
         command(**arguments)
     assert result.read_text() == "kept"

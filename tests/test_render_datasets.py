@@ -15,7 +15,7 @@ from PIL import Image, ImageSequence
 from render_scene import LAT, LON, SUN, lunargr_render
 
 from stages.physics.maps.grid import read_grid, unit_vectors
-from stages.render.dataset import quaternion
+from stages.render.dataset import to_quaternion
 from stages.render.pictures import read_exr
 
 TRAJECTORY = f"""view_id,longitude_deg,latitude_deg,altitude_m,look_longitude_deg,look_latitude_deg
@@ -105,7 +105,7 @@ def test_a_rotation_comes_back_from_its_quaternion(rng):
     for _ in range(50):
         rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         rotation *= np.sign(np.linalg.det(rotation))
-        w, x, y, z = quaternion(rotation)
+        w, x, y, z = to_quaternion(rotation)
         back = np.array(
             [
                 [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

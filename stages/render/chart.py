@@ -59,7 +59,9 @@ def fit_chart(grid: Grid) -> Chart:
         miss = _terms(check[2] / scale, check[3] / scale, degree) @ solution - np.stack([check[1], check[0]], axis=1)
         error = float(np.abs(miss).max())
         if error < TOLERANCE:
-            return Chart(axes, _square(np.asarray(solution, float), degree), scale, 1.02 * scale, grid.radius)
+            forward = np.zeros((2, degree + 1, degree + 1))
+            forward[:, *np.transpose(_powers(degree))] = solution.T
+            return Chart(axes, forward, scale, 1.02 * scale, grid.radius)
     raise GeometryError(
         f"the scene spans {height} x {width} px of {grid.gsd:g} m, too much of the body for one perspective view; "
         "crop it (gdal_translate -projwin) to what the camera can see."
@@ -93,18 +95,14 @@ def _lattice(grid: Grid, axes: Floats, margin: float, count: int, shift: float) 
     return row[good], col[good], local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]
 
 
+def _powers(degree: int) -> list[tuple[int, int]]:
+    """(i, j) of the terms x^i y^j of a polynomial."""
+    return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+
+
 def _terms(x: Floats, y: Floats, degree: int) -> Floats:
-    return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
-
-
-def _square(solution: Floats, degree: int) -> Floats:
-    result = np.zeros((2, degree + 1, degree + 1))
-    k = 0
-    for i in range(degree + 1):
-        for j in range(degree + 1 - i):
-            result[:, i, j] = solution[k]
-            k += 1
-    return result
+    """(n, terms) at scaled gnomonic coordinates (n,)."""
+    return np.stack([x**i * y**j for i, j in _powers(degree)], axis=1)
 
 
 @numba.njit(cache=True, inline="always")

@@ -90,18 +90,23 @@ class StereoConfig:
 
 @dataclass(frozen=True)
 class Summary:
-    """What was rendered, for the line at the end."""
+    """What was rendered, for the line at the end.
+
+    size_px : samples, lines; known_share, shadow_share : of the pixels, 0..1; mean : I/F; samples : rays per pixel and axis
+    skipped : the view was there already, and was not looked at
+    clipped : pixels where the model's I/F was below 0 and is drawn as 0
+    """
 
     view_id: str
     files: tuple[Path, ...]
     size_px: tuple[int, int]
-    known_share: float
-    mean: float
-    shadow_share: float
-    incidence_deg: tuple[float, float]
-    samples: int
+    known_share: float = math.nan
+    mean: float = math.nan
+    shadow_share: float = math.nan
+    incidence_deg: tuple[float, float] = (math.nan, math.nan)
+    samples: int = 0
     skipped: bool = False
-    clipped: int = 0  # pixels where the model's I/F was below 0 and is drawn as 0
+    clipped: int = 0
 
 
 def inputs(source: Path, config: Config) -> list[Path]:
@@ -131,12 +136,8 @@ def check(config: Config, trajectory: bool = False) -> None:
         raise ConfigError(f"`view`: expected one of {', '.join(VIEWS)}; found '{config.view}'.")
     if config.samples is not None and not 1 <= config.samples <= 32:
         raise ConfigError(f"`samples`: expected rays per pixel and axis in 1..32, found {config.samples}.")
-    if not 0 < config.fov_deg < 180:
-        raise ConfigError(f"`fov_deg`: expected degrees between 0 and 180, found {config.fov_deg:g}.")
     if config.solar_distance_au is not None and not 0.05 <= config.solar_distance_au <= 100:
         raise ConfigError(f"`solar_distance_au`: expected 0.05 .. 100 au, found {config.solar_distance_au:g}.")
-    if config.quaternion is not None and abs(math.hypot(*config.quaternion) - 1) > 0.01:
-        raise ConfigError(f"`quaternion`: expected one of unit length, found {math.hypot(*config.quaternion):g}.")
     if not 0 < config.size_px[0] * config.size_px[1] <= LARGEST_VIEW:
         raise ConfigError(
             f"`size_px`: expected a view of at most {LARGEST_VIEW:,} pixels, found {config.size_px[0]} x {config.size_px[1]}."

@@ -16,13 +16,14 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from schemas.errors import InputError
 from schemas.files.outputs import atomic_path
-from stages.common.arrays import Floats
+from stages.common.arrays import Floats, Floats32, Mask
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
-from stages.render.pictures import DISPLAY_GAMMA, read_exr
+from stages.render.pictures import read_exr, stretch
 
 POINTS_PER_SIDE = 24  # of each view, on which the sparse points are picked
 SAME_PLACE = 2e-3  # of the distance: a point that another view sees this near is the same
@@ -87,6 +88,7 @@ def ray_directions(camera: Pinhole) -> Floats:
 
 
 def _ray_slopes(camera: Pinhole) -> tuple[Floats, Floats]:
+    """Right and down per unit forward of the pixels' rays, (lines, samples) each."""
     sample, line = np.meshgrid(np.arange(camera.samples) + 0.5, np.arange(camera.lines) + 0.5)
     x = (sample - camera.principal_point_px[0]) / camera.focal_px[0]
     y = (line - camera.principal_point_px[1]) / camera.focal_px[1]
@@ -100,8 +102,16 @@ def _white(views: Sequence[View]) -> float:
     return max(float(np.percentile(values, 99.5)), 1e-6) if values.size else 1.0
 
 
-def _write_image(path: Path, image: NDArray[np.float32], white: float) -> Path:
-    grey = np.rint(255 * np.clip(np.nan_to_num(image) / white, 0, 1) ** (1 / DISPLAY_GAMMA)).astype(np.uint8)
+def write_text(path: Path, text: str) -> Path:
+    """A whole text file, or none."""
+    with atomic_path(path) as partial:
+        partial.write_text(text)
+    return path
+
+
+def _write_image(path: Path, image: Floats32, white: float) -> Path:
+    """An 8-bit picture with display gamma. image : (H, W) I/F; white : the I/F that is shown white"""
+    grey, _ = stretch(image, (0.0, white))
     data = cv2.imencode(".png", cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB))[1].tobytes()
     with atomic_path(path) as partial:
         partial.write_bytes(data)
@@ -118,9 +128,7 @@ def _write_world(path: Path, world: World, grid: Grid) -> Path:
         "body_radius": grid.radius,
         "unit": "m",
     }
-    with atomic_path(path) as partial:
-        partial.write_text(json.dumps(document, indent=1))
-    return path
+    return write_text(path, json.dumps(document, indent=1))
 
 
 def _write_nerfstudio(views: Sequence[View], world: World, target: Path) -> list[Path]:
@@ -145,12 +153,8 @@ def _write_nerfstudio(views: Sequence[View], world: World, target: Path) -> list
                 **_intrinsics(view.camera),
             }
         )
-    path = target / "transforms.json"
-    with atomic_path(path) as partial:
-        partial.write_text(
-            json.dumps({"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}, indent=1)
-        )
-    return [*written, path]
+    document = {"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}
+    return [*written, write_text(target / "transforms.json", json.dumps(document, indent=1))]
 
 
 def _intrinsics(camera: Pinhole) -> dict[str, float]:
@@ -183,37 +187,32 @@ def _write_colmap(views: Sequence[View], world: World, target: Path) -> list[Pat
         intrinsics = (*c.focal_px, *c.principal_point_px)
         cameras.append(f"{k + 1} PINHOLE {c.samples} {c.lines} {' '.join(f'{v:.9g}' for v in intrinsics)}")
         rotation, place = world.pose(c)
-        pose = (*quaternion(rotation.T), *(-rotation.T @ place))
+        pose = (*to_quaternion(rotation.T), *(-rotation.T @ place))
         images.append(f"{k + 1} {' '.join(f'{v:.12g}' for v in pose)} {k + 1} {view.view_id}.png")
         images.append(" ".join(f"{x:.4f} {y:.4f} {point}" for x, y, point in seen[k]))
-    written = []
-    for name, text in (("cameras", cameras), ("images", images), ("points3D", lines)):
-        path = folder / f"{name}.txt"
-        with atomic_path(path) as partial:
-            partial.write_text("\n".join(text) + "\n")
-        written.append(path)
-    return written
+    tables = (("cameras", cameras), ("images", images), ("points3D", lines))
+    return [write_text(folder / f"{name}.txt", "\n".join(table) + "\n") for name, table in tables]
 
 
 def _tracks(views: Sequence[View], world: World) -> Iterator[tuple[Floats, list[tuple[int, float, float]]]]:
-    """Ground points of every view, (3,) in the world, with (view, sample, line) of all views that see them."""
+    """Ground points of every view, (3,) in the world's axes, m, with (view, sample, line) of all views that see them."""
     depths = [read_exr(view.exr)["depth"] for view in views]
     for k, view in enumerate(views):
         points, sample, line = _grid_points(view.camera, depths[k], world)
         tracks = [[(k, s, ln)] for s, ln in zip(sample, line, strict=True)]
-        for other, view_there in enumerate(views):
+        for other, other_view in enumerate(views):
             if other == k:
                 continue
-            there, x, y, distance = project(view_there.camera, world, points)
-            found = depths[other][y[there].astype(int), x[there].astype(int)]
-            same = np.abs(found - distance[there]) < SAME_PLACE * distance[there]
-            for n in np.flatnonzero(there)[same]:
+            inside, x, y, distance = project(other_view.camera, world, points)
+            depth = depths[other][y[inside].astype(int), x[inside].astype(int)]
+            same = np.abs(depth - distance[inside]) < SAME_PLACE * distance[inside]
+            for n in np.flatnonzero(inside)[same]:
                 tracks[n].append((other, float(x[n]), float(y[n])))
         yield from zip(points, tracks, strict=True)
 
 
-def _grid_points(camera: Pinhole, depth: NDArray[np.float32], world: World) -> tuple[Floats, Floats, Floats]:
-    """(n, 3) ground points of a coarse grid of pixels, in the world, and their samples and lines."""
+def _grid_points(camera: Pinhole, depth: Floats32, world: World) -> tuple[Floats, Floats, Floats]:
+    """(n, 3) ground points of a coarse grid of pixels, in the world's axes, and their samples and lines (n,)."""
     step = max(1, math.ceil(max(camera.lines, camera.samples) / POINTS_PER_SIDE))
     line, sample = (v.ravel() for v in np.mgrid[step // 2 : camera.lines : step, step // 2 : camera.samples : step])
     known = np.isfinite(depth[line, sample])
@@ -226,7 +225,7 @@ def _grid_points(camera: Pinhole, depth: NDArray[np.float32], world: World) -> t
     )
 
 
-def project(camera: Pinhole, world: World, points: Floats) -> tuple[NDArray[np.bool_], Floats, Floats, Floats]:
+def project(camera: Pinhole, world: World, points: Floats) -> tuple[Mask, Floats, Floats, Floats]:
     """Whether each of (n, 3) world points falls on the image, its sample and line, and its distance, m."""
     rotation, place = world.pose(camera)
     local = (points - place) @ rotation
@@ -238,20 +237,7 @@ def project(camera: Pinhole, world: World, points: Floats) -> tuple[NDArray[np.b
     return inside, x, y, np.linalg.norm(local, axis=1)
 
 
-def quaternion(rotation: Floats) -> tuple[float, float, float, float]:
-    """(3, 3) rotation -> w, x, y, z with w >= 0, by the largest of its four forms (Shepperd 1978)."""
-    trace = float(np.trace(rotation))
-    squares = np.array([trace, *np.diag(rotation)])
-    k = int(np.argmax(squares))
-    r = rotation
-    if k == 0:
-        q = np.array([1 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    else:
-        i, j, m = k - 1, k % 3, (k + 1) % 3
-        q = np.empty(4)
-        q[0] = r[m, j] - r[j, m]
-        q[1 + i] = 1 + 2 * r[i, i] - trace
-        q[1 + j] = r[j, i] + r[i, j]
-        q[1 + m] = r[m, i] + r[i, m]
-    q /= np.linalg.norm(q) * (-1 if q[0] < 0 else 1)
-    return float(q[0]), float(q[1]), float(q[2]), float(q[3])
+def to_quaternion(rotation: Floats) -> tuple[float, float, float, float]:
+    """(3, 3) rotation -> w, x, y, z with w >= 0."""
+    x, y, z, w = (float(v) for v in Rotation.from_matrix(rotation).as_quat(canonical=True))
+    return w, x, y, z

@@ -45,10 +45,10 @@ LATTICE = 33  # rays per axis of the first look
 class Scene:
     """The part of a surface that a camera sees, at the resolution that its pixels need.
 
-    grid : of that part; row, col : its first pixel on the surface's grid; factor : px of the surface per px here
-    maps : (C, h, w) coefficients or (C, 1, 1); horizon : (h, w), rad, or None
+    grid : of that part; maps : (C, h, w) coefficients or (C, 1, 1); horizon : (h, w), rad, or None
     lit : (2, h, w) I/F where extensions have shaded the ground beforehand, and where it was clipped at 0; or None
     added : (h, w) I/F that the Earth and the terrain around add, or None
+    samples : rays per pixel and axis; distance : from the camera to the ground, m
     deviation : (h, w) I/F, standard deviation of photographs about the ground's I/F, or None where it is not asked for
     """
 
@@ -66,9 +66,9 @@ class Scene:
 def seen_window(
     surface: Surface, camera: Camera, relief: tuple[float, float], samples: int | None
 ) -> tuple[Window, int, int, float]:
-    """Which window of the map a camera can see, samples per pixel and axis, coarsening factor, distance to the ground.
+    """Which window of the map a camera can see, rays per pixel and axis, coarsening factor, distance to the ground (m).
 
-    relief : lowest and highest elevation, m. Raises GeometryError where the view misses the map or starts under it.
+    samples : rays per pixel and axis, None for as many as the pixel's footprint asks for; relief : lowest and highest elevation, m. Raises GeometryError where the view misses the map or starts under it.
     """
     grid = surface.grid
     line = np.linspace(0, camera.lines, LATTICE)
@@ -78,10 +78,8 @@ def seen_window(
     _check_above_ground(surface, origins, relief)
     near, far = shell_crossing(origins, directions, grid.radius + relief[0] - 1.0, grid.radius + relief[1] + 1.0)
     steps = np.linspace(0.0, 1.0, 9)
-    distances = (near[:, None] + (far - near)[:, None] * steps).ravel()
-    points = (origins[:, None, :] + 0.0).repeat(9, axis=1).reshape(-1, 3) + distances[:, None] * directions.repeat(
-        9, axis=0
-    )
+    distances = near[:, None] + (far - near)[:, None] * steps
+    points = origins[:, None] + distances[..., None] * directions[:, None]
     known = np.isfinite(distances)
     if not known.any():
         raise GeometryError(
@@ -97,8 +95,7 @@ def seen_window(
     row, col, distances = row[inside], col[inside], distances[inside]
     # beyond the map by more than its own size is no place that a neighbouring ray leads back from
     row, col = np.clip(row, -grid.height, 2 * grid.height), np.clip(col, -grid.width, 2 * grid.width)
-    pad_row = 4 + (np.ptp(row) if row.size else 0) * 1.5 / (LATTICE - 1)
-    pad_col = 4 + (np.ptp(col) if col.size else 0) * 1.5 / (LATTICE - 1)
+    pad_row, pad_col = (4 + np.ptp(places) * 1.5 / (LATTICE - 1) for places in (row, col))
     top, bottom = max(0, int(row.min() - pad_row)), min(grid.height, int(row.max() + pad_row) + 2)
     left, right = max(0, int(col.min() - pad_col)), min(grid.width, int(col.max() + pad_col) + 2)
     if bottom - top < 2 or right - left < 2:
@@ -169,7 +166,10 @@ def make_scene(
     samples: int | None,
     errors: bool = False,
 ) -> Scene:
-    """Read and prepare what a camera sees, with its standard deviations if ``errors``. Raises GeometryError."""
+    """Read and prepare what a camera sees, with its standard deviations if ``errors``. Raises GeometryError.
+
+    relief : lowest and highest elevation, m; samples : see :func:`seen_window`
+    """
     window, samples, factor, distance = seen_window(surface, camera, relief, samples)
     grid = surface.grid.window(*window)
     elevation = surface.elevation[window.part]
@@ -186,12 +186,16 @@ def make_scene(
     deviation = _blocks(window, lambda b: _deviation(surface, light, b, lit, window)) if errors else None
     if factor > 1:
         elevation = coarsen(elevation, factor)
-        horizon = None if horizon is None else coarsen(horizon, factor)
-        lit = None if lit is None else np.stack([coarsen(m, factor) for m in lit])
-        added = None if added is None else coarsen(added, factor)
-        deviation = None if deviation is None else coarsen(deviation, factor)  # errors of neighbours are alike
+        (
+            horizon,
+            lit,
+            added,
+            deviation,
+        ) = (  # errors of neighbours are alike: the deviation of a mean is the mean of theirs
+            None if values is None else coarsen(values, factor) for values in (horizon, lit, added, deviation)
+        )
         if maps.shape[1] > 1:
-            maps = np.stack([coarsen(m, factor) for m in maps])
+            maps = coarsen(maps, factor)
         coarse = grid.transform @ Affine.scale(factor)
         grid = Grid(grid.crs_wkt, coarse, elevation.shape[0], elevation.shape[1], grid.radius)
     return Scene(grid, build_height_field(elevation, grid), maps, horizon, lit, added, samples, distance, deviation)
@@ -223,13 +227,13 @@ def _blocks(window: Window, field: Callable[[Window], Floats32 | None]) -> Float
 def coarsen(values: Floats32, factor: int) -> Floats32:
     """Means of whole factor x factor blocks, over what is known (NaN where nothing is).
 
-    values : (H, W); returns (H // factor, W // factor)
+    values : (..., H, W); returns (..., H // factor, W // factor)
     """
-    height, width = (n // factor for n in values.shape)
-    blocks = values[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    height, width = (n // factor for n in values.shape[-2:])
+    blocks = values[..., : height * factor, : width * factor].reshape(*values.shape[:-2], height, factor, width, factor)
     known = np.isfinite(blocks)
-    count = known.sum(axis=(1, 3))
-    total = np.where(known, blocks, 0).sum(axis=(1, 3), dtype=np.float64)
+    count = known.sum(axis=(-3, -1))
+    total = np.where(known, blocks, 0).sum(axis=(-3, -1), dtype=np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         return (total / count).astype(np.float32)
 
@@ -244,7 +248,7 @@ def render_view(surface: Surface, camera: Camera, light: Light, scene: Scene) ->
     for first in range(0, camera.lines, lines_at_once):
         count = min(lines_at_once, camera.lines - first)
         centre = _trace(camera, scene, first, count, 1)
-        band = _backplanes(surface, light, scene, centre)
+        band = _backplanes(light, scene, centre)
         if scene.deviation is not None:
             band["image_std"] = sample_maps(scene.deviation[None], centre.hits)[0]
         fine = centre if scene.samples == 1 else _trace(camera, scene, first, count, scene.samples)
@@ -256,6 +260,8 @@ def render_view(surface: Surface, camera: Camera, light: Light, scene: Scene) ->
 
 @dataclass(frozen=True)
 class _Rays:
+    """origins : (N, 3) or (1, 3), m; directions : (N, 3); hits : (N,)"""
+
     origins: Floats
     directions: Floats
     hits: Hits
@@ -336,7 +342,7 @@ def _in_space(scene: Scene, rays: _Rays) -> NDArray[np.bool_]:
 
 
 def _mean(values: Floats32, lines: int, width: int, samples: int) -> Floats32:
-    """Pixel means over the known samples; NaN where fewer than half are known."""
+    """(lines width samples^2,) of rays -> pixel means over the known ones; NaN where fewer than half are known."""
     if samples == 1:
         return values
     cells = values.reshape(lines, samples, width, samples)
@@ -349,7 +355,8 @@ def _mean(values: Floats32, lines: int, width: int, samples: int) -> Floats32:
         return np.where(2 * count >= samples**2, total / count, np.nan).astype(np.float32)
 
 
-def _backplanes(surface: Surface, light: Light, scene: Scene, rays: _Rays) -> dict[str, Floats32]:
+def _backplanes(light: Light, scene: Scene, rays: _Rays) -> dict[str, Floats32]:
+    """(N,) by name, as in BACKPLANES."""
     angles, visible = _light_at(light, scene, rays)
     points = hit_points(rays.hits, rays.origins, rays.directions)
     shadow = np.where(angles.cos_incidence > 0, 1 - visible, np.float32(1))

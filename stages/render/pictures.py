@@ -23,8 +23,8 @@ from stages.common.arrays import Floats32
 DISPLAY_GAMMA = 2.2
 
 
-def _failed(path: Path, message: str) -> OSError | InputError:
-    """OpenImageIO reports a full disk like any other failure: an OSError lets atomic_path tell them apart."""
+def _write_error(path: Path, message: str) -> OSError | InputError:
+    """What to raise. OpenImageIO reports a full disk like any other failure: an OSError lets atomic_path tell them apart."""
     with contextlib.suppress(OSError):
         stat = os.statvfs(path.parent)
         if stat.f_bavail * stat.f_frsize < 1 << 20:
@@ -32,6 +32,14 @@ def _failed(path: Path, message: str) -> OSError | InputError:
     return InputError(
         f"{path}: cannot be written ({' '.join(message.split())}); free some space or choose another `output`."
     )
+
+
+def _open_output(path: Path, partial: Path, spec: Any) -> Any:
+    """The open file ``partial`` that becomes ``path``. Raises OSError, InputError."""
+    output = oiio.ImageOutput.create(str(partial))
+    if output is None or not output.open(str(partial), spec):
+        raise _write_error(path, output.geterror() if output else oiio.geterror())
+    return output
 
 
 class ExrWriter:
@@ -46,7 +54,7 @@ class ExrWriter:
         block = np.ascontiguousarray(np.stack([band[c] for c in self.channels], axis=-1), np.float32)
         rows = block.shape[0]
         if not self._output.write_scanlines(self._row, self._row + rows, 0, block):
-            raise _failed(self._path, self._output.geterror())
+            raise _write_error(self._path, self._output.geterror())
         self._row += rows
 
 
@@ -62,16 +70,16 @@ def write_exr(
         spec.attribute("Software", "lunargr")
         for key, value in (metadata or {}).items():
             spec.attribute(f"lunargr:{key}", value if isinstance(value, (int, float)) else str(value))
-        output = oiio.ImageOutput.create(str(partial))
-        if output is None or not output.open(str(partial), spec):
-            raise _failed(path, output.geterror() if output else oiio.geterror())
+        output = _open_output(path, partial, spec)
         try:
             yield ExrWriter(path, output, channels)
         except BaseException:
             output.close()
             raise
         if not output.close() or not _has_last_line(partial, height):
-            raise _failed(path, output.geterror() or "its last lines are not there: the disk is full or over quota")
+            raise _write_error(
+                path, output.geterror() or "its last lines are not there: the disk is full or over quota"
+            )
 
 
 def _has_last_line(path: Path, height: int) -> bool:
@@ -129,7 +137,7 @@ class Preview:
 def stretch(
     image: Floats32, limits: tuple[float, float] | None = None
 ) -> tuple[NDArray[np.uint8], tuple[float, float]]:
-    """A linear image as 8-bit grey for the eye, and the limits (black, white) that were used.
+    """A linear image (H, W) as 8-bit grey for the eye, and the limits (black, white) that were used.
 
     White is the 99.5th percentile, black a little under the 0.2th and never below 0 (0 where there are shadows), with
     display gamma.
@@ -155,7 +163,7 @@ def stretch(
 def write_png(path: Path, image: Floats32, limits: tuple[float, float] | None = None) -> tuple[float, float]:
     """A stretched 8-bit preview, transparent (and black beneath) where ``image`` is NaN; returns the limits used.
 
-    image : (H, W), I/F
+    image : (H, W), I/F; limits : as in :func:`stretch`
     """
     grey, limits = stretch(image, limits)
     alpha = np.isfinite(image).astype(np.uint8)
@@ -166,13 +174,9 @@ def write_png(path: Path, image: Floats32, limits: tuple[float, float] | None = 
         spec.channelnames = ("Y", "A")
         spec.alpha_channel = 1
         spec.attribute("oiio:UnassociatedAlpha", 1)
-        output = oiio.ImageOutput.create(str(partial))
-        if (
-            output is None
-            or not output.open(str(partial), spec)
-            or not output.write_image(np.ascontiguousarray(pixels))
-        ):
-            raise _failed(path, output.geterror() if output else oiio.geterror())
+        output = _open_output(path, partial, spec)
+        if not output.write_image(np.ascontiguousarray(pixels)):
+            raise _write_error(path, output.geterror())
         if not output.close() or b"IEND" not in partial.read_bytes()[-12:]:
-            raise _failed(path, output.geterror() or "its end is not there: the disk is full or over quota")
+            raise _write_error(path, output.geterror() or "its end is not there: the disk is full or over quota")
     return limits

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from stages.common.arrays import Floats
+from stages.common.arrays import Floats, Floats32
 from stages.physics.terrain.block_geometry import slope_difference
 from stages.render.chart import chart_gradient
 from stages.render.raycast import HeightField, Hits, turn
@@ -24,10 +23,10 @@ def hit_points(hits: Hits, origins: Floats, directions: Floats) -> Floats:
 class HitAngles:
     """Per hit (N,) float32, NaN where there is none: cosines of incidence and emission, phase, the Sun's elevation, rad."""
 
-    cos_incidence: NDArray[np.float32]
-    cos_emission: NDArray[np.float32]
-    phase: NDArray[np.float32]
-    sun_elevation: NDArray[np.float32]
+    cos_incidence: Floats32
+    cos_emission: Floats32
+    phase: Floats32
+    sun_elevation: Floats32
 
 
 def hit_angles(field: HeightField, origins: Floats, directions: Floats, hits: Hits, sun_position: Floats) -> HitAngles:
@@ -100,7 +99,7 @@ def _angles(z, forward, scale, axes, origins, directions, depth, row, col, sun, 
         out[3, n] = math.asin(min(1.0, max(-1.0, (x * sx + y * sy + w * sw) / math.sqrt(x * x + y * y + w * w))))
 
 
-def sample_maps(maps: NDArray[np.float32], hits: Hits) -> NDArray[np.float32]:
+def sample_maps(maps: Floats32, hits: Hits) -> Floats32:
     """(C, N) bilinear samples of (C, H, W) maps at the hits; unknown pixels (NaN) carry no weight, all unknown is NaN."""
     maps = np.ascontiguousarray(maps, np.float32)
     result = np.empty((maps.shape[0], len(hits.row)), np.float32)

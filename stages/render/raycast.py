@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import GeometryError
-from stages.common.arrays import Floats
+from stages.common.arrays import Floats, Floats32
 from stages.physics.maps.grid import Grid
 from stages.render.chart import Chart, chart_position, fit_chart, step_length
 
 MISS, HIT, BELOW = 0, 1, 2  # a ray left the scene, met the surface, or came in under it (a hole or the scene's edge)
+GOES_ON = -1
 
 
 @dataclass(frozen=True)
@@ -28,12 +29,12 @@ class HeightField:
     """A DEM ready for rays.
 
     elevation : (H, W) float32, m above the sphere, NaN where unknown
-    pyramid, offsets, shapes : maxima over 2^k x 2^k cells, k = 1.., in one array
-    lowest, highest : m
+    pyramid : maxima over 2^k x 2^k cells, k = 1.., one level after another; offsets, shapes : where each begins, its rows and columns
+    lowest, highest : m; chart : from points in space to pixels; step : m along a ray, see ``chart.step_length``
     """
 
-    elevation: NDArray[np.float32]
-    pyramid: NDArray[np.float32]
+    elevation: Floats32
+    pyramid: Floats32
     offsets: NDArray[np.int64]
     shapes: NDArray[np.int64]
     lowest: float
@@ -56,7 +57,7 @@ class Hits:
     col: Floats
 
 
-def build_height_field(elevation: NDArray[np.float32], grid: Grid) -> HeightField:
+def build_height_field(elevation: Floats32, grid: Grid) -> HeightField:
     """Prepare a DEM for rays: one pass over it. Raises GeometryError where it holds no cell of four known heights.
 
     elevation : (H, W), m, NaN = unknown
@@ -70,18 +71,17 @@ def build_height_field(elevation: NDArray[np.float32], grid: Grid) -> HeightFiel
         shapes.append(((shapes[-1][0] + 1) // 2, (shapes[-1][1] + 1) // 2))
     if len(shapes) == 1:
         shapes.append((1, 1))
-    sizes = np.array([0] + [h * w for h, w in shapes[1:]], np.int64)
-    offsets = np.concatenate([[0], np.cumsum(sizes[1:])[:-1], [0]])[: len(shapes) - 1]
-    offsets = np.concatenate([[0], offsets]).astype(np.int64)
+    ends = np.cumsum([height * width for height, width in shapes[1:]])
+    offsets = np.array([0, 0, *ends[:-1]], np.int64)  # level 0 is the elevation itself
     shape_array = np.array(shapes, np.int64)
-    pyramid = np.empty(int(sizes.sum()), np.float32)
+    pyramid = np.empty(int(ends[-1]), np.float32)
     _build_first(elevation, pyramid, shape_array)
     for level in range(2, len(shapes)):
         _build_next(pyramid, offsets, shape_array, level)
     highest = float(pyramid[-1])
     if not math.isfinite(highest):
         raise GeometryError("the DEM holds no valid elevation where the camera looks; check its nodata.")
-    lowest = float(_lowest(elevation))
+    lowest = float(np.nanmin(elevation))
     return HeightField(elevation, pyramid, offsets, shape_array, lowest, highest, fit_chart(grid), step_length(grid))
 
 
@@ -134,16 +134,6 @@ def _build_next(pyramid, offsets, shapes, level):
 
 
 @numba.njit(cache=True)
-def _lowest(z):
-    best = np.float32(np.inf)
-    for j in range(z.shape[0]):
-        for i in range(z.shape[1]):
-            if z[j, i] < best:
-                best = z[j, i]
-    return best
-
-
-@numba.njit(cache=True)
 def _smallest_root(a, b, c, limit):
     """Smallest root of a t^2 + b t + c in [0, limit], or -1."""
     if c <= 0.0:
@@ -174,7 +164,7 @@ def _trace_step(z, pyramid, offsets, shapes, c0, r0, h0, c1, r1, h1, bulge, leve
 
     bulge : m, how far the ray's height sags below the chord: h(s) = h0 + (h1 - h0) s - bulge s (1 - s)
     level : where in the pyramid to start; above : whether the ray is known to be above the surface
-    returns (status or -1 to go on, s, level, above)
+    returns (status, GOES_ON where it neither meets nor misses, s, level, above)
     """
     height, width = z.shape
     top = shapes.shape[0] - 1
@@ -185,14 +175,14 @@ def _trace_step(z, pyramid, offsets, shapes, c0, r0, h0, c1, r1, h1, bulge, leve
         a, b = -c0 / dc, (width - 1 - c0) / dc
         s, end = max(s, min(a, b)), min(end, max(a, b))
     elif c0 < 0.0 or c0 > width - 1:
-        return -1, 1.0, level, False
+        return GOES_ON, 1.0, level, False
     if dr != 0.0:
         a, b = -r0 / dr, (height - 1 - r0) / dr
         s, end = max(s, min(a, b)), min(end, max(a, b))
     elif r0 < 0.0 or r0 > height - 1:
-        return -1, 1.0, level, False
+        return GOES_ON, 1.0, level, False
     if s >= end:
-        return -1, 1.0, level, False
+        return GOES_ON, 1.0, level, False
     if s > 0.0:
         above = False  # it comes in over the scene's edge here
     i = min(max(int(math.floor(c0 + dc * s)), 0), width - 2)
@@ -233,7 +223,7 @@ def _trace_step(z, pyramid, offsets, shapes, c0, r0, h0, c1, r1, h1, bulge, leve
                 c = ha - (z00 + bx * u + by * v + d * u * v)
                 if c <= 0.0 and not above:
                     if c < -1e-6 * (1.0 + abs(ha)):
-                        return 2, s, level, above
+                        return BELOW, s, level, above
                     c = 0.0
                 b = linear + 2.0 * bulge * s - (bx * dc + by * dr + d * (u * dr + v * dc))
                 a = bulge - d * dc * dr
@@ -241,10 +231,10 @@ def _trace_step(z, pyramid, offsets, shapes, c0, r0, h0, c1, r1, h1, bulge, leve
                 if t < 0.0 and (a * span + b) * span + c <= 0.0:
                     t = span
                 if t >= 0.0:
-                    return 1, s + t, level, above
+                    return HIT, s + t, level, above
                 above = True
         if out >= end:
-            return -1, 1.0, level, above
+            return GOES_ON, 1.0, level, above
         s = out
         if sx <= sy:
             i = (ci + 1) * size if dc > 0.0 else ci * size - 1
@@ -253,7 +243,7 @@ def _trace_step(z, pyramid, offsets, shapes, c0, r0, h0, c1, r1, h1, bulge, leve
             j = (cj + 1) * size if dr > 0.0 else cj * size - 1
             i = min(max(int(math.floor(c0 + dc * s)), ci * size), (ci + 1) * size - 1, width - 2)
         if i < 0 or j < 0 or i > width - 2 or j > height - 2:
-            return -1, 1.0, level, above
+            return GOES_ON, 1.0, level, above
         if level < top:
             level += 1
 
@@ -294,14 +284,14 @@ def _cast_one(
     closest = px * px + py * py + pz * pz  # squared distance of the ray's line from the body's centre
     outer = (radius + highest + 0.01) ** 2 - closest
     if outer <= 0.0:
-        return 0, np.nan, np.nan, np.nan
+        return MISS, np.nan, np.nan, np.nan
     outer = math.sqrt(outer)
     t, last = max(-b - outer, 0.0), -b + outer
     inner = (radius + lowest - 0.01) ** 2 - closest
     if inner > 0.0 and -b - math.sqrt(inner) > 0.0:
         last = min(last, -b - math.sqrt(inner))
     if last <= t:
-        return 0, np.nan, np.nan, np.nan
+        return MISS, np.nan, np.nan, np.nan
     pieces = int(math.ceil((last - t) / step))
     length = (last - t) / pieces
     level, above = max(shapes.shape[0] - 3, 0), False
@@ -320,12 +310,12 @@ def _cast_one(
             result, s, level, above = _trace_step(
                 z, pyramid, offsets, shapes, c0, r0, h0, c1, r1, h1, bulge, level, above
             )
-            if result == 1:
-                return 1, t - length + s * length, r0 + (r1 - r0) * s, c0 + (c1 - c0) * s
-            if result == 2:
-                return 2, np.nan, np.nan, np.nan
+            if result == HIT:
+                return HIT, t - length + s * length, r0 + (r1 - r0) * s, c0 + (c1 - c0) * s
+            if result == BELOW:
+                return BELOW, np.nan, np.nan, np.nan
         else:
             above = False
         known, c0, r0, h0 = inside, c1, r1, h1
         t += length
-    return 0, np.nan, np.nan, np.nan
+    return MISS, np.nan, np.nan, np.nan

@@ -13,17 +13,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
-from schemas.files.outputs import Output, atomic_path, check_output
-from stages.common.arrays import Floats
+from schemas.files.outputs import Output, check_output
+from stages.common.arrays import Floats, Floats32
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.terrain.surface import Surface
 from stages.render.config import SUN, Config, StereoConfig, check, output_files
-from stages.render.dataset import World, make_world, project, ray_directions
+from stages.render.dataset import World, make_world, project, ray_directions, write_text
 from stages.render.pictures import read_exr, write_exr
 from stages.render.setup import make_light, open_source
 from stages.render.viewpoint import look_at, pinhole_view
@@ -73,8 +72,7 @@ def run_stereo(
         "seed": stereo.seed,
         "pairs": pairs,
     }
-    with atomic_path(manifest) as partial:
-        partial.write_text(json.dumps(document, indent=1))
+    write_text(manifest, json.dumps(document, indent=1))
     progress(stereo.count, stereo.count, "pairs")
     return manifest
 
@@ -151,8 +149,11 @@ def _render_pair(
         camera = pinhole_view(
             position, look_at(position, target, roll), config.fov_deg, config.size_px, surface.grid.radius
         )
-        sun = {"sun_azimuth_deg": rng.uniform(0, 360), "sun_elevation_deg": rng.uniform(*stereo.sun_elevation_deg)}
-        own = replace(config, sun_azimuth_deg=sun["sun_azimuth_deg"], sun_elevation_deg=sun["sun_elevation_deg"])
+        sun: dict[str, Any] = {
+            "sun_azimuth_deg": rng.uniform(0, 360),
+            "sun_elevation_deg": rng.uniform(*stereo.sun_elevation_deg),
+        }
+        own = replace(config, **sun)
         files = output_files(folder / f"{name}_{side}.exr", "pinhole")
         light = make_light(surface, own, body, relief)
         render_camera(surface, camera, light, relief, files, own, f"{name}_{side}", show_nothing)
@@ -164,14 +165,15 @@ def _render_pair(
     path = folder / f"{name}_matches.exr"
     with write_exr(path, depths[0].shape[0], depths[0].shape[1], list(matches)) as writer:
         writer.write(matches)
-    lit = np.mean(matches["visible"][np.isfinite(depths[0])]) if np.isfinite(depths[0]).any() else 0.0
+    ground = np.isfinite(depths[0])
+    overlap = float(np.mean(matches["visible"][ground])) if ground.any() else 0.0
     return {
         "pair_id": name,
         "split": split,
         "tile": tile,
         "baseline": float(np.linalg.norm(cameras[0].centre - cameras[1].centre)),
         "convergence_deg": convergence,
-        "overlap": float(lit),
+        "overlap": overlap,
         "left": views[0],
         "right": views[1],
         "matches": path.name,
@@ -193,8 +195,8 @@ def _lines_of_sight(
 
 
 def correspondences(
-    left: Pinhole, right: Pinhole, depths: tuple[NDArray[np.float32], NDArray[np.float32]], world: World
-) -> dict[str, NDArray[np.float32]]:
+    left: Pinhole, right: Pinhole, depths: tuple[Floats32, Floats32], world: World
+) -> dict[str, Floats32]:
     """Where the right camera sees the ground of each left pixel: ``sample``, ``line`` (first pixel's centre at 0.5) and
     ``visible`` (1 = inside its picture and not hidden); each (lines, samples) float32, NaN where the left sees no ground.
 

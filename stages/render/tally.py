@@ -12,14 +12,8 @@ from stages.common.arrays import Floats32
 from stages.render.config import Summary
 
 
-def skipped(view_id: str, files: Sequence[Path], size: tuple[int, int]) -> Summary:
-    """The line of a view that was there already."""
-    nothing = (math.nan, math.nan)
-    return Summary(view_id, tuple(files), size, math.nan, math.nan, math.nan, nothing, 0, skipped=True)
-
-
 class Tally:
-    """Shares and means gathered from bands."""
+    """Shares and means of an image, gathered from its bands of rows."""
 
     def __init__(self) -> None:
         self.pixels = self.known = self.clipped = 0

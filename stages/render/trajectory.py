@@ -10,6 +10,7 @@ from pathlib import Path
 
 from schemas.errors import InputError
 from schemas.files.user_files import read_text
+from stages.render.config import SUN
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _NUMBERS = (
@@ -33,7 +34,10 @@ _KNOWN = ("view_id", "time", *_NUMBERS)
 
 @dataclass(frozen=True)
 class ViewRow:
-    """One row: place (degrees, metres above the sphere), attitude by target or quaternion, and what replaces the command's own options."""
+    """One row: place and target (degrees, degrees, metres above the sphere) or attitude, and what replaces the command's options.
+
+    fov_deg : None for the command's own; sun : fields of ``Config`` by name, empty for the command's own Sun
+    """
 
     view_id: str
     position: tuple[float, float, float]
@@ -105,17 +109,7 @@ def _row(path: Path, number: int, record: dict[str, str | None]) -> ViewRow:
                 f"{where}: expected either a place to look at or all of qw, qx, qy, qz, found both or too few; keep one of them."
             )
         quaternion = tuple(value[q] for q in _QUATERNION)
-    sun: dict[str, float | str] = {
-        name: value[name]
-        for name in (
-            "subsolar_longitude_deg",
-            "subsolar_latitude_deg",
-            "sun_azimuth_deg",
-            "sun_elevation_deg",
-            "solar_distance_au",
-        )
-        if name in value
-    }
+    sun: dict[str, float | str] = {name: value[name] for name in SUN if name in value}
     if text.get("time"):
         sun["time"] = text["time"]
     view_id = text.get("view_id") or f"view_{number:04d}"

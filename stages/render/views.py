@@ -25,7 +25,7 @@ from stages.render.dataset import View, export_views
 from stages.render.perspective import apply_sensor, make_scene, render_view
 from stages.render.pictures import Preview, write_exr, write_png
 from stages.render.setup import camera_place, find_camera, make_light, metadata, open_source
-from stages.render.tally import Tally, skipped
+from stages.render.tally import Tally
 from stages.render.trajectory import ViewRow, read_trajectory
 
 
@@ -67,7 +67,7 @@ def run_trajectory(
         for number, view in enumerate(views):
             progress(number, len(views), "views")
             if view.view_id in done:
-                results.append(skipped(view.view_id, outputs[view.view_id], config.size_px))
+                results.append(Summary(view.view_id, tuple(outputs[view.view_id]), config.size_px, skipped=True))
                 continue
             own = _with_row(config, view)
             key = repr([getattr(own, k) for k in SUN])

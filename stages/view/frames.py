@@ -14,7 +14,9 @@ NODES = 17
 
 @dataclass(frozen=True)
 class Frames:
-    """axes : (NODES, NODES, 3, 3) float32, grid-east, grid-north and up of each node in the axes of the map's middle
+    """Local axes and pixel sizes at nodes spread evenly over a map.
+
+    axes : (NODES, NODES, 3, 3) float32, grid-east, grid-north and up of each node in the axes of the map's middle
     pixel_size : (NODES, NODES, 2) float32, true m from row to row and from column to column, at height 0
     middle : (3, 3), the middle's axes in body-fixed coordinates; convergence_deg : of true north there
     """

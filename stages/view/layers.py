@@ -80,10 +80,11 @@ def read_content(path: Path, max_px: int) -> Content:
         known &= np.isfinite(layer.values)
     if not known.any():
         raise InputError(f"{path}: expected valid coefficients and elevations, found none; nothing to show.")
-    return Content(_coarse_grid(full, factor, elevation.shape), model, elevation, coefficients, others, factor)
+    return Content(coarse_grid(full, factor, elevation.shape), model, elevation, coefficients, others, factor)
 
 
-def _coarse_grid(full: Grid, factor: int, shape: tuple[int, ...]) -> Grid:
+def coarse_grid(full: Grid, factor: int, shape: tuple[int, ...]) -> Grid:
+    """The grid of means over ``factor`` x ``factor`` pixels, of which there are ``shape``."""
     return Grid(full.crs_wkt, full.transform @ Affine.scale(factor), shape[0], shape[1], full.radius)
 
 
@@ -102,15 +103,21 @@ def _others(file: h5py.File, grid: Grid, names: list[str], factor: int) -> list[
             which = mapped if deviations else names
             if len(which) == len(variable):
                 found += [
-                    _layer(variable, f"{of}_std" if deviations else f"{name}_{of}", f"{name} of {of}", (k,), factor)
-                    for k, of in enumerate(which)
+                    _layer(
+                        variable,
+                        f"{coefficient}_std" if deviations else f"{name}_{coefficient}",
+                        f"{name} of {coefficient}",
+                        (k,),
+                        factor,
+                    )
+                    for k, coefficient in enumerate(which)
                 ]
     return [layer for layer in found if np.isfinite(layer.values).any()]
 
 
 def _layer(variable: h5py.Dataset, name: str, title: str, lead: tuple[int, ...], factor: int) -> Layer:
-    told = variable.attrs.get("long_name")
-    text = title.replace("_", " ") + (f": {told}" if told is not None else "")
+    long_name = variable.attrs.get("long_name")
+    text = title.replace("_", " ") + (f": {long_name}" if long_name is not None else "")
     return Layer(name, text, _unit(variable), _shrunk(variable, lead, factor))
 
 
@@ -132,7 +139,7 @@ def _shrunk(variable: h5py.Dataset, lead: tuple[int, ...], factor: int) -> Float
 
 
 def block_mean(values: Floats32, factor: int) -> Floats32:
-    """Means of ``factor`` x ``factor`` pixels that are known, NaN where more than half of them are not."""
+    """(H, W) -> (H // factor, W // factor), means of the pixels that are known, NaN where more than half of them are not."""
     if factor == 1:
         return values
     height, width = (n // factor for n in values.shape)

@@ -32,7 +32,7 @@ class Packed:
 
 
 def pack_map(values: NDArray, known: NDArray[np.bool_], step: float) -> Packed:
-    """values : (H, W), kept to half a ``step``; where not ``known`` the page gets something smooth, to be ignored."""
+    """Values (H, W), kept to half a ``step``; where not ``known`` (H, W) the page gets something smooth, to be ignored."""
     filled = fill_along_rows(values, known)
     offset = float(filled.min())
     step = max(step, (float(filled.max()) - offset) / (LEVELS // 8), 1e-30)
@@ -50,7 +50,7 @@ def pack_map(values: NDArray, known: NDArray[np.bool_], step: float) -> Packed:
 
 
 def spread_step(values: NDArray, known: NDArray[np.bool_], levels: int) -> float:
-    """The range between the 1st and 99th percentiles in so many steps."""
+    """The step that divides the range between the 1st and 99th percentiles of the known values (H, W) into ``levels``."""
     sample = values[known]
     if sample.size == 0:
         return 1.0
@@ -59,7 +59,7 @@ def spread_step(values: NDArray, known: NDArray[np.bool_], levels: int) -> float
 
 
 def fill_along_rows(values: NDArray, known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Unknown pixels take the last known value before them in reading order (the first known at the start)."""
+    """(H, W) in which unknown pixels take the last known value before them in reading order (the first known at the start)."""
     flat, mask = np.asarray(values, np.float64).ravel(), known.ravel()
     if not mask.any():
         return np.zeros(values.shape)
@@ -92,6 +92,10 @@ class Blob:
             "order": packed.order,
             "planes": packed.planes,
         }
+
+    def add_mask(self, mask: NDArray[np.bool_]) -> dict[str, object]:
+        """A mask (H, W) as a map of 0 and 1."""
+        return self.add_map(pack_map(mask, np.ones_like(mask), 1.0))
 
     def text(self) -> str:
         """All of it in base64."""

@@ -68,9 +68,8 @@ def describe(content: Content, frames: Frames, photographs: Sequence[Photograph]
         entry["map"] = blob.add_map(packed)
         # most maps are known where the coefficients are
         if not np.array_equal(good, mapped):
-            entry["known"] = blob.add_map(pack_map(good, np.ones_like(good), 1.0))
+            entry["known"] = blob.add_mask(good)
         fields.append(entry)
-    everywhere = np.ones_like(known)
     return {
         "height": grid.height,
         "width": grid.width,
@@ -80,8 +79,8 @@ def describe(content: Content, frames: Frames, photographs: Sequence[Photograph]
         "model": {"name": content.model.name, "title": content.model.title, "formula": content.model.formula},
         "count": len(content.coefficients),
         "elevation": blob.add_map(pack_map(content.elevation, known, HEIGHT_STEP * grid.gsd)),
-        "elevation_known": blob.add_map(pack_map(known, everywhere, 1.0)),
-        "mapped": blob.add_map(pack_map(mapped, everywhere, 1.0)),
+        "elevation_known": blob.add_mask(known),
+        "mapped": blob.add_mask(mapped),
         "fields": fields,
         "nodes": NODES,
         "axes": [round(float(v), 9) for v in frames.axes.ravel()],
@@ -104,7 +103,7 @@ def _photograph(photograph: Photograph, blob: Blob) -> dict[str, Any]:
         "elevation": photograph.sun_elevation_deg,
         "camera": photograph.camera.tolist(),
         "map": blob.add_map(pack_map(photograph.image, good, spread_step(photograph.image, good, PHOTOGRAPH_LEVELS))),
-        "known": blob.add_map(pack_map(good, np.ones_like(good), 1.0)),
+        "known": blob.add_mask(good),
     }
 
 

@@ -11,17 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import PAIRS, SPLITS, InputError, open_artefact, read_strings
+from stages.common.arrays import Floats32
 from stages.physics.maps.grid import Grid
 from stages.view.frames import Frames
-from stages.view.layers import Floats32, block_mean
+from stages.view.layers import block_mean
 
 SAME_GSD = 0.01  # relative
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """image : (h, w) float32, NaN where invalid; row, col of its first pixel on the page's map
+    """A crop of a measured image, with its Sun and its camera.
 
+    image : (h, w) float32, NaN where invalid; row, col of its first pixel on the page's map
     sun_azimuth_deg, sun_elevation_deg : over the map's middle, from true north
     camera : (3,), m, from the middle's point on the sphere along the middle's axes
     """

@@ -7,12 +7,12 @@ from typing import Any, cast
 import cv2
 import numpy as np
 
-from stages.physics.maps.grid import Grid
+from stages.common.arrays import Floats32
 from stages.physics.terrain.shading import Light, shade_block
 from stages.physics.terrain.sun import sun_from_angles
 from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface
-from stages.view.layers import Content, Floats32, block_mean
+from stages.view.layers import Content, block_mean, coarse_grid
 
 LARGEST_PX = 720
 GAMMA = 2.2
@@ -24,10 +24,7 @@ def still_jpeg(content: Content, sun_azimuth_deg: float, sun_elevation_deg: floa
     factor = max(1, -(-max(content.elevation.shape) // LARGEST_PX))
     elevation = block_mean(content.elevation, factor)
     coefficients = np.stack([block_mean(layer.values, factor) for layer in content.coefficients])
-    grid = content.grid
-    small = Grid(
-        grid.crs_wkt, grid.transform @ grid.transform.scale(factor), elevation.shape[0], elevation.shape[1], grid.radius
-    )
+    small = coarse_grid(content.grid, factor, elevation.shape)
     sun = sun_from_angles(sun_azimuth_deg, sun_elevation_deg, small)
     relief = float(np.nanmax(elevation) - np.nanmin(elevation))
     # arrays slice as the file's variables do

@@ -108,15 +108,15 @@ class Relighter {
   }
 
   /** Shade the layer into ``shown``; span: the values that become 0 and 1 there */
-  show(what, span) {
+  show(index, span) {
     const origin = new THREE.Vector2(0, 0), limits = new THREE.Vector2(...span);
-    this.passes.run("shade", this.uniforms({ what, form: 0, origin, range: limits }), this.shown);
+    this.passes.run("shade", this.uniforms({ layer_index: index, form: 0, origin, range: limits }), this.shown);
   }
 
   /** Four numbers of each pixel of a window; form 1: I/F (-1: unknown), incidence, emission, phase; 2: sunlight, slope, height */
   read(row, col, height, width, form = 1) {
     const into = target(width, height, THREE.RGBAFormat, THREE.FloatType), out = new Float32Array(4 * width * height);
-    const values = this.uniforms({ what: 0, form, origin: new THREE.Vector2(col, row), range: new THREE.Vector2(0, 1) });
+    const values = this.uniforms({ layer_index: 0, form, origin: new THREE.Vector2(col, row), range: new THREE.Vector2(0, 1) });
     this.passes.run("shade", values, into);
     this.renderer.readRenderTargetPixels(into, 0, 0, width, height, out);
     into.dispose();
@@ -131,9 +131,9 @@ class Relighter {
   }
 
   /** Values that black and white stand for, from a few thousand pixels of the map; span: as it was shown with */
-  contrast(what, span) {
-    const layer = this.layers[what];
-    if (what >= QUANTITIES.length) return spread(layer.values, 0.005);
+  contrast(index, span) {
+    const layer = this.layers[index];
+    if (index >= QUANTITIES.length) return spread(layer.values, 0.005);
     if (layer.name === "elevation") return spread(this.page.elevation, 0);
     if (layer.name === "sunlight") return [0, 1];
     const size = 96, into = (this.sample ??= target(size, size, THREE.RGBAFormat, THREE.FloatType));
@@ -144,7 +144,7 @@ class Relighter {
     found.sort((a, b) => a - b);
     if (!found.length) return [0, 1];
     const low = found[Math.floor(0.002 * found.length)], high = found[Math.floor(0.995 * (found.length - 1))];
-    if (what === 0) return [Math.min(0.9 * low, high / 2), Math.max(1.05 * high - 0.05 * low, 1e-4)];
+    if (index === 0) return [Math.min(0.9 * low, high / 2), Math.max(1.05 * high - 0.05 * low, 1e-4)];
     return high > low ? [low, high] : [low - 0.5, low + 0.5];
   }
 }

@@ -8,7 +8,7 @@ uniform vec3 sun;                // unit vector, in the axes of the map's middle
 uniform bool from_above;         // every pixel is seen from straight above, else from
 uniform vec3 camera;             // m, from the middle's point on the sphere
 uniform float radius, base;      // m; base: the page's base height
-uniform int what;                // see relight.js; from FIRST_FIELD on a map
+uniform int layer_index;         // of QUANTITIES in relight.js, from FIRST_FIELD on of the maps
 uniform vec2 range;              // the value that becomes 0, and the one that becomes 1
 uniform ivec2 origin;
 uniform int form;                // 0: (value, known); 1, 2: four numbers of a pixel
@@ -69,14 +69,14 @@ void main() {
   if (form == 1) { result = vec4(known ? image : -1.0, angles.xyz); return; }
   if (form == 2) { result = vec4(mu0 > 0.0 ? visible : 0.0, angles.w, is_known(here) ? base + here : NOTHING, 0.0); return; }
   float value = image;
-  if (what > 0) known = is_known(here);
-  if (what == 1) value = mu0 > 0.0 ? visible : 0.0;
-  else if (what == 2) value = angles.x;
-  else if (what == 3) value = angles.y;
-  else if (what == 4) value = angles.z;
-  else if (what == 5) value = angles.w;
-  else if (what == 6) value = base + here;
-  else if (what >= FIRST_FIELD) known = field(place, what - FIRST_FIELD, value);
+  if (layer_index > 0) known = is_known(here);
+  if (layer_index == 1) value = mu0 > 0.0 ? visible : 0.0;
+  else if (layer_index == 2) value = angles.x;
+  else if (layer_index == 3) value = angles.y;
+  else if (layer_index == 4) value = angles.z;
+  else if (layer_index == 5) value = angles.w;
+  else if (layer_index == 6) value = base + here;
+  else if (layer_index >= FIRST_FIELD) known = field(place, layer_index - FIRST_FIELD, value);
   float alpha = known ? 1.0 : 0.0;
   result = vec4((value - range.x) / (range.y - range.x) * alpha, alpha, 0.0, 1.0);
 }
