@@ -65,7 +65,7 @@ def search(state: State, most: int) -> Outcome:
                 break
         tried.sort(key=lambda f: -f.gain)
         faint = FAINT**2 / 2 * float(view.whole.gram[0, 0])
-        sure = [f for f in tried if f.gain_interval()[0] > 0 and f.gain > faint]
+        sure = [f for f in tried if f.gain_interval()[0] > 0 and (f.gain > faint or shows_in_shade(view.whole, f))]
         for f in tried:
             low, high = f.gain_interval()
             if low > 0 and f not in sure:
@@ -120,6 +120,14 @@ def doubt_all(state: State, view: View, sure: float = SURE) -> dict[str, tuple[f
         out[cause.effect.name] = cause.found.gain, f"fitted with everything else {why}"
         settle(state, view)
     return out
+
+
+def shows_in_shade(whole: Whole, found: Found) -> bool:
+    """Whether deep shadow of held-out ground surely gains: what light there is asks neither the law nor the covariance of lit ground."""
+    if found.guise.per_frame:
+        return False
+    gains = whole.held_out(whole.places(found.guise), whole.exclude(found.guise), found.spread, shade=True)
+    return interval(gains)[0] > 0
 
 
 def choose(sure: list[Found]) -> tuple[Found, list[str]]:
@@ -316,7 +324,6 @@ def _few(rows: Rows, count: int) -> Rows:
         shared_dark=0 * rows.shared_dark[keep],
         own=rows.own[:0],
         own_mean=rows.own_mean[:0],
-        own_dark=rows.own_dark[:0],
     )
 
 
