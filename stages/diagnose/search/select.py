@@ -85,8 +85,12 @@ def search(state: State, most: int) -> Outcome:
             if not sure or taken:
                 break
             chosen, group = choose(sure)
+            before = list(state.causes)
             why = take(state, view, chosen, group)
             taken = not why
+            for gone in [c for c in before if c not in state.causes]:
+                refused.add(gone.effect.name)
+                out.rejected[gone.effect.name] = (gone.found.gain, f"beside {chosen.effect} it is no cause any more")
             if why:
                 sure = [f for f in sure if f is not chosen]
                 refused.add(chosen.effect)
@@ -184,11 +188,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     saved = [(c, c.copy()) for c in causes]
     cause = Cause(first, found, group=group)
     state.causes.append(cause)
-    look = refine(state, view)
-    why = _doubt_any(state, cause)
-    if not why:
-        errors_over_images(state, look)
-        why = _doubt_any(state, cause)
+    look, why = _fit_beside(state, view, cause)
     if not why:
         gains, total, test_gains = secant_gains(state, cause, look, tested)
         low, high = interval(gains, cause.found.sizes)
@@ -198,6 +198,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
             why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
         why = why or contradicted(test_gains)
     if why:
+        state.open[cause.effect.name] = cause.worst_error
         state.causes[:] = causes
         for c, before in saved:
             vars(c).update(vars(before))
@@ -229,12 +230,31 @@ def ordinary(first: Effect) -> str:
     return ""
 
 
-def _doubt_any(state: State, cause: Cause) -> str:
-    """Why the cause, or another beside it, cannot be one, or ''."""
-    others = [c for c in state.causes if c is not cause]
-    return doubt(state, cause) or next(
-        (f"beside it {c.effect.name} is no cause any more: {w}" for c in others if (w := doubt(state, c))), ""
-    )
+def _fit_beside(state: State, view: View, cause: Cause) -> tuple[View, str]:
+    """Fit everything with the new cause; why it, or another beside it, cannot be one, or ''.
+
+    One that is nothing beside the new one makes way for it: the new one is something beside either. Values per frame, which mimic what
+    one value for all does, drive none out.
+    """
+    while True:
+        look = refine(state, view)
+        why, other = _doubt_any(state, cause)
+        if not why:
+            errors_over_images(state, look)
+            why, other = _doubt_any(state, cause)
+        if other is None or cause.found.guise.per_frame or ODD in why:
+            return look, why
+        state.causes.remove(other)
+
+
+def _doubt_any(state: State, cause: Cause) -> tuple[str, Cause | None]:
+    """Why the cause, or another beside it, cannot be one, or ''; and which other."""
+    if why := doubt(state, cause):
+        return why, None
+    for c in state.causes:
+        if why := doubt(state, c):
+            return f"beside it {c.effect.name} is no cause any more: {why}", c
+    return "", None
 
 
 def contradicted(gains: np.ndarray) -> str:

@@ -48,6 +48,13 @@ class Cause:
         """Whether one amount acts on all images, which other ground can be asked about by itself."""
         return type(self.effect).scope == "scene" and len(self.found.guise.columns) == 1
 
+    @property
+    def worst_error(self) -> float:
+        """The largest error of any kind of a scene-wide value, in sizes worth knowing."""
+        strong = type(self.effect).strong
+        every = [(k, e) for kind in (self.errors, self.over_images) for k, e in kind.items() if strong.get(k)]
+        return max((e / strong[k] for k, e in every), default=0.0)
+
     def copy(self) -> Cause:
         """As it is now, whatever is fitted later."""
         out = copy.copy(self)
@@ -79,6 +86,8 @@ class State:
     causes: list[Cause] = field(default_factory=list)
     # effects whose best values nothing real has: of them the others have no ordinary amounts beside them
     impossible: set[str] = field(default_factory=set)
+    # effects that were fitted and refused -> their largest error, in sizes worth knowing
+    open: dict[str, float] = field(default_factory=dict)
     reference: Nominal | None = None
     say: Callable[[str], None] = lambda text: None
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
