@@ -111,10 +111,12 @@ def test_leaving_out_images_is_leaving_out_their_rows(answers):
     gone = [int(f) for f in row.patch.frames[:2]]
     by_schur = products(row, view.model, view.grid, state.frames, None, [gone])
     kept = torch.tensor([int(f) not in gone for f in row.patch.frames])
-    of_patch = ("images", "weight", "scale", "slopes", "level", "frames", "dark")
-    patch = replace(row.patch, **{name: getattr(row.patch, name)[kept] for name in of_patch})
-    of_rows = ("shared", "shared_mean", "own", "own_mean", "shared_dark", "own_dark")
-    fewer = Rows(patch, **{name: getattr(row, name)[:, kept] for name in of_rows})
+    lighter = torch.tensor([int(f) not in gone for f in row.patch.dark_frames], dtype=torch.bool)
+    of_patch = {"images": kept, "weight": kept, "scale": kept, "slopes": kept, "level": kept, "frames": kept}
+    of_patch |= {"shaded": lighter, "dark_frames": lighter, "dark": lighter}
+    patch = replace(row.patch, **{name: getattr(row.patch, name)[used] for name, used in of_patch.items()})
+    of_rows = {"shared": kept, "shared_mean": kept, "own": kept, "own_mean": kept, "shared_dark": lighter}
+    fewer = Rows(patch, **{name: getattr(row, name)[:, used] for name, used in of_rows.items()})
     plain = products(fewer, view.model, view.grid, state.frames)
     there = np.isin(by_schur.place, plain.place)
     scale = np.sqrt(np.outer(plain.gram.diagonal(), plain.gram.diagonal())).clip(1e-20)

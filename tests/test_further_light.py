@@ -6,12 +6,15 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from relief import hills, metric_grid
 from render_scene import LAT, LON, lunargr_render, write_dem
 
 from schemas.files.outputs import Output
 from stages import render
+from stages.effects import get_effect
 from stages.physics.bodies.ephemeris import earth_position
+from stages.physics.formation.chain import Observation, form
 from stages.physics.horizon import make_overview
 from stages.physics.light.earth import EARTH_DISTANCE, earth_irradiance
 from stages.physics.light.sky import Surroundings, terrain_light
@@ -68,6 +71,28 @@ def test_one_bounce_in_a_spherical_crater_is_buhls(crater, tmp_path):
     assert np.abs(light[away > 420]).max() < 0.02 * expected
     level = 1 - (420 - math.sqrt(420**2 - 300**2)) / (2 * 420)
     assert channels["sky_view"][inside].mean() == pytest.approx(level, abs=0.005)
+
+
+def test_light_that_diagnose_looks_for_is_buhls_wherever_the_camera_stands():
+    """Of a law that is brighter towards the Sun, between facets as bright as at 30 deg; explaining a measurement, in the dark alone."""
+    z, away = bowl(n=192, radius=400.0, rim=300.0)
+    sun = torch.tensor([[math.cos(math.radians(20)), 0.0, math.sin(math.radians(20))]] * 2)
+    cameras = torch.tensor([[1e7, 0.0, 1e7], [-1e7, 0.0, 1e7]])
+    ground = torch.from_numpy(z)[None].expand(2, -1, -1).contiguous()
+    # the rim's circle as seen from inside: the Sun is hidden where the mouth is left before the sphere
+    row, col = np.mgrid[:192, :192] - 95.5
+    top = np.sqrt(np.maximum(300.0**2 - (row * GSD) ** 2, 0)) - col * GSD
+    horizon = np.where(away < 300, np.arctan2(-z, np.maximum(top, 1e-3)), -1.0)
+    scene = Observation(ground, sun, cameras, GSD, 1e9, torch.from_numpy(horizon).float()[None].expand(2, -1, -1))
+    model = get_model("M2")
+    coefficients = torch.tensor([0.2, 0.1, 0.0])[None, :, None, None]
+    effect = get_effect("interreflection")({"strength": 1.0})
+    light = form(scene, model, coefficients, [effect]) - form(scene, model, coefficients)
+    albedo = (0.2 * math.cos(math.radians(30)) + 0.1 * math.cos(math.radians(30))) / math.cos(math.radians(30))
+    expected = albedo**2 * math.sin(math.radians(20)) * (300 / (2 * 400)) ** 2
+    inside = torch.from_numpy(away < 240)
+    torch.testing.assert_close(light[0], light[1], atol=1e-7, rtol=0)
+    assert float(light[0][inside].mean()) == pytest.approx(expected, rel=0.1)  # of cells of 15 m
 
 
 def test_a_camera_sees_the_bounce_that_the_map_shows(crater, tmp_path):

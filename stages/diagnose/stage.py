@@ -27,6 +27,7 @@ from stages.diagnose.result.answer import Answer
 from stages.diagnose.result.files import write_diagnosis
 from stages.diagnose.result.named import by_histogram, by_registration, by_search
 from stages.diagnose.result.score import blind_effects, displacements, score, unconfirmed
+from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, doubt_all, search
 from stages.diagnose.search.shadows import by_shadows, contradicted
@@ -137,7 +138,8 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         doubted |= doubt_all(state, outcome.view, STILL)
     placed, refused = by_registration(state)
     clipped = cut(data, state) if cut else None  # was taken out of the images before anything was sought
-    answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + by_shadows(state)
+    ground, shown = by_ground(state)
+    answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + by_shadows(state) + ground
     rejected = refused | outcome.rejected | doubted
     answer.rejected = {k: v for k, v in rejected.items() if k not in {c.effect.name for c in answer.causes}}
     if state.registration is not None:
@@ -147,7 +149,8 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     after = _residual(state)
     answer.budget = budget(view.rows, view.model, view.grid, before, after)
     line, share = peak(view.rows, view.model, view.grid, frames)
-    answer.blind = blind_effects(state, outcome, {c.effect.name for c in answer.causes})
+    known = shown | {c.effect.name for c in answer.causes}
+    answer.blind = blind_effects(state, outcome, known)
     answer.unexplained_fraction = share if line > LINE else 0.0
     if not answer.causes and outcome.sure:
         answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)

@@ -185,6 +185,14 @@ class Effect(ABC):
         return None
 
     @classmethod
+    def read_off_ground(cls, albedo: Tensor, seen: Tensor) -> tuple[Values, Tensor, Tensor] | None:
+        """(values per site, size^2, ordinary size^2) of an effect that shows in what all images of a site have in common, or None.
+
+        albedo, seen : (sites, H, W) relative to the prediction, and 1 where it is known; both sizes are (sites,)
+        """
+        return None
+
+    @classmethod
     def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
         """Whether anything real has these values; a fit that ends elsewhere stands for something else."""
         return True
@@ -227,6 +235,11 @@ class Effect(ABC):
         known = (index >= 0) & (index < len(given))
         picked = given.to(like)[index.clamp(0, len(given) - 1)]
         return torch.where(known, picked, torch.full_like(picked, self.null()[name]))[:, None, None]
+
+
+def telling_share(state: State) -> Tensor | float:
+    """Of light that deep shadow alone tells of: 1 in a prediction; where a measurement is being explained, what the Sun leaves dark, (B, H, W)."""
+    return 1.0 if state.measured is None or state.sun_visibility is None else 1 - state.sun_visibility
 
 
 _EFFECTS: dict[str, type[Effect]] = {}

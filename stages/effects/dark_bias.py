@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import ClassVar
 
-from stages.effects.base import Effect, Survey, Trial, register
+from stages.effects.base import Effect, Survey, Trial, register, telling_share
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
@@ -24,7 +24,6 @@ class DarkBias(Effect):
     parameters = (Parameter("iof", "1", -0.1, 0.1, 0.0, "added I/F, truth minus given"),)
     strong: ClassVar = {"iof": 0.004}
     tolerance: ClassVar = {"iof": 5e-5}  # half a step of 12 bits
-    of_law = True  # on lit ground light that is always added is a term of the law
 
     @classmethod
     def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
@@ -36,4 +35,5 @@ class DarkBias(Effect):
         return [Trial(({"iof": 0.02 * survey.brightness},))]
 
     def apply(self, state: State) -> None:
-        state.image = state.image + self.value("iof", state)
+        # on lit ground light that is always added is a term of the law
+        state.image = state.image + self.value("iof", state) * telling_share(state)

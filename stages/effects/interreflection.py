@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from stages.effects.base import Effect, register
+from stages.effects.base import Effect, register, telling_share
 from stages.physics.formation.chain import State
 from stages.physics.light.sky import form_factors
 from stages.physics.photometry import Parameter
@@ -29,13 +29,15 @@ class Interreflection(Effect):
     linear = True
     title = "light scattered by the terrain"
     mechanism = (
-        "Sunlit slopes light their neighbours, most of all inside craters and in shadows. One bounce between diffuse facets of "
-        "the scene's own reflectance, gathered over the terrain that each cell of the crop sees; strength 1 is that light in full."
+        "Sunlit slopes light their neighbours, most of all inside craters and in shadows. One bounce between diffuse facets that "
+        "reflect as much as the ground at incidence 30, emission 0 and phase 30 deg (as of `render --bounce`), gathered over the "
+        "terrain that each cell of the crop sees; strength 1 is that light in full."
     )
     reference = "Shkuratov et al. (2005), Icarus 173, 3; form factors: Goral et al. (1984), SIGGRAPH 18, 213"
     confused_with = ("earthshine", "dark_bias")
     separate = "an image with the Sun so low that crater floors lie in shadow beside lit walls"
-    parameters = (Parameter("strength", "1", -1.0, 5.0, 0.0, "share of the light that diffuse terrain would scatter"),)
+    # towards the light both facets reflect twice as much as at 30 deg: strength 4
+    parameters = (Parameter("strength", "1", -1.0, 10.0, 0.0, "share of the light that diffuse terrain would scatter"),)
     strong: ClassVar = {"strength": 1.0}
 
     def apply(self, state: State) -> None:
@@ -44,14 +46,13 @@ class Interreflection(Effect):
 
 
 def _add(state: State, strength: Tensor) -> None:
-    mu0 = state.angles.cos_incidence
-    # albedo of the same diffuse facets: what leaves a lit facet over what reaches it
-    lit = mu0 > 0.2
-    share = state.reflectance / mu0.clamp(min=0.2) * lit
-    albedo = share.sum((-2, -1), keepdim=True) / lit.sum((-2, -1), keepdim=True).clamp(min=1)
-    state.radiance = state.radiance + strength * albedo * received(
-        state.elevation, state.radiance, state.observation.gsd
-    )
+    albedo = state.albedo()
+    leaving = albedo * state.angles.cos_incidence.clamp(min=0)
+    if state.sun_visibility is not None:
+        leaving = leaving * state.sun_visibility
+    # relief finer than the DEM lights sunlit ground as much again
+    light = albedo * received(state.elevation, leaving, state.observation.gsd) * telling_share(state)
+    state.radiance = state.radiance + strength * light
 
 
 def received(elevation: Tensor, radiance: Tensor, gsd: float) -> Tensor:

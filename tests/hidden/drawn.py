@@ -6,6 +6,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, laplace
 
 from hidden.departures import equivalents
+from hidden.laws import LAWS
 from hidden.scene import Scene, Truth
 
 
@@ -33,6 +34,12 @@ def drawn(scene: Scene, truth: Truth, seed: int) -> dict[str, float]:
         columns = frames[0][1].response(np.arange(first - half, last + half))
         out["column_pattern"] = float(columns.std() / np.mean(seen))
     out |= _on_the_dem(scene, truth, dems)
+    if (
+        "interreflection" in truth.effect
+    ):  # planted between facets of normal albedo; 1 is the catalogue's, of RADF at 30, 0, 30
+        law, across = LAWS[truth.law], np.cos(np.radians(30))
+        normal, oblique = (float(law(np.array([x]), np.ones(1), x, np.ones(1))[0]) / x for x in (1.0, across))
+        out["interreflection"] = truth.effect["interreflection"]["strength"] * (normal / oblique) ** 2
     samples = [s for site in range(scene.layout.sites) for s in scene.lit_samples(site, truth)]
     return out | equivalents(truth.effect, samples)
 

@@ -31,7 +31,8 @@ class Covariance:
     mean_albedo: float
     mean_relief: float
     mean_own: float
-    dark: float = 1.0  # of a piece's mean in deep shadow
+    dark: float = 1.0  # of a piece's mean in deep shadow, about ...
+    dark_level: float = 0.0  # ... what all these have in common
     level: Tensor | None = None
     size: dict[int, float] = field(default_factory=dict)  # of a patch (by its number), times the above
     mean_size: dict[int, float] = field(default_factory=dict)
@@ -126,17 +127,16 @@ def estimate(patches: Sequence[Patch], rows: Sequence[tuple[Tensor, Tensor]], gr
     return model
 
 
-def shadow_variance(patches: Sequence[Patch], residuals: Sequence[Tensor]) -> float:
-    """Variance of the means in deep shadow about what they have in common; residuals : (n,) of every patch.
+def shadow_variance(residuals: Sequence[Tensor]) -> tuple[float, float]:
+    """Mean of the means in deep shadow, which is no noise, and their variance about it; residuals : (s,) of every patch.
 
     One value more is taken to lie as far from it as they all do from nothing: two that agree by chance are not exact.
     """
-    seen = [r[p.dark.sum((-2, -1)) > 0] for p, r in zip(patches, residuals, strict=True)]
-    values = torch.cat(seen).double()
+    values = torch.cat(list(residuals)).double()
     if not len(values):
-        return 1.0
+        return 0.0, 1.0
     squares = (values - values.mean()).square().sum() + values.square().mean()
-    return max(float(squares) / len(values), 1e-10)
+    return float(values.mean()), max(float(squares) / len(values), 1e-10)
 
 
 def _unit_mean(sizes: dict[int, float]) -> dict[int, float]:

@@ -18,7 +18,10 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Rows:
-    """Coefficients, means and means in deep shadow of one patch: shared (1 + m, n, K) with the residual first, per frame (k, n, K)."""
+    """Coefficients and means of one patch, shared (1 + m, n, K) with the residual first, per frame (k, n, K); means in deep shadow (1 + m, s).
+
+    What has a value per frame is in proportion to light, and brings none into the dark.
+    """
 
     patch: Patch
     shared: Tensor
@@ -26,18 +29,18 @@ class Rows:
     own: Tensor
     own_mean: Tensor
     shared_dark: Tensor
-    own_dark: Tensor
 
 
 Residual = tuple[
     Tensor, Tensor, Tensor
-]  # coefficients (n, K), means (n,), means in deep shadow (n,); or (R, ...) of each
+]  # coefficients (n, K), means (n,), means in deep shadow (s,); or (R, ...) of each
 
 
 @dataclass
 class Products:
     """Sums over one patch. gram : (M, M), place : (M,) where its columns stand in the whole; sham : (M, R) with sham residuals
 
+    shade : (1 + m, 1 + m) what deep shadow adds to ``gram`` of the shared columns
     images : for every group of images (M, M), what is gone from ``gram`` without them: the squares of these images given the others
     The whole: residual, shared columns, then column by column the frames.
     """
@@ -50,6 +53,7 @@ class Products:
     site: int
     images: list[Array] = field(default_factory=list)
     level: Products | None = None  # of the means alone
+    shade: Array | None = None
 
     def without(self, group: int) -> Products:
         """The sums as if a group of images had not been taken."""
@@ -63,7 +67,7 @@ def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> Residual:
     about = rows.shared_mean[0].double() - (0 if model.level is None else model.level[rows.patch.frames])
     lower = torch.linalg.cholesky(model.mean_matrix(rows.patch))
     mean = torch.linalg.solve_triangular(lower, about[:, None], upper=False)
-    return white, mean[:, 0], rows.shared_dark[0] / model.dark**0.5
+    return white, mean[:, 0], (rows.shared_dark[0] - model.dark_level) / model.dark**0.5
 
 
 def _by_wave(z: Tensor) -> Tensor:
@@ -96,7 +100,7 @@ def products(
     columns = _Columns(rows, model, grid, bool(groups))
     factor = _factor(model, patch, grid).real
     mean = None if patch.free else torch.linalg.inv(torch.linalg.cholesky(model.mean_matrix(patch)))
-    every = torch.ones(len(patch.frames), dtype=torch.float64)
+    every = torch.ones(len(patch.dark_frames), dtype=torch.float64)
     gram = columns.gram(factor, mean, every)
     m, k = len(rows.shared), len(rows.own)
     place = np.concatenate([np.arange(m), (m + np.arange(k)[:, None] * frames + patch.frames.numpy()[None]).flatten()])
@@ -106,15 +110,18 @@ def products(
     level = None if mean is None else _of_means(rows, mean, place, shams)
     parts = []
     for group in groups:
-        gone = torch.tensor([int(f) in group for f in patch.frames])
+        gone, darker = (
+            torch.tensor([int(f) in group for f in frames], dtype=torch.bool)
+            for frames in (patch.frames, patch.dark_frames)
+        )
         part = np.zeros_like(gram)
-        if bool(gone.any()):
+        if bool(gone.any() | darker.any()):
             rest = None if mean is None else _given_others(mean[None], gone)[0]
-            part = columns.gram(_given_others(factor, gone), rest, gone.double())
+            part = columns.gram(_given_others(factor, gone), rest, darker.double())
             own = np.concatenate([np.zeros(m, bool), np.tile(gone.numpy(), k)])
             part[own], part[:, own] = gram[own], gram[:, own]  # to the last bit: nothing is left of them
         parts.append(part)
-    return Products(gram, place, sham, squares, patch.ground, patch.site, parts, level)
+    return Products(gram, place, sham, squares, patch.ground, patch.site, parts, level, columns.shade(every).numpy())
 
 
 def _of_means(rows: Rows, mean: Tensor, place: NDArray[np.int64], shams: Residual | None) -> Products:
@@ -164,8 +171,8 @@ class _Columns:
             if often:
                 self.across = torch.stack(across).double().view(len(inner), -1, n, self.k, n)
 
-    def gram(self, factor: Tensor, mean: Tensor | None, images: Tensor) -> Array:
-        """(M, M) of all columns, whitened by ``factor`` (B, r, n) and, their means, by (r, n); images : (n,) whose deep shadow counts."""
+    def gram(self, factor: Tensor, mean: Tensor | None, shaded: Tensor) -> Array:
+        """(M, M) of all columns, whitened by ``factor`` (B, r, n) and, their means, by (r, n); shaded : (s,) 1 where deep shadow counts."""
         rows, k = self.rows, self.k
         n, m = factor.shape[-1], len(rows.shared)
         by_wave = factor[self.of_wave].to(self.shared.dtype)
@@ -187,13 +194,15 @@ class _Columns:
             dense += shared @ shared.T
             cross = cross + (shared @ mean)[:, None] * rows.own_mean.double()
             own += torch.einsum("ai,ij,bj->aibj", rows.own_mean.double(), others, rows.own_mean.double())
-        shadow, own_shadow = (x.double() * images / self.dark for x in (rows.shared_dark, rows.own_dark))
-        dense += shadow @ shadow.T
-        cross = cross + shadow[:, None] * own_shadow
-        own += torch.diag_embed(own_shadow[:, None] * own_shadow).permute(0, 2, 1, 3)
+        dense += self.shade(shaded)
         top = torch.cat([dense, cross.flatten(1)], 1)
         low = torch.cat([cross.flatten(1).T, own.reshape(k * n, k * n)], 1)
         return torch.cat([top, low]).numpy()
+
+    def shade(self, shaded: Tensor) -> Tensor:
+        """(1 + m, 1 + m) of the shared columns' means in deep shadow; shaded : (s,) 1 where it counts."""
+        shadow = self.rows.shared_dark.double() * shaded / self.dark
+        return shadow @ shadow.T
 
     def beside(self, shams: Residual, factor: Tensor, mean: Tensor | None) -> tuple[Array, Array]:
         """Products (M, R) of all columns with whitened sham residuals, and the squares of these, (R,)."""
@@ -205,7 +214,6 @@ class _Columns:
         first += (rows.shared_dark.double() / self.dark) @ dark.double().T
         back = by_wave.mT @ sham
         second = _real_part(self.own.permute(1, 2, 0) @ back.transpose(0, 1), self.k).double().transpose(0, 1)
-        second += (rows.own_dark.double() / self.dark)[..., None] * dark.double().T
         squares = (z.real.square() + z.imag.square()).sum((1, 2)).double()
         if mean is not None:
             first += rows.shared_mean.double() @ mean.T @ means.double().T
@@ -219,14 +227,16 @@ def make_shams(white: Sequence[Residual], grid: Grid, count: int, seed: int) -> 
     rng = np.random.default_rng(seed)
     mirror = _mirror(grid)
     out = [
-        (torch.empty(count, *z.shape, dtype=z.dtype), torch.empty(count, len(m)), torch.empty(count, len(m)))
-        for z, m, _ in white
+        (torch.empty(count, *z.shape, dtype=z.dtype), torch.empty(count, len(m)), torch.empty(count, len(d)))
+        for z, m, d in white
     ]
     pieces = len(white)
+    shadows = np.concatenate([d.numpy() for _, _, d in white])
     for r in range(count):
+        drawn = torch.from_numpy(rng.permutation(shadows)).split([len(d) for _, _, d in white])
         shift = int(rng.integers(1, pieces)) if pieces > 1 else 0
         for p in range(pieces):
-            z, mean, dark = white[(p + shift) % pieces]
+            z, mean, _ = white[(p + shift) % pieces]
             n = len(out[p][0][0])
             images = torch.from_numpy(np.concatenate([rng.permutation(len(z)) for _ in range(-(-n // len(z)))])[:n])
             w = z[images]
@@ -235,7 +245,7 @@ def make_shams(white: Sequence[Residual], grid: Grid, count: int, seed: int) -> 
             if rng.random() < 0.5:
                 w = w.conj()
             sign = float(rng.choice([-1.0, 1.0]))
-            for into, sham in zip(out[p], (w, mean[images], dark[images]), strict=True):
+            for into, sham in zip(out[p], (w, mean[images], drawn[p]), strict=True):
                 into[r] = sign * sham
     return out
 

@@ -266,18 +266,14 @@ class Whole:
         return found, null / 2 / math.log(10)
 
     def held_out(
-        self, places: NDArray[np.int64], exclude: Sequence[int] = (), spread: float = 0.0, scored: Whole | None = None
+        self, places: NDArray[np.int64], exclude: Sequence[int] = (), spread: float = 0.0, shade: bool = False
     ) -> Array:
-        """(labels,) nats that the columns gain on ground that they and the nuisance were not fitted to.
-
-        scored : products by which the gain is counted, these where None
-        """
+        """(labels,) nats that the columns gain on ground that they and the nuisance were not fitted to; ``shade``: in its deep shadow."""
         n = self.nuisance([*places, *exclude])
         every = np.concatenate([n, places])
         precision = self.weight(n) + self._least(n)
         more = np.concatenate([precision, np.full(len(places), spread**-2 if spread else 0.0) + self._least(places)])
         out = np.zeros(max(self.labels) + 1)
-        judge = scored or self
         for fold in self.folds:
             rest = self.gram.copy()
             for k in fold:
@@ -288,8 +284,7 @@ class Whole:
             b1, b0 = np.zeros(self.size), np.zeros(self.size)
             b1[every], b0[n] = with_, without
             for k in fold:
-                u = judge.units[k]
-                out[self.labels[k]] += 0.5 * (_left(u, b0) - _left(u, b1))
+                out[self.labels[k]] += 0.5 * (_left(self.units[k], b0, shade) - _left(self.units[k], b1, shade))
         return out
 
     def without_one(
@@ -405,9 +400,10 @@ def _solve(a: Array, b: Array) -> Array:
     return scale * cho_solve(_root(scaled), scale * b)
 
 
-def _left(unit: Products, b: Array) -> float:
-    own = b[unit.place]
-    return float(unit.gram[0, 0] - 2 * own @ unit.gram[:, 0] + own @ unit.gram @ own)
+def _left(unit: Products, b: Array, shade: bool = False) -> float:
+    gram = unit.gram if not shade or unit.shade is None else unit.shade
+    own = b[unit.place[: len(gram)]]
+    return float(gram[0, 0] - 2 * own @ gram[:, 0] + own @ gram @ own)
 
 
 __all__ = ["Whole", "weigh_all"]

@@ -18,7 +18,7 @@ from stages.physics.formation import chain as formation
 from stages.physics.formation import geometry
 from stages.physics.formation.chain import State
 from stages.physics.light.sun_disc import sun_visibility
-from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
+from stages.physics.photometry import ReflectanceModel, lambert_albedo, masked_radiance_factor
 
 STEP = 0.02  # of a slope, as tangent
 SCATTER = 0.14  # 8 deg: rms slope of relief below a typical DEM's resolution
@@ -91,9 +91,13 @@ class Chain:
     def _expose(self, state: State, reflectance: Tensor, effects: list[Effect], measured: bool = True) -> Tensor:
         state = copy.copy(state)
         state.further_light = list(state.further_light)
-        state.reflectance = reflectance
+        state.reflectance, state.albedo = reflectance, lambda: self._albedo
         state.measured = self._measured if measured else None
         return formation.expose(state, effects)
+
+    @cached_property
+    def _albedo(self) -> Tensor:
+        return lambert_albedo(self.model, self.model.unpack(self.coefficients, dim=1))
 
     def predict(self) -> Tensor:
         """(n, H, W) I/F, of which nothing is taken from the image; not to be changed."""

@@ -148,6 +148,9 @@ def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
         if cls.of_law and not len(whole.form_places()):  # a law that is fitted follows it
             out.append(name)
             continue
+        if SURE * state.open.get(name, 0.0) > 1:  # errors over ground or images are larger than the likelihood's
+            out.append(name)
+            continue
         if found.alone >= SURE:
             continue
         error = math.inf

@@ -85,8 +85,9 @@ def make_grid(height: int, width: int) -> Grid:
 class Patch:
     """One piece of one site. weight : (n, h, w) window on judged pixels; scale : (n, h, w), I/F that residuals are relative to
 
-    dark : (n, h, w) 1 in deep shadow, 0 elsewhere and in images that show too little of it
     images : (n,) which of the site's images; slopes : (n, 2) relative brightness per slope to the east and north
+    shaded, dark_frames : (s,) which of them show enough deep shadow, lit ground beside it or not
+    dark : (s, h, w) by which a field is multiplied to add up to its mean in deep shadow, relative to brightness
     """
 
     number: int
@@ -100,6 +101,8 @@ class Patch:
     slopes: Tensor
     level: Tensor
     frames: Tensor
+    shaded: Tensor
+    dark_frames: Tensor
     dark: Tensor
     free: bool  # gain and offset of every image
 
@@ -109,8 +112,8 @@ class Patch:
         return x
 
     def shadow(self, fields: Tensor) -> Tensor:
-        """Mean of relative fields (m, N, H, W) in deep shadow, (m, n); 0 where there is none."""
-        return (self.relative(fields) * self.dark).sum((-2, -1)) / self.dark.sum((-2, -1)).clamp(min=1)
+        """Mean of relative fields (m, N, H, W) in deep shadow, (m, s)."""
+        return (fields[:, self.shaded, self.rows, self.columns] * self.dark).sum((-2, -1))
 
     def transform(self, fields: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
         """Fields (m, N, H, W) -> coefficients (m, n, K) complex and means (m, n)."""
@@ -199,9 +202,11 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
             )
             bright = 1 / s
             bright = bright - ((bright * weight).sum((-2, -1)) / total)[:, None, None]
-            frames = torch.from_numpy(chain.site.frames)[images]
-            dark = deep[images, rows, columns].float()
-            dark *= (dark.sum((-2, -1)) >= SHADOWED)[:, None, None] & (not free)
+            frames = torch.from_numpy(chain.site.frames)
+            dark = deep[:, rows, columns].float()
+            count = dark.sum((-2, -1), keepdim=True)
+            shaded = torch.nonzero((count.flatten() >= SHADOWED) & (not free))[:, 0]
+            dark = (dark / (scale[:, rows, columns] * count.clamp(min=1)))[shaded]
             out.append(
                 Patch(
                     (number * pieces + i) * pieces + j,
@@ -214,7 +219,9 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
                     s,
                     slopes,
                     bright,
-                    frames,
+                    frames[images],
+                    shaded,
+                    frames[shaded],
                     dark,
                     free,
                 )

@@ -65,7 +65,7 @@ def search(state: State, most: int) -> Outcome:
                 break
         tried.sort(key=lambda f: -f.gain)
         faint = FAINT**2 / 2 * float(view.whole.gram[0, 0])
-        sure = [f for f in tried if f.gain_interval()[0] > 0 and f.gain > faint]
+        sure = [f for f in tried if f.gain_interval()[0] > 0 and (f.gain > faint or shows_in_shade(view.whole, f))]
         for f in tried:
             low, high = f.gain_interval()
             if low > 0 and f not in sure:
@@ -85,8 +85,12 @@ def search(state: State, most: int) -> Outcome:
             if not sure or taken:
                 break
             chosen, group = choose(sure)
+            before = list(state.causes)
             why = take(state, view, chosen, group)
             taken = not why
+            for gone in [c for c in before if c not in state.causes]:
+                refused.add(gone.effect.name)
+                out.rejected[gone.effect.name] = (gone.found.gain, f"beside {chosen.effect} it is no cause any more")
             if why:
                 sure = [f for f in sure if f is not chosen]
                 refused.add(chosen.effect)
@@ -120,6 +124,14 @@ def doubt_all(state: State, view: View, sure: float = SURE) -> dict[str, tuple[f
         out[cause.effect.name] = cause.found.gain, f"fitted with everything else {why}"
         settle(state, view)
     return out
+
+
+def shows_in_shade(whole: Whole, found: Found) -> bool:
+    """Whether deep shadow of held-out ground surely gains: what light there is asks neither the law nor the covariance of lit ground."""
+    if found.guise.per_frame:
+        return False
+    gains = whole.held_out(whole.places(found.guise), whole.exclude(found.guise), found.spread, shade=True)
+    return interval(gains)[0] > 0
 
 
 def choose(sure: list[Found]) -> tuple[Found, list[str]]:
@@ -176,11 +188,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     saved = [(c, c.copy()) for c in causes]
     cause = Cause(first, found, group=group)
     state.causes.append(cause)
-    look = refine(state, view)
-    why = _doubt_any(state, cause)
-    if not why:
-        errors_over_images(state, look)
-        why = _doubt_any(state, cause)
+    look, why = _fit_beside(state, view, cause)
     if not why:
         gains, total, test_gains = secant_gains(state, cause, look, tested)
         low, high = interval(gains, cause.found.sizes)
@@ -190,6 +198,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
             why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
         why = why or contradicted(test_gains)
     if why:
+        state.open[cause.effect.name] = cause.worst_error
         state.causes[:] = causes
         for c, before in saved:
             vars(c).update(vars(before))
@@ -221,12 +230,31 @@ def ordinary(first: Effect) -> str:
     return ""
 
 
-def _doubt_any(state: State, cause: Cause) -> str:
-    """Why the cause, or another beside it, cannot be one, or ''."""
-    others = [c for c in state.causes if c is not cause]
-    return doubt(state, cause) or next(
-        (f"beside it {c.effect.name} is no cause any more: {w}" for c in others if (w := doubt(state, c))), ""
-    )
+def _fit_beside(state: State, view: View, cause: Cause) -> tuple[View, str]:
+    """Fit everything with the new cause; why it, or another beside it, cannot be one, or ''.
+
+    One that is nothing beside the new one makes way for it: the new one is something beside either. Values per frame, which mimic what
+    one value for all does, drive none out.
+    """
+    while True:
+        look = refine(state, view)
+        why, other = _doubt_any(state, cause)
+        if not why:
+            errors_over_images(state, look)
+            why, other = _doubt_any(state, cause)
+        if other is None or cause.found.guise.per_frame or ODD in why:
+            return look, why
+        state.causes.remove(other)
+
+
+def _doubt_any(state: State, cause: Cause) -> tuple[str, Cause | None]:
+    """Why the cause, or another beside it, cannot be one, or ''; and which other."""
+    if why := doubt(state, cause):
+        return why, None
+    for c in state.causes:
+        if why := doubt(state, c):
+            return f"beside it {c.effect.name} is no cause any more: {why}", c
+    return "", None
 
 
 def contradicted(gains: np.ndarray) -> str:
@@ -316,7 +344,6 @@ def _few(rows: Rows, count: int) -> Rows:
         shared_dark=0 * rows.shared_dark[keep],
         own=rows.own[:0],
         own_mean=rows.own_mean[:0],
-        own_dark=rows.own_dark[:0],
     )
 
 

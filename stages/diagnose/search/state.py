@@ -48,6 +48,13 @@ class Cause:
         """Whether one amount acts on all images, which other ground can be asked about by itself."""
         return type(self.effect).scope == "scene" and len(self.found.guise.columns) == 1
 
+    @property
+    def worst_error(self) -> float:
+        """The largest error of any kind of a scene-wide value, in sizes worth knowing."""
+        strong = type(self.effect).strong
+        every = [(k, e) for kind in (self.errors, self.over_images) for k, e in kind.items() if strong.get(k)]
+        return max((e / strong[k] for k, e in every), default=0.0)
+
     def copy(self) -> Cause:
         """As it is now, whatever is fitted later."""
         out = copy.copy(self)
@@ -79,6 +86,8 @@ class State:
     causes: list[Cause] = field(default_factory=list)
     # effects whose best values nothing real has: of them the others have no ordinary amounts beside them
     impossible: set[str] = field(default_factory=set)
+    # effects that were fitted and refused -> their largest error, in sizes worth knowing
+    open: dict[str, float] = field(default_factory=dict)
     reference: Nominal | None = None
     say: Callable[[str], None] = lambda text: None
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
@@ -164,7 +173,7 @@ class State:
         for patch in make_patches(number, chain, pieces, self.free_gains):
             z, mean = patch.transform(shared, grid)
             z_own, mean_own = patch.transform(own, grid)
-            out.append(Rows(patch, z, mean, z_own, mean_own, patch.shadow(shared), patch.shadow(own)))
+            out.append(Rows(patch, z, mean, z_own, mean_own, patch.shadow(shared)))
         return out
 
     def look(self, names: Sequence[str], shams: int = SHAMS) -> View:
@@ -203,7 +212,7 @@ class State:
 
     def _covariance(self, rows: Sequence[Rows], grid: Grid) -> Covariance:
         model = estimate([r.patch for r in rows], [(r.shared[0], r.shared_mean[0]) for r in rows], grid, self.frames)
-        model.dark = shadow_variance([r.patch for r in rows], [r.shared_dark[0] for r in rows])
+        model.dark_level, model.dark = shadow_variance([r.shared_dark[0] for r in rows])
         return model
 
     def without_images(self, view: View) -> list[Whole]:
@@ -265,15 +274,13 @@ def _taken_over(row: Rows, view: View, plan: Plan, moved: Tensor, own: Tensor) -
     per_frame = _order(plan.frame_keys(), plan.per_frame[: len(own)], view.plan.frame_keys())
     z, mean = row.patch.transform(moved, grid)
     z_own, mean_own = row.patch.transform(own, grid)
-    dark, dark_own = row.patch.shadow(moved), row.patch.shadow(own)
     return Rows(
         row.patch,
         torch.cat([z, row.shared])[shared],
         torch.cat([mean, row.shared_mean])[shared],
         torch.cat([z_own, row.own])[per_frame],
         torch.cat([mean_own, row.own_mean])[per_frame],
-        torch.cat([dark, row.shared_dark])[shared],
-        torch.cat([dark_own, row.own_dark])[per_frame],
+        torch.cat([row.patch.shadow(moved), row.shared_dark])[shared],
     )
 
 

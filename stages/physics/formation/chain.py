@@ -17,7 +17,7 @@ from stages.physics.formation import facets, geometry
 from stages.physics.formation.geometry import Angles
 from stages.physics.formation.resampling import displace
 from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
-from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
+from stages.physics.photometry import ReflectanceModel, lambert_albedo, masked_radiance_factor
 
 SLOTS = ("geometry", "illumination", "reflectance", "radiance", "sensor")
 
@@ -63,9 +63,11 @@ class State:
     illumination  sees also slopes, view; may change: sun_direction, sun_horizon, sun_radius, further_light (functions
                   of the state, run once the directly lit radiance is known; each adds to it)
     reflectance   sees also angles, sun_visibility; may change: reflectance (I/F of a lit facet)
+    further_light sees also albedo(), that of a diffuse facet of this ground, broadcastable to the image: light that
+                  comes from all sides does not ask where the camera stands
     radiance      may change: radiance (I/F that reaches the camera)
-    sensor        may change: image; sees measured, the image to be explained, (B, H, W), NaN where invalid, or None: an
-                  echo repeats the light that truly came in, with shadows in their true places
+    sensor        may change: image; sees measured, the image to be explained, (B, H, W) with NaN where invalid, as
+                  further_light does, or None: an echo repeats the light that truly came in, with shadows in their true places
     """
 
     observation: Observation
@@ -81,6 +83,7 @@ class State:
     angles: Angles = field(default=None)  # type: ignore[assignment]
     sun_visibility: Tensor | None = None
     reflectance: Tensor = field(default=None)  # type: ignore[assignment]
+    albedo: Callable[[], Tensor] = field(default=None)  # type: ignore[assignment]
     radiance: Tensor = field(default=None)  # type: ignore[assignment]
     image: Tensor = field(default=None)  # type: ignore[assignment]
     measured: Tensor | None = None
@@ -119,6 +122,7 @@ def form(
     state = illuminate(observation, extensions)
     parameters = model.unpack(coefficients, dim=1)
     state.reflectance = masked_radiance_factor(model, parameters, state.angles)
+    state.albedo = lambda: lambert_albedo(model, parameters)
     return expose(state, extensions)
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from schemas.errors import RegistryError
 from stages.physics.formation.geometry import Angles
@@ -25,6 +27,7 @@ class Parameter:
     description: str
 
 
+STANDARD = math.radians(30)  # incidence and phase of the standard geometry (30, 0, 30) of maps and laboratories
 ALBEDO = Parameter("albedo", "1", 0.0, 1.0, 0.12, "normal albedo: I/F at incidence = emission = phase = 0")
 
 
@@ -138,6 +141,16 @@ def masked_radiance_factor(
         angles = replace(angles, cos_incidence=mu0.clamp(min=floor), cos_emission=mu.clamp(min=floor))
     value = model.radiance_factor(parameters, angles)
     return torch.where(lit, value, torch.zeros((), dtype=value.dtype, device=value.device))
+
+
+def lambert_albedo(model: ReflectanceModel, parameters: Mapping[str, Tensor]) -> Tensor:
+    """Of a diffuse facet that reflects as much as the model's at incidence 30, emission 0 and phase 30 deg.
+
+    parameters : by name, each (...) or what broadcasts to it; returns (...)
+    """
+    incidence = torch.full_like(next(iter(torch.broadcast_tensors(*parameters.values()))), STANDARD)
+    angles = Angles.from_angles(incidence, torch.zeros_like(incidence), incidence)
+    return masked_radiance_factor(model, parameters, angles).clamp(min=0) / math.cos(STANDARD)
 
 
 _MODELS: dict[str, ReflectanceModel] = {}

@@ -10,19 +10,16 @@ import numpy as np
 import torch
 
 from stages.common.arrays import Floats, Floats32
-from stages.physics.formation.geometry import Angles
 from stages.physics.horizon.scene import make_overview
 from stages.physics.light.earth import EARTH_RADIUS, earth_irradiance, earth_phase
 from stages.physics.light.sky import Surroundings, terrain_light
 from stages.physics.maps.window import Window
-from stages.physics.photometry import masked_radiance_factor
-from stages.physics.photometry.quantities import to_reflectance_factor
+from stages.physics.photometry import lambert_albedo
 from stages.physics.terrain.block_geometry import block_geometry
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.sun_visibility import SunHorizon, visible_share
 from stages.physics.terrain.surface import Surface
 
-STANDARD = math.radians(30)  # incidence and phase of the standard geometry (30, 0, 30) of maps and laboratories
 FINEST = 2  # px per cell of the map's means around a window
 OVERVIEW_PX = 2048
 BLOCK_PX = 1024
@@ -69,11 +66,7 @@ def diffuse_albedo(surface: Surface, window: Window) -> Floats32:
     returns (h, w) or (1, 1) where it is the same everywhere; NaN where the map is unknown
     """
     coefficients = torch.from_numpy(np.ascontiguousarray(surface.read_coefficients(*window)))
-    shape = coefficients.shape[1:]
-    incidence, emission = torch.full(shape, STANDARD), torch.zeros(shape)
-    angles = Angles.from_angles(incidence, emission, incidence)
-    value = masked_radiance_factor(surface.model, surface.model.unpack(coefficients, dim=0), angles).numpy()
-    value = to_reflectance_factor(np.maximum(value, 0), np.full_like(value, math.cos(STANDARD)))
+    value = lambert_albedo(surface.model, surface.model.unpack(coefficients, dim=0)).numpy()
     value[~np.isfinite(coefficients.numpy()).all(axis=0)] = np.nan
     return value
 

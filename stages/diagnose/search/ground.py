@@ -1,0 +1,112 @@
+"""What all images of a site have in common tells of the ground by itself: patterns that stand out of ordinary texture.
+
+The covariance takes whatever they share for ground, so that no other cause is drowned by it. Effects with values per site say what they
+read off it (``read_off_ground``); it is named where images that it was not read off from show it, too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stages.common.intervals import student_quantile
+from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, nats
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.parallel import per_site
+from stages.diagnose.result.answer import Named
+from stages.diagnose.rows.patches import judged
+from stages.diagnose.search.state import State
+from stages.diagnose.settings import CORRELATED
+from stages.effects import Effect, effect_names, get_effect
+
+PARTS = 2  # of a site's images: what is read off from one is judged on the other
+
+
+def by_ground(state: State) -> tuple[list[Named], set[str]]:
+    """Causes that the ground shows, and the effects that it would show at a size worth knowing."""
+    chains = [c for c in state.chains() if c.site.count >= PARTS]
+    out: list[Named] = []
+    shown: set[str] = set()
+    if len(chains) < 3:  # no interval
+        return out, shown
+    left = per_site(_relative, chains)
+    for name in effect_names():
+        cls = get_effect(name)
+        whole = _read_off(cls, left, [slice(None)])
+        if whole is None:
+            continue
+        values, size, usual = whole
+        known = torch.isfinite(size)
+        excess = (size - usual)[known].numpy()
+        if len(excess) < 3:
+            continue
+        least = max(cls.tolerance.values(), default=0.0) ** 2
+        half = student_quantile(len(excess) - 1) * float(excess.std(ddof=1)) / math.sqrt(len(excess))
+        if float(usual[known].mean()) + half + least < cls.size(cls.strong) ** 2:
+            shown.add(name)
+        before, after, pixels = _on_other_images(cls, state, chains, left)
+        percent = gain_interval(before, after)
+        if excess.mean() - half > least and percent[1] > 0:
+            value = math.sqrt(float(size[known].mean()))
+            error = math.hypot(half / student_quantile(len(excess) - 1) / (2 * value), math.sqrt(least))
+            first = cls.parameters[0]
+            total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
+            spread = abs(total) * (percent[2] - percent[1]) / (4 * percent[0])
+            was, now = (math.sqrt(float(x.sum()) / pixels) for x in (before, after))
+            effect, chance = _of_sites(cls, values, state, chains), gain_chance(before, after)
+            parameters = {first.name: (value, error, first.unit)}
+            out.append(Named(effect, parameters, chance, total, spread, was, now, percent, [name]))
+    return out, shown
+
+
+def _relative(chain: Chain) -> tuple[Tensor, Tensor]:
+    """(n, H, W) residual over the prediction on fully lit ground, 0 elsewhere, and what it weighs there: the inverse of an image's variance."""
+    lit, _ = judged(chain)
+    residual = torch.where(lit, chain.site.image / chain.predict().clamp(min=1e-6) - 1, 0.0)
+    count = lit.sum((-2, -1)).clamp(min=1)
+    variance = residual.square().sum((-2, -1)) / count
+    return residual, lit / variance.clamp(min=1e-8)[:, None, None]
+
+
+def _read_off(cls: type[Effect], left: Sequence[tuple[Tensor, Tensor]], parts: Sequence[slice]):
+    """What the effect reads off the mean of these images of every site; a field of the effect that no site knows is None."""
+    maps, seen = [], []
+    for residual, weight in left:
+        some = torch.cat([torch.arange(len(weight))[p] for p in parts])
+        total = weight[some].sum(0)
+        maps.append((residual * weight)[some].sum(0) / total.clamp(min=1e-9))
+        seen.append((total > 0).float())
+    return cls.read_off_ground(torch.stack(maps), torch.stack(seen))
+
+
+def _of_sites(cls: type[Effect], values, state: State, chains: Sequence[Chain]) -> Effect:
+    """The effect with these values of the chains' sites in tables by the sites' numbers."""
+    numbers = torch.tensor([c.site.number for c in chains])
+    tables = {k: torch.zeros(int(numbers.max()) + 1).index_copy(0, numbers, v) for k, v in values.items()}
+    return cls(tables, state.data)
+
+
+def _on_other_images(
+    cls: type[Effect], state: State, chains: Sequence[Chain], left
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Squared relative residuals of every site without the effect, and with what its other images say of it; their pixels."""
+    before, after, pixels = np.zeros(len(chains)), np.zeros(len(chains)), 0.0
+    for part in range(PARTS):
+        others = [slice(k, None, PARTS) for k in range(PARTS) if k != part]
+        found = _read_off(cls, left, others)
+        assert found is not None
+        effect = _of_sites(cls, found[0], state, chains)
+        for k, (chain, (residual, weight)) in enumerate(zip(chains, left, strict=True)):
+            image, lit = residual[part::PARTS], (weight[part::PARTS] > 0).double()
+            more = (chain.render(effect) / chain.render().clamp(min=1e-6) - 1)[part::PARTS]
+            before[k] += float((image.double().square() * lit).sum())
+            after[k] += float(((image - more).double().square() * lit).sum())
+            pixels += float(lit.sum())
+    return before, after, max(pixels, 1.0)
+
+
+__all__ = ["by_ground"]
