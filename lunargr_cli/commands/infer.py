@@ -12,8 +12,6 @@ import typer
 from lunargr_cli import options
 from lunargr_cli.console import Console
 from schemas.files.locks import scratch_path
-from schemas.files.user_files import check_file
-from schemas.reading import is_artefact
 from stages import infer, ingest
 from stages.infer import Config
 
@@ -63,6 +61,9 @@ def command(
 ) -> None:
     """Predict georeferenced maps of reflectance coefficients for a DEM of any size."""
     config = options.configure(Config, locals(), shard=options.parse_shard(shard), geotiff=not no_geotiff)
+    from schemas.files.user_files import check_file
+    from schemas.reading import is_artefact
+
     console, to = Console(quiet), options.make_map_output(output, overwrite, geotiff, no_geotiff)
     interrupted = scheduler is not None or resume  # may have got as far as the GeoTIFF: its parts tell
     infer.check_files([terrain, checkpoint], replace(to, resume=interrupted), config)

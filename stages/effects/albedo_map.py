@@ -46,7 +46,10 @@ class AlbedoMap(Effect):
 
     @classmethod
     def read_off_ground(cls, albedo: Tensor, seen: Tensor) -> tuple[Values, Tensor, Tensor]:
-        """Cosines by least squares; what a spectrum as steep as that of ground would have of them, going by finer ones, is ordinary."""
+        """Cosines by least squares; what a spectrum as steep as that of ground would have of them, going by finer ones, is ordinary.
+
+        albedo, seen : (sites, H, W), as of :meth:`Effect.read_off_ground`
+        """
         low, fine, ordinary = _fields(*albedo.shape[-2:])
         known = seen.double().flatten(1)
         share = known.mean(1)

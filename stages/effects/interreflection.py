@@ -30,7 +30,7 @@ class Interreflection(Effect):
     title = "light scattered by the terrain"
     mechanism = (
         "Sunlit slopes light their neighbours, most of all inside craters and in shadows. One bounce between diffuse facets that "
-        "reflect as much as the ground at incidence 30, emission 0 and phase 30 deg (as of `render --bounce`), gathered over the "
+        "reflect as much as the ground at incidence 30, emission 0 and phase 30 deg (as `lunargr render` takes it), gathered over the "
         "terrain that each cell of the crop sees; strength 1 is that light in full."
     )
     reference = "Shkuratov et al. (2005), Icarus 173, 3; form factors: Goral et al. (1984), SIGGRAPH 18, 213"

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
-from torch import Tensor
 
 from schemas.errors import RegistryError
 from stages.physics.formation.geometry import Angles
@@ -143,7 +142,7 @@ def masked_radiance_factor(
     return torch.where(lit, value, torch.zeros((), dtype=value.dtype, device=value.device))
 
 
-def lambert_albedo(model: ReflectanceModel, parameters: Mapping[str, Tensor]) -> Tensor:
+def lambert_albedo(model: ReflectanceModel, parameters: Mapping[str, torch.Tensor]) -> torch.Tensor:
     """Of a diffuse facet that reflects as much as the model's at incidence 30, emission 0 and phase 30 deg.
 
     parameters : by name, each (...) or what broadcasts to it; returns (...)
