@@ -112,7 +112,7 @@ def test_other_bodies_by_name_or_radius():
             GeometryError,
             "expected unit quaternions, found one of length 1.73",
         ),
-        ({"type": "fisheye"}, RegistryError, "unknown camera 'fisheye'; choose one of:"),
+        ({"type": "no-such-camera"}, RegistryError, "unknown camera 'no-such-camera'; choose one of:"),
         ({"body": "krypton"}, GeometryError, "krypton"),
     ],
 )

@@ -8,43 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from schemas import RegistryError
-from stages.effects import Survey, effect_names, fields, get_effect
+from schemas import ConfigError, RegistryError
+from stages.diagnose.result.answer import Answer, Named
+from stages.diagnose.result.files import write_diagnosis
+from stages.effects import Effect, Survey, effect_names, fields, get_effect, load_extension, register
 from stages.effects.filters import gaussian
 from stages.physics.formation.chain import Observation, form
 from stages.physics.formation.resampling import displace, displace_anywhere
 from stages.physics.photometry import get_model
 
-CATALOGUE = [
-    "misregistration",
-    "dem_smoothing",
-    "dem_scale",
-    "line_jitter",
-    "sun_elevation",
-    "sun_azimuth",
-    "penumbra",
-    "distant_shadow",
-    "interreflection",
-    "earthshine",
-    "opposition_surge",
-    "phase_slope",
-    "limb_darkening",
-    "macroscopic_roughness",
-    "slope_albedo",
-    "elevation_albedo",
-    "curvature_albedo",
-    "albedo_map",
-    "azimuthal_anisotropy",
-    "image_gain",
-    "dark_bias",
-    "nonlinearity",
-    "psf_blur",
-    "column_pattern",
-    "echo",
-    "saturation",
-    "relief_displacement",
-    "frame_field",
-]
+CATALOGUE = effect_names()
 
 
 def _scene() -> Observation:
@@ -78,8 +51,9 @@ def _values(cls, trial, factor: float = 1.0) -> dict:
     return values
 
 
-def test_the_catalogue_is_complete():
-    assert sorted(effect_names()) == sorted(CATALOGUE)
+def test_the_catalogue_has_what_the_documents_name():
+    wanted = "misregistration dem_smoothing dem_scale line_jitter sun_elevation sun_azimuth penumbra distant_shadow interreflection earthshine opposition_surge phase_slope limb_darkening macroscopic_roughness slope_albedo elevation_albedo curvature_albedo albedo_map azimuthal_anisotropy image_gain dark_bias nonlinearity psf_blur column_pattern echo saturation relief_displacement frame_field"
+    assert set(wanted.split()) <= set(CATALOGUE)
 
 
 def test_unknown_names_list_the_choices():
@@ -99,10 +73,11 @@ def test_effect(name):
     ]
     assert max(changed) > 1e-5
     assert all(math.isfinite(c) for c in changed)
-    for p in cls.fitted():
-        assert p.lower <= p.default <= p.upper, p
-    assert cls.mechanism and cls.reference and cls.separate and cls.confused_with
-    assert all(other in CATALOGUE for other in cls.confused_with)
+    for p in (*cls.parameters, *cls.fitted()):
+        assert p.lower <= p.default <= p.upper and p.unit, p
+    assert {p.name for p in cls.fitted()} >= set(cls.strong), "a size worth knowing of what is not fitted"
+    assert cls.mechanism and cls.reference and cls.separate and cls.confused_with, name
+    assert set(cls.confused_with) <= set(CATALOGUE), name
 
 
 @pytest.mark.parametrize("name", [n for n in CATALOGUE if n != "distant_shadow"])
@@ -221,3 +196,25 @@ def test_gradients_of_a_wave_that_is_hardly_resolved():
     east, south = gradients(torch.sin(0.9 * x).expand(1, 32, 64))
     assert torch.allclose(east[0, 10, 8:-8], 0.9 * torch.cos(0.9 * x)[8:-8], atol=0.03)
     assert float(south.abs().max()) == 0.0
+
+
+@pytest.mark.parametrize("variable", [("image_gain", None), None])
+def test_values_per_image_come_back_whether_or_not_they_have_a_variable_of_their_own(tmp_path, monkeypatch, variable):
+    """As an effect of somebody else's has them, which no schema knows; images that were not diagnosed have the null value."""
+    cls = get_effect("image_gain")
+    monkeypatch.setattr(cls, "table", variable)
+    effect = cls({"gain": torch.tensor([0.1, 0.0, -0.2])}, SURVEY)
+    cause = Named(effect, {"rms": (0.1, 0.01, "1")}, 0.01, 9.0, 1.0, 0.1, 0.09, (5.0, 4.0, 6.0), ["image_gain"])
+    write_diagnosis(tmp_path / "d.h5", Answer("named", causes=[cause]), ["a", "b", "c"], [], False)
+    [found] = load_extension(tmp_path / "d.h5", ["c", "x", "a"])
+    torch.testing.assert_close(found.values["gain"], torch.tensor([-0.2, 0.0, 0.1]))
+
+
+@pytest.mark.parametrize(("attribute", "value"), [("scope", "frame"), ("slot", "lens"), ("title", None)])
+def test_an_effect_that_is_not_whole_is_refused_in_one_line(attribute, value):
+    body = {k: getattr(get_effect("dark_bias"), k) for k in ("slot", "title", "mechanism", "reference", "parameters")}
+    body |= {"name": "mine", attribute: value, "apply": lambda self, state: None}
+    cls = type("Mine", (Effect,), {k: v for k, v in body.items() if v is not None})
+    with pytest.raises(ConfigError, match=f"effect mine: expected .*{attribute}"):
+        register(cls)
+    assert "mine" not in effect_names()

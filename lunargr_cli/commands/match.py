@@ -27,7 +27,10 @@ def command(
     ],
     matchers: Annotated[
         list[str] | None,
-        typer.Option("--matcher", help="daisy, sift, aliked or disk; may be repeated (default: daisy and sift)."),
+        typer.Option(
+            "--matcher",
+            help="daisy, sift, aliked, disk, or one that you added; may be repeated (default: daisy and sift).",
+        ),
     ] = None,
     split: Annotated[str, typer.Option("--split", help="train, validation or test (for pairs).")] = Config.split,
     count: Annotated[

@@ -72,6 +72,8 @@ DIAGNOSIS = declare(
             "field_term": "cosines of a frame's response over a crop",
             "column": "detector samples, evenly spaced from the first to the last",
             "site": "sites of the pairs, by their number there",
+            "frame_value": "coordinates of effects with values per image that name no variable of their own",
+            "site_value": "the same of effects with values per site",
             "term": "cosines of an albedo pattern, down and across a crop, in the order of the effect's coordinates",
         },
         variables=(
@@ -107,6 +109,14 @@ DIAGNOSIS = declare(
                 "1",
                 "albedo_map: amplitudes of the cosines at each site, relative to its albedo; 0 for sites not looked at",
             ),
+            text_column(
+                "frame_value", "frame_value_name", "effect and coordinate of a column of frame_values", required=False
+            ),
+            _value("frame_values", ("frame", "frame_value"), "1", "values per image, in the unit of the coordinate"),
+            text_column(
+                "site_value", "site_value_name", "effect and coordinate of a column of site_values", required=False
+            ),
+            _value("site_values", ("site", "site_value"), "1", "values per site, in the unit of the coordinate"),
         ),
         attributes=(
             Attribute("report", "the diagnosis as JSON (docs: the output of diagnose)", kind="json"),

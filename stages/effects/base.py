@@ -14,6 +14,7 @@ from schemas.errors import ConfigError, RegistryError
 from stages.physics.formation.chain import SLOTS, State
 from stages.physics.photometry import Parameter
 
+SCOPES = ("scene", "image", "site")
 Values = dict[str, Any]  # coordinate -> float (scene), or tensor (frames,) or (sites,)
 
 
@@ -84,7 +85,8 @@ class Effect(ABC):
     one_sided    a fixed coordinate by whose sign it is told from what is alike on both sides
     of_law       another form of the reflectance law could do the same: it is a cause only where that form has nothing to add
     shadow_error how far its first coordinate may be off where shadows alone tell it, since the DEM's horizons are
-    table        where values per image (or site) stand in diagnosis.h5, and the name of their second dimension
+    table        a variable of diagnosis.h5 of its own for values per image or site, and its second dimension or None; without
+                 one they stand in `frame_values` or `site_values`
     linear       whether the image is linear in the coordinates: a first estimate beyond their bounds stays there
     """
 
@@ -246,7 +248,15 @@ _EFFECTS: dict[str, type[Effect]] = {}
 
 
 def register(cls: type[Effect]) -> type[Effect]:
-    """Class decorator: make an effect known under its name."""
+    """Class decorator: make an effect known under its name. Raises ConfigError in one line for one that is not whole."""
+    where = f"effect {getattr(cls, 'name', cls.__name__)}"
+    for attribute in ("name", "slot", "title", "mechanism", "reference", "parameters"):
+        if not hasattr(cls, attribute):
+            raise ConfigError(
+                f"{where}: expected `{attribute}` in class {cls.__name__} of {cls.__module__}, found none."
+            )
+    if cls.scope not in SCOPES:
+        raise ConfigError(f"{where}: expected a scope out of {', '.join(SCOPES)}, found '{cls.scope}'.")
     if cls.slot not in SLOTS:
         raise ConfigError(f"effect {cls.name}: expected a slot out of {', '.join(SLOTS)}, found '{cls.slot}'.")
     _EFFECTS[cls.name] = cls

@@ -45,7 +45,9 @@ class Matcher(ABC):
 
     def __init__(self, models: Models) -> None:
         if models.features is not None and not self.needs_models:
-            raise ConfigError(f"`features_model`: the matcher '{self.name}' takes no network; choose aliked or disk.")
+            raise ConfigError(
+                f"`features_model`: the matcher '{self.name}' takes no network; choose one that does: {', '.join(n for n, c in sorted(_MATCHERS.items()) if c.needs_models)}."
+            )
 
     @abstractmethod
     def match(self, measured: np.ndarray, rendered: np.ndarray) -> Matches:
@@ -56,7 +58,10 @@ _MATCHERS: dict[str, type[Matcher]] = {}
 
 
 def register(cls: type[Matcher]) -> type[Matcher]:
-    """Class decorator: make a matcher known under its name."""
+    """Class decorator: make a matcher known under its name. Raises ConfigError in one line for one that is not whole."""
+    for attribute in ("name", "title", "reference"):
+        if not hasattr(cls, attribute):
+            raise ConfigError(f"matcher {cls.__name__}: expected `{attribute}` in {cls.__module__}, found none.")
     _MATCHERS[cls.name] = cls
     return cls
 
@@ -68,10 +73,10 @@ def _load_all() -> None:
         importlib.import_module(f"stages.match.{module.name}")
 
 
-def matcher_names() -> list[str]:
-    """The registered matchers, sorted."""
+def matchers() -> list[type[Matcher]]:
+    """The registered matchers, by name."""
     _load_all()
-    return sorted(_MATCHERS)
+    return [_MATCHERS[name] for name in sorted(_MATCHERS)]
 
 
 def get_matcher(name: str, models: Models = Models()) -> Matcher:

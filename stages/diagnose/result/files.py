@@ -17,14 +17,24 @@ from stages.diagnose.result.answer import Answer
 def write_diagnosis(
     path: Path, answer: Answer, image_ids: Sequence[str], inputs: Sequence[Path], overwrite: bool
 ) -> None:
-    """Write the file. Values per image stand in tables, under the name and in the order that the effect's class gives."""
+    """Write the file. Values per image or site stand in the variable that the effect's class names, or in a common one."""
     entries: list[dict[str, Any]] = []
     tables: dict[str, Any] = {}
+    shared: dict[str, list[tuple[str, Tensor]]] = {"frame": [], "site": []}  # columns of effects without a variable
     sizes = {"frame": len(image_ids)}
     for cause in answer.causes:
         effect = cause.effect
         entry: dict[str, Any] = {"effect": effect.name, "survey": effect.survey.to_json(), "values": {}}
-        if effect.table and any(isinstance(v, Tensor) and v.ndim for v in effect.values.values()):
+        if not any(isinstance(v, Tensor) and v.ndim for v in effect.values.values()):
+            entry["values"] = {k: float(v) + effect.in_simulation.get(k, 0.0) for k, v in effect.values.items()}
+        elif effect.table is None:
+            kind = "site" if effect.scope == "site" else "frame"
+            first = len(shared[kind])
+            shared[kind] += [(f"{effect.name} {k}", torch.as_tensor(v).float()) for k, v in effect.values.items()]
+            entry["tables"] = {
+                k: {"variable": f"{kind}_values", "column": first + j} for j, k in enumerate(effect.values)
+            }
+        else:
             variable, second = effect.table
             data = torch.stack([torch.as_tensor(v) for v in effect.values.values()], 1).float().numpy()
             tables[variable] = data if second else data[:, 0]
@@ -33,11 +43,14 @@ def write_diagnosis(
                 sizes[second] = data.shape[1]
             if effect.scope == "site":
                 sizes["site"] = len(data)
-        else:
-            entry["values"] = {k: float(v) + effect.in_simulation.get(k, 0.0) for k, v in effect.values.items()}
         for variable, (curve, dimension) in effect.curves().items():
             tables[variable], sizes[dimension] = curve, len(curve)
         entries.append(entry)
+    for kind, columns in shared.items():
+        if columns:
+            data = torch.stack(torch.broadcast_tensors(*(values for _, values in columns)), 1).numpy()
+            tables[f"{kind}_values"], tables[f"{kind}_value_name"] = data, [name for name, _ in columns]
+            sizes |= {kind: len(data), f"{kind}_value": len(columns)}
     attributes = {"report": json.dumps(answer.to_json()), "extension": json.dumps(entries)}
     with ArtefactWriter(
         path, DIAGNOSIS, sizes, config=answer.config, inputs=inputs, attributes=attributes, overwrite=overwrite
