@@ -7,8 +7,14 @@ import pytest
 import torch
 from hidden.laws import LAWS
 from orbital_angles import orbital_cosines
+from planted import semi_real
 
-from stages.diagnose.model.laws import lunar_laws
+from stages.diagnose.model.form import better_form, other_laws
+from stages.diagnose.model.laws import LunarLaws, lunar_laws
+from stages.diagnose.model.nominal import fit, load_nominal
+from stages.diagnose.model.sites import load_site, number_grounds
+from stages.effects import Survey, effect_names, get_effect
+from stages.pairs.reader import PairReader
 from stages.physics.formation.geometry import Angles
 
 # percent of brightness, rms: what a law leaves passes for causes, since noise of so many pixels is averaged to 0.01 %
@@ -42,3 +48,39 @@ def test_a_law_is_followed_with_coefficients_that_are_no_surprise(laws, angles, 
     left = 100 * np.sqrt(np.mean((a @ found - b) ** 2))
     assert left < LEFT[name]
     assert np.abs(found[1:] / found[0] / scatter[1:]).max() < 4
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    """Four places in eight images each, to be filled."""
+    with PairReader(semi_real(tmp_path_factory.mktemp("film") / "pairs.h5", 4711, sites=3)) as reader:
+        sites = [load_site(reader, np.flatnonzero(reader.site == k)) for k in np.unique(reader.site)]
+    number_grounds(sites)
+    return sites
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_film_is_fitted_by_measured_laws_unless_the_ground_has_the_nominal_form(places, name):
+    """Albedo leaves most of the residual, whatever the law: what the right one leaves surely less need not be half of it."""
+    generator = torch.Generator().manual_seed(3)
+    nominal = load_nominal(None, "M2", "dn")
+    with torch.no_grad():
+        for site in places:
+            angles = nominal.chain(site, []).state.angles
+            cosines = [c.double().clamp(min=1e-3).numpy() for c in (angles.cos_incidence, angles.cos_emission)]
+            light = torch.as_tensor(LAWS[name](*cosines, angles.cos_phase.double().numpy(), 0.1)).float()
+            albedo = 1 + 0.03 * torch.randn(light.shape[1:], generator=generator)
+            gain, offset = torch.rand(2, site.count, 1, 1, generator=generator) + 0.5
+            site.gain, site.offset = torch.ones(site.count), torch.zeros(site.count)
+            site.read = site.image = 2000 * gain * light * albedo + 50 * offset
+        fit(nominal, places, [], "dn", [s.read for s in places], start=True)
+        nominal.laws = other_laws(nominal, places, "dn")
+        other = better_form(nominal, places, "dn")
+    assert isinstance(other and other.model, LunarLaws) == (name != "linear")
+
+
+def test_beside_free_gains_no_effect_of_the_law_is_visible():
+    of_law = [get_effect(n) for n in effect_names() if get_effect(n).of_law]
+    assert len(of_law) > 3
+    assert not any(e.visible(Survey(units="dn"), frozenset()) for e in of_law)
+    assert all(e.visible(Survey(units="iof"), frozenset()) for e in of_law)

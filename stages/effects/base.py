@@ -157,8 +157,8 @@ class Effect(ABC):
 
     @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:
-        """Whether files with these optional variables can show the effect at all."""
-        return True
+        """Whether files with these optional variables can show the effect at all; beside free gains nothing is known of the law."""
+        return not (cls.of_law and survey.units == "dn")
 
     @classmethod
     def step(cls, name: str, survey: Survey) -> float:

@@ -30,7 +30,6 @@ class Found:
     sizes: Array = field(default_factory=lambda: np.ones(1))  # squares of the residual on these units
     spread: float = 0.0
     beside: float = 0.0  # scatter of the gains per frame beside it, where that is less than without
-    alone: float = 0.0  # standard errors by which the largest amount differs from nothing
 
     @property
     def gain(self) -> float:

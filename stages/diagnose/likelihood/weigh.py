@@ -212,15 +212,12 @@ class Whole:
         inflation = max(1.0, float(null.mean()) / len(places)) if len(null) else 1.0
         error = np.sqrt(np.maximum(inverse.diagonal(), 0))
         surprises = surprise(np.concatenate([[ratio], null]) / inflation, len(places))
-        found = Found(
-            guise.effect, guise, amount, error, float(surprises[0]), alone=math.sqrt(max(ratio / inflation, 0.0))
-        )
+        found = Found(guise.effect, guise, amount, error, float(surprises[0]))
         if len(self.scattered):
             beside, spread, instead = (self.levels or self)._beside_gains(places, self.exclude(guise))
             if beside > ratio:
                 found.surprise = max(found.surprise, float(surprise(np.array([beside / inflation]), len(places))[0]))
                 found.beside = spread
-                found.alone = math.sqrt(beside / inflation)
                 found.amount = amount if instead is None else instead
         return found, surprises[1:]
 
@@ -262,7 +259,6 @@ class Whole:
         amount = variance @ score
         error = np.sqrt(np.maximum(variance.diagonal(), 0))
         found = Found(guise.effect, guise, amount, error, float(best[0]) / 2 / math.log(10), spread=spread)
-        found.alone = math.sqrt(float(best[0]))
         return found, null / 2 / math.log(10)
 
     def held_out(

@@ -5,14 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
+from torch import Tensor
 
+from stages.common.arrays import Floats
+from stages.diagnose.likelihood.jackknife import gain_interval
 from stages.diagnose.model.laws import LunarLaws, lunar_laws
 from stages.diagnose.model.nominal import Nominal, fit, lit_mask
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sampled import draw
 from stages.diagnose.model.sites import Site
-from stages.diagnose.settings import HALVED
+from stages.diagnose.settings import CORRELATED, HALVED
 
 
 def relative_misfit(nominal: Nominal, sites: Sequence[Site], varied: bool = False, whole: bool = False) -> float:
@@ -46,11 +50,61 @@ def other_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> LunarLaws
 
 
 def better_form(nominal: Nominal, sites: Sequence[Site], units: str) -> Nominal | None:
-    """Measured lunar laws, fitted, if they leave less than half of the squared residual; or None. The sites are as they were."""
+    """Measured lunar laws, fitted, if they leave surely less than the nominal one; or None. The sites are as they were.
+
+    Of calibrated images they leave less than half, for a single cause may be what the nominal law lacks. Of images with free gains, beside which
+    no cause is known by what it does to the law, they leave surely less of ground that neither law was fitted to.
+    """
     other = measured_laws(nominal, sites, units)
-    if other is None or relative_misfit(other, sites) ** 2 > HALVED * relative_misfit(nominal, sites) ** 2:
+    if other is None:
         return None
-    return other
+    if units == "dn":
+        sure = gain_interval(left_elsewhere(nominal, sites), left_elsewhere(other, sites))[1] > 0
+    else:
+        sure = relative_misfit(other, sites) ** 2 <= HALVED * relative_misfit(nominal, sites) ** 2
+    return other if sure else None
+
+
+def left_elsewhere(nominal: Nominal, sites: Sequence[Site]) -> Floats:
+    """(grounds,) squared relative residuals of the images as they were read, each with its own gain and offset, the coefficients moved to
+    what all other ground says of them.
+    """
+
+    def of(site: Site) -> Tensor:
+        """(1 + C, 1 + C) products of the residual and of what each free coefficient adds to it."""
+        chain = nominal.chain(site, [])
+        mask = lit_mask(chain)
+        level = (site.read * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
+        weight = (mask / level.clamp(min=1e-9)[:, None, None]).double()
+        flat = torch.stack([site.read, chain.predict(), *chain.surface_tangents()]).double() * weight
+        image, predicted, *moved = flat.flatten(2)
+        offset = torch.nn.functional.normalize(weight.flatten(1), dim=-1)
+        shape = torch.nn.functional.normalize(_without(predicted, offset), dim=-1)
+        gain = (image * shape).sum(-1) / (predicted * shape).sum(-1).clamp(min=1e-12)
+        columns = [image, *(gain.clamp(min=0)[:, None] * m for m in moved)]
+        free = torch.stack([_without(_without(c, offset), shape) for c in columns]).flatten(1)
+        return free @ free.T
+
+    products = torch.zeros(max(s.ground for s in sites) + 1, *2 * [1 + int(nominal.free.sum())], dtype=torch.float64)
+    products.index_add_(0, torch.tensor([s.ground for s in sites]), torch.stack(per_site(of, sites)))
+    own, at = products.numpy(), nominal.vector[nominal.free].double().numpy()
+    known = np.zeros(len(at))
+    if isinstance(nominal.model, LunarLaws):
+        pixels = sum(float(s.read_valid.sum()) for s in sites)
+        known = CORRELATED * own[:, 0, 0].sum() / pixels * nominal.model.scatter[nominal.free].double().numpy() ** -2
+    out = []
+    for ground in own:
+        rest = own.sum(0) - ground
+        # what an image's own gain or offset does as well is not seen
+        normal = rest[1:, 1:] + np.diag(known + 1e-9 * rest.diagonal()[1:].max())
+        move = np.linalg.solve(normal, rest[1:, 0] - known * at)
+        out.append(ground[0, 0] - 2 * move @ ground[1:, 0] + move @ ground[1:, 1:] @ move)
+    return np.array(out)
+
+
+def _without(x: Tensor, direction: Tensor) -> Tensor:
+    """(n, X) less its part along unit vectors (n, X)."""
+    return x - (x * direction).sum(-1, keepdim=True) * direction
 
 
 def measured_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> Nominal | None:
@@ -73,4 +127,4 @@ def measured_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> Nomina
     return other
 
 
-__all__ = ["better_form", "measured_laws", "other_laws", "relative_misfit"]
+__all__ = ["better_form", "left_elsewhere", "measured_laws", "other_laws", "relative_misfit"]

@@ -130,7 +130,7 @@ def _hidden_squares(state: State) -> np.ndarray:
 
 
 def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
-    """Effects whose expected error is more than a size worth knowing allows, and which are not seen all the same."""
+    """Effects whose expected error is more than a size worth knowing allows, and which are not named all the same."""
     out = []
     seen = set(state.open_names())
     for name in effect_names():
@@ -150,8 +150,6 @@ def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
             continue
         if SURE * state.open.get(name, 0.0) > 1:  # errors over ground or images are larger than the likelihood's
             out.append(name)
-            continue
-        if found.alone >= SURE:
             continue
         error = math.inf
         for guise in whole.plan.guises:
