@@ -67,8 +67,8 @@ def held_out_images(result: dict[str, Any]) -> list[Sentence]:
     unseen = f"{counted(len(result.get('images', [])), 'unseen image')}, {basis(result)}"
     if sun:
         unseen += f", their Suns {sun['least']:.0f} to {sun['most']:.0f} deg from the nearest one used"
-    what = "On seen ground under unseen images, which is another claim, albedo from the other photographs"
-    return [compared(what, "the map from terrain alone", gain, unseen)]
+    ours = "On seen ground under unseen images, which is another claim, albedo from the other photographs"
+    return [compared(ours, "the map from terrain alone", gain, unseen)]
 
 
 def albedo(file: h5py.File) -> list[Sentence]:
