@@ -42,15 +42,15 @@ class Pace:
         return elapsed, seconds_each * (total - done)
 
 
-def bar_line(what: str, done: int, total: int, times: tuple[float, float | None], width: int, plain: bool) -> str:
+def bar_line(label: str, done: int, total: int, times: tuple[float, float | None], width: int, plain: bool) -> str:
     """'epoch 2/6 ━━━━━━──── 38 %, 14 s, 42 s left', in at most ``width`` characters; plain : ASCII alone"""
     words = f" {progress_words(done, total, times)}"
-    room = min(LONGEST_BAR, width - len(what) - len(words) - 2)
+    room = min(LONGEST_BAR, width - len(label) - len(words) - 2)
     if room < 5 or total <= 0:
-        return f"{what}{words}"[: width - 1]
+        return f"{label}{words}"[: width - 1]
     full = room * min(max(done, 0), total) // total
     filled, empty = ("#", "-") if plain else ("━", "─")
-    return f"{what} {filled * full}{empty * (room - full)}{words}"
+    return f"{label} {filled * full}{empty * (room - full)}{words}"
 
 
 def progress_words(done: int, total: int, times: tuple[float, float | None]) -> str:

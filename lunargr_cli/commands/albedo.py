@@ -57,20 +57,20 @@ def command(
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_albedo
 
-        found = run_albedo(svbrdf, scene, to, config, Work(scheduler, parts, console.say, console.progress))
+        summary = run_albedo(svbrdf, scene, to, config, Work(scheduler, parts, console.say, console.progress))
     else:
-        found = albedo.run(svbrdf, scene, to, config, console.say, console.progress)
-    mean, std, low, high = found.albedo
+        summary = albedo.run(svbrdf, scene, to, config, console.say, console.progress)
+    mean, std, low, high = summary.albedo
     console.say(
-        f"{output}: albedo from {len(found.images)} images over {found.covered_share:.1%} of the map, "
-        f"{found.mean_images:.1f} a pixel, {mean:.3f} +- {std:.3f} ({low:.3f} .. {high:.3f}), "
-        f"median standard deviation {found.albedo_std:.3f}"
+        f"{output}: albedo from {len(summary.images)} images over {summary.covered_share:.1%} of the map, "
+        f"{summary.mean_images:.1f} a pixel, {mean:.3f} +- {std:.3f} ({low:.3f} .. {high:.3f}), "
+        f"median standard deviation {summary.albedo_std:.3f}"
     )
-    if found.left_out:
-        console.say(f"left out: {', '.join(found.left_out)}")
+    if summary.left_out:
+        console.say(f"left out: {', '.join(summary.left_out)}")
     rows = []
-    for number, (size, shared, own) in enumerate(found.bands):
-        last = number == len(found.bands) - 1
+    for number, (size, shared, own) in enumerate(summary.bands):
+        last = number == len(summary.bands) - 1
         rows.append((f"{'over ' if last else ''}{size:.0f}", f"{shared:.4f}", f"{own:.4f}"))
     console.table(
         "log albedo beyond the map, by size of structure", ("px", "shared by all images", "of one image alone"), rows

@@ -80,7 +80,7 @@ def command(
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_infer
 
-        found = run_infer(
+        summary = run_infer(
             terrain, checkpoint, to, config, gridding, Work(scheduler, parts, console.say, console.progress)
         )
     else:
@@ -89,9 +89,9 @@ def command(
             if gridding is not None:
                 scene = stack.enter_context(scratch_path(output, "grid"))
                 ingest.run(terrain, None, scene, gridding, progress=console.progress)
-            found = infer.run(scene, checkpoint, to, config, console.say, console.progress)
+            summary = infer.run(scene, checkpoint, to, config, console.say, console.progress)
     console.say(
-        f"{output}: {found.grid.height} x {found.grid.width} px at {found.grid.gsd:g} m, {found.valid_share:.1%} valid"
+        f"{output}: {summary.grid.height} x {summary.grid.width} px at {summary.grid.gsd:g} m, {summary.valid_share:.1%} valid"
     )
-    rows = [(name, *(f"{v:.5f}" for v in values)) for name, values in found.coefficients.items()]
-    console.table(f"coefficients of {found.model}", ("name", "mean", "std", "1 %", "99 %"), rows)
+    rows = [(name, *(f"{v:.5f}" for v in values)) for name, values in summary.coefficients.items()]
+    console.table(f"coefficients of {summary.model}", ("name", "mean", "std", "1 %", "99 %"), rows)

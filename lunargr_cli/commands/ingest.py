@@ -52,21 +52,21 @@ def command(
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_ingest
 
-        found = run_ingest(dem, images, to, config, Work(scheduler, parts, console.say, console.progress))
+        summary = run_ingest(dem, images, to, config, Work(scheduler, parts, console.say, console.progress))
     else:
-        found = ingest.run(dem, images, to, config, console.say, console.progress)
-    grid, (low, high) = found.grid, found.elevation_range
-    method = "reprojected to a local metric grid" if found.resampled else "area means of the DEM's own grid"
+        summary = ingest.run(dem, images, to, config, console.say, console.progress)
+    grid, (low, high) = summary.grid, summary.elevation_range
+    method = "reprojected to a local metric grid" if summary.resampled else "area means of the DEM's own grid"
     console.say(
         f"{output}: {grid.height} x {grid.width} px at {grid.gsd:g} m, {method}; "
-        f"{found.dem_valid_share:.1%} valid, {low:.1f} to {high:.1f} m"
+        f"{summary.dem_valid_share:.1%} valid, {low:.1f} to {high:.1f} m"
     )
-    for name in found.skipped:
+    for name in summary.skipped:
         console.say(f"left out: image '{name}' does not touch the DEM")
-    for frame in found.blank:
+    for frame in summary.blank:
         console.say(
             f"warning: {frame.path}: image '{frame.image_id}' has no valid pixel on the DEM; is it all nodata there?"
         )
-    if found.frames:
-        rows = [(f.image_id, f.units, f"{a:.2f}") for f, a in zip(found.frames, found.valid_area_km2, strict=True)]
+    if summary.frames:
+        rows = [(f.image_id, f.units, f"{a:.2f}") for f, a in zip(summary.frames, summary.valid_area_km2, strict=True)]
         console.table(f"images: where a crop of {crop} px fits", ("image", "units", "km2"), rows)

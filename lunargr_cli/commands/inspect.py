@@ -30,37 +30,45 @@ def command(
     from schemas.provenance import chain
     from schemas.rasters import raster_kind
 
-    found = _of_raster(file) if raster_kind(file) else _of_artefact(file)
+    content = _describe_raster(file) if raster_kind(file) else _describe_artefact(file)
     steps = chain(file)
     if raster_kind(file) and steps[-1].record is None:
         raise ArtefactError(
             f"{file}: expected a raster that a lunargr command wrote, found no record of one; gdalinfo and oiiotool read others."
         )
     if json_file is not None:
-        content = {"file": file.name, "schema": found.schema, "attributes": found.attributes, found.what: found.parts}
-        write_json(json_file, content | {"chain": [asdict(s) for s in steps]})
+        result = {
+            "file": file.name,
+            "schema": content.schema,
+            "attributes": content.attributes,
+            content.kind: content.parts,
+        }
+        write_json(json_file, result | {"chain": [asdict(s) for s in steps]})
     console = Console()
-    write_out(f"{file}: {found.title}\n")
-    rows = [(n, *(v for v in part.values() if isinstance(v, str))) for n, part in found.parts.items()]
-    console.table(found.what, ("name", *found.columns), rows)
-    shown = {k: v for k, v in found.attributes.items() if k != "provenance"}
+    write_out(f"{file}: {content.title}\n")
+    rows = [(n, *(v for v in part.values() if isinstance(v, str))) for n, part in content.parts.items()]
+    console.table(content.kind, ("name", *content.columns), rows)
+    shown = {k: v for k, v in content.attributes.items() if k != "provenance"}
     console.table("attributes", ("name", "value"), shown.items())
     console.table("made by, in this order", ("file", "command", "version", "seed", "sha256"), [_row(s) for s in steps])
 
 
 @dataclass(frozen=True)
-class Found:
-    """parts : the variables or bands by name, what is text in them stands in the table under ``columns``"""
+class Content:
+    """What a file holds.
+
+    kind : of its parts, 'variables' or 'bands'; parts : by name, what is text in them stands in the table under ``columns``
+    """
 
     schema: str
     title: str
-    what: str
+    kind: str
     columns: tuple[str, ...]
     parts: dict[str, dict[str, Any]]
     attributes: dict[str, Any]
 
 
-def _of_artefact(file: Path) -> Found:
+def _describe_artefact(file: Path) -> Content:
     from schemas import open_artefact, read_kind
 
     schema = read_kind(file)
@@ -78,19 +86,19 @@ def _of_artefact(file: Path) -> Found:
             and not str(data[name].attrs.get("NAME", "")).startswith("This is a netCDF dim")
         }
     title = f"{schema.title} ('{schema.name}', version {schema.version}, written by 'lunargr {schema.stage}')"
-    return Found(schema.name, title, "variables", ("shape", "type"), variables, attributes)
+    return Content(schema.name, title, "variables", ("shape", "type"), variables, attributes)
 
 
-def _of_raster(file: Path) -> Found:
+def _describe_raster(file: Path) -> Content:
     from schemas.rasters import read_raster
 
-    found = read_raster(file)
-    size = "x".join(map(str, found.shape))
+    raster = read_raster(file)
+    size = "x".join(map(str, raster.shape))
     bands = {
-        name: {"shape": list(found.shape), "size": size, "unit": unit, "dtype": kind}
-        for name, unit, kind in found.bands
+        name: {"shape": list(raster.shape), "size": size, "unit": unit, "dtype": kind}
+        for name, unit, kind in raster.bands
     }
-    return Found(found.kind, found.kind, "bands", ("shape", "unit", "type"), bands, dict(found.tags))
+    return Content(raster.kind, raster.kind, "bands", ("shape", "unit", "type"), bands, dict(raster.tags))
 
 
 def _row(step: Step) -> tuple[object, ...]:

@@ -90,18 +90,18 @@ def command(
 
         if blocks_csv is not None:
             raise ConfigError("--shifts: parts do not keep the blocks' own shifts; leave out --scheduler and --resume.")
-        found = run_project(crops, to, config, Work(scheduler, parts, console.say, console.progress))
+        summary = run_project(crops, to, config, Work(scheduler, parts, console.say, console.progress))
     else:
-        found = project.run(crops, to, config, console.say, console.progress)
-    (i0, i1), (e0, e1) = found.incidence_deg, found.emission_deg
+        summary = project.run(crops, to, config, console.say, console.progress)
+    (i0, i1), (e0, e1) = summary.incidence_deg, summary.emission_deg
     console.say(
-        f"{output}: {found.pairs} pairs, {found.valid_share:.1%} of pixels valid, {found.shadowed_share:.1%} of these in cast shadow; "
+        f"{output}: {summary.pairs} pairs, {summary.valid_share:.1%} of pixels valid, {summary.shadowed_share:.1%} of these in cast shadow; "
         f"incidence {i0:.1f}-{i1:.1f} deg, emission {e0:.1f}-{e1:.1f} deg"
     )
-    if found.registered:
-        _say_registered(console, found.registered)
+    if summary.registered:
+        _say_registered(console, summary.registered)
     if blocks_csv is not None:
-        _write_blocks(blocks_csv, found.registered)
+        _write_blocks(blocks_csv, summary.registered)
 
 
 def _say_registered(console: Console, registered: Sequence[Registered]) -> None:

@@ -68,9 +68,9 @@ def command(
     }
     config = options.configure(Config, locals(), **texts, **numbers)
     console = Console(quiet)
-    found = train.run(pairs, Output(output, overwrite, resume), config, console.say, console.progress)
-    best = found.history.best_epoch
+    summary = train.run(pairs, Output(output, overwrite, resume), config, console.say, console.progress)
+    best = summary.history.best_epoch
     console.say(
-        f"{output}: best epoch {best + 1}, validation MSE {found.history.validation_loss[best]:.4e}; "
-        f"{found.pairs_per_second:.1f} pairs/s in {found.precision}"
+        f"{output}: best epoch {best + 1}, validation MSE {summary.history.validation_loss[best]:.4e}; "
+        f"{summary.pairs_per_second:.1f} pairs/s in {summary.precision}"
     )

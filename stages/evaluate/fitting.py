@@ -90,9 +90,8 @@ def fit_rows(data: Fitting, rows: Sequence[Row], tick: Callable[[int], None] = l
                 grams[renderer.name][part].add(features, batch.image, batch.usable, batch.frame)
             tick(len(chosen))
     for renderer in renderers:
-        known, own = grams[renderer.name]
-        use_own = (known.pixels == 0)[:, None, None]
-        joined = np.where(use_own, own.gram, known.gram)
+        of_train, of_orphans = grams[renderer.name]
+        joined = np.where((of_train.pixels == 0)[:, None, None], of_orphans.gram, of_train.gram)
         renderer.gain, renderer.offset = solve_gain_offset(joined, np.ones(1))
 
 

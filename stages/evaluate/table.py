@@ -52,8 +52,8 @@ def metric_table(scores: Scores, unit: np.ndarray) -> dict[str, dict[str, Any]]:
             values = scores.runs(name, metric)
             row[metric] = _mean(values)
             if metric != "ssim_range_1":
-                found = ratio_interval(values, crops, unit)
-                row[f"{metric}_low"], row[f"{metric}_high"] = found.low, found.high
+                interval = ratio_interval(values, crops, unit)
+                row[f"{metric}_low"], row[f"{metric}_high"] = interval.low, interval.high
         numbers: dict[str, Any] = {key: finite(value) for key, value in row.items()}
         table[name] = numbers | {"freedom": freedom(name), "mse_runs": runs.tolist()}
     return table

@@ -41,7 +41,10 @@ def open_source(source: Path, config: Config, body: Body) -> Iterator[Surface]:
 def make_light(
     surface: Surface, config: Config, body: Body, relief: tuple[float, float], camera: Camera | None = None
 ) -> Light:
-    """The light over a surface; a camera model that knows its Sun stands in for a Sun that nobody named."""
+    """The light over a surface; a camera model that knows its Sun stands in for a Sun that nobody named. Raises LunargrError.
+
+    relief : lowest and highest elevation, m
+    """
     known = camera.sun_position(np.array([camera.lines / 2])) if camera is not None and config.camera else None
     if known is not None and all(getattr(config, name) is None for name in SUN):
         sun = Sun(known[0], SUN_RADIUS * AU / float(np.linalg.norm(known[0])))
@@ -69,7 +72,7 @@ def make_light(
 
 
 def _earthshine(surface: Surface, config: Config, body: Body, sun: Sun, relief: float) -> Earthshine:
-    """The Earth's light over a surface of the Moon. Raises LunargrError."""
+    """The Earth's light over a surface of the Moon. relief : m, highest above lowest point. Raises LunargrError."""
     if body.name != "moon":
         raise ConfigError(f"`earthshine`: expected the Moon, which alone the Earth lights, found `body` {body.name}.")
     grid = surface.grid
@@ -87,9 +90,9 @@ def _earthshine(surface: Surface, config: Config, body: Body, sun: Sun, relief: 
         raise ConfigError(
             "`earthshine`: expected `time`, or `earth_azimuth_deg` and `earth_elevation_deg`; found neither."
         )
-    found = Earthshine.over(surface, sun, position, relief, config.shadows)
-    check_sun_is_up(found.disc, grid, relief, "Earth")
-    return found
+    earthshine = Earthshine.over(surface, sun, position, relief, config.shadows)
+    check_sun_is_up(earthshine.disc, grid, relief, "Earth")
+    return earthshine
 
 
 def _named_sun(surface: Surface, config: Config, body: Body) -> Sun:
@@ -161,7 +164,7 @@ def camera_place(camera: Camera) -> NDArray[np.float64]:
 
 
 def metadata(surface: Surface, config: Config, light: Light) -> dict[str, object]:
-    """What a file must say about how it came to be."""
+    """The attributes of a rendered file: source, model, Sun, options, and the record of the run."""
     facts = {k: v for k, v in asdict(config).items() if v not in (None, {}, False) and k != "shard"}
     return {
         "source": surface.path.name,

@@ -53,8 +53,8 @@ def run_stereo(
     manifest = folder / "manifest.json"
     check_output(manifest, [source], output.overwrite)
     body = find_body("moon" if config.body is None else config.body)
-    own = replace(config, view="pinhole", position=(0.0, 0.0, 0.0))
-    check(own)
+    view_config = replace(config, view="pinhole", position=(0.0, 0.0, 0.0))
+    check(view_config)
     rng = np.random.default_rng(stereo.seed)
     pairs: list[dict[str, Any]] = []
     with open_source(source, config, body) as surface:
@@ -62,7 +62,7 @@ def run_stereo(
         places = _Places(surface, config, stereo, rng)
         for number in range(stereo.count):
             progress(number, stereo.count, "pairs")
-            pairs.append(_render_pair(f"pair_{number:05d}", surface, places, own, body, relief, world, folder))
+            pairs.append(_render_pair(f"pair_{number:05d}", surface, places, view_config, body, relief, world, folder))
     document = {
         "source": source.name,
         "pixel_centre": 0.5,
@@ -153,10 +153,10 @@ def _render_pair(
             "sun_azimuth_deg": rng.uniform(0, 360),
             "sun_elevation_deg": rng.uniform(*stereo.sun_elevation_deg),
         }
-        own = replace(config, **sun)
+        view_config = replace(config, **sun)
         files = output_files(folder / f"{name}_{side}.exr", "pinhole")
-        light = make_light(surface, own, body, relief)
-        render_camera(surface, camera, light, relief, files, own, f"{name}_{side}", show_nothing)
+        light = make_light(surface, view_config, body, relief)
+        render_camera(surface, camera, light, relief, files, view_config, f"{name}_{side}", show_nothing)
         views.append({"image": files[0].name, "preview": files[1].name, "camera": camera.to_document(), **sun})
         exrs.append(read_exr(files[0]))
         cameras.append(camera)
@@ -209,9 +209,9 @@ def correspondences(
     inside, sample, line, distance = project(right, world, points)
     visible = np.zeros(len(points))
     inside &= known
-    found = depths[1][line[inside].astype(int), sample[inside].astype(int)]
+    nearest = depths[1][line[inside].astype(int), sample[inside].astype(int)]
     # the right camera may see farther, past an edge within the pixel, but nothing nearer
-    visible[inside] = found > distance[inside] * (1 - SAME_PLACE)
+    visible[inside] = nearest > distance[inside] * (1 - SAME_PLACE)
     shape = depths[0].shape
     named = {"sample": sample, "line": line, "visible": visible}
     return {k: np.where(known, v, np.nan).reshape(shape).astype(np.float32) for k, v in named.items()}

@@ -69,31 +69,31 @@ def run_trajectory(
             if view.view_id in done:
                 results.append(Summary(view.view_id, tuple(outputs[view.view_id]), config.size_px, skipped=True))
                 continue
-            own = _with_row(config, view)
-            key = repr([getattr(own, k) for k in SUN])
+            view_config = _with_row(config, view)
+            key = repr([getattr(view_config, k) for k in SUN])
             try:
                 if key not in lights:
-                    lights = {key: make_light(surface, own, body, relief)}
-                camera = find_camera(surface, own)
+                    lights = {key: make_light(surface, view_config, body, relief)}
+                camera = find_camera(surface, view_config)
                 light = replace(lights[key], camera_position=camera_place(camera))
                 results.append(
                     render_camera(
-                        surface, camera, light, relief, outputs[view.view_id], own, view.view_id, show_nothing
+                        surface, camera, light, relief, outputs[view.view_id], view_config, view.view_id, show_nothing
                     )
                 )
             except LunargrError as error:
                 raise type(error)(f"{table.name}, {view.view_id}: {error}") from None
         if config.export is not None:
             cameras = [cast(Pinhole, find_camera(surface, _with_row(config, view))) for view in views]
-            found = [View(v.view_id, c, outputs[v.view_id][0]) for v, c in zip(views, cameras, strict=True)]
-            export_views(found, surface.grid, folder, config.export)
+            rendered = [View(v.view_id, c, outputs[v.view_id][0]) for v, c in zip(views, cameras, strict=True)]
+            export_views(rendered, surface.grid, folder, config.export)
     progress(len(views), len(views), "views")
     return results
 
 
 def _with_row(config: Config, view: ViewRow) -> Config:
     """The configuration of one row: what the row leaves empty stays as it is; a row's Sun replaces the whole Sun."""
-    own = replace(
+    view_config = replace(
         config,
         position=view.position,
         look_at=view.look_at if view.look_at is not None or view.quaternion is not None else config.look_at,
@@ -102,8 +102,8 @@ def _with_row(config: Config, view: ViewRow) -> Config:
         fov_deg=view.fov_deg if view.fov_deg is not None else config.fov_deg,
     )
     if view.sun:
-        own = replace(own, **{**dict.fromkeys(SUN), **view.sun})  # type: ignore[arg-type]
-    return own
+        view_config = replace(view_config, **{**dict.fromkeys(SUN), **view.sun})  # type: ignore[arg-type]
+    return view_config
 
 
 def render_camera(

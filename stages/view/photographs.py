@@ -44,10 +44,10 @@ def read_photographs(path: Path, grid: Grid, factor: int, frames: Frames, count:
     grid : of the page; factor : pixels of the file along each side of one of its pixels
     """
     with open_artefact(path, PAIRS) as file:
-        own, found = grid.gsd / factor, float(file.attrs["gsd_m"])
-        if abs(found - own) > SAME_GSD * own:
+        map_gsd, crop_gsd = grid.gsd / factor, float(file.attrs["gsd_m"])
+        if abs(crop_gsd - map_gsd) > SAME_GSD * map_gsd:
             raise InputError(
-                f"{path}: expected crops at the map's {own:g} m per pixel, found {found:g} m; give the pairs.h5 of this map's scene."
+                f"{path}: expected crops at the map's {map_gsd:g} m per pixel, found {crop_gsd:g} m; give the pairs.h5 of this map's scene."
             )
         size = file["image"].shape[1:]
         rows, cols = grid.rowcol_of_lonlat(file["longitude_deg"][...], file["latitude_deg"][...])
