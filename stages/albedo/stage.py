@@ -30,6 +30,7 @@ from stages.albedo.registered import register
 from stages.albedo.writing import Maps, copy_map, kept_attributes
 from stages.common.arrays import Floats32
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.shards import shard_range
 from stages.physics.bodies.spheres import find_body
 from stages.physics.horizon.scene import make_overview
 from stages.physics.images.table import Frame, load_frames
@@ -242,9 +243,7 @@ def _edge(ground: Ground) -> int:
 
 def _own_rows(ground: Ground, edge: int, config: Config) -> tuple[int, int]:
     rows = ground.map["valid"].shape[0]
-    index, count = config.shard
-    bands = -(-rows // edge)
-    first, last = (min(rows, edge * (bands * k // count)) for k in (index, index + 1))
+    first, last = (min(rows, edge * band) for band in shard_range(-(-rows // edge), config.shard))
     return first, last
 
 
