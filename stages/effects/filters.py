@@ -15,24 +15,25 @@ MARGIN = 12  # px of mirrored border, over 3 sigma of anything that the effects 
 def gaussian(image: Tensor, sigma2: Tensor | float, limit: float = 4.0, slopes: bool = False) -> Tensor:
     """Blur by a Gaussian of variance ``sigma2`` px^2; negative: sharpen, each frequency at most ``limit`` times.
 
-    image : (B, H, W); sigma2 : scalar. Differentiable in both.
+    image : (..., H, W); sigma2 : scalar. Differentiable in both.
     slopes : go on beyond the borders with the slope that there is (heights), not mirrored (brightness): no crease is sharpened
     """
     margin = min(MARGIN, image.shape[-1] - 1, image.shape[-2] - 1)
     if slopes:
         wide = _turned(_turned(image, margin).transpose(-2, -1), margin).transpose(-2, -1)
     else:
-        wide = pad(image[:, None], (margin,) * 4, mode="reflect")[:, 0]
+        wide = pad(image.flatten(0, -3)[:, None], (margin,) * 4, mode="reflect")[:, 0]
+        wide = wide.view(*image.shape[:-2], *wide.shape[-2:])
     height, width = wide.shape[-2:]
     ky = torch.fft.fftfreq(height, device=image.device)[:, None] * (2 * math.pi)
     kx = torch.fft.rfftfreq(width, device=image.device) * (2 * math.pi)
     gain = torch.exp(-0.5 * torch.as_tensor(sigma2, dtype=image.dtype) * (kx * kx + ky * ky)).clamp(max=limit)
     blurred = torch.fft.irfft2(torch.fft.rfft2(wide) * gain, s=(height, width))
-    return blurred[:, margin : height - margin, margin : width - margin]
+    return blurred[..., margin : height - margin, margin : width - margin]
 
 
 def fine(image: Tensor, mask: Tensor, sigma: float) -> Tensor:
-    """The image less its Gaussian mean over ``sigma`` px of valid pixels, 0 where invalid; (n, H, W)."""
+    """The image (..., H, W) less its Gaussian mean over ``sigma`` px of valid pixels, 0 where invalid; mask : broadcastable to it."""
     share = gaussian(mask, sigma**2).clamp(min=1e-3)
     return (image - gaussian(image * mask, sigma**2) / share) * mask
 

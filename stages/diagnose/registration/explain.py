@@ -233,8 +233,7 @@ def own_fields(
     ``shifts`` (frames, 2, T) of frames.
     """
     sites = [c.site for c in chains]
-    ends = []
-    matched: list[Matched] = []
+    starts: list[list[Field]] = []
     # the strongest peak of a correlation may be a neighbouring crater, and the shift of a frame one of another part of the scene
     for own_share, of_frame in ((0.0, 1.0), (1.0, 1.0), (1.0, 0.0)):
         known = []
@@ -246,9 +245,15 @@ def own_fields(
             with laid(sites, known):
                 own = captured(chains)
             known = [(e + d[:, :1, None], s + d[:, 1:, None]) for (e, s), d in zip(known, own, strict=True)]
+        if not any(_near(known, other) for other in starts):  # they would end at the same place
+            starts.append(known)
+    ends = []
+    matched: list[Matched] = []
+    none = torch.zeros(len(shifts), 2, terms, dtype=shifts.dtype)
+    for known in starts:
         for _ in range(3):
-            matched = _match_all(chains, known, frame, level, 1)
-            known = _own_fields(matched, torch.zeros_like(shifts), shares, 1, terms)
+            matched = _match_all(chains, known, frame, level, 1, terms)
+            known = _own_fields(matched, none, shares, 1, terms)
         ends.append(known)
     out = []
     for k, m in enumerate(matched):
@@ -260,6 +265,12 @@ def own_fields(
     return out
 
 
+def _near(first: Sequence[Field], second: Sequence[Field]) -> bool:
+    """Whether displacements differ by half a pixel at most."""
+    pairs = [(a, b) for f, s in zip(first, second, strict=True) for a, b in zip(f, s, strict=True)]
+    return all(float((a - b).abs().max()) <= 0.5 for a, b in pairs)
+
+
 def _frame(sites: Sequence[Site]) -> Frame:
     places = torch.tensor([s.place for s in sites])
     size = max(sites[0].image.shape[-2:])
@@ -269,11 +280,15 @@ def _frame(sites: Sequence[Site]) -> Frame:
 
 
 def _match_all(
-    chains: Sequence[Chain], known: Sequence[Field], frame: Frame, level: float, pieces: int
+    chains: Sequence[Chain],
+    known: Sequence[Field],
+    frame: Frame,
+    level: float,
+    pieces: int,
+    terms: int | None = None,
 ) -> list[Matched]:
     def of(k: int) -> list[Matched]:
-        chain = chains[k]
-        return match(chain, chain.predict(), lit_mask_read(chain), known[k], frame, level, pieces)
+        return match(chains[k], lit_mask_read(chains[k]), known[k], frame, level, pieces, terms)
 
     return [m for part in per_site(of, range(len(chains))) for m in part]
 
@@ -294,7 +309,7 @@ def _own_fields(
     share : of relief displacement, or one per site
     terms : 1 for a shift, 3 for an affine map about the crop's centre; the scatter of either is estimated
     """
-    axis = len(TERMS) + WAVES
+    axis = len(matched[0].basis)
     place = torch.tensor([*range(terms), *range(axis, axis + terms)])
     degree = torch.tensor([min(k, 1) for k in range(terms)] * 2)
     parts = []

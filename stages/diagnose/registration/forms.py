@@ -83,6 +83,7 @@ class Matched:
     """One site beside its rendering: products of (gradient x basis) and of the displacement that the residual asks for.
 
     gram : (n, P, P), score : (n, P) in units of the residual's variance, P = 2 T + 1 (east, south, leaning)
+    basis : (T, H, W)
     part : (H, W) float, the piece of the site that it is of
     """
 
@@ -95,20 +96,30 @@ class Matched:
 
 
 def match(
-    chain: Chain, rendered: Tensor, lit: Tensor, known: tuple[Tensor, Tensor], frame: Frame, level: float, pieces: int
+    chain: Chain,
+    lit: Tensor,
+    known: tuple[Tensor, Tensor],
+    frame: Frame,
+    level: float,
+    pieces: int,
+    terms: int | None = None,
 ) -> list[Matched]:
-    """The products of a site, whose images are displaced by about ``known`` (n, H, W), in so many pieces a side."""
+    """The products of a site, whose images are displaced by about ``known`` (n, H, W), in so many pieces a side.
+
+    terms : how many of the basis are asked for, all where None
+    """
+    rendered = chain.predict()
     site = chain.site
     image, valid = aligned(site.read, site.read_valid, *known)
     mask = (valid & lit).float()
-    measured, predicted = fine(image, mask, BROAD), fine(rendered, mask, BROAD)
+    measured, predicted, *slopes = fine(torch.stack([image, rendered, *gradients(rendered)]), mask, BROAD)
     scale = ((measured * predicted).sum((-2, -1)) / predicted.square().sum((-2, -1)).clamp(min=1e-20)).clamp(min=0)
     residual = measured - scale[:, None, None] * predicted
-    east, south = (fine(g, mask, BROAD) * scale[:, None, None] for g in gradients(rendered))
+    east, south = (g * scale[:, None, None] for g in slopes)
     variance = residual.square().sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
     weight = mask / variance.clamp(min=1e-20)[:, None, None]
     target = residual + east * known[0] + south * known[1]
-    fields = basis(frame, site)
+    fields = basis(frame, site)[:terms]
     leaning = lean(site.observation, level)
     columns = torch.cat(
         [
@@ -163,7 +174,7 @@ def solve(
 
 
 def displacement(site: Matched, coefficients: Tensor, share: float) -> tuple[Tensor, Tensor]:
-    """(n, H, W) each, px."""
+    """(n, H, W) each, px; coefficients : (frames, 2, T)."""
     own = coefficients[torch.from_numpy(site.chain.site.frames)].float()
     field = torch.einsum("nat,thw->anhw", own, site.basis)
     return field[0] + share * site.leaning[0], field[1] + share * site.leaning[1]
