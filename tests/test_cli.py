@@ -122,3 +122,22 @@ def test_version_is_that_of_the_package():
         [sys.executable, "-m", "lunargr_cli.main", "--version"], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == f"lunargr {version('lunargr')}" and not done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "names"),
+    [
+        (["match", "--list"], ["daisy", "sift", "--features-model"]),
+        (["models", "--cameras"], ["pinhole", "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL"]),
+    ],
+)
+def test_registries_are_listed(command, names, monkeypatch):
+    """What a user may choose from, files that were added among it."""
+    monkeypatch.setenv("COLUMNS", "200")
+    result = lunargr(*command)
+    assert result.returncode == 0 and all(name in result.stdout for name in names)
+
+
+def test_match_without_files_says_what_to_give():
+    result = lunargr("match")
+    assert result.returncode == 3 and "give pairs.h5 and checkpoint.h5, or --list" in result.stderr

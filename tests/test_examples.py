@@ -17,7 +17,12 @@ MOON = 1737400.0
 
 @pytest.mark.parametrize(
     ("script", "says"),
-    [("new_effect", "haze 0.002"), ("new_camera", "round trip"), ("new_matcher", "moved by 2.0, 0.0 px")],
+    [
+        ("new_effect", "haze 0.002"),
+        ("new_effect_per_image", "readout_smear with"),
+        ("new_camera", "round trip"),
+        ("new_matcher", "moved by 2.0, 0.0 px"),
+    ],
 )
 def test_example_runs(script, says, capsys):
     runpy.run_path(str(ROOT / "examples" / f"{script}.py"), run_name="__main__")

@@ -10,6 +10,7 @@ import typer
 from lunargr_cli.console import Console
 from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Seed, configure
 from lunargr_cli.paths import Writes
+from schemas.errors import ConfigError
 from schemas.files.outputs import Output
 from stages import match
 from stages.match import Config
@@ -19,12 +20,12 @@ NAME, ORDER = "match", 71
 
 def command(
     files: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(
             metavar="FILES",
             help="PAIRS CHECKPOINT; or an EVALUATION with renderings; or a measured image and rendered ones.",
         ),
-    ],
+    ] = None,
     matchers: Annotated[
         list[str] | None,
         typer.Option(
@@ -47,6 +48,7 @@ def command(
         typer.Option("--figures", metavar="DIR", help="Write match pictures, coloured by error, as PNG."),
         Writes.FOLDER,
     ] = None,
+    list_matchers: Annotated[bool, typer.Option("--list", help="Explain every matcher and stop.")] = False,
     seed: Seed = Config.seed,
     device: Device = Config.device,
     json_file: Json = None,
@@ -58,13 +60,25 @@ def command(
     Both show the same ground, pixel for pixel, so every match should end where it began: the learned reflectance
     beside Hapke matched to each crop's range, as in the Lunar-G2R paper.
     """
+    console = Console(quiet)
+    if list_matchers:
+        _list_matchers(console)
+        return
+    if not files:
+        raise ConfigError("match: expected files to match, found none; give pairs.h5 and checkpoint.h5, or --list.")
     config = configure(Config, locals(), matchers=tuple(matchers or Config.matchers))
     from stages.match.stage import result_lines
 
-    console = Console(quiet)
     to = Output(overwrite=overwrite, json=json_file, figures=figures)
     result = match.run(files, to, config, console.say, console.progress)
     extent = f"{result['crops']} picture(s) of 512 x 384 on {result['tiles']} ground tile(s)"
     console.table(f"matching consistency over {extent}", *result_lines(result))
     if figures is not None:
         console.say(f"written: {figures}/")
+
+
+def _list_matchers(console: Console) -> None:
+    from stages.match.base import matchers
+
+    rows = [(m.name, m.title, "--features-model" if m.needs_models else "-", m.reference) for m in matchers()]
+    console.table("matchers", ("name", "what", "needs", "reference"), rows)

@@ -1,7 +1,8 @@
-"""`lunargr models`: the reflectance models, their parameters, published sets and other programs' conventions."""
+"""`lunargr models`: the reflectance models, their parameters, published sets and other programs' conventions; the cameras."""
 
 from __future__ import annotations
 
+import inspect
 from typing import Annotated
 
 import typer
@@ -20,6 +21,7 @@ def command(
     conventions: Annotated[
         bool, typer.Option("--conventions", help="List the conventions that 'lunargr convert' knows.")
     ] = False,
+    cameras: Annotated[bool, typer.Option("--cameras", help="List the cameras that images may come with.")] = False,
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Print the reference part of docs/photometry.md.")
     ] = False,
@@ -39,6 +41,8 @@ def command(
         _print_sets(catalogue.parameter_sets(None if chosen is None else chosen.name))
     elif conventions:
         _print_conventions(None if chosen is None else chosen.name)
+    elif cameras:
+        _print_cameras()
     elif chosen is None:
         _print_all()
     else:
@@ -83,6 +87,13 @@ def _print_sets(sets) -> None:  # type: ignore[no-untyped-def]
 
     rows = [(s.name, s.model, catalogue.values_text(s), s.description, s.reference) for s in sets]
     Console().table("published sets", ("name", "model", "values", "what", "source"), rows)
+
+
+def _print_cameras() -> None:
+    from stages.physics.cameras import cameras
+
+    rows = [(c.kind, ", ".join(c.answers_to), str(inspect.getdoc(inspect.getmodule(c))).split("\n")[0]) for c in cameras()]
+    Console().table("cameras", ("kind", "`type` or `name_model` in its file", "what"), rows)
 
 
 def _print_conventions(model: str | None) -> None:

@@ -10,7 +10,7 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from stages.physics.cameras.base import Camera, camera_from_document, camera_kinds, read_document, register
+from stages.physics.cameras.base import Camera, camera_from_document, camera_kinds, cameras, read_document, register
 from stages.physics.cameras.isis_cube import cube_document, is_cube
 
 for _module in pkgutil.iter_modules(__path__):
@@ -25,4 +25,4 @@ def open_camera(path: str | Path) -> Camera:
     return camera_from_document(read_document(path), str(path))
 
 
-__all__ = ["Camera", "camera_from_document", "camera_kinds", "open_camera", "register"]
+__all__ = ["Camera", "camera_from_document", "camera_kinds", "cameras", "open_camera", "register"]

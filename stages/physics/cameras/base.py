@@ -154,6 +154,11 @@ def camera_kinds() -> list[str]:
     return sorted({cls.kind for cls in _CAMERAS.values()})
 
 
+def cameras() -> list[type[Camera]]:
+    """The registered cameras, by kind."""
+    return sorted(set(_CAMERAS.values()), key=lambda cls: cls.kind)
+
+
 def camera_from_document(document: Mapping[str, Any], where: str) -> Camera:
     """The camera of a JSON document, ours (key ``type``) or an ISD (key ``name_model``). Raises LunargrError."""
     name = document.get("type", document.get("name_model"))
