@@ -42,18 +42,22 @@ def test_a_seam_of_a_dem_is_not_sharpened():
 def test_two_shadows_that_agree_by_chance_are_not_exact():
     """As wide as they all lie from nothing where they are few, as they scatter where they are many."""
 
-    def variance(values):
-        return shadow_variance([torch.tensor(values)])[1]
+    def variance(values, light=None):
+        light = torch.ones(1, len(values)) if light is None else torch.tensor(light)[None]
+        return shadow_variance([torch.tensor(values)], [light])[1]
 
     assert variance([]) == 1.0
     assert variance([-0.0054, -0.0050]) ** 0.5 > 0.003
     many = np.random.default_rng(1).normal(0.05, 0.01, 400)
     assert variance(many.tolist()) ** 0.5 == pytest.approx(0.01, rel=0.15)
+    # light that falls on one shadow more than on another is no scatter
+    walls = np.random.default_rng(2).uniform(0, 0.1, 400)
+    assert variance((many + walls - 0.05).tolist(), walls.tolist()) ** 0.5 == pytest.approx(0.01, rel=0.15)
 
 
 def test_a_fit_that_ends_beside_a_bound_is_nothing_real():
-    """Half a pixel sharper than the optics is where the search stops, not what a camera does."""
-    for value, possible in ((-0.494, False), (-0.5, False), (0.8, True)):
+    """An image sharper than its pixels is where the search stops, not what a camera does."""
+    for value, possible in ((-0.294, False), (-0.3, False), (0.8, True)):
         cause = Cause(get_effect("psf_blur")({"sigma2_px2": value}), found=None)
         cause.errors = cause.of_given_shape = cause.over_images = {"sigma2_px2": 0.01}
         assert doubt(SimpleNamespace(data=None, frames=8), cause).startswith(ODD) != possible

@@ -92,7 +92,9 @@ def _print_sets(sets) -> None:  # type: ignore[no-untyped-def]
 def _print_cameras() -> None:
     from stages.physics.cameras import cameras
 
-    rows = [(c.kind, ", ".join(c.answers_to), str(inspect.getdoc(inspect.getmodule(c))).split("\n")[0]) for c in cameras()]
+    rows = [
+        (c.kind, ", ".join(c.answers_to), str(inspect.getdoc(inspect.getmodule(c))).split("\n")[0]) for c in cameras()
+    ]
     Console().table("cameras", ("kind", "`type` or `name_model` in its file", "what"), rows)
 
 

@@ -129,13 +129,14 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         answer.form = state.nominal.model.title
         say(f"{config.model} has not the form of the ground's law: {answer.form} took its place")
     doubted = unconfirmed(state) | contradicted(state)
-    assert outcome.view is not None
+    view = outcome.view
+    assert view is not None
     displaced = state.registration is not None and state.registration.form.name != "none"
     if state.causes and displaced:  # what looked like a displacement may have been a cause that is named by now
         _register(state)
     if doubted or (state.causes and displaced):
-        settle(state, outcome.view)
-        doubted |= doubt_all(state, outcome.view, STILL)
+        settle(state, view)
+        doubted |= doubt_all(state, view, STILL)
     placed, refused = by_registration(state)
     clipped = cut(data, state) if cut else None  # was taken out of the images before anything was sought
     ground, shown = by_ground(state)
@@ -144,10 +145,9 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     answer.rejected = {k: v for k, v in rejected.items() if k not in {c.effect.name for c in answer.causes}}
     if state.registration is not None:
         answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}
-    view = outcome.view
-    assert view is not None
     after = _residual(state)
-    answer.budget = budget(view.rows, view.model, view.grid, before, after)
+    # what a better law or registration took away is no cause where none is named
+    answer.budget = budget(view.rows, view.model, view.grid, before if answer.causes else after, after)
     line, share = peak(view.rows, view.model, view.grid, frames)
     known = shown | {c.effect.name for c in answer.causes}
     answer.blind = blind_effects(state, outcome, known)

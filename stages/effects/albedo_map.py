@@ -27,7 +27,6 @@ WHOLE = 0.9  # of a site: holes tear texture up, and what is torn has no spectru
 class AlbedoMap(Effect):
     name = "albedo_map"
     slot = "reflectance"
-    channel = "albedo"
     linear = True
     scope = "site"
     table = ("site_albedo", "term")

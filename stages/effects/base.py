@@ -63,31 +63,30 @@ class Trial:
 class Effect(ABC):
     """Base of every effect. Subclasses fill the class attributes and ``apply``; the default trial is one per parameter.
 
-    slot         where in the chain it acts: geometry, illumination, reflectance, radiance or sensor
-    scope        'scene': one set of values; 'image': one per source image; 'site': one per ground site
-    parameters   what the report gives; ``default`` is the null value
-    coordinates  what is fitted, where that is not the parameters themselves
-    strong       a size that anybody would want to be told about: data that cannot show this much are blind to it
-    tolerance    a size that every real data set has; smaller effects are a nuisance and no cause
-    channel      where `diagnose` looks for it: 'lit' (fully lit ground and deep shadow), 'edge' (also about shadow
-                 edges), 'albedo' or 'relief' (what stays with the ground in all images: its albedo, its slopes)
-    displaces    whether it moves images against the ground: what is known of it is taken out of the measurement
-    relative     whether its values per image are known against the other images only: what all share is the ground's
-    in_simulation  what a coordinate gets added in the extended model: `diagnose` judges with slopes of fourth order,
-                 while the simulation's smooth the ground by about a quarter of a squared pixel themselves
-    shaped       coordinates that guises step through and that stay free once the effect is named
-    always       an effect with values per image that all images have a little of: its ordinary size, in multiples of ``strong``
-    scatters     ... whose ordinary size is estimated from the data
-    never_named  judged by a step of its own: registration, or a histogram
-    leans        ... and displaces relief by its height, not images as a whole
-    along_lines  ... and displaces the lines of an image against each other
-    keep_below   what is brighter than this times a level that was read off says nothing more
-    one_sided    a fixed coordinate by whose sign it is told from what is alike on both sides
-    of_law       another form of the reflectance law could do the same: it is a cause only where that form has nothing to add
-    shadow_error how far its first coordinate may be off where shadows alone tell it, since the DEM's horizons are
-    table        a variable of diagnosis.h5 of its own for values per image or site, and its second dimension or None; without
-                 one they stand in `frame_values` or `site_values`
-    linear       whether the image is linear in the coordinates: a first estimate beyond their bounds stays there
+    slot            where in the chain it acts: geometry, illumination, reflectance, radiance or sensor
+    scope           'scene': one set of values; 'image': one per source image; 'site': one per ground site
+    parameters      what the report gives; ``default`` is the null value
+    coordinates     what is fitted, where that is not the parameters themselves
+    strong          coordinate -> a size that anybody would want to be told about: data that cannot show it are blind to the effect
+    tolerance       coordinate -> a size that every data set has: smaller effects are no cause
+    displaces       whether it moves images against the ground: what is known of it is taken out of the measurement
+    relative        whether its values per image are known beside those of the other images only: what all share is the ground's
+    lights_shadows  whether it brings light into deep shadow; one kind of light is told from another there
+    linear          whether the image is linear in the coordinates: a first estimate beyond their bounds stays there
+    of_law          whether another reflectance law could do the same: it is a cause only where no other law has anything to add
+    in_simulation   coordinate -> what is added to it in the extended model: `diagnose` judges with slopes of fourth order, while the
+                    simulation's smooth the ground by about a quarter of a squared pixel themselves
+    shaped          coordinates that say what the effect looks like, not how strong it is: they are stepped through, and fitted once it is named
+    always          standard deviation of values per image that every data set has, in multiples of ``strong``; 0: none
+    scatters        whether that standard deviation is estimated from the data instead
+    judged_apart    whether a step of its own judges it, not the search: registration, or a histogram of all pixels
+    leans           of those that displace: relief by its height, not images as a whole
+    along_lines     of those that displace: the lines of an image against each other
+    keep_below      of a level that was read off a histogram: what is brighter than this times the level says nothing more
+    one_sided       a fixed coordinate; the effect acts on one side of a pixel only, and by its sign it is told from what acts on both
+    shadow_error    how far its first coordinate may be off where shadows alone tell it, since the DEM's horizons are
+    table           (variable, second dimension or None) of diagnosis.h5 for values per image or site; without it they stand in
+                    `frame_values` or `site_values`
     """
 
     name: ClassVar[str]
@@ -102,15 +101,15 @@ class Effect(ABC):
     coordinates: ClassVar[tuple[Parameter, ...]] = ()
     strong: ClassVar[Mapping[str, float]] = {}
     tolerance: ClassVar[Mapping[str, float]] = {}
-    channel: ClassVar[str] = "lit"
     displaces: ClassVar[bool] = False
     relative: ClassVar[bool] = False
+    lights_shadows: ClassVar[bool] = False
     linear: ClassVar[bool] = False
     in_simulation: ClassVar[Mapping[str, float]] = {}
     shaped: ClassVar[tuple[str, ...]] = ()
     always: ClassVar[float] = 0.0
     scatters: ClassVar[bool] = False
-    never_named: ClassVar[bool] = False
+    judged_apart: ClassVar[bool] = False
     leans: ClassVar[bool] = False
     along_lines: ClassVar[bool] = False
     one_sided: ClassVar[str] = ""

@@ -14,7 +14,6 @@ from stages.physics.photometry import Parameter
 class CurvatureAlbedo(Effect):
     name = "curvature_albedo"
     slot = "reflectance"
-    channel = "albedo"
     linear = True
     title = "albedo that follows curvature"
     mechanism = (

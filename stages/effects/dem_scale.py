@@ -15,7 +15,6 @@ from stages.physics.photometry import Parameter
 class DemScale(Effect):
     name = "dem_scale"
     slot = "geometry"
-    channel = "relief"
     title = "vertical scale of the DEM"
     mechanism = (
         "A wrong base-to-height ratio in stereo, or shape from shading with a wrong albedo, scales all heights: every slope, "

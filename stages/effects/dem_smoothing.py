@@ -14,7 +14,6 @@ from stages.physics.photometry import Parameter
 class DemSmoothing(Effect):
     name = "dem_smoothing"
     slot = "geometry"
-    channel = "relief"
     title = "DEM smoother (or rougher) than the ground"
     mechanism = (
         "Stereo correlation windows, laser footprints and interpolation blur relief: shading from the DEM lacks the contrast "

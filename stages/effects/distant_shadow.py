@@ -23,7 +23,6 @@ DISTANCES = (0.25, 0.35, USUAL, 0.7, 1.0, 1.4, 2.0, 2.8)  # crops: beyond them a
 class DistantShadow(Effect):
     name = "distant_shadow"
     slot = "illumination"
-    channel = "edge"
     title = "shadow of terrain outside the DEM"
     mechanism = (
         "The horizon is computed from the DEM; a mountain beyond its edge still hides the Sun. Modelled as a straight ridge "

@@ -17,6 +17,7 @@ from stages.physics.photometry import Parameter
 class Earthshine(Effect):
     name = "earthshine"
     slot = "illumination"
+    lights_shadows = True
     linear = True
     title = "light from the Earth or the sky"
     mechanism = (

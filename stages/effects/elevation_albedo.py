@@ -13,7 +13,6 @@ from stages.physics.photometry import Parameter
 class ElevationAlbedo(Effect):
     name = "elevation_albedo"
     slot = "reflectance"
-    channel = "albedo"
     linear = True
     title = "albedo that follows height"
     mechanism = (

@@ -26,6 +26,7 @@ KEEP = 16  # pieces of ground whose form factors are kept, a few MB each
 class Interreflection(Effect):
     name = "interreflection"
     slot = "illumination"
+    lights_shadows = True
     linear = True
     title = "light scattered by the terrain"
     mechanism = (

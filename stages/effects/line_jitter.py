@@ -28,7 +28,7 @@ class LineJitter(Effect):
     scope = "image"
     table = ("line_jitter_px", "mode")
     displaces = True
-    never_named = True
+    judged_apart = True
     along_lines = True
     relative = True
     title = "lines shifted against each other"

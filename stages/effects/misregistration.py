@@ -17,7 +17,7 @@ class Misregistration(Effect):
     table = ("image_shift_px", "axis")
     always = 0.2
     scatters = True
-    never_named = True
+    judged_apart = True
     displaces = True
     title = "image shifted against the DEM"
     mechanism = (

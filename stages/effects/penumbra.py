@@ -22,7 +22,6 @@ BEYOND = 1.4  # times that: what some ground does alone, so that a wide Sun must
 class Penumbra(Effect):
     name = "penumbra"
     slot = "illumination"
-    channel = "edge"
     title = "width of the penumbra"
     mechanism = (
         "The Sun's disc makes shadow edges soft. A point source, a wrong distance of the Sun, or roughness of the horizon below "

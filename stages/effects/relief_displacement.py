@@ -19,7 +19,7 @@ class ReliefDisplacement(Effect):
     name = "relief_displacement"
     slot = "geometry"
     scope = "image"
-    never_named = True
+    judged_apart = True
     leans = True
     displaces = True
     title = "relief displacement (missing or wrong orthorectification)"

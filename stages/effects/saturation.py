@@ -20,7 +20,7 @@ BINS = (0.02, 0.002)  # of the level: noise added later makes the pile wide, a c
 class Saturation(Effect):
     name = "saturation"
     slot = "sensor"
-    never_named = True
+    judged_apart = True
     keep_below = 0.97
     title = "saturation"
     mechanism = (

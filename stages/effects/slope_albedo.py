@@ -14,7 +14,6 @@ from stages.physics.photometry import Parameter
 class SlopeAlbedo(Effect):
     name = "slope_albedo"
     slot = "reflectance"
-    channel = "albedo"
     linear = True
     title = "albedo that follows slope"
     mechanism = (

@@ -31,8 +31,8 @@ class Covariance:
     mean_albedo: float
     mean_relief: float
     mean_own: float
-    dark: float = 1.0  # of a piece's mean in deep shadow, about ...
-    dark_level: float = 0.0  # ... what all these have in common
+    dark: float = 1.0  # of a piece's mean in deep shadow, about what light explains
+    dark_rest: dict[int, Tensor] = field(default_factory=dict)  # ... and what it leaves of a patch's (by its number)
     level: Tensor | None = None
     size: dict[int, float] = field(default_factory=dict)  # of a patch (by its number), times the above
     mean_size: dict[int, float] = field(default_factory=dict)
@@ -127,16 +127,22 @@ def estimate(patches: Sequence[Patch], rows: Sequence[tuple[Tensor, Tensor]], gr
     return model
 
 
-def shadow_variance(residuals: Sequence[Tensor]) -> tuple[float, float]:
-    """Mean of the means in deep shadow, which is no noise, and their variance about it; residuals : (s,) of every patch.
+def shadow_variance(residuals: Sequence[Tensor], light: Sequence[Tensor]) -> tuple[list[Tensor], float]:
+    """Of the means in deep shadow (s,) of every patch, what no light that falls there explains, and its variance; light : (L, s) of every
+    kind, which is no noise.
 
-    One value more is taken to lie as far from it as they all do from nothing: two that agree by chance are not exact.
+    One value more is taken to lie as far off as they all do from nothing: few that agree by chance are not exact.
     """
-    values = torch.cat(list(residuals)).double()
+    values, columns = torch.cat(list(residuals)).double(), torch.cat(list(light), 1).double().T
     if not len(values):
-        return 0.0, 1.0
-    squares = (values - values.mean()).square().sum() + values.square().mean()
-    return float(values.mean()), max(float(squares) / len(values), 1e-10)
+        return list(residuals), 1.0
+    rest = values
+    free = 0
+    if len(values) > 2 * columns.shape[1]:
+        free = int(torch.linalg.matrix_rank(columns))
+        rest = values - columns @ torch.linalg.lstsq(columns, values[:, None], driver="gelsd").solution[:, 0]
+    squares = rest.square().sum() + values.square().mean()
+    return list(rest.split([len(r) for r in residuals])), max(float(squares) / (len(values) + 1 - free), 1e-10)
 
 
 def _unit_mean(sizes: dict[int, float]) -> dict[int, float]:

@@ -67,7 +67,8 @@ def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> Residual:
     about = rows.shared_mean[0].double() - (0 if model.level is None else model.level[rows.patch.frames])
     lower = torch.linalg.cholesky(model.mean_matrix(rows.patch))
     mean = torch.linalg.solve_triangular(lower, about[:, None], upper=False)
-    return white, mean[:, 0], (rows.shared_dark[0] - model.dark_level) / model.dark**0.5
+    dark = model.dark_rest.get(rows.patch.number, rows.shared_dark[0])
+    return white, mean[:, 0], dark / model.dark**0.5
 
 
 def _by_wave(z: Tensor) -> Tensor:

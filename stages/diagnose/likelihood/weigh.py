@@ -24,6 +24,7 @@ class Whole:
 
     def __init__(self, units: Sequence[Products], plan: Plan, frames: int, drifting: bool = True) -> None:
         self.units, self.plan, self.frames = list(units), plan, frames
+        self.given = self.units
         levels = [u.level for u in units if u.level is not None]
         # brightness of images as wholes, which what is not known of their insides must not decide on
         self.levels = Whole(levels, plan, frames, drifting=False) if levels else None
@@ -184,9 +185,11 @@ class Whole:
         return (information + information.T) / 2, score, shams, n
 
     def exclude(self, guise: Guise) -> list[int]:
-        """What the nuisance does without beside this effect."""
-        form = self.form_places().tolist() if get_effect(guise.effect).of_law else []
-        return [1 + k for k in self.plan.ordinary.get(guise.effect, [])] + form
+        """What the nuisance does without beside this effect: ordinary amounts of it, and of all that lights shadows where it does."""
+        cls = get_effect(guise.effect)
+        alike = [n for n in self.plan.ordinary if cls.lights_shadows and get_effect(n).lights_shadows]
+        form = self.form_places().tolist() if cls.of_law else []
+        return [1 + k for n in {guise.effect, *alike} for k in self.plan.ordinary.get(n, [])] + form
 
     def form_places(self) -> NDArray[np.int64]:
         """Places of the columns of another form of the reflectance."""
@@ -195,6 +198,13 @@ class Whole:
     def known_places(self, places: Sequence[int]) -> NDArray[np.int64]:
         """Those of the places that the data say anything of."""
         return np.array([p for p in places if self.seen[p]], dtype=np.int64)
+
+    def expected_errors(self, guise: Guise) -> Array:
+        """(J,) standard errors of the amounts, each alone, at least as wide as sham residuals scatter."""
+        information, _, shams, _ = self.reduce(self.places(guise), self.exclude(guise))
+        power = np.maximum(information.diagonal(), 1e-12)
+        inflation = np.maximum((shams**2).mean(1) / power, 1.0) if shams.shape[1] else 1.0
+        return np.sqrt(inflation / power)
 
     def weigh(self, guise: Guise) -> tuple[Found, Array]:
         """Evidence for one guise, and the same of every sham."""
@@ -322,12 +332,24 @@ class Whole:
     def law_adds(self, guise: Guise | None) -> Array:
         """(labels,) nats that another form of the reflectance gains on held-out ground, alone or beside an effect of the law."""
         places = self.places(guise) if guise else np.zeros(0, np.int64)
-        kept = dict(self.precision)
-        self.precision |= {int(p): 1e-10 * self.gram[p, p] for p in places}
         ordinary = [1 + k for k in self.plan.ordinary.get(guise.effect if guise else "", [])]
-        added = self.held_out(self.form_places(), [k for k in ordinary if k not in places])
+        return self._held_out_beside(places, self.form_places(), [k for k in ordinary if k not in places])
+
+    def gains_beside(self, found: Found, other: Found) -> Array:
+        """(labels,) nats that an effect gains on held-out ground where any amount of another one stands beside it."""
+        return self._held_out_beside(
+            self.places(other.guise), self.places(found.guise), self.exclude(found.guise), found.spread
+        )
+
+    def _held_out_beside(
+        self, free: NDArray[np.int64], places: NDArray[np.int64], exclude: Sequence[int], spread: float = 0.0
+    ) -> Array:
+        """:meth:`held_out` beside any amounts of the columns ``free``."""
+        kept = dict(self.precision)
+        self.precision |= {int(p): 1e-10 * self.gram[p, p] for p in free}
+        gains = self.held_out(places, exclude, spread)
         self.precision = kept
-        return added
+        return gains
 
 
 def weigh_all(whole: Whole) -> tuple[dict[str, Found], Array]:
@@ -337,7 +359,7 @@ def weigh_all(whole: Whole) -> tuple[dict[str, Found], Array]:
     every = [
         (guise, *whole.weigh(guise))
         for guise in whole.plan.guises
-        if not get_effect(guise.effect).never_named
+        if not get_effect(guise.effect).judged_apart
         and len(whole.places(guise))
         and whole.seen[whole.places(guise)].all()
     ]

@@ -61,7 +61,7 @@ def by_registration(state: State) -> tuple[list[Named], dict[str, tuple[float, s
     refused: dict[str, tuple[float, str]] = {}
     for name in effect_names():
         cls = get_effect(name)
-        if cls.displaces and cls.never_named:
+        if cls.displaces and cls.judged_apart:
             explained = _leaning if cls.leans else _lines if cls.along_lines else _shifts
             made, why = explained(state, r, name)
             if made is not None and why:

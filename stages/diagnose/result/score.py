@@ -30,7 +30,7 @@ def score(state: State, answer: Answer) -> HeldOut:
     """
     if not state.hidden or not answer.causes or state.reference is None:
         return HeldOut()
-    named = [c.effect for c in answer.causes if c.effect.displaces and c.effect.never_named]
+    named = [c.effect for c in answer.causes if c.effect.displaces and c.effect.judged_apart]
     effects = [c.effect for c in answer.causes if c.effect not in named]
     plain, moved = displacements(state, named)
     units = max(s.ground for s in state.hidden) + 1
@@ -130,46 +130,33 @@ def _hidden_squares(state: State) -> np.ndarray:
 
 
 def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
-    """Effects whose expected error is more than a size worth knowing allows, and which are not named all the same."""
-    out = []
-    seen = set(state.open_names())
-    for name in effect_names():
-        cls = get_effect(name)
-        if name in named or (cls.never_named and cls.displaces and state.registration is not None):
+    """Effects that these data could not have shown at a size worth knowing, and that are not named all the same."""
+    return [n for n in effect_names() if n not in named and _could_not_show(state, outcome, n)]
+
+
+def _could_not_show(state: State, outcome: Outcome, name: str) -> bool:
+    """Whether the expected error is too large, or came out too large where the effect was tried."""
+    cls = get_effect(name)
+    if cls.judged_apart:
+        return False
+    if name not in state.open_names() or name not in outcome.best:
+        return True
+    assert outcome.view is not None
+    whole = outcome.view.whole
+    if cls.of_law and not len(whole.form_places()):  # a law that is fitted follows it
+        return True
+    found = state.open.get(name, 0.0)  # over ground or images, larger than the likelihood's
+    expected = []
+    for guise in (g for g in whole.plan.guises if g.effect == name):
+        every = whole.expected_errors(guise)
+        if guise.per_frame:
+            expected.append(float(np.median(every)) / math.sqrt(state.frames))
             continue
-        found = outcome.best.get(name)
-        if cls.never_named:
-            continue
-        if name not in seen or found is None:
-            out.append(name)
-            continue
-        assert outcome.view is not None
-        whole = outcome.view.whole
-        if cls.of_law and not len(whole.form_places()):  # a law that is fitted follows it
-            out.append(name)
-            continue
-        if SURE * state.open.get(name, 0.0) > 1:  # errors over ground or images are larger than the likelihood's
-            out.append(name)
-            continue
-        error = math.inf
-        for guise in whole.plan.guises:
-            if guise.effect != name:
-                continue
-            if guise.per_frame:
-                information, _, _, _ = whole.reduce(whole.places(guise))
-                error = min(
-                    error, float(1 / np.sqrt(max(np.median(information.diagonal()), 1e-12))) / math.sqrt(state.frames)
-                )
-                continue
-            information, _, _, _ = whole.reduce(whole.places(guise), whole.exclude(guise))
-            for k, column in enumerate(guise.trial.columns):
-                ((coordinate, at),) = column.items()
-                size = abs(at - cls.null()[coordinate])
-                worth = cls.strong.get(coordinate, 0.0) or size
-                error = min(error, size / worth / math.sqrt(max(float(information[k, k]), 1e-30)))
-        if SURE * error > 1:
-            out.append(name)
-    return out
+        for column, error in zip(guise.trial.columns, every, strict=True):
+            ((coordinate, at),) = column.items()
+            size = abs(at - cls.null()[coordinate])
+            expected.append(float(error) * size / (cls.strong.get(coordinate, 0.0) or size))
+    return SURE * max(found, min(expected, default=math.inf)) > 1
 
 
 __all__ = ["blind_effects", "score"]

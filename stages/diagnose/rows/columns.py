@@ -91,7 +91,7 @@ def make_plan(
     named = [e.name for e in chain.base if e.scope == "image"]
     for name in [*named, *(n for n in names if n not in named)]:
         cls = get_effect(name)
-        if cls.never_named and not cls.always:
+        if cls.judged_apart and not cls.always:
             continue
         if cls.scope == "scene":
             for trial in cls.trials(data) if candidates else cls.trials(data)[:1]:

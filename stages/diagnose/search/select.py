@@ -39,12 +39,14 @@ def search(state: State, most: int) -> Outcome:
     """Name causes until no candidate is left."""
     out = Outcome()
     refused: set[str] = set()
+    view: View | None = None
     while True:
-        known = set(state.impossible)
-        view = state.look(state.open_names())
+        # the data look as before where nothing was named
+        view = state.without_impossible(view, state.open_names()) if view else state.look(state.open_names())
         if not state.causes and state.law_is_another(view, refused):
             refused -= {n for n in refused if not get_effect(n).of_law}  # nothing was judged beside this law
             state.impossible.clear()
+            view = None
             continue
         best, _ = weigh_all(view.whole)
         out.rejected = {k: v for k, v in out.rejected.items() if k in refused}
@@ -80,31 +82,32 @@ def search(state: State, most: int) -> Outcome:
                 )
         if len(state.causes) >= most:
             break
-        taken = False
+        taken, strange = False, False
         for _ in range(TRIES):
-            if not sure or taken:
+            if not sure or taken or strange:
                 break
             chosen, group = choose(sure)
+            sure = [f for f in sure if f is not chosen]
             before = list(state.causes)
-            why = take(state, view, chosen, group)
-            taken = not why
+            others = [f for f in tried if f.effect not in refused]
+            why = may_be_another(view.whole, chosen, others) or take(state, view, chosen, group)
+            taken, strange = not why, why.startswith(ODD)
             for gone in [c for c in before if c not in state.causes]:
                 refused.add(gone.effect.name)
                 out.rejected[gone.effect.name] = (gone.found.gain, f"beside {chosen.effect} it is no cause any more")
-            if why:
-                sure = [f for f in sure if f is not chosen]
-                refused.add(chosen.effect)
-                out.rejected[chosen.effect] = (chosen.gain, why)
-                if why.startswith(ODD) and chosen.gain > NOTABLE * float(view.whole.gram[0, 0]):
-                    out.sure = True
-                    state.impossible.add(chosen.effect)
-                state.say(f"{chosen.effect} is not taken: {why}")
-            else:
+            if taken:
                 state.say(f"{chosen.effect} gains {chosen.gain:.0f} nats on held-out ground")
-        if not taken and state.impossible == known:
+                continue
+            state.say(f"{chosen.effect} is not taken: {why}")
+            refused.add(chosen.effect)
+            out.rejected[chosen.effect] = (chosen.gain, why)
+            if strange:  # the others were judged beside amounts of it that nothing has
+                out.sure |= chosen.gain > NOTABLE * float(view.whole.gram[0, 0])
+                state.impossible.add(chosen.effect)
+        if not (taken or strange):
             break
-        if not taken:  # the others were judged beside amounts of it that nothing has
-            refused = set(state.impossible)
+        if taken:
+            view = None
     settle(state, view)
     out.rejected |= doubt_all(state, view)
     for cause in state.causes:
@@ -149,6 +152,24 @@ def choose(sure: list[Found]) -> tuple[Found, list[str]]:
             group.append(f.effect)
     group.sort(key=lambda n: n != best.effect)
     return best, group
+
+
+def may_be_another(whole: Whole, found: Found, others: Sequence[Found]) -> str:
+    """Why an effect may stand for what is ordinary, or as likely and not sure on its own, or ''."""
+
+    def sure(gains: np.ndarray) -> bool:
+        return interval(gains, whole.sizes)[0] > 0
+
+    if get_effect(found.effect).lights_shadows:
+        own = [1 + k for k in whole.plan.ordinary.get(found.effect, [])]
+        if not sure(whole.held_out(whole.places(found.guise), own)):
+            return "ordinary amounts of other light in shadows would explain it as well"
+    if found.guise.per_frame:
+        for other in others:
+            likely = not other.guise.per_frame and other.surprise >= found.surprise
+            if likely and not sure(whole.gains_beside(found, other)):
+                return f"{other.effect}, of which these data are not sure, would explain it as well"
+    return ""
 
 
 def _as_good(found: Found, best: Found) -> bool:

@@ -23,7 +23,7 @@ from stages.diagnose.registration.explain import Registration
 from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, moved_columns, shared_columns
 from stages.diagnose.rows.patches import Grid, cuts, make_grid, make_patches
 from stages.diagnose.settings import FAINT, FOLDS, SEEN, SHAMS
-from stages.effects import Effect, Survey, get_effect
+from stages.effects import Effect, Survey, effect_names, get_effect
 
 
 @dataclass
@@ -160,8 +160,6 @@ class State:
     def open_names(self) -> list[str]:
         """Effects that are not named and that data of this kind can show."""
         named = {c.effect.name for c in self.causes}
-        from stages.effects import effect_names
-
         every = [n for n in effect_names() if n not in named]
         return [n for n in every if get_effect(n).visible(self.data, self.has)]
 
@@ -183,12 +181,18 @@ class State:
         plan = make_plan(chains[0], names, self.data, impossible=self.impossible)
 
         rows = [r for part in per_site(lambda k: self.rows(k, chains[k], plan), range(len(chains))) for r in part]
-        model = self._covariance(rows, grid)
+        model = self._covariance(rows, plan, grid)
         tricks: list[Residual | None] = [None] * len(rows)
         if shams:
             tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
         whole = self._whole(rows, tricks, plan, grid, model)
         return View(whole, plan, rows, grid, model)
+
+    def without_impossible(self, view: View, names: Sequence[str]) -> View:
+        """The same look beside ordinary amounts of no effect that is impossible by now."""
+        plan = make_plan(self.chains()[0], names, self.data, impossible=self.impossible)
+        whole = self._scattered(Whole(view.whole.given, plan, self.frames))
+        return View(whole, plan, view.rows, view.grid, view.model)
 
     def again(self, view: View, names: Sequence[str], model: Covariance | None = None) -> View:
         """A look beside ordinary amounts of these effects. Only the residual and the causes' own columns are rendered, the rest is as in ``view``.
@@ -201,7 +205,7 @@ class State:
         rows = [
             r for part in per_site(lambda k: self.moved(view, k, chains[k], plan), range(len(chains))) for r in part
         ]
-        model = model or self._covariance(rows, view.grid)
+        model = model or self._covariance(rows, plan, view.grid)
         return View(self._whole(rows, [None] * len(rows), plan, view.grid, model), plan, rows, view.grid, model)
 
     def moved(self, view: View, site: int, chain: Chain, plan: Plan) -> list[Rows]:
@@ -210,9 +214,13 @@ class State:
         own = frame_columns(chain, plan, self.data, named=True)
         return [_taken_over(r, view, plan, moved, own) for r in view.rows if r.patch.site == site]
 
-    def _covariance(self, rows: Sequence[Rows], grid: Grid) -> Covariance:
+    def _covariance(self, rows: Sequence[Rows], plan: Plan, grid: Grid) -> Covariance:
         model = estimate([r.patch for r in rows], [(r.shared[0], r.shared_mean[0]) for r in rows], grid, self.frames)
-        model.dark_level, model.dark = shadow_variance([r.shared_dark[0] for r in rows])
+        light = [
+            1 + k for k, name in enumerate(plan.shared) if name in effect_names() and get_effect(name).lights_shadows
+        ]
+        rest, model.dark = shadow_variance([r.shared_dark[0] for r in rows], [r.shared_dark[light] for r in rows])
+        model.dark_rest = {r.patch.number: d for r, d in zip(rows, rest, strict=True)}
         return model
 
     def without_images(self, view: View) -> list[Whole]:
