@@ -218,3 +218,17 @@ def test_an_effect_that_is_not_whole_is_refused_in_one_line(attribute, value):
     with pytest.raises(ConfigError, match=f"effect mine: expected .*{attribute}"):
         register(cls)
     assert "mine" not in effect_names()
+
+
+@pytest.mark.parametrize("mistake", ["import nothing_like_this", "def f(:", "1 / 0"])
+def test_a_file_that_is_not_right_is_named(tmp_path, monkeypatch, mistake):
+    """Whoever adds one reads which file it is, not what else could not be loaded."""
+    from stages.common.registry import import_all
+
+    folder = tmp_path / f"added_{abs(hash(mistake))}"
+    folder.mkdir()
+    (folder / "__init__.py").write_text("")
+    (folder / "haze.py").write_text(mistake)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(ConfigError, match=rf"{folder.name}\.haze: expected a module that can be imported, found "):
+        import_all(folder.name, [str(folder)])

@@ -6,15 +6,10 @@ order in which effects are listed never matters within the physics. The list of 
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
-
+from stages.common.registry import import_all
 from stages.effects.base import Effect, Survey, Trial, effect_names, get_effect, register
 
-_TOOLS = ("base", "fields", "filters", "extension")
-for _module in pkgutil.iter_modules(__path__):
-    if _module.name not in _TOOLS:
-        importlib.import_module(f"{__name__}.{_module.name}")
+import_all(__name__, __path__, but=("base", "fields", "filters", "extension"))
 
 from stages.effects.extension import load_extension  # noqa: E402 - it needs the registry filled
 

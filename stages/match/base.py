@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from schemas.errors import ConfigError, RegistryError
+from stages.common.registry import import_all
 
 
 @dataclass(frozen=True)
@@ -69,8 +68,7 @@ def register(cls: type[Matcher]) -> type[Matcher]:
 def _load_all() -> None:
     import stages.match as package
 
-    for module in pkgutil.iter_modules(package.__path__):
-        importlib.import_module(f"stages.match.{module.name}")
+    import_all("stages.match", package.__path__)
 
 
 def matchers() -> list[type[Matcher]]:

@@ -6,15 +6,13 @@ and decorates itself with @register. ``examples/new_camera.py`` shows one.
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from pathlib import Path
 
+from stages.common.registry import import_all
 from stages.physics.cameras.base import Camera, camera_from_document, camera_kinds, cameras, read_document, register
 from stages.physics.cameras.isis_cube import cube_document, is_cube
 
-for _module in pkgutil.iter_modules(__path__):
-    importlib.import_module(f"{__name__}.{_module.name}")
+import_all(__name__, __path__)
 
 
 def open_camera(path: str | Path) -> Camera:

@@ -10,9 +10,7 @@ A new model is one new file in this folder: it subclasses ReflectanceModel and d
 
 from __future__ import annotations
 
-import importlib
 import math
-import pkgutil
 from collections.abc import Mapping
 from typing import Any
 
@@ -20,6 +18,7 @@ import numpy as np
 import torch
 
 from schemas.errors import RegistryError
+from stages.common.registry import import_all
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry.base import (
     Parameter,
@@ -33,8 +32,7 @@ from stages.physics.photometry.base import (
 )
 from stages.physics.photometry.published import ParameterSet, get_set, published_sets
 
-for _module in pkgutil.iter_modules(__path__):
-    importlib.import_module(f"{__name__}.{_module.name}")
+import_all(__name__, __path__)
 
 
 def evaluate(model: str, parameters: Mapping[str, Any], incidence: Any, emission: Any, phase: Any) -> Any:
