@@ -17,7 +17,7 @@ from stages.diagnose.search.select import ODD, beyond_bounds, doubt
 from stages.diagnose.search.state import Cause
 from stages.effects import get_effect
 from stages.effects.base import Survey
-from stages.effects.filters import seams
+from stages.effects.filters import gaussian, seams
 
 
 def test_a_seam_of_a_dem_is_not_sharpened():
@@ -79,3 +79,13 @@ def test_a_shape_that_is_open_does_not_make_an_effect_nothing():
     for error, sure in ((0.05, True), (0.2, False)):
         cause.of_given_shape = {"B0": error}
         assert (doubt(SimpleNamespace(data=None, frames=8), cause) == "") == sure
+
+
+def test_sharpening_goes_on_smoothly():
+    """Waves that stop growing one after the other would make a fit stop at the first of them."""
+    relief = torch.from_numpy(np.random.default_rng(4).normal(0, 1, (1, 64, 64)).cumsum(1).cumsum(2))
+    sizes = np.linspace(0.5, 1.0, 26)
+    heights = torch.stack([gaussian(relief, -float(s), slopes=True)[0] for s in sizes])
+    first, second = heights.diff(dim=0), heights.diff(n=2, dim=0)
+    assert float(second.square().mean().sqrt() / first.square().mean().sqrt()) < 0.15  # 0.33 with a sudden end
+    assert torch.equal(gaussian(relief, 0.0, slopes=True).round(decimals=6), relief.round(decimals=6))

@@ -6,9 +6,10 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
+from torch.nn.functional import pad, softplus
 
 SEAM = 8.0  # robust standard deviations: relief has no line that is so straight and so high
+SUDDEN = 6.0  # inverse width, in nats of amplitude, of the passage to the largest gain
 MARGIN = 12  # px of mirrored border, over 3 sigma of anything that the effects ask for
 
 
@@ -27,7 +28,13 @@ def gaussian(image: Tensor, sigma2: Tensor | float, limit: float = 4.0, slopes: 
     height, width = wide.shape[-2:]
     ky = torch.fft.fftfreq(height, device=image.device)[:, None] * (2 * math.pi)
     kx = torch.fft.rfftfreq(width, device=image.device) * (2 * math.pi)
-    gain = torch.exp(-0.5 * torch.as_tensor(sigma2, dtype=image.dtype) * (kx * kx + ky * ky)).clamp(max=limit)
+    power = -0.5 * torch.as_tensor(sigma2, dtype=image.dtype) * (kx * kx + ky * ky)
+    # a sudden end would make waves stop growing one after the other, and what is fitted to them jump
+    log_limit = math.log(limit)
+    over = softplus(SUDDEN * (power - log_limit)) - math.log1p(
+        math.exp(-SUDDEN * log_limit)
+    )  # 0 where nothing is filtered
+    gain = torch.exp(power - over / SUDDEN)
     blurred = torch.fft.irfft2(torch.fft.rfft2(wide) * gain, s=(height, width))
     return blurred[..., margin : height - margin, margin : width - margin]
 
