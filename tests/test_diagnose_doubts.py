@@ -18,6 +18,7 @@ from stages.diagnose.search.state import Cause
 from stages.effects import get_effect
 from stages.effects.base import Survey
 from stages.effects.filters import gaussian, seams
+from stages.effects.saturation import BINS
 
 
 def test_a_seam_of_a_dem_is_not_sharpened():
@@ -89,3 +90,10 @@ def test_sharpening_goes_on_smoothly():
     first, second = heights.diff(dim=0), heights.diff(n=2, dim=0)
     assert float(second.square().mean().sqrt() / first.square().mean().sqrt()) < 0.15  # 0.33 with a sudden end
     assert torch.equal(gaussian(relief, 0.0, slopes=True).round(decimals=6), relief.round(decimals=6))
+
+
+@pytest.mark.parametrize("width", BINS)
+def test_a_few_pixels_far_above_all_others_are_no_level(width):
+    """... wherever they fall among the bins, the last one among them."""
+    bright = torch.cat([torch.linspace(0, 0.5, 3997), torch.tensor([1.0, *2 * [(1 + width) ** 2.5]])])
+    assert get_effect("saturation").read_off(bright) is None

@@ -51,7 +51,7 @@ class Saturation(Effect):
             if width == BINS[0]:
                 before, above = counts[max(best - 5, 0) : best - 1].mean(), float(counts[best + 2 :].sum())
             else:  # whole numbers leave bins between them empty, and brighter ones lie beyond the bins
-                before, above = counts[: best - 1].max(), float((bright >= edges[best + 2]).sum())
+                before, above = counts[: best - 1].max(), float((bright >= edges[min(best + 2, len(edges) - 1)]).sum())
             # resampling rings a little over the level, noise added later blurs it: the pile is three bins wide
             pile = float(counts[best - 1 : best + 2].sum())
             if pile >= PILE and counts[best] >= STANDS_OUT * before and above <= 0.05 * pile:
