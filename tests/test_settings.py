@@ -34,7 +34,7 @@ OTHERS = {("infer", "geotiff"), ("albedo", "geotiff"), ("match", "matchers")}
 # What commands have beside settings.
 BESIDE = {
     "output", "overwrite", "resume", "quiet", "json_file", "figures", "report", "scheduler", "parts", "no_geotiff", "models",
-    "seeds", "held_out_images", "list_effects", "blocks_csv", "dem", "trajectory", "stereo", "altitude", "convergence", "pairs",
+    "seeds", "held_out_images", "list_effects", "list_matchers", "files", "blocks_csv", "dem", "trajectory", "stereo", "altitude", "convergence", "pairs",
     "images", "seed", "checkpoint", "source", "split", "body",
 }  # fmt: skip
 
