@@ -10,7 +10,7 @@ import pytest
 from camera_rays import image_to_terrain, looking_at
 
 from schemas.errors import GeometryError, InputError, RegistryError
-from stages.physics.cameras import camera_from_document, camera_kinds, open_camera
+from stages.physics.cameras import camera_from_document, cameras, open_camera
 from stages.physics.cameras.base import Camera
 from stages.physics.cameras.orthographic import Orthographic
 from stages.physics.cameras.pinhole import Pinhole
@@ -137,4 +137,4 @@ def test_missing_keys_and_files_are_named(tmp_path):
 
 
 def test_the_registry_lists_its_kinds():
-    assert {"pinhole", "orthographic"} <= set(camera_kinds())
+    assert {"pinhole", "orthographic"} <= {c.kind for c in cameras()}

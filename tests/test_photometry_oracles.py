@@ -16,11 +16,14 @@ from stages.physics.photometry import evaluate, get_model, masked_radiance_facto
 
 TOLERANCE = 1e-6
 FOLDER = SHARED / "oracles"
+ABSENT = [
+    pytest.param(None, marks=pytest.mark.skip(reason=f"no tables of other programs at {FOLDER}: set LUNARGR_SHARED"))
+]
 
 
 def _comparisons():
     if not FOLDER.is_dir():
-        return [pytest.param(None, marks=pytest.mark.skip(reason="reference data not found: set LUNARGR_SHARED"))]
+        return ABSENT
     return [
         pytest.param(c, id=f"{c.table.removesuffix('.csv')}: {c.case}")
         for table in oracles.TABLES.values()
@@ -101,7 +104,7 @@ def test_derivatives_to_slope_and_albedo_agree_with_giant(shared, name):
 
 def _hillshade():
     if not FOLDER.is_dir():
-        return [pytest.param(None, marks=pytest.mark.skip(reason="reference data not found: set LUNARGR_SHARED"))]
+        return ABSENT
     return [pytest.param(r, id=r["case"]) for r in oracles.read(FOLDER / "isis_hillshade_truth.csv")]
 
 

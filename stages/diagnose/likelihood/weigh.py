@@ -24,7 +24,7 @@ class Whole:
 
     def __init__(self, units: Sequence[Products], plan: Plan, frames: int, drifting: bool = True) -> None:
         self.units, self.plan, self.frames = list(units), plan, frames
-        self.given = self.units
+        self.given = self.units  # before the drift of coefficients is taken out of them
         levels = [u.level for u in units if u.level is not None]
         # brightness of images as wholes, which what is not known of their insides must not decide on
         self.levels = Whole(levels, plan, frames, drifting=False) if levels else None
@@ -189,7 +189,11 @@ class Whole:
         cls = get_effect(guise.effect)
         alike = [n for n in self.plan.ordinary if cls.lights_shadows and get_effect(n).lights_shadows]
         form = self.form_places().tolist() if cls.of_law else []
-        return [1 + k for n in {guise.effect, *alike} for k in self.plan.ordinary.get(n, [])] + form
+        return [p for n in dict.fromkeys([guise.effect, *alike]) for p in self.ordinary_places(n)] + form
+
+    def ordinary_places(self, effect: str) -> list[int]:
+        """Places of the ordinary amounts of an effect among the nuisance."""
+        return [1 + k for k in self.plan.ordinary.get(effect, [])]
 
     def form_places(self) -> NDArray[np.int64]:
         """Places of the columns of another form of the reflectance."""
@@ -332,7 +336,7 @@ class Whole:
     def law_adds(self, guise: Guise | None) -> Array:
         """(labels,) nats that another form of the reflectance gains on held-out ground, alone or beside an effect of the law."""
         places = self.places(guise) if guise else np.zeros(0, np.int64)
-        ordinary = [1 + k for k in self.plan.ordinary.get(guise.effect if guise else "", [])]
+        ordinary = self.ordinary_places(guise.effect) if guise else []
         return self._held_out_beside(places, self.form_places(), [k for k in ordinary if k not in places])
 
     def gains_beside(self, found: Found, other: Found) -> Array:

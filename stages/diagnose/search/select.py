@@ -160,10 +160,9 @@ def may_be_another(whole: Whole, found: Found, others: Sequence[Found]) -> str:
     def sure(gains: np.ndarray) -> bool:
         return interval(gains, whole.sizes)[0] > 0
 
-    if get_effect(found.effect).lights_shadows:
-        own = [1 + k for k in whole.plan.ordinary.get(found.effect, [])]
-        if not sure(whole.held_out(whole.places(found.guise), own)):
-            return "ordinary amounts of other light in shadows would explain it as well"
+    own = whole.ordinary_places(found.effect)
+    if get_effect(found.effect).lights_shadows and not sure(whole.held_out(whole.places(found.guise), own)):
+        return "ordinary amounts of other light in shadows would explain it as well"
     if found.guise.per_frame:
         for other in others:
             likely = not other.guise.per_frame and other.surprise >= found.surprise

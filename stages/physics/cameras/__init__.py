@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from stages.common.registry import import_all
-from stages.physics.cameras.base import Camera, camera_from_document, camera_kinds, cameras, read_document, register
+from stages.physics.cameras.base import Camera, camera_from_document, cameras, read_document, register
 from stages.physics.cameras.isis_cube import cube_document, is_cube
 
 import_all(__name__, __path__)
@@ -23,4 +23,4 @@ def open_camera(path: str | Path) -> Camera:
     return camera_from_document(read_document(path), str(path))
 
 
-__all__ = ["Camera", "camera_from_document", "camera_kinds", "cameras", "open_camera", "register"]
+__all__ = ["Camera", "camera_from_document", "cameras", "open_camera", "register"]

@@ -149,11 +149,6 @@ def register(cls: type[Camera]) -> type[Camera]:
     return cls
 
 
-def camera_kinds() -> list[str]:
-    """The registered kinds of cameras, sorted."""
-    return sorted({cls.kind for cls in _CAMERAS.values()})
-
-
 def cameras() -> list[type[Camera]]:
     """The registered cameras, by kind."""
     return sorted(set(_CAMERAS.values()), key=lambda cls: cls.kind)
