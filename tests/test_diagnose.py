@@ -86,6 +86,12 @@ def test_planted_cause_is_named(scene, diagnosed, effect):
         assert found["unit"]
 
 
+def test_large_gains_of_images_are_one_cause(scene, tmp_path):
+    """What a first estimate leaves of them is no second cause, nor a curve of the detector."""
+    answer = diagnose.run(_pairs(scene, tmp_path, {"image_gain": {"rms": 0.2}})).answer
+    assert [c.effect.name for c in answer.causes] == ["image_gain"]
+
+
 @pytest.mark.parametrize("seed", [21, *(pytest.param(s, marks=pytest.mark.slow) for s in (22, 23, 24))])
 def test_nothing_hidden_names_nothing(scene, tmp_path, seed):
     answer = diagnose.run(_pairs(scene, tmp_path, {}, seed)).answer

@@ -19,7 +19,7 @@ MOON = 1737400.0
     ("script", "says"),
     [
         ("new_effect", "haze 0.002"),
-        ("new_effect_per_image", "readout_smear with"),
+        ("new_effect_per_image", "motion_blur with"),
         ("new_camera", "round trip"),
         ("new_matcher", "moved by 2.0, 0.0 px"),
     ],
