@@ -51,7 +51,9 @@ def search(state: State, most: int) -> Outcome:
         best, _ = weigh_all(view.whole)
         out.rejected = {k: v for k, v in out.rejected.items() if k in refused}
         out.view, out.best = view, best
-        done = refused | {c.effect.name for c in state.causes}  # values per image of causes are weighed as well: what is left of them
+        done = refused | {
+            c.effect.name for c in state.causes
+        }  # values per image of causes are weighed as well: what is left of them
         strong = [f for f in best.values() if f.p <= DISCOVERY and f.effect not in done]
         strong.sort(key=lambda f: -f.surprise)
         tried: list[Found] = []
