@@ -51,9 +51,8 @@ def search(state: State, most: int) -> Outcome:
         best, _ = weigh_all(view.whole)
         out.rejected = {k: v for k, v in out.rejected.items() if k in refused}
         out.view, out.best = view, best
-        done = refused | {
-            c.effect.name for c in state.causes
-        }  # values per image of causes are weighed as well: what is left of them
+        # values per image of a cause are weighed as well: what is left of them is no further cause
+        done = refused | {c.effect.name for c in state.causes}
         strong = [f for f in best.values() if f.p <= DISCOVERY and f.effect not in done]
         strong.sort(key=lambda f: -f.surprise)
         tried: list[Found] = []
@@ -71,21 +70,10 @@ def search(state: State, most: int) -> Outcome:
         tried.sort(key=lambda f: -f.gain)
         faint = FAINT**2 / 2 * float(view.whole.gram[0, 0])
         sure = [f for f in tried if f.gain_interval()[0] > 0 and (f.gain > faint or shows_in_shade(view.whole, f))]
-        for f in tried:
-            low, high = f.gain_interval()
-            if low > 0 and f not in sure:
-                out.rejected[f.effect] = (
-                    f.gain,
-                    f"it gains {f.gain:.0f} nats, and less than {faint:.0f} is ordinary in so many pixels",
-                )
-            elif f not in sure:
-                out.rejected[f.effect] = (
-                    f.gain,
-                    f"on ground that it was not fitted to it gains {f.gain:.0f} nats ({low:.0f} .. {high:.0f}), which may be nothing",
-                )
+        out.rejected |= {f.effect: (f.gain, _why_not_sure(f, faint)) for f in tried if f not in sure}
         if len(state.causes) >= most:
             break
-        taken, strange = False, False
+        taken = strange = False
         for _ in range(TRIES):
             if not sure or taken or strange:
                 break
@@ -116,6 +104,13 @@ def search(state: State, most: int) -> Outcome:
     for cause in state.causes:
         out.rejected.pop(cause.effect.name, None)
     return out
+
+
+def _why_not_sure(found: Found, faint: float) -> str:
+    low, high = found.gain_interval()
+    if low > 0:
+        return f"it gains {found.gain:.0f} nats, and less than {faint:.0f} is ordinary in so many pixels"
+    return f"on ground that it was not fitted to it gains {found.gain:.0f} nats ({low:.0f} .. {high:.0f}), which may be nothing"
 
 
 def doubt_all(state: State, view: View, sure: float = SURE) -> dict[str, tuple[float, str]]:
