@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
+
+ORDINARY = 0.04  # what a DEM that is too smooth does to the lengths of shadows
 
 
 @register
@@ -30,6 +33,14 @@ class DemScale(Effect):
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
         return [Trial(({"relative": 0.05},))]
+
+    @classmethod
+    def shadow_trials(cls, survey: Survey) -> list[Trial]:
+        return [Trial(({"relative": 0.02 * k},)) for k in range(-15, 21)]
+
+    @classmethod
+    def shadows_ordinarily(cls, values: Mapping[str, Any]) -> bool:
+        return abs(float(values["relative"])) <= ORDINARY
 
     def apply(self, state: State) -> None:
         factor = 1 + self.value("relative", state)

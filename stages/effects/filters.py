@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -19,6 +20,21 @@ def gaussian(image: Tensor, sigma2: Tensor | float, limit: float = 4.0, slopes: 
     image : (..., H, W); sigma2 : scalar. Differentiable in both.
     slopes : go on beyond the borders with the slope that there is (heights), not mirrored (brightness): no crease is sharpened
     """
+
+    def gain(waves: Tensor) -> Tensor:
+        power = -0.5 * torch.as_tensor(sigma2, dtype=image.dtype) * waves.square()
+        # a sudden end would make waves stop growing one after the other, and what is fitted to them jump
+        log_limit = math.log(limit)
+        over = softplus(SUDDEN * (power - log_limit)) - math.log1p(
+            math.exp(-SUDDEN * log_limit)
+        )  # 0 where nothing is filtered
+        return torch.exp(power - over / SUDDEN)
+
+    return filtered(image, gain, slopes)
+
+
+def filtered(image: Tensor, gain: Callable[[Tensor], Tensor], slopes: bool = False) -> Tensor:
+    """Every wave of (..., H, W) times its ``gain``, a function of wave numbers, rad/px; ``slopes``: as of :func:`gaussian`."""
     margin = min(MARGIN, image.shape[-1] - 1, image.shape[-2] - 1)
     if slopes:
         wide = _turned(_turned(image, margin).transpose(-2, -1), margin).transpose(-2, -1)
@@ -28,15 +44,8 @@ def gaussian(image: Tensor, sigma2: Tensor | float, limit: float = 4.0, slopes: 
     height, width = wide.shape[-2:]
     ky = torch.fft.fftfreq(height, device=image.device)[:, None] * (2 * math.pi)
     kx = torch.fft.rfftfreq(width, device=image.device) * (2 * math.pi)
-    power = -0.5 * torch.as_tensor(sigma2, dtype=image.dtype) * (kx * kx + ky * ky)
-    # a sudden end would make waves stop growing one after the other, and what is fitted to them jump
-    log_limit = math.log(limit)
-    over = softplus(SUDDEN * (power - log_limit)) - math.log1p(
-        math.exp(-SUDDEN * log_limit)
-    )  # 0 where nothing is filtered
-    gain = torch.exp(power - over / SUDDEN)
-    blurred = torch.fft.irfft2(torch.fft.rfft2(wide) * gain, s=(height, width))
-    return blurred[..., margin : height - margin, margin : width - margin]
+    changed = torch.fft.irfft2(torch.fft.rfft2(wide) * gain(torch.hypot(kx, ky)), s=(height, width))
+    return changed[..., margin : height - margin, margin : width - margin]
 
 
 def fine(image: Tensor, mask: Tensor, sigma: float) -> Tensor:

@@ -40,6 +40,7 @@ class Interreflection(Effect):
     # towards the light both facets reflect twice as much as at 30 deg: strength 4
     parameters = (Parameter("strength", "1", -1.0, 10.0, 0.0, "share of the light that diffuse terrain would scatter"),)
     strong: ClassVar = {"strength": 1.0}
+    tolerance: ClassVar = {"strength": 0.3}  # what relief that the DEM has not lights of its shadows
 
     def apply(self, state: State) -> None:
         strength = self.value("strength", state)

@@ -44,7 +44,7 @@ class SunElevation(Effect):
 
     @classmethod
     def shadows_ordinarily(cls, values: Mapping[str, Any]) -> bool:
-        return float(values["error_deg"]) <= HORIZON  # too dark is also what relief and the law at grazing light make
+        return abs(float(values["error_deg"])) <= HORIZON
 
     def apply(self, state: State) -> None:
         east, north, up = state.sun_direction.to(state.elevation.dtype).unbind(-1)

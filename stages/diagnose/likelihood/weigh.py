@@ -16,7 +16,7 @@ from stages.diagnose.likelihood.products import Array, Products
 from stages.diagnose.likelihood.tails import surprise
 from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.settings import FOLDS, LEVELS, SIMPLER, UNITS
-from stages.effects import get_effect
+from stages.effects import Effect, get_effect
 
 
 class Whole:
@@ -185,11 +185,19 @@ class Whole:
         return (information + information.T) / 2, score, shams, n
 
     def exclude(self, guise: Guise) -> list[int]:
-        """What the nuisance does without beside this effect: ordinary amounts of it, and of all that lights shadows where it does."""
+        """What the nuisance does without beside this effect: ordinary amounts of it, and of all that lights shadows where it does;
+        what :meth:`stood_for` names.
+        """
         cls = get_effect(guise.effect)
         alike = [n for n in self.plan.ordinary if cls.lights_shadows and get_effect(n).lights_shadows]
-        form = self.form_places().tolist() if cls.of_law else []
-        return [p for n in dict.fromkeys([guise.effect, *alike]) for p in self.ordinary_places(n)] + form
+        ordinary = [p for n in dict.fromkeys([guise.effect, *alike]) for p in self.ordinary_places(n)]
+        return ordinary + self.stood_for([cls])
+
+    def stood_for(self, causes: Sequence[type[Effect]]) -> list[int]:
+        """Places of what these effects stand for: another form of the law, errors of the DEM."""
+        form = self.form_places().tolist() if any(c.of_law for c in causes) else []
+        relief = any(c.slot == "geometry" and not c.displaces for c in causes)
+        return form + ([1 + k for k in self.plan.dem_errors] if relief else [])
 
     def ordinary_places(self, effect: str) -> list[int]:
         """Places of the ordinary amounts of an effect among the nuisance."""

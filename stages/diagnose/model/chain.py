@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from stages.diagnose.model.laws import LunarLaws
+from stages.diagnose.model.relief import ShareOfRelief, SharpSlopes
 from stages.diagnose.model.sites import Site
 from stages.diagnose.settings import BROAD
 from stages.effects import Effect
@@ -17,38 +18,10 @@ from stages.effects.filters import fine, gradients
 from stages.physics.formation import chain as formation
 from stages.physics.formation import geometry
 from stages.physics.formation.chain import State
-from stages.physics.light.sun_disc import sun_visibility
 from stages.physics.photometry import ReflectanceModel, lambert_albedo, masked_radiance_factor
 
 STEP = 0.02  # of a slope, as tangent
 SCATTER = 0.14  # 8 deg: rms slope of relief below a typical DEM's resolution
-
-
-class SharpSlopes:
-    """Slopes by fourth-order differences, as an extension of the model.
-
-    Second-order ones, which the simulation uses, take the mean over two pixels: a third of a squared pixel along the
-    slope, that images do not have. Judged with them every image looks sharper than it is, and every DEM smoother.
-    """
-
-    slot = "illumination"
-
-    def __init__(self, gsd: float, body_radius: float) -> None:
-        self.gsd, self.body_radius = gsd, body_radius
-        self.made: object = None
-
-    def apply(self, state: State) -> None:
-        """Put the slopes that the images resolve in place of the central differences."""
-        if state.slopes is self.made:  # taken over from the state that they were made for
-            return
-        z = state.elevation
-        east, north = geometry.slopes(z, self.gsd)
-        far, near = z[..., 4:] - z[..., :-4], z[..., 3:-1] - z[..., 1:-3]
-        east[..., 2:-2] = (8 * near - far) / (12 * self.gsd)
-        far, near = z[..., 4:, :] - z[..., :-4, :], z[..., 3:-1, :] - z[..., 1:-3, :]
-        north[..., 2:-2, :] = (far - 8 * near) / (12 * self.gsd)
-        state.slopes = geometry.curvature_slopes(east, north, self.gsd, self.body_radius)
-        self.made = self.made or state.slopes
 
 
 class Chain:
@@ -81,14 +54,16 @@ class Chain:
         """Angles and visibility under the base effects; not to be changed."""
         return self._state
 
-    def _illuminate(self, effects: Sequence[Effect], known: State | None = None) -> State:
+    def _illuminate(self, effects: Sequence[formation.Extension], known: State | None = None) -> State:
         return formation.illuminate(self.site.observation, [self._sharp, *effects], known)
 
     def _surface(self, state: State, coefficients: Tensor | None = None) -> Tensor:
         c = self.coefficients if coefficients is None else coefficients
         return masked_radiance_factor(self.model, self.model.unpack(c, dim=1), state.angles)
 
-    def _expose(self, state: State, reflectance: Tensor, effects: list[Effect], measured: bool = True) -> Tensor:
+    def _expose(
+        self, state: State, reflectance: Tensor, effects: Sequence[formation.Extension], measured: bool = True
+    ) -> Tensor:
         state = copy.copy(state)
         state.further_light = list(state.further_light)
         state.reflectance, state.albedo = reflectance, lambda: self._albedo
@@ -115,11 +90,11 @@ class Chain:
             site.valid, predicted + fine(site.image - predicted, site.valid.float(), 2 * BROAD), torch.nan
         )
 
-    def render(self, extra: Effect | None = None) -> Tensor:
+    def render(self, extra: formation.Extension | None = None) -> Tensor:
         """(n, H, W) I/F with one more effect, which may know the image."""
         if extra is None:
             return self._expose(self._state, self._state.reflectance, self.base)
-        effects = [*self.base, extra]
+        effects: list[formation.Extension] = [*self.base, extra]
         if extra.slot in ("geometry", "illumination"):
             state = self._illuminate(effects, self._state)
             same = state.angles.cos_incidence is self._state.angles.cos_incidence
@@ -195,15 +170,13 @@ class Chain:
             out.append((self._expose(state, self._surface(state), self.base) - self.rendered) / STEP)
         return out[0], out[1]
 
-    def visibility(self, effects: Sequence[Effect]) -> Tensor | None:
-        """(n, H, W) share of the Sun's disc above the horizon, with these effects of the illumination beside the base."""
+    def sunlight(self, effects: Sequence[Effect]) -> tuple[Tensor, Tensor | None, Tensor]:
+        """Elevation of the Sun (n,), terrain horizon (n, H, W) and radius of the disc, rad, with these effects of the illumination beside the base."""
         state = copy.copy(self._state)
         for effect in effects:
             effect.apply(state)
-        if state.sun_horizon is None:
-            return None
         sun = torch.asin(state.sun_direction[:, 2].clamp(-1, 1)).to(state.elevation.dtype)
-        return sun_visibility(sun[:, None, None], state.sun_horizon, state.sun_radius)
+        return sun, state.sun_horizon, torch.as_tensor(state.sun_radius, dtype=sun.dtype)
 
     def unresolved_slopes(self) -> Tensor:
         """What a scatter of slopes within a pixel, or of the DEM's own slopes, does to the mean: its second order."""
@@ -214,6 +187,10 @@ class Chain:
             state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
             out += 0.25 * self._expose(state, self._surface(state), self.base)
         return out
+
+    def without_dem_errors(self, kept: Callable[[Tensor], Tensor]) -> Tensor:
+        """What the rendering changes by if of the DEM's waves only a share is relief, (n, H, W); ``kept``: of wave numbers, rad/px."""
+        return self.render(ShareOfRelief(kept)) - self.rendered
 
     def lit(self) -> Tensor:
         """(n, H, W) bool: ground that the Sun's centre shines on."""

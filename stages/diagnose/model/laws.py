@@ -12,6 +12,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
+from scipy.linalg import eigh
 from torch import Tensor
 
 from stages.common.arrays import Floats
@@ -88,8 +89,8 @@ def lunar_laws(cosines: Tensor, brightness: float | None = None) -> LunarLaws:
     laws = laws / laws.mean(1, keepdims=True)
     mean = laws.mean(0)
     departures = laws / mean - 1
-    _, sizes, axes = np.linalg.svd(departures / math.sqrt(departures.size), full_matrices=False)
-    count = min(DIRECTIONS, len(sizes))
+    sizes, axes = _main_directions(departures)
+    count = len(sizes)
     seeliger = (angles.cos_incidence / (angles.cos_incidence + angles.cos_emission)).numpy()
     shapes = np.concatenate([np.ones((1, len(mean))), axes[:count] * math.sqrt(len(mean))]) * mean / seeliger
     shapes *= (brightness or 0.06) / (mean * shapes[0] / shapes[0]).mean()
@@ -98,6 +99,16 @@ def lunar_laws(cosines: Tensor, brightness: float | None = None) -> LunarLaws:
     # by what is wrong with brightness, since at grazing light laws go apart without bound
     weights = np.linalg.lstsq((terms * seeliger).T, (shapes * seeliger).T, rcond=1e-10)[0].T
     return LunarLaws(low, high, weights, sizes[:count])
+
+
+def _main_directions(departures: Floats) -> tuple[Floats, Floats]:
+    """Standard deviations (K,) and directions (K, N), unit vectors, of the scatter of (laws, N) about nothing, the largest first."""
+    among = departures @ departures.T / departures.size  # far fewer laws than angles
+    count = min(DIRECTIONS, *departures.shape)
+    squares, mixtures = eigh(among, subset_by_index=[len(among) - count, len(among) - 1])
+    sizes = np.sqrt(np.maximum(squares[::-1], 0.0))
+    axes = mixtures.T[::-1] @ departures / (np.maximum(sizes, 1e-12)[:, None] * math.sqrt(departures.size))
+    return sizes, axes
 
 
 def _factors(angles: Angles, low: Floats, high: Floats) -> list[list[Tensor]]:

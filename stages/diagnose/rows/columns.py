@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -40,6 +40,7 @@ class Plan:
     form: list[int] = field(
         default_factory=list
     )  # of another form of the reflectance: a nuisance of all but effects of the law
+    dem_errors: list[int] = field(default_factory=list)  # of what the DEM has and the ground has not
     pull: dict[int, float] = field(
         default_factory=dict
     )  # columns whose prior is not about what is rendered: its distance, in the column's unit
@@ -81,6 +82,7 @@ def make_plan(
         for k in range(len(chain.laws.scatter) - 1):
             plan.form.append(shared(f"form {k}", 1.0))
     shared("slopes within a pixel", 1.0)
+    plan.dem_errors.append(shared("errors of the DEM", 1.0))
     for place, effect in enumerate(chain.base):
         if effect.scope == "scene":
             for p in effect.fitted():
@@ -111,8 +113,8 @@ def make_plan(
     return plan
 
 
-def shared_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
-    """(1 + m, n, H, W): the residual first, then the shared columns in the plan's order.
+def shared_columns(chain: Chain, plan: Plan, data: Survey, kept: Callable[[Tensor], Tensor]) -> Tensor:
+    """(1 + m, n, H, W): the residual first, then the shared columns in the plan's order. kept : share of the DEM's waves without its errors
 
     Albedo that all images of a place share is part of the residual's covariance.
     """
@@ -122,6 +124,7 @@ def shared_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
         *chain.surface_tangents(),
         *chain.form_tangents(),
         chain.unresolved_slopes(),
+        chain.without_dem_errors(kept),
         *moved[1:],
     ]
     for guise in plan.guises:

@@ -80,7 +80,7 @@ def _left(state: State, view: View) -> float:
     kept = dict(whole.precision)
     for place in _scene_places(view)[0]:
         whole.precision.pop(int(place), None)
-    _, score, _, _ = whole.reduce(np.zeros(1, dtype=np.int64), _no_form(state, whole))
+    _, score, _, _ = whole.reduce(np.zeros(1, dtype=np.int64), _stood_for(state, whole))
     whole.precision = kept
     return float(score[0])
 
@@ -177,12 +177,12 @@ def _step(state: State, view: View, share: float) -> float:
 
 def _amounts(state: State, whole: Whole, places: NDArray[np.int64]) -> list[NDArray[np.float64]]:
     """Moves of all coordinates and their errors."""
-    return list(whole.errors(places, _no_form(state, whole)))
+    return list(whole.errors(places, _stood_for(state, whole)))
 
 
-def _no_form(state: State, whole: Whole) -> list[int]:
-    """Places of another form of the law where a cause is of the law: beside it no other form stands."""
-    return whole.form_places().tolist() if any(type(c.effect).of_law for c in state.causes) else []
+def _stood_for(state: State, whole: Whole) -> list[int]:
+    """Places of what the causes stand for."""
+    return whole.stood_for([type(c.effect) for c in state.causes])
 
 
 def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:

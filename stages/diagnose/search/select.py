@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,6 +23,7 @@ from stages.diagnose.settings import DISCOVERY, FAINT, FOLDS, NOTABLE, SIMPLER, 
 from stages.effects import Effect, get_effect
 
 ODD = "nothing real has the values that fit best"
+ORDINARY = "is ordinary"
 
 
 @dataclass
@@ -38,13 +39,15 @@ class Outcome:
 def search(state: State, most: int) -> Outcome:
     """Name causes until no candidate is left."""
     out = Outcome()
-    refused: set[str] = set()
+    refused: dict[str, str] = {}  # effect -> why
     view: View | None = None
     while True:
         # the data look as before where nothing was named
         view = state.without_impossible(view, state.open_names()) if view else state.look(state.open_names())
         if not state.causes and state.law_is_another(view, refused):
-            refused -= {n for n in refused if not get_effect(n).of_law}  # nothing was judged beside this law
+            refused = {
+                n: why for n, why in refused.items() if get_effect(n).of_law
+            }  # nothing was judged beside this law
             state.impossible.clear()
             view = None
             continue
@@ -52,18 +55,13 @@ def search(state: State, most: int) -> Outcome:
         out.rejected = {k: v for k, v in out.rejected.items() if k in refused}
         out.view, out.best = view, best
         # values per image of a cause are weighed as well: what is left of them is no further cause
-        done = refused | {c.effect.name for c in state.causes}
+        done = {*refused, *(c.effect.name for c in state.causes)}
         strong = [f for f in best.values() if f.p <= DISCOVERY and f.effect not in done]
         strong.sort(key=lambda f: -f.surprise)
         tried: list[Found] = []
         for found in strong:
-            whole = view.whole
-            # beside gains of every image nothing is left to gain: they know already how bright each is on other ground
-            beside = whole.scattered.tolist() if found.beside else []
-            without = [*whole.exclude(found.guise), *beside]
-            found.gains = whole.held_out(whole.places(found.guise), without, found.spread)
-            found.sizes = whole.sizes
-            if not another_law(whole, found, out):
+            judge(view.whole, found)
+            if not another_law(view.whole, found, out):
                 tried.append(found)
             if len(tried) == TRIED:
                 break
@@ -80,17 +78,16 @@ def search(state: State, most: int) -> Outcome:
             chosen, group = choose(sure)
             sure = [f for f in sure if f is not chosen]
             before = list(state.causes)
-            others = [f for f in tried if f.effect not in refused]
-            why = may_be_another(view.whole, chosen, others) or take(state, view, chosen, group)
+            why = may_be_another(view.whole, chosen, best, refused) or take(state, view, chosen, group)
             taken, strange = not why, why.startswith(ODD)
             for gone in [c for c in before if c not in state.causes]:
-                refused.add(gone.effect.name)
-                out.rejected[gone.effect.name] = (gone.found.gain, f"beside {chosen.effect} it is no cause any more")
+                refused[gone.effect.name] = f"beside {chosen.effect} it is no cause any more"
+                out.rejected[gone.effect.name] = (gone.found.gain, refused[gone.effect.name])
             if taken:
                 state.say(f"{chosen.effect} gains {chosen.gain:.0f} nats on held-out ground")
                 continue
             state.say(f"{chosen.effect} is not taken: {why}")
-            refused.add(chosen.effect)
+            refused[chosen.effect] = why
             out.rejected[chosen.effect] = (chosen.gain, why)
             if strange:  # the others were judged beside amounts of it that nothing has
                 out.sure |= chosen.gain > NOTABLE * float(view.whole.gram[0, 0])
@@ -152,8 +149,22 @@ def choose(sure: list[Found]) -> tuple[Found, list[str]]:
     return best, group
 
 
-def may_be_another(whole: Whole, found: Found, others: Sequence[Found]) -> str:
-    """Why an effect may stand for what is ordinary, or as likely and not sure on its own, or ''."""
+def judge(whole: Whole, found: Found) -> None:
+    """Set what the effect gains on held-out ground."""
+    # beside gains of every image nothing is left to gain: they know already how bright each is on other ground
+    beside = whole.scattered.tolist() if found.beside else []
+    without = [*whole.exclude(found.guise), *beside]
+    found.gains, found.sizes = whole.held_out(whole.places(found.guise), without, found.spread), whole.sizes
+
+
+def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refused: Mapping[str, str]) -> str:
+    """Why an effect may stand for what is ordinary, or as likely and not sure on its own, or ''. refused : effect -> why"""
+    for other in [best[n] for n in get_effect(found.effect).confused_with if n in refused and n in best]:
+        judge(whole, other)
+        if other.more_than(found)[0] > 0:
+            return f"{other.effect}, which is no cause, explains more of it"
+        if refused[other.effect].endswith(ORDINARY) and found.more_than(other)[0] <= 0:
+            return f"{other.effect}, of which there is an ordinary amount, explains as much of it"
 
     def sure(gains: np.ndarray) -> bool:
         return interval(gains, whole.sizes)[0] > 0
@@ -162,7 +173,7 @@ def may_be_another(whole: Whole, found: Found, others: Sequence[Found]) -> str:
     if get_effect(found.effect).lights_shadows and not sure(whole.held_out(whole.places(found.guise), own)):
         return "ordinary amounts of other light in shadows would explain it as well"
     if found.guise.per_frame:
-        for other in others:
+        for other in best.values():
             likely = not other.guise.per_frame and other.surprise >= found.surprise
             if likely and not sure(whole.gains_beside(found, other)):
                 return f"{other.effect}, of which these data are not sure, would explain it as well"
@@ -244,7 +255,7 @@ def ordinary(first: Effect) -> str:
         for name, least in cls.tolerance.items():
             size = cls.size(first.values) if name not in first.values else abs(first.values[name] - cls.null()[name])
             if size < least / 2:
-                return f"{name} is {size:.2g}, and less than {least:.2g} is ordinary"
+                return f"{name} is {size:.2g}, and less than {least:.2g} {ORDINARY}"
     return ""
 
 
@@ -289,7 +300,7 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     if cls.scope == "image":
         size, error = cause.rms, cause.errors.get("rms", math.inf)
         least = max(cls.tolerance.values(), default=0.0)
-        return f"it is {size:.2g}, and less than {least:.2g} is ordinary" if size - 2 * error < least else ""
+        return f"it is {size:.2g}, and less than {least:.2g} {ORDINARY}" if size - 2 * error < least else ""
     values = {k: float(v) for k, v in cause.effect.values.items()}
     if not cls.plausible(values, state.data):
         return ODD
@@ -311,7 +322,7 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     for name, least in cls.tolerance.items():
         size = cls.size(values) if name not in values else abs(values[name] - cls.null()[name])
         if size - 2 * cause.errors.get(name, 0.0) < least:
-            return f"{name} is {size:.2g}, and less than {least:.2g} is ordinary"
+            return f"{name} is {size:.2g}, and less than {least:.2g} {ORDINARY}"
     return ""
 
 
@@ -336,7 +347,7 @@ def secant_gains(state: State, cause: Cause, look: View, before: View | None) ->
     total = float(whole.gram[0, 0])
     if not cause.single:
         return cause.found.gains, total, np.zeros(0)
-    form = list(whole.form_places()) if type(cause.effect).of_law else []
+    form = whole.stood_for([type(cause.effect)])
     if cause.found.beside:
         form += (look.whole.scattered + 1).tolist()  # one shared column more
     place = np.array([whole.first - 1])

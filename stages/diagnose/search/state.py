@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_variance
+from stages.diagnose.likelihood.dem_errors import kept_share
 from stages.diagnose.likelihood.found import Found
 from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
 from stages.diagnose.likelihood.weigh import Whole
@@ -21,7 +22,7 @@ from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.explain import Registration
 from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, moved_columns, shared_columns
-from stages.diagnose.rows.patches import Grid, cuts, make_grid, make_patches
+from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patches
 from stages.diagnose.settings import FAINT, FOLDS, SEEN, SHAMS
 from stages.effects import Effect, Survey, effect_names, get_effect
 
@@ -89,6 +90,9 @@ class State:
     # effects that were fitted and refused -> their largest error, in sizes worth knowing
     open: dict[str, float] = field(default_factory=dict)
     reference: Nominal | None = None
+    kept: Callable[[Tensor], Tensor] = (
+        torch.ones_like
+    )  # share of the DEM's waves that is relief if all that it may lack is its errors
     say: Callable[[str], None] = lambda text: None
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
 
@@ -163,10 +167,22 @@ class State:
         every = [n for n in effect_names() if n not in named]
         return [n for n in every if get_effect(n).visible(self.data, self.has)]
 
-    def rows(self, number: int, chain: Chain, plan: Plan) -> list[Rows]:
+    def kept_share(self, chains: Sequence[Chain], grid: Grid) -> Callable[[Tensor], Tensor]:
+        """Of the DEM's waves, if all relief that images show beside it is errors of the DEM."""
+        patches: list[Patch] = []
+        left: list[tuple[Tensor, Tensor]] = []
+        for number, chain in enumerate(chains):
+            residual = (chain.site.image - chain.rendered)[None]
+            for patch in make_patches(number, chain, self.grid()[1], self.free_gains):
+                z, mean = patch.transform(residual, grid)
+                patches.append(patch)
+                left.append((z[0], mean[0]))
+        return kept_share(chains, patches, grid, estimate(patches, left, grid, self.frames))
+
+    def rows(self, number: int, chain: Chain, plan: Plan, kept: Callable[[Tensor], Tensor]) -> list[Rows]:
         """Of one site, piece by piece."""
         grid, pieces = self.grid()
-        shared, own = shared_columns(chain, plan, self.data), frame_columns(chain, plan, self.data)
+        shared, own = shared_columns(chain, plan, self.data, kept), frame_columns(chain, plan, self.data)
         out = []
         for patch in make_patches(number, chain, pieces, self.free_gains):
             z, mean = patch.transform(shared, grid)
@@ -180,7 +196,9 @@ class State:
         grid, _ = self.grid()
         plan = make_plan(chains[0], names, self.data, impossible=self.impossible)
 
-        rows = [r for part in per_site(lambda k: self.rows(k, chains[k], plan), range(len(chains))) for r in part]
+        self.kept = self.kept_share(chains, grid)
+        every = per_site(lambda k: self.rows(k, chains[k], plan, self.kept), range(len(chains)))
+        rows = [r for part in every for r in part]
         model = self._covariance(rows, plan, grid)
         tricks: list[Residual | None] = [None] * len(rows)
         if shams:

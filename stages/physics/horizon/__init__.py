@@ -15,11 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError
 from stages.physics.horizon.hulls import sweep_horizon
+from stages.physics.horizon.occluder import occluder_distance
 from stages.physics.horizon.scene import Overview, horizon_in_scene, make_overview
 from stages.physics.horizon.shadow import sweep_shadow
 from stages.physics.horizon.sweeps import PixelSize
 
-__all__ = ["Overview", "cast_shadow", "horizon", "horizon_in_scene", "make_overview"]
+__all__ = ["Overview", "cast_shadow", "horizon", "horizon_in_scene", "make_overview", "occluder_distance"]
 
 
 def _check(

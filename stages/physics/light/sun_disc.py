@@ -10,6 +10,7 @@ from torch import Tensor
 
 SUN_RADIUS = math.radians(0.2666)  # mean angular radius of the Sun at 1 au
 DARKENING = 0.6  # u of the limb darkening I = 1 - u (1 - mu) in visible light (Cox 2000)
+DARKENED = DARKENING * 2 / 3 / (1 - DARKENING / 3)  # flux of the mu-term over the whole disc's
 
 
 def sun_visibility(sun_elevation: Tensor, horizon: Tensor, radius: float | Tensor = SUN_RADIUS) -> Tensor:
@@ -21,6 +22,12 @@ def sun_visibility(sun_elevation: Tensor, horizon: Tensor, radius: float | Tenso
     return disc_share(t, torch.sqrt(1 - t * t), torch.asin(t))
 
 
+def visibility_slope(t: Tensor) -> Tensor:
+    """Change of that share per radius by which the horizon ``t`` radii above the Sun's centre rises: the disc's flux along the horizon."""
+    inside = (1 - t * t).clamp(min=0)
+    return -(1 - DARKENED) * 2 / math.pi * inside.sqrt() - DARKENED * 0.75 * inside
+
+
 @register_jitable
 def disc_share(t, root, angle):
     """Share of a limb-darkened disc above a straight line ``t`` radii above its centre; tensors, or numbers in kernels.
@@ -30,5 +37,4 @@ def disc_share(t, root, angle):
     """
     uniform = 0.5 - (t * root + angle) / math.pi
     darkened = 0.5 - 0.75 * (t - t**3 / 3)  # the share for slices of weight (1 - t^2), by the same integral
-    weight = DARKENING * 2 / 3 / (1 - DARKENING / 3)  # flux of the mu-term over the whole disc's
-    return (1 - weight) * uniform + weight * darkened
+    return (1 - DARKENED) * uniform + DARKENED * darkened

@@ -1,0 +1,116 @@
+"""Where shadows end, and how well a DEM can know it.
+
+What casts a shadow is off by some height, and so is the ground that it falls on: seen from there, the horizon is off by an angle
+that goes with one over the distance. So errors of the DEM, and relief finer than it, widen the edges of shadows cast from near by and
+lengthen them (a horizon is the highest of all that stands in a direction), while a wide Sun widens all edges by the same angle and a wrong
+one moves all by the same. Two lengths say how much: ``blur`` and ``lift``, fitted wherever shadows are compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stages.common.arrays import Floats
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.settings import CLEAR, DARKEST
+from stages.effects import Effect
+from stages.physics.horizon import occluder_distance
+from stages.physics.light.sun_disc import sun_visibility, visibility_slope
+
+NEAREST = 3.0  # px: edges of shadows cast from nearer by hang on the slope of the ground itself
+PARTS = 4  # bands of a site's lines that are judged apart, where grounds are few
+
+
+@dataclass(frozen=True)
+class Horizons:
+    """What errors of the DEM do to its horizons, for terrain at a distance of one pixel: radius of the blur and lift, rad px."""
+
+    blur: float = 0.15
+    lift: float = 0.0
+
+
+class Edges:
+    """The facets of one site that the Sun would shine on, and the share of its light that arrives there.
+
+    ground : the chain whose relief casts the shadows, if it is another one
+    """
+
+    def __init__(self, chain: Chain, ground: Chain | None = None) -> None:
+        self.chain = ground or chain
+        site, facet = chain.site, chain.state.reflectance
+        known = chain.state.sun_visibility
+        assert known is not None
+        lit = chain.lit() & site.valid
+        level = (facet * lit).sum((-2, -1), keepdim=True) / lit.sum((-2, -1), keepdim=True).clamp(min=1)
+        use = site.valid & (facet > DARKEST * level)
+        distance = _distances(chain, use)
+        above = chain.height_above_horizon()
+        assert above is not None
+        use &= (distance >= NEAREST) | (above.abs() > CLEAR)
+        self.image, self.row, self.column = torch.nonzero(use, as_tuple=True)
+        self.nearness = 1 / distance[use].clamp(min=NEAREST)
+        self.measured = (known + (site.image - chain.predict()) / facet.clamp(min=1e-9)).clamp(0, 1)[use]
+        band = torch.repeat_interleave(
+            torch.arange(PARTS), torch.tensor([len(p) for p in np.array_split(np.arange(use.shape[1]), PARTS)])
+        )
+        self.part = band[self.row]
+
+    def products(self, effects: Sequence[Effect], beside: Sequence[Effect], about: Horizons) -> Floats:
+        """(effects, PARTS, 3, 3) of the residual share of sunlight and of what a little more blur and lift would add to the expected one."""
+        out = [self._products([*(b for b in beside if b.name != e.name), e], about) for e in effects]
+        return torch.stack(out).numpy()
+
+    def _products(self, effects: Sequence[Effect], about: Horizons) -> Tensor:
+        _, known, _ = self.chain.sunlight([e for e in effects if e.slot == "geometry"])
+        sun, horizon, disc = self.chain.sunlight(effects)
+        assert known is not None and horizon is not None
+        at = self.image, self.row, self.column
+        above = sun[self.image] - horizon[at]
+        # what an effect raises above the DEM stands far off, as it was given
+        near = torch.where(horizon[at] > known[at], 0.0, self.nearness)
+
+        radius = torch.hypot(disc, about.blur * near)
+        t = (about.lift * near - above) / radius
+        slope = visibility_slope(t) / radius
+        wider = -slope * t * about.blur * near.square() / radius
+        columns = [self.measured - sun_visibility(above, about.lift * near, radius), wider, slope * near]
+        x = torch.stack(columns).double()
+        out = torch.zeros(PARTS, 3, 3, dtype=torch.float64)
+        for p in range(PARTS):
+            own = x[:, self.part == p]
+            out[p] = own @ own.T
+        return out
+
+
+def _distances(chain: Chain, use: Tensor) -> Tensor:
+    """(n, H, W) px to what makes the horizon; 0 where not in use."""
+    state, gsd = chain.state, chain.site.observation.gsd
+    assert state.sun_horizon is not None
+    out = []
+    for k, (sun, mask) in enumerate(zip(state.sun_direction, use, strict=True)):
+        elevation = state.elevation[min(k, len(state.elevation) - 1)]
+        azimuth = math.atan2(float(sun[0]), float(sun[1]))
+        distance = occluder_distance(elevation.numpy(), gsd, azimuth, state.sun_horizon[k].numpy(), mask.numpy())
+        out.append(torch.from_numpy(distance))
+    return torch.stack(out)
+
+
+def move(products: Floats) -> Floats:
+    """(2,) more blur and lift with which the squares of (3, 3) are least."""
+    inner = products[1:, 1:] + 1e-9 * np.trace(products[1:, 1:]) * np.eye(2) + 1e-12 * np.eye(2)
+    return np.linalg.solve(inner, products[1:, 0])
+
+
+def squares(products: Floats, moved: Floats) -> Floats:
+    """Of (..., 3, 3), what that blur and lift leave."""
+    change = np.concatenate([[1.0], -moved])
+    return np.asarray(change @ products @ change)
+
+
+__all__ = ["PARTS", "Edges", "Horizons", "move", "squares"]
