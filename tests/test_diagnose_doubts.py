@@ -10,10 +10,12 @@ import torch
 from hidden.terrain import make_terrain
 from scipy.ndimage import gaussian_filter
 
-from stages.diagnose.likelihood.covariance import shadow_variance
+from stages.diagnose.likelihood.covariance import Covariance, shadow_variance
+from stages.diagnose.likelihood.dem_errors import kept_share
 from stages.diagnose.likelihood.found import Found
 from stages.diagnose.rows.columns import Guise
-from stages.diagnose.search.select import ODD, beyond_bounds, doubt
+from stages.diagnose.rows.patches import make_grid
+from stages.diagnose.search.select import ODD, ORDINARY, beyond_bounds, doubt, judge, may_be_another
 from stages.diagnose.search.state import Cause
 from stages.effects import get_effect
 from stages.effects.base import Survey
@@ -38,6 +40,47 @@ def test_a_seam_of_a_dem_is_not_sharpened():
             get_effect("dem_smoothing")({"sigma2_px2": 1.44}).apply(state)
             sharp[name] = state.elevation
         assert torch.allclose(sharp["seamed"] - step, sharp["plain"], atol=0.06)
+
+
+def test_what_of_a_dem_may_be_errors_is_what_images_show_beside_it():
+    """Slopes that are white noise of a known variance: the share that is relief is one less the ratio of variances, wave by wave."""
+    grid = make_grid(48, 48)
+    rng = np.random.default_rng(3)
+    waves = torch.zeros(grid.annuli, dtype=torch.float64)
+    model = Covariance(waves, waves.clone(), torch.ones(grid.annuli, 1), 0.0, 0.0, 1.0, radius=grid.radius.tolist())
+    model.relief[2:] = 0.01**2 / 4
+    model.relief[-1] = 1.0
+    chains, patches = [], []
+    for k in range(40):
+        slopes = [torch.from_numpy(rng.normal(0, 0.01, (1, 48, 48))).float() for _ in range(2)]
+        chains.append(SimpleNamespace(state=SimpleNamespace(slopes=slopes)))
+        patches.append(SimpleNamespace(site=k, rows=slice(0, 48), columns=slice(0, 48)))
+    kept = kept_share(chains, patches, grid, model)(2 * torch.pi * grid.radius)
+    assert kept[:2].tolist() == [1.0, 1.0]
+    assert kept[2:-1].numpy() == pytest.approx(np.full(grid.annuli - 3, 0.75), abs=0.04)
+    assert kept[-1] < 1e-6  # all of it
+
+
+def test_what_is_ordinary_explains_as_much_or_the_rival_is_refused():
+    """A pedestal of an ordinary size, and light from terrain that gains no more than it; light that surely gains more."""
+    shade = Guise("dark_bias", get_effect("dark_bias").trials(Survey())[0], (0,))
+    light = Guise("interreflection", get_effect("interreflection").trials(Survey())[0], (1,))
+
+    def refused(gains, because):
+        both = {g.effect: Found(g.effect, g, np.ones(1), np.ones(1), 9.0) for g in (shade, light)}
+        held = {0: np.array([10.0, 12, 9, 11]), 1: np.array(gains, float)}
+        whole = SimpleNamespace(
+            scattered=np.zeros(0), sizes=np.ones(4), places=lambda g: np.array(g.columns), exclude=lambda g: [],
+            held_out=lambda places, *rest: held[int(places[0])], ordinary_places=lambda name: [],
+        )  # fmt: skip
+        judge(whole, both["interreflection"])
+        return may_be_another(whole, both["interreflection"], both, {"dark_bias": because})
+
+    small = f"iof is 5e-05, and less than 0.0001 {ORDINARY}"
+    assert "as much" in refused([11, 10, 12, 9], small)
+    assert "more" in refused([1, 1, 2, 1], "the test pairs contradict it")
+    assert not refused([11, 10, 12, 9], ODD)
+    assert not refused([21, 22, 20, 22], small)
 
 
 def test_two_shadows_that_agree_by_chance_are_not_exact():

@@ -12,7 +12,7 @@ rows          Residuals relative to brightness, and what a little of everything 
 likelihood    The covariance of the residuals, estimated from them by wavelength: albedo and relief that all images of a place share,
               what each image has of its own, noise. One image of a place is enough, several tell the parts apart. Under it, generalised least squares
               for every effect, along with the nominal coefficients (which may drift from place to place, by as much as they are seen
-              to), the directions in which the law may be another one, gains and shifts per frame, and ordinary amounts of other effects. Sham residuals, those of other ground
+              to), the directions in which the law may be another one, errors of the DEM, gains and shifts per frame, and ordinary amounts of other effects. Sham residuals, those of other ground
               mirrored and shuffled, say how large the largest of all statistics is when nothing is there.
 search        The effect that gains most on held-out ground, if shams hardly do as well, is rendered at its values and everything is fitted
               again. It is named if it is real (its own file says what is plausible and what is ordinary), if it is there

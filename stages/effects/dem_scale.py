@@ -29,6 +29,7 @@ class DemScale(Effect):
     parameters = (Parameter("relative", "1", -0.5, 1.0, 0.0, "relative error of heights, truth minus given"),)
     strong: ClassVar = {"relative": 0.1}
     tolerance: ClassVar = {"relative": 0.02}
+    shadow_error = ORDINARY / 2
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
@@ -36,7 +37,8 @@ class DemScale(Effect):
 
     @classmethod
     def shadow_trials(cls, survey: Survey) -> list[Trial]:
-        return [Trial(({"relative": 0.02 * k},)) for k in range(-15, 21)]
+        errors = (-0.3, -0.2, -0.14, -0.1, -0.07, -ORDINARY, -0.02, 0.0, 0.02, ORDINARY, 0.07, 0.1, 0.14, 0.2, 0.3, 0.4)
+        return [Trial(({"relative": e},)) for e in errors]
 
     @classmethod
     def shadows_ordinarily(cls, values: Mapping[str, Any]) -> bool:

@@ -35,6 +35,20 @@ class Horizons:
     lift: float = 0.0
 
 
+class _Facets:
+    """Some facets of a site: where they lie, in which part, how near what casts shadow on them stands, and the measured share of light."""
+
+    def __init__(self, use: Tensor, distance: Tensor, measured: Tensor) -> None:
+        self.at = torch.nonzero(use, as_tuple=True)  # image, row, column
+        self.part = torch.bucketize(self.at[1], _first_lines(use.shape[1]), right=True) - 1
+        self.nearness = 1 / distance[use].clamp(min=NEAREST)
+        self.measured = measured[use]
+
+
+def _first_lines(lines: int) -> Tensor:
+    return torch.tensor([int(part[0]) for part in np.array_split(np.arange(lines), PARTS)])
+
+
 class Edges:
     """The facets of one site that the Sun would shine on, and the share of its light that arrives there.
 
@@ -53,13 +67,12 @@ class Edges:
         above = chain.height_above_horizon()
         assert above is not None
         use &= (distance >= NEAREST) | (above.abs() > CLEAR)
-        self.image, self.row, self.column = torch.nonzero(use, as_tuple=True)
-        self.nearness = 1 / distance[use].clamp(min=NEAREST)
-        self.measured = (known + (site.image - chain.predict()) / facet.clamp(min=1e-9)).clamp(0, 1)[use]
-        band = torch.repeat_interleave(
-            torch.arange(PARTS), torch.tensor([len(p) for p in np.array_split(np.arange(use.shape[1]), PARTS)])
-        )
-        self.part = band[self.row]
+        near = use & (above.abs() < CLEAR)
+        measured = (known + (site.image - chain.predict()) / facet.clamp(min=1e-9)).clamp(0, 1)
+        self.near, self.every = _Facets(near, distance, measured), _Facets(use, distance, measured)
+        # only a wall beyond the DEM darkens what the Sun stands well above
+        away = torch.where(use & ~near, measured - (above > 0).float(), 0.0).double()
+        self.away = torch.stack([p.square().sum() for p in torch.tensor_split(away, PARTS, 1)])
 
     def products(self, effects: Sequence[Effect], beside: Sequence[Effect], about: Horizons) -> Floats:
         """(effects, PARTS, 3, 3) of the residual share of sunlight and of what a little more blur and lift would add to the expected one."""
@@ -70,21 +83,22 @@ class Edges:
         _, known, _ = self.chain.sunlight([e for e in effects if e.slot == "geometry"])
         sun, horizon, disc = self.chain.sunlight(effects)
         assert known is not None and horizon is not None
-        at = self.image, self.row, self.column
-        above = sun[self.image] - horizon[at]
-        # what an effect raises above the DEM stands far off, as it was given
-        near = torch.where(horizon[at] > known[at], 0.0, self.nearness)
-
-        radius = torch.hypot(disc, about.blur * near)
-        t = (about.lift * near - above) / radius
+        raised = horizon > known  # what an effect raises above the DEM stands far off, as it was given
+        facets = self.every if bool(raised.any()) else self.near
+        above = sun[facets.at[0]] - horizon[facets.at]
+        nearness = torch.where(raised[facets.at], 0.0, facets.nearness)
+        radius = torch.hypot(disc, about.blur * nearness)
+        t = (about.lift * nearness - above) / radius
         slope = visibility_slope(t) / radius
-        wider = -slope * t * about.blur * near.square() / radius
-        columns = [self.measured - sun_visibility(above, about.lift * near, radius), wider, slope * near]
-        x = torch.stack(columns).double()
+        wider = -slope * t * about.blur * nearness.square() / radius
+        left = facets.measured - sun_visibility(above, about.lift * nearness, radius)
+        x = torch.stack([left, wider, slope * nearness]).double()
         out = torch.zeros(PARTS, 3, 3, dtype=torch.float64)
         for p in range(PARTS):
-            own = x[:, self.part == p]
+            own = x[:, facets.part == p]
             out[p] = own @ own.T
+        if facets is self.near:
+            out[:, 0, 0] += self.away
         return out
 
 
