@@ -239,8 +239,8 @@ class Effect(ABC):
 
 
 def telling_share(state: State) -> Tensor | float:
-    """Of light that deep shadow alone tells of: 1 in a prediction; where a measurement is being explained, what the Sun leaves dark, (B, H, W)."""
-    return 1.0 if state.measured is None or state.sun_visibility is None else 1 - state.sun_visibility
+    """Of light that deep shadow alone tells of: 1 in a simulation; where a law is fitted to lit ground, what the Sun leaves dark, (B, H, W)."""
+    return 1 - state.sun_visibility if state.law_fitted and state.sun_visibility is not None else 1.0
 
 
 _EFFECTS: dict[str, type[Effect]] = {}

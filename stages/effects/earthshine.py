@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import torch
 
-from stages.effects.base import Effect, Survey, Trial, register
+from stages.effects.base import Effect, Survey, Trial, register, telling_share
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
@@ -69,12 +69,13 @@ class Earthshine(Effect):
 
     def _shine(self, state: State) -> None:
         slope_east, slope_north = state.slopes
-        facing = self.value("up", state) - slope_east * self.value("east", state)
-        facing = (facing - slope_north * self.value("north", state)) * torch.rsqrt(1 + slope_east**2 + slope_north**2)
-        dark = all(not torch.is_tensor(v) and v == 0 for v in self.values.values())
-        if not dark:
-            # a facet turned away gets nothing; the sign of a single trial column is kept so that columns stay linear
-            above = (self.value("up", state) > 0) | (
-                (self.value("east", state) != 0) & (self.value("north", state) != 0)
-            )
-            state.radiance = state.radiance + torch.where(above, facing.clamp(min=0), facing)
+        cosine = torch.rsqrt(1 + slope_east**2 + slope_north**2)
+        up, east, north = (self.value(n, state) for n in ("up", "east", "north"))
+        if all(not torch.is_tensor(v) and v == 0 for v in self.values.values()):
+            return
+        facing = (up - slope_east * east - slope_north * north) * cosine
+        # a facet turned away gets nothing; the sign of a single trial column is kept so that columns stay linear
+        above = (up > 0) | ((east != 0) & (north != 0))
+        light = torch.where(above, facing.clamp(min=0), facing)
+        # what falls on all lit ground alike is a pedestal, or a term of the law
+        state.radiance = state.radiance + light - (1 - telling_share(state)) * up * cosine

@@ -68,6 +68,7 @@ class Chain:
         state.further_light = list(state.further_light)
         state.reflectance, state.albedo = reflectance, lambda: self._albedo
         state.measured = self._measured if measured else None
+        state.law_fitted = True
         return formation.expose(state, effects)
 
     @cached_property

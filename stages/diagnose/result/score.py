@@ -157,7 +157,9 @@ def _could_not_show(state: State, outcome: Outcome, name: str) -> bool:
             size = abs(at - cls.null()[coordinate])
             expected.append(float(error) * size / (cls.strong.get(coordinate, 0.0) or size))
     error = min(expected, default=math.inf)
-    if len(outcome.best[name].gains):  # what other ground would have to add to, and how far it scatters over that ground
+    if len(
+        outcome.best[name].gains
+    ):  # what other ground would have to add to, and how far it scatters over that ground
         low, high = outcome.best[name].gain_interval()
         if 0.5 / error**2 < (high - low) / 2:
             return True

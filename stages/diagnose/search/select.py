@@ -304,8 +304,8 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     values = {k: float(v) for k, v in cause.effect.values.items()}
     if not cls.plausible(values, state.data):
         return ODD
-    for name in cause.errors:
-        value, near = values[name], cause.of_given_shape.get(name, 1e-9)  # a shape may end anywhere
+    for name in [n for n in cause.errors if n not in cls.shaped]:  # a shape may end anywhere
+        value, near = values[name], cause.of_given_shape.get(name, 1e-9)
         bounds = [b for b in cls.bounds(name) if b != cls.null()[name]]
         if any(abs(value - b) < near for b in bounds):
             return f"{ODD}: {name} ends at {value:.3g}, within an error of a bound of what is possible"

@@ -67,7 +67,8 @@ class State:
                   comes from all sides does not ask where the camera stands
     radiance      may change: radiance (I/F that reaches the camera)
     sensor        may change: image; sees measured, the image to be explained, (B, H, W) with NaN where invalid, as
-                  further_light does, or None: an echo repeats the light that truly came in, with shadows in their true places
+                  further_light does, or None: an echo repeats the light that truly came in, with shadows in their true places;
+                  law_fitted, whether the law is fitted to lit ground: light that falls there alike is a term of it
     """
 
     observation: Observation
@@ -87,6 +88,7 @@ class State:
     radiance: Tensor = field(default=None)  # type: ignore[assignment]
     image: Tensor = field(default=None)  # type: ignore[assignment]
     measured: Tensor | None = None
+    law_fitted: bool = False
 
 
 class Extension(Protocol):
