@@ -24,7 +24,8 @@ CLEAR = math.radians(
 RUGGED = 1.35  # ... and on rugged ground so many times its rms slope, since facets that seem to face the Sun are chosen by the DEM's errors
 SEEN = 3  # pieces of ground that an image shows at least: of fewer, its own variance is not known, and its rows outweigh all others
 SHADOWED = 30  # pixels of deep shadow in a piece of an image, below which their mean is not used
-SHADED = 0.01  # of the squares of light shares: less says nothing that other shadows of the DEM's errors could not
+SHADED = 0.005  # of the squares of light shares: what less gains, errors of the DEM gain as well
+OPEN = 0.05  # of them: walls of several distances that leave no more than this beyond the best are as likely
 FEWEST_PIXELS = 400  # of an image in a crop: fewer do not give a spectrum
 
 # --- registration ---

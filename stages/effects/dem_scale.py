@@ -11,7 +11,7 @@ from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
-ORDINARY = 0.04  # what a DEM that is too smooth does to the lengths of shadows
+ORDINARY = 0.02  # what a DEM that is too smooth does to the lengths of shadows
 
 
 @register
@@ -29,7 +29,7 @@ class DemScale(Effect):
     parameters = (Parameter("relative", "1", -0.5, 1.0, 0.0, "relative error of heights, truth minus given"),)
     strong: ClassVar = {"relative": 0.1}
     tolerance: ClassVar = {"relative": 0.02}
-    shadow_error = ORDINARY / 2
+    shadow_error = ORDINARY
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
@@ -37,7 +37,7 @@ class DemScale(Effect):
 
     @classmethod
     def shadow_trials(cls, survey: Survey) -> list[Trial]:
-        errors = (-0.3, -0.2, -0.14, -0.1, -0.07, -ORDINARY, -0.02, 0.0, 0.02, ORDINARY, 0.07, 0.1, 0.14, 0.2, 0.3, 0.4)
+        errors = (-0.3, -0.2, -0.14, -0.1, -0.07, -0.04, -ORDINARY, 0.0, ORDINARY, 0.04, 0.07, 0.1, 0.14, 0.2, 0.3, 0.4)
         return [Trial(({"relative": e},)) for e in errors]
 
     @classmethod

@@ -12,7 +12,7 @@ from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
-HORIZON = 0.5  # deg: what errors of the DEM do to horizons
+HORIZON = 0.3  # deg: what errors of the DEM do to horizons, beyond the blur and lift that go with distance
 
 
 @register

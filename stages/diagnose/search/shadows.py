@@ -22,7 +22,7 @@ from stages.diagnose.model.parallel import per_site
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.edges import PARTS, Edges, Horizons, move, squares
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CORRELATED, FOLDS, SHADED, UNITS
+from stages.diagnose.settings import CORRELATED, FOLDS, OPEN, SHADED, UNITS
 from stages.effects import Effect, effect_names, get_effect
 
 ROUNDS = 5  # at most, in which the horizons' errors are fitted at a value's best
@@ -188,7 +188,7 @@ def by_shadows(state: State) -> list[Named]:
         return []
     if around := effect.shadow_neighbours(state.data):
         near = shadows.in_turn([type(effect)({**t.fixed, **t.columns[0]}, state.data) for t in around])
-        effect, scatter = near.open_between(SHADED * float(before.sum()))
+        effect, scatter = near.open_between(OPEN * float(before.sum()))
         value, error = float(effect.values[name]), math.hypot(error, scatter)
     made = type(effect)({**effect.values, name: value}, state.data)
     rivals = [t.best.name for t in found if t is not first and not gain_interval(t.held_out()[shown], after)[1] > 0]
