@@ -25,7 +25,7 @@ def sun_visibility(sun_elevation: Tensor, horizon: Tensor, radius: float | Tenso
 def visibility_slope(t: Tensor) -> Tensor:
     """Change of that share per radius by which the horizon rises: less the disc's flux along the horizon.
 
-    t : (...), how far the horizon stands above the Sun's centre, in radii; returns (...)
+    t : (N,) or any shape, how far the horizon stands above the Sun's centre, in radii; returns likewise
     """
     inside = (1 - t * t).clamp(min=0)
     return -(1 - DARKENED) * 2 / math.pi * inside.sqrt() - DARKENED * 0.75 * inside
