@@ -182,7 +182,7 @@ def by_shadows(state: State) -> list[Named]:
     effect, value = whole.best, whole.value()
     name = effect.fitted()[0].name
     error = whole.error(np.flatnonzero(shown))
-    nearer = math.copysign(max(abs(value) - 2 * error, 0.0), value)
+    nearer = math.copysign(max(abs(value) - 2 * math.hypot(error, effect.shadow_error), 0.0), value)
     most = max(abs(float(e.values[name])) for e in whole.effects)
     if abs(value) >= most or effect.shadows_ordinarily({**effect.values, name: nearer}):
         return []
