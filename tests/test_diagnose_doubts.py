@@ -78,7 +78,7 @@ def test_what_is_ordinary_explains_as_much_or_the_rival_is_refused():
 
     small = f"iof is 5e-05, and less than 0.0001 {ORDINARY}"
     assert "as much" in refused([11, 10, 12, 9], small)
-    assert "more" in refused([1, 1, 2, 1], "the test pairs contradict it")
+    assert not refused([1, 1, 2, 1], "the test pairs contradict it")
     assert not refused([11, 10, 12, 9], ODD)
     assert not refused([21, 22, 20, 22], small)
 

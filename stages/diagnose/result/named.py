@@ -102,11 +102,10 @@ def _lines(state: State, r: Registration, name: str) -> tuple[Named | None, str]
         return None, ""
     amounts = r.coefficients[:, :, len(TERMS) :].float()  # (frames, 2, waves), as the effect's coordinates are ordered
     effect = cls({p.name: amounts.flatten(1)[:, k] for k, p in enumerate(cls.fitted())}, state.data)
-    size = cls.size(effect.values)
-    if size < max(cls.tolerance.values()):
+    size, error = cls.size(effect.values), r.shift_error * math.sqrt(2 * r.form.waves)
+    if _ordinary(size, error, cls):
         return None, ""
     plain = r.form.beside(waves=0)
-    error = r.shift_error * math.sqrt(2 * r.form.waves)
     made = _named(effect, {"rms_px": (size, error, "px")}, r, plain.name, r.form.name)
     return made, r.doubt(plain.name, r.form.name, (plain.name, r.form.name))
 
@@ -144,10 +143,16 @@ def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str
 
     effect = made(r.fitted[form][0])
     size = cls.size(effect.values)
-    if size < max(cls.tolerance.values()):
+    scatter = float(jackknife_error(np.array([cls.size(made(c).values) for c in r.without[form]])))
+    error = max(scatter, r.shift_error)
+    if _ordinary(size, error, cls):
         return None, ""
-    error = float(jackknife_error(np.array([cls.size(made(c).values) for c in r.without[form]])))
-    return _named(effect, {"rms_px": (size, max(error, r.shift_error), "px")}, r, first, form, frames), why
+    return _named(effect, {"rms_px": (size, error, "px")}, r, first, form, frames), why
+
+
+def _ordinary(size: float, error: float, cls: type[Effect]) -> bool:
+    """Whether what the scatter of its values leaves of an rms size is ordinary."""
+    return size**2 - error**2 < max(cls.tolerance.values()) ** 2
 
 
 def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State], Named | None] | None:

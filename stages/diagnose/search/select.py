@@ -160,11 +160,10 @@ def judge(whole: Whole, found: Found) -> None:
 def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refused: Mapping[str, str]) -> str:
     """Why an effect may stand for what is ordinary, or as likely and not sure on its own, or ''. refused : effect -> why"""
     for other in [best[n] for n in get_effect(found.effect).confused_with if n in refused and n in best]:
-        judge(whole, other)
-        if other.more_than(found)[0] > 0:
-            return f"{other.effect}, which is no cause, explains more of it"
-        if refused[other.effect].endswith(ORDINARY) and found.more_than(other)[0] <= 0:
-            return f"{other.effect}, of which there is an ordinary amount, explains as much of it"
+        if refused[other.effect].endswith(ORDINARY):
+            judge(whole, other)
+            if found.more_than(other)[0] <= 0:
+                return f"{other.effect}, of which there is an ordinary amount, explains as much of it"
 
     def sure(gains: np.ndarray) -> bool:
         return interval(gains, whole.sizes)[0] > 0
