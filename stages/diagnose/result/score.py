@@ -157,10 +157,10 @@ def _could_not_show(state: State, outcome: Outcome, name: str) -> bool:
             size = abs(at - cls.null()[coordinate])
             expected.append(float(error) * size / (cls.strong.get(coordinate, 0.0) or size))
     error = min(expected, default=math.inf)
-    if len(
-        outcome.best[name].gains
-    ):  # what other ground would have to add to, and how far it scatters over that ground
-        low, high = outcome.best[name].gain_interval()
+    judged = outcome.best[name]
+    if len(judged.gains):
+        # what such a size would add, and how far gains scatter over other ground
+        low, high = judged.gain_interval()
         if 0.5 / error**2 < (high - low) / 2:
             return True
     return SURE * max(found, error) > 1

@@ -90,9 +90,8 @@ class State:
     # effects that were fitted and refused -> their largest error, in sizes worth knowing
     open: dict[str, float] = field(default_factory=dict)
     reference: Nominal | None = None
-    kept: Callable[[Tensor], Tensor] = (
-        torch.ones_like
-    )  # share of the DEM's waves that is relief if all that it may lack is its errors
+    # share of the DEM's waves that is relief if all that images show beside it is its errors
+    kept: Callable[[Tensor], Tensor] = torch.ones_like
     say: Callable[[str], None] = lambda text: None
     progress: Callable[[int, int, str], None] = lambda done, total, what: None
 
@@ -154,8 +153,7 @@ class State:
 
     def leave_out_rare_images(self) -> None:
         """Images that show too few pieces of ground, unless that is all there are."""
-        _, pieces = self.grid()
-        patches = [p for k, chain in enumerate(self.chains()) for p in make_patches(k, chain, pieces, self.free_gains)]
+        patches = [p for k, chain in enumerate(self.chains()) for p in self.patches(k, chain)]
         seen = torch.bincount(torch.cat([p.frames for p in patches]), minlength=self.frames) if patches else None
         if seen is not None and int(seen.max()) >= SEEN:
             for site in self.sites:
@@ -167,24 +165,30 @@ class State:
         every = [n for n in effect_names() if n not in named]
         return [n for n in every if get_effect(n).visible(self.data, self.has)]
 
-    def kept_share(self, chains: Sequence[Chain], grid: Grid) -> Callable[[Tensor], Tensor]:
-        """Of the DEM's waves, if all relief that images show beside it is errors of the DEM."""
-        patches: list[Patch] = []
-        left: list[tuple[Tensor, Tensor]] = []
-        for number, chain in enumerate(chains):
-            residual = (chain.site.image - chain.rendered)[None]
-            for patch in make_patches(number, chain, self.grid()[1], self.free_gains):
-                z, mean = patch.transform(residual, grid)
-                patches.append(patch)
-                left.append((z[0], mean[0]))
-        return kept_share(chains, patches, grid, estimate(patches, left, grid, self.frames))
+    def patches(self, number: int, chain: Chain) -> list[Patch]:
+        """The pieces of one site that show enough pixels."""
+        return make_patches(number, chain, self.grid()[1], self.free_gains)
 
-    def rows(self, number: int, chain: Chain, plan: Plan, kept: Callable[[Tensor], Tensor]) -> list[Rows]:
+    def kept_share(
+        self, chains: Sequence[Chain], patches: Sequence[Sequence[Patch]], grid: Grid
+    ) -> Callable[[Tensor], Tensor]:
+        """Of the DEM's waves, if all relief that images show beside it is errors of the DEM. patches : of every chain"""
+        every: list[Patch] = []
+        left: list[tuple[Tensor, Tensor]] = []
+        for chain, pieces in zip(chains, patches, strict=True):
+            residual = (chain.site.image - chain.rendered)[None]
+            for patch in pieces:
+                z, mean = patch.transform(residual, grid)
+                every.append(patch)
+                left.append((z[0], mean[0]))
+        return kept_share(chains, every, grid, estimate(every, left, grid, self.frames))
+
+    def rows(self, patches: Sequence[Patch], chain: Chain, plan: Plan) -> list[Rows]:
         """Of one site, piece by piece."""
-        grid, pieces = self.grid()
-        shared, own = shared_columns(chain, plan, self.data, kept), frame_columns(chain, plan, self.data)
+        grid, _ = self.grid()
+        shared, own = shared_columns(chain, plan, self.data, self.kept), frame_columns(chain, plan, self.data)
         out = []
-        for patch in make_patches(number, chain, pieces, self.free_gains):
+        for patch in patches:
             z, mean = patch.transform(shared, grid)
             z_own, mean_own = patch.transform(own, grid)
             out.append(Rows(patch, z, mean, z_own, mean_own, patch.shadow(shared)))
@@ -196,8 +200,9 @@ class State:
         grid, _ = self.grid()
         plan = make_plan(chains[0], names, self.data, impossible=self.impossible)
 
-        self.kept = self.kept_share(chains, grid)
-        every = per_site(lambda k: self.rows(k, chains[k], plan, self.kept), range(len(chains)))
+        patches = per_site(lambda k: self.patches(k, chains[k]), range(len(chains)))
+        self.kept = self.kept_share(chains, patches, grid)
+        every = per_site(lambda k: self.rows(patches[k], chains[k], plan), range(len(chains)))
         rows = [r for part in every for r in part]
         model = self._covariance(rows, plan, grid)
         tricks: list[Residual | None] = [None] * len(rows)
