@@ -16,7 +16,7 @@ from schemas.files.companions import companions_of
 from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.diagnose.config import Config
-from stages.diagnose.likelihood.left import budget, peak
+from stages.diagnose.likelihood.left import budget, field_of_images, peak
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import better_form, other_laws, relative_misfit
 from stages.diagnose.model.laws import LunarLaws
@@ -31,8 +31,8 @@ from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, doubt_all, search
 from stages.diagnose.search.shadows import by_shadows, contradicted
-from stages.diagnose.search.state import State
-from stages.diagnose.settings import LINE, MISFIT, STILL
+from stages.diagnose.search.state import State, View
+from stages.diagnose.settings import ALIKE, LINE, MISFIT, STILL
 from stages.effects import effect_names
 from stages.pairs.reader import PairReader
 
@@ -148,10 +148,10 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     after = _residual(state)
     # what a better law or registration took away is no cause where none is named
     answer.budget = budget(view.rows, view.model, view.grid, before if answer.causes else after, after)
-    line, share = peak(view.rows, view.model, view.grid, frames)
+    answer.structure = _structure(view, frames)
     known = shown | {c.effect.name for c in answer.causes}
     answer.blind = blind_effects(state, outcome, known)
-    answer.unexplained_fraction = share if line > LINE else 0.0
+    answer.unexplained_fraction = max(answer.structure.values(), default=0.0)
     if not answer.causes and outcome.sure:
         answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)
     answer.verdict = _verdict(answer)
@@ -168,6 +168,16 @@ def _register(state: State) -> None:
     for site, found in zip(state.hidden, displacements(state, [])[1], strict=True):
         site.displacement = found if placed else None
     state.fit()
+
+
+def _structure(view: View, frames: int) -> dict[str, float]:
+    """What is left that neither ground nor noise has, and its share of the residual's variance."""
+    line, share = peak(view.rows, view.model, view.grid, frames)
+    alike, low = field_of_images(view.rows, view.model, view.grid)
+    out = {"lines across an image": share} if line > LINE else {}
+    if low > 0 and alike > ALIKE:
+        out["a broad field in each image that is the same on all ground"] = alike
+    return out
 
 
 def _verdict(answer: Answer) -> str:

@@ -1,4 +1,6 @@
-"""What is left: how its variance is shared out, and whether a single wave stands out of it that no covariance of ground or noise has."""
+"""What is left: how its variance is shared out, and whether it has what no covariance of ground or noise has: a single wave that stands out,
+or a broad field in an image that comes back on all ground.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,11 @@ from scipy.special import gammaincinv
 from torch import Tensor
 
 from stages.diagnose.likelihood.covariance import Covariance
+from stages.diagnose.likelihood.found import interval
 from stages.diagnose.likelihood.products import Rows, whitened_residual
 from stages.diagnose.likelihood.tails import surprise
 from stages.diagnose.rows.patches import Grid
-from stages.diagnose.settings import FAR, NEAR, PEAK
+from stages.diagnose.settings import BROADEST, FAR, NEAR, PEAK
 
 
 def budget(rows: list[Rows], model: Covariance, grid: Grid, before: float, after: float) -> dict[str, float]:
@@ -36,6 +39,35 @@ def budget(rows: list[Rows], model: Covariance, grid: Grid, before: float, after
         "own_to_image": (1 - named) * own / total,
         "noise": (1 - named) * noise / total,
     }
+
+
+def field_of_images(rows: list[Rows], model: Covariance, grid: Grid) -> tuple[float, float]:
+    """Of the squares of the broadest waves, the share that an image has alike on all ground that falls on the same part of its detector,
+    and the lower bound of that (95 %).
+
+    Stray light, vignetting and film do that. Ground does not, and noise does not come back; products of different ground have neither.
+    """
+    broad = grid.annulus < BROADEST
+    pieces: dict[int, list[tuple[int, Tensor, Tensor]]] = {}
+    for row in rows:
+        z, _, _ = whitened_residual(row, model, grid)
+        size = row.patch.weight.square().mean((-2, -1)) * model.size.get(row.patch.number, 1.0)
+        z = z[:, broad] / size.clamp(min=1e-6).sqrt()[:, None]
+        for k, frame in enumerate(row.patch.frames.tolist()):
+            pieces.setdefault(frame, []).append((row.patch.ground, row.patch.middle[k], z[k]))
+    alike, squares = np.zeros(1 + max(r.patch.ground for r in rows)), 0.0
+    for every in pieces.values():
+        ground = torch.tensor([g for g, _, _ in every])
+        middle, z = (torch.stack([piece[k] for piece in every]) for k in (1, 2))
+        near = (middle[:, None] - middle).abs().amax(-1) < min(grid.height, grid.width) / 8
+        others = (near & (ground[:, None] != ground)).to(z.dtype)
+        count = others.real.sum(1)
+        mean = others @ z / count.clamp(min=1)[:, None]
+        np.add.at(alike, ground.numpy(), (z.conj() * mean).real.sum(1).double().numpy())
+        squares += float(z[count > 0].abs().square().sum())
+    if not squares:
+        return 0.0, 0.0
+    return float(alike.sum()) / squares, interval(alike)[0] / squares
 
 
 def peak(rows: list[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[float, float]:
@@ -80,4 +112,4 @@ def _about(power: Tensor, grid: Grid) -> Tensor:
     return torch.from_numpy(median_filter(plane, footprint=ring, mode="wrap")[row, column])
 
 
-__all__ = ["budget", "peak"]
+__all__ = ["budget", "field_of_images", "peak"]

@@ -82,6 +82,7 @@ class Answer:
     rejected: dict[str, tuple[float, str]] = field(default_factory=dict)
     registration: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     unexplained_fraction: float = 0.0
+    structure: dict[str, float] = field(default_factory=dict)  # nothing in the catalogue explains it: words -> share
     blind: list[str] = field(default_factory=list)
     held_out: HeldOut = field(default_factory=HeldOut)
     pairs: int = 0
@@ -103,6 +104,7 @@ class Answer:
                 for k, (g, a, b) in self.registration.items()
             ],
             "unexplained_fraction": number(self.unexplained_fraction),
+            "structure": [{"what": k, "share": number(v)} for k, v in self.structure.items()],
             "blind": self.blind,
             "held_out": self.held_out.to_json(),
             "data": {"pairs": self.pairs, "sites": self.sites, "images": self.images},
@@ -128,9 +130,14 @@ class Answer:
             parts = [f"{c.effect.title} ({describe(c.to_json()['parameters'])})" for c in self.causes]
             left = self.budget.get("common_to_images", 0.0)
             rest = f"; of the residual's variance {100 * self.budget.get('named', 0):.0f} % is that, {100 * left:.0f} % is common to the images of a place"
-            return f"The simulation lacks {' and '.join(parts)}{rest if self.budget else ''}."
+            more = (
+                f". What is left holds {' and '.join(self.structure)}, which nothing named explains"
+                if self.structure
+                else ""
+            )
+            return f"The simulation lacks {' and '.join(parts)}{rest if self.budget else ''}{more}."
         if self.verdict == "unexplained":
-            return "The residual holds structure that nothing in the catalogue explains."
+            return f"The residual holds {' and '.join(self.structure) or 'structure'} that nothing in the catalogue explains."
         if self.verdict == "cannot_tell":
             return f"Nothing significant was found, but these data could not show: {', '.join(self.blind)}."
         return "Nothing in the catalogue explains a significant part of the residual, and no structure is left over."

@@ -88,6 +88,7 @@ class Patch:
     images : (n,) which of the site's images; slopes : (n, 2) relative brightness per slope to the east and north
     shaded, dark_frames : (s,) which of them show enough deep shadow, lit ground beside it or not
     dark : (s, h, w) by which a field is multiplied to add up to its mean in deep shadow, relative to brightness
+    middle : (n, 2) line and sample of the detector that its middle falls on; in the crop where the detector is not known
     """
 
     number: int
@@ -104,6 +105,7 @@ class Patch:
     shaded: Tensor
     dark_frames: Tensor
     dark: Tensor
+    middle: Tensor
     free: bool  # gain and offset of every image
 
     def relative(self, fields: Tensor) -> Tensor:
@@ -184,6 +186,7 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
     # what is bright all the same is lit ground that the DEM does not know of
     deep &= chain.site.image < DARKEST * level[:, None, None]
     east, north = chain.slope_tangents
+    detector = chain.site.on_detector()
     h, w = height // pieces, width // pieces
     out = []
     for i in range(pieces):
@@ -223,6 +226,7 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
                     shaded,
                     frames[shaded],
                     dark,
+                    detector[images][:, :, rows, columns].nanmean((-2, -1)),
                     free,
                 )
             )

@@ -45,7 +45,7 @@ def refine(state: State, view: View) -> View:
     """
     look: View | None = None
     least, last = math.inf, math.inf  # squares left at the best values so far, length of the last step
-    share = 1.0  # of a step
+    share = used = 1.0  # of a step, and of the last one
     best = [c.effect for c in state.causes]
     state.fit()  # from here on the coefficients move along as columns
     for _ in range(STEPS):
@@ -54,7 +54,7 @@ def refine(state: State, view: View) -> View:
         if look is not None and abs(left - least) < SETTLED:
             break
         if left > least:  # the step was too long: half of it, from where it started
-            share *= 0.5
+            share = used / 2
             for cause, effect in zip(state.causes, best, strict=True):
                 cause.effect = effect
             if share < SHORTEST:
@@ -63,7 +63,7 @@ def refine(state: State, view: View) -> View:
             look, least = now, left
             best = [c.effect for c in state.causes]
         assert look is not None
-        moved = _step(state, look, share)
+        moved, used = _step(state, look, share), share
         if moved < SETTLED:
             break
         if look is now:  # steps that do not get shorter are too short: the squares are no parabola

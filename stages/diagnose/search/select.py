@@ -14,6 +14,7 @@ from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.likelihood.products import Products, Rows, products
+from stages.diagnose.likelihood.tails import together
 from stages.diagnose.likelihood.weigh import Whole, weigh_all
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle
@@ -313,10 +314,11 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
         every = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in errors.items()]
         return math.hypot(*every) if every else math.inf
 
-    if away(cause.of_given_shape) < sure:  # an effect that may be nothing has no shape that could be uncertain
+    # an effect that may be nothing has no shape that could be uncertain
+    if away(cause.of_given_shape) < together(sure, len(cause.of_given_shape)):
         return f"it comes out {away(cause.of_given_shape):.1f} errors from nothing"
-    groups = min(FOLDS, state.frames)
-    if away(cause.over_images) < student_quantile(max(groups - 1, 1)):
+    freedom = max(min(FOLDS, state.frames) - 1, 1)
+    if away(cause.over_images) < together(student_quantile(freedom), len(cause.over_images), freedom):
         return f"other images give it other values: {away(cause.over_images):.1f} errors over images from nothing"
     for name, least in cls.tolerance.items():
         size = cls.size(values) if name not in values else abs(values[name] - cls.null()[name])
