@@ -57,8 +57,8 @@ def field_of_images(rows: list[Rows], model: Covariance, grid: Grid) -> tuple[fl
             pieces.setdefault(frame, []).append((row.patch.ground, row.patch.middle[k], z[k]))
     alike, squares = np.zeros(1 + max(r.patch.ground for r in rows)), 0.0
     for every in pieces.values():
-        ground = torch.tensor([g for g, _, _ in every])
-        middle, z = (torch.stack([piece[k] for piece in every]) for k in (1, 2))
+        ground = torch.tensor([piece[0] for piece in every])
+        middle, z = torch.stack([piece[1] for piece in every]), torch.stack([piece[2] for piece in every])
         near = (middle[:, None] - middle).abs().amax(-1) < min(grid.height, grid.width) / 8
         others = (near & (ground[:, None] != ground)).to(z.dtype)
         count = others.real.sum(1)

@@ -1,4 +1,4 @@
-"""Tails of chi square, of F and of Student's t, from scipy.special: scipy.stats takes more than a second to import."""
+"""Tails of chi square and of Student's t, from scipy.special: scipy.stats takes more than a second to import."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfc, fdtri, gammaincc, gammainccinv, gammaln, stdtr
+from scipy.special import erfc, gammaincc, gammainccinv, gammaln, stdtr
 
 
 def surprise(ratio: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
@@ -17,16 +17,9 @@ def surprise(ratio: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
     return np.maximum(np.where(exact < 600, exact, leading) / math.log(10), 0.0)
 
 
-def together(errors: float, count: int, freedom: float = math.inf) -> float:
-    """How far from nothing, as the root of the sum of squares in standard errors, ``count`` values lie by chance as rarely as one by
-    ``errors``; freedom : with which standard errors are known, by which ``errors`` is Student's.
-    """
-    if count < 2:
-        return errors
-    if math.isinf(freedom):
-        return math.sqrt(2 * float(gammainccinv(count / 2, erfc(errors / math.sqrt(2)))))
-    inside = 1 - 2 * student_tail(errors, freedom)
-    return math.sqrt(count * float(fdtri(count, freedom, inside)))
+def together(errors: float, count: int) -> float:
+    """How far from nothing, as the root of the sum of squares in standard errors, ``count`` values lie by chance as rarely as one by ``errors``."""
+    return math.sqrt(2 * float(gammainccinv(count / 2, erfc(errors / math.sqrt(2)))))
 
 
 def student_tail(t: float, freedom: float) -> float:

@@ -68,16 +68,17 @@ class Whole:
         Their scatter is estimated along the main directions in which they change the images (expectation-maximisation), and
         the amounts of each unit are integrated out.
         """
-        places = 1 + np.array(
-            [k for k, n in enumerate(self.plan.shared) if n.startswith("coefficient")],
-            dtype=np.int64,
-        )
-        if not len(places):
-            return
+        free = [k for k, n in enumerate(self.plan.shared) if n.startswith("coefficient")]
+        places = 1 + np.array([*free, *self.plan.ground], dtype=np.int64)
         total = np.sum([u.gram[np.ix_(places, places)] for u in self.units], 0)
         scale = 1 / np.sqrt(np.maximum(total.diagonal(), 1e-30))
-        _, axes = np.linalg.eigh(total * np.outer(scale, scale))
+        axes = np.eye(len(places))
+        if free:
+            axes[: len(free), : len(free)] = np.linalg.eigh((total * np.outer(scale, scale))[: len(free), : len(free)])[
+                1
+            ]
         main = (scale[:, None] * axes) * math.sqrt(len(self.units))  # a unit's column has about unit information
+        common = np.arange(len(places)) < len(free)  # the others have no amount that is the same everywhere
         spread = np.full(main.shape[1], 1.0)
         squares = [main.T @ u.gram[np.ix_(places, places)] @ main for u in self.units]
         score = np.array([main.T @ u.gram[places, 0] for u in self.units])
@@ -85,9 +86,9 @@ class Whole:
             posterior = [np.linalg.inv(g + np.diag(spread**-2)) for g in squares]
             weight = [np.eye(len(spread)) - g @ c for g, c in zip(squares, posterior, strict=True)]
             top = sum(w @ g for w, g in zip(weight, squares, strict=True))
-            mean = np.linalg.solve(
-                top + 1e-9 * np.eye(len(top)), sum(w @ s for w, s in zip(weight, score, strict=True))
-            )
+            right = np.sum([w @ s for w, s in zip(weight, score, strict=True)], 0)
+            mean = np.zeros(len(places))
+            mean[common] = np.linalg.solve(top[np.ix_(common, common)] + 1e-9 * np.eye(len(free)), right[common])
             own = np.array([c @ (s - g @ mean) for c, g, s in zip(posterior, squares, score, strict=True)])
             variance = own**2 + np.array([c.diagonal() for c in posterior])
             spread = np.sqrt(np.maximum(variance.mean(0), 1e-8))

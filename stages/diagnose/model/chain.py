@@ -193,6 +193,15 @@ class Chain:
         """What the rendering changes by if of the DEM's waves only a share is relief, (n, H, W); ``kept``: of wave numbers, rad/px."""
         return self.render(ShareOfRelief(kept)) - self.rendered
 
+    def brighter(self) -> list[Tensor]:
+        """Two (n, H, W): what albedo adds that grows over the crop to the east, and to the south.
+
+        Of single waves, which the covariance knows, it has all at once, and in one phase.
+        """
+        height, width = self.rendered.shape[-2:]
+        east, south = torch.linspace(-1, 1, width), torch.linspace(-1, 1, height)
+        return [self.rendered * east, self.rendered * south[:, None]]
+
     def lit(self) -> Tensor:
         """(n, H, W) bool: ground that the Sun's centre shines on."""
         above, facing = self.height_above_horizon(), self._state.angles.cos_incidence > 0

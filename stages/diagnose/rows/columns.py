@@ -41,6 +41,9 @@ class Plan:
         default_factory=list
     )  # of another form of the reflectance: a nuisance of all but effects of the law
     dem_errors: list[int] = field(default_factory=list)  # of what the DEM has and the ground has not
+    ground: list[int] = field(
+        default_factory=list
+    )  # of what all images of one place share, by its own amount on every piece of ground
     pull: dict[int, float] = field(
         default_factory=dict
     )  # columns whose prior is not about what is rendered: its distance, in the column's unit
@@ -83,6 +86,7 @@ def make_plan(
             plan.form.append(shared(f"form {k}", 1.0))
     shared("slopes within a pixel", 1.0)
     plan.dem_errors.append(shared("errors of the DEM", 1.0))
+    plan.ground += [shared("brighter to the east"), shared("brighter to the south")]
     for place, effect in enumerate(chain.base):
         if effect.scope == "scene":
             for p in effect.fitted():
@@ -125,6 +129,7 @@ def shared_columns(chain: Chain, plan: Plan, data: Survey, kept: Callable[[Tenso
         *chain.form_tangents(),
         chain.unresolved_slopes(),
         chain.without_dem_errors(kept),
+        *chain.brighter(),
         *moved[1:],
     ]
     for guise in plan.guises:

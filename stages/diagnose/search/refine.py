@@ -117,9 +117,18 @@ def errors_over_images(state: State, view: View) -> None:
             whole.precision.pop(int(p), None)
         if whole.seen[places].all():
             left.append(_amounts(state, whole, places)[0])
-    if len(left) > 1:
-        for (place, name, _), error in zip([owned[k] for k in amounts], jackknife_error(np.array(left)), strict=True):
-            state.causes[place].over_images[name] = float(error)
+    if len(left) < 2:
+        return
+    table, kept = np.array(left), [owned[k] for k in amounts]
+    for (place, name, _), error in zip(kept, jackknife_error(table), strict=True):
+        state.causes[place].over_images[name] = float(error)
+    for place in {place for place, _, _ in kept}:
+        cause = state.causes[place]
+        own = [k for k, (p, _, _) in enumerate(kept) if p == place]
+        null = type(cause.effect).null()
+        found = np.array([float(cause.effect.values[kept[k][1]]) - null[kept[k][1]] for k in own])
+        along = found / np.array([max(cause.of_given_shape[kept[k][1]], 1e-30) for k in own]) ** 2
+        cause.share_error = float(jackknife_error(table[:, own] @ along / max(found @ along, 1e-30)))
 
 
 def _scene_places(view: View) -> tuple[NDArray[np.int64], list[tuple[int, str, float]]]:

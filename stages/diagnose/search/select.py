@@ -310,16 +310,13 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
         if any(abs(value - b) < near for b in bounds):
             return f"{ODD}: {name} ends at {value:.3g}, within an error of a bound of what is possible"
 
-    def away(errors: dict[str, float]) -> float:
-        every = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in errors.items()]
-        return math.hypot(*every) if every else math.inf
-
     # an effect that may be nothing has no shape that could be uncertain
-    if away(cause.of_given_shape) < together(sure, len(cause.of_given_shape)):
-        return f"it comes out {away(cause.of_given_shape):.1f} errors from nothing"
+    away = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in cause.of_given_shape.items()]
+    if away and math.hypot(*away) < together(sure, len(away)):
+        return f"it comes out {math.hypot(*away):.1f} errors from nothing"
     freedom = max(min(FOLDS, state.frames) - 1, 1)
-    if away(cause.over_images) < together(student_quantile(freedom), len(cause.over_images), freedom):
-        return f"other images give it other values: {away(cause.over_images):.1f} errors over images from nothing"
+    if cause.share_error * student_quantile(freedom) > 1:
+        return f"other images give it other values: {1 / cause.share_error:.1f} errors over images from nothing"
     for name, least in cls.tolerance.items():
         size = cls.size(values) if name not in values else abs(values[name] - cls.null()[name])
         if size - 2 * cause.errors.get(name, 0.0) < least:
