@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,6 +16,7 @@ from stages.diagnose.likelihood.dem_errors import kept_share
 from stages.diagnose.likelihood.found import Found
 from stages.diagnose.rows.columns import Guise
 from stages.diagnose.rows.patches import make_grid
+from stages.diagnose.search import refine
 from stages.diagnose.search.select import ODD, ORDINARY, beyond_bounds, doubt, judge, may_be_another
 from stages.diagnose.search.state import Cause
 from stages.effects import get_effect
@@ -83,6 +85,28 @@ def test_what_is_ordinary_explains_as_much_or_the_rival_is_refused():
     assert not refused([21, 22, 20, 22], small)
 
 
+def test_values_per_image_do_not_stand_for_what_one_value_for_all_does():
+    """Gains of images beside a flat field that was not sure: refused where it gains as much, whatever it was refused for."""
+    flat = Guise("column_pattern", get_effect("column_pattern").trials(Survey())[0], (0,))
+    gains = Guise("image_gain", get_effect("image_gain").trials(Survey())[0], (1,), per_frame=True)
+
+    def refused(of_gains):
+        both = {g.effect: Found(g.effect, g, np.ones(1), np.ones(1), 9.0) for g in (flat, gains)}
+        held = {0: np.array([10.0, 12, 9, 11]), 1: np.array(of_gains, float)}
+        whole = SimpleNamespace(
+            scattered=np.zeros(0), sizes=np.ones(4), places=lambda g: np.array(g.columns), exclude=lambda g: [],
+            held_out=lambda places, *rest: held[int(places[0])], ordinary_places=lambda name: [],
+            gains_beside=lambda found, other: np.array([5.0, 6, 5, 6]),
+        )  # fmt: skip
+        judge(whole, both["image_gain"])
+        return may_be_another(
+            whole, both["image_gain"], both, {"column_pattern": "it comes out 1.4 errors from nothing"}
+        )
+
+    assert "not sure" in refused([11, 10, 12, 9])
+    assert not refused([21, 22, 20, 22])
+
+
 def test_two_shadows_that_agree_by_chance_are_not_exact():
     """As wide as they all lie from nothing where they are few, as they scatter where they are many."""
 
@@ -119,10 +143,22 @@ def test_light_from_below_is_no_earthshine():
 def test_a_shape_that_is_open_does_not_make_an_effect_nothing():
     """Height and width of a surge trade places: that its width is open does not say that there may be none."""
     cause = Cause(get_effect("opposition_surge")({"B0": 0.6, "h": 0.03}), found=None)
-    cause.errors, cause.over_images = {"B0": 0.2, "h": 0.01}, {"B0": 0.05}
+    cause.errors, cause.share_error = {"B0": 0.2, "h": 0.01}, 0.05 / 0.6
     for error, sure in ((0.05, True), (0.2, False)):
-        cause.of_given_shape = {"B0": error}
+        cause.of_given_shape, cause.away = {"B0": error}, 0.6 / error
         assert (doubt(SimpleNamespace(data=None, frames=8), cause) == "") == sure
+
+
+def test_values_that_stand_for_each_other_are_sure_together():
+    """Each of two cosines is open by itself, their sum is not: the covariance says so, as in any linear fit."""
+    cause = Cause(get_effect("column_pattern")({"c1": 0.02, "c2": 0.02}), found=None)
+    own = [(0, name, 1.0) for name in ("c1", "c2")]
+    alike, alone = np.array([[1.0, -0.99], [-0.99, 1.0]]) * 0.02**2, np.eye(2) * 0.02**2
+    for covariance, away in ((alone, math.sqrt(2)), (alike, math.sqrt(2 / 0.01))):
+        refine._set_away(SimpleNamespace(causes=[cause]), own, np.full(2, 0.02), covariance)
+        assert cause.away == pytest.approx(away)
+    refine._set_away(SimpleNamespace(causes=[cause]), own, np.full(2, 0.04), alone)  # as a jackknife has it
+    assert cause.away == pytest.approx(math.sqrt(2) / 2)
 
 
 def test_sharpening_goes_on_smoothly():

@@ -23,7 +23,7 @@ class ImageGain(Effect):
         "gain anyway, so they cannot show it."
     )
     reference = "Humm et al. (2016), Space Sci. Rev. 200, 431 (radiometric calibration of the LROC NACs)"
-    confused_with = ("phase_slope", "opposition_surge", "azimuthal_anisotropy")
+    confused_with = ("phase_slope", "opposition_surge", "azimuthal_anisotropy", "column_pattern")
     separate = "more images than there are phase angles and Sun azimuths in play"
     parameters = (Parameter("rms", "1", 0.0, 1.0, 0.0, "rms of the gains about their mean"),)
     coordinates = (Parameter("gain", "1", -0.9, 4.0, 0.0, "relative gain of an image"),)

@@ -324,12 +324,13 @@ class Whole:
             out.append(_solve(rest[np.ix_(every, every)] + more, rest[every, 0] - pulled)[len(n) :])
         return np.array(out)
 
-    def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array]:
-        """Amounts and their standard errors: the larger of the likelihood's and the jackknife's."""
+    def errors(self, places: NDArray[np.int64], exclude: Sequence[int] = ()) -> tuple[Array, Array, Array]:
+        """Amounts, their standard errors, which are the larger of the likelihood's and the jackknife's, and the likelihood's covariance."""
         information, score, _, _ = self.reduce(places, exclude)
         inverse = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
         scatter = jackknife_error(self.without_one(places, exclude))
-        return inverse @ score, np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter)
+        errors: Array = np.maximum(np.sqrt(np.maximum(inverse.diagonal(), 0)), scatter).astype(np.float64)
+        return inverse @ score, errors, inverse.astype(np.float64)
 
     def another_law(self, guise: Guise | None, surely: bool = False) -> float:
         """Nats that another form of the reflectance has to add beside an effect of the law, which explains less than most of what

@@ -153,15 +153,12 @@ def _step(state: State, view: View, share: float) -> float:
         seen = whole.seen[places]
         for p in places:
             whole.precision.pop(int(p), None)
-        amounts, errors = _amounts(state, whole, places[seen])
+        amounts, errors, _ = _amounts(state, whole, places[seen])
         owned = [step for (_, step), ok in zip(scene, seen, strict=True) if ok]
         amount_only = np.array([name not in type(state.causes[place].effect).shaped for place, name, _ in owned])
         if amount_only.any():
-            held = _amounts(state, whole, places[seen][amount_only])[1]
-            for (place, name, _), error in zip(
-                [o for o, ok in zip(owned, amount_only, strict=True) if ok], held, strict=True
-            ):
-                state.causes[place].of_given_shape[name] = float(error)
+            amounted = [o for o, ok in zip(owned, amount_only, strict=True) if ok]
+            _set_away(state, amounted, *_amounts(state, whole, places[seen][amount_only])[1:])
         for p in places:
             whole.precision[int(p)] = 1e-10 * whole.gram[p, p]
         alone = {c.effect.name: 0 for c in state.causes}
@@ -184,8 +181,28 @@ def _step(state: State, view: View, share: float) -> float:
     return largest
 
 
+def _set_away(
+    state: State, owned: list[tuple[int, str, float]], errors: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> None:
+    """Errors of amounts where what only shapes an effect is held, and how far each cause is from nothing by all of them together.
+
+    Values that stand for each other have large errors each, and may be sure together: that is what the covariance says.
+    """
+    for place in {place for place, _, _ in owned}:
+        cause = state.causes[place]
+        own = [k for k, (p, _, _) in enumerate(owned) if p == place]
+        names = [owned[k][1] for k in own]
+        cause.of_given_shape |= dict(zip(names, errors[own].tolist(), strict=True))
+        null = type(cause.effect).null()
+        found = np.array([float(cause.effect.values[n]) - null[n] for n in names])
+        known = covariance[np.ix_(own, own)]
+        wider = float((errors[own] ** 2 / np.maximum(known.diagonal(), 1e-30)).mean())
+        squares = float(found @ np.linalg.pinv(known, rcond=1e-9, hermitian=True) @ found)
+        cause.away = math.sqrt(max(squares, 0.0) / max(wider, 1.0))
+
+
 def _amounts(state: State, whole: Whole, places: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-    """Moves of all coordinates and their errors."""
+    """Moves of all coordinates, their errors, and the likelihood's covariance."""
     return list(whole.errors(places, _stood_for(state, whole)))
 
 

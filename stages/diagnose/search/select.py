@@ -25,6 +25,7 @@ from stages.effects import Effect, get_effect
 
 ODD = "nothing real has the values that fit best"
 ORDINARY = "is ordinary"
+UNSURE = "these data are not sure"
 
 
 @dataclass
@@ -161,10 +162,11 @@ def judge(whole: Whole, found: Found) -> None:
 def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refused: Mapping[str, str]) -> str:
     """Why an effect may stand for what is ordinary, or as likely and not sure on its own, or ''. refused : effect -> why"""
     for other in [best[n] for n in get_effect(found.effect).confused_with if n in refused and n in best]:
-        if refused[other.effect].endswith(ORDINARY):
+        known = refused[other.effect].endswith(ORDINARY)
+        if known or found.guise.per_frame:  # which stands for what one value for all does, sure or not
             judge(whole, other)
             if found.more_than(other)[0] <= 0:
-                return f"{other.effect}, of which there is an ordinary amount, explains as much of it"
+                return f"{other.effect}, of which {'there is an ordinary amount' if known else UNSURE}, explains as much of it"
 
     def sure(gains: np.ndarray) -> bool:
         return interval(gains, whole.sizes)[0] > 0
@@ -176,7 +178,7 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
         for other in best.values():
             likely = not other.guise.per_frame and other.surprise >= found.surprise
             if likely and not sure(whole.gains_beside(found, other)):
-                return f"{other.effect}, of which these data are not sure, would explain it as well"
+                return f"{other.effect}, of which {UNSURE}, would explain it as well"
     return ""
 
 
@@ -311,9 +313,8 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
             return f"{ODD}: {name} ends at {value:.3g}, within an error of a bound of what is possible"
 
     # an effect that may be nothing has no shape that could be uncertain
-    away = [abs(values[n] - cls.null()[n]) / max(e, 1e-12) for n, e in cause.of_given_shape.items()]
-    if away and math.hypot(*away) < together(sure, len(away)):
-        return f"it comes out {math.hypot(*away):.1f} errors from nothing"
+    if cause.away < together(sure, len(cause.of_given_shape)):
+        return f"it comes out {cause.away:.1f} errors from nothing"
     freedom = max(min(FOLDS, state.frames) - 1, 1)
     if cause.share_error * student_quantile(freedom) > 1:
         return f"other images give it other values: {1 / cause.share_error:.1f} errors over images from nothing"

@@ -36,6 +36,7 @@ class Cause:
     errors: dict[str, float] = field(default_factory=dict)
     of_given_shape: dict[str, float] = field(default_factory=dict)  # errors where what only shapes the effect is held
     over_images: dict[str, float] = field(default_factory=dict)  # errors by leaving out images
+    away: float = math.inf  # standard errors from nothing, of all amounts together
     share_error: float = 0.0  # of one factor on all values, by leaving out images
     rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)

@@ -1,0 +1,77 @@
+"""What `diagnose` takes for structure, and for ground: fields that an image has alike everywhere, albedo that grows over a crop."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chi2, norm
+
+from stages.diagnose.likelihood.covariance import Covariance
+from stages.diagnose.likelihood.left import field_of_images
+from stages.diagnose.likelihood.products import Products, Rows
+from stages.diagnose.likelihood.tails import together
+from stages.diagnose.likelihood.weigh import Whole
+from stages.diagnose.rows.columns import Plan
+from stages.diagnose.rows.patches import make_grid
+
+SIZE, FRAMES = 32, 6
+
+
+def rows(field: float, seed: int, apart: float = 0.0) -> list[Rows]:
+    """White residuals of six images on eight grounds, and a broad field of its own in each image; apart : px between grounds on the detector."""
+    rng = np.random.default_rng(seed)
+    grid = make_grid(SIZE, SIZE)
+    y, x = np.mgrid[0:SIZE, 0:SIZE] / SIZE - 0.5
+    fields = [field * (a * x + b * y) for a, b in rng.normal(0, 1, (FRAMES, 2))]
+    out = []
+    for ground in range(8):
+        images = torch.tensor(np.stack([f + rng.normal(0, 1, f.shape) for f in fields]))
+        z = torch.fft.rfft2(images).flatten(-2)[:, grid.keep] * grid.root
+        patch = SimpleNamespace(
+            number=ground, ground=ground, frames=torch.arange(FRAMES), slopes=torch.zeros(FRAMES, 2),
+            weight=torch.ones(FRAMES, SIZE, SIZE), middle=torch.full((FRAMES, 2), apart * ground),
+        )  # fmt: skip
+        none = torch.zeros(1, FRAMES)
+        out.append(Rows(patch, z.to(torch.complex64)[None], none, z[:0], none[:0], torch.zeros(1, 0)))
+    return out
+
+
+def test_a_field_of_its_own_is_seen_where_ground_falls_on_the_same_part_of_the_detector():
+    grid = make_grid(SIZE, SIZE)
+    model = Covariance.white(grid.annuli, FRAMES)
+    found = [field_of_images(rows(0.0, seed), model, grid) for seed in range(40)]
+    assert np.mean([share for share, _ in found]) == pytest.approx(0.0, abs=0.01)
+    assert sum(low > 0 for _, low in found) <= 4  # of 40 at 2.5 %
+    share, low = field_of_images(rows(1.5, 1), model, grid)
+    assert 0 < low < share
+    assert field_of_images(rows(1.5, 1, apart=SIZE), model, grid) == (0.0, 0.0)
+
+
+def test_many_values_are_as_far_from_nothing_as_chi_square_has_it():
+    for sure in (2.6, 4.0):
+        assert together(sure, 1) == pytest.approx(sure)
+        for count in (2, 3, 8):
+            assert chi2.sf(together(sure, count) ** 2, count) == pytest.approx(2 * norm.sf(sure))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_albedo_that_grows_over_a_crop_is_of_that_ground(seed):
+    """A candidate that looks half like it is off by no more than its error, which says how much of it is lost."""
+    rng = np.random.default_rng(seed)
+    shared = ["coefficient 0", "brighter to the east", "brighter to the south", "candidate"]
+    plan = Plan(shared=shared, prior={0: np.inf}, ground=[1, 2])
+    units = []
+    for ground in range(12):
+        columns = rng.normal(0, 1, (4, 400))
+        columns[3] += columns[1]
+        residual = rng.normal(0, 1, 400) + rng.normal(0, 5, 2) @ columns[1:3] + 0.1 * columns[3] + 3.0 * columns[0]
+        every = np.vstack([residual, columns])
+        units.append(Products(every @ every.T, np.arange(5), np.zeros((5, 0)), np.zeros(0), ground, ground))
+    whole = Whole(units, plan, 1)
+    amounts, errors, covariance = whole.errors(np.array([4]))
+    assert abs(amounts[0] - 0.1) < 3.5 * errors[0]
+    assert errors[0] < 0.04
+    assert covariance[0, 0] ** 0.5 == pytest.approx((12 * 400) ** -0.5, rel=0.1)
