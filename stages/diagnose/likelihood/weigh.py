@@ -214,17 +214,23 @@ class Whole:
 
     def expected_errors(self, guise: Guise) -> Array:
         """(J,) standard errors of the amounts, each alone, at least as wide as sham residuals scatter."""
+        if judge := self._by_levels(guise):
+            return judge.expected_errors(guise)
         information, _, shams, _ = self.reduce(self.places(guise), self.exclude(guise))
         power = np.maximum(information.diagonal(), 1e-12)
         inflation = np.maximum((shams**2).mean(1) / power, 1.0) if shams.shape[1] else 1.0
         return np.sqrt(inflation / power)
 
+    def _by_levels(self, guise: Guise) -> Whole | None:
+        """The sums that tell an effect which changes the brightness of images as wholes; None for any other."""
+        effect = get_effect(guise.effect)
+        return self.levels if effect.scatters and not effect.displaces else None
+
     def weigh(self, guise: Guise) -> tuple[Found, Array]:
         """Evidence for one guise, and the same of every sham."""
+        if judge := self._by_levels(guise):
+            return judge.weigh(guise)
         places = self.places(guise)
-        effect = get_effect(guise.effect)
-        if self.levels is not None and effect.scatters and not effect.displaces:
-            return self.levels.weigh(guise)
         information, score, shams, _ = self.reduce(places, self.exclude(guise))
         if guise.per_frame:
             return self._weigh_frames(guise, information, score, shams)

@@ -150,7 +150,7 @@ def _could_not_show(state: State, outcome: Outcome, name: str) -> bool:
     for guise in (g for g in whole.plan.guises if g.effect == name):
         every = whole.expected_errors(guise)
         if guise.per_frame:
-            expected.append(float(np.median(every)) / math.sqrt(state.frames))
+            expected.append(float(np.median(every)) / math.sqrt(len(every)))
             continue
         for column, error in zip(guise.trial.columns, every, strict=True):
             ((coordinate, at),) = column.items()
