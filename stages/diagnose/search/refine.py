@@ -14,6 +14,8 @@ from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import LONGEST, SETTLED, SHORTEST, STEPS
 from stages.effects import Survey, get_effect
 
+TELLING = 0.05  # of the largest change that leaving out a group of images makes: what changes less has no part in it
+
 
 def as_effect(found, data: Survey, frames: int, whole):
     """The effect at the first estimate of its values, within bounds."""
@@ -128,7 +130,11 @@ def errors_over_images(state: State, view: View) -> None:
         null = type(cause.effect).null()
         found = np.array([float(cause.effect.values[kept[k][1]]) - null[kept[k][1]] for k in own])
         along = found / np.array([max(cause.of_given_shape[kept[k][1]], 1e-30) for k in own]) ** 2
-        cause.share_error = float(jackknife_error(table[:, own] @ along / max(found @ along, 1e-30)))
+        shares = table[:, own] @ along / max(found @ along, 1e-30)
+        cause.share_error = float(jackknife_error(shares))
+        away = np.abs(shares - np.median(shares))
+        telling = int((away > TELLING * away.max()).sum())  # where few images show deep shadow, few tell of light in it
+        cause.share_freedom = max(telling - 1, 1)
 
 
 def _scene_places(view: View) -> tuple[NDArray[np.int64], list[tuple[int, str, float]]]:

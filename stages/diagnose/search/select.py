@@ -20,7 +20,7 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.search.tested import hidden_look, hidden_rows
-from stages.diagnose.settings import DISCOVERY, FAINT, FOLDS, NOTABLE, SIMPLER, SURE, TRIED, TRIES
+from stages.diagnose.settings import DISCOVERY, FAINT, NOTABLE, SIMPLER, SURE, TRIED, TRIES
 from stages.effects import Effect, get_effect
 
 ODD = "nothing real has the values that fit best"
@@ -315,12 +315,14 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     # an effect that may be nothing has no shape that could be uncertain
     if cause.away < together(sure, len(cause.of_given_shape)):
         return f"it comes out {cause.away:.1f} errors from nothing"
-    freedom = max(min(FOLDS, state.frames) - 1, 1)
-    if cause.share_error * student_quantile(freedom) > 1:
+    if cause.share_error * student_quantile(cause.share_freedom) > 1:
         return f"other images give it other values: {1 / cause.share_error:.1f} errors over images from nothing"
+    reported = cls.report(values, cause.errors)
     for name, least in cls.tolerance.items():
-        size = cls.size(values) if name not in values else abs(values[name] - cls.null()[name])
-        if size - 2 * cause.errors.get(name, 0.0) < least:
+        size, error = reported[name]
+        if name in values:
+            size, error = abs(values[name] - cls.null()[name]), cause.errors.get(name, 0.0)
+        if size - 2 * error < least:
             return f"{name} is {size:.2g}, and less than {least:.2g} {ORDINARY}"
     return ""
 

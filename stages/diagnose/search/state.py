@@ -38,6 +38,7 @@ class Cause:
     over_images: dict[str, float] = field(default_factory=dict)  # errors by leaving out images
     away: float = math.inf  # standard errors from nothing, of all amounts together
     share_error: float = 0.0  # of one factor on all values, by leaving out images
+    share_freedom: int = 1  # with which it is known
     rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)
     gain_percent: float = float("nan")
@@ -261,7 +262,8 @@ class State:
 
     def image_groups(self, rows: Sequence[Rows]) -> list[list[int]]:
         """Frames that are left out together; none where there are too few to leave one out."""
-        frames = sorted({int(f) for row in rows for f in row.patch.frames})
+        every = [f for row in rows for f in (row.patch.frames, row.patch.dark_frames)]
+        frames = sorted(set(torch.cat(every).tolist()))  # most deep shadow is in images that show little lit ground
         return [frames[k::FOLDS] for k in range(min(FOLDS, len(frames)))] if len(frames) > 2 else []
 
     def _whole(
