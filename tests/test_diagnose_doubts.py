@@ -17,7 +17,7 @@ from stages.diagnose.likelihood.found import Found
 from stages.diagnose.rows.columns import Guise
 from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
-from stages.diagnose.search.select import ODD, ORDINARY, beyond_bounds, doubt, judge, may_be_another
+from stages.diagnose.search.select import ODD, ORDINARY, beyond_bounds, choose, doubt, judge, may_be_another
 from stages.diagnose.search.state import Cause
 from stages.effects import get_effect
 from stages.effects.base import Survey
@@ -107,6 +107,23 @@ def test_values_per_image_do_not_stand_for_what_one_value_for_all_does():
     assert not refused([21, 22, 20, 22])
 
 
+def test_light_from_above_alone_is_a_pedestal():
+    """Three values for a direction of light, of which one falls on all ground alike: named where it surely gains more than that one."""
+
+    def named(more):
+        sure = [
+            Found(name, Guise(name, get_effect(name).trials(Survey())[0], columns), amount, np.ones(len(amount)), 9.0, gains=gains)
+            for name, columns, amount, gains in (
+                ("earthshine", (0, 1, 2), np.array([0.1, 0.0, 4.0]), np.array([10.0, 12, 9, 11]) + more),
+                ("dark_bias", (3,), np.array([4.0]), np.array([10.1, 11, 9, 11])),
+            )
+        ]  # fmt: skip
+        return choose(sure)[0].effect
+
+    assert named(0.2) == "dark_bias"
+    assert named(5.0) == "earthshine"
+
+
 def test_two_shadows_that_agree_by_chance_are_not_exact():
     """As wide as they all lie from nothing where they are few, as they scatter where they are many."""
 
@@ -143,7 +160,7 @@ def test_light_from_below_is_no_earthshine():
 def test_a_shape_that_is_open_does_not_make_an_effect_nothing():
     """Height and width of a surge trade places: that its width is open does not say that there may be none."""
     cause = Cause(get_effect("opposition_surge")({"B0": 0.6, "h": 0.03}), found=None)
-    cause.errors, cause.share_error = {"B0": 0.2, "h": 0.01}, 0.05 / 0.6
+    cause.errors, cause.share_error, cause.share_freedom = {"B0": 0.2, "h": 0.01}, 0.05 / 0.6, 7
     for error, sure in ((0.05, True), (0.2, False)):
         cause.of_given_shape, cause.away = {"B0": error}, 0.6 / error
         assert (doubt(SimpleNamespace(data=None, frames=8), cause) == "") == sure

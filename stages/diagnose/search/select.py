@@ -137,12 +137,16 @@ def shows_in_shade(whole: Whole, found: Found) -> bool:
 def choose(sure: list[Found]) -> tuple[Found, list[str]]:
     """The best, or one with fewer values that gains nearly as much; and all that gain the same within their scatter.
 
-    Values per frame can mimic what one value for all does: where the two gain the same, the one value is the cause.
+    Values per frame can mimic what one value for all does: where the two gain the same, the one value is the cause. So it is with
+    several values beside fewer of what they are confused with: light from above alone is a pedestal.
     """
     best = max(sure, key=lambda f: f.gain)
     if best.guise.per_frame:
         simple = [f for f in sure if not f.guise.per_frame and _as_good(f, best)]
         best = max(simple, key=lambda f: f.gain, default=best)
+    alike = get_effect(best.effect).confused_with
+    fewer = [f for f in sure if f.effect in alike and not f.guise.per_frame and len(f.amount) < len(best.amount)]
+    best = max((f for f in fewer if best.more_than(f)[0] <= 0), key=lambda f: f.gain, default=best)
     group = []
     for f in sorted(sure, key=lambda f: -f.gain):
         if f is best or best.more_than(f)[0] <= 0:
