@@ -107,13 +107,19 @@ def _without(x: Tensor, direction: Tensor) -> Tensor:
     return x - (x * direction).sum(-1, keepdim=True) * direction
 
 
-def measured_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> Nominal | None:
-    """Measured lunar laws, fitted in the place of a fitted sum of terms; or None. The sites are as they were.
+def may_be_exchanged(nominal: Nominal) -> bool:
+    """Whether measured lunar laws may take its place: that of a fitted sum of terms.
 
     A physical law, such as Hapke's, is one of those measured, and stays with the freedom that it has.
     """
+    fitted = nominal.predictor is None and nominal.model.linear and bool(nominal.free.all())
+    return fitted and nominal.laws is not None
+
+
+def measured_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> Nominal | None:
+    """Measured lunar laws, fitted in the nominal one's place; or None. The sites are as they were."""
     laws = nominal.laws
-    if nominal.predictor is not None or laws is None or not nominal.model.linear or not bool(nominal.free.all()):
+    if laws is None or not may_be_exchanged(nominal):
         return None
     vector = torch.tensor([p.default for p in laws.parameters])
     free = torch.ones(len(vector), dtype=torch.bool)
@@ -127,4 +133,4 @@ def measured_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> Nomina
     return other
 
 
-__all__ = ["better_form", "left_elsewhere", "measured_laws", "other_laws", "relative_misfit"]
+__all__ = ["better_form", "left_elsewhere", "may_be_exchanged", "measured_laws", "other_laws", "relative_misfit"]

@@ -60,11 +60,15 @@ class Plan:
 
 
 def make_plan(
-    chain: Chain, names: Sequence[str], data: Survey, candidates: bool = True, impossible: Container[str] = ()
+    chain: Chain,
+    names: Sequence[str],
+    data: Survey,
+    candidates: Container[str] | None = None,
+    impossible: Container[str] = (),
 ) -> Plan:
     """Columns for the nominal model's freedom, the effects in the chain, and the effects ``names``.
 
-    candidates : every way these may look; otherwise what every data set has of them
+    candidates : those that stand there in every way they may look (None: all); of the others, what every data set has of them
     impossible : effects of which these data cannot have an ordinary amount
     """
     plan = Plan()
@@ -100,7 +104,7 @@ def make_plan(
         if cls.judged_apart and not cls.always:
             continue
         if cls.scope == "scene":
-            for trial in cls.trials(data) if candidates else cls.trials(data)[:1]:
+            for trial in cls.trials(data) if candidates is None or name in candidates else cls.trials(data)[:1]:
                 places = tuple(shared(name) for _ in trial.columns)
                 plan.guises.append(Guise(name, trial, places))
                 if name not in plan.ordinary and name not in impossible and (size := cls.ordinary(trial)) > 0:

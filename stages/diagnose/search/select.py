@@ -43,6 +43,7 @@ def search(state: State, most: int) -> Outcome:
     out = Outcome()
     refused: dict[str, str] = {}  # effect -> why
     view: View | None = None
+    state.choose_law()
     while True:
         # the data look as before where nothing was named
         view = state.without_impossible(view, state.open_names()) if view else state.look(state.open_names())

@@ -163,8 +163,8 @@ def by_shadows(state: State) -> list[Named]:
     if not shadows.every:
         return []
     named = {type(c.effect).name for c in state.causes}
-    if any(c.effect.slot == "geometry" and not c.effect.displaces for c in state.causes):
-        # relief that is wrong casts wrong shadows
+    if any(c.effect.slot == "geometry" and not c.effect.displaces for c in state.causes) or any(map(_turned, chains)):
+        # relief that is wrong casts wrong shadows; a horizon is known in the direction where the Sun was said to be
         named |= {n for n in shadows.every if get_effect(n).shadow_error}
     usual = shadows.usual()
     found = shadows.unusual(usual, named)
@@ -194,6 +194,14 @@ def by_shadows(state: State) -> list[Named]:
     rivals = [t.best.name for t in found if t is not first and not gain_interval(t.held_out()[shown], after)[1] > 0]
     pixels = float(sum(c.site.valid.sum() for c in chains))
     return [_named(made, error, before, after, pixels, rivals)]
+
+
+def _turned(chain: Chain) -> bool:
+    """Whether a cause turned the Sun about the vertical."""
+    (east, north), (given_east, given_north) = (
+        d[:, :2].unbind(-1) for d in (chain.state.sun_direction, chain.site.observation.sun_direction)
+    )
+    return bool(((east * given_north - north * given_east).abs() > 1e-4).any())
 
 
 def _on_one_line(first: Effect, second: Effect) -> bool:

@@ -16,7 +16,7 @@ from stages.diagnose.likelihood.found import Found
 from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
 from stages.diagnose.likelihood.weigh import Whole
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.form import measured_laws
+from stages.diagnose.model.form import may_be_exchanged, measured_laws
 from stages.diagnose.model.nominal import Nominal, fit
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
@@ -113,6 +113,12 @@ class State:
         base = self.base
         return per_site(lambda site: self.nominal.chain(site, base), self.sites)
 
+    def choose_law(self) -> None:
+        """Let measured laws take the nominal one's place before anything else is looked at: what that takes is soon rendered."""
+        if may_be_exchanged(self.nominal):
+            names = self.open_names()
+            self.law_is_another(self.look(names, 0, [n for n in names if get_effect(n).of_law]))
+
     def law_is_another(self, view: View, refused: Container[str] = ()) -> bool:
         """Whether another law surely gains on held-out ground whatever effect of the law stands beside it; measured ones take the nominal one's place then.
 
@@ -120,7 +126,7 @@ class State:
         """
         whole = view.whole
         places = whole.form_places()
-        if not len(places):
+        if not len(places) or not may_be_exchanged(self.nominal):
             return False
         least = FAINT**2 / 2 * float(whole.gram[0, 0])
         alone = [
@@ -197,11 +203,11 @@ class State:
             out.append(Rows(patch, z, mean, z_own, mean_own, patch.shadow(shared)))
         return out
 
-    def look(self, names: Sequence[str], shams: int = SHAMS) -> View:
-        """Rows and products of everything, with the effects ``names`` as candidates."""
+    def look(self, names: Sequence[str], shams: int = SHAMS, candidates: Container[str] | None = None) -> View:
+        """Rows and products of everything, with the effects ``names``; candidates : those that may be named, None for all."""
         chains = self.chains()
         grid, _ = self.grid()
-        plan = make_plan(chains[0], names, self.data, impossible=self.impossible)
+        plan = make_plan(chains[0], names, self.data, candidates, self.impossible)
 
         patches = per_site(lambda k: self.patches(k, chains[k]), range(len(chains)))
         self.kept = self.kept_share(chains, patches, grid)
@@ -226,7 +232,7 @@ class State:
         model : the covariance, estimated where None
         """
         chains = self.chains()
-        plan = make_plan(chains[0], names, self.data, candidates=False, impossible=self.impossible)
+        plan = make_plan(chains[0], names, self.data, candidates=(), impossible=self.impossible)
 
         rows = [
             r for part in per_site(lambda k: self.moved(view, k, chains[k], plan), range(len(chains))) for r in part

@@ -22,7 +22,7 @@ def hidden_look(state: State, view: View) -> View | None:
     chains = _chains(state)
     if not chains:
         return None
-    plan = make_plan(chains[0], along(state, view), state.data, candidates=False, impossible=state.impossible)
+    plan = make_plan(chains[0], along(state, view), state.data, candidates=(), impossible=state.impossible)
     rows = [r for k, chain in enumerate(chains) for r in state.rows(state.patches(NOT_LEARNED + k, chain), chain, plan)]
     return dataclasses.replace(view, plan=plan, rows=rows)
 
