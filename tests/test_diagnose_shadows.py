@@ -40,7 +40,7 @@ class ShadowedGround:
         light = sun_visibility(up + np.radians(sun_deg), true, np.radians(radius_deg))
         image = 0.05 * light * torch.from_numpy(rng.normal(1, 0.1, (1, 64, 64))).float()
         every = torch.ones(3, 64, 64, dtype=torch.bool)
-        observation = SimpleNamespace(gsd=10.0)
+        observation = SimpleNamespace(gsd=10.0, sun_direction=self.suns)
         self.state.observation = observation
         self.site = SimpleNamespace(ground=number, valid=every, image=image, observation=observation)
 
@@ -82,6 +82,19 @@ def test_shadows_tell_a_wall_the_sun_and_its_disc_whatever_the_law(planted, name
         assert abs(value - truth) < 3 * error < 2 * abs(truth)
         assert found[0].percent[1] > 0
         assert name != "distant_shadow" or found[0].effect.values["side"] in (0.0, 4.0)
+
+
+def test_a_horizon_is_known_where_the_sun_was_said_to_be():
+    """Beside a Sun that was turned by three degrees, edges that are off by a degree are no wide disc."""
+    rng = np.random.default_rng(5)
+    chains = [ShadowedGround(rng, k, radius_deg=2.0) for k in range(4)]
+    turn = math.radians(3.0)
+    for chain in chains:
+        chain.site.observation.sun_direction = chain.suns @ torch.tensor(
+            [[math.cos(turn), math.sin(turn), 0.0], [-math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]]
+        )
+    state = SimpleNamespace(chains=lambda: chains, causes=[], data=Survey(crop_px=64, gsd=10.0), free_gains=False)
+    assert not by_shadows(state)
 
 
 @pytest.mark.parametrize("azimuth_deg", [0, 37, 90, 135, 200, 270, 333])

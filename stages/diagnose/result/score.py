@@ -147,17 +147,18 @@ def _could_not_show(state: State, outcome: Outcome, name: str) -> bool:
     if cls.of_law and not len(whole.form_places()):  # a law that is fitted follows it
         return True
     found = state.open.get(name, 0.0)  # over ground or images, larger than the likelihood's
-    expected = []
+    expected: dict[str, float] = {}  # coordinate -> the least of all guises; every coordinate must show
     for guise in (g for g in whole.plan.guises if g.effect == name):
         every = whole.expected_errors(guise)
         if guise.per_frame:
-            expected.append(float(np.median(every)) / math.sqrt(len(every)))
+            expected["rms"] = float(np.median(every)) / math.sqrt(len(every))
             continue
         for column, error in zip(guise.trial.columns, every, strict=True):
             ((coordinate, at),) = column.items()
             size = abs(at - cls.null()[coordinate])
-            expected.append(float(error) * size / (cls.strong.get(coordinate, 0.0) or size))
-    error = min(expected, default=math.inf)
+            error = float(error) * size / (cls.strong.get(coordinate, 0.0) or size)
+            expected[coordinate] = min(expected.get(coordinate, math.inf), error)
+    error = max(expected.values(), default=math.inf)
     judged = outcome.best[name]
     if len(judged.gains):
         # what such a size would add, and how far gains scatter over other ground
