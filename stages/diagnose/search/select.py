@@ -322,11 +322,12 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
         return f"it comes out {cause.away:.1f} errors from nothing"
     if cause.share_error * student_quantile(cause.share_freedom) > 1:
         return f"other images give it other values: {1 / cause.share_error:.1f} errors over images from nothing"
-    reported = cls.report(values, cause.errors)
+    errors = {k: max(e, cause.over_images.get(k, 0.0)) for k, e in cause.errors.items()}
+    reported = cls.report(values, errors)
     for name, least in cls.tolerance.items():
         size, error = reported[name]
         if name in values:
-            size, error = abs(values[name] - cls.null()[name]), cause.errors.get(name, 0.0)
+            size, error = abs(values[name] - cls.null()[name]), errors.get(name, 0.0)
         if size - 2 * error < least:
             return f"{name} is {size:.2g}, and less than {least:.2g} {ORDINARY}"
     return ""
