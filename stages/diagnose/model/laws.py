@@ -27,7 +27,7 @@ DEGREE = 6  # of the polynomials in both cosines and the root of the phase angle
 ROUGH = math.radians(20), math.radians(38)  # Hapke's roughness bends where no polynomial does ...
 ROUGH_DEGREE = 2  # ... and is another one for other parameters: of the polynomials that multiply it
 SEED = 1
-BLOCK = 1 << 14  # pixels whose products are held at a time
+BLOCK = 1 << 16  # pixels whose products are held at a time
 TERMS = [(i, j, k) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) for k in range(DEGREE + 1 - i - j)]
 SIMPLE = [n for n, term in enumerate(TERMS) if sum(term) <= ROUGH_DEGREE]
 
@@ -57,7 +57,20 @@ class LunarLaws(ReflectanceModel):
 
     def parts(self, angles: Angles) -> Tensor:
         """(C, ...) I/F that a coefficient of 1 adds, over the shape of the angles, for each coefficient."""
-        return _sums(self.weights, _factors(angles, self.low, self.high)) * _seeliger(angles)
+        return self._sums(self.weights, angles) * _seeliger(angles)
+
+    def _sums(self, weights: Tensor, angles: Angles) -> Tensor:
+        """(R, ...) sums of all terms, weighted by (R, terms); so many pixels at a time as a processor's own memory holds."""
+        shape = angles.cos_incidence.shape
+        every = [x.expand(shape).flatten() for x in (angles.cos_incidence, angles.cos_emission, angles.cos_phase)]
+        out = torch.empty(len(weights), len(every[0]), dtype=every[0].dtype)
+        weights = weights.to(out.dtype)
+        for at in range(0, out.shape[1], BLOCK):
+            factors = _factors(Angles(*(x[at : at + BLOCK] for x in every)), self.low, self.high)
+            out[:, at : at + BLOCK] = (
+                _sum_of_one(weights[0], factors) if len(weights) == 1 else weights @ _terms(factors)
+            )
+        return out.unflatten(1, shape)
 
     def radiance_factor(self, parameters: Mapping[str, Tensor], angles: Angles) -> Tensor:
         """I/F (...,) of the law with these coefficients."""
@@ -65,7 +78,7 @@ class LunarLaws(ReflectanceModel):
         if any(a.numel() > 1 for a in amounts):
             return torch.stack([a * part for a, part in zip(amounts, self.parts(angles), strict=True)]).sum(0)
         weights = torch.stack([a.flatten()[0] for a in amounts]).to(self.weights.dtype) @ self.weights
-        return _sums(weights[None], _factors(angles, self.low, self.high))[0] * _seeliger(angles)
+        return self._sums(weights[None], angles)[0] * _seeliger(angles)
 
 
 def _seeliger(angles: Angles) -> Tensor:
@@ -123,7 +136,7 @@ def _factors(angles: Angles, low: Floats, high: Floats) -> list[list[Tensor]]:
         while len(each) <= DEGREE:
             each.append(2 * scaled * each[-1] - each[-2])
         out.append(each)
-    return [*out, [roughness_factor(angles, torch.tensor(theta, dtype=out[0][0].dtype)) for theta in ROUGH]]
+    return [*out, list(roughness_factor(angles, torch.tensor(ROUGH, dtype=out[0][0].dtype)[:, None]))]
 
 
 def _terms(factors: list[list[Tensor]]) -> Tensor:
@@ -139,14 +152,33 @@ def _terms(factors: list[list[Tensor]]) -> Tensor:
     return out
 
 
-def _sums(weights: Tensor, factors: list[list[Tensor]]) -> Tensor:
-    """(R, ...) sums of all terms, weighted by (R, terms)."""
-    shape = factors[0][0].shape
-    flat = [[x.expand(shape).flatten() for x in f] for f in factors]
-    out = torch.empty(len(weights), len(flat[0][0]), dtype=flat[0][0].dtype)
-    for at in range(0, out.shape[1], BLOCK):
-        out[:, at : at + BLOCK] = weights.to(out.dtype) @ _terms([[x[at : at + BLOCK] for x in f] for f in flat])
-    return out.unflatten(1, shape)
+def _sum_of_one(weights: Tensor, factors: list[list[Tensor]]) -> Tensor:
+    """(N,) the sum of :func:`_terms` weighted by (terms,), one factor taken out after the other."""
+    first, second, third, rough = factors
+    out = _polynomial(weights[: len(TERMS)], TERMS, first, second, third)
+    for n, factor in enumerate(rough):
+        own = weights[len(TERMS) + n * len(SIMPLE) :][: len(SIMPLE)]
+        out.addcmul_(factor, _polynomial(own, [TERMS[k] for k in SIMPLE], first, second, third))
+    return out
+
+
+def _polynomial(
+    weights: Tensor, terms: list[tuple[int, int, int]], first: list[Tensor], second: list[Tensor], third: list[Tensor]
+) -> Tensor:
+    """(N,) sum of products of one of each factors, each product times its weight."""
+    pairs = list(dict.fromkeys((i, j) for i, j, _ in terms))
+    degree = max(k for _, _, k in terms)
+    among = weights.new_zeros(len(pairs), degree + 1)
+    among[[pairs.index((i, j)) for i, j, _ in terms], [k for _, _, k in terms]] = weights
+    inner = among @ torch.stack(third[: degree + 1])
+    out = torch.zeros_like(first[0])
+    for i in dict.fromkeys(i for i, _ in pairs):
+        row = torch.zeros_like(out)
+        for (at, j), part in zip(pairs, inner, strict=True):
+            if at == i:
+                row.addcmul_(part, second[j])
+        out.addcmul_(row, first[i])
+    return out
 
 
 def _draw(angles: Angles) -> Floats:
