@@ -8,19 +8,15 @@ from __future__ import annotations
 import math
 
 # --- which pixels say anything ---
-LIT_MARGIN = math.radians(
-    1.2
-)  # rad above the horizon: closer, an ordinary error of the DEM decides whether a pixel is lit
-GRAZING = math.cos(
-    math.radians(84.0)
-)  # cosine of incidence: a slope error of a degree changes brightness by 15 % there
+# rad above the horizon: closer, an ordinary error of the DEM decides whether a pixel is lit
+LIT_MARGIN = math.radians(1.2)
+# cosine of incidence: a slope error of a degree changes brightness by 15 % there
+GRAZING = math.cos(math.radians(84.0))
 DARKEST = 0.3  # of an image's mean: noise of darker pixels is not divided by less than this
-TAPER = (
-    0.12  # of a crop's side, at either end: a window this wide keeps borders out of the spectrum and 80 % of the area
-)
-CLEAR = math.radians(
-    15.0
-)  # rad of the Sun above facet and horizon: lower, a slope error of a degree is 7 % of brightness and more
+# of a crop's side, at either end: a window this wide keeps borders out of the spectrum and 80 % of the area
+TAPER = 0.12
+# rad of the Sun above facet and horizon: lower, a slope error of a degree is 7 % of brightness and more
+CLEAR = math.radians(15.0)
 RUGGED = 1.35  # ... and on rugged ground so many times its rms slope, since facets that seem to face the Sun are chosen by the DEM's errors
 SEEN = 3  # pieces of ground that an image shows at least: of fewer, its own variance is not known, and its rows outweigh all others
 SHADOWED = 30  # pixels of deep shadow in a piece of an image, below which their mean is not used

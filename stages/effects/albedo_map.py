@@ -15,10 +15,8 @@ from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
 ORDERS = tuple((m, n) for m in range(4) for n in range(4) if 0 < m + n <= 4)
-FINE = (
-    4,
-    16,
-)  # orders both ways of ordinary texture: a broad field that does not end as cosines do leaks along the axes only
+# orders both ways of ordinary texture: a broad field that does not end as cosines do leaks along the axes only
+FINE = 4, 16
 STEEPEST = 3.0  # spectra of ground fall as k^-3 where units of it meet at sharp borders (Porod 1951), and less steeply elsewhere
 WHOLE = 0.9  # of a site: holes tear texture up, and what is torn has no spectrum
 

@@ -41,13 +41,9 @@ def detector_axes(sample: Tensor | None, line: Tensor | None, batch: int) -> tup
     identity = torch.eye(2)
     if sample is None or line is None:
         return identity[0].expand(batch, 2), identity[1].expand(batch, 2)
-    jacobian = torch.stack(
-        [
-            torch.stack([_mean_step(sample, -1), _mean_step(sample, -2)], -1),
-            torch.stack([_mean_step(line, -1), _mean_step(line, -2)], -1),
-        ],
-        -2,
-    )  # d(sample, line) / d(column, row)
+    # d(sample, line) / d(column, row)
+    steps = [torch.stack([_mean_step(x, -1), _mean_step(x, -2)], -1) for x in (sample, line)]
+    jacobian = torch.stack(steps, -2)
     determinant = torch.linalg.det(jacobian)
     safe = torch.where((determinant.abs() > 1e-6)[:, None, None], jacobian, identity.to(jacobian))
     inverse = torch.linalg.inv(safe)

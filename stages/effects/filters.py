@@ -25,9 +25,8 @@ def gaussian(image: Tensor, sigma2: Tensor | float, limit: float = 4.0, slopes: 
         power = -0.5 * torch.as_tensor(sigma2, dtype=image.dtype) * waves.square()
         # a sudden end would make waves stop growing one after the other, and what is fitted to them jump
         log_limit = math.log(limit)
-        over = softplus(SUDDEN * (power - log_limit)) - math.log1p(
-            math.exp(-SUDDEN * log_limit)
-        )  # 0 where nothing is filtered
+        nothing = math.log1p(math.exp(-SUDDEN * log_limit))  # what is over where nothing is filtered
+        over = softplus(SUDDEN * (power - log_limit)) - nothing
         return torch.exp(power - over / SUDDEN)
 
     return filtered(image, gain, slopes)

@@ -37,16 +37,13 @@ class Plan:
     prior: dict[int, float] = field(default_factory=dict)
     frame_prior: dict[int, float] = field(default_factory=dict)
     ordinary: dict[str, list[int]] = field(default_factory=dict)  # effect -> its columns among the nuisance
-    form: list[int] = field(
-        default_factory=list
-    )  # of another form of the reflectance: a nuisance of all but effects of the law
+    # of another form of the reflectance: a nuisance of all but effects of the law
+    form: list[int] = field(default_factory=list)
     dem_errors: list[int] = field(default_factory=list)  # of what the DEM has and the ground has not
-    ground: list[int] = field(
-        default_factory=list
-    )  # of what all images of one place share, by its own amount on every piece of ground
-    pull: dict[int, float] = field(
-        default_factory=dict
-    )  # columns whose prior is not about what is rendered: its distance, in the column's unit
+    # of what all images of one place share, by its own amount on every piece of ground
+    ground: list[int] = field(default_factory=list)
+    # columns whose prior is not about what is rendered: its distance, in the column's unit
+    pull: dict[int, float] = field(default_factory=dict)
     guises: list[Guise] = field(default_factory=list)
     steps: list[tuple[int, str, float]] = field(default_factory=list)  # base effect, coordinate, step: tangents
 

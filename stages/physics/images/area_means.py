@@ -44,9 +44,8 @@ def area_means(
         for part in halves:
             values[part], complete[part] = area_means(read_window, size, line[part], sample[part], wanted[part])
         return values, complete
-    spans = [
-        np.hypot(np.diff(lines, axis=axis), np.diff(samples, axis=axis)).max(axis=(1, 2)) for axis in (1, 2)
-    ]  # along rows' sides, along columns'
+    # along rows' sides, along columns'
+    spans = [np.hypot(np.diff(lines, axis=a), np.diff(samples, axis=a)).max(axis=(1, 2)) for a in (1, 2)]
     n_row, n_col = (_samples_per_side(span) for span in spans)
     pixels = read_window(l0, s0, l1 - l0, s1 - s0)
     first = CSM_CENTRE + l0, CSM_CENTRE + s0
