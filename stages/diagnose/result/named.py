@@ -33,7 +33,7 @@ def by_search(state: State) -> list[Named]:
             values = {k: float(v) for k, v in cause.effect.values.items()}
             found = cls.report(values, cause.reported_errors)
         else:
-            found = {cls.parameters[0].name: (cause.rms, cause.errors.get("rms", math.inf))}
+            found = {cls.parameters[0].name: (cause.rms, cause.reported_errors.get("rms", math.inf))}
         low, high = cause.found.gain_interval()
         out.append(
             Named(

@@ -68,7 +68,8 @@ class Cause:
     @property
     def reported_errors(self) -> dict[str, float]:
         """The larger ones of either, and what every data set has of the effect, which is part of what was found."""
-        ordinary = type(self.effect).tolerance
+        cls = type(self.effect)
+        ordinary = cls.tolerance if cls.scope == "scene" else {"rms": max(cls.tolerance.values(), default=0.0)}
         return {
             k: math.hypot(max(e, self.over_images.get(k, 0.0)), ordinary.get(k, 0.0)) for k, e in self.errors.items()
         }
