@@ -173,9 +173,9 @@ def _register(state: State) -> None:
 def _structure(view: View, frames: int) -> dict[str, float]:
     """What is left that neither ground nor noise has, and its share of the residual's variance."""
     line, share = peak(view.rows, view.model, view.grid, frames)
-    alike, low = field_of_images(view.rows, view.model, view.grid)
+    alike, surely = field_of_images(view.rows, view.model, view.grid)
     out = {"lines across an image": share} if line > LINE else {}
-    if low > 0 and alike > ALIKE:
+    if surely > ALIKE:
         out["a broad field in each image that is the same on all ground"] = alike
     return out
 
