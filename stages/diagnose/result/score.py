@@ -151,7 +151,9 @@ def _could_not_show(state: State, outcome: Outcome, name: str) -> bool:
     for guise in (g for g in whole.plan.guises if g.effect == name):
         every = whole.expected_errors(guise)
         if guise.per_frame:
-            expected["rms"] = float(np.median(every)) / math.sqrt(len(every))
+            # values that scatter by a size worth knowing add s - log(1 + s) each to twice the log likelihood, s in squares of their errors
+            seen = 1 / np.maximum(every, 1e-6) ** 2
+            expected["rms"] = 1 / math.sqrt(max(float((seen - np.log1p(seen)).sum()), 1e-12))
             continue
         for column, error in zip(guise.trial.columns, every, strict=True):
             ((coordinate, at),) = column.items()
