@@ -171,7 +171,9 @@ def _register(state: State) -> None:
 
 
 def _structure(view: View, frames: int) -> dict[str, float]:
-    """What is left that neither ground nor noise has, and its share of the residual's variance."""
+    """What is left that neither ground nor noise has, and its share: of a line, of the squares of that frame; of a field, of
+    the squares of the broadest waves of all images; both weighted by the inverse covariance.
+    """
     line, share = peak(view.rows, view.model, view.grid, frames)
     alike, surely = field_of_images(view.rows, view.model, view.grid)
     out = {"lines across an image": share} if line > LINE else {}

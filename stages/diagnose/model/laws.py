@@ -8,7 +8,7 @@ costs likelihood, so that a wrong Sun or DEM is not taken for a peculiar law.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -28,7 +28,10 @@ ROUGH = math.radians(20), math.radians(38)  # Hapke's roughness bends where no p
 ROUGH_DEGREE = 2  # ... and is another one for other parameters: of the polynomials that multiply it
 SEED = 1
 BLOCK = 1 << 16  # pixels whose products are held at a time
-TERMS = [(i, j, k) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) for k in range(DEGREE + 1 - i - j)]
+Term = tuple[int, int, int]  # degrees in the three factors
+TERMS: list[Term] = [
+    (i, j, k) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) for k in range(DEGREE + 1 - i - j)
+]
 SIMPLE = [n for n, term in enumerate(TERMS) if sum(term) <= ROUGH_DEGREE]
 
 
@@ -155,28 +158,26 @@ def _terms(factors: list[list[Tensor]]) -> Tensor:
 def _sum_of_one(weights: Tensor, factors: list[list[Tensor]]) -> Tensor:
     """(N,) the sum of :func:`_terms` weighted by (terms,), one factor taken out after the other."""
     first, second, third, rough = factors
-    out = _polynomial(weights[: len(TERMS)], TERMS, first, second, third)
+    out = _polynomial(weights[: len(TERMS)], DEGREE, TERMS, first, second, third)
+    simple = [TERMS[k] for k in SIMPLE]
     for n, factor in enumerate(rough):
         own = weights[len(TERMS) + n * len(SIMPLE) :][: len(SIMPLE)]
-        out.addcmul_(factor, _polynomial(own, [TERMS[k] for k in SIMPLE], first, second, third))
+        out.addcmul_(factor, _polynomial(own, ROUGH_DEGREE, simple, first, second, third))
     return out
 
 
 def _polynomial(
-    weights: Tensor, terms: list[tuple[int, int, int]], first: list[Tensor], second: list[Tensor], third: list[Tensor]
+    weights: Tensor, degree: int, terms: Sequence[Term], first: list[Tensor], second: list[Tensor], third: list[Tensor]
 ) -> Tensor:
-    """(N,) sum of products of one of each factors, each product times its weight."""
-    pairs = list(dict.fromkeys((i, j) for i, j, _ in terms))
-    degree = max(k for _, _, k in terms)
-    among = weights.new_zeros(len(pairs), degree + 1)
-    among[[pairs.index((i, j)) for i, j, _ in terms], [k for _, _, k in terms]] = weights
-    inner = among @ torch.stack(third[: degree + 1])
+    """(N,) sum of products of one of each factors, each product times its weight; terms : (i, j, k) of i + j + k up to the degree"""
+    among = weights.new_zeros((degree + 1,) * 3)
+    among[tuple(zip(*terms, strict=True))] = weights
+    powers = torch.stack(third[: degree + 1])
     out = torch.zeros_like(first[0])
-    for i in dict.fromkeys(i for i, _ in pairs):
+    for i in range(degree + 1):
         row = torch.zeros_like(out)
-        for (at, j), part in zip(pairs, inner, strict=True):
-            if at == i:
-                row.addcmul_(part, second[j])
+        for part, factor in zip(among[i, : degree + 1 - i] @ powers, second, strict=False):
+            row.addcmul_(part, factor)
         out.addcmul_(row, first[i])
     return out
 

@@ -82,7 +82,9 @@ class Answer:
     rejected: dict[str, tuple[float, str]] = field(default_factory=dict)
     registration: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     unexplained_fraction: float = 0.0
-    structure: dict[str, float] = field(default_factory=dict)  # nothing in the catalogue explains it: words -> share
+    structure: dict[str, float] = field(
+        default_factory=dict
+    )  # nothing in the catalogue explains it: words -> share of the waves where it is
     blind: list[str] = field(default_factory=list)
     held_out: HeldOut = field(default_factory=HeldOut)
     pairs: int = 0

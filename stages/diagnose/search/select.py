@@ -47,7 +47,7 @@ def search(state: State, most: int) -> Outcome:
     while True:
         # the data look as before where nothing was named
         view = state.without_impossible(view, state.open_names()) if view else state.look(state.open_names())
-        if not state.causes and state.law_is_another(view, refused):
+        if refused and not state.causes and state.law_is_another(view, refused):  # before, it was not
             refused = {
                 n: why for n, why in refused.items() if get_effect(n).of_law
             }  # nothing was judged beside this law
@@ -322,7 +322,7 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
         return f"it comes out {cause.away:.1f} errors from nothing"
     if cause.share_error * student_quantile(cause.share_freedom) > 1:
         return f"other images give it other values: {1 / cause.share_error:.1f} errors over images from nothing"
-    errors = {k: max(e, cause.over_images.get(k, 0.0)) for k, e in cause.errors.items()}
+    errors = cause.larger_errors
     reported = cls.report(values, errors)
     for name, least in cls.tolerance.items():
         size, error = reported[name]

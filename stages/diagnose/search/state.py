@@ -66,13 +66,16 @@ class Cause:
         return out
 
     @property
+    def larger_errors(self) -> dict[str, float]:
+        """Over ground or over images."""
+        return {k: max(e, self.over_images.get(k, 0.0)) for k, e in self.errors.items()}
+
+    @property
     def reported_errors(self) -> dict[str, float]:
-        """The larger ones of either, and what every data set has of the effect, which is part of what was found."""
+        """The larger ones, and what every data set has of the effect, which is part of what was found."""
         cls = type(self.effect)
         ordinary = cls.tolerance if cls.scope == "scene" else {"rms": max(cls.tolerance.values(), default=0.0)}
-        return {
-            k: math.hypot(max(e, self.over_images.get(k, 0.0)), ordinary.get(k, 0.0)) for k, e in self.errors.items()
-        }
+        return {k: math.hypot(e, ordinary.get(k, 0.0)) for k, e in self.larger_errors.items()}
 
 
 @dataclass
