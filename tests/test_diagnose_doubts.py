@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from stages.diagnose.likelihood.covariance import Covariance, shadow_variance
 from stages.diagnose.likelihood.dem_errors import kept_share
-from stages.diagnose.likelihood.found import Found
+from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.rows.columns import Guise
 from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
@@ -74,6 +74,7 @@ def test_what_is_ordinary_explains_as_much_or_the_rival_is_refused():
         whole = SimpleNamespace(
             scattered=np.zeros(0), sizes=np.ones(4), places=lambda g: np.array(g.columns), exclude=lambda g: [],
             held_out=lambda places, *rest: held[int(places[0])], ordinary_places=lambda name: [],
+            power=lambda places, amount: np.ones(4),
         )  # fmt: skip
         judge(whole, both["interreflection"])
         return may_be_another(whole, both["interreflection"], both, {"dark_bias": because})
@@ -124,20 +125,50 @@ def test_light_from_above_alone_is_a_pedestal():
     assert named(5.0) == "earthshine"
 
 
-def test_two_shadows_that_agree_by_chance_are_not_exact():
-    """As wide as they all lie from nothing where they are few, as they scatter where they are many."""
+def _shadows(values, light=None, cells=1):
+    """The model of means in the deep shadow of one image, so many cells on each piece of ground."""
+    model = Covariance.white(1, 1)
+    pieces = torch.tensor(values, dtype=torch.float64).split(cells)
+    kinds = torch.ones(1, len(values)) if light is None else torch.tensor(light)[None]
+    patches = [
+        SimpleNamespace(number=k, dark_frames=torch.zeros(len(v), dtype=torch.long)) for k, v in enumerate(pieces)
+    ]
+    shadow_variance(model, patches, pieces, kinds.split(cells, 1))
+    return model
 
-    def variance(values, light=None):
-        light = torch.ones(1, len(values)) if light is None else torch.tensor(light)[None]
-        return shadow_variance([torch.tensor(values)], [light])[1]
 
-    assert variance([]) == 1.0
-    assert variance([-0.0054, -0.0050]) ** 0.5 > 0.003
+def test_scatter_of_shadows_is_what_no_light_explains():
+    """As far as they lie from nothing where there are too few to scatter, as they scatter where there are many."""
+    assert _shadows([]).dark == 1.0
+    assert _shadows([-0.0054]).dark_piece ** 0.5 > 0.005
     many = np.random.default_rng(1).normal(0.05, 0.01, 400)
-    assert variance(many.tolist()) ** 0.5 == pytest.approx(0.01, rel=0.15)
+    assert _shadows(many.tolist()).dark_piece ** 0.5 == pytest.approx(0.01, rel=0.15)
     # light that falls on one shadow more than on another is no scatter
     walls = np.random.default_rng(2).uniform(0, 0.1, 400)
-    assert variance((many + walls - 0.05).tolist(), walls.tolist()) ** 0.5 == pytest.approx(0.01, rel=0.15)
+    assert _shadows((many + walls - 0.05).tolist(), walls.tolist()).dark_piece ** 0.5 == pytest.approx(0.01, rel=0.15)
+
+
+def test_pieces_of_ground_differ_as_their_cells_do_at_least():
+    """Relief that the DEM has not lights a piece's cells together; pieces that agree by chance are not exact."""
+    rng = np.random.default_rng(3)
+    alone, piece = rng.normal(0, 0.01, (100, 9)), rng.normal(0, 0.03, (100, 1))
+    together = _shadows((alone + piece).flatten().tolist(), cells=9)
+    assert together.dark**0.5 == pytest.approx(0.01, rel=0.15) and together.dark_piece**0.5 == pytest.approx(
+        0.03, rel=0.2
+    )
+    same = _shadows((alone[:2] - alone[:2].mean(1, keepdims=True)).flatten().tolist(), cells=9)
+    assert same.dark_piece >= same.dark > 1e-5
+    # the nine cells of a piece say little more than one does
+    root = together.dark_root(SimpleNamespace(dark_frames=torch.zeros(9, dtype=torch.long)))
+    level = torch.linalg.solve_triangular(root, torch.ones(9, 1, dtype=torch.float64), upper=False)
+    assert float(level.square().sum()) == pytest.approx(1 / (together.dark_piece + together.dark / 9), rel=1e-6)
+
+
+def test_gains_in_few_shadows_are_judged_by_the_ground_that_shows_them():
+    """Where most ground has nothing to gain, the rest is compared with itself; one piece of ground says nothing of others."""
+    gains, shown = np.array([20.0, 22, 18, 21, *np.zeros(12)]), np.array([1.0, 1, 1, 1, *np.zeros(12)])
+    assert interval(gains, shown)[0] > 70 > interval(gains)[0]
+    assert interval(gains[:3], np.array([1.0, 0.01, 0.01]))[0] == -math.inf
 
 
 def test_a_fit_that_ends_beside_a_bound_is_nothing_real():

@@ -43,10 +43,13 @@ def test_shadow_counts_where_the_sun_is_too_low_to_judge_lit_ground():
     """Most deep shadow is in images that show nothing else that is judged: a pedestal is seen there, at once and exactly."""
     chain = _chain()
     (patch,) = make_patches(0, chain, 1, free=False)
-    assert patch.frames.tolist() == [3] and patch.dark_frames.tolist() == [5]
+    assert patch.frames.tolist() == [3] and set(patch.dark_frames.tolist()) == {5}
     brightness = 0.3 * 0.05 * math.sin(LOW)  # what residuals of darker pixels are relative to
     fields = (chain.site.image - chain.predict())[None]
-    assert patch.shadow(fields).numpy() == pytest.approx(np.array([[0.0004 / brightness]]), rel=1e-4)
+    shadow = patch.shadow(fields)[0]
+    assert len(shadow) == 32 and shadow.numpy() == pytest.approx(
+        0.0004 / brightness, rel=1e-4
+    )  # cells of 8 px of one half
     assert not len(make_patches(0, chain, 1, free=True)[0].shaded)  # beside a free offset it says nothing
 
 
@@ -63,6 +66,12 @@ def test_shadow_of_an_image_left_out_is_left_out():
     dark = patch.shadow(fields).double()
     assert np.allclose(made.images[0], (dark @ dark.T).numpy()) and np.allclose(made.shade, made.images[0])
     assert np.allclose(made.gram, made.images[0] + made.images[1])
+    own = Covariance.white(grid.annuli, 6)
+    own.dark_own = 0.04
+    light = products(rows, own, grid, 6, None, [[5], [3]])
+    assert light.place[-1] == 2 + 5  # light of its own of the sixth image, after the residual and one column
+    assert light.gram[-1, -1] == pytest.approx(0.04 * 32) and np.allclose(light.gram[-1, :2], 0.2 * dark.sum(1))
+    assert np.allclose(light.without(0).gram[-1], 0) and np.allclose(light.without(1).gram[-1], light.gram[-1])
     white = [(z[0], mean[0], torch.tensor([2.0])), (z[0], mean[0], torch.zeros(0))]
     for _, _, sham in make_shams(white, grid, 3, 0)[:1]:
         assert sham.abs().tolist() == [[2.0]] * 3

@@ -113,7 +113,7 @@ def test_leaving_out_images_is_leaving_out_their_rows(answers):
     kept = torch.tensor([int(f) not in gone for f in row.patch.frames])
     lighter = torch.tensor([int(f) not in gone for f in row.patch.dark_frames], dtype=torch.bool)
     of_patch = {"images": kept, "weight": kept, "scale": kept, "slopes": kept, "level": kept, "frames": kept}
-    of_patch |= {"shaded": lighter, "dark_frames": lighter, "dark": lighter}
+    of_patch |= {"dark_frames": lighter}
     patch = replace(row.patch, **{name: getattr(row.patch, name)[used] for name, used in of_patch.items()})
     of_rows = {"shared": kept, "shared_mean": kept, "own": kept, "own_mean": kept, "shared_dark": lighter}
     fewer = Rows(patch, **{name: getattr(row, name)[:, used] for name, used in of_rows.items()})

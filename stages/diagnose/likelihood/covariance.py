@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from stages.diagnose.rows.patches import Grid, Patch
-from stages.diagnose.settings import ADDED, BORROWED, ROUNDS, SECTORS
+from stages.diagnose.settings import ADDED, BORROWED, DARKEST, ROUNDS, SECTORS
 
 
 @dataclass
@@ -31,7 +31,9 @@ class Covariance:
     mean_albedo: float
     mean_relief: float
     mean_own: float
-    dark: float = 1.0  # of a piece's mean in deep shadow, about what light explains
+    dark: float = 1.0  # of the mean of a cell of deep shadow, about its piece's
+    dark_piece: float = 0.0  # of the mean of a piece's cells in one image, about what light explains
+    dark_own: float = 0.0  # of light that falls into all deep shadow of one image alone, stray light say
     dark_rest: dict[int, Tensor] = field(default_factory=dict)  # ... and what it leaves of a patch's (by its number)
     level: Tensor | None = None
     size: dict[int, float] = field(default_factory=dict)  # of a patch (by its number), times the above
@@ -58,6 +60,12 @@ class Covariance:
         g = patch.slopes.double()
         own = torch.eye(len(g), dtype=torch.float64) * self.mean_own
         return (self.mean_albedo + self.mean_relief * (g @ g.T) + own) * self.mean_size.get(patch.number, 1.0)
+
+    def dark_root(self, patch: Patch) -> Tensor:
+        """(s, s) lower Cholesky factor of the covariance of the cells of deep shadow; those of different images are independent."""
+        of = patch.dark_frames
+        same = (of[:, None] == of).double()
+        return torch.linalg.cholesky(self.dark_piece * same + self.dark * torch.eye(len(of), dtype=torch.float64))
 
 
 def estimate(patches: Sequence[Patch], rows: Sequence[tuple[Tensor, Tensor]], grid: Grid, frames: int) -> Covariance:
@@ -127,22 +135,39 @@ def estimate(patches: Sequence[Patch], rows: Sequence[tuple[Tensor, Tensor]], gr
     return model
 
 
-def shadow_variance(residuals: Sequence[Tensor], light: Sequence[Tensor]) -> tuple[list[Tensor], float]:
-    """Of the means in deep shadow (s,) of every patch, what no light that falls there explains, and its variance; light : (L, s) of every
-    kind, which is no noise.
+def shadow_variance(
+    model: Covariance, patches: Sequence[Patch], residuals: Sequence[Tensor], light: Sequence[Tensor]
+) -> None:
+    """Set the variances of means in deep shadow, of which relief that the DEM has not lights some, and what light leaves of them.
 
-    One value more is taken to lie as far off as they all do from nothing: few that agree by chance are not exact.
+    residuals : (s,) of every patch; light : (L, s) of every kind that falls there, which is no noise. Pieces differ at least as the cells within one.
     """
-    values, columns = torch.cat(list(residuals)).double(), torch.cat(list(light), 1).double().T
+    values, kinds = torch.cat(list(residuals)).double(), torch.cat(list(light), 1).double().T
     if not len(values):
-        return list(residuals), 1.0
-    rest = values
-    free = 0
-    if len(values) > 2 * columns.shape[1]:
-        free = int(torch.linalg.matrix_rank(columns))
-        rest = values - columns @ torch.linalg.lstsq(columns, values[:, None], driver="gelsd").solution[:, 0]
-    squares = rest.square().sum() + values.square().mean()
-    return list(rest.split([len(r) for r in residuals])), max(float(squares) / (len(values) + 1 - free), 1e-10)
+        return
+    frames = torch.cat([p.dark_frames for p in patches])
+    piece = torch.cat([torch.full_like(p.dark_frames, k) for k, p in enumerate(patches)])
+    images = (frames[:, None] == torch.unique(frames)).double()
+    _, block = torch.unique(torch.stack([piece, frames]), dim=1, return_inverse=True)
+    member = (block[:, None] == torch.arange(int(block.max()) + 1)).double()
+    share = member / member.sum(0)
+    blocks = member.shape[1]
+    about = values - member @ (share.T @ values)
+    rest, free = values, 0
+    for columns, asked in ((torch.cat([kinds, images], 1), 2), (images, 1)):  # each image may have light of its own
+        means = share.T @ columns
+        rank = int(torch.linalg.matrix_rank(means))
+        if blocks > asked * rank:
+            fitted = torch.linalg.lstsq(means, share.T @ values[:, None], driver="gelsd").solution
+            rest, free = values - (columns @ fitted)[:, 0], rank
+            about = rest - member @ (share.T @ rest)
+            break
+    several = len(values) - blocks
+    within = float(about.square().sum()) / several if several else 0.0
+    between = float((share.T @ rest).square().sum()) / (blocks - free) if free or not several else within
+    model.dark, model.dark_piece = max(within or between, 1e-10), max(within, between, 1e-10)
+    model.dark_rest = {p.number: r for p, r in zip(patches, rest.split([len(r) for r in residuals]), strict=True)}
+    model.dark_own = model.mean_own / DARKEST**2  # lit ground tells how much of their own images have
 
 
 def _unit_mean(sizes: dict[int, float]) -> dict[int, float]:

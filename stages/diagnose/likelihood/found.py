@@ -50,11 +50,13 @@ def interval(gains: Array, sizes: Array | None = None) -> tuple[float, float]:
 
     sizes : of the pieces, to which gains are in proportion but for chance (a ratio estimate: Cochran 1977, ch. 6); alike where None
     """
-    units = len(gains)
-    if units < 3:
+    if sizes is None or len(sizes) != len(gains):
+        sizes = np.ones(len(gains))
+    share = sizes / max(float(sizes.sum()), 1e-30)
+    units = 1 / max(float(share @ share), 1e-30)  # as many alike
+    if units < 2 or len(gains) < 3:
         return -math.inf, math.inf
     total = float(gains.sum())
-    share = np.full(units, 1 / units) if sizes is None or len(sizes) != units else sizes / sizes.sum()
     chance = gains - total * share
     half = student_quantile(units - 1) * math.sqrt(units / (units - 1) * float(chance @ chance))
     return total - half, total + half

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Rows:
-    """Coefficients and means of one patch, shared (1 + m, n, K) with the residual first, per frame (k, n, K); means in deep shadow (1 + m, s).
+    """Coefficients and means of one patch, shared (1 + m, n, K) with the residual first, per frame (k, n, K); means of cells of deep shadow (1 + m, s).
 
     What has a value per frame is in proportion to light, and brings none into the dark.
     """
@@ -42,7 +42,7 @@ class Products:
 
     shade : (1 + m, 1 + m) what deep shadow adds to ``gram`` of the shared columns
     images : for every group of images (M, M), what is gone from ``gram`` without them: the squares of these images given the others
-    The whole: residual, shared columns, then column by column the frames.
+    The whole: residual, shared columns, then column by column the frames, then the light of its own in the shadows of every frame.
     """
 
     gram: Array
@@ -68,7 +68,8 @@ def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> Residual:
     lower = torch.linalg.cholesky(model.mean_matrix(rows.patch))
     mean = torch.linalg.solve_triangular(lower, about[:, None], upper=False)
     dark = model.dark_rest.get(rows.patch.number, rows.shared_dark[0])
-    return white, mean[:, 0], dark / model.dark**0.5
+    dark = torch.linalg.solve_triangular(model.dark_root(rows.patch), dark.double()[:, None], upper=False)
+    return white, mean[:, 0], dark[:, 0]
 
 
 def _by_wave(z: Tensor) -> Tensor:
@@ -104,11 +105,17 @@ def products(
     every = torch.ones(len(patch.dark_frames), dtype=torch.float64)
     gram = columns.gram(factor, mean, every)
     m, k = len(rows.shared), len(rows.own)
-    place = np.concatenate([np.arange(m), (m + np.arange(k)[:, None] * frames + patch.frames.numpy()[None]).flatten()])
+    place = np.concatenate(
+        [
+            np.arange(m),
+            (m + np.arange(k)[:, None] * frames + patch.frames.numpy()[None]).flatten(),
+            m + k * frames + columns.own_dark_frames.numpy(),
+        ]
+    )
     sham, squares = np.zeros((len(place), 0)), np.zeros(0)
     if shams is not None:
         sham, squares = columns.beside(shams, factor, mean)
-    level = None if mean is None else _of_means(rows, mean, place, shams)
+    level = None if mean is None else _of_means(rows, mean, place[: m + k * len(patch.frames)], shams)
     parts = []
     for group in groups:
         gone, darker = (
@@ -119,7 +126,8 @@ def products(
         if bool(gone.any() | darker.any()):
             rest = None if mean is None else _given_others(mean[None], gone)[0]
             part = columns.gram(_given_others(factor, gone), rest, darker.double())
-            own = np.concatenate([np.zeros(m, bool), np.tile(gone.numpy(), k)])
+            light = np.isin(columns.own_dark_frames, group)
+            own = np.concatenate([np.zeros(m, bool), np.tile(gone.numpy(), k), light])
             part[own], part[:, own] = gram[own], gram[:, own]  # to the last bit: nothing is left of them
         parts.append(part)
     return Products(gram, place, sham, squares, patch.ground, patch.site, parts, level, columns.shade(every).numpy())
@@ -151,9 +159,15 @@ class _Columns:
     """
 
     def __init__(self, rows: Rows, model: Covariance, grid: Grid, often: bool) -> None:
-        self.rows, self.dark, self.of_wave = rows, model.dark**0.5, grid.bins
+        self.rows, self.of_wave = rows, grid.bins
         self.bins = torch.unique(grid.bins)
         self.k = len(rows.own)
+        # light of its own of every image, in units of its standard deviation
+        cells, root = rows.patch.dark_frames, model.dark_root(rows.patch)
+        self.dark = torch.linalg.solve_triangular(root, rows.shared_dark.double().T, upper=False).T
+        self.own_dark_frames = torch.unique(cells) if model.dark_own else cells[:0]
+        own = (self.own_dark_frames == cells[:, None]).double() * model.dark_own**0.5
+        self.own_dark = torch.linalg.solve_triangular(root, own, upper=False).T
         self.shared = _by_wave(rows.shared)
         self.own = _by_wave(rows.own)
         n = rows.own.shape[1]
@@ -198,12 +212,15 @@ class _Columns:
         dense += self.shade(shaded)
         top = torch.cat([dense, cross.flatten(1)], 1)
         low = torch.cat([cross.flatten(1).T, own.reshape(k * n, k * n)], 1)
-        return torch.cat([top, low]).numpy()
+        lit = torch.cat([top, low])
+        light = self.own_dark * shaded
+        across_light = torch.zeros(len(light), len(lit), dtype=torch.float64)
+        across_light[:, :m] = light @ self.dark.T
+        return torch.cat([torch.cat([lit, across_light.T], 1), torch.cat([across_light, light @ light.T], 1)]).numpy()
 
     def shade(self, shaded: Tensor) -> Tensor:
         """(1 + m, 1 + m) of the shared columns' means in deep shadow; shaded : (s,) 1 where it counts."""
-        shadow = self.rows.shared_dark.double() * shaded / self.dark
-        return shadow @ shadow.T
+        return (self.dark * shaded) @ self.dark.T
 
     def beside(self, shams: Residual, factor: Tensor, mean: Tensor | None) -> tuple[Array, Array]:
         """Products (M, R) of all columns with whitened sham residuals, and the squares of these, (R,)."""
@@ -212,7 +229,7 @@ class _Columns:
         by_wave = factor[self.of_wave].to(self.shared.dtype)
         white, sham = by_wave @ self.shared, _by_wave(z)
         first = _real_part(white.flatten(0, 1).T @ sham.flatten(0, 1), len(rows.shared)).double()
-        first += (rows.shared_dark.double() / self.dark) @ dark.double().T
+        first += self.dark @ dark.double().T
         back = by_wave.mT @ sham
         second = _real_part(self.own.permute(1, 2, 0) @ back.transpose(0, 1), self.k).double().transpose(0, 1)
         squares = (z.real.square() + z.imag.square()).sum((1, 2)).double()
@@ -220,7 +237,7 @@ class _Columns:
             first += rows.shared_mean.double() @ mean.T @ means.double().T
             second += torch.einsum("an,nr->anr", rows.own_mean.double(), mean.T @ means.double().T)
             squares += means.double().square().sum(1)
-        return torch.cat([first, second.flatten(0, 1)]).numpy(), squares.numpy()
+        return torch.cat([first, second.flatten(0, 1), self.own_dark @ dark.double().T]).numpy(), squares.numpy()
 
 
 def make_shams(white: Sequence[Residual], grid: Grid, count: int, seed: int) -> list[Residual]:

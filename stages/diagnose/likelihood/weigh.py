@@ -32,7 +32,9 @@ class Whole:
         self.drift: tuple[NDArray[np.int64], Array, Array] | None = None  # places, main directions, their scatter
         if drifting:
             self._let_coefficients_drift()
-        self.size = self.first + len(plan.per_frame) * frames
+        lit = self.first + len(plan.per_frame) * frames
+        self.own_light = lit + np.arange(frames)  # places of the light of its own in the shadows of every frame
+        self.size = lit + frames
         self.gram = np.zeros((self.size, self.size))
         shams = units[0].sham.shape[1]
         self.sham, self.sham_squares = np.zeros((self.size, shams)), np.zeros(shams)
@@ -106,7 +108,7 @@ class Whole:
 
     def gains_on(self, units: Sequence[Products], places: NDArray[np.int64], exclude: Sequence[int] = ()) -> Array:
         """(len(units),) nats that the columns gain on other ground, all that is fitted here taken over."""
-        n = self.nuisance([*places, *exclude])
+        n = self.nuisance([*places, *exclude, *self.own_light])
         every = np.concatenate([n, places])
         more = np.concatenate([self.weight(n), np.zeros(len(places))])
         b1, b0 = np.zeros(self.size), np.zeros(self.size)
@@ -136,7 +138,7 @@ class Whole:
         for k, sd in self.plan.frame_prior.items():
             for place in self.frame_places([k]):
                 out[int(place)] = sd**-2
-        return out
+        return out | {int(place): 1.0 for place in self.own_light if self.seen[place]}
 
     def nuisance(self, without: Sequence[int] = ()) -> NDArray[np.int64]:
         """Places of the nuisance, ``without`` some."""
@@ -290,11 +292,21 @@ class Whole:
         found = Found(guise.effect, guise, amount, error, float(best[0]) / 2 / math.log(10), spread=spread)
         return found, null / 2 / math.log(10)
 
+    def power(self, places: NDArray[np.int64], amount: Array) -> Array:
+        """(labels,) squares of these amounts on every piece of ground, to which what they gain is in proportion but for chance."""
+        every = np.zeros(self.size)
+        every[places] = amount
+        squares = [float(every[u.place] @ u.gram @ every[u.place]) for u in self.units]
+        return np.bincount(self.labels, weights=squares).astype(np.float64)
+
     def held_out(
         self, places: NDArray[np.int64], exclude: Sequence[int] = (), spread: float = 0.0, shade: bool = False
     ) -> Array:
-        """(labels,) nats that the columns gain on ground that they and the nuisance were not fitted to; ``shade``: in its deep shadow."""
-        n = self.nuisance([*places, *exclude])
+        """(labels,) nats that the columns gain on ground that they and the nuisance were not fitted to; ``shade``: in its deep shadow.
+
+        Beside light of its own in every image nothing is left to gain: other ground tells how much that is.
+        """
+        n = self.nuisance([*places, *exclude, *self.own_light])
         every = np.concatenate([n, places])
         precision = self.weight(n) + self._least(n)
         more = np.concatenate([precision, np.full(len(places), spread**-2 if spread else 0.0) + self._least(places)])

@@ -16,7 +16,7 @@ from stages.diagnose.registration.explain import OWN, Registration, lit_mask_rea
 from stages.diagnose.registration.forms import FORMS, TERMS
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CORRELATED, FOLDS, ROUNDS
+from stages.diagnose.settings import CORRELATED, FOLDS, ROUNDS, STILL
 from stages.effects import Effect, Survey, effect_names, get_effect
 from stages.effects.filters import gaussian
 
@@ -107,6 +107,8 @@ def _lines(state: State, r: Registration, name: str) -> tuple[Named | None, str]
         return None, ""
     plain = r.form.beside(waves=0)
     made = _named(effect, {"rms_px": (size, error, "px")}, r, plain.name, r.form.name)
+    if size < STILL * error:
+        return made, f"it comes out {size / error:.1f} errors from nothing"
     return made, r.doubt(plain.name, r.form.name, (plain.name, r.form.name))
 
 

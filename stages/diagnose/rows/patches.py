@@ -12,6 +12,7 @@ from torch import Tensor
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import lit_mask
 from stages.diagnose.settings import (
+    CELL,
     CLEAR,
     DARKEST,
     FEWEST_PIXELS,
@@ -86,8 +87,9 @@ class Patch:
     """One piece of one site. weight : (n, h, w) window on judged pixels; scale : (n, h, w), I/F that residuals are relative to
 
     images : (n,) which of the site's images; slopes : (n, 2) relative brightness per slope to the east and north
-    shaded, dark_frames : (s,) which of them show enough deep shadow, lit ground beside it or not
-    dark : (s, h, w) by which a field is multiplied to add up to its mean in deep shadow, relative to brightness
+    shaded : (d,) which of the site's images show deep shadow, lit ground beside it or not
+    dark_frames : (s,) of every cell of deep shadow
+    dark, cell : (d, h, w) by which a field is multiplied to add up to its means in the cells, relative to brightness; in which one a pixel is
     middle : (n, 2) line and sample of the detector that its middle falls on; in the crop where the detector is not known
     """
 
@@ -105,6 +107,7 @@ class Patch:
     shaded: Tensor
     dark_frames: Tensor
     dark: Tensor
+    cell: Tensor
     middle: Tensor
     free: bool  # gain and offset of every image
 
@@ -114,8 +117,10 @@ class Patch:
         return x
 
     def shadow(self, fields: Tensor) -> Tensor:
-        """Mean of relative fields (m, N, H, W) in deep shadow, (m, s)."""
-        return (fields[:, self.shaded, self.rows, self.columns] * self.dark).sum((-2, -1))
+        """Means of relative fields (m, N, H, W) in cells of deep shadow, (m, s)."""
+        pixels = fields[:, self.shaded, self.rows, self.columns] * self.dark
+        out = torch.zeros(len(fields), len(self.dark_frames), dtype=pixels.dtype)
+        return out.index_add_(1, self.cell.flatten(), pixels.flatten(1))
 
     def transform(self, fields: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
         """Fields (m, N, H, W) -> coefficients (m, n, K) complex and means (m, n)."""
@@ -206,10 +211,7 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
             bright = 1 / s
             bright = bright - ((bright * weight).sum((-2, -1)) / total)[:, None, None]
             frames = torch.from_numpy(chain.site.frames)
-            dark = deep[:, rows, columns].float()
-            count = dark.sum((-2, -1), keepdim=True)
-            shaded = torch.nonzero((count.flatten() >= SHADOWED) & (not free))[:, 0]
-            dark = (dark / (scale[:, rows, columns] * count.clamp(min=1)))[shaded]
+            shaded, of, dark, cell = _cells(deep[:, rows, columns] & (not free))
             out.append(
                 Patch(
                     (number * pieces + i) * pieces + j,
@@ -224,13 +226,31 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
                     bright,
                     frames[images],
                     shaded,
-                    frames[shaded],
-                    dark,
+                    frames[of],
+                    dark / scale[shaded, rows, columns],
+                    cell,
                     detector[images][:, :, rows, columns].nanmean((-2, -1)),
                     free,
                 )
             )
     return out
+
+
+def _cells(deep: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Cells in which an image shows enough deep shadow, (N, h, w) bool: images that have any, (d,); the image of each cell, (s,); (d, h, w)
+    shares of pixels in the mean of their cell, and in which one they are.
+    """
+    _, height, width = deep.shape
+    across = math.ceil(width / CELL)
+    place = (torch.arange(height) // CELL)[:, None] * across + torch.arange(width) // CELL
+    count = torch.zeros(len(deep), int(place.max()) + 1).index_add_(1, place.flatten(), deep.flatten(1).float())
+    enough = count >= SHADOWED
+    of = torch.nonzero(enough)[:, 0]
+    number = torch.zeros_like(count, dtype=torch.long)
+    number[enough] = torch.arange(len(of))
+    images = torch.unique(of)
+    share = deep.float() * (enough / count.clamp(min=1))[:, place]
+    return images, of, share[images], number[images][:, place]
 
 
 __all__ = ["Grid", "Patch", "judged", "make_grid", "make_patches"]

@@ -131,9 +131,13 @@ def errors_over_images(state: State, view: View) -> None:
         found = np.array([float(cause.effect.values[kept[k][1]]) - null[kept[k][1]] for k in own])
         along = found / np.array([max(cause.of_given_shape[kept[k][1]], 1e-30) for k in own]) ** 2
         shares = table[:, own] @ along / max(found @ along, 1e-30)
-        cause.share_error = float(jackknife_error(shares))
         away = np.abs(shares - np.median(shares))
         telling = int((away > TELLING * away.max()).sum())  # where few images show deep shadow, few tell of light in it
+        if telling < 3 and cause.effect.lights_shadows:
+            # what an image may have of its own is in the likelihood, and too few are left to see it
+            cause.over_images, cause.share_error = {}, 0.0
+            continue
+        cause.share_error = float(jackknife_error(shares))
         cause.share_freedom = max(telling - 1, 1)
 
 

@@ -78,7 +78,7 @@ def search(state: State, most: int) -> Outcome:
         for _ in range(TRIES):
             if not sure or taken or strange:
                 break
-            chosen, group = choose(sure)
+            chosen, group = choose(sure, tried)
             sure = [f for f in sure if f is not chosen]
             before = list(state.causes)
             why = may_be_another(view.whole, chosen, best, refused) or take(state, view, chosen, group)
@@ -132,11 +132,12 @@ def shows_in_shade(whole: Whole, found: Found) -> bool:
     if found.guise.per_frame:
         return False
     gains = whole.held_out(whole.places(found.guise), whole.exclude(found.guise), found.spread, shade=True)
-    return interval(gains)[0] > 0
+    return interval(gains, found.sizes)[0] > 0
 
 
-def choose(sure: list[Found]) -> tuple[Found, list[str]]:
-    """The best, or one with fewer values that gains nearly as much; and all that gain the same within their scatter.
+def choose(sure: list[Found], tried: Sequence[Found] = ()) -> tuple[Found, list[str]]:
+    """The best, or one with fewer values that gains nearly as much; and all that gain the same within their scatter, though these data
+    be not sure of what it is confused with. tried : all that have evidence
 
     Values per frame can mimic what one value for all does: where the two gain the same, the one value is the cause. So it is with
     several values beside fewer of what they are confused with: light from above alone is a pedestal.
@@ -148,8 +149,9 @@ def choose(sure: list[Found]) -> tuple[Found, list[str]]:
     alike = get_effect(best.effect).confused_with
     fewer = [f for f in sure if f.effect in alike and not f.guise.per_frame and len(f.amount) < len(best.amount)]
     best = max((f for f in fewer if best.more_than(f)[0] <= 0), key=lambda f: f.gain, default=best)
+    likely = [f for f in tried if f not in sure and f.gain > 0 and f.effect in get_effect(best.effect).confused_with]
     group = []
-    for f in sorted(sure, key=lambda f: -f.gain):
+    for f in sorted([*sure, *likely], key=lambda f: -f.gain):
         if f is best or best.more_than(f)[0] <= 0:
             group.append(f.effect)
     group.sort(key=lambda n: n != best.effect)
@@ -162,6 +164,10 @@ def judge(whole: Whole, found: Found) -> None:
     beside = whole.scattered.tolist() if found.beside else []
     without = [*whole.exclude(found.guise), *beside]
     found.gains, found.sizes = whole.held_out(whole.places(found.guise), without, found.spread), whole.sizes
+    if get_effect(found.effect).lights_shadows:
+        found.sizes = whole.power(
+            whole.places(found.guise), found.amount
+        )  # much ground has no shadow, and nothing to gain
 
 
 def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refused: Mapping[str, str]) -> str:
@@ -174,7 +180,7 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
                 return f"{other.effect}, of which {'there is an ordinary amount' if known else UNSURE}, explains as much of it"
 
     def sure(gains: np.ndarray) -> bool:
-        return interval(gains, whole.sizes)[0] > 0
+        return interval(gains, found.sizes)[0] > 0
 
     own = whole.ordinary_places(found.effect)
     if get_effect(found.effect).lights_shadows and not sure(whole.held_out(whole.places(found.guise), own)):
@@ -226,10 +232,10 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     state.causes.append(cause)
     look, why = _fit_beside(state, view, cause)
     if not why:
-        gains, total, test_gains = secant_gains(state, cause, look, tested)
-        low, high = interval(gains, cause.found.sizes)
+        gains, sizes, total, test_gains = secant_gains(state, cause, look, tested)
+        low, high = interval(gains, sizes)
         cause.gain_percent, cause.gain_low, cause.gain_high = (200 * x / total for x in (float(gains.sum()), low, high))
-        cause.found = dataclasses.replace(cause.found, gains=gains)
+        cause.found = dataclasses.replace(cause.found, gains=gains, sizes=sizes)
         if low <= 0:
             why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
         why = why or contradicted(test_gains)
@@ -333,9 +339,11 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     return ""
 
 
-def secant_gains(state: State, cause: Cause, look: View, before: View | None) -> tuple[np.ndarray, float, np.ndarray]:
-    """Nats that the cause, as it was rendered, gains beside everything else: on held-out ground, (labels,); the squares without it; its
-    gains on the test pairs, which are ``before`` as they were without it.
+def secant_gains(
+    state: State, cause: Cause, look: View, before: View | None
+) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    """Nats that the cause, as it was rendered, gains beside everything else: on held-out ground, and what they go with (labels,); the squares
+    without it; its gains on the test pairs, which are ``before`` as they were without it.
 
     Effects with many values keep the gain that their columns had on held-out ground: one amount for all would not be held out.
     """
@@ -353,7 +361,7 @@ def secant_gains(state: State, cause: Cause, look: View, before: View | None) ->
     whole = _beside(units, cause, look, state.frames)
     total = float(whole.gram[0, 0])
     if not cause.single:
-        return cause.found.gains, total, np.zeros(0)
+        return cause.found.gains, cause.found.sizes, total, np.zeros(0)
     form = whole.stood_for([type(cause.effect)])
     if cause.found.beside:
         form += (look.whole.scattered + 1).tolist()  # one shared column more
@@ -367,7 +375,8 @@ def secant_gains(state: State, cause: Cause, look: View, before: View | None) ->
     grounds = [u.ground for u in tested]
     if len(set(grounds)) >= 3:  # else pieces of ground, where there are too few grounds for an interval
         gains = np.bincount(grounds, weights=gains).astype(np.float64)
-    return whole.held_out(place, form), total, gains
+    shades = type(cause.effect).lights_shadows
+    return whole.held_out(place, form), whole.power(place, np.ones(1)) if shades else cause.found.sizes, total, gains
 
 
 def _few(rows: Rows, count: int) -> Rows:

@@ -255,8 +255,8 @@ class State:
         light = [
             1 + k for k, name in enumerate(plan.shared) if name in effect_names() and get_effect(name).lights_shadows
         ]
-        rest, model.dark = shadow_variance([r.shared_dark[0] for r in rows], [r.shared_dark[light] for r in rows])
-        model.dark_rest = {r.patch.number: d for r, d in zip(rows, rest, strict=True)}
+        residuals, lights = [r.shared_dark[0] for r in rows], [r.shared_dark[light] for r in rows]
+        shadow_variance(model, [r.patch for r in rows], residuals, lights)
         return model
 
     def without_images(self, view: View) -> list[Whole]:
