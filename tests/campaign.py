@@ -62,7 +62,15 @@ PLANTS: dict[str, dict] = {
 }
 PAIRED = ("phase_slope", "limb_darkening", "column_pattern", "image_gain", "line_jitter", "echo")
 LOOSE = {"opposition_surge": 0.3, "interreflection": 0.3}  # bars on parameters other than 10 %
-UNKNOWN = {"banding": {"amplitude": 0.01, "period": 7.0}, "ghost": {"share": 0.03}}
+UNKNOWN = {  # effects that the catalogue has not
+    "banding": {"amplitude": 0.01, "period": 7.0},
+    "ghost": {"share": 0.03},
+    "hot_columns": {"share": 0.02, "every": 8},
+    "motion": {"px": 3},
+    "stray_light": {"share": 0.1, "px": 12.0},
+    "blooming": {"above": 1.3, "share": 0.5, "px": 9},
+    "compression": {"step": 0.03},
+}
 
 
 def random_world(rng: np.random.Generator) -> dict:
@@ -170,6 +178,7 @@ def summarise(cases: list[dict]) -> str:
     wrong = [c for c in strange if c["answer"]["causes"]]
     lines.append(f"| outside the catalogue: `unexplained` | {_share(len(said), len(strange))} |")
     lines.append(f"| outside the catalogue: a name | {_share(len(wrong), len(strange))} |")
+    lines += [f"| ... {_of_unknown(name, strange)}" for name in UNKNOWN if any(name in c["planted"] for c in strange)]
     seconds = [c["seconds"] for c in cases]
     lines.append(f"| seconds per diagnosis, median / largest | {np.median(seconds):.1f} / {max(seconds):.1f} |")
     lines += [
@@ -211,6 +220,14 @@ def _by_world(cases: list[dict]) -> list[str]:
         shares += [_share(len(part), len(single)) for part in (right, wrong, more, denied)]
         lines.append(f"| {world} | {' | '.join(shares)} |")
     return lines
+
+
+def _of_unknown(name: str, strange: list[dict]) -> str:
+    mine = [c for c in strange if name in c["planted"]]
+    named = Counter(x["effect"] for c in mine for x in c["answer"]["causes"])
+    said = sum(c["answer"]["verdict"] == "unexplained" for c in mine)
+    fid = " ".join(f"{c['fid']:.2f}" for c in mine)
+    return f"`{name}`, {fid} of the noise: `unexplained`; names | {said} of {len(mine)}; {dict(named)} |"
 
 
 def _strength(c: dict) -> float:
@@ -306,8 +323,11 @@ def draw_jobs(rng: np.random.Generator, layout: Layout, options: argparse.Namesp
         key = next(iter(values))
         strengths = [1.0] if effect == "saturation" else options.strengths  # a level, not a size
         jobs += [{effect: {**values, key: values[key] * s}} for s in strengths for _ in range(options.plants)]
+    unknown = list(UNKNOWN)
+    if options.draw or options.only is not None:
+        unknown = rng.choice(unknown, options.unknown, replace=False).tolist() if options.unknown else []
+    jobs += [{k: UNKNOWN[k]} for k in unknown for _ in range(options.plants)]
     if options.only is None and not options.draw:
-        jobs += [{k: v} for k, v in UNKNOWN.items() for _ in range(options.plants)]
         for _ in range(options.doubles):
             jobs.append({str(k): PLANTS[str(k)] for k in rng.choice(PAIRED, 2, replace=False)})
     return [(int(rng.integers(2**31)), job) for job in jobs]
@@ -364,6 +384,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--only", nargs="*", default=None, help="effects; none for nulls alone")
     parser.add_argument("--draw", type=int, default=0, help="effects per scene, drawn from these; 0 for all")
+    parser.add_argument("--unknown", type=int, default=0, help="beside --draw or --only: so many that no catalogue has")
     parser.add_argument(
         "--laws",
         nargs="+",

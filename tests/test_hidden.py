@@ -6,8 +6,11 @@ import ast
 
 import numpy as np
 import pytest
+from campaign import UNKNOWN
 from conftest import ROOT
 from hidden import departures, laws, sensor
+from hidden.faults import FAULTS
+from scipy.ndimage import gaussian_filter
 
 
 def test_hidden_data_import_nothing_of_the_program():
@@ -50,3 +53,14 @@ def test_veil_is_broad_and_its_own_in_every_image():
     assert first.std() == pytest.approx(0.02, rel=0.02)
     assert np.abs(np.diff(first)).mean() < 0.15 * first.std()
     assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.3
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_that_the_catalogue_has_not_keep_the_light(name):
+    """They change images by as much as planted and leave their mean alone but for what is read twice."""
+    rng = np.random.default_rng(4)
+    signal = 0.05 * (1 + 0.2 * gaussian_filter(rng.normal(size=(97, 97)), 2, mode="wrap") / 0.14)
+    changed = FAULTS[name](signal.copy(), np.arange(97) + 2500.0, np.arange(97) + 10.0, **UNKNOWN[name])
+    assert changed.shape == signal.shape and not np.array_equal(changed, signal)
+    assert 0.001 < np.abs(changed / signal - 1).mean() < 0.1
+    assert changed.mean() == pytest.approx(signal.mean(), rel=0.005)

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from hidden.departures import FORMS, factor
+from hidden.faults import FAULTS
 from hidden.laws import LAWS, roughness
 from hidden.layers import SUN_RADIUS_DEG, Ground
 from hidden.sensor import Detector, Pose, shoot
@@ -371,8 +372,7 @@ class Scene:
                 return rms * wave[0] @ basis / norm, rms * wave[1] @ basis / norm
 
             camera.warp = warp
-        if "banding" in effect:
-            camera.banding = (effect["banding"]["amplitude"], effect["banding"]["period"])
+        camera.faults = {name: values for name, values in effect.items() if name in FAULTS}
         if "ghost" in effect:
             cy, cx = rng.uniform(-0.3, 0.3, 2) * self.layout.size
             width, share = self.layout.size / 6, effect["ghost"]["share"]

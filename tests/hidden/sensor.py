@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter
 
+from hidden.faults import FAULTS, LAST
+
 
 @dataclass
 class Detector:
@@ -28,8 +30,8 @@ class Detector:
     smear: tuple[float, int, int] | None = None  # share, lag, axis
     response: Any = None  # function of sample
     level: float = np.inf
-    banding: tuple[float, float] | None = None  # relative amplitude, period in lines: not in the catalogue
     ghost: Any = None  # function (sample, line) -> share of the mean signal: not in the catalogue
+    faults: dict[str, dict[str, Any]] = field(default_factory=dict)  # name -> values: none is in the catalogue
     warp: Any = None  # function line -> (samples, lines) that the platform moved
 
 
@@ -81,6 +83,9 @@ def expose(rng, seen: np.ndarray, pose: Pose, camera: Detector) -> np.ndarray:
     signal = seen
     if camera.blur_sigma > 0:
         signal = gaussian_filter(signal, camera.blur_sigma, mode="nearest")
+    for name, values in camera.faults.items():
+        if name not in LAST:
+            signal = FAULTS[name](signal, samples, lines, **values)
     if camera.ghost is not None:
         signal = signal + signal.mean() * camera.ghost(samples[None], lines[:, None])
     signal = signal * camera.gain
@@ -106,9 +111,9 @@ def expose(rng, seen: np.ndarray, pose: Pose, camera: Detector) -> np.ndarray:
         electrons = mean * np.sign(electrons) * (np.abs(electrons) / mean) ** (1 + camera.gamma)
     if camera.quadratic:
         electrons = electrons + camera.quadratic * electrons**2
-    if camera.banding is not None:
-        amplitude, period = camera.banding
-        electrons = electrons * (1 + amplitude * np.sin(2 * np.pi * lines / period))[:, None]
+    for name, values in camera.faults.items():
+        if name in LAST:
+            electrons = FAULTS[name](electrons, samples, lines, **values)
     electrons = np.minimum(electrons, camera.level) + camera.bias
     # companded to the bits of the link, as most flight cameras do: steps grow with the root of the signal
     steps = 2**camera.bits / 4
