@@ -20,19 +20,24 @@ from stages.diagnose.rows.patches import make_grid
 SIZE, FRAMES = 32, 6
 
 
-def rows(field: float, seed: int, apart: float = 0.0) -> list[Rows]:
-    """White residuals of six images on eight grounds, and a broad field of its own in each image; apart : px between grounds on the detector."""
+def rows(field: float, seed: int, apart: float = 0.0, grounds: int = 8, albedo: float = 0.0) -> list[Rows]:
+    """White residuals of six images on some grounds, and a broad field of its own in each image; apart : px between grounds on the detector.
+
+    albedo : of a slope of brightness that all images of a ground share
+    """
     rng = np.random.default_rng(seed)
     grid = make_grid(SIZE, SIZE)
     y, x = np.mgrid[0:SIZE, 0:SIZE] / SIZE - 0.5
     fields = [field * (a * x + b * y) for a, b in rng.normal(0, 1, (FRAMES, 2))]
     out = []
-    for ground in range(8):
-        images = torch.tensor(np.stack([f + rng.normal(0, 1, f.shape) for f in fields]))
+    for ground in range(grounds):
+        a, b = albedo * rng.normal(0, 1, 2)
+        images = torch.tensor(np.stack([f + a * x + b * y + rng.normal(0, 1, f.shape) for f in fields]))
         z = torch.fft.rfft2(images).flatten(-2)[:, grid.keep] * grid.root
         patch = SimpleNamespace(
             number=ground, ground=ground, frames=torch.arange(FRAMES), slopes=torch.zeros(FRAMES, 2),
             weight=torch.ones(FRAMES, SIZE, SIZE), middle=torch.full((FRAMES, 2), apart * ground),
+            dark_frames=torch.zeros(0, dtype=torch.long),
         )  # fmt: skip
         none = torch.zeros(1, FRAMES)
         out.append(Rows(patch, z.to(torch.complex64)[None], none, z[:0], none[:0], torch.zeros(1, 0)))
@@ -48,6 +53,16 @@ def test_a_field_of_its_own_is_seen_where_ground_falls_on_the_same_part_of_the_d
     share, low = field_of_images(rows(1.5, 1), model, grid)
     assert 0 < low < share
     assert field_of_images(rows(1.5, 1, apart=SIZE), model, grid) == (0.0, 0.0)
+
+
+def test_ground_that_is_alike_by_chance_is_no_field_of_the_images():
+    """All images see the albedo of few grounds, which may be alike: what one ground shares with the others they share with it."""
+    grid = make_grid(SIZE, SIZE)
+    model = Covariance.white(grid.annuli, FRAMES)
+    found = [field_of_images(rows(0.0, seed, grounds=4, albedo=2.0), model, grid) for seed in range(60)]
+    assert sum(low > 0 for _, low in found) <= 5 and max(share for share, _ in found) > 0.2
+    found = [field_of_images(rows(2.0, seed, grounds=4), model, grid) for seed in range(10)]
+    assert sum(low > 0 for _, low in found) >= 8
 
 
 def test_many_values_are_as_far_from_nothing_as_chi_square_has_it():

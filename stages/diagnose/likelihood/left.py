@@ -12,8 +12,9 @@ from scipy.ndimage import median_filter
 from scipy.special import gammaincinv
 from torch import Tensor
 
+from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.covariance import Covariance
-from stages.diagnose.likelihood.found import interval
+from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.products import Rows, whitened_residual
 from stages.diagnose.likelihood.tails import surprise
 from stages.diagnose.rows.patches import Grid
@@ -55,7 +56,7 @@ def field_of_images(rows: list[Rows], model: Covariance, grid: Grid) -> tuple[fl
         z = z[:, broad] / size.clamp(min=1e-6).sqrt()[:, None]
         for k, frame in enumerate(row.patch.frames.tolist()):
             pieces.setdefault(frame, []).append((row.patch.ground, row.patch.middle[k], z[k]))
-    alike, squares = np.zeros(1 + max(r.patch.ground for r in rows)), 0.0
+    alike, squares = np.zeros((2, 1 + max(r.patch.ground for r in rows)))
     for every in pieces.values():
         ground = torch.tensor([piece[0] for piece in every])
         middle, z = torch.stack([piece[1] for piece in every]), torch.stack([piece[2] for piece in every])
@@ -64,10 +65,15 @@ def field_of_images(rows: list[Rows], model: Covariance, grid: Grid) -> tuple[fl
         count = others.real.sum(1)
         mean = others @ z / count.clamp(min=1)[:, None]
         np.add.at(alike, ground.numpy(), (z.conj() * mean).real.sum(1).double().numpy())
-        squares += float(z[count > 0].abs().square().sum())
-    if not squares:
+        np.add.at(squares, ground[count > 0].numpy(), z[count > 0].abs().square().sum(1).double().numpy())
+    alike, squares = alike[squares > 0], squares[squares > 0]
+    grounds = len(squares)
+    if grounds < 3:
         return 0.0, 0.0
-    return float(alike.sum()) / squares, interval(alike)[0] / squares
+    share = float(alike.sum() / squares.sum())
+    # every product is one of two pieces of ground: without one of them those that are left are fewer, and weigh more
+    without = (alike.sum() - 2 * alike) / (squares.sum() - squares) * (grounds - 1) / (grounds - 2)
+    return share, share - student_quantile(grounds - 1) * float(jackknife_error(without))
 
 
 def peak(rows: list[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[float, float]:
