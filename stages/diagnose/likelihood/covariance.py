@@ -148,23 +148,27 @@ def shadow_variance(
     frames = torch.cat([p.dark_frames for p in patches])
     piece = torch.cat([torch.full_like(p.dark_frames, k) for k, p in enumerate(patches)])
     images = (frames[:, None] == torch.unique(frames)).double()
-    _, block = torch.unique(torch.stack([piece, frames]), dim=1, return_inverse=True)
-    member = (block[:, None] == torch.arange(int(block.max()) + 1)).double()
-    share = member / member.sum(0)
-    blocks = member.shape[1]
-    about = values - member @ (share.T @ values)
+    _, block, cells = torch.unique(torch.stack([piece, frames]), dim=1, return_inverse=True, return_counts=True)
+    blocks = len(cells)
+
+    def means(x: Tensor) -> Tensor:
+        """Over the cells of a piece in one image."""
+        return torch.zeros(blocks, *x.shape[1:], dtype=x.dtype).index_add_(0, block, x) / cells.view(
+            -1, *[1] * (x.ndim - 1)
+        )
+
     rest, free = values, 0
     for columns, asked in ((torch.cat([kinds, images], 1), 2), (images, 1)):  # each image may have light of its own
-        means = share.T @ columns
-        rank = int(torch.linalg.matrix_rank(means))
+        of_pieces = means(columns)
+        rank = int(torch.linalg.matrix_rank(of_pieces))
         if blocks > asked * rank:
-            fitted = torch.linalg.lstsq(means, share.T @ values[:, None], driver="gelsd").solution
+            fitted = torch.linalg.lstsq(of_pieces, means(values)[:, None], driver="gelsd").solution
             rest, free = values - (columns @ fitted)[:, 0], rank
-            about = rest - member @ (share.T @ rest)
             break
+    about = rest - means(rest)[block]
     several = len(values) - blocks
     within = float(about.square().sum()) / several if several else 0.0
-    between = float((share.T @ rest).square().sum()) / (blocks - free) if free or not several else within
+    between = float(means(rest).square().sum()) / (blocks - free) if free or not several else within
     model.dark, model.dark_piece = max(within or between, 1e-10), max(within, between, 1e-10)
     model.dark_rest = {p.number: r for p, r in zip(patches, rest.split([len(r) for r in residuals]), strict=True)}
     model.dark_own = model.mean_own / DARKEST**2  # lit ground tells how much of their own images have
