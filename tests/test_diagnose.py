@@ -235,7 +235,8 @@ def test_images_that_are_cut_off_as_a_whole_are_clipping(monkeypatch):
 
 def test_one_amount_for_all_images_stands_for_the_gains_that_it_explains():
     """A pattern over images explains gains that follow it; gains that follow nothing stay what they are."""
-    from stages.diagnose.likelihood.weigh import Whole
+    from stages.diagnose.likelihood.weigh import beside_gains
+    from stages.diagnose.likelihood.whole import Whole
 
     rng = np.random.default_rng(4)
     azimuth = np.linspace(0, 2 * np.pi, 12, endpoint=False)
@@ -246,7 +247,7 @@ def test_one_amount_for_all_images_stands_for_the_gains_that_it_explains():
         whole = Whole.__new__(Whole)
         whole.scattered = np.arange(2, 14)
         whole.reduce = lambda places, exclude, seen=seen: (columns.T @ columns, columns.T @ seen, None, None)
-        nats, spread, instead = whole._beside_gains(np.arange(2), [])
+        nats, spread, instead = beside_gains(whole, np.arange(2), [])
         assert (instead is not None) == stands
         if stands:
             assert instead == pytest.approx([2.0, 1.0], abs=0.3) and spread < 0.3 and nats > 100

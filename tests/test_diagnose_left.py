@@ -13,7 +13,7 @@ from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.left import field_of_images
 from stages.diagnose.likelihood.products import Products, Rows
 from stages.diagnose.likelihood.tails import together
-from stages.diagnose.likelihood.weigh import Whole
+from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.rows.columns import Plan
 from stages.diagnose.rows.patches import make_grid
 

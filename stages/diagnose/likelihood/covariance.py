@@ -153,9 +153,8 @@ def shadow_variance(
 
     def means(x: Tensor) -> Tensor:
         """Over the cells of a piece in one image."""
-        return torch.zeros(blocks, *x.shape[1:], dtype=x.dtype).index_add_(0, block, x) / cells.view(
-            -1, *[1] * (x.ndim - 1)
-        )
+        summed = torch.zeros(blocks, *x.shape[1:], dtype=x.dtype).index_add_(0, block, x)
+        return torch.einsum("b...,b->b...", summed, 1 / cells.to(x.dtype))
 
     rest, free = values, 0
     for columns, asked in ((torch.cat([kinds, images], 1), 2), (images, 1)):  # each image may have light of its own

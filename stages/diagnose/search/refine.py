@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from stages.diagnose.likelihood.jackknife import jackknife_error
-from stages.diagnose.likelihood.weigh import Whole
+from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import LONGEST, SETTLED, SHORTEST, STEPS
 from stages.effects import Survey, get_effect

@@ -15,7 +15,8 @@ from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.likelihood.products import Products, Rows, products
 from stages.diagnose.likelihood.tails import together
-from stages.diagnose.likelihood.weigh import Whole, weigh_all
+from stages.diagnose.likelihood.weigh import weigh_all
+from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle
 from stages.diagnose.search.state import Cause, State, View
@@ -164,10 +165,8 @@ def judge(whole: Whole, found: Found) -> None:
     beside = whole.scattered.tolist() if found.beside else []
     without = [*whole.exclude(found.guise), *beside]
     found.gains, found.sizes = whole.held_out(whole.places(found.guise), without, found.spread), whole.sizes
-    if get_effect(found.effect).lights_shadows:
-        found.sizes = whole.power(
-            whole.places(found.guise), found.amount
-        )  # much ground has no shadow, and nothing to gain
+    if get_effect(found.effect).lights_shadows:  # much ground has no shadow, and nothing to gain
+        found.sizes = whole.power(whole.places(found.guise), found.amount)
 
 
 def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refused: Mapping[str, str]) -> str:

@@ -14,7 +14,7 @@ from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_v
 from stages.diagnose.likelihood.dem_errors import kept_share
 from stages.diagnose.likelihood.found import Found
 from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
-from stages.diagnose.likelihood.weigh import Whole
+from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import may_be_exchanged, measured_laws
 from stages.diagnose.model.nominal import Nominal, fit
