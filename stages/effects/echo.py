@@ -62,7 +62,8 @@ class Echo(Effect):
         source = state.image
         # the DEM does not know where shadows end as well as the image does, whose resampling, though, blurs near by
         if state.measured is not None and abs(float(lag)) >= CLEAR_LAG:
-            source = torch.where(state.measured.isfinite(), state.measured, source)
+            measured = state.measured()
+            source = torch.where(measured.isfinite(), measured, source)
         repeated = displace(source, -(lag * step[:, 0])[:, None, None], -(lag * step[:, 1])[:, None, None])
         state.image = state.image + self.value("fraction", state) * repeated
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -49,8 +50,18 @@ def filtered(image: Tensor, gain: Callable[[Tensor], Tensor], slopes: bool = Fal
 
 def fine(image: Tensor, mask: Tensor, sigma: float) -> Tensor:
     """The image (..., H, W) less its Gaussian mean over ``sigma`` px of valid pixels, 0 where invalid; mask : broadcastable to it."""
-    share = gaussian(mask, sigma**2).clamp(min=1e-3)
-    return (image - gaussian(image * mask, sigma**2) / share) * mask
+    down, across = (blur_matrix(count, sigma).to(image.dtype) for count in image.shape[-2:])
+    share = (down @ mask @ across.T).clamp(min=1e-3)
+    return (image - down @ (image * mask) @ across.T / share) * mask
+
+
+@lru_cache(maxsize=8)
+def blur_matrix(count: int, sigma: float) -> Tensor:
+    """(count, count) by which a Gaussian of ``sigma`` px blurs one axis, mirrored at its borders: two products are faster than a transform."""
+    distance = torch.arange(count)[:, None] - torch.arange(-count, 2 * count)
+    kernel = torch.exp(-0.5 * (distance / sigma).square().clamp(max=60.0))  # smaller numbers would be denormal, and slow
+    before, here, after = (kernel / kernel.sum(1, keepdim=True)).split(count, 1)
+    return here + before.flip(1) + after.flip(1)
 
 
 def plane(heights: Tensor) -> Tensor:

@@ -73,14 +73,8 @@ def whitened_residual(rows: Rows, model: Covariance, grid: Grid) -> Residual:
 
 
 def _by_wave(z: Tensor) -> Tensor:
-    """(m, n, K) complex as (K, n, 2 m): real parts, then imaginary ones."""
-    return torch.cat([z.real, z.imag]).permute(2, 1, 0).contiguous()
-
-
-def _real_part(products: Tensor, count: int) -> Tensor:
-    """Of (..., 2 m, 2 k) products of real and imaginary parts, the real part of the Hermitian ones, (..., m, k); ``count`` is m."""
-    width = products.shape[-1] // 2
-    return products[..., :count, :width] + products[..., count:, width:]
+    """(m, n, K) complex as (2 K, n, m): real parts of all waves, then imaginary ones."""
+    return torch.cat([z.real, z.imag], -1).permute(2, 1, 0).contiguous()
 
 
 def _factor(model: Covariance, patch: Patch, grid: Grid) -> Tensor:
@@ -155,11 +149,11 @@ def _given_others(factor: Tensor, gone: Tensor) -> Tensor:
 class _Columns:
     """The columns of one patch, ready for products under several weights.
 
-    Real and imaginary parts of a column stand side by side, (K, n, 2 m): a product over waves and images is one matrix product.
+    Real and imaginary parts count as waves of their own, (2 K, n, m): a product over waves and images is one matrix product.
     """
 
     def __init__(self, rows: Rows, model: Covariance, grid: Grid, often: bool) -> None:
-        self.rows, self.of_wave = rows, grid.bins
+        self.rows, self.of_wave = rows, grid.bins.repeat(2)
         self.bins = torch.unique(grid.bins)
         self.k = len(rows.own)
         # light of its own of every image, in units of its standard deviation
@@ -192,7 +186,7 @@ class _Columns:
         n, m = factor.shape[-1], len(rows.shared)
         by_wave = factor[self.of_wave].to(self.shared.dtype)
         white = by_wave @ self.shared
-        dense = _real_part(white.flatten(0, 1).T @ white.flatten(0, 1), m).double()
+        dense = (white.flatten(0, 1).T @ white.flatten(0, 1)).double()
         cross = torch.zeros(m, k, n, dtype=torch.float64)
         own = torch.zeros(k, n, k, n, dtype=torch.float64)
         if k:
@@ -201,9 +195,8 @@ class _Columns:
             if len(self.across):
                 cross = torch.einsum("bmrkn,brn->mkn", self.across, precision)
             else:
-                back = (by_wave.mT @ white).transpose(0, 1)  # (n, K, 2 m)
-                products = back.mT @ self.own.transpose(0, 1)  # (n, 2 m, 2 k)
-                cross = _real_part(products, m).double().permute(1, 2, 0)
+                back = (by_wave.mT @ white).transpose(0, 1)  # (n, 2 K, m)
+                cross = (back.mT @ self.own.transpose(0, 1)).double().permute(1, 2, 0)
         if mean is not None:
             shared, others = rows.shared_mean.double() @ mean.T, mean.T @ mean
             dense += shared @ shared.T
@@ -228,10 +221,10 @@ class _Columns:
         z, means, dark = shams
         by_wave = factor[self.of_wave].to(self.shared.dtype)
         white, sham = by_wave @ self.shared, _by_wave(z)
-        first = _real_part(white.flatten(0, 1).T @ sham.flatten(0, 1), len(rows.shared)).double()
+        first = (white.flatten(0, 1).T @ sham.flatten(0, 1)).double()
         first += self.dark @ dark.double().T
         back = by_wave.mT @ sham
-        second = _real_part(self.own.permute(1, 2, 0) @ back.transpose(0, 1), self.k).double().transpose(0, 1)
+        second = (self.own.permute(1, 2, 0) @ back.transpose(0, 1)).double().transpose(0, 1)
         squares = (z.real.square() + z.imag.square()).sum((1, 2)).double()
         if mean is not None:
             first += rows.shared_mean.double() @ mean.T @ means.double().T

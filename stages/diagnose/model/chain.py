@@ -27,8 +27,8 @@ SCATTER = 0.14  # 8 deg: rms slope of relief below a typical DEM's resolution
 class Chain:
     """Renders a site with the effects named so far (``base``) plus one more.
 
-    coefficients : broadcastable to (n, C, H, W). moved : effects that the site's images are rid of; free : coefficients
-    that may move, None for all; laws : the directions in which the law may be another one
+    coefficients : broadcastable to (n, C, H, W); free : those that may move, None for all
+    laws : the directions in which the law may be another one; known : a chain of this site, whose angles and reflectance are taken over where they are the same
     """
 
     def __init__(
@@ -37,16 +37,20 @@ class Chain:
         model: ReflectanceModel,
         coefficients: Tensor,
         base: Sequence[Effect],
-        moved: Sequence[Effect] = (),
         free: Tensor | None = None,
         laws: LunarLaws | None = None,
+        known: Chain | None = None,
     ) -> None:
         self.site, self.model, self.coefficients, self.base = site, model, coefficients, list(base)
-        self.moved = list(moved)
         self.free, self.laws = free, laws
-        self._sharp = SharpSlopes(site.observation.gsd, site.observation.body_radius)
-        self._state = self._illuminate(self.base)
-        self._state.reflectance = self._surface(self._state)
+        self._sharp = known._sharp if known else SharpSlopes(site.observation.gsd, site.observation.body_radius)
+        self._state = self._illuminate(self.base, known._state if known else None)
+        alike = known is not None and known.model is model and torch.equal(known.coefficients, coefficients)
+        if known is not None and alike and self._state.angles is known._state.angles:
+            self._state.reflectance, self._tilted = known._state.reflectance, known._tilted
+        else:
+            self._state.reflectance = self._surface(self._state)
+            self._tilted: dict[tuple[float, float], Tensor] = {}  # (n, H, W) reflectance at other slopes, by how much
         self.rendered = self.render()
 
     @property
@@ -67,7 +71,7 @@ class Chain:
         state = copy.copy(state)
         state.further_light = list(state.further_light)
         state.reflectance, state.albedo = reflectance, lambda: self._albedo
-        state.measured = self._measured if measured else None
+        state.measured = (lambda: self._measured) if measured else None
         state.law_fitted = True
         return formation.expose(state, effects)
 
@@ -163,13 +167,20 @@ class Chain:
     @cached_property
     def slope_tangents(self) -> tuple[Tensor, Tensor]:
         """d image / d slope to the east and to the north: how an error of the DEM shows in every image."""
+        east, north = (self._with_slopes(*by) for by in ((STEP, 0.0), (0.0, STEP)))
+        return (east - self.rendered) / STEP, (north - self.rendered) / STEP
+
+    def _with_slopes(self, more_east: float, more_north: float) -> Tensor:
+        """(n, H, W) I/F with all slopes changed by so much."""
+        by = more_east, more_north
         east, north = self._state.slopes
-        out = []
-        for de, dn in ((STEP, 0.0), (0.0, STEP)):
-            state = copy.copy(self._state)
-            state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
-            out.append((self._expose(state, self._surface(state), self.base) - self.rendered) / STEP)
-        return out[0], out[1]
+        state = copy.copy(self._state)
+        state.angles = geometry.photometric_angles(
+            east + more_east, north + more_north, state.sun_direction, state.view
+        )
+        if by not in self._tilted:
+            self._tilted[by] = self._surface(state)
+        return self._expose(state, self._tilted[by], self.base)
 
     def sunlight(self, effects: Sequence[Effect]) -> tuple[Tensor, Tensor | None, Tensor]:
         """Elevation of the Sun (n,), terrain horizon (n, H, W) and radius of the disc, rad, with these effects of the illumination beside the base."""
@@ -181,13 +192,8 @@ class Chain:
 
     def unresolved_slopes(self) -> Tensor:
         """What a scatter of slopes within a pixel, or of the DEM's own slopes, does to the mean: its second order."""
-        east, north = self._state.slopes
-        out = -self.rendered.clone()
-        for de, dn in ((SCATTER, 0.0), (-SCATTER, 0.0), (0.0, SCATTER), (0.0, -SCATTER)):
-            state = copy.copy(self._state)
-            state.angles = geometry.photometric_angles(east + de, north + dn, state.sun_direction, state.view)
-            out += 0.25 * self._expose(state, self._surface(state), self.base)
-        return out
+        ways = (SCATTER, 0.0), (-SCATTER, 0.0), (0.0, SCATTER), (0.0, -SCATTER)
+        return 0.25 * sum((self._with_slopes(*by) for by in ways), start=-4 * self.rendered)
 
     def without_dem_errors(self, kept: Callable[[Tensor], Tensor]) -> Tensor:
         """What the rendering changes by if of the DEM's waves only a share is relief, (n, H, W); ``kept``: of wave numbers, rad/px."""

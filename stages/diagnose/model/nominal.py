@@ -38,6 +38,7 @@ class Nominal:
     predictor: Any = None
     laws: LunarLaws | None = None  # the directions in which the law may be another one
     maps: dict[int, Tensor] = field(default_factory=dict)  # what the network says of each site
+    latest: dict[int, Chain] = field(default_factory=dict)  # of each site (by its identity)
 
     def coefficients(self, site: Site) -> Tensor:
         """(1 or n, C, 1 or H, 1 or W)"""
@@ -48,10 +49,12 @@ class Nominal:
             self.maps[site.number] = self.predictor.coefficients(site.observation.elevation[:1])
         return self.maps[site.number] * vector
 
-    def chain(self, site: Site, base: Sequence[Effect], moved: Sequence[Effect] = ()) -> Chain:
+    def chain(self, site: Site, base: Sequence[Effect]) -> Chain:
         """The formation chain of one site with these effects."""
         free = self.free if self.predictor is None else None  # maps may still drift
-        return Chain(site, self.model, self.coefficients(site), base, moved, free, self.laws)
+        chain = Chain(site, self.model, self.coefficients(site), base, free, self.laws, self.latest.get(id(site)))
+        self.latest[id(site)] = chain
+        return chain
 
 
 def load_nominal(checkpoint: Path | None, model: str, units: str, free: Sequence[str] = ()) -> Nominal:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 
 import numpy as np
 import torch
@@ -84,7 +85,7 @@ class Registration:
         own = {leans: self.settled(chains, self.share if leans else 0.0, 1) for leans in (False, True)}
         for m, k in zip(matched, range(len(sites)), strict=True):
             every = [*(fields[f.name][k] for f in FORMS), own[False][k], own[True][k]]
-            for name, squares in zip([*fields, *OWN], left(m, every), strict=True):
+            for name, (squares,) in zip([*fields, *OWN], left([m], every), strict=True):
                 total = self.tested.setdefault(name, np.zeros((max(group) + 1, len(self.coefficients))))
                 np.add.at(total[group[k]], m.chain.site.frames, squares)
 
@@ -215,9 +216,11 @@ def _beside_own(
     Unlike a form of the whole scene such shifts need no other ground to be known.
     """
     out = {name: np.zeros((max(group) + 1, frames)) for name in OWN}
-    for k, (m, g) in enumerate(zip(matched, group, strict=True)):
-        for name, squares in zip(OWN, left(m, [f[k // pieces] for f in fields]), strict=True):
-            np.add.at(out[name][g], m.chain.site.frames, squares)
+    for site, own in enumerate(zip(*fields, strict=True)):
+        of = slice(site * pieces, (site + 1) * pieces)
+        for name, every in zip(OWN, left(matched[of], own), strict=True):
+            for g, squares in zip(group[of], every, strict=True):
+                np.add.at(out[name][g], matched[of.start].chain.site.frames, squares)
     return out
 
 
@@ -258,7 +261,7 @@ def own_fields(
     out = []
     for k, m in enumerate(matched):
         every = [end[k] for end in ends]
-        best = torch.from_numpy(np.argmin(left(m, every), 0))
+        best = torch.from_numpy(np.argmin([squares for (squares,) in left([m], every)], 0))
         n = torch.arange(len(best))
         east, south = (torch.stack([field[axis] for field in every])[best, n] for axis in (0, 1))
         out.append((east, south))
@@ -359,13 +362,18 @@ def _held_out(matched: list[Matched], group: Sequence[int], frames: int, spread:
     folds = [[k for k, g in enumerate(group) if g % FOLDS == fold] for fold in range(FOLDS)]
     folds = [f for f in folds if f]
     out = [np.zeros((max(group) + 1, frames)) for _ in FORMS]
-    for fold in folds:
+
+    def of(fold: list[int]) -> list[tuple[list[int], list[list[NDArray[np.float64]]]]]:
         rest = [m for k, m in enumerate(matched) if k not in fold]
         share = solve(rest, FORMS[-1], frames, spread)[1]
         found = [solve(rest, form, frames, spread, share if form.leaning else None) for form in FORMS]
-        for k in fold:
-            fields = [displacement(matched[k], *f) for f in found]
-            for into, squares in zip(out, left(matched[k], fields), strict=True):
+        sites = [list(own) for _, own in groupby(fold, lambda k: id(matched[k].chain))]
+        fields = [[displacement(matched[own[0]], *f) for f in found] for own in sites]
+        return [(own, left([matched[k] for k in own], f)) for own, f in zip(sites, fields, strict=True)]
+
+    for places, forms in (site for fold in per_site(of, folds) for site in fold):
+        for into, every in zip(out, forms, strict=True):
+            for k, squares in zip(places, every, strict=True):
                 np.add.at(into[group[k]], matched[k].chain.site.frames, squares)
     return out
 
@@ -397,24 +405,30 @@ def _grounds(matched: Sequence[Matched]) -> list[int]:
     return [numbers.index(m.chain.site.ground) if len(numbers) > 3 else k for k, m in enumerate(matched)]
 
 
-def left(m: Matched, fields) -> list[NDArray[np.float64]]:
-    """(n,) sums of squared relative residuals on the pixels that all fields keep, gain and offset per image taken out."""
-    chain = m.chain
+def left(parts: Sequence[Matched], fields: Sequence[Field]) -> list[list[NDArray[np.float64]]]:
+    """Of every field, for every part of one site: (n,) sums of squared relative residuals on the pixels that all fields keep, gain and offset
+    per image and part taken out.
+    """
+    chain = parts[0].chain
     predicted, lit = chain.predict(), lit_mask_read(chain)
     moved = [aligned(chain.site.read, chain.site.read_valid, *f) for f in fields]
-    mask = lit & torch.stack([v for _, v in moved]).all(0) & (m.part > 0)
-    weight = mask.double()
-    n = weight.sum((-2, -1)).clamp(min=1)
-    level = ((predicted * weight).sum((-2, -1)) / n).clamp(min=1e-9)
-    x = (predicted - level[:, None, None]) * weight
-    out = []
-    for image, _ in moved:
-        y = image * weight
-        y = (y - (y.sum((-2, -1)) / n)[:, None, None]) * weight
-        slope = ((x * y).sum((-2, -1)) / x.square().sum((-2, -1)).clamp(min=1e-20)).clamp(min=0)  # brighter is brighter
-        kept = y - slope[:, None, None] * x
-        out.append((kept.square().sum((-2, -1)) / _norm(chain)).numpy())
-    return out
+    kept = lit & torch.stack([v for _, v in moved]).all(0)
+
+    def of(image: Tensor, m: Matched) -> NDArray[np.float64]:
+        rows, columns = m.here
+        weight = kept[:, rows, columns].double()
+        n = weight.sum((-2, -1), keepdim=True).clamp(min=1)
+
+        def varied(x: Tensor) -> Tensor:
+            x = x[:, rows, columns] * weight
+            return (x - x.sum((-2, -1), keepdim=True) / n) * weight
+
+        x, y = varied(predicted), varied(image)
+        slope = (x * y).sum((-2, -1), keepdim=True) / x.square().sum((-2, -1), keepdim=True).clamp(min=1e-20)
+        rest = y - slope.clamp(min=0) * x  # brighter is brighter
+        return (rest.square().sum((-2, -1)) / _norm(chain)).numpy()
+
+    return [[of(image, m) for m in parts] for image, _ in moved]
 
 
 def _norm(chain: Chain) -> Tensor:

@@ -84,7 +84,7 @@ class Matched:
 
     gram : (n, P, P), score : (n, P) in units of the residual's variance, P = 2 T + 1 (east, south, leaning)
     basis : (T, H, W)
-    part : (H, W) float, the piece of the site that it is of
+    here : rows and columns of the piece of the site that it is of
     """
 
     chain: Chain
@@ -92,7 +92,7 @@ class Matched:
     score: Tensor
     basis: Tensor
     leaning: tuple[Tensor, Tensor]
-    part: Tensor
+    here: tuple[slice, slice]
 
 
 def match(
@@ -121,27 +121,24 @@ def match(
     target = residual + east * known[0] + south * known[1]
     fields = basis(frame, site)[:terms]
     leaning = lean(site.observation, level)
-    columns = torch.cat(
-        [
-            east[:, None] * fields,
-            south[:, None] * fields,
-            (east * leaning[0] + south * leaning[1])[:, None],
-        ],
-        1,
-    ).flatten(2)
+    along = (east * leaning[0] + south * leaning[1])[:, None]
+    columns = torch.cat([east[:, None] * fields, south[:, None] * fields, along], 1)
     out = []
-    for part in _parts(image.shape[-2], image.shape[-1], pieces):
-        weighted = columns * (weight * part).flatten(1)[:, None]
-        gram = (weighted @ columns.transpose(1, 2)).double()
-        score = torch.einsum("npx,nx->np", weighted, target.flatten(1)).double()
-        out.append(Matched(chain, gram, score, fields, leaning, part))
+    for rows, across in _parts(image.shape[-2], image.shape[-1], pieces):
+        own = columns[:, :, rows, across].flatten(2)
+        weighted = own * weight[:, rows, across].flatten(1)[:, None]
+        gram = (weighted @ own.transpose(1, 2)).double()
+        score = torch.einsum("npx,nx->np", weighted, target[:, rows, across].flatten(1)).double()
+        out.append(Matched(chain, gram, score, fields, leaning, (rows, across)))
     return out
 
 
-def _parts(height: int, width: int, pieces: int) -> list[Tensor]:
-    row = torch.arange(height)[:, None] * pieces // height
-    column = torch.arange(width) * pieces // width
-    return [((row == i) & (column == j)).float() for i in range(pieces) for j in range(pieces)]
+def _parts(height: int, width: int, pieces: int) -> list[tuple[slice, slice]]:
+    def cut(count: int) -> list[slice]:
+        edges = [-(-k * count // pieces) for k in range(pieces + 1)]
+        return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
+
+    return [(rows, columns) for rows in cut(height) for columns in cut(width)]
 
 
 def solve(

@@ -13,7 +13,7 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import lit_mask
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.capture import capture, correlations, peak
+from stages.diagnose.registration.capture import correlations, peak
 from stages.diagnose.settings import BROAD, CAPTURE, CORRELATED, SURE
 from stages.effects.relief_displacement import lean
 
@@ -58,8 +58,10 @@ def captured(chains: Sequence[Chain]) -> list[Tensor]:
 
     def of(chain: Chain) -> tuple[Tensor, Tensor, Tensor]:
         site, rendered, lit = chain.site, chain.predict(), _lit(chain)
-        shift, highest = capture(site.read, site.read_valid, rendered, lit, CAPTURE, BROAD)
-        _, still = capture(site.read, site.read_valid, rendered, lit, 1, BROAD)
+        every = correlations(site.read, site.read_valid, rendered, lit, CAPTURE, BROAD)
+        shift, highest = peak(every)
+        near = slice(CAPTURE - 1, CAPTURE + 2)
+        still = every[:, near, near].flatten(1).amax(1)
         count = (site.read_valid & lit).sum((-2, -1)).float()
         z = (torch.atanh(highest.clamp(max=0.999)) - torch.atanh(still.clamp(-0.9, 0.999))) * (
             count / CORRELATED

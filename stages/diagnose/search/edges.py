@@ -36,17 +36,15 @@ class Horizons:
 
 
 class _Facets:
-    """Some facets of a site: where they lie, in which part, how near what casts shadow on them stands, and the measured share of light."""
+    """Some facets of a site, part after part: where they lie, how near what casts shadow on them stands, the measured share of light."""
 
     def __init__(self, use: Tensor, distance: Tensor, measured: Tensor) -> None:
-        self.at = torch.nonzero(use, as_tuple=True)  # image, row, column
-        self.part = torch.bucketize(self.at[1], _first_lines(use.shape[1]), right=True) - 1
-        self.nearness = 1 / distance[use].clamp(min=NEAREST)
-        self.measured = measured[use]
-
-
-def _first_lines(lines: int) -> Tensor:
-    return torch.tensor([int(part[0]) for part in np.array_split(np.arange(lines), PARTS)])
+        row, image, column = torch.nonzero(use.transpose(0, 1), as_tuple=True)
+        self.at = image, row, column
+        ends = torch.tensor([int(part[-1]) for part in np.array_split(np.arange(use.shape[1]), PARTS)])
+        self.counts = torch.searchsorted(row, ends, right=True).diff(prepend=torch.zeros(1, dtype=torch.long)).tolist()
+        self.nearness = 1 / distance[self.at].clamp(min=NEAREST)
+        self.measured = measured[self.at]
 
 
 class Edges:
@@ -80,8 +78,8 @@ class Edges:
         return torch.stack(out).numpy()
 
     def _products(self, effects: Sequence[Effect], about: Horizons) -> Tensor:
-        _, known, _ = self.chain.sunlight([e for e in effects if e.slot == "geometry"])
         sun, horizon, disc = self.chain.sunlight(effects)
+        known = self.chain.sunlight([e for e in effects if e.slot == "geometry"])[1]
         assert known is not None and horizon is not None
         raised = horizon > known  # what an effect raises above the DEM stands far off, as it was given
         facets = self.every if bool(raised.any()) else self.near
@@ -93,10 +91,7 @@ class Edges:
         wider = -slope * t * about.blur * nearness.square() / radius
         left = facets.measured - sun_visibility(above, about.lift * nearness, radius)
         x = torch.stack([left, wider, slope * nearness]).double()
-        out = torch.zeros(PARTS, 3, 3, dtype=torch.float64)
-        for p in range(PARTS):
-            own = x[:, facets.part == p]
-            out[p] = own @ own.T
+        out = torch.stack([own @ own.T for own in x.split(facets.counts, 1)])
         if facets is self.near:
             out[:, 0, 0] += self.away
         return out

@@ -66,7 +66,7 @@ class State:
     further_light sees also albedo(), that of a diffuse facet of this ground, broadcastable to the image: light that
                   comes from all sides does not ask where the camera stands
     radiance      may change: radiance (I/F that reaches the camera)
-    sensor        may change: image; sees measured, the image to be explained, (B, H, W) with NaN where invalid, as
+    sensor        may change: image; sees measured(), the image to be explained, (B, H, W) with NaN where invalid, as
                   further_light does, or None: an echo repeats the light that truly came in, with shadows in their true places;
                   law_fitted, whether the law is fitted to lit ground: light that falls there alike is a term of it
     """
@@ -87,7 +87,7 @@ class State:
     albedo: Callable[[], Tensor] = field(default=None)  # type: ignore[assignment]
     radiance: Tensor = field(default=None)  # type: ignore[assignment]
     image: Tensor = field(default=None)  # type: ignore[assignment]
-    measured: Tensor | None = None
+    measured: Callable[[], Tensor] | None = None
     law_fitted: bool = False
 
 
