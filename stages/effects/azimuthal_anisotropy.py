@@ -20,15 +20,15 @@ class AzimuthalAnisotropy(Effect):
     title = "dependence on the Sun's azimuth"
     mechanism = (
         "Unresolved ripples, ejecta lineations or cliffs of one orientation reflect more when lit from one side: reflectance is "
-        "multiplied by 1 + (east sin(azimuth) + north cos(azimuth)) cot(elevation)^shading of the Sun: 0 for what is painted on, 1 for "
-        "relief below a pixel, which shades the more the lower the Sun."
+        "multiplied by 1 + (east sin(azimuth) + north cos(azimuth)) (cot(elevation) / its mean)^shading of the Sun: 0 for what is painted "
+        "on, 1 for relief below a pixel, which shades the more the lower the Sun."
     )
     reference = "Shkuratov et al. (2011), Planet. Space Sci. 59, 1326 (photometric anisotropy of the lunar surface)"
     confused_with = ("sun_azimuth", "image_gain")
     separate = "an image of the same ground with the Sun on the opposite side"
     parameters = (
-        Parameter("east", "1", -0.3, 0.3, 0.0, "relative change when lit from the east"),
-        Parameter("north", "1", -0.3, 0.3, 0.0, "relative change when lit from the north"),
+        Parameter("east", "1", -0.3, 0.3, 0.0, "relative change when lit from the east at the mean elevation"),
+        Parameter("north", "1", -0.3, 0.3, 0.0, "relative change when lit from the north at the mean elevation"),
     )
     coordinates = (*parameters, Parameter("shading", "1", 0.0, 1.5, 0.0, "how it grows as the Sun gets lower"))
     strong: ClassVar = {"east": 0.05, "north": 0.05}
@@ -44,5 +44,5 @@ class AzimuthalAnisotropy(Effect):
         level = torch.sqrt(sun[:, 0] ** 2 + sun[:, 1] ** 2).clamp(min=1e-6)
         east, north = (sun[:, 0] / level)[:, None, None], (sun[:, 1] / level)[:, None, None]
         across = self.value("east", state) * east + self.value("north", state) * north
-        height = (sun[:, 2].clamp(min=LOWEST) / level)[:, None, None]
+        height = (sun[:, 2].clamp(min=LOWEST) / level / self.survey.sun_tangent)[:, None, None]
         state.reflectance = state.reflectance * (1 + across * height ** -self.value("shading", state))

@@ -34,6 +34,7 @@ class Survey:
     curvature: tuple[float, float] = (0.0, 1.0)  # of the Laplacian after a 2 px blur, 1/m
     relief: float = 100.0  # largest range of heights in a crop, m
     columns: tuple[float, float] = (0.0, 127.0)  # first and last detector sample
+    sun_tangent: float = 1.0  # of the Sun's elevation, geometric mean over the images
     lean_px: float = 0.0  # rms of h tan(emission), heights from their mean
     units: str = "iof"
     has_detector: bool = False
@@ -151,8 +152,8 @@ class Effect(ABC):
 
     @classmethod
     def shadows_ordinarily(cls, values: Mapping[str, Any]) -> bool:
-        """Whether shadows of every data set look as with these values, since relief has finer detail than the DEM."""
-        return False
+        """Whether shadows of every data set look as with these values, since relief has finer detail than the DEM; with null values they do."""
+        return float(values[cls.parameters[0].name]) == cls.parameters[0].default
 
     @classmethod
     def visible(cls, survey: Survey, has: frozenset[str]) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from stages.effects import fields
 from stages.effects.base import Effect, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
@@ -17,7 +18,7 @@ class ElevationAlbedo(Effect):
     title = "albedo that follows height"
     mechanism = (
         "Lava floods low ground and is darker than the highlands; crater rays and dust settle by height. Standardised over the "
-        "data set."
+        "data set; waves of the DEM shorter than 7 px do not count."
     )
     reference = "Lucey et al. (1998), JGR 103, 3679 (lunar albedo and composition)"
     confused_with = ("albedo_map",)
@@ -30,5 +31,5 @@ class ElevationAlbedo(Effect):
 
     def apply(self, state: State) -> None:
         mean, std = self.survey.elevation
-        field = (state.observation.elevation - mean) / std
+        field = fields.broad((state.observation.elevation - mean) / std)
         state.reflectance = state.reflectance * (1 + self.value("per_std", state) * field)

@@ -7,10 +7,14 @@ import math
 import torch
 from torch import Tensor
 
-from stages.effects.filters import gaussian, laplacian
+from stages.effects.filters import filtered, gaussian, laplacian
 from stages.physics.formation import geometry
 
 CURVATURE_SIGMA2 = 4.0  # px^2: curvature of the raw DEM is mostly its noise
+FINEST = (
+    7.0,
+    10.0,
+)  # px, wavelengths between which waves of the DEM count more and more: of finer ones few are those of the ground
 
 
 def slope(elevation: Tensor, gsd: float) -> Tensor:
@@ -26,6 +30,12 @@ def curvature(elevation: Tensor, gsd: float) -> Tensor:
     """
     level = elevation - elevation.mean(dim=(-2, -1), keepdim=True)
     return laplacian(gaussian(level, CURVATURE_SIGMA2), gsd)
+
+
+def broad(field: Tensor) -> Tensor:
+    """A field (B, H, W) that follows from the DEM, without the waves that few DEMs resolve."""
+    last, first = (2 * math.pi / wavelength for wavelength in FINEST)
+    return filtered(field, lambda waves: ((last - waves) / (last - first)).clamp(0, 1), slopes=True)
 
 
 def cosine_field(order: tuple[int, int], height: int, width: int) -> Tensor:

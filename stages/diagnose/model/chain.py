@@ -43,14 +43,15 @@ class Chain:
     ) -> None:
         self.site, self.model, self.coefficients, self.base = site, model, coefficients, list(base)
         self.free, self.laws = free, laws
-        self._sharp = known._sharp if known else SharpSlopes(site.observation.gsd, site.observation.body_radius)
-        self._state = self._illuminate(self.base, known._state if known else None)
+        sharp = known._sharp if known else SharpSlopes(site.observation.gsd, site.observation.body_radius)
+        self._sharp: SharpSlopes = sharp
+        self._state: State = self._illuminate(self.base, known._state if known else None)
+        self._tilted: dict[tuple[float, float], Tensor] = {}  # (n, H, W) reflectance at other slopes, by how much
         alike = known is not None and known.model is model and torch.equal(known.coefficients, coefficients)
         if known is not None and alike and self._state.angles is known._state.angles:
             self._state.reflectance, self._tilted = known._state.reflectance, known._tilted
         else:
             self._state.reflectance = self._surface(self._state)
-            self._tilted: dict[tuple[float, float], Tensor] = {}  # (n, H, W) reflectance at other slopes, by how much
         self.rendered = self.render()
 
     @property

@@ -150,12 +150,19 @@ def survey(sites: list[Site], frames: int, units: str) -> Survey:
         curvature=_moments([fields.curvature(z, first.gsd) for z in terrain]),
         relief=max(float(z.max() - z.min()) for z in terrain),
         columns=ends,
+        sun_tangent=float(torch.cat([_sun_tangent(s.observation) for s in sites]).log().mean().exp()),
         lean_px=float(torch.stack(leaning).mean().sqrt()),
         units=units,
         has_detector=known,
         frames=frames,
         sites=len(sites),
     )
+
+
+def _sun_tangent(observation: Observation) -> Tensor:
+    """(n,) of the Sun's elevation, of images that it shines on from aside."""
+    east, north, up = observation.sun_direction.unbind(-1)
+    return (up / torch.hypot(east, north)).clamp(0.01, 100.0)
 
 
 def _moments(parts: list[Tensor]) -> tuple[float, float]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -136,7 +137,7 @@ def match(
 def _parts(height: int, width: int, pieces: int) -> list[tuple[slice, slice]]:
     def cut(count: int) -> list[slice]:
         edges = [-(-k * count // pieces) for k in range(pieces + 1)]
-        return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
+        return [slice(a, b) for a, b in pairwise(edges)]
 
     return [(rows, columns) for rows in cut(height) for columns in cut(width)]
 

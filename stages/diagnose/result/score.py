@@ -108,8 +108,8 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
         state.fit()
         without = _hidden_squares(state)
         gain, _, high = gain_interval(without, with_cause)
-        # where there is no interval signs decide, but on what was judged on pieces of this ground already, or in the dark
-        open_ = not (cause.single or type(cause.effect).lights_shadows)
+        # where there is no interval signs decide, but on what was judged on pieces of this ground already
+        open_ = type(cause.effect).scope != "scene"
         if high < 0 or (math.isnan(high) and open_ and with_cause.sum() > without.sum()):
             gain = 100 * (1 - with_cause.sum() / max(float(without.sum()), 1e-30))
             why = f"the test pairs contradict it: it gains {gain:.1f} % there (up to {high:.1f})"

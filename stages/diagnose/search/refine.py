@@ -8,13 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from stages.common.intervals import effective_units
 from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import LONGEST, SETTLED, SHORTEST, STEPS
 from stages.effects import Survey, get_effect
-
-TELLING = 0.05  # of the largest change that leaving out a group of images makes: what changes less has no part in it
 
 
 def as_effect(found, data: Survey, frames: int, whole):
@@ -113,12 +112,14 @@ def errors_over_images(state: State, view: View) -> None:
     places = every[amounts]
     if not len(places):
         return
-    left = []
+    left, covariances = [], []
     for whole in state.without_images(view):
         for p in every:
             whole.precision.pop(int(p), None)
         if whole.seen[places].all():
-            left.append(_amounts(state, whole, places)[0])
+            moves, _, covariance = _amounts(state, whole, places)
+            left.append(moves)
+            covariances.append(covariance)
     if len(left) < 2:
         return
     table, kept = np.array(left), [owned[k] for k in amounts]
@@ -131,14 +132,17 @@ def errors_over_images(state: State, view: View) -> None:
         found = np.array([float(cause.effect.values[kept[k][1]]) - null[kept[k][1]] for k in own])
         along = found / np.array([max(cause.of_given_shape[kept[k][1]], 1e-30) for k in own]) ** 2
         shares = table[:, own] @ along / max(found @ along, 1e-30)
-        away = np.abs(shares - np.median(shares))
-        telling = int((away > TELLING * away.max()).sum())  # where few images show deep shadow, few tell of light in it
-        if telling < 3 and cause.effect.lights_shadows:
+        rest = [
+            float(found @ np.linalg.pinv(c[np.ix_(own, own)], rcond=1e-9, hermitian=True) @ found) for c in covariances
+        ]
+        told = np.maximum(sum(rest) / (len(rest) - 1) - np.array(rest), 0.0)  # by each group of images, if it adds up
+        groups = effective_units(told) if told.any() else len(told)
+        if groups < 3 and cause.effect.lights_shadows:  # few images show deep shadow
             # what an image may have of its own is in the likelihood, and too few are left to see it
             cause.over_images, cause.share_error = {}, 0.0
             continue
         cause.share_error = float(jackknife_error(shares))
-        cause.share_freedom = max(telling - 1, 1)
+        cause.share_freedom = max(groups - 1, 1.0)
 
 
 def _scene_places(view: View) -> tuple[NDArray[np.int64], list[tuple[int, str, float]]]:

@@ -344,7 +344,8 @@ def secant_gains(
     """Nats that the cause, as it was rendered, gains beside everything else: on held-out ground, and what they go with (labels,); the squares
     without it; its gains on the test pairs, which are ``before`` as they were without it.
 
-    Effects with many values keep the gain that their columns had on held-out ground: one amount for all would not be held out.
+    Effects with several values keep the gain that their columns had on held-out ground: one amount for all would not be held out. On the
+    test pairs it is, but of values per image.
     """
     others = [c.effect for c in state.causes if c is not cause]
     few = 1 + sum(n.startswith("coefficient") for n in look.plan.shared)
@@ -359,7 +360,7 @@ def secant_gains(
     units = [products(more, look.model, look.grid, state.frames) for more in pieces]
     whole = _beside(units, cause, look, state.frames)
     total = float(whole.gram[0, 0])
-    if not cause.single:
+    if type(cause.effect).scope != "scene":
         return cause.found.gains, cause.found.sizes, total, np.zeros(0)
     form = whole.stood_for([type(cause.effect)])
     if cause.found.beside:
@@ -374,6 +375,8 @@ def secant_gains(
     grounds = [u.ground for u in tested]
     if len(set(grounds)) >= 3:  # else pieces of ground, where there are too few grounds for an interval
         gains = np.bincount(grounds, weights=gains).astype(np.float64)
+    if not cause.single:
+        return cause.found.gains, cause.found.sizes, total, gains
     shades = type(cause.effect).lights_shadows
     return whole.held_out(place, form), whole.power(place, np.ones(1)) if shades else cause.found.sizes, total, gains
 

@@ -182,14 +182,16 @@ def by_shadows(state: State) -> list[Named]:
     effect, value = whole.best, whole.value()
     name = effect.fitted()[0].name
     error = whole.error(np.flatnonzero(shown))
-    nearer = math.copysign(max(abs(value) - 2 * math.hypot(error, effect.shadow_error), 0.0), value)
     most = max(abs(float(e.values[name])) for e in whole.effects)
-    if abs(value) >= most or effect.shadows_ordinarily({**effect.values, name: nearer}):
+    if abs(value) >= most:
         return []
     if around := effect.shadow_neighbours(state.data):
         near = shadows.in_turn([type(effect)({**t.fixed, **t.columns[0]}, state.data) for t in around])
         effect, scatter = near.open_between(OPEN * float(before.sum()))
         value, error = float(effect.values[name]), math.hypot(error, scatter)
+    nearer = math.copysign(max(abs(value) - 2 * math.hypot(error, effect.shadow_error), 0.0), value)
+    if effect.shadows_ordinarily({**effect.values, name: nearer}):
+        return []
     made = type(effect)({**effect.values, name: value}, state.data)
     rivals = [t.best.name for t in found if t is not first and not gain_interval(t.held_out()[shown], after)[1] > 0]
     pixels = float(sum(c.site.valid.sum() for c in chains))

@@ -38,7 +38,7 @@ class Cause:
     over_images: dict[str, float] = field(default_factory=dict)  # errors by leaving out images
     away: float = math.inf  # standard errors from nothing, of all amounts together
     share_error: float = 0.0  # of one factor on all values, by leaving out images
-    share_freedom: int = 1  # with which it is known
+    share_freedom: float = 1.0  # with which it is known
     rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)
     gain_percent: float = float("nan")
