@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter
 from stages.diagnose.likelihood.covariance import Covariance, shadow_variance
 from stages.diagnose.likelihood.dem_errors import kept_share
 from stages.diagnose.likelihood.found import Found, interval
+from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.rows.columns import Guise
 from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
@@ -224,3 +225,16 @@ def test_a_few_pixels_far_above_all_others_are_no_level(width):
     """... wherever they fall among the bins, the last one among them."""
     bright = torch.cat([torch.linspace(0, 0.5, 3997), torch.tensor([1.0, *2 * [(1 + width) ** 2.5]])])
     assert get_effect("saturation").read_off(bright) is None
+
+
+def test_jackknife_of_units_that_tell_unequally_much() -> None:
+    """Means of values of known, unequal precision scatter by as much as it says; where one alone knows a value, leaving it out shows nothing."""
+    rng = np.random.default_rng(0)
+    precision = np.array([5, 1, 1, 1, 0.5, 0.5, 0.5, 0.5])
+    values = rng.normal(0, precision**-0.5, (4000, 8))
+    means = (values * precision).sum(1) / precision.sum()
+    rest = precision.sum() - precision
+    without = ((values * precision).sum(1, keepdims=True) - values * precision) / rest
+    variance = np.mean([jackknife_error(w, rest) ** 2 for w in without])
+    assert 0.75 < variance / means.var() < 1.15
+    assert jackknife_error(np.array([900.0, 0.0, 0.0]), np.array([1e-6, 2.0, 2.0])) < 0.01

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stages.common.intervals import student_quantile
+from stages.common.intervals import effective_units, student_quantile
 from stages.diagnose.likelihood.products import Array
 from stages.diagnose.rows.columns import Guise
 
@@ -53,7 +53,7 @@ def interval(gains: Array, sizes: Array | None = None) -> tuple[float, float]:
     if sizes is None or len(sizes) != len(gains):
         sizes = np.ones(len(gains))
     share = sizes / max(float(sizes.sum()), 1e-30)
-    units = 1 / max(float(share @ share), 1e-30)  # as many alike ones (Kish 1965, Survey Sampling, 11.7)
+    units = effective_units(share) if share.any() else 0.0
     if units < 2 or len(gains) < 3:
         return -math.inf, math.inf
     total = float(gains.sum())

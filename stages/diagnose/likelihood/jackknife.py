@@ -11,12 +11,19 @@ from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.tails import student_tail
 
 
-def jackknife_error(without: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard error of a statistic, given its values with one unit left out each, (U, ...)."""
+def jackknife_error(without: NDArray[np.float64], left: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Standard error of a statistic, given its values with one unit left out each, (U, ...).
+
+    left : likewise, the information that is left without each (Hinkley 1977, Technometrics 19, 285); alike where None
+    """
     units = len(without)
     if units < 2:
         return np.full(without.shape[1:], math.inf)
-    return np.sqrt((units - 1) / units * ((without - without.mean(0)) ** 2).sum(0))
+    left = np.ones_like(without) if left is None else left
+    share = left / np.maximum(left.sum(0), 1e-300)
+    apart = without - (share * without).sum(0)
+    kept = np.minimum((units - 1) * share, 1.0)  # of the whole
+    return np.sqrt(units / (units - 1) * ((kept * apart) ** 2).sum(0))
 
 
 def gain_interval(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -123,26 +123,28 @@ def errors_over_images(state: State, view: View) -> None:
     if len(left) < 2:
         return
     table, kept = np.array(left), [owned[k] for k in amounts]
-    for (place, name, _), error in zip(kept, jackknife_error(table), strict=True):
-        state.causes[place].over_images[name] = float(error)
     for place in {place for place, _, _ in kept}:
         cause = state.causes[place]
         own = [k for k, (p, _, _) in enumerate(kept) if p == place]
         null = type(cause.effect).null()
         found = np.array([float(cause.effect.values[kept[k][1]]) - null[kept[k][1]] for k in own])
-        along = found / np.array([max(cause.of_given_shape[kept[k][1]], 1e-30) for k in own]) ** 2
-        shares = table[:, own] @ along / max(found @ along, 1e-30)
-        rest = [
-            float(found @ np.linalg.pinv(c[np.ix_(own, own)], rcond=1e-9, hermitian=True) @ found) for c in covariances
-        ]
-        told = np.maximum(sum(rest) / (len(rest) - 1) - np.array(rest), 0.0)  # by each group of images, if it adds up
+        parts = [c[np.ix_(own, own)] for c in covariances]
+        known = [np.linalg.pinv(c, rcond=1e-9, hermitian=True) for c in parts]
+        rest = np.array([float(found @ precision @ found) for precision in known])
+        # of one factor on all values: each counts as far as the images that are left know it
+        shares = np.array([float(found @ precision @ move[own]) for precision, move in zip(known, left, strict=True)])
+        told = np.maximum(rest.sum() / (len(rest) - 1) - rest, 0.0)  # by each group of images, if it adds up
         groups = effective_units(told) if told.any() else len(told)
         if groups < 3 and cause.effect.lights_shadows:  # few images show deep shadow
             # what an image may have of its own is in the likelihood, and too few are left to see it
             cause.over_images, cause.share_error = {}, 0.0
             continue
-        cause.share_error = float(jackknife_error(shares))
-        cause.share_freedom = max(groups - 1, 1.0)
+        cause.share_error, cause.share_freedom = (
+            float(jackknife_error(shares / np.maximum(rest, 1e-30), rest)),
+            max(groups - 1, 1.0),
+        )
+        errors = jackknife_error(table[:, own], 1 / np.maximum([c.diagonal() for c in parts], 1e-30))
+        cause.over_images = {kept[k][1]: float(error) for k, error in zip(own, errors, strict=True)}
 
 
 def _scene_places(view: View) -> tuple[NDArray[np.int64], list[tuple[int, str, float]]]:
