@@ -133,7 +133,7 @@ def test_no_effect_is_named_in_the_method():
 
 
 def test_a_shift_of_five_pixels_is_captured():
-    from stages.diagnose.registration.capture import capture
+    from stages.diagnose.registration.capture import correlations, peak
     from stages.effects.filters import gaussian
 
     torch.manual_seed(1)
@@ -141,9 +141,9 @@ def test_a_shift_of_five_pixels_is_captured():
     rendered, image = ground[:, 8:72, 8:72], ground[:, 8 - 3 : 72 - 3, 8 + 5 : 72 + 5] * 2 + 1
     valid = torch.ones(2, 64, 64)
     valid[:, 20:30, 10:40] = 0
-    shift, peak = capture(image, valid, rendered, torch.ones(2, 64, 64), 8, 6.0)
+    shift, highest = peak(correlations(image, valid, rendered, torch.ones(2, 64, 64), 8, 6.0))
     assert torch.allclose(shift, torch.tensor([[5.0, -3.0]]).expand(2, 2), atol=0.1)
-    assert float(peak.min()) > 0.9
+    assert float(highest.min()) > 0.9
 
 
 def test_relief_displacement_lies_along_the_view():
@@ -225,7 +225,7 @@ def test_images_that_are_cut_off_as_a_whole_are_clipping(monkeypatch):
             SimpleNamespace(predict=lambda p=p: p, site=SimpleNamespace(gain=torch.ones(6), offset=torch.zeros(6)))
             for p in predicted
         ]
-        monkeypatch.setattr(named, "lit_mask_read", lambda chain: torch.ones(6, 64, 64, dtype=torch.bool))
+        monkeypatch.setattr(named, "full_light", lambda chain: torch.ones(6, 64, 64, dtype=torch.bool))
         masks = [torch.ones(6, 64, 64, dtype=torch.bool)] * 4
         before, after, _ = named._clipped(
             SimpleNamespace(chains=lambda c=chains: c), list(images), masks, get_effect("saturation")

@@ -12,7 +12,9 @@ from planted import semi_real
 from stages.diagnose.model.form import better_form, other_laws
 from stages.diagnose.model.laws import LunarLaws, lunar_laws
 from stages.diagnose.model.nominal import fit, load_nominal
-from stages.diagnose.model.sites import load_site, number_grounds
+from stages.diagnose.model.sites import Site, load_site, number_grounds
+from stages.diagnose.registration.explain import explain
+from stages.diagnose.rows.patches import cuts
 from stages.effects import Survey, effect_names, get_effect
 from stages.pairs.reader import PairReader
 from stages.physics.formation.geometry import Angles
@@ -84,3 +86,20 @@ def test_beside_free_gains_no_effect_of_the_law_is_visible():
     assert len(of_law) > 3
     assert not any(e.visible(Survey(units="dn"), frozenset()) for e in of_law)
     assert all(e.visible(Survey(units="iof"), frozenset()) for e in of_law)
+
+
+def test_pieces_of_one_place_are_left_out_side_by_side(tmp_path, monkeypatch):
+    """Of few places, pieces are left out one by one, on several threads at a time: none may change what the others look at."""
+    with PairReader(semi_real(tmp_path / "pairs.h5", 4712, sites=2)) as reader:
+        sites = [load_site(reader, np.flatnonzero(reader.site == k)) for k in np.unique(reader.site)[:2]]
+        frames = len(reader.image_ids)
+    number_grounds(sites)
+    nominal, changed = load_nominal(None, "M2", "iof"), set()
+    with torch.no_grad():
+        fit(nominal, sites, [], "iof", [s.read for s in sites], start=True)
+        change = object.__setattr__
+        with monkeypatch.context() as patch:
+            patch.setattr(Site, "__setattr__", lambda site, name, value: (changed.add(name), change(site, name, value)))
+            found = explain(sites, nominal, [], frames, 0.0)
+    assert "valid" not in changed
+    assert found.squares["none"].shape == (len(sites) * cuts(sites[0].image.shape[-1], len(sites)) ** 2, frames)

@@ -11,10 +11,8 @@ from stages.effects.filters import filtered, gaussian, laplacian
 from stages.physics.formation import geometry
 
 CURVATURE_SIGMA2 = 4.0  # px^2: curvature of the raw DEM is mostly its noise
-FINEST = (
-    7.0,
-    10.0,
-)  # px, wavelengths between which waves of the DEM count more and more: of finer ones few are those of the ground
+# px, wavelengths between which waves of the DEM count more and more: of finer ones few are those of the ground
+FINEST = 7.0, 10.0
 
 
 def slope(elevation: Tensor, gsd: float) -> Tensor:

@@ -59,9 +59,8 @@ def fine(image: Tensor, mask: Tensor, sigma: float) -> Tensor:
 def blur_matrix(count: int, sigma: float) -> Tensor:
     """(count, count) by which a Gaussian of ``sigma`` px blurs one axis, mirrored at its borders: two products are faster than a transform."""
     distance = torch.arange(count)[:, None] - torch.arange(-count, 2 * count)
-    kernel = torch.exp(
-        -0.5 * (distance / sigma).square().clamp(max=60.0)
-    )  # smaller numbers would be denormal, and slow
+    # smaller numbers would be denormal, and slow
+    kernel = torch.exp(-0.5 * (distance / sigma).square().clamp(max=60.0))
     before, here, after = (kernel / kernel.sum(1, keepdim=True)).split(count, 1)
     return here + before.flip(1) + after.flip(1)
 

@@ -38,7 +38,6 @@ class Nominal:
     predictor: Any = None
     laws: LunarLaws | None = None  # the directions in which the law may be another one
     maps: dict[int, Tensor] = field(default_factory=dict)  # what the network says of each site
-    latest: dict[int, Chain] = field(default_factory=dict)  # of each site (by its identity)
 
     def coefficients(self, site: Site) -> Tensor:
         """(1 or n, C, 1 or H, 1 or W)"""
@@ -52,9 +51,8 @@ class Nominal:
     def chain(self, site: Site, base: Sequence[Effect]) -> Chain:
         """The formation chain of one site with these effects."""
         free = self.free if self.predictor is None else None  # maps may still drift
-        chain = Chain(site, self.model, self.coefficients(site), base, free, self.laws, self.latest.get(id(site)))
-        self.latest[id(site)] = chain
-        return chain
+        site.latest = Chain(site, self.model, self.coefficients(site), base, free, self.laws, site.latest)
+        return site.latest
 
 
 def load_nominal(checkpoint: Path | None, model: str, units: str, free: Sequence[str] = ()) -> Nominal:
@@ -84,9 +82,14 @@ def load_nominal(checkpoint: Path | None, model: str, units: str, free: Sequence
 
 
 def lit_mask(chain: Chain) -> Tensor:
-    """Pixels in full light, clear of the horizon and of grazing incidence, (n, H, W) bool."""
+    """Valid pixels in full light, (n, H, W) bool."""
+    return chain.site.valid & full_light(chain)
+
+
+def full_light(chain: Chain) -> Tensor:
+    """Ground in full light, clear of the horizon and of grazing incidence, seen by an image or not, (n, H, W) bool."""
     angles = chain.state.angles
-    lit = chain.site.valid & (angles.cos_incidence > GRAZING) & (angles.cos_emission > 0.15)
+    lit = (angles.cos_incidence > GRAZING) & (angles.cos_emission > 0.15)
     above = chain.height_above_horizon()
     return lit if above is None else lit & (above > LIT_MARGIN)
 

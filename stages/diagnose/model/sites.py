@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,6 +17,9 @@ from stages.effects.relief_displacement import lean
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import Observation
 
+if TYPE_CHECKING:
+    from stages.diagnose.model.chain import Chain
+
 
 @dataclass
 class Site:
@@ -27,6 +31,7 @@ class Site:
     gain, offset : (n,), measured = gain x I/F + offset; 1 and 0 for calibrated images
     displacement : where each image looks for its pixels, (columns east, rows south), px, broadcastable to it
     left_out : of the images, those too seldom seen for a covariance of their own
+    latest : its last rendering, of which the next one takes over what is the same
     ground : number that sites share whose crops overlap: what is learned on one is known on the other
     """
 
@@ -43,6 +48,7 @@ class Site:
     displacement: tuple[Tensor, Tensor] | None = None
     left_out: frozenset[int] = frozenset()
     ground: int = 0
+    latest: Chain | None = None
     _laid: tuple[object, Tensor, Tensor] | None = None  # for one displacement: image and mask over the ground
 
     @property

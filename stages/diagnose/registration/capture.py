@@ -34,13 +34,6 @@ def correlation(image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, mos
     return torch.where(enough, top / below.clamp(min=1e-30).sqrt(), 0.0)
 
 
-def capture(
-    image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, most: int, sigma: float
-) -> tuple[Tensor, Tensor]:
-    """Shift (n, 2) east and south, px, that brings each image over its rendering, and the correlation there, (n,)."""
-    return peak(correlations(image, valid, rendered, lit, most, sigma))
-
-
 def correlations(image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, most: int, sigma: float) -> Tensor:
     """:func:`correlation` of what is finer than ``sigma`` px."""
     valid, lit = valid.float(), lit.float()
@@ -64,4 +57,4 @@ def peak(map_: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([column - most + east, row - most + south], 1), best
 
 
-__all__ = ["capture", "correlation", "correlations", "peak"]
+__all__ = ["correlation", "correlations", "peak"]

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, jackknife_error, nats
+from stages.diagnose.model.nominal import full_light
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.explain import OWN, Registration, lit_mask_read, shifted_frames
 from stages.diagnose.registration.forms import FORMS, TERMS
+from stages.diagnose.registration.registered import Registration, shifted_frames
+from stages.diagnose.registration.squares import OWN
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import CORRELATED, FOLDS, ROUNDS, STILL
@@ -242,7 +244,7 @@ def _clipped(
     for (k, quarter), g in zip(quarters, group, strict=True):
         site = chains[k].site
         predicted = chains[k].predict() * site.gain[:, None, None] + site.offset[:, None, None]
-        elsewhere = masks[k] & lit_mask_read(chains[k])
+        elsewhere = masks[k] & full_light(chains[k])
         lit = part(k, quarter, elsewhere).clone()
         part(k, quarter, elsewhere)[:] = False
         image, plain = part(k, quarter, images[k]), part(k, quarter, predicted)

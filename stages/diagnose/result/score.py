@@ -12,9 +12,8 @@ import torch
 from stages.diagnose.likelihood.jackknife import gain_interval
 from stages.diagnose.model.aligned import aligned
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.nominal import lit_mask, scale_images
+from stages.diagnose.model.nominal import full_light, lit_mask, scale_images
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.explain import lit_mask_read
 from stages.diagnose.result.answer import Answer, HeldOut
 from stages.diagnose.search.select import Outcome
 from stages.diagnose.search.state import State
@@ -37,7 +36,7 @@ def score(state: State, answer: Answer) -> HeldOut:
     before, after, count = np.zeros(units), np.zeros(units), 0.0
     for site, first, last in zip(state.hidden, plain, moved, strict=True):
         images = [aligned(site.read, site.read_valid, *d) if d else (site.read, site.read_valid) for d in (first, last)]
-        mask = lit_mask_read(state.reference.chain(site, [])) & images[0][1] & images[1][1]
+        mask = full_light(state.reference.chain(site, [])) & images[0][1] & images[1][1]
         squares, pixels = _squares(site, state.reference.chain(site, []), images[0][0], mask, state.free_gains)
         before[site.ground] += squares
         after[site.ground] += _squares(site, state.nominal.chain(site, effects), images[1][0], mask, state.free_gains)[

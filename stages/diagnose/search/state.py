@@ -20,7 +20,7 @@ from stages.diagnose.model.form import may_be_exchanged, measured_laws
 from stages.diagnose.model.nominal import Nominal, fit
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.explain import Registration
+from stages.diagnose.registration.registered import Registration
 from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, moved_columns, shared_columns
 from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patches
 from stages.diagnose.settings import FAINT, FOLDS, SEEN, SHAMS

@@ -1,0 +1,99 @@
+"""What displacements leave of the residual: sums of squares on ground that they were not fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stages.diagnose.model.aligned import aligned
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.nominal import full_light
+from stages.diagnose.model.parallel import per_site
+from stages.diagnose.registration.forms import FORMS, Matched, displacement, solve
+from stages.diagnose.registration.start import Field
+from stages.diagnose.settings import FOLDS
+
+OWN = "own", "own, leaning"  # each image's own shift, without and with relief displacement
+
+
+def held_out(matched: list[Matched], group: Sequence[int], frames: int, spread: float) -> list[NDArray[np.float64]]:
+    """Squared residual per piece of ground and frame, (pieces, frames) for each form, fitted to other ground."""
+    folds = [[k for k, g in enumerate(group) if g % FOLDS == fold] for fold in range(FOLDS)]
+    folds = [f for f in folds if f]
+    out = [np.zeros((max(group) + 1, frames)) for _ in FORMS]
+
+    def of(fold: list[int]) -> list[tuple[list[int], list[list[NDArray[np.float64]]]]]:
+        rest = [m for k, m in enumerate(matched) if k not in fold]
+        share = solve(rest, FORMS[-1], frames, spread)[1]
+        found = [solve(rest, form, frames, spread, share if form.leaning else None) for form in FORMS]
+        sites = [list(own) for _, own in groupby(fold, lambda k: id(matched[k].chain))]
+        fields = [[displacement(matched[own[0]], *f) for f in found] for own in sites]
+        return [(own, left([matched[k] for k in own], f)) for own, f in zip(sites, fields, strict=True)]
+
+    for places, forms in (site for fold in per_site(of, folds) for site in fold):
+        for into, every in zip(out, forms, strict=True):
+            for k, squares in zip(places, every, strict=True):
+                np.add.at(into[group[k]], matched[k].chain.site.frames, squares)
+    return out
+
+
+def held_out_beside_own(
+    matched: Sequence[Matched], group: Sequence[int], fields: Sequence[Sequence[Field]], frames: int, pieces: int
+) -> dict[str, NDArray[np.float64]]:
+    """Squares (pieces of ground, frames) without and with relief displacement, its share by other ground, beside each image's own shift.
+
+    Unlike a form of the whole scene such shifts need no other ground to be known.
+    """
+    out = {name: np.zeros((max(group) + 1, frames)) for name in OWN}
+    for site, own in enumerate(zip(*fields, strict=True)):
+        of = slice(site * pieces, (site + 1) * pieces)
+        for name, every in zip(OWN, left(matched[of], own), strict=True):
+            for g, squares in zip(group[of], every, strict=True):
+                np.add.at(out[name][g], matched[of.start].chain.site.frames, squares)
+    return out
+
+
+def left(parts: Sequence[Matched], fields: Sequence[Field]) -> list[list[NDArray[np.float64]]]:
+    """Of every field, for every part of one site: (n,) sums of squared relative residuals on the pixels that all fields keep, gain and offset
+    per image and part taken out.
+    """
+    chain = parts[0].chain
+    predicted, lit = chain.predict(), full_light(chain)
+    moved = [aligned(chain.site.read, chain.site.read_valid, *f) for f in fields]
+    kept = lit & torch.stack([v for _, v in moved]).all(0)
+
+    def of(image: Tensor, m: Matched) -> NDArray[np.float64]:
+        rows, columns = m.here
+        weight = kept[:, rows, columns].double()
+        n = weight.sum((-2, -1), keepdim=True).clamp(min=1)
+
+        def varied(x: Tensor) -> Tensor:
+            x = x[:, rows, columns] * weight
+            return (x - x.sum((-2, -1), keepdim=True) / n) * weight
+
+        x, y = varied(predicted), varied(image)
+        slope = (x * y).sum((-2, -1), keepdim=True) / x.square().sum((-2, -1), keepdim=True).clamp(min=1e-20)
+        rest = y - slope.clamp(min=0) * x  # brighter is brighter
+        return (rest.square().sum((-2, -1)) / _norm(chain)).numpy()
+
+    return [[of(image, m) for m in parts] for image, _ in moved]
+
+
+def _norm(chain: Chain) -> Tensor:
+    """(n,) squared brightness as measured, so that images of all exposures count alike."""
+    mask = chain.site.read_valid.double()
+    return ((chain.site.read * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)).square().clamp(min=1e-20)
+
+
+def grounds(matched: Sequence[Matched]) -> list[int]:
+    """Which pieces are left out together: all that lie on one ground, where there are enough grounds."""
+    numbers = sorted({m.chain.site.ground for m in matched})
+    return [numbers.index(m.chain.site.ground) if len(numbers) > 3 else k for k, m in enumerate(matched)]
+
+
+__all__ = ["OWN", "grounds", "held_out", "held_out_beside_own", "left"]
