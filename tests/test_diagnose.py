@@ -158,18 +158,15 @@ def test_relief_displacement_lies_along_the_view():
     assert float(south.abs().max()) < 1e-3
 
 
-def test_crops_that_overlap_are_one_ground():
+def test_ground_that_several_crops_show_counts_once():
     from types import SimpleNamespace
 
-    from stages.diagnose.model.sites import number_grounds
+    from stages.diagnose.model.sites import overlap
 
-    places = [(0.0, 0.0), (100.0, 0.0), (40.0, 40.0), (90.0, 60.0)]
-    sites = [SimpleNamespace(place=p, image=torch.zeros(1, 48, 48), ground=0) for p in places]
-    number_grounds(sites)
-    assert [s.ground == sites[0].ground for s in sites] == [True, False, True, False]
-    assert sites[1].ground != sites[3].ground
-    number_grounds(sites[1:])
-    assert len({s.ground for s in sites[1:]}) == 3
+    places = [(0.0, 0.0), (100.0, 0.0), (40.0, 40.0), (90.0, 44.0), (-44.0, 10.0)]
+    first, *others = [SimpleNamespace(place=p, image=torch.zeros(2, 48, 48)) for p in places]
+    assert [overlap(first, o) for o in others] == [False, True, False, False]
+    assert overlap(first, first) and overlap(others[1], first)
 
 
 def test_the_test_pairs_take_back_a_name_that_they_contradict():

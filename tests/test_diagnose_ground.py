@@ -31,7 +31,7 @@ def _chain(size: int = 64):
     )
     site = SimpleNamespace(
         valid=torch.ones(2, size, size, dtype=torch.bool), image=predicted + 0.0004, left_out=frozenset({1}),
-        frames=np.array([3, 5]), ground=0, on_detector=lambda: torch.zeros(2, 2, size, size),
+        frames=np.array([3, 5]), on_detector=lambda: torch.zeros(2, 2, size, size),
     )  # fmt: skip
     return SimpleNamespace(
         state=state, site=site, predict=lambda: predicted, height_above_horizon=lambda: sun - horizon,

@@ -12,7 +12,7 @@ from planted import semi_real
 from stages.diagnose.model.form import better_form, other_laws
 from stages.diagnose.model.laws import LunarLaws, lunar_laws
 from stages.diagnose.model.nominal import fit, load_nominal
-from stages.diagnose.model.sites import Site, load_site, number_grounds
+from stages.diagnose.model.sites import Site, load_site
 from stages.diagnose.registration.explain import explain
 from stages.diagnose.rows.patches import cuts
 from stages.effects import Survey, effect_names, get_effect
@@ -57,7 +57,6 @@ def places(tmp_path_factory):
     """Four places in eight images each, to be filled."""
     with PairReader(semi_real(tmp_path_factory.mktemp("film") / "pairs.h5", 4711, sites=3)) as reader:
         sites = [load_site(reader, np.flatnonzero(reader.site == k)) for k in np.unique(reader.site)]
-    number_grounds(sites)
     return sites
 
 
@@ -93,7 +92,6 @@ def test_pieces_of_one_place_are_left_out_side_by_side(tmp_path, monkeypatch):
     with PairReader(semi_real(tmp_path / "pairs.h5", 4712, sites=2)) as reader:
         sites = [load_site(reader, np.flatnonzero(reader.site == k)) for k in np.unique(reader.site)[:2]]
         frames = len(reader.image_ids)
-    number_grounds(sites)
     nominal, changed = load_nominal(None, "M2", "iof"), set()
     with torch.no_grad():
         fit(nominal, sites, [], "iof", [s.read for s in sites], start=True)

@@ -35,7 +35,7 @@ def rows(field: float, seed: int, apart: float = 0.0, grounds: int = 8, albedo: 
         images = torch.tensor(np.stack([f + a * x + b * y + rng.normal(0, 1, f.shape) for f in fields]))
         z = torch.fft.rfft2(images).flatten(-2)[:, grid.keep] * grid.root
         patch = SimpleNamespace(
-            number=ground, ground=ground, frames=torch.arange(FRAMES), slopes=torch.zeros(FRAMES, 2),
+            number=ground, site=ground, frames=torch.arange(FRAMES), slopes=torch.zeros(FRAMES, 2),
             weight=torch.ones(FRAMES, SIZE, SIZE), middle=torch.full((FRAMES, 2), apart * ground),
             dark_frames=torch.zeros(0, dtype=torch.long),
         )  # fmt: skip
@@ -84,7 +84,7 @@ def test_albedo_that_grows_over_a_crop_is_of_that_ground(seed):
         columns[3] += columns[1]
         residual = rng.normal(0, 1, 400) + rng.normal(0, 5, 2) @ columns[1:3] + 0.1 * columns[3] + 3.0 * columns[0]
         every = np.vstack([residual, columns])
-        units.append(Products(every @ every.T, np.arange(5), np.zeros((5, 0)), np.zeros(0), ground, ground))
+        units.append(Products(every @ every.T, np.arange(5), np.zeros((5, 0)), np.zeros(0), ground))
     whole = Whole(units, plan, 1)
     amounts, errors, covariance = whole.errors(np.array([4]))
     assert abs(amounts[0] - 0.1) < 3.5 * errors[0]

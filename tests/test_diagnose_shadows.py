@@ -42,7 +42,7 @@ class ShadowedGround:
         every = torch.ones(3, 64, 64, dtype=torch.bool)
         observation = SimpleNamespace(gsd=10.0, sun_direction=self.suns)
         self.state.observation = observation
-        self.site = SimpleNamespace(ground=number, valid=every, image=image, observation=observation)
+        self.site = SimpleNamespace(number=number, valid=every, image=image, observation=observation)
 
     def predict(self):
         return self.state.reflectance * self.state.sun_visibility

@@ -21,7 +21,7 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import better_form, other_laws, relative_misfit
 from stages.diagnose.model.laws import LunarLaws
 from stages.diagnose.model.nominal import fit, lit_mask, load_nominal
-from stages.diagnose.model.sites import Site, group_pairs, load_site, number_grounds, survey
+from stages.diagnose.model.sites import Site, group_pairs, load_site, overlap, survey
 from stages.diagnose.registration.explain import explain
 from stages.diagnose.result.answer import Answer
 from stages.diagnose.result.files import write_diagnosis
@@ -88,8 +88,6 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     train, test = split(reader)
     sites = _load(reader, train, config)
     hidden = _load(reader, test, dataclasses.replace(config, most_sites=64))
-    number_grounds(sites)
-    number_grounds(hidden)
     answer = Answer("cannot_tell", config={**dataclasses.asdict(config), "checkpoint": str(checkpoint or "")})
     answer.pairs, answer.sites = sum(s.count for s in sites), len(sites)
     answer.images = len({int(f) for s in sites for f in s.frames})
@@ -192,12 +190,12 @@ def _verdict(answer: Answer) -> str:
 
 def _load(reader: PairReader, pairs: np.ndarray, config: Config) -> list[Site]:
     sites: list[Site] = []
-    used = 0
+    used, placed = 0, "row" in reader.file  # others do not say where crops lie
     for members in group_pairs(reader, pairs, config.most_images):
         if used and (used + len(members) > config.most_pairs or len(sites) >= config.most_sites):
             break
         site = load_site(reader, members)
-        if site is not None:
+        if site is not None and not (placed and any(overlap(site, other) for other in sites)):
             sites.append(site)
             used += site.count
     return sites

@@ -55,8 +55,8 @@ def field_of_images(rows: list[Rows], model: Covariance, grid: Grid) -> tuple[fl
         size = row.patch.weight.square().mean((-2, -1)) * model.size.get(row.patch.number, 1.0)
         z = z[:, broad] / size.clamp(min=1e-6).sqrt()[:, None]
         for k, frame in enumerate(row.patch.frames.tolist()):
-            pieces.setdefault(frame, []).append((row.patch.ground, row.patch.middle[k], z[k]))
-    alike, squares = np.zeros((2, 1 + max(r.patch.ground for r in rows)))
+            pieces.setdefault(frame, []).append((row.patch.site, row.patch.middle[k], z[k]))
+    alike, squares = np.zeros((2, 1 + max(r.patch.site for r in rows)))
     for every in pieces.values():
         ground = torch.tensor([piece[0] for piece in every])
         middle, z = torch.stack([piece[1] for piece in every]), torch.stack([piece[2] for piece in every])

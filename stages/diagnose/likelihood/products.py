@@ -49,7 +49,6 @@ class Products:
     place: NDArray[np.int64]
     sham: Array
     sham_squares: Array
-    ground: int
     site: int
     images: list[Array] = field(default_factory=list)
     level: Products | None = None  # of the means alone
@@ -124,7 +123,7 @@ def products(
             own = np.concatenate([np.zeros(m, bool), np.tile(gone.numpy(), k), light])
             part[own], part[:, own] = gram[own], gram[:, own]  # to the last bit: nothing is left of them
         parts.append(part)
-    return Products(gram, place, sham, squares, patch.ground, patch.site, parts, level, columns.shade(every).numpy())
+    return Products(gram, place, sham, squares, patch.site, parts, level, columns.shade(every).numpy())
 
 
 def _of_means(rows: Rows, mean: Tensor, place: NDArray[np.int64], shams: Residual | None) -> Products:
@@ -134,9 +133,7 @@ def _of_means(rows: Rows, mean: Tensor, place: NDArray[np.int64], shams: Residua
     every = torch.cat([shared, own])
     means = shams[1].double() if shams is not None else every[:0]
     sham = (every @ means.T).numpy()
-    return Products(
-        (every @ every.T).numpy(), place, sham, means.square().sum(1).numpy(), rows.patch.ground, rows.patch.site
-    )
+    return Products((every @ every.T).numpy(), place, sham, means.square().sum(1).numpy(), rows.patch.site)
 
 
 def _given_others(factor: Tensor, gone: Tensor) -> Tensor:

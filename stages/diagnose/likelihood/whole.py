@@ -56,13 +56,9 @@ class Whole:
         self.folds = [f for f in self.folds if len(f)]
 
     def _labels(self) -> list[int]:
-        """Which units are left out together: all on one ground; pieces of a crop that overlaps no other, where grounds are few."""
-        grounds = sorted({u.ground for u in self.units})
-        alone = {g for g in grounds if len({u.site for u in self.units if u.ground == g}) == 1}
-        few = len(grounds) < UNITS
-        keys = [(u.ground, k if few and u.ground in alone else -1) for k, u in enumerate(self.units)]
-        numbers = {key: n for n, key in enumerate(dict.fromkeys(keys))}
-        return [numbers[key] for key in keys]
+        """Which units are left out together: all of a site, or each by itself where sites are few."""
+        sites = sorted({u.site for u in self.units})
+        return list(range(len(self.units))) if len(sites) < UNITS else [sites.index(u.site) for u in self.units]
 
     def _let_coefficients_drift(self) -> None:
         """Take out of every unit what the nominal coefficients may be there beside the rest: reflectance varies over the ground.

@@ -66,7 +66,7 @@ def better_form(nominal: Nominal, sites: Sequence[Site], units: str) -> Nominal 
 
 
 def left_elsewhere(nominal: Nominal, sites: Sequence[Site]) -> Floats:
-    """(grounds,) squared relative residuals of the images as they were read, each with its own gain and offset, the coefficients moved to
+    """(sites,) squared relative residuals of the images as they were read, each with its own gain and offset, the coefficients moved to
     what all other ground says of them.
     """
 
@@ -85,9 +85,7 @@ def left_elsewhere(nominal: Nominal, sites: Sequence[Site]) -> Floats:
         free = torch.stack([_without(_without(c, offset), shape) for c in columns]).flatten(1)
         return free @ free.T
 
-    products = torch.zeros(max(s.ground for s in sites) + 1, *2 * [1 + int(nominal.free.sum())], dtype=torch.float64)
-    products.index_add_(0, torch.tensor([s.ground for s in sites]), torch.stack(per_site(of, sites)))
-    own, at = products.numpy(), nominal.vector[nominal.free].double().numpy()
+    own, at = torch.stack(per_site(of, sites)).numpy(), nominal.vector[nominal.free].double().numpy()
     known = np.zeros(len(at))
     if isinstance(nominal.model, LunarLaws):
         pixels = sum(float(s.read_valid.sum()) for s in sites)

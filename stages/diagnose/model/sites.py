@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.diagnose.model.aligned import aligned
-from stages.diagnose.settings import FEWEST_PIXELS
+from stages.diagnose.settings import FEWEST_PIXELS, TAPER
 from stages.effects import Survey, fields
 from stages.effects.relief_displacement import lean
 from stages.pairs.reader import PairReader
@@ -32,7 +32,6 @@ class Site:
     displacement : where each image looks for its pixels, (columns east, rows south), px, broadcastable to it
     left_out : of the images, those too seldom seen for a covariance of their own
     latest : its last rendering, of which the next one takes over what is the same
-    ground : number that sites share whose crops overlap: what is learned on one is known on the other
     """
 
     observation: Observation
@@ -47,7 +46,6 @@ class Site:
     offset: Tensor
     displacement: tuple[Tensor, Tensor] | None = None
     left_out: frozenset[int] = frozenset()
-    ground: int = 0
     latest: Chain | None = None
     _laid: tuple[object, Tensor, Tensor] | None = None  # for one displacement: image and mask over the ground
 
@@ -114,19 +112,14 @@ def group_pairs(reader: PairReader, pairs: NDArray[np.int64], most: int) -> list
     return sorted(groups, key=lambda g: -len(g))
 
 
-def number_grounds(sites: list[Site]) -> None:
-    """Sites whose crops overlap get the same ``ground``, others each its own."""
-    placed = len({s.place for s in sites}) > 1  # files without rows and columns do not say
-    for k, site in enumerate(sites):
-        site.ground = k
-    for k, site in enumerate(sites):
-        height, width = site.image.shape[-2:]
-        for other in sites[:k]:
-            beside = abs(site.place[0] - other.place[0]) >= height or abs(site.place[1] - other.place[1]) >= width
-            if placed and not beside and other.ground != site.ground:
-                old, new = site.ground, other.ground
-                for any_ in sites:
-                    any_.ground = new if any_.ground == old else any_.ground
+def overlap(site: Site, other: Site) -> bool:
+    """Whether two crops show the same ground, but for the borders that windows leave out.
+
+    What is learned on one piece of ground is judged on another one, which must not be the same.
+    """
+    sides = site.image.shape[-2:]
+    apart = (abs(a - b) for a, b in zip(site.place, other.place, strict=True))
+    return all(d < (1 - TAPER) * side for d, side in zip(apart, sides, strict=True))
 
 
 def survey(sites: list[Site], frames: int, units: str) -> Survey:

@@ -61,7 +61,6 @@ class Registration:
         """Squares of every form on ground that nothing was fitted to, into ``tested``: relief displacement beside each image's own field."""
         if not sites:
             return
-        group = [s.ground for s in sites]
         chains = [nominal.chain(s, []) for s in sites]
         known = [self.at(c) for c in chains]
         matched = match_all(chains, known, self.frame, self.level, 1)
@@ -70,8 +69,8 @@ class Registration:
         for m, k in zip(matched, range(len(sites)), strict=True):
             every = [*(fields[f.name][k] for f in FORMS), own[False][k], own[True][k]]
             for name, (squares,) in zip([*fields, *OWN], left([m], every), strict=True):
-                total = self.tested.setdefault(name, np.zeros((max(group) + 1, len(self.coefficients))))
-                np.add.at(total[group[k]], m.chain.site.frames, squares)
+                total = self.tested.setdefault(name, np.zeros((len(sites), len(self.coefficients))))
+                np.add.at(total[k], m.chain.site.frames, squares)
 
     def doubt(self, first: str, second: str, tested: tuple[str, str], frames: NDArray[np.int64] | None = None) -> str:
         """Why the second form's gain over the first is not sure, with the test pairs' part in it; ''. frames : that count, all where None"""

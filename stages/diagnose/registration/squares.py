@@ -92,8 +92,8 @@ def _norm(chain: Chain) -> Tensor:
 
 def grounds(matched: Sequence[Matched]) -> list[int]:
     """Which pieces are left out together: all that lie on one ground, where there are enough grounds."""
-    numbers = sorted({m.chain.site.ground for m in matched})
-    return [numbers.index(m.chain.site.ground) if len(numbers) > 3 else k for k, m in enumerate(matched)]
+    numbers = sorted({m.chain.site.number for m in matched})
+    return [numbers.index(m.chain.site.number) if len(numbers) > 3 else k for k, m in enumerate(matched)]
 
 
 __all__ = ["OWN", "grounds", "held_out", "held_out_beside_own", "left"]

@@ -32,16 +32,14 @@ def score(state: State, answer: Answer) -> HeldOut:
     named = [c.effect for c in answer.causes if c.effect.displaces and c.effect.judged_apart]
     effects = [c.effect for c in answer.causes if c.effect not in named]
     plain, moved = displacements(state, named)
-    units = max(s.ground for s in state.hidden) + 1
-    before, after, count = np.zeros(units), np.zeros(units), 0.0
-    for site, first, last in zip(state.hidden, plain, moved, strict=True):
+    before, after = np.zeros((2, len(state.hidden)))
+    count = 0.0
+    for k, (site, first, last) in enumerate(zip(state.hidden, plain, moved, strict=True)):
         images = [aligned(site.read, site.read_valid, *d) if d else (site.read, site.read_valid) for d in (first, last)]
         mask = full_light(state.reference.chain(site, [])) & images[0][1] & images[1][1]
         squares, pixels = _squares(site, state.reference.chain(site, []), images[0][0], mask, state.free_gains)
-        before[site.ground] += squares
-        after[site.ground] += _squares(site, state.nominal.chain(site, effects), images[1][0], mask, state.free_gains)[
-            0
-        ]
+        before[k] = squares
+        after[k], _ = _squares(site, state.nominal.chain(site, effects), images[1][0], mask, state.free_gains)
         count += pixels
     if not count > 0:
         return HeldOut()
@@ -121,11 +119,11 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
 
 def _hidden_squares(state: State) -> np.ndarray:
     """Squared error on every ground of the test pairs."""
-    total = np.zeros(max((s.ground for s in state.hidden), default=0) + 1)
-    for site in state.hidden:
+    total = np.zeros(len(state.hidden))
+    for k, site in enumerate(state.hidden):
         site.align()
         chain = state.nominal.chain(site, state.base)
-        total[site.ground] += _squares(site, chain, site.laid, lit_mask(chain), state.free_gains)[0]
+        total[k], _ = _squares(site, chain, site.laid, lit_mask(chain), state.free_gains)
     return total
 
 

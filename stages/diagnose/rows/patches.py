@@ -95,7 +95,6 @@ class Patch:
 
     number: int
     site: int
-    ground: int
     images: Tensor
     rows: slice
     columns: slice
@@ -216,7 +215,6 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
                 Patch(
                     (number * pieces + i) * pieces + j,
                     number,
-                    chain.site.ground,
                     images,
                     rows,
                     columns,

@@ -97,7 +97,10 @@ def search(state: State, most: int) -> Outcome:
                 out.sure |= chosen.gain > NOTABLE * float(view.whole.gram[0, 0])
                 state.impossible.add(chosen.effect)
         if not (taken or strange):
-            break
+            odd = {f.effect for f in tried if not f.guise.per_frame and beyond_bounds(f)} - state.impossible
+            if not odd:
+                break
+            state.impossible |= odd  # what it gains may not be sure, and it hides others all the same
         if taken:
             view = None
     settle(state, view)
@@ -372,7 +375,7 @@ def secant_gains(
         for more in _with_cause(state, chain, others, rows, look)
     ]
     gains = whole.gains_on(tested, place, form)
-    grounds = [u.ground for u in tested]
+    grounds = [u.site for u in tested]
     if len(set(grounds)) >= 3:  # else pieces of ground, where there are too few grounds for an interval
         gains = np.bincount(grounds, weights=gains).astype(np.float64)
     if not cause.single:

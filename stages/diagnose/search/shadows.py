@@ -104,9 +104,8 @@ class Shadows:
         classes = [get_effect(n) for n in effect_names()]
         for e in [c({**t.fixed, **t.columns[0]}, state.data) for c in classes for t in c.shadow_trials(state.data)]:
             self.every.setdefault(e.name, []).append(e)
-        group = [e.chain.site.ground for e in self.edges for _ in range(PARTS)]
-        enough = len(set(group)) >= UNITS
-        self.numbers = np.unique(group, return_inverse=True)[1] if enough else np.arange(len(group))
+        count = len(self.edges)
+        self.numbers = np.repeat(np.arange(count), PARTS) if count >= UNITS else np.arange(count * PARTS)
 
     def tried(self, effects: list[Effect], beside: Sequence[Effect], about: Horizons = Horizons()) -> Tried:
         """What these values leave, beside other effects; ``about``: errors of horizons to start from."""

@@ -23,7 +23,7 @@ from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.registered import Registration
 from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, moved_columns, shared_columns
 from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patches
-from stages.diagnose.settings import FAINT, FOLDS, SEEN, SHAMS
+from stages.diagnose.settings import FAINT, GROUPS, SEEN, SHAMS
 from stages.effects import Effect, Survey, effect_names, get_effect
 
 
@@ -274,7 +274,7 @@ class State:
         """Frames that are left out together; none where there are too few to leave one out."""
         every = [f for row in rows for f in (row.patch.frames, row.patch.dark_frames)]
         frames = sorted(set(torch.cat(every).tolist()))  # most deep shadow is in images that show little lit ground
-        return [frames[k::FOLDS] for k in range(min(FOLDS, len(frames)))] if len(frames) > 2 else []
+        return [frames[k::GROUPS] for k in range(min(GROUPS, len(frames)))] if len(frames) > 2 else []
 
     def _whole(
         self, rows: Sequence[Rows], shams: Sequence[Residual | None], plan: Plan, grid: Grid, model: Covariance
