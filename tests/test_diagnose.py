@@ -169,6 +169,24 @@ def test_ground_that_several_crops_show_counts_once():
     assert overlap(first, first) and overlap(others[1], first)
 
 
+def test_of_crops_that_overlap_one_is_diagnosed(tmp_path):
+    """As 'lunargr sample' draws them, most crops share ground: merged into one piece, they would leave none to judge on."""
+    import h5py
+
+    from stages.diagnose import Config
+    from stages.diagnose.stage import _load
+    from stages.pairs.reader import PairReader
+
+    path = semi_real(tmp_path / "pairs.h5", 4713, sites=4, images=2)
+    row = np.array([0, 30, 64, 64, 500])
+    column = np.array([0, 30, 0, 64, 0])
+    with h5py.File(path, "a") as file:
+        file["row"], file["col"] = row[file["site"][...]], column[file["site"][...]]
+    with PairReader(path) as reader:
+        sites = _load(reader, np.arange(reader.count), Config())
+    assert [s.number for s in sites] == [0, 2, 3, 4]
+
+
 def test_the_test_pairs_take_back_a_name_that_they_contradict():
     from stages.diagnose.search.select import contradicted
 
