@@ -159,14 +159,11 @@ def test_relief_displacement_lies_along_the_view():
 
 
 def test_ground_that_several_crops_show_counts_once():
-    from types import SimpleNamespace
-
     from stages.diagnose.model.sites import overlap
 
-    places = [(0.0, 0.0), (100.0, 0.0), (40.0, 40.0), (90.0, 44.0), (-44.0, 10.0)]
-    first, *others = [SimpleNamespace(place=p, image=torch.zeros(2, 48, 48)) for p in places]
-    assert [overlap(first, o) for o in others] == [False, True, False, False]
-    assert overlap(first, first) and overlap(others[1], first)
+    first, *others = np.array([(0.0, 0.0), (100.0, 0.0), (40.0, 40.0), (90.0, 44.0), (-44.0, 10.0)])
+    assert [overlap(first, o[None], (48, 48)) for o in others] == [False, True, False, False]
+    assert overlap(first, np.array(others), (48, 48)) and not overlap(first, np.zeros((0, 2)), (48, 48))
 
 
 def test_of_crops_that_overlap_one_is_diagnosed(tmp_path):

@@ -189,15 +189,22 @@ def _verdict(answer: Answer) -> str:
 
 
 def _load(reader: PairReader, pairs: np.ndarray, config: Config) -> list[Site]:
+    """Sites that share no ground, those that most images show first."""
     sites: list[Site] = []
-    used, placed = 0, "row" in reader.file  # others do not say where crops lie
+    used = 0
+    # files without rows and columns do not say where crops lie
+    places = np.stack([reader.file[k][...] for k in ("row", "col")], 1) if "row" in reader.file else None
+    taken = np.zeros((0, 2))
     for members in group_pairs(reader, pairs, config.most_images):
         if used and (used + len(members) > config.most_pairs or len(sites) >= config.most_sites):
             break
+        if places is not None and overlap(places[members[0]], taken, reader.size):
+            continue
         site = load_site(reader, members)
-        if site is not None and not (placed and any(overlap(site, other) for other in sites)):
+        if site is not None:
             sites.append(site)
             used += site.count
+            taken = np.concatenate([taken, [site.place]])
     return sites
 
 

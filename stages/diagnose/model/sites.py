@@ -103,23 +103,20 @@ def load_site(reader: PairReader, pairs: NDArray[np.int64]) -> Site | None:
 
 def group_pairs(reader: PairReader, pairs: NDArray[np.int64], most: int) -> list[NDArray[np.int64]]:
     """Pairs by site, each site cut to ``most`` images spread evenly; sites with many images first."""
-    groups = []
-    for number in np.unique(reader.site[pairs]):
-        members = pairs[reader.site[pairs] == number]
-        if len(members) > most:
-            members = members[np.linspace(0, len(members) - 1, most).round().astype(int)]
-        groups.append(members)
+    site = reader.site[pairs]
+    order = np.argsort(site, kind="stable")
+    groups = np.split(pairs[order], np.flatnonzero(np.diff(site[order])) + 1) if len(pairs) else []
+    groups = [g[np.linspace(0, len(g) - 1, most).round().astype(int)] if len(g) > most else g for g in groups]
     return sorted(groups, key=lambda g: -len(g))
 
 
-def overlap(site: Site, other: Site) -> bool:
-    """Whether two crops show the same ground, but for the borders that windows leave out.
+def overlap(place: NDArray[np.float64], others: NDArray[np.float64], sides: tuple[int, int]) -> bool:
+    """Whether a crop shows the same ground as one of the others, but for the borders that windows leave out.
 
     What is learned on one piece of ground is judged on another one, which must not be the same.
+    place, others : (2,) and (K, 2) rows and columns in the scene; sides : height and width of all crops, px
     """
-    sides = site.image.shape[-2:]
-    apart = (abs(a - b) for a, b in zip(site.place, other.place, strict=True))
-    return all(d < (1 - TAPER) * side for d, side in zip(apart, sides, strict=True))
+    return bool((np.abs(others - place) < (1 - TAPER) * np.array(sides)).all(1).any())
 
 
 def survey(sites: list[Site], frames: int, units: str) -> Survey:
