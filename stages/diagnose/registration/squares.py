@@ -91,7 +91,7 @@ def _norm(chain: Chain) -> Tensor:
 
 
 def grounds(matched: Sequence[Matched]) -> list[int]:
-    """Which pieces are left out together: all that lie on one ground, where there are enough grounds."""
+    """Which pieces are left out together: all of a site, or each by itself where sites are few."""
     numbers = sorted({m.chain.site.number for m in matched})
     return [numbers.index(m.chain.site.number) if len(numbers) > 3 else k for k, m in enumerate(matched)]
 
