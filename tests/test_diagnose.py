@@ -100,8 +100,9 @@ def test_nothing_hidden_names_nothing(scene, tmp_path, seed):
 
 
 @pytest.mark.slow
-def test_lines_outside_the_catalogue_are_unexplained(scene, tmp_path):
-    answer = diagnose.run(_pairs(scene, tmp_path, {"banding": UNKNOWN["banding"]})).answer
+@pytest.mark.parametrize("fault", [{"banding": UNKNOWN["banding"]}, {"blooming": UNKNOWN["blooming"] | {"above": 1.1}}])
+def test_faults_outside_the_catalogue_are_unexplained(scene, tmp_path, fault):
+    answer = diagnose.run(_pairs(scene, tmp_path, fault)).answer
     assert answer.unexplained_fraction > 0
     assert answer.verdict == "unexplained" and not answer.causes
 
@@ -182,6 +183,19 @@ def test_of_crops_that_overlap_one_is_diagnosed(tmp_path):
     with PairReader(path) as reader:
         sites = _load(reader, np.arange(reader.count), Config())
     assert [s.number for s in sites] == [0, 2, 3, 4]
+
+
+def test_of_many_crops_those_that_are_diagnosed_lie_all_over_the_scene():
+    from stages.diagnose.model.sites import all_over
+
+    crops = [np.array([k]) for k in range(1000)]
+    several = np.array([1000, 1001])
+    taken = all_over([several, *crops], most_pairs=384, most_sites=128)[:128]
+    assert taken[0] is several
+    places = np.sort([int(g[0]) for g in taken[1:]])
+    gaps = np.diff([0, *places, 1000])
+    assert gaps.max() < 2 * 1000 / len(places)
+    assert all(a is b for a, b in zip(all_over(crops[:100], 384, 128), crops[:100], strict=True))
 
 
 def test_the_test_pairs_take_back_a_name_that_they_contradict():

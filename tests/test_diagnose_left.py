@@ -7,11 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.stats import chi2, norm
 
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.left import field_of_images
 from stages.diagnose.likelihood.products import Products, Rows
+from stages.diagnose.likelihood.spilled import responses
 from stages.diagnose.likelihood.tails import together
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.rows.columns import Plan
@@ -63,6 +65,39 @@ def test_ground_that_is_alike_by_chance_is_no_field_of_the_images():
     assert sum(low > 0 for _, low in found) <= 5 and max(share for share, _ in found) > 0.2
     found = [field_of_images(rows(2.0, seed, grounds=4), model, grid) for seed in range(10)]
     assert sum(low > 0 for _, low in found) >= 8
+
+
+def spilled_over(kernel: tuple[int, int], turned: bool = False, power: int = 2) -> tuple[float, float]:
+    """Share of what a power of the brightness leaves on pixels about it (kernel: down, across) that only columns of one direction explain,
+    and their mean amount along the detector's samples; the detector may be turned by 90 deg.
+    """
+    grid = make_grid(SIZE, SIZE)
+    rough = gaussian_filter(np.random.default_rng(2).normal(size=(1, SIZE, SIZE)), (0, 1, 1))
+    bright = torch.from_numpy(np.exp(0.6 * rough / rough.std()))
+    y, x = np.mgrid[0:SIZE, 0:SIZE].astype(float)
+    detector = torch.from_numpy(np.stack([-x, y] if turned else [y, x]))[None]
+    site = SimpleNamespace(on_detector=lambda: detector)
+    chain = SimpleNamespace(rendered=bright, site=site, lit=lambda: torch.ones_like(bright, dtype=torch.bool))
+    everything = slice(0, SIZE)
+    patch = SimpleNamespace(
+        site=0, images=torch.tensor([0]), rows=everything, columns=everything, weight=torch.ones_like(bright)
+    )
+    columns = [c[0][:, 0] for c in responses([SimpleNamespace(patch=patch)], [chain], grid)]
+    left = uniform_filter(bright.numpy()[0] ** power, kernel, mode="wrap")
+    spread = np.fft.rfft2(left - left.mean()).flatten()[grid.keep] * grid.root.numpy()
+    along, both, b = (np.concatenate([z.real, z.imag], -1).T for z in (columns[0], torch.cat(columns), spread))
+    without, amounts = np.linalg.lstsq(along, b, rcond=None)[0], np.linalg.lstsq(both, b, rcond=None)[0]
+    squares = [float((x**2).sum()) for x in (b, b - along @ without, b - both @ amounts)]
+    return (squares[1] - squares[2]) / squares[0], float(amounts[along.shape[1] :][: grid.annuli].mean())
+
+
+def test_what_spreads_along_one_direction_of_the_detector_is_told_from_what_spreads_everywhere():
+    down, across = spilled_over((9, 1)), spilled_over((1, 9))
+    assert min(down[0], across[0]) > 0.02
+    assert down[1] > 0.2 and across[1] < -0.2  # waves along the samples stay
+    assert spilled_over((9, 1), turned=True)[1] < -0.2  # samples run down there
+    assert spilled_over((5, 5))[0] < 0.002
+    assert spilled_over((9, 1), power=1)[0] < 0.005  # motion is no spilling
 
 
 def test_many_values_are_as_far_from_nothing_as_chi_square_has_it():

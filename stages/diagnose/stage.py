@@ -21,7 +21,7 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import better_form, other_laws, relative_misfit
 from stages.diagnose.model.laws import LunarLaws
 from stages.diagnose.model.nominal import fit, lit_mask, load_nominal
-from stages.diagnose.model.sites import Site, group_pairs, load_site, overlap, survey
+from stages.diagnose.model.sites import Site, all_over, grounds, load_site, survey
 from stages.diagnose.registration.explain import explain
 from stages.diagnose.result.answer import Answer
 from stages.diagnose.result.files import write_diagnosis
@@ -146,7 +146,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     after = _residual(state)
     # what a better law or registration took away is no cause where none is named
     answer.budget = budget(view.rows, view.model, view.grid, before if answer.causes else after, after)
-    answer.structure = _structure(view, frames)
+    answer.structure = _structure(state, view)
     known = shown | {c.effect.name for c in answer.causes}
     answer.blind = blind_effects(state, outcome, known)
     answer.unexplained_fraction = max(answer.structure.values(), default=0.0)
@@ -168,15 +168,18 @@ def _register(state: State) -> None:
     state.fit()
 
 
-def _structure(view: View, frames: int) -> dict[str, float]:
+def _structure(state: State, view: View) -> dict[str, float]:
     """What is left that neither ground nor noise has, and its share: of a line, of the squares of that frame; of a field, of
-    the squares of the broadest waves of all images; both weighted by the inverse covariance.
+    the squares of the broadest waves of all images; of light that spreads, of all squares; weighted by the inverse covariance.
     """
-    line, share = peak(view.rows, view.model, view.grid, frames)
+    line, share = peak(view.rows, view.model, view.grid, state.frames)
     alike, surely = field_of_images(view.rows, view.model, view.grid)
     out = {"lines across an image": share} if line > LINE else {}
     if surely > ALIKE:
         out["a broad field in each image that is the same on all ground"] = alike
+    spread, sure = state.spilled(view)
+    if sure:
+        out["light of bright pixels that spreads along one direction of the detector"] = spread
     return out
 
 
@@ -189,22 +192,17 @@ def _verdict(answer: Answer) -> str:
 
 
 def _load(reader: PairReader, pairs: np.ndarray, config: Config) -> list[Site]:
-    """Sites that share no ground, those that most images show first."""
+    """Sites that share no ground, those that most images show first, from all over the scene."""
     sites: list[Site] = []
     used = 0
-    # files without rows and columns do not say where crops lie
-    places = np.stack([reader.file[k][...] for k in ("row", "col")], 1) if "row" in reader.file else None
-    taken = np.zeros((0, 2))
-    for members in group_pairs(reader, pairs, config.most_images):
+    every = grounds(reader, pairs, config.most_images)
+    for members in all_over(every, config.most_pairs, config.most_sites):
         if used and (used + len(members) > config.most_pairs or len(sites) >= config.most_sites):
             break
-        if places is not None and overlap(places[members[0]], taken, reader.size):
-            continue
         site = load_site(reader, members)
         if site is not None:
             sites.append(site)
             used += site.count
-            taken = np.concatenate([taken, [site.place]])
     return sites
 
 

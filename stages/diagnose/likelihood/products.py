@@ -30,6 +30,16 @@ class Rows:
     own_mean: Tensor
     shared_dark: Tensor
 
+    def with_shared(self, kept: Sequence[int], more: Tensor) -> Rows:
+        """With some of the shared columns, and others (k, n, K) that have neither means nor light in the dark."""
+        none = torch.zeros(len(more), 1)
+        return replace(
+            self,
+            shared=torch.cat([self.shared[kept], more]),
+            shared_mean=torch.cat([self.shared_mean[kept], none.expand(-1, self.shared_mean.shape[1])]),
+            shared_dark=torch.cat([self.shared_dark[kept], none.expand(-1, self.shared_dark.shape[1])]),
+        )
+
 
 Residual = tuple[
     Tensor, Tensor, Tensor

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -101,13 +102,21 @@ def load_site(reader: PairReader, pairs: NDArray[np.int64]) -> Site | None:
     return Site(observation, image, valid, image, valid, pairs, number, (place[0], place[1]), one, one * 0)
 
 
-def group_pairs(reader: PairReader, pairs: NDArray[np.int64], most: int) -> list[NDArray[np.int64]]:
-    """Pairs by site, each site cut to ``most`` images spread evenly; sites with many images first."""
+def grounds(reader: PairReader, pairs: NDArray[np.int64], most: int) -> list[NDArray[np.int64]]:
+    """Pairs by site, of sites that share no ground, each cut to ``most`` images spread evenly; sites with many images first."""
     site = reader.site[pairs]
     order = np.argsort(site, kind="stable")
     groups = np.split(pairs[order], np.flatnonzero(np.diff(site[order])) + 1) if len(pairs) else []
     groups = [g[np.linspace(0, len(g) - 1, most).round().astype(int)] if len(g) > most else g for g in groups]
-    return sorted(groups, key=lambda g: -len(g))
+    groups = sorted(groups, key=lambda g: -len(g))
+    if "row" not in reader.file:  # such files do not say where crops lie
+        return groups
+    place = np.stack([reader.file[k][...] for k in ("row", "col")], 1)
+    apart: list[NDArray[np.int64]] = []
+    for g in groups:
+        if not overlap(place[g[0]], place[[a[0] for a in apart]], reader.size):
+            apart.append(g)
+    return apart
 
 
 def overlap(place: NDArray[np.float64], others: NDArray[np.float64], sides: tuple[int, int]) -> bool:
@@ -117,6 +126,14 @@ def overlap(place: NDArray[np.float64], others: NDArray[np.float64], sides: tupl
     place, others : (2,) and (K, 2) rows and columns in the scene; sides : height and width of all crops, px
     """
     return bool((np.abs(others - place) < (1 - TAPER) * np.array(sides)).all(1).any())
+
+
+def all_over(groups: list[NDArray[np.int64]], most_pairs: int, most_sites: int) -> list[NDArray[np.int64]]:
+    """Where not all can be taken, in an order in which the first ones lie all over the scene: crops are numbered by row. Many images still go first."""
+    if len(groups) <= most_sites and sum(map(len, groups)) <= most_pairs:
+        return groups
+    golden = np.arange(len(groups)) * (math.sqrt(5) - 1) / 2 % 1  # no two of the first n are nearer than about 1/n
+    return [groups[k] for k in np.lexsort((golden, np.array([-len(g) for g in groups])))]
 
 
 def survey(sites: list[Site], frames: int, units: str) -> Survey:

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_variance
 from stages.diagnose.likelihood.dem_errors import kept_share
-from stages.diagnose.likelihood.found import Found
+from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
+from stages.diagnose.likelihood.spilled import responses
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import may_be_exchanged, measured_laws
@@ -258,6 +259,23 @@ class State:
         residuals, lights = [r.shared_dark[0] for r in rows], [r.shared_dark[light] for r in rows]
         shadow_variance(model, [r.patch for r in rows], residuals, lights)
         return model
+
+    def spilled(self, view: View) -> tuple[float, bool]:
+        """Share of the weighted squares that squared brightness along one direction of the detector gains on held-out ground, and whether it surely does."""
+        along, asked = responses(view.rows, self.chains(), view.grid)
+        plan, kept = view.plan.without_candidates()
+        free, count = len(along[0]), len(plan.shared)
+        plan.prior |= dict.fromkeys(range(count, count + free), math.inf)
+        plan.shared += ["spilled"] * (free + len(asked[0]))
+        rows = [
+            r.with_shared([0, *(1 + k for k in kept)], torch.cat(z))
+            for r, *z in zip(view.rows, along, asked, strict=True)
+        ]
+        whole = self._whole(rows, [None] * len(rows), plan, view.grid, view.model)
+        gains = whole.held_out(whole.known_places(range(1 + count + free, 1 + len(plan.shared))))
+        squares = 0.5 * float(whole.gram[0, 0])
+        sure = interval(gains, whole.sizes)[0] > 0 and gains.sum() > FAINT**2 * squares
+        return float(gains.sum()) / squares, bool(sure)
 
     def without_images(self, view: View) -> list[Whole]:
         """The sums of a look as if one group of images after the other had not been taken; what scatters does so as it did with all."""

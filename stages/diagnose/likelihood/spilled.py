@@ -1,0 +1,59 @@
+"""Whether bright pixels act on others along one direction of the detector, as charge that spills along columns does.
+
+A response to the squared brightness, by wavelength and by direction. What optics and motion do is linear in the light, and what an unknown
+law does is the same in all directions: both are fitted along. Ground knows nothing of the detector's directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from stages.diagnose.likelihood.products import Rows
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.sites import Site
+from stages.diagnose.rows.patches import Grid
+
+
+def responses(rows: Sequence[Rows], chains: Sequence[Chain], grid: Grid) -> tuple[list[Tensor], list[Tensor]]:
+    """Coefficients (k, n, K) of every row: to be fitted along, and of squared brightness with one direction."""
+    along, asked = [], []
+    for row in rows:
+        once, twice = _of_powers(row, chains[row.patch.site], grid)
+        across = 2 * (_angles(grid) - _turn(chains[row.patch.site].site)[row.patch.images][:, None])
+        annuli = torch.nn.functional.one_hot(grid.annulus, grid.annuli).T[:, None]
+        directed = torch.cat([annuli * across.cos(), annuli * across.sin()])
+        along.append(torch.cat([annuli * once, directed * once, annuli * twice]))
+        asked.append(directed * twice)
+    return along, asked
+
+
+def _of_powers(row: Rows, chain: Chain, grid: Grid) -> tuple[Tensor, Tensor]:
+    """(n, K) of the rendered brightness over its mean, and of its square."""
+    patch, lit = row.patch, chain.lit()
+    level = (chain.rendered * lit).sum((-2, -1)) / lit.sum((-2, -1)).clamp(min=1)
+    bright = (chain.rendered / level.clamp(min=1e-9)[:, None, None])[patch.images, patch.rows, patch.columns]
+    out = []
+    for x in (bright, bright.square()):
+        mean = (x * patch.weight).sum((-2, -1)) / patch.weight.sum((-2, -1)).clamp(min=1e-9)
+        z = torch.fft.rfft2((x - mean[:, None, None]) * patch.weight)
+        out.append(z.flatten(-2)[:, grid.keep] * grid.root)
+    return out[0], out[1]
+
+
+def _angles(grid: Grid) -> Tensor:
+    """(K,) rad from the crop's columns to its rows, of every wave."""
+    columns = grid.width // 2 + 1
+    down = torch.fft.fftfreq(grid.height)[grid.keep // columns]
+    return torch.atan2(down, torch.fft.rfftfreq(grid.width)[grid.keep % columns])
+
+
+def _turn(site: Site) -> Tensor:
+    """(n,) rad by which the detector's samples run off the crop's columns."""
+    sample = site.on_detector()[:, 1]
+    return torch.atan2(sample.diff(dim=1).nanmean((-2, -1)), sample.diff(dim=2).nanmean((-2, -1)))
+
+
+__all__ = ["responses"]
