@@ -1,7 +1,8 @@
 """Whether bright pixels act on others along one direction of the detector, as charge that spills along columns does.
 
-A response to the squared brightness, by wavelength and by direction. What optics and motion do is linear in the light, and what an unknown
-law does is the same in all directions: both are fitted along. Ground knows nothing of the detector's directions.
+A response to the squared brightness, by wavelength and by direction. What optics and motion do is linear in the light, what an unknown law
+does to slopes is the same in all directions or goes with that of the Sun: all of these are fitted along. Ground knows nothing of the detector's
+directions. Where the Sun stands alike in all images, its direction and the detector's cannot be told apart, and nothing is found.
 """
 
 from __future__ import annotations
@@ -22,11 +23,15 @@ def responses(rows: Sequence[Rows], chains: Sequence[Chain], grid: Grid) -> tupl
     along, asked = [], []
     for row in rows:
         once, twice = _of_powers(row, chains[row.patch.site], grid)
-        across = 2 * (_angles(grid) - _turn(chains[row.patch.site].site)[row.patch.images][:, None])
+        site, images = chains[row.patch.site].site, row.patch.images
         annuli = torch.nn.functional.one_hot(grid.annulus, grid.annuli).T[:, None]
-        directed = torch.cat([annuli * across.cos(), annuli * across.sin()])
-        along.append(torch.cat([annuli * once, directed * once, annuli * twice]))
-        asked.append(directed * twice)
+        view = site.observation.camera_position  # of the middle of the crop
+        axes = _azimuth(site.observation.sun_direction), _azimuth(view), _turn(site)
+        across = [2 * (_angles(grid) - axis[images][:, None]) for axis in axes]
+        *lit, detector = (torch.cat([annuli * a.cos(), annuli * a.sin()]) for a in across)
+        known = [annuli * once, annuli * twice, *(a * z for a in lit for z in (once, twice)), detector * once]
+        along.append(torch.cat(known))
+        asked.append(detector * twice)
     return along, asked
 
 
@@ -48,6 +53,11 @@ def _angles(grid: Grid) -> Tensor:
     columns = grid.width // 2 + 1
     down = torch.fft.fftfreq(grid.height)[grid.keep // columns]
     return torch.atan2(down, torch.fft.rfftfreq(grid.width)[grid.keep % columns])
+
+
+def _azimuth(direction: Tensor) -> Tensor:
+    """(n,) rad from the crop's columns, which run east, of (n, 3) east, north, up; rows run south."""
+    return torch.atan2(-direction[:, 1], direction[:, 0])
 
 
 def _turn(site: Site) -> Tensor:
