@@ -1,8 +1,9 @@
 """Whether bright pixels act on others along one direction of the detector, as charge that spills along columns does.
 
 A response to the squared brightness, by wavelength and by direction. What optics and motion do is linear in the light, what an unknown law
-does to slopes is the same in all directions or goes with that of the Sun: all of these are fitted along. Ground knows nothing of the detector's
-directions. Where the Sun stands alike in all images, its direction and the detector's cannot be told apart, and nothing is found.
+does to slopes is the same in all directions or goes with those of the Sun and of the camera: all of these are fitted along. Ground knows nothing
+of the detector's directions. Where the Sun or the camera stands alike in all images, its direction and the detector's cannot be told apart,
+and nothing is found.
 """
 
 from __future__ import annotations
@@ -61,9 +62,9 @@ def _azimuth(direction: Tensor) -> Tensor:
 
 
 def _turn(site: Site) -> Tensor:
-    """(n,) rad by which the detector's samples run off the crop's columns."""
+    """(n,) rad by which the detector's samples run off the crop's columns; 0 where no two neighbours have one."""
     sample = site.on_detector()[:, 1]
-    return torch.atan2(sample.diff(dim=1).nanmean((-2, -1)), sample.diff(dim=2).nanmean((-2, -1)))
+    return torch.atan2(sample.diff(dim=1).nanmean((-2, -1)), sample.diff(dim=2).nanmean((-2, -1))).nan_to_num()
 
 
 __all__ = ["responses"]
