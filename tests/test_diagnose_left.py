@@ -14,11 +14,11 @@ from scipy.stats import chi2, norm
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.left import field_of_images
 from stages.diagnose.likelihood.products import Products, Rows
-from stages.diagnose.likelihood.spilled import responses
 from stages.diagnose.likelihood.tails import together
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.rows.columns import Plan
 from stages.diagnose.rows.patches import make_grid
+from stages.diagnose.search.spilled import responses
 
 SIZE, FRAMES = 32, 6
 

@@ -31,8 +31,9 @@ from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, doubt_all, search
 from stages.diagnose.search.shadows import by_shadows, contradicted
+from stages.diagnose.search.spilled import spilled
 from stages.diagnose.search.state import State, View
-from stages.diagnose.settings import ALIKE, LINE, MISFIT, STILL
+from stages.diagnose.settings import ALIKE, FAINT, LINE, MISFIT, STILL
 from stages.effects import effect_names
 from stages.pairs.reader import PairReader
 
@@ -177,8 +178,8 @@ def _structure(state: State, view: View) -> dict[str, float]:
     out = {"lines across an image": share} if line > LINE else {}
     if surely > ALIKE:
         out["a broad field in each image that is the same on all ground"] = alike
-    spread, sure = state.spilled(view)
-    if sure:
+    spread, surely = spilled(state, view)
+    if surely > 0 and spread > FAINT**2:
         out["light of bright pixels that spreads along one direction of the detector"] = spread
     return out
 

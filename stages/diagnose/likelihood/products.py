@@ -30,14 +30,14 @@ class Rows:
     own_mean: Tensor
     shared_dark: Tensor
 
-    def with_shared(self, kept: Sequence[int], more: Tensor) -> Rows:
-        """With some of the shared columns, and others (k, n, K) that have neither means nor light in the dark."""
-        none = torch.zeros(len(more), 1)
+    def with_more(self, shared: Tensor) -> Rows:
+        """With further shared columns (k, n, K), which have neither means nor light in the dark."""
+        of_mean, of_dark = (x.new_zeros(len(shared), x.shape[1]) for x in (self.shared_mean, self.shared_dark))
         return replace(
             self,
-            shared=torch.cat([self.shared[kept], more]),
-            shared_mean=torch.cat([self.shared_mean[kept], none.expand(-1, self.shared_mean.shape[1])]),
-            shared_dark=torch.cat([self.shared_dark[kept], none.expand(-1, self.shared_dark.shape[1])]),
+            shared=torch.cat([self.shared, shared]),
+            shared_mean=torch.cat([self.shared_mean, of_mean]),
+            shared_dark=torch.cat([self.shared_dark, of_dark]),
         )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Container, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -50,24 +50,6 @@ class Plan:
     def shared_keys(self) -> list[tuple[str, int]]:
         """What each shared column is, to find it in another plan: a name, and of effects its number among their columns."""
         return [(name, self.shared[:k].count(name)) for k, name in enumerate(self.shared)]
-
-    def without_candidates(self) -> tuple[Plan, list[int]]:
-        """The plan of what is fitted along whatever is judged, and which of the shared columns that are."""
-        judged = {k for g in self.guises if not g.per_frame for k in g.columns} - self.prior.keys()
-        kept = [k for k in range(len(self.shared)) if k not in judged]
-        at = {k: place for place, k in enumerate(kept)}
-        plan = replace(
-            self,
-            shared=[self.shared[k] for k in kept],
-            prior={at[k]: v for k, v in self.prior.items()},
-            ordinary={n: [at[k] for k in columns] for n, columns in self.ordinary.items()},
-            form=[at[k] for k in self.form],
-            dem_errors=[at[k] for k in self.dem_errors],
-            ground=[at[k] for k in self.ground],
-            pull={at[k]: v for k, v in self.pull.items()},
-            guises=[g for g in self.guises if g.per_frame],
-        )
-        return plan, kept
 
     def frame_keys(self) -> list[tuple[str, int]]:
         """The same of the columns per frame."""

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_variance
 from stages.diagnose.likelihood.dem_errors import kept_share
-from stages.diagnose.likelihood.found import Found, interval
+from stages.diagnose.likelihood.found import Found
 from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
-from stages.diagnose.likelihood.spilled import responses
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import may_be_exchanged, measured_laws
@@ -26,6 +25,9 @@ from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, moved_c
 from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patches
 from stages.diagnose.settings import FAINT, GROUPS, SEEN, SHAMS
 from stages.effects import Effect, Survey, effect_names, get_effect
+
+# of every row (k, n, K): columns that are fitted along, and columns that are judged
+Further = Callable[[Sequence[Rows], Sequence[Chain], Grid], tuple[list[Tensor], list[Tensor]]]
 
 
 @dataclass
@@ -231,10 +233,12 @@ class State:
         whole = self._scattered(Whole(view.whole.given, plan, self.frames))
         return View(whole, plan, view.rows, view.grid, view.model)
 
-    def again(self, view: View, names: Sequence[str], model: Covariance | None = None) -> View:
+    def again(
+        self, view: View, names: Sequence[str], model: Covariance | None = None, further: Further | None = None
+    ) -> View:
         """A look beside ordinary amounts of these effects. Only the residual and the causes' own columns are rendered, the rest is as in ``view``.
 
-        model : the covariance, estimated where None
+        model : the covariance, estimated where None; further : shared columns that no effect has, which stand last
         """
         chains = self.chains()
         plan = make_plan(chains[0], names, self.data, candidates=(), impossible=self.impossible)
@@ -243,6 +247,12 @@ class State:
             r for part in per_site(lambda k: self.moved(view, k, chains[k], plan), range(len(chains))) for r in part
         ]
         model = model or self._covariance(rows, plan, view.grid)
+        if further:
+            known, asked = further(rows, chains, view.grid)
+            rows = [r.with_more(torch.cat(z)) for r, *z in zip(rows, known, asked, strict=True)]
+            first = len(plan.shared)
+            plan.prior |= dict.fromkeys(range(first, first + len(known[0])), math.inf)
+            plan.shared += ["further"] * len(torch.cat([known[0], asked[0]]))
         return View(self._whole(rows, [None] * len(rows), plan, view.grid, model), plan, rows, view.grid, model)
 
     def moved(self, view: View, site: int, chain: Chain, plan: Plan) -> list[Rows]:
@@ -259,23 +269,6 @@ class State:
         residuals, lights = [r.shared_dark[0] for r in rows], [r.shared_dark[light] for r in rows]
         shadow_variance(model, [r.patch for r in rows], residuals, lights)
         return model
-
-    def spilled(self, view: View) -> tuple[float, bool]:
-        """Share of the weighted squares that squared brightness along one direction of the detector gains on held-out ground, and whether it surely does."""
-        along, asked = responses(view.rows, self.chains(), view.grid)
-        plan, kept = view.plan.without_candidates()
-        free, count = len(along[0]), len(plan.shared)
-        plan.prior |= dict.fromkeys(range(count, count + free), math.inf)
-        plan.shared += ["spilled"] * (free + len(asked[0]))
-        rows = [
-            r.with_shared([0, *(1 + k for k in kept)], torch.cat(z))
-            for r, *z in zip(view.rows, along, asked, strict=True)
-        ]
-        whole = self._whole(rows, [None] * len(rows), plan, view.grid, view.model)
-        gains = whole.held_out(whole.known_places(range(1 + count + free, 1 + len(plan.shared))))
-        squares = 0.5 * float(whole.gram[0, 0])
-        sure = interval(gains, whole.sizes)[0] > 0 and gains.sum() > FAINT**2 * squares
-        return float(gains.sum()) / squares, bool(sure)
 
     def without_images(self, view: View) -> list[Whole]:
         """The sums of a look as if one group of images after the other had not been taken; what scatters does so as it did with all."""
