@@ -16,7 +16,8 @@ likelihood    The covariance of the residuals, estimated from them by wavelength
               mirrored and shuffled, say how large the largest of all statistics is when nothing is there.
 search        The effect that gains most on held-out ground, if shams hardly do as well, is rendered at its values and everything is fitted
               again. It is named if it is real (its own file says what is plausible and what is ordinary), if it is there
-              whichever images are left out, and if its held-out gain is above zero for sure. Then the next.
+              whichever images are left out, and if its held-out gain is above zero for sure. Then the next. Shadows, ground that images share and
+              light that spreads on the detector are looked at by themselves, last.
 result        What is named, how much of the residual is what, what was refused and why, what these data could not have shown.
 
 Whatever is special about one effect stands in its own file under ``stages/effects``; the numbers set by hand that decide what is found stand in ``settings.py``.

@@ -111,12 +111,12 @@ def grounds(reader: PairReader, pairs: NDArray[np.int64], most: int) -> list[NDA
     groups = sorted(groups, key=lambda g: -len(g))
     if "row" not in reader.file:  # such files do not say where crops lie
         return groups
-    place = np.stack([reader.file[k][...] for k in ("row", "col")], 1)
-    apart: list[NDArray[np.int64]] = []
-    for g in groups:
-        if not overlap(place[g[0]], place[[a[0] for a in apart]], reader.size):
-            apart.append(g)
-    return apart
+    place = np.stack([reader.file[k][...] for k in ("row", "col")], 1)[[g[0] for g in groups]]
+    apart: list[int] = []
+    for k in range(len(groups)):
+        if not overlap(place[k], place[apart], reader.size):
+            apart.append(k)
+    return [groups[k] for k in apart]
 
 
 def overlap(place: NDArray[np.float64], others: NDArray[np.float64], sides: tuple[int, int]) -> bool:
