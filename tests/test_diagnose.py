@@ -232,6 +232,29 @@ def test_a_pile_of_a_tenth_of_all_pixels_is_clipping():
     assert saturation.read_off(values.clamp(max=level))[0] == pytest.approx(level, rel=0.002)
 
 
+def test_clipping_shows_after_bicubic_resampling():
+    """It rings by a per cent above the level, in single images that are clipped in a few places."""
+    import cv2
+
+    from stages.effects import get_effect
+
+    rng, level = np.random.default_rng(8), 0.06
+    ground = cv2.GaussianBlur(rng.normal(size=(4, 160, 160, 1)).reshape(640, 160), (0, 0), 2.0).reshape(4, 160, 160)
+    images = 0.045 + 0.007 * ground / ground.std()
+    turned = cv2.getRotationMatrix2D((80, 80), 7.0, 0.93)
+
+    def laid(images):
+        every = [cv2.warpAffine(k.astype(np.float32), turned, (160, 160), flags=cv2.INTER_CUBIC) for k in images]
+        return torch.from_numpy(np.stack(every)[:, 20:-20, 20:-20].copy()).flatten()
+
+    saturation = get_effect("saturation")
+    clipped = laid(images.clip(max=level))
+    assert 0.01 < float((clipped > 0.998 * level).float().mean()) < 0.03
+    assert float((clipped > 1.002 * level).float().mean()) > 0.0005  # it does ring
+    assert saturation.read_off(clipped)[0] == pytest.approx(level, rel=0.003)
+    assert saturation.read_off(laid(images)) is None
+
+
 def test_images_that_are_cut_off_as_a_whole_are_clipping(monkeypatch):
     """Nothing of them is left to fit, and the law that is extrapolated to them may be too dark: their own brightness is not asked."""
     from types import SimpleNamespace

@@ -15,6 +15,7 @@ from stages.diagnose.likelihood.covariance import Covariance, shadow_variance
 from stages.diagnose.likelihood.dem_errors import kept_share
 from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.likelihood.jackknife import jackknife_error
+from stages.diagnose.model.aligned import aligned
 from stages.diagnose.rows.columns import Guise
 from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
@@ -24,6 +25,7 @@ from stages.effects import get_effect
 from stages.effects.base import Survey
 from stages.effects.filters import gaussian, seams
 from stages.effects.saturation import BINS
+from stages.physics.formation.resampling import displace
 
 
 def test_a_seam_of_a_dem_is_not_sharpened():
@@ -238,3 +240,22 @@ def test_jackknife_of_units_that_tell_unequally_much() -> None:
     variance = np.mean([jackknife_error(w, rest) ** 2 for w in without])
     assert 0.75 < variance / means.var() < 1.15
     assert jackknife_error(np.array([900.0, 0.0, 0.0]), np.array([1e-6, 2.0, 2.0])) < 0.01
+
+
+def test_images_that_are_laid_elsewhere_keep_their_noise() -> None:
+    """Or those that moved by half a pixel would seem better than others; and what is not known does not ring into its neighbours."""
+    noise = torch.randn(2, 96, 96, generator=torch.manual_seed(3))
+    everywhere = torch.ones(2, 96, 96, dtype=torch.bool)
+    half = torch.full((2, 96, 96), 0.5)
+    moved, valid = aligned(noise, everywhere, half, half)
+    quick, _ = aligned(noise, everywhere, half, half, displace)
+    power = [float(z[valid].square().mean()) for z in (noise, moved, quick)]
+    assert power[1] > 0.65 * power[0] and power[2] < 0.5 * power[0]
+    wave = torch.cos(2 * math.pi * 0.3 * (torch.arange(96.0) + 0.2)).expand(2, 96, 96)
+    moved, _ = aligned(wave, everywhere, torch.full((2, 96, 96), 0.3), 0 * half)
+    expected = torch.cos(2 * math.pi * 0.3 * (torch.arange(96.0) - 0.1))
+    assert (moved - expected)[:, 8:-8, 8:-8].abs().max() < 0.03
+    flat, hole = torch.full((2, 96, 96), 5.0), everywhere.clone()
+    hole[:, 40:50, 30:60] = False
+    moved, valid = aligned(flat * hole, hole, half, half)
+    assert not valid[:, 40:50, 31:60].any() and (moved[valid] - 5.0).abs().max() < 1e-4

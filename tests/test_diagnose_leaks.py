@@ -15,6 +15,7 @@ from test_diagnose import _pairs, scene  # noqa: F401
 from schemas.files.outputs import Output
 from stages import diagnose
 from stages.diagnose.likelihood.products import Rows, products
+from stages.diagnose.result import score
 from stages.diagnose.result.score import unconfirmed
 from stages.diagnose.search.refine import along, errors_over_images
 from stages.diagnose.search.tested import hidden_look, hidden_rows
@@ -89,6 +90,16 @@ def test_the_test_pairs_take_a_name_back(answers):
         state.causes[:] = [c for c in state.causes if c.effect is not invented]
     assert list(refused) == ["image_gain"] and "test pairs" in refused["image_gain"][1]
     assert [c.effect.name for c in state.causes] == before
+
+
+def test_a_single_test_ground_has_pieces_and_an_interval(answers, monkeypatch):
+    """Nothing else could take a name back where the test pairs show one place only."""
+    state = answers[2]
+    monkeypatch.setattr(state, "hidden", state.hidden[:1])
+    squares = score._hidden_squares(state)
+    assert len(squares) >= 4
+    monkeypatch.setattr(state, "hidden", state.hidden * 100)
+    assert len(score._hidden_squares(state)) == 100  # many are pieces themselves
 
 
 def test_errors_are_those_over_images_where_these_are_larger(answers):

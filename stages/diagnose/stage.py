@@ -137,7 +137,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         settle(state, view)
         doubted |= doubt_all(state, view, STILL)
     placed, refused = by_registration(state)
-    clipped = cut(data, state) if cut else None  # was taken out of the images before anything was sought
+    clipped = cut[0](data, state) if cut else None  # was taken out of the images before anything was sought
     ground, shown = by_ground(state)
     answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + by_shadows(state) + ground
     rejected = refused | outcome.rejected | doubted
@@ -148,6 +148,8 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     # what a better law or registration took away is no cause where none is named
     answer.budget = budget(view.rows, view.model, view.grid, before if answer.causes else after, after)
     answer.structure = _structure(state, view)
+    if cut and not clipped:
+        answer.structure["brightness that piles up at one level"] = cut[1]
     known = shown | {c.effect.name for c in answer.causes}
     answer.blind = blind_effects(state, outcome, known)
     answer.unexplained_fraction = max(answer.structure.values(), default=0.0)
@@ -175,7 +177,7 @@ def _structure(state: State, view: View) -> dict[str, float]:
     """
     line, share = peak(view.rows, view.model, view.grid, state.frames)
     alike, surely = field_of_images(view.rows, view.model, view.grid)
-    out = {"lines across an image": share} if line > LINE else {}
+    out = {"lines across an image": share} if line > LINE and share > FAINT**2 else {}
     if surely > ALIKE:
         out["a broad field in each image that is the same on all ground"] = alike
     spread, surely = spilled(state, view)

@@ -13,6 +13,7 @@ from stages.physics.photometry import Parameter
 
 PILE = 150  # pixels
 STANDS_OUT = 3.0  # times the bins below
+RINGING = 0.01  # of the level, by which bicubic resampling of an edge of common contrast overshoots
 BINS = (0.02, 0.002)  # of the level: noise added later makes the pile wide, a crowded histogram asks for narrow ones
 
 
@@ -48,11 +49,12 @@ class Saturation(Effect):
             edges = top * (1 + width) ** torch.arange(-16.0, 4.0)
             counts = torch.histogram(bright, edges)[0]
             best = int(counts[6:].argmax()) + 6
-            if width == BINS[0]:
-                before, above = counts[max(best - 5, 0) : best - 1].mean(), float(counts[best + 2 :].sum())
-            else:  # whole numbers leave bins between them empty, and brighter ones lie beyond the bins
-                before, above = counts[: best - 1].max(), float((bright >= edges[min(best + 2, len(edges) - 1)]).sum())
             # resampling rings a little over the level, noise added later blurs it: the pile is three bins wide
+            above = float((bright >= edges[best] * (1 + max(2 * width, RINGING))).sum())
+            if width == BINS[0]:
+                before = counts[max(best - 5, 0) : best - 1].mean()
+            else:  # whole numbers leave bins between them empty
+                before = counts[: best - 1].max()
             pile = float(counts[best - 1 : best + 2].sum())
             if pile >= PILE and counts[best] >= STANDS_OUT * before and above <= 0.05 * pile:
                 break

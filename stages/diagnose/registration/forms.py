@@ -22,6 +22,7 @@ from stages.diagnose.settings import BROAD, FIELD_ORDER
 from stages.effects.filters import fine, gradients
 from stages.effects.line_jitter import ORDERS, line_waves
 from stages.effects.relief_displacement import lean
+from stages.physics.formation.resampling import displace
 
 TERMS = tuple((i, k - i) for k in range(FIELD_ORDER + 1) for i in range(k + 1))  # powers of x and y
 WAVES = len(ORDERS)
@@ -111,7 +112,7 @@ def match(
     """
     rendered = chain.predict()
     site = chain.site
-    image, valid = aligned(site.read, site.read_valid, *known)
+    image, valid = aligned(site.read, site.read_valid, *known, displace)  # only linearised about: a quick one does
     mask = (valid & lit).float()
     measured, predicted, *slopes = fine(torch.stack([image, rendered, *gradients(rendered)]), mask, BROAD)
     scale = ((measured * predicted).sum((-2, -1)) / predicted.square().sum((-2, -1)).clamp(min=1e-20)).clamp(min=0)

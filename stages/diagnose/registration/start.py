@@ -16,6 +16,7 @@ from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.capture import correlations, peak
 from stages.diagnose.settings import BROAD, CAPTURE, CORRELATED, SURE
 from stages.effects.relief_displacement import lean
+from stages.physics.formation.resampling import displace
 
 Field = tuple[Tensor, Tensor]  # (n, H, W) px east and south, or broadcastable to it
 
@@ -45,7 +46,7 @@ def laid(sites: Sequence[Site], known: Sequence[Field]) -> Iterator[None]:
     """Sites as if their images had been read without these displacements."""
     kept = [(s.read, s.read_valid) for s in sites]
     for site, field in zip(sites, known, strict=True):
-        site.read, site.read_valid = aligned(site.read, site.read_valid, *field)
+        site.read, site.read_valid = aligned(site.read, site.read_valid, *field, displace)
     try:
         yield
     finally:

@@ -159,10 +159,10 @@ def _ordinary(size: float, error: float, cls: type[Effect]) -> bool:
     return size**2 - error**2 < max(cls.tolerance.values()) ** 2
 
 
-def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State], Named | None] | None:
-    """Read effects off the histogram of all pixels, mask what they spoilt, and return what makes the cause of it.
+def by_histogram(sites: Sequence[Site], units: str) -> tuple[Callable[[Survey, State], Named | None], float] | None:
+    """Read effects off the histogram of all pixels, mask what they spoilt, and return what makes the cause of it, and their share of the pixels.
 
-    That is None where clipping the prediction at the level does not surely bring it nearer to ground that the level was not read off from.
+    The cause is None where clipping the prediction at the level does not surely bring it nearer to ground that the level was not read off from.
     """
     bright = torch.cat([s.read[s.read_valid].flatten() for s in sites])
     for name in effect_names():
@@ -171,6 +171,7 @@ def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State],
         if found is None:
             continue
         level, error, _ = found
+        share = float((bright > level - error).float().mean())
         images, masks = [s.read for s in sites], [s.read_valid for s in sites]
         for site in sites:
             near: Tensor = gaussian(torch.where(site.read_valid, site.read, 0.0), 1.0)
@@ -200,7 +201,7 @@ def by_histogram(sites: Sequence[Site], units: str) -> Callable[[Survey, State],
             was, now = (math.sqrt(float(x.sum()) / pixels) for x in (before, after))
             return Named(effect, values, gain_chance(before, after), total, spread, was, now, percent, [cls.name])
 
-        return make
+        return make, share
     return None
 
 

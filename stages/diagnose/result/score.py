@@ -15,6 +15,7 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import full_light, lit_mask, scale_images
 from stages.diagnose.model.sites import Site
 from stages.diagnose.result.answer import Answer, HeldOut
+from stages.diagnose.rows.patches import cuts
 from stages.diagnose.search.select import Outcome
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import SURE
@@ -32,20 +33,25 @@ def score(state: State, answer: Answer) -> HeldOut:
     named = [c.effect for c in answer.causes if c.effect.displaces and c.effect.judged_apart]
     effects = [c.effect for c in answer.causes if c.effect not in named]
     plain, moved = displacements(state, named)
-    before, after = np.zeros((2, len(state.hidden)))
+    before: list[np.ndarray] = []
+    after: list[np.ndarray] = []
     count = 0.0
-    for k, (site, first, last) in enumerate(zip(state.hidden, plain, moved, strict=True)):
+    for site, first, last in zip(state.hidden, plain, moved, strict=True):
         images = [aligned(site.read, site.read_valid, *d) if d else (site.read, site.read_valid) for d in (first, last)]
         mask = full_light(state.reference.chain(site, [])) & images[0][1] & images[1][1]
-        squares, pixels = _squares(site, state.reference.chain(site, []), images[0][0], mask, state.free_gains)
-        before[k] = squares
-        after[k], _ = _squares(site, state.nominal.chain(site, effects), images[1][0], mask, state.free_gains)
+        for part, chain, (image, _) in (
+            (before, state.reference.chain(site, []), images[0]),
+            (after, state.nominal.chain(site, effects), images[1]),
+        ):
+            squares, pixels = _squares(site, chain, image, mask, state)
+            part.append(squares)
         count += pixels
     if not count > 0:
         return HeldOut()
-    _, low, high = gain_interval(before, after)
+    nominal, extended = np.concatenate(before), np.concatenate(after)
+    _, low, high = gain_interval(nominal, extended)
     pairs = sum(s.count for s in state.hidden)
-    return HeldOut(pairs, len(state.hidden), before.sum() / count, after.sum() / count, low, high)
+    return HeldOut(pairs, len(state.hidden), nominal.sum() / count, extended.sum() / count, low, high)
 
 
 def displacements(state: State, named: Sequence[Effect]) -> tuple[Fields, Fields]:
@@ -71,13 +77,17 @@ def displacements(state: State, named: Sequence[Effect]) -> tuple[Fields, Fields
 Fields = list[tuple[torch.Tensor, torch.Tensor]] | list[None]
 
 
-def _squares(site: Site, chain: Chain, image: torch.Tensor, mask: torch.Tensor, free: bool) -> tuple[float, float]:
-    """Squared error and number of pixels. Where several images show a pixel its own albedo is a nuisance: one factor for all of them.
+def _squares(
+    site: Site, chain: Chain, image: torch.Tensor, mask: torch.Tensor, state: State
+) -> tuple[np.ndarray, float]:
+    """Squared errors of the pieces of one ground, and its number of pixels. Where several images show a pixel its own albedo is a nuisance: one
+    factor for all of them.
 
     Without it albedo, which no cause is about, would drown what the images of a place disagree on.
     """
     site.image = image
     predicted = chain.predict()
+    free = state.free_gains
     if free:
         scale_images(site, image, predicted, mask)
     weight = mask.double()
@@ -90,8 +100,11 @@ def _squares(site: Site, chain: Chain, image: torch.Tensor, mask: torch.Tensor, 
         weight = weight * (weight.sum(0) > 1)
         seen = (weight * predicted.square()).sum(0).clamp(min=1e-12)
         predicted = predicted * ((weight * predicted * measured).sum(0) / seen)
-    error = (measured - predicted).double() * weight
-    return float(error.square().sum()), float(weight.sum())
+    squares = ((measured - predicted).double() * weight).square().sum(0)
+    # few grounds are cut, as those are that are learned from, or there would be no interval
+    pieces = cuts(min(squares.shape), len(state.hidden))
+    parts = [part.sum() for rows in squares.tensor_split(pieces) for part in rows.tensor_split(pieces, 1)]
+    return torch.stack(parts).numpy(), float(weight.sum())
 
 
 def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
@@ -105,10 +118,7 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
         state.fit()
         without = _hidden_squares(state)
         gain, _, high = gain_interval(without, with_cause)
-        # where there is no interval signs decide, but on what was judged on pieces of this ground already
-        open_ = type(cause.effect).scope != "scene"
-        if high < 0 or (math.isnan(high) and open_ and with_cause.sum() > without.sum()):
-            gain = 100 * (1 - with_cause.sum() / max(float(without.sum()), 1e-30))
+        if high < 0:
             why = f"the test pairs contradict it: it gains {gain:.1f} % there (up to {high:.1f})"
             out[cause.effect.name] = cause.found.gain, why
             continue
@@ -118,13 +128,13 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
 
 
 def _hidden_squares(state: State) -> np.ndarray:
-    """Squared error on every ground of the test pairs."""
-    total = np.zeros(len(state.hidden))
-    for k, site in enumerate(state.hidden):
+    """Squared errors on every piece of ground of the test pairs."""
+    out = [np.zeros(0)]
+    for site in state.hidden:
         site.align()
         chain = state.nominal.chain(site, state.base)
-        total[k], _ = _squares(site, chain, site.laid, lit_mask(chain), state.free_gains)
-    return total
+        out.append(_squares(site, chain, site.laid, lit_mask(chain), state)[0])
+    return np.concatenate(out)
 
 
 def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
