@@ -26,7 +26,7 @@ from stages.diagnose.registration.explain import explain
 from stages.diagnose.result.answer import Answer
 from stages.diagnose.result.files import write_diagnosis
 from stages.diagnose.result.named import by_histogram, by_registration, by_search
-from stages.diagnose.result.score import blind_effects, displacements, score, unconfirmed
+from stages.diagnose.result.score import beside_shadows, blind_effects, displacements, score, unconfirmed
 from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, doubt_all, search
@@ -139,8 +139,13 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     placed, refused = by_registration(state)
     clipped = cut[0](data, state) if cut else None  # was taken out of the images before anything was sought
     ground, shown = by_ground(state)
-    answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + by_shadows(state) + ground
-    rejected = refused | outcome.rejected | doubted
+    shaded, extended = by_shadows(state), state.nominal
+    contrary: dict[str, tuple[float, str]] = {}
+    if shaded:
+        extended, contrary = beside_shadows(state, shaded)
+    shaded = [c for c in shaded if c.effect.name not in contrary]
+    answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + shaded + ground
+    rejected = refused | outcome.rejected | doubted | contrary
     answer.rejected = {k: v for k, v in rejected.items() if k not in {c.effect.name for c in answer.causes}}
     if state.registration is not None:
         answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}
@@ -156,7 +161,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     if not answer.causes and outcome.sure:
         answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)
     answer.verdict = _verdict(answer)
-    answer.held_out = score(state, answer)
+    answer.held_out = score(state, answer, extended)
     return Result(answer, state, outcome)
 
 

@@ -12,9 +12,9 @@ import torch
 from stages.diagnose.likelihood.jackknife import gain_interval
 from stages.diagnose.model.aligned import aligned
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.nominal import full_light, lit_mask, scale_images
+from stages.diagnose.model.nominal import Nominal, fit, full_light, lit_mask, scale_images
 from stages.diagnose.model.sites import Site
-from stages.diagnose.result.answer import Answer, HeldOut
+from stages.diagnose.result.answer import Answer, HeldOut, Named
 from stages.diagnose.rows.patches import cuts
 from stages.diagnose.search.select import Outcome
 from stages.diagnose.search.state import State
@@ -22,9 +22,34 @@ from stages.diagnose.settings import SURE
 from stages.effects import Effect, effect_names, get_effect
 
 
-def score(state: State, answer: Answer) -> HeldOut:
+def beside_shadows(state: State, shaded: Sequence[Named]) -> tuple[Nominal, dict[str, tuple[float, str]]]:
+    """The nominal model, fitted again beside what shadows tell; and effect -> nats, why, where the test pairs surely lose by that all the same.
+
+    Shadows are judged whatever the law: nothing was fitted beside their cause yet, and a Sun that stands higher makes all ground brighter.
+    """
+    known = [state.base, [*state.base, *(c.effect for c in shaded)]]
+    models = [copy.copy(state.nominal) for _ in known]
+    for nominal, effects in zip(models, known, strict=True):
+        fit(nominal, state.sites, effects, state.units, [s.laid for s in state.sites])
+    squares: list[list[np.ndarray]] = [[np.zeros(0)], [np.zeros(0)]]
+    for site in state.hidden:
+        site.align()
+        chains = [nominal.chain(site, effects) for nominal, effects in zip(models, known, strict=True)]
+        mask = lit_mask(chains[0]) & lit_mask(chains[1])
+        for part, chain in zip(squares, chains, strict=True):
+            part.append(_squares(site, chain, site.laid, mask, state)[0])
+    gain, _, high = gain_interval(*(np.concatenate(part) for part in squares))
+    if not high < 0:
+        return models[1], {}
+    why = f"the test pairs contradict it: it gains {gain:.1f} % there (up to {high:.1f})"
+    return state.nominal, {c.effect.name: (c.gain, why) for c in shaded}
+
+
+def score(state: State, answer: Answer, extended: Nominal) -> HeldOut:
     """Squared errors of both models on the same pixels, with the same nuisance: the albedo of every pixel that several images show, gains
     of dn images, smooth fields of displacement.
+
+    extended : as it was fitted beside the causes
 
     Relative to brightness for dn images, else in I/F. What registration found counts where it is named, else both have it.
     """
@@ -36,22 +61,22 @@ def score(state: State, answer: Answer) -> HeldOut:
     before: list[np.ndarray] = []
     after: list[np.ndarray] = []
     count = 0.0
-    for site, first, last in zip(state.hidden, plain, moved, strict=True):
-        images = [aligned(site.read, site.read_valid, *d) if d else (site.read, site.read_valid) for d in (first, last)]
+    for site, was, now in zip(state.hidden, plain, moved, strict=True):
+        images = [aligned(site.read, site.read_valid, *d) if d else (site.read, site.read_valid) for d in (was, now)]
         mask = full_light(state.reference.chain(site, [])) & images[0][1] & images[1][1]
         for part, chain, (image, _) in (
             (before, state.reference.chain(site, []), images[0]),
-            (after, state.nominal.chain(site, effects), images[1]),
+            (after, extended.chain(site, effects), images[1]),
         ):
             squares, pixels = _squares(site, chain, image, mask, state)
             part.append(squares)
         count += pixels
     if not count > 0:
         return HeldOut()
-    nominal, extended = np.concatenate(before), np.concatenate(after)
-    _, low, high = gain_interval(nominal, extended)
+    first, last = np.concatenate(before), np.concatenate(after)
+    _, low, high = gain_interval(first, last)
     pairs = sum(s.count for s in state.hidden)
-    return HeldOut(pairs, len(state.hidden), nominal.sum() / count, extended.sum() / count, low, high)
+    return HeldOut(pairs, len(state.hidden), first.sum() / count, last.sum() / count, low, high)
 
 
 def displacements(state: State, named: Sequence[Effect]) -> tuple[Fields, Fields]:
@@ -177,4 +202,4 @@ def _could_not_show(state: State, outcome: Outcome, name: str) -> bool:
     return SURE * max(found, error) > 1
 
 
-__all__ = ["blind_effects", "score"]
+__all__ = ["beside_shadows", "blind_effects", "score", "unconfirmed"]
