@@ -126,8 +126,8 @@ def _squares(
         seen = (weight * predicted.square()).sum(0).clamp(min=1e-12)
         predicted = predicted * ((weight * predicted * measured).sum(0) / seen)
     squares = ((measured - predicted).double() * weight).square().sum(0)
-    # few grounds are cut, as those are that are learned from, or there would be no interval
-    pieces = cuts(min(squares.shape), len(state.hidden))
+    # one or two grounds are cut, as those are that are learned from: there would be no interval
+    pieces = cuts(min(squares.shape), len(state.hidden)) if len(state.hidden) < 3 else 1
     parts = [part.sum() for rows in squares.tensor_split(pieces) for part in rows.tensor_split(pieces, 1)]
     return torch.stack(parts).numpy(), float(weight.sum())
 
