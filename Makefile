@@ -15,7 +15,7 @@ SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 # A module is compiled once, when it is first imported: pip leaves it to us (see below).
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help install demo demo-paper demo-albedo figures test test-slow mutants fuzz endurance lint bench campaign campaign-real docs wheel vendor-js reproduce-apollo15 reproduce-models clean
+.PHONY: help install demo demo-paper demo-albedo figures test test-slow mutants fuzz endurance lint bench campaign campaign-laboratory campaign-real docs wheel vendor-js reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -66,6 +66,9 @@ bench: $(TESTED) ## speed and memory, each beside a named peer in the same run; 
 
 campaign: $(TESTED) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
 	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign
+
+campaign-laboratory: $(TESTED) ## what diagnose names in files of another laboratory's simulator; SEED=N
+	$(BIN)/python tests/laboratory_campaign.py --seed $(or $(SEED),$(error make campaign-laboratory SEED=N)) --cases 44 --jobs $(or $(JOBS),2) --output results/laboratory
 
 # Pairs of real photographs; REGISTERED=pairs.h5 adds a registered set.
 campaign-real: $(TESTED) results/apollo15/diagnosis.h5 ## plant effects into real photographs and see what diagnose names (needs the reference data)
