@@ -4,22 +4,48 @@ from __future__ import annotations
 
 import ast
 
+import laboratory_campaign
 import numpy as np
 import pytest
 from campaign import UNKNOWN
 from conftest import ROOT
 from hidden import departures, laws, sensor
 from hidden.faults import FAULTS
+from laboratory.cases import deal
 from scipy.ndimage import gaussian_filter
 
+from stages.effects import effect_names
 
-def test_hidden_data_import_nothing_of_the_program():
-    for path in sorted((ROOT / "tests" / "hidden").glob("*.py")):
+
+@pytest.mark.parametrize("simulator", ["hidden", "laboratory"])
+def test_hidden_data_import_nothing_of_the_program(simulator):
+    others = {"hidden", "laboratory"} - {simulator}
+    paths = sorted((ROOT / "tests" / simulator).glob("*.py"))
+    assert len(paths) > 5
+    for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             for name in names:
-                assert name.split(".")[0] not in ("stages", "schemas", "lunargr_cli"), f"{path.name} imports {name}"
+                known = {"stages", "schemas", "lunargr_cli", *others}
+                assert name.split(".")[0] not in known, f"{path.name} imports {name}"
+
+
+def test_a_hand_of_the_other_laboratory_is_dealt_as_its_seed_says():
+    hand = deal(5, 44)
+    assert hand == deal(5, 44) != deal(6, 44)
+    assert sum(d.effect is None and d.fault is None for d in hand) == 14 and sum(d.fault is not None for d in hand) == 8
+    assert {d.effect for d in hand if d.effect} <= set(effect_names())
+    assert {d.layout for d in hand if d.fault} == set("abcd")
+
+
+def test_an_answer_is_right_if_the_first_name_is_what_was_planted():
+    def answered(*names, blind=()):
+        causes = [{"effect": name, "parameters": {}} for name in names]
+        return laboratory_campaign.judged({"planted": {"echo": {}}, "answer": {"causes": causes, "blind": [*blind]}})
+
+    found = [answered("echo", "psf_blur"), answered("psf_blur", "echo"), answered(blind=["echo"]), answered()]
+    assert found == ["right", "another first", "no name, in `blind`", "no name, not in `blind`"]
 
 
 def test_roughness_of_a_smooth_surface_is_one():
