@@ -20,10 +20,10 @@ from stages.diagnose.likelihood.left import budget, field_of_images, peak
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import better_form, other_laws, relative_misfit
 from stages.diagnose.model.laws import LunarLaws
-from stages.diagnose.model.nominal import fit, lit_mask, load_nominal
+from stages.diagnose.model.nominal import Nominal, fit, lit_mask, load_nominal
 from stages.diagnose.model.sites import Site, all_over, grounds, load_site, survey
 from stages.diagnose.registration.explain import explain
-from stages.diagnose.result.answer import Answer
+from stages.diagnose.result.answer import Answer, Named
 from stages.diagnose.result.files import write_diagnosis
 from stages.diagnose.result.named import by_histogram, by_registration, by_search
 from stages.diagnose.result.score import beside_shadows, blind_effects, displacements, score, unconfirmed
@@ -139,11 +139,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     placed, refused = by_registration(state)
     clipped = cut[0](data, state) if cut else None  # was taken out of the images before anything was sought
     ground, shown = by_ground(state)
-    shaded, extended = by_shadows(state), state.nominal
-    contrary: dict[str, tuple[float, str]] = {}
-    if shaded:
-        extended, contrary = beside_shadows(state, shaded)
-    shaded = [c for c in shaded if c.effect.name not in contrary]
+    shaded, extended, contrary = _by_shadows(state)
     answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + shaded + ground
     rejected = refused | outcome.rejected | doubted | contrary
     answer.rejected = {k: v for k, v in rejected.items() if k not in {c.effect.name for c in answer.causes}}
@@ -152,9 +148,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     after = _residual(state)
     # what a better law or registration took away is no cause where none is named
     answer.budget = budget(view.rows, view.model, view.grid, before if answer.causes else after, after)
-    answer.structure = _structure(state, view)
-    if cut and not clipped:
-        answer.structure["brightness that piles up at one level"] = cut[1]
+    answer.structure = _structure(state, view, cut[1] if cut and not clipped else 0.0)
     known = shown | {c.effect.name for c in answer.causes}
     answer.blind = blind_effects(state, outcome, known)
     answer.unexplained_fraction = max(answer.structure.values(), default=0.0)
@@ -176,9 +170,20 @@ def _register(state: State) -> None:
     state.fit()
 
 
-def _structure(state: State, view: View) -> dict[str, float]:
+def _by_shadows(state: State) -> tuple[list[Named], Nominal, dict[str, tuple[float, str]]]:
+    """What shadows tell and the test pairs do not refuse, the nominal model as it is fitted beside that, and what they refuse."""
+    found = by_shadows(state)
+    if not found:
+        return [], state.nominal, {}
+    extended, contrary = beside_shadows(state, found)
+    return [c for c in found if c.effect.name not in contrary], extended, contrary
+
+
+def _structure(state: State, view: View, piled: float) -> dict[str, float]:
     """What is left that neither ground nor noise has, and its share: of a line, of the squares of that frame; of a field, of
     the squares of the broadest waves of all images; of light that spreads, of all squares; weighted by the inverse covariance.
+
+    piled : share of all pixels that pile up at one level and are no cause
     """
     line, share = peak(view.rows, view.model, view.grid, state.frames)
     alike, surely = field_of_images(view.rows, view.model, view.grid)
@@ -188,6 +193,8 @@ def _structure(state: State, view: View) -> dict[str, float]:
     spread, surely = spilled(state, view)
     if surely > 0 and spread > FAINT**2:
         out["light of bright pixels that spreads along one direction of the detector"] = spread
+    if piled:
+        out["brightness that piles up at one level"] = piled
     return out
 
 
