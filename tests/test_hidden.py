@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 
 import laboratory_campaign
 import numpy as np
@@ -12,6 +13,9 @@ from conftest import ROOT
 from hidden import departures, laws, sensor
 from hidden.faults import FAULTS
 from laboratory.cases import deal
+from laboratory.faults import FAULTS as LABORATORY_FAULTS
+from laboratory.plant import Plant
+from laboratory.planted import PLANTED
 from scipy.ndimage import gaussian_filter
 
 from stages.effects import effect_names
@@ -29,6 +33,13 @@ def test_hidden_data_import_nothing_of_the_program(simulator):
             for name in names:
                 known = {"stages", "schemas", "lunargr_cli", *others}
                 assert name.split(".")[0] not in known, f"{path.name} imports {name}"
+
+
+@pytest.mark.parametrize("kind", [*PLANTED.values(), *LABORATORY_FAULTS.values()], ids=lambda kind: kind.name)
+def test_every_plant_of_the_other_laboratory_says_what_it_does(kind):
+    assert not inspect.isabstract(kind)
+    own = {name for k in kind.__mro__[:-2] if k is not Plant for name in vars(k)}
+    assert own & {"iof", "departure", "image", "given_sun", "given_dem"}
 
 
 def test_a_hand_of_the_other_laboratory_is_dealt_as_its_seed_says():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import numpy as np
 from scipy import fft, ndimage
@@ -17,7 +19,7 @@ BLOCK = 8  # px of a JPEG block
 
 
 class Fault(Plant):
-    """By default it acts on the signal of the sensor, before noise."""
+    """What its seed draws is its own."""
 
     def draw(self, rng: np.random.Generator) -> None:
         self.seed = int(rng.integers(2**62))
@@ -26,26 +28,30 @@ class Fault(Plant):
     def draw_fault(self, rng: np.random.Generator) -> None:
         """Draw what the fault has of its own."""
 
+
+class OnSignal(Fault, ABC):
+    """It acts on the signal of the detector's pixels: of the `sensor`, before noise, if not of the `optics`, or `after` all else."""
+
+    where: ClassVar[str] = "sensor"
+
     def departure(self, x: float) -> Departure:
-        return Departure(sensor=lambda signal, patch: self.sense(signal, patch, x))
+        return Departure(**{self.where: lambda signal, patch: self.sense(signal, patch, x)})
 
+    @abstractmethod
     def sense(self, signal: Array, patch: Patch, x: float) -> Array:
-        """Detector pixels with the fault at strength x."""
-        raise NotImplementedError
+        """The signal with the fault at strength x."""
 
 
-class Ghost(Fault):
+class Ghost(OnSignal):
     """A blurred, displaced and perhaps turned second image from a reflection between lenses."""
 
     name = "ghost"
+    where = "optics"
     start, low, high = 0.03, 0.002, 0.4
 
     def draw_fault(self, rng: np.random.Generator) -> None:
         self.samples, self.lines, self.blur = rng.uniform(6, 30), rng.uniform(6, 30), rng.uniform(1.5, 5)
         self.turned = bool(rng.random() < 0.5)
-
-    def departure(self, x: float) -> Departure:
-        return Departure(optics=lambda signal, patch: self.sense(signal, patch, x))
 
     def sense(self, signal: Array, patch: Patch, x: float) -> Array:
         second = signal[::-1, ::-1] if self.turned else signal
@@ -53,7 +59,7 @@ class Ghost(Fault):
         return signal + x * ndimage.gaussian_filter(second, self.blur)
 
 
-class Banding(Fault):
+class Banding(OnSignal):
     """An offset that wanders from line to line."""
 
     name = "banding"
@@ -68,15 +74,13 @@ class Banding(Fault):
         return signal + x * self.scene.mean_iof * offset[np.clip(patch.lines, 0, LINES - 1)]
 
 
-class Jpeg(Fault):
+class Jpeg(OnSignal):
     """Cosine coefficients of blocks rounded to steps of the noise, coarser for higher frequencies."""
 
     name = "jpeg"
+    where = "after"
     needs_noise = True
     start, low, high = 1.0, 0.05, 20.0
-
-    def departure(self, x: float) -> Departure:
-        return Departure(after=lambda signal, patch: self.sense(signal, patch, x))
 
     def sense(self, signal: Array, patch: Patch, x: float) -> Array:
         scene = self.scene
@@ -90,7 +94,7 @@ class Jpeg(Fault):
         return blocks.reshape(padded.shape[0], -1)[:rows, :cols]
 
 
-class ChargeSmear(Fault):
+class ChargeSmear(OnSignal):
     """Each column of a frame adds a share of its mean: no shutter while it was read."""
 
     name = "charge_smear"
@@ -112,7 +116,7 @@ class MotionBlur(Fault):
         return Departure(motion=x)
 
 
-class Moire(Fault):
+class Moire(OnSignal):
     """A sine of its own period and direction in every image."""
 
     name = "moire"
@@ -128,7 +132,7 @@ class Moire(Fault):
         return signal + x * self.scene.mean_iof * 1.414 * np.sin(2 * np.pi * along / period + phase)
 
 
-class CosmicRays(Fault):
+class CosmicRays(OnSignal):
     """Bright pixels, and dead ones, at random; x: their share."""
 
     name = "cosmic_rays"
@@ -141,7 +145,7 @@ class CosmicRays(Fault):
         return signal + hit * np.where(dead, -0.9 * signal, bright)
 
 
-class StrayGradient(Fault):
+class StrayGradient(OnSignal):
     """Light that grows towards one side of the frame, another side in every image."""
 
     name = "stray_gradient"
@@ -171,7 +175,7 @@ class Nearest(Fault):
         return Departure(resampling=0)
 
 
-class OddEven(Fault):
+class OddEven(OnSignal):
     """Two amplifiers: odd and even columns with gains of their own."""
 
     name = "odd_even"
@@ -181,21 +185,22 @@ class OddEven(Fault):
         return signal * (1 + x * (2 * (patch.samples % 2) - 1))
 
 
-class CoarseQuantisation(Fault):
+class CoarseQuantisation(OnSignal):
     """x: the step, I/F."""
 
     name = "coarse_quantisation"
+    where = "after"
     needs_noise = True
 
     def draw_fault(self, rng: np.random.Generator) -> None:
         level = self.scene.mean_iof
         self.start, self.low, self.high = 0.01 * level, 0.001 * level, 0.4 * level
 
-    def departure(self, x: float) -> Departure:
-        return Departure(after=lambda signal, patch: np.round(signal / x) * x)
+    def sense(self, signal: Array, patch: Patch, x: float) -> Array:
+        return np.round(signal / x) * x
 
 
-class DustRings(Fault):
+class DustRings(OnSignal):
     """Out-of-focus grains on the detector's window."""
 
     name = "dust_rings"

@@ -77,6 +77,14 @@ def ridge_tangent(ridge: np.ndarray, x: float, y: float, z: float, se: float, sn
 
 
 @njit(cache=True, fastmath=True)
+def slopes(height: np.ndarray, a: int, b: int, dx: float) -> tuple[float, float, float]:
+    """Slope to the east and to the north at a sample, and the vertical part of the unit normal."""
+    gx = (height[a, b + 1] - height[a, b - 1]) / (2 * dx)
+    gy = -(height[a + 1, b] - height[a - 1, b]) / (2 * dx)
+    return gx, gy, 1.0 / math.sqrt(1 + gx * gx + gy * gy)
+
+
+@njit(cache=True, fastmath=True)
 def render(
     height: np.ndarray,
     texture: np.ndarray,
@@ -109,9 +117,7 @@ def render(
         for j in range(out.shape[1]):
             a = r0 + i
             b = c0 + j
-            gx = (height[a, b + 1] - height[a, b - 1]) / (2 * dx)
-            gy = -(height[a + 1, b] - height[a - 1, b]) / (2 * dx)
-            nn = 1.0 / math.sqrt(1 + gx * gx + gy * gy)
+            gx, gy, nn = slopes(height, a, b, dx)
             n0 = -gx * nn
             n1 = -gy * nn
             n2 = nn
@@ -171,9 +177,7 @@ def bounce(
         for j in range(out.shape[1]):
             a = r0 + i
             b = c0 + j
-            gx = (height[a, b + 1] - height[a, b - 1]) / (2 * dx)
-            gy = -(height[a + 1, b] - height[a - 1, b]) / (2 * dx)
-            nn = 1.0 / math.sqrt(1 + gx * gx + gy * gy)
+            gx, gy, nn = slopes(height, a, b, dx)
             total = 0.0
             for q in range(azimuths):
                 az = 2 * PI * (q + 0.5) / azimuths

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
 import numpy as np
 from scipy import ndimage
@@ -52,16 +53,16 @@ class SunElevation(SunError):
         self.start, self.low, self.high = 1.5, log_uniform(rng, 0.2, 0.8), 7.0
 
 
-class DemError(Plant):
+class DemError(Plant, ABC):
     """The file's DEM is worse than the ground was; its images are orthorectified with it."""
 
     of_inputs = True
     needs = Needs(oblique=False)
     _worse: tuple[float, Array] | None = None  # the last strength and its ground
 
+    @abstractmethod
     def worse(self, x: float) -> Array:
         """The ground on the fine grid, as this DEM would have it."""
-        raise NotImplementedError
 
     def iof(self, pair: int, x: float) -> Array:
         if self._worse is None or self._worse[0] != x:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 
 import numpy as np
 from scipy import ndimage
@@ -12,7 +13,7 @@ from .layout import Needs
 from .plant import Plant
 
 
-class AlbedoOf(Plant):
+class AlbedoOf(Plant, ABC):
     """Albedo times 1 + x z, where z is a standardised map of pixels."""
 
     def draw(self, rng: np.random.Generator) -> None:
@@ -21,9 +22,9 @@ class AlbedoOf(Plant):
         ground = self.scene.ground
         self.fine = refine(pattern, ground.fine, ground.height.shape[0]).astype(np.float32)
 
+    @abstractmethod
     def pattern(self, rng: np.random.Generator) -> Array:
         """(grid, grid): mean 0 and deviation 1 over the crops."""
-        raise NotImplementedError
 
     def standardised(self, values: Array) -> Array:
         crops = self.scene.sites.crops(values)

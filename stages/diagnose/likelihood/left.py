@@ -89,13 +89,8 @@ def peak(rows: list[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[
     seen = count > 0
     power, count = power[seen], count[seen]
     best, largest = 0.0, 0.0
-    columns = grid.width // 2 + 1
-    down, right = (
-        torch.fft.fftfreq(grid.height)[grid.keep // columns],
-        torch.fft.rfftfreq(grid.width)[grid.keep % columns],
-    )
     # broad waves are ground and film; of those in the corners, shorter than two pixels, images that were resampled have next to nothing
-    fine = (grid.annulus >= 2) & (torch.hypot(down, right) <= 0.5)
+    fine = (grid.annulus >= 2) & (torch.hypot(*grid.waves) <= 0.5)
     for p, n in zip(power, count, strict=True):
         level = torch.zeros(grid.annuli, dtype=torch.float64)
         for a in range(grid.annuli):

@@ -58,4 +58,4 @@ def _without_holes(image: Tensor, valid: Tensor) -> Tensor:
     return out
 
 
-__all__ = ["aligned", "spline"]
+__all__ = ["aligned"]

@@ -41,8 +41,12 @@ def beside_shadows(state: State, shaded: Sequence[Named]) -> tuple[Nominal, dict
     gain, _, high = gain_interval(*(np.concatenate(part) for part in squares))
     if not high < 0:
         return models[1], {}
-    why = f"the test pairs contradict it: it gains {gain:.1f} % there (up to {high:.1f})"
-    return state.nominal, {c.effect.name: (c.gain, why) for c in shaded}
+    return state.nominal, {c.effect.name: (c.gain, _contradiction(gain, high)) for c in shaded}
+
+
+def _contradiction(gain: float, high: float) -> str:
+    """Why a cause is none: percent that the squared error of the test pairs shrinks by, and the upper bound of that."""
+    return f"the test pairs contradict it: it gains {gain:.1f} % there (up to {high:.1f})"
 
 
 def score(state: State, answer: Answer, extended: Nominal) -> HeldOut:
@@ -144,8 +148,7 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
         without = _hidden_squares(state)
         gain, _, high = gain_interval(without, with_cause)
         if high < 0:
-            why = f"the test pairs contradict it: it gains {gain:.1f} % there (up to {high:.1f})"
-            out[cause.effect.name] = cause.found.gain, why
+            out[cause.effect.name] = cause.found.gain, _contradiction(gain, high)
             continue
         state.causes[:], state.nominal = kept, nominal
         state.fit()

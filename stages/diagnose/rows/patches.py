@@ -49,6 +49,12 @@ class Grid:
         return len(self.radius)
 
     @cached_property
+    def waves(self) -> tuple[Tensor, Tensor]:
+        """(K,) cycles/px down the rows and along the columns."""
+        columns = self.width // 2 + 1
+        return torch.fft.fftfreq(self.height)[self.keep // columns], torch.fft.rfftfreq(self.width)[self.keep % columns]
+
+    @cached_property
     def bins(self) -> Tensor:
         """(H, W) number of the ring and sector that each frequency belongs to."""
         return self.annulus * SECTORS + self.sector

@@ -63,9 +63,7 @@ def _of_powers(row: Rows, chain: Chain, grid: Grid) -> tuple[Tensor, Tensor]:
 
 def _angles(grid: Grid) -> Tensor:
     """(K,) rad from the crop's columns to its rows, of every wave."""
-    columns = grid.width // 2 + 1
-    down = torch.fft.fftfreq(grid.height)[grid.keep // columns]
-    return torch.atan2(down, torch.fft.rfftfreq(grid.width)[grid.keep % columns])
+    return torch.atan2(*grid.waves)
 
 
 def _azimuth(direction: Tensor) -> Tensor:
