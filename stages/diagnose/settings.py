@@ -50,6 +50,7 @@ HALVED = 0.5  # of the squared residual: laws that leave less take the place of 
 MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model says nothing about the images
 BROADEST = 3  # annuli: up to four waves across a piece of ground, what stray light and film differ by within one
 ALIKE = 0.03  # of the squares of these, surely (95 %): laws and flat fields that are not known to a few tenths of a per cent make up to 0.02 alike
+STANDS_OUT = 15.0  # times what lies about a pixel: shadows below a pixel made dark ones of up to 17, bright ones of up to 9; dark ones need twice this
 LINE = 25.0  # -log10 of the chance of the strongest single wave: leakage of windows made up to 15 on development data, lines from 40
 BORROWED = 20.0  # waves' worth of the mean over frames in each frame's own variance: broad annuli have few waves
 ADDED = 50.0  # waves' worth of a size of 1 in each piece of ground's own size

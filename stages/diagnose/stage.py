@@ -16,7 +16,7 @@ from schemas.files.companions import companions_of
 from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.diagnose.config import Config
-from stages.diagnose.likelihood.left import budget, field_of_images, peak
+from stages.diagnose.likelihood.budget import budget
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import better_form, other_laws, relative_misfit
 from stages.diagnose.model.laws import LunarLaws
@@ -31,9 +31,9 @@ from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, doubt_all, search
 from stages.diagnose.search.shadows import by_shadows, contradicted
-from stages.diagnose.search.spilled import spilled
-from stages.diagnose.search.state import State, View
-from stages.diagnose.settings import ALIKE, FAINT, LINE, MISFIT, STILL
+from stages.diagnose.search.state import State
+from stages.diagnose.settings import MISFIT, STILL
+from stages.diagnose.structure.kinds import structure
 from stages.effects import effect_names
 from stages.pairs.reader import PairReader
 
@@ -148,7 +148,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     after = _residual(state)
     # what a better law or registration took away is no cause where none is named
     answer.budget = budget(view.rows, view.model, view.grid, before if answer.causes else after, after)
-    answer.structure = _structure(state, view, cut[1] if cut and not clipped else 0.0)
+    answer.structure = structure(state, view, cut[1] if cut and not clipped else 0.0)
     known = shown | {c.effect.name for c in answer.causes}
     answer.blind = blind_effects(state, outcome, known)
     answer.unexplained_fraction = max(answer.structure.values(), default=0.0)
@@ -177,25 +177,6 @@ def _by_shadows(state: State) -> tuple[list[Named], Nominal, dict[str, tuple[flo
         return [], state.nominal, {}
     extended, contrary = beside_shadows(state, found)
     return [c for c in found if c.effect.name not in contrary], extended, contrary
-
-
-def _structure(state: State, view: View, piled: float) -> dict[str, float]:
-    """What is left that neither ground nor noise has, and its share: of a line, of the squares of that frame; of a field, of
-    the squares of the broadest waves of all images; of light that spreads, of all squares; weighted by the inverse covariance.
-
-    piled : share of all pixels that pile up at one level and are no cause
-    """
-    line, share = peak(view.rows, view.model, view.grid, state.frames)
-    alike, surely = field_of_images(view.rows, view.model, view.grid)
-    out = {"lines across an image": share} if line > LINE and share > FAINT**2 else {}
-    if surely > ALIKE:
-        out["a broad field in each image that is the same on all ground"] = alike
-    spread, surely = spilled(state, view)
-    if surely > 0 and spread > FAINT**2:
-        out["light of bright pixels that spreads along one direction of the detector"] = spread
-    if piled:
-        out["brightness that piles up at one level"] = piled
-    return out
 
 
 def _verdict(answer: Answer) -> str:

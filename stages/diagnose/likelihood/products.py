@@ -92,6 +92,12 @@ def _factor(model: Covariance, patch: Patch, grid: Grid) -> Tensor:
     return torch.linalg.inv(lower).to(torch.complex64)
 
 
+def precision(model: Covariance, patch: Patch, grid: Grid) -> Tensor:
+    """(bins, n, n) complex64: inverse of the covariance of the images."""
+    factor = _factor(model, patch, grid)
+    return factor.mH @ factor
+
+
 def products(
     rows: Rows,
     model: Covariance,
@@ -278,4 +284,4 @@ def _mirror(grid: Grid) -> Tensor:
     return back[flipped]
 
 
-__all__ = ["Products", "Rows", "make_shams", "products", "whitened_residual"]
+__all__ = ["Products", "Rows", "make_shams", "precision", "products", "whitened_residual"]

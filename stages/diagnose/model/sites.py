@@ -64,12 +64,17 @@ class Site:
         self.image = (laid_image - self.offset[:, None, None]) / self.gain[:, None, None]
 
     def on_detector(self) -> Tensor:
-        """(n, 2, H, W) line and sample of every pixel; row and column of the crop where the detector is not known."""
+        """(n, 2, H, W) line and sample of every pixel as the images lie now; row and column of the crop where the detector is not known."""
         line, sample = self.observation.detector_line, self.observation.detector_sample
         if line is None or sample is None:
             rows, columns = (torch.arange(k, dtype=self.read.dtype) for k in self.read.shape[-2:])
             line, sample = rows[:, None].expand_as(self.read), columns.expand_as(self.read)
-        return torch.stack([line, sample], 1)
+        out = torch.stack([line, sample], 1)
+        if self.displacement is not None:
+            east, south = (d[:, None] for d in self.displacement)
+            down, across = torch.gradient(out, dim=(-2, -1))
+            out = out + down * south + across * east
+        return out
 
     @property
     def count(self) -> int:

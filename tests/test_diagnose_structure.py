@@ -12,13 +12,17 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 from scipy.stats import chi2, norm
 
 from stages.diagnose.likelihood.covariance import Covariance
-from stages.diagnose.likelihood.left import field_of_images
 from stages.diagnose.likelihood.products import Products, Rows
 from stages.diagnose.likelihood.tails import together
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.rows.columns import Plan
 from stages.diagnose.rows.patches import make_grid
-from stages.diagnose.search.spilled import responses
+from stages.diagnose.structure.detector import pattern_of_detector
+from stages.diagnose.structure.fields import field_of_images
+from stages.diagnose.structure.innovations import Innovation, innovations
+from stages.diagnose.structure.lines import line_of_brightness, line_of_displacement
+from stages.diagnose.structure.pixels import pixels_that_stand_out
+from stages.diagnose.structure.spilled import responses
 
 SIZE, FRAMES = 32, 6
 
@@ -66,6 +70,90 @@ def test_ground_that_is_alike_by_chance_is_no_field_of_the_images():
     assert sum(low > 0 for _, low in found) <= 5 and max(share for share, _ in found) > 0.2
     found = [field_of_images(rows(2.0, seed, grounds=4), model, grid) for seed in range(10)]
     assert sum(low > 0 for _, low in found) >= 8
+
+
+def left(seed: int, fault=lambda images, slopes, line, sample: images) -> list[Innovation]:
+    """White innovations of six images of eight grounds with a fault, each image on another part of the detector, ground not in line with it."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:SIZE, 0:SIZE].astype(float)
+    out = []
+    for ground in range(8):
+        at = rng.uniform(0, 2 * SIZE, (FRAMES, 2))[:, :, None, None]
+        detector = 0.87 * np.stack([y + 0.1 * x, x - 0.1 * y]) + at
+        rough = gaussian_filter(rng.normal(size=(SIZE, SIZE)), 1.5)
+        bright = 1 + 0.1 * rough / rough.std()
+        slopes = np.gradient(bright)
+        images = fault(rng.normal(0, 1, (FRAMES, SIZE, SIZE)), slopes, *detector.swapaxes(0, 1))
+        weight = torch.ones(FRAMES, SIZE, SIZE)
+        patch = SimpleNamespace(
+            site=ground, weight=weight, scale=torch.tensor(bright).expand(FRAMES, -1, -1), frames=torch.arange(FRAMES)
+        )
+        out.append(Innovation(patch, torch.tensor(images), weight > 0, torch.tensor(detector)))
+    return out
+
+
+def test_an_innovation_is_what_the_other_images_do_not_foretell():
+    """Albedo that all six share is foretold; noise that one has alone stays, in units of what is not foretold."""
+    grid = make_grid(SIZE, SIZE)
+    model = Covariance.white(grid.annuli, FRAMES)
+    model.albedo[:] = 1e4
+    given = rows(0.0, 3)
+    shared = torch.randn(len(grid.keep), dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
+    for row in given:
+        row.shared[0] += 30 * shared * grid.root
+    sites = [SimpleNamespace(on_detector=lambda: torch.zeros(FRAMES, 2, SIZE, SIZE))] * len(given)
+    for row in given:
+        row.patch.images, row.patch.rows, row.patch.columns = torch.arange(FRAMES), slice(SIZE), slice(SIZE)
+    noise = torch.fft.irfft2(_plane(rows(0.0, 3)[0].shared[0] / grid.root, grid), s=(SIZE, SIZE))
+    found = innovations(given, model, grid, sites)[0].value
+    expected = noise - noise.mean(0)  # the rest of six values about their mean
+    assert torch.allclose(found, expected / expected.square().mean((-2, -1), keepdim=True).sqrt(), atol=2e-2)
+
+
+def _plane(z: torch.Tensor, grid) -> torch.Tensor:
+    plane = torch.zeros(len(z), SIZE * (SIZE // 2 + 1), dtype=z.dtype)
+    plane[:, grid.keep] = z
+    return plane.unflatten(1, (SIZE, -1))
+
+
+def test_a_pixel_stands_out_if_it_shines_or_is_much_darker_than_a_small_shadow():
+    assert all(pixels_that_stand_out(left(seed)) == (0, 0.0) for seed in range(20))
+    bright, dark = left(1), left(1)
+    for every, size in ((bright, 25.0), (dark, -25.0)):
+        every[3].value[2, 15, 16] = size
+    assert pixels_that_stand_out(bright) == (1, pytest.approx(625 / (8 * FRAMES * SIZE**2), rel=0.05))
+    assert pixels_that_stand_out(dark) == (0, 0.0)
+    dark[3].value[2, 15, 16] = -45.0
+    assert pixels_that_stand_out(dark)[0] == 1
+    bright[3].value[2, 10:21, 11:22] *= 10.0  # rough ground about it
+    bright[3].value[2, 15, 16] = 25.0
+    assert pixels_that_stand_out(bright) == (0, 0.0)
+
+
+def test_what_stays_on_the_detector_is_told_from_what_goes_with_the_ground():
+    pattern = np.random.default_rng(9).normal(0, 0.5, (4 * SIZE, 4 * SIZE))
+
+    def dusty(images, slopes, line, sample):
+        return images + pattern[np.round(line).astype(int), np.round(sample).astype(int)]
+
+    found = [pattern_of_detector(left(seed)) for seed in range(20)]
+    assert sum(low > 0 for _, low in found) <= 3  # of 20 at 2.5 %
+    share, low = pattern_of_detector(left(1, dusty))
+    assert low > 0.15 and share == pytest.approx(0.25 / 1.25, rel=0.1)
+    albedo = np.random.default_rng(5)
+    assert pattern_of_detector(left(1, lambda images, *_: images + albedo.normal(0, 2, (SIZE, SIZE))))[1] < 0
+
+
+def test_the_nearest_pixel_of_a_detector_leaves_lines_in_where_it_shows_the_ground_and_not_in_brightness():
+    def nearest(images, slopes, line, sample):
+        down, across = (x / x.std() for x in slopes)
+        return images + 2 * ((line - np.round(line)) * down + (sample - np.round(sample)) * across)
+
+    grid = make_grid(SIZE, SIZE)
+    assert max(line_of_displacement(left(seed), grid, FRAMES)[0] for seed in range(20)) < 5
+    chance, share = line_of_displacement(left(1, nearest), grid, FRAMES)
+    assert chance > 25 and share > 0.005
+    assert line_of_brightness(rows(0.0, 1), Covariance.white(grid.annuli, FRAMES), grid, FRAMES)[0] < 5
 
 
 def spilled_over(

@@ -1,0 +1,94 @@
+"""A single wave that stands out in the spectrum of a frame: of its brightness, or of where it shows the ground."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.ndimage import median_filter
+from scipy.special import gammaincinv
+from torch import Tensor
+
+from stages.diagnose.likelihood.covariance import Covariance
+from stages.diagnose.likelihood.products import Rows, whitened_residual
+from stages.diagnose.likelihood.tails import surprise
+from stages.diagnose.rows.patches import Grid
+from stages.diagnose.settings import FAR, NEAR, PEAK
+from stages.diagnose.structure.innovations import Innovation
+
+LARGEST, STEEPEST = 5.0, 3.0  # standard deviations: a single pixel, or an edge, is no line
+
+
+def line_of_brightness(rows: Sequence[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[float, float]:
+    """-log10 of the chance of the strongest single wave of any frame among all of them, and its share of that frame's squares."""
+    spectra = []
+    for row in rows:
+        z, _, _ = whitened_residual(row, model, grid)
+        size = (row.patch.weight.square().mean((-2, -1)) * model.size.get(row.patch.number, 1.0)).clamp(min=1e-6)
+        spectra.append((row.patch.frames, z / size.sqrt()[:, None]))
+    return _strongest(spectra, grid, frames)
+
+
+def line_of_displacement(every: Sequence[Innovation], grid: Grid, frames: int) -> tuple[float, float]:
+    """The same of what is left times the slope of the rendered brightness, along columns or rows: a displacement that comes
+    back at equal distances, as the nearest pixel of a detector leaves it. It goes with the image's slopes, whose own spectrum hides it.
+    """
+    best = 0.0, 0.0
+    for axis in (-1, -2):
+        spectra = []
+        for one in every:
+            patch = one.patch
+            bright = patch.scale / patch.scale.mean((-2, -1), keepdim=True)
+            slope = torch.gradient(bright, dim=axis)[0]
+            slope = slope / slope.square().mean().sqrt().clamp(min=1e-9)
+            moved = one.value.clamp(-LARGEST, LARGEST) * slope.clamp(-STEEPEST, STEEPEST) * patch.weight
+            z = torch.fft.rfft2(moved).flatten(-2)[:, grid.keep]
+            size = (z.abs().square().mean(1)).clamp(min=1e-9).sqrt()
+            spectra.append((patch.frames, z / size[:, None]))
+        best = max(best, _strongest(spectra, grid, frames))
+    return best
+
+
+def _strongest(spectra: Sequence[tuple[Tensor, Tensor]], grid: Grid, frames: int) -> tuple[float, float]:
+    """spectra : frames (n,) and coefficients (n, K) of every piece of ground"""
+    power = torch.zeros(frames, len(grid.keep), dtype=torch.float64)
+    count = torch.zeros(frames, dtype=torch.float64)
+    for of, z in spectra:
+        power.index_add_(0, of, z.abs().square().double())
+        count.index_add_(0, of, torch.ones(len(of), dtype=torch.float64))
+    seen = count > 0
+    power, count = power[seen], count[seen]
+    best, largest = 0.0, 0.0
+    # broad waves are ground and film; of those in the corners, shorter than two pixels, images that were resampled have next to nothing
+    fine = (grid.annulus >= 2) & (torch.hypot(*grid.waves) <= 0.5)
+    for p, n in zip(power, count, strict=True):
+        level = torch.zeros(grid.annuli, dtype=torch.float64)
+        for a in range(grid.annuli):
+            level[a] = p[grid.annulus == a].median()
+        ratio = p / level[grid.annulus].clamp(min=1e-30)
+        ratio = (ratio / _about(ratio, grid).clamp(min=1))[fine]
+        top = float(ratio.max())
+        shape = max(float(n), 1.0)
+        middle = float(gammaincinv(shape, 0.5))
+        chance = float(surprise(np.array([2 * top * middle]), 2 * shape)[0]) - math.log10(len(ratio) * len(power))
+        # neighbours share a wave through the window: what stands out by a little is no line
+        if top > PEAK and chance > best:
+            best, largest = chance, float((p[fine] * (ratio > PEAK)).sum() / p.sum())
+    return best, largest
+
+
+def _about(power: Tensor, grid: Grid) -> Tensor:
+    """(K,) median power of the waves some way off each one: slanting light and optics make power go with direction, in no line."""
+    columns = grid.width // 2 + 1
+    row, column = grid.keep // columns, grid.keep % columns
+    plane = np.full((grid.height, grid.width), float(power.median()))
+    plane[row, column] = power
+    plane[-row % grid.height, -column % grid.width] = power
+    y, x = np.ogrid[-FAR : FAR + 1, -FAR : FAR + 1]
+    ring = (np.hypot(y, x) <= FAR) & (np.hypot(y, x) > NEAR)
+    return torch.from_numpy(median_filter(plane, footprint=ring, mode="wrap")[row, column])
+
+
+__all__ = ["line_of_brightness", "line_of_displacement"]
