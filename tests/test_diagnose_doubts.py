@@ -15,8 +15,9 @@ from stages.diagnose.likelihood.covariance import Covariance, shadow_variance
 from stages.diagnose.likelihood.dem_errors import kept_share
 from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.likelihood.jackknife import jackknife_error
+from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.aligned import aligned
-from stages.diagnose.rows.columns import Guise
+from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
 from stages.diagnose.search.select import ODD, ORDINARY, beyond_bounds, choose, doubt, judge, may_be_another
@@ -66,27 +67,59 @@ def test_what_of_a_dem_may_be_errors_is_what_images_show_beside_it():
     assert kept[-1] < 1e-6  # all of it
 
 
+def _whole(**found):
+    """Sums that answer as they are told to; all else of no account."""
+    usual = {
+        "scattered": np.zeros(0), "sizes": np.ones(4), "places": lambda g: np.array(g.columns), "exclude": lambda g: [],
+        "ordinary_places": lambda name: [], "power": lambda places, amount: np.ones(4), "mirrored": lambda g: None,
+    }  # fmt: skip
+    return SimpleNamespace(**usual | found)
+
+
 def test_what_is_ordinary_explains_as_much_or_the_rival_is_refused():
-    """A pedestal of an ordinary size, and light from terrain that gains no more than it; light that surely gains more."""
+    """A pedestal of an ordinary size, and light from terrain that gains next to nothing beside any amount of it; and light that surely does."""
     shade = Guise("dark_bias", get_effect("dark_bias").trials(Survey())[0], (0,))
     light = Guise("interreflection", get_effect("interreflection").trials(Survey())[0], (1,))
 
-    def refused(gains, because):
+    def refused(beside, because):
         both = {g.effect: Found(g.effect, g, np.ones(1), np.ones(1), 9.0) for g in (shade, light)}
-        held = {0: np.array([10.0, 12, 9, 11]), 1: np.array(gains, float)}
-        whole = SimpleNamespace(
-            scattered=np.zeros(0), sizes=np.ones(4), places=lambda g: np.array(g.columns), exclude=lambda g: [],
-            held_out=lambda places, *rest: held[int(places[0])], ordinary_places=lambda name: [],
-            power=lambda places, amount: np.ones(4),
-        )  # fmt: skip
+        whole = _whole(
+            held_out=lambda *rest: np.array([11.0, 10, 12, 9]),
+            gains_beside=lambda found, other: np.array(beside, float) * (other.effect == "dark_bias"),
+        )
         judge(whole, both["interreflection"])
         return may_be_another(whole, both["interreflection"], both, {"dark_bias": because})
 
     small = f"iof is 5e-05, and less than 0.0001 {ORDINARY}"
-    assert "as much" in refused([11, 10, 12, 9], small)
-    assert not refused([1, 1, 2, 1], "the test pairs contradict it")
-    assert not refused([11, 10, 12, 9], ODD)
-    assert not refused([21, 22, 20, 22], small)
+    assert "as much" in refused([1, -1, 2, 0], small)
+    assert not refused([1, -1, 2, 0], "the test pairs contradict it")
+    assert not refused([1, -1, 2, 0], ODD)
+    assert not refused([3, 4, 3, 4], small)
+
+
+def test_an_echo_explains_more_than_what_lies_on_the_other_side():
+    """Optics and relief that the DEM has not are alike before and behind."""
+    before, behind = (
+        Guise("echo", next(t for t in get_effect("echo").trials(Survey()) if t.fixed["lag_px"] == lag), (k,))
+        for k, lag in enumerate((8.0, -8.0))
+    )
+
+    def refused(mirrored):
+        held = {0: np.array([10.0, 12, 9, 11]), 1: np.array(mirrored, float)}
+        found = Found("echo", before, np.ones(1), np.ones(1), 9.0)
+        whole = _whole(held_out=lambda places, *rest: held[int(places[0])], mirrored=lambda guise: behind)
+        judge(whole, found)
+        return may_be_another(whole, found, {"echo": found}, {})
+
+    assert "other side" in refused([11, 10, 12, 9])
+    assert not refused([5, 4, 6, 5])
+    trials = get_effect("echo").trials(Survey())
+    plan = Plan(guises=[Guise("echo", t, (k,)) for k, t in enumerate(trials)])
+    of_plan = SimpleNamespace(plan=plan)
+    for guise in plan.guises:
+        other = Whole.mirrored(of_plan, guise)
+        assert other.trial.fixed == {**guise.trial.fixed, "lag_px": -guise.trial.fixed["lag_px"]}
+    assert Whole.mirrored(of_plan, Guise("psf_blur", get_effect("psf_blur").trials(Survey())[0], (0,))) is None
 
 
 def test_values_per_image_do_not_stand_for_what_one_value_for_all_does():
@@ -97,11 +130,10 @@ def test_values_per_image_do_not_stand_for_what_one_value_for_all_does():
     def refused(of_gains):
         both = {g.effect: Found(g.effect, g, np.ones(1), np.ones(1), 9.0) for g in (flat, gains)}
         held = {0: np.array([10.0, 12, 9, 11]), 1: np.array(of_gains, float)}
-        whole = SimpleNamespace(
-            scattered=np.zeros(0), sizes=np.ones(4), places=lambda g: np.array(g.columns), exclude=lambda g: [],
-            held_out=lambda places, *rest: held[int(places[0])], ordinary_places=lambda name: [],
+        whole = _whole(
+            held_out=lambda places, *rest: held[int(places[0])],
             gains_beside=lambda found, other: np.array([5.0, 6, 5, 6]),
-        )  # fmt: skip
+        )
         judge(whole, both["image_gain"])
         return may_be_another(
             whole, both["image_gain"], both, {"column_pattern": "it comes out 1.4 errors from nothing"}

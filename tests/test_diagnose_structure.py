@@ -116,18 +116,17 @@ def _plane(z: torch.Tensor, grid) -> torch.Tensor:
     return plane.unflatten(1, (SIZE, -1))
 
 
-def test_a_pixel_stands_out_if_it_shines_or_is_much_darker_than_a_small_shadow():
+def test_a_pixel_stands_out_by_more_than_small_shadows_and_rough_ground_do():
     assert all(pixels_that_stand_out(left(seed)) == (0, 0.0) for seed in range(20))
-    bright, dark = left(1), left(1)
-    for every, size in ((bright, 25.0), (dark, -25.0)):
-        every[3].value[2, 15, 16] = size
-    assert pixels_that_stand_out(bright) == (1, pytest.approx(625 / (8 * FRAMES * SIZE**2), rel=0.05))
-    assert pixels_that_stand_out(dark) == (0, 0.0)
-    dark[3].value[2, 15, 16] = -45.0
-    assert pixels_that_stand_out(dark)[0] == 1
-    bright[3].value[2, 10:21, 11:22] *= 10.0  # rough ground about it
-    bright[3].value[2, 15, 16] = 25.0
-    assert pixels_that_stand_out(bright) == (0, 0.0)
+    for sign in (1, -1):
+        every = left(1)
+        every[3].value[2, 15, 16] = 20.0 * sign  # as a facet or a small shadow
+        assert pixels_that_stand_out(every) == (0, 0.0)
+        every[3].value[2, 15, 16] = 45.0 * sign
+        assert pixels_that_stand_out(every) == (1, pytest.approx(45**2 / (8 * FRAMES * SIZE**2), rel=0.05))
+        every[3].value[2, 10:21, 11:22] *= 5.0  # rough ground about it
+        every[3].value[2, 15, 16] = 45.0 * sign
+        assert pixels_that_stand_out(every) == (0, 0.0)
 
 
 def test_what_stays_on_the_detector_is_told_from_what_goes_with_the_ground():

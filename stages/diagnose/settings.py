@@ -50,7 +50,8 @@ HALVED = 0.5  # of the squared residual: laws that leave less take the place of 
 MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model says nothing about the images
 BROADEST = 3  # annuli: up to four waves across a piece of ground, what stray light and film differ by within one
 ALIKE = 0.03  # of the squares of these, surely (95 %): laws and flat fields that are not known to a few tenths of a per cent make up to 0.02 alike
-STANDS_OUT = 15.0  # times what lies about a pixel: shadows below a pixel made dark ones of up to 17, bright ones of up to 9; dark ones need twice this
+FLAT = 0.0025  # rms of lines, relative to brightness, that a good flat field leaves
+STANDS_OUT = 30.0  # times what lies about a pixel: shadows and bright facets below a pixel made up to 17
 LINE = 25.0  # -log10 of the chance of the strongest single wave: leakage of windows made up to 15 on development data, lines from 40
 BORROWED = 20.0  # waves' worth of the mean over frames in each frame's own variance: broad annuli have few waves
 ADDED = 50.0  # waves' worth of a size of 1 in each piece of ground's own size
@@ -60,7 +61,9 @@ LEVELS = (0.03, 0.1, 0.3, 1.0, 3.0)  # standard deviations of values per frame t
 TRIED = 8  # candidates per look whose held-out gain is computed, the most surprising first
 TRIES = 6  # candidates per look that are fitted before the search ends: of real data three or four turn out ordinary
 SIMPLER = 0.8  # of the gain of many values (one per frame, another law), with which one value for all is preferred
-NOTABLE = 0.01  # of the weighted squares: an impossible fit that gains so much is structure
+NOTABLE = (
+    0.01  # of the weighted squares: an impossible fit that gains so much is structure, and so are lines that hold it
+)
 STEPS = 10  # Gauss-Newton steps at most
 SHORTEST = 0.1  # of a Gauss-Newton step: where that does not help either, the values stay
 LONGEST = 16.0  # times a Gauss-Newton step, where steps do not get shorter

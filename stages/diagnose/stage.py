@@ -25,7 +25,7 @@ from stages.diagnose.model.sites import Site, all_over, grounds, load_site, surv
 from stages.diagnose.registration.explain import explain
 from stages.diagnose.result.answer import Answer, Named
 from stages.diagnose.result.files import write_diagnosis
-from stages.diagnose.result.named import by_histogram, by_registration, by_search
+from stages.diagnose.result.named import Cut, by_histogram, by_registration, by_search
 from stages.diagnose.result.score import beside_shadows, blind_effects, displacements, score, unconfirmed
 from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
@@ -33,7 +33,7 @@ from stages.diagnose.search.select import Outcome, doubt_all, search
 from stages.diagnose.search.shadows import by_shadows, contradicted
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import MISFIT, STILL
-from stages.diagnose.structure.kinds import structure
+from stages.diagnose.structure.kinds import PILED, structure
 from stages.effects import effect_names
 from stages.pairs.reader import PairReader
 
@@ -127,17 +127,33 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     if isinstance(state.nominal.model, LunarLaws):
         answer.form = state.nominal.model.title
         say(f"{config.model} has not the form of the ground's law: {answer.form} took its place")
+    _fill(answer, state, outcome, cut, before)
+    return Result(answer, state, outcome)
+
+
+def _fill(answer: Answer, state: State, outcome: Outcome, cut: Cut | None, before: float) -> None:
+    """Doubt what the search found once more, look at what is judged apart, and write all of it into the answer.
+
+    cut : what the histogram shows; before : mean square of the residual when nothing was known
+    """
     doubted = unconfirmed(state) | contradicted(state)
     view = outcome.view
     assert view is not None
     displaced = state.registration is not None and state.registration.form.name != "none"
-    if state.causes and displaced:  # what looked like a displacement may have been a cause that is named by now
+    if state.named and displaced:  # what looked like a displacement may have been a cause that is named by now
         _register(state)
-    if doubted or (state.causes and displaced):
+    if doubted or (state.named and displaced):
         settle(state, view)
         doubted |= doubt_all(state, view, STILL)
+    after = _residual(state)
+    left = structure(state, view, cut[1] if cut else 0.0)
+    ordinary = {c.effect.name for c in state.causes} - {c.effect.name for c in state.named}
+    if ordinary:  # rendered to judge the others beside it; from here on the simulation is what is named, and no more
+        before *= after / _without_ordinary(state)
     placed, refused = by_registration(state)
-    clipped = cut[0](data, state) if cut else None  # was taken out of the images before anything was sought
+    clipped = cut[0](state.data, state) if cut else None  # was taken out of the images before anything was sought
+    if clipped:
+        left.pop(PILED, None)
     ground, shown = by_ground(state)
     shaded, extended, contrary = _by_shadows(state)
     answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + shaded + ground
@@ -145,18 +161,15 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     answer.rejected = {k: v for k, v in rejected.items() if k not in {c.effect.name for c in answer.causes}}
     if state.registration is not None:
         answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}
-    after = _residual(state)
     # what a better law or registration took away is no cause where none is named
     answer.budget = budget(view.rows, view.model, view.grid, before if answer.causes else after, after)
-    answer.structure = structure(state, view, cut[1] if cut and not clipped else 0.0)
-    known = shown | {c.effect.name for c in answer.causes}
-    answer.blind = blind_effects(state, outcome, known)
+    answer.structure = left
+    answer.blind = blind_effects(state, outcome, shown | ordinary | {c.effect.name for c in answer.causes})
     answer.unexplained_fraction = max(answer.structure.values(), default=0.0)
     if not answer.causes and outcome.sure:
         answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)
     answer.verdict = _verdict(answer)
     answer.held_out = score(state, answer, extended)
-    return Result(answer, state, outcome)
 
 
 def _register(state: State) -> None:
@@ -222,6 +235,13 @@ def _residual(state: State) -> float:
                 total += float((mean.square() * area).sum())
             count += float(area.sum())
     return total / count if count else math.nan
+
+
+def _without_ordinary(state: State) -> float:
+    """Take what is ordinary out of the model, fit the nominal one again; the mean square of the residual then."""
+    state.causes[:] = state.named
+    state.fit()
+    return _residual(state)
 
 
 def _as_read(chain: Chain) -> torch.Tensor:

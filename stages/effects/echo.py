@@ -15,7 +15,8 @@ from stages.physics.formation.chain import Observation, State
 from stages.physics.formation.resampling import displace
 from stages.physics.photometry import Parameter
 
-CLEAR_LAG = 4  # px, from which on an echo is no matter of the point spread function
+CLEAR_LAG = 2  # px, beyond which an echo is no matter of the point spread function
+RESAMPLED = 4  # px, from which on the measured image, which resampling blurs near by, may be repeated
 
 
 @register
@@ -52,7 +53,7 @@ class Echo(Effect):
 
     @classmethod
     def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
-        """Nearer, an echo is not told from blur, soft shadows and relief that the DEM has not, all of which are some 4 px wide."""
+        """Nearer, an echo is not told from optics that are not alike before and behind, and from images that lie beside the ground."""
         return abs(values["lag_px"]) > CLEAR_LAG
 
     def apply(self, state: State) -> None:
@@ -61,7 +62,7 @@ class Echo(Effect):
         lag = torch.as_tensor(self.values["lag_px"], dtype=state.image.dtype)
         source = state.image
         # the DEM does not know where shadows end as well as the image does, whose resampling, though, blurs near by
-        if state.measured is not None and abs(float(lag)) >= CLEAR_LAG:
+        if state.measured is not None and abs(float(lag)) >= RESAMPLED:
             measured = state.measured()
             source = torch.where(measured.isfinite(), measured, source)
         repeated = displace(source, -(lag * step[:, 0])[:, None, None], -(lag * step[:, 1])[:, None, None])

@@ -125,6 +125,13 @@ class Whole:
             return self.frame_places(guise.columns)
         return np.array([1 + k for k in guise.columns])
 
+    def mirrored(self, guise: Guise) -> Guise | None:
+        """The same effect on the other side, where it is one that has two."""
+        if not (side := get_effect(guise.effect).one_sided):
+            return None
+        fixed = {**guise.trial.fixed, side: -guise.trial.fixed[side]}
+        return next((g for g in self.plan.guises if g.effect == guise.effect and g.trial.fixed == fixed), None)
+
     def _precision(self) -> dict[int, float]:
         """Place of every nuisance column -> inverse prior variance."""
         out: dict[int, float] = {}

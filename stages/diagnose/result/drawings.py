@@ -57,7 +57,7 @@ def _crops(state: State, image_ids: Sequence[str]) -> list[Crop]:
     read = (site.read - site.offset[:, None, None]) / site.gain[:, None, None]
     without = {
         cause.effect.name: state.nominal.chain(site, [e for e in state.base if e is not cause.effect]).predict()
-        for cause in state.causes
+        for cause in state.named
     }
     found = []
     for k in dict.fromkeys(np.linspace(0, site.count - 1, CROPS).round().astype(int)):

@@ -28,7 +28,7 @@ ENDLESS = 1e9  # a gain that takes all lit ground beyond any level
 def by_search(state: State) -> list[Named]:
     """The causes that the search found, with errors and units."""
     out = []
-    for cause in state.causes:
+    for cause in state.named:
         cls = type(cause.effect)
         units = {p.name: p.unit for p in cls.parameters}
         if cls.scope == "scene":
@@ -159,7 +159,10 @@ def _ordinary(size: float, error: float, cls: type[Effect]) -> bool:
     return size**2 - error**2 < max(cls.tolerance.values()) ** 2
 
 
-def by_histogram(sites: Sequence[Site], units: str) -> tuple[Callable[[Survey, State], Named | None], float] | None:
+Cut = tuple[Callable[[Survey, State], Named | None], float]  # what makes the cause of it, share of the pixels
+
+
+def by_histogram(sites: Sequence[Site], units: str) -> Cut | None:
     """Read effects off the histogram of all pixels, mask what they spoilt, and return what makes the cause of it, and their share of the pixels.
 
     The cause is None where clipping the prediction at the level does not surely bring it nearer to ground that the level was not read off from.
@@ -258,4 +261,4 @@ def _clipped(
     return before, after, max(count, 1.0)
 
 
-__all__ = ["by_histogram", "by_registration", "by_search"]
+__all__ = ["Cut", "by_histogram", "by_registration", "by_search"]

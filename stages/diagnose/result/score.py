@@ -139,7 +139,7 @@ def _squares(
 def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
     """Take out causes of the search that surely lose on the test pairs, the last one first; name -> its gain in nats where it was learned, and why."""
     out: dict[str, tuple[float, str]] = {}
-    for cause in state.causes[::-1]:  # what was found last stands on what was found before
+    for cause in state.named[::-1]:  # what was found last stands on what was found before
         with_cause = _hidden_squares(state)
         kept, nominal = list(state.causes), state.nominal
         state.causes[:] = [c for c in kept if c is not cause]

@@ -48,7 +48,7 @@ def search(state: State, most: int) -> Outcome:
     while True:
         # the data look as before where nothing was named
         view = state.without_impossible(view, state.open_names()) if view else state.look(state.open_names())
-        if refused and not state.causes and state.law_is_another(view, refused):  # before, it was not
+        if refused and not state.named and state.law_is_another(view, refused):  # before, it was not
             refused = {
                 n: why for n, why in refused.items() if get_effect(n).of_law
             }  # nothing was judged beside this law
@@ -73,7 +73,7 @@ def search(state: State, most: int) -> Outcome:
         faint = FAINT**2 / 2 * float(view.whole.gram[0, 0])
         sure = [f for f in tried if f.gain_interval()[0] > 0 and (f.gain > faint or shows_in_shade(view.whole, f))]
         out.rejected |= {f.effect: (f.gain, _why_not_sure(f, faint)) for f in tried if f not in sure}
-        if len(state.causes) >= most:
+        if len(state.named) >= most:
             break
         taken = strange = False
         for _ in range(TRIES):
@@ -92,6 +92,7 @@ def search(state: State, most: int) -> Outcome:
                 continue
             state.say(f"{chosen.effect} is not taken: {why}")
             refused[chosen.effect] = why
+            taken = any(c.effect.name == chosen.effect for c in state.causes)  # rendered, and not named
             out.rejected[chosen.effect] = (chosen.gain, why)
             if strange:  # the others were judged beside amounts of it that nothing has
                 out.sure |= chosen.gain > NOTABLE * float(view.whole.gram[0, 0])
@@ -105,7 +106,7 @@ def search(state: State, most: int) -> Outcome:
             view = None
     settle(state, view)
     out.rejected |= doubt_all(state, view)
-    for cause in state.causes:
+    for cause in state.named:
         out.rejected.pop(cause.effect.name, None)
     return out
 
@@ -123,7 +124,7 @@ def doubt_all(state: State, view: View, sure: float = SURE) -> dict[str, tuple[f
     sure : standard errors from nothing that are asked
     """
     out = {}
-    while doubted := [(c, why) for c in state.causes if (why := doubt(state, c, sure))]:
+    while doubted := [(c, why) for c in state.named if (why := doubt(state, c, sure))]:
         cause, why = doubted[-1]  # what was found last stands on the rest
         state.causes.remove(cause)
         out[cause.effect.name] = cause.found.gain, f"fitted with everything else {why}"
@@ -174,16 +175,22 @@ def judge(whole: Whole, found: Found) -> None:
 
 def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refused: Mapping[str, str]) -> str:
     """Why an effect may stand for what is ordinary, or as likely and not sure on its own, or ''. refused : effect -> why"""
-    for other in [best[n] for n in get_effect(found.effect).confused_with if n in refused and n in best]:
-        known = refused[other.effect].endswith(ORDINARY)
-        if known or found.guise.per_frame:  # which stands for what one value for all does, sure or not
-            judge(whole, other)
-            if found.more_than(other)[0] <= 0:
-                return f"{other.effect}, of which {'there is an ordinary amount' if known else UNSURE}, explains as much of it"
 
     def sure(gains: np.ndarray) -> bool:
         return interval(gains, found.sizes)[0] > 0
 
+    for other in [best[n] for n in get_effect(found.effect).confused_with if n in refused and n in best]:
+        if refused[other.effect].endswith(ORDINARY):
+            if not sure(whole.gains_beside(found, other)):
+                return f"{other.effect}, of which there is an ordinary amount, explains as much of it"
+        elif found.guise.per_frame:  # which stands for what one value for all does, sure or not
+            judge(whole, other)
+            if found.more_than(other)[0] <= 0:
+                return f"{other.effect}, of which {UNSURE}, explains as much of it"
+    if (mirrored := whole.mirrored(found.guise)) and not sure(
+        found.gains - whole.held_out(whole.places(mirrored), whole.exclude(mirrored))
+    ):
+        return "what lies on the other side explains as much of it"
     own = whole.ordinary_places(found.effect)
     if get_effect(found.effect).lights_shadows and not sure(whole.held_out(whole.places(found.guise), own)):
         return "ordinary amounts of other light in shadows would explain it as well"
@@ -241,6 +248,10 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         if low <= 0:
             why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
         why = why or contradicted(test_gains)
+    ordinary_alone = why.endswith(ORDINARY) and why == doubt(state, cause)
+    cause.ordinary = ordinary_alone and cls.scope == "scene" and not (cls.of_law or cls.lights_shadows)
+    if cause.ordinary:  # a first-order column of a blur is wrong by more than the noise
+        return why
     if why:
         state.open[cause.effect.name] = cause.worst_error
         state.causes[:] = causes
@@ -295,7 +306,7 @@ def _doubt_any(state: State, cause: Cause) -> tuple[str, Cause | None]:
     """Why the cause, or another beside it, cannot be one, or ''; and which other."""
     if why := doubt(state, cause):
         return why, None
-    for c in state.causes:
+    for c in state.named:
         if why := doubt(state, c):
             return f"beside it {c.effect.name} is no cause any more: {why}", c
     return "", None

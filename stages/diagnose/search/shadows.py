@@ -227,7 +227,7 @@ def _named(made: Effect, error: float, before: Floats, after: Floats, pixels: fl
 def contradicted(state: State) -> dict[str, tuple[float, str]]:
     """Take back causes that change the relief where shadows surely fit worse with them; effect -> nats, why."""
     out: dict[str, tuple[float, str]] = {}
-    for cause in [c for c in state.causes if c.effect.slot == "geometry" and not c.effect.displaces]:
+    for cause in [c for c in state.named if c.effect.slot == "geometry" and not c.effect.displaces]:
         others = [c.effect for c in state.causes if c is not cause]
         chains = [c for c in state.chains() if c.state.sun_horizon is not None]
         if not chains or state.free_gains:

@@ -44,6 +44,9 @@ class Cause:
     share_freedom: float = 1.0  # with which it is known
     rms: float = float("nan")  # of values per frame
     group: list[str] = field(default_factory=list)
+    ordinary: bool = (
+        False  # no cause but what all data have of the effect, rendered like one so that others are judged beside it
+    )
     gain_percent: float = float("nan")
     gain_low: float = float("nan")
     gain_high: float = float("nan")
@@ -111,6 +114,11 @@ class State:
         return [c.effect for c in self.causes]
 
     @property
+    def named(self) -> list[Cause]:
+        """Those that are more than ordinary."""
+        return [c for c in self.causes if not c.ordinary]
+
+    @property
     def free_gains(self) -> bool:
         """Whether every image has an unknown gain and offset."""
         return self.units == "dn"
@@ -176,9 +184,9 @@ class State:
                 site.left_out = frozenset(k for k, f in enumerate(site.frames) if seen[f] < SEEN)
 
     def open_names(self) -> list[str]:
-        """Effects that are not named and that data of this kind can show."""
-        named = {c.effect.name for c in self.causes}
-        every = [n for n in effect_names() if n not in named]
+        """Effects that are not rendered yet and that data of this kind can show."""
+        known = {c.effect.name for c in self.causes}
+        every = [n for n in effect_names() if n not in known]
         return [n for n in every if get_effect(n).visible(self.data, self.has)]
 
     def patches(self, number: int, chain: Chain) -> list[Patch]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from stages.diagnose.search.state import State, View
-from stages.diagnose.settings import ALIKE, FAINT, LINE
+from stages.diagnose.settings import ALIKE, FAINT, FLAT, LINE, NOTABLE
 from stages.diagnose.structure.detector import pattern_of_detector
 from stages.diagnose.structure.fields import field_of_images
 from stages.diagnose.structure.innovations import innovations
@@ -11,21 +11,23 @@ from stages.diagnose.structure.lines import line_of_brightness, line_of_displace
 from stages.diagnose.structure.pixels import pixels_that_stand_out
 from stages.diagnose.structure.spilled import spilled
 
+PILED = "brightness that piles up at one level"
+
 
 def structure(state: State, view: View, piled: float) -> dict[str, float]:
     """What is left that neither ground nor noise has, and its share: of a line, of the squares of that frame; of a field, of
     the squares of the broadest waves of all images; of all else, of all squares; weighted by the inverse covariance.
 
-    piled : share of all pixels that pile up at one level and are no cause
+    piled : share of all pixels that pile up at one level
     """
     out: dict[str, float] = {}
     left = innovations(view.rows, view.model, view.grid, state.sites)
-    for what, (line, share) in (
-        ("lines across an image", line_of_brightness(view.rows, view.model, view.grid, state.frames)),
-        ("displacements that come back at equal distances", line_of_displacement(left, view.grid, state.frames)),
-    ):
-        if line > LINE and share > FAINT**2:
-            out[what] = share
+    line, share, rms = line_of_brightness(view.rows, view.model, view.grid, state.frames)
+    if line > LINE and rms > FLAT:
+        out["lines across an image"] = share
+    line, share = line_of_displacement(left, view.grid, state.frames)
+    if line > LINE and share > NOTABLE:  # bilinear resampling leaves half of that
+        out["displacements that come back at equal distances"] = share
     for what, (alike, surely) in (
         (
             "a broad field in each image that is the same on all ground",
@@ -42,7 +44,7 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
     if surely > 0 and spread > FAINT**2:
         out["light of bright pixels that spreads along one direction of the detector"] = spread
     if piled:
-        out["brightness that piles up at one level"] = piled
+        out[PILED] = piled
     return out
 
 

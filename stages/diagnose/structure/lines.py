@@ -21,14 +21,22 @@ from stages.diagnose.structure.innovations import Innovation
 LARGEST, STEEPEST = 5.0, 3.0  # standard deviations: a single pixel, or an edge, is no line
 
 
-def line_of_brightness(rows: Sequence[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[float, float]:
-    """-log10 of the chance of the strongest single wave of any frame among all of them, and its share of that frame's squares."""
+def line_of_brightness(rows: Sequence[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[float, float, float]:
+    """-log10 of the chance of the strongest single wave of any frame among all of them, its share of that frame's squares, and
+    its rms relative to brightness.
+    """
     spectra = []
     for row in rows:
         z, _, _ = whitened_residual(row, model, grid)
         size = (row.patch.weight.square().mean((-2, -1)) * model.size.get(row.patch.number, 1.0)).clamp(min=1e-6)
         spectra.append((row.patch.frames, z / size.sqrt()[:, None]))
-    return _strongest(spectra, grid, frames)
+    chance, share, frame, waves = _strongest(spectra, grid, frames)
+    squares, pixels = 0.0, 0.0
+    for row in rows:
+        here = row.patch.frames == frame
+        squares += float(row.shared[0][here][:, waves].abs().square().sum())
+        pixels += float(row.patch.weight[here].square().sum())
+    return chance, share, math.sqrt(squares / max(pixels, 1.0))
 
 
 def line_of_displacement(every: Sequence[Innovation], grid: Grid, frames: int) -> tuple[float, float]:
@@ -47,36 +55,39 @@ def line_of_displacement(every: Sequence[Innovation], grid: Grid, frames: int) -
             z = torch.fft.rfft2(moved).flatten(-2)[:, grid.keep]
             size = (z.abs().square().mean(1)).clamp(min=1e-9).sqrt()
             spectra.append((patch.frames, z / size[:, None]))
-        best = max(best, _strongest(spectra, grid, frames))
+        best = max(best, _strongest(spectra, grid, frames)[:2])
     return best
 
 
-def _strongest(spectra: Sequence[tuple[Tensor, Tensor]], grid: Grid, frames: int) -> tuple[float, float]:
-    """spectra : frames (n,) and coefficients (n, K) of every piece of ground"""
+def _strongest(spectra: Sequence[tuple[Tensor, Tensor]], grid: Grid, frames: int) -> tuple[float, float, int, Tensor]:
+    """-log10 of its chance, its share of the squares, its frame (-1: none), and which waves it is, (K,) bool.
+
+    spectra : frames (n,) and coefficients (n, K) of every piece of ground
+    """
     power = torch.zeros(frames, len(grid.keep), dtype=torch.float64)
     count = torch.zeros(frames, dtype=torch.float64)
     for of, z in spectra:
         power.index_add_(0, of, z.abs().square().double())
         count.index_add_(0, of, torch.ones(len(of), dtype=torch.float64))
-    seen = count > 0
-    power, count = power[seen], count[seen]
-    best, largest = 0.0, 0.0
+    seen = torch.nonzero(count)[:, 0]
+    best, largest, frame, waves = 0.0, 0.0, -1, torch.zeros(len(grid.keep), dtype=torch.bool)
     # broad waves are ground and film; of those in the corners, shorter than two pixels, images that were resampled have next to nothing
     fine = (grid.annulus >= 2) & (torch.hypot(*grid.waves) <= 0.5)
-    for p, n in zip(power, count, strict=True):
+    for number, p, n in zip(seen.tolist(), power[seen], count[seen], strict=True):
         level = torch.zeros(grid.annuli, dtype=torch.float64)
         for a in range(grid.annuli):
             level[a] = p[grid.annulus == a].median()
         ratio = p / level[grid.annulus].clamp(min=1e-30)
-        ratio = (ratio / _about(ratio, grid).clamp(min=1))[fine]
+        ratio = torch.where(fine, ratio / _about(ratio, grid).clamp(min=1), 0.0)
         top = float(ratio.max())
         shape = max(float(n), 1.0)
         middle = float(gammaincinv(shape, 0.5))
-        chance = float(surprise(np.array([2 * top * middle]), 2 * shape)[0]) - math.log10(len(ratio) * len(power))
+        chance = float(surprise(np.array([2 * top * middle]), 2 * shape)[0]) - math.log10(int(fine.sum()) * len(seen))
         # neighbours share a wave through the window: what stands out by a little is no line
         if top > PEAK and chance > best:
-            best, largest = chance, float((p[fine] * (ratio > PEAK)).sum() / p.sum())
-    return best, largest
+            best, frame, waves = chance, number, ratio > PEAK
+            largest = float(p[waves].sum() / p.sum())
+    return best, largest, frame, waves
 
 
 def _about(power: Tensor, grid: Grid) -> Tensor:

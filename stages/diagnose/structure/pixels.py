@@ -1,4 +1,4 @@
-"""Single pixels that stand out, as cosmic rays, hot and dead pixels do: relief below a pixel throws small shadows, and shines nowhere."""
+"""Single pixels that stand out by more than small shadows and bright facets do: cosmic rays, hot and dead pixels."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ def pixels_that_stand_out(every: Sequence[Innovation]) -> tuple[int, float]:
         ratio = _beside_neighbours(one)
         size = ratio.abs().amax(0)
         peak = size == max_pool2d(size[None], 5, 1, 2)[0]
-        sign = ratio.gather(0, ratio.abs().argmax(0, keepdim=True))[0].sign()
-        odd = peak & (size > torch.where(sign > 0, STANDS_OUT, 2 * STANDS_OUT))
+        odd = peak & (size > STANDS_OUT)
         found += int(odd.sum())
         out += float((one.value.square().amax(0) * odd).sum())
         total += float(one.value.square().sum())
