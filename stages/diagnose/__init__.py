@@ -1,6 +1,6 @@
 """`lunargr diagnose`: what the simulation gets wrong, why, and what fixing it is worth.
 
-One likelihood, in five steps, each a folder:
+One likelihood, in six steps, each a folder:
 
 model         The nominal simulation of every site, rendered again with small changes. Where its law does not fit, the mean of measured lunar
               laws takes its place, with the directions in which these differ.
@@ -16,8 +16,10 @@ likelihood    The covariance of the residuals, estimated from them by wavelength
               mirrored and shuffled, say how large the largest of all statistics is when nothing is there.
 search        The effect that gains most on held-out ground, if shams hardly do as well, is rendered at its values and everything is fitted
               again. It is named if it is real (its own file says what is plausible and what is ordinary), if it is there
-              whichever images are left out, and if its held-out gain is above zero for sure. Then the next. Shadows, ground that images share and
-              light that spreads on the detector are looked at by themselves, last.
+              whichever images are left out, and if its held-out gain is above zero for sure. What is surely there and ordinary is rendered
+              and not named. Then the next. Shadows and ground that images share are looked at by themselves, last.
+structure     What is left that neither ground nor noise has, and nothing in the catalogue explains: lines, patterns of the detector, single pixels,
+              light that spreads.
 result        What is named, how much of the residual is what, what was refused and why, what these data could not have shown.
 
 Whatever is special about one effect stands in its own file under ``stages/effects``; the numbers set by hand that decide what is found stand in ``settings.py``.

@@ -1,1 +1,1 @@
-"""Step 5: the verdict, the JSON, diagnosis.h5 and the page."""
+"""Step 6: the verdict, the JSON, diagnosis.h5 and the page."""
