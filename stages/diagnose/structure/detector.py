@@ -23,13 +23,15 @@ def pattern_of_detector(every: Sequence[Innovation]) -> tuple[float, float]:
     place, value, site = _on_pixels(every)
     if not len(place):
         return 0.0, 0.0
-    pixels, pixel = np.unique(place, axis=0, return_inverse=True)
+    first = place.min(0)
+    wide = int(place[:, 1].max() - first[1]) + 1
+    number, pixel = np.unique((place - first) @ [wide, 1], return_inverse=True)  # of every pixel that is hit, row by row
     total, count = np.bincount(pixel, value), np.bincount(pixel)
-    _, block = np.unique(pixels // BLOCK, axis=0, return_inverse=True)
+    _, block = np.unique(number // wide // BLOCK * wide + number % wide // BLOCK, return_inverse=True)
     alike, squares = np.zeros((2, int(block.max()) + 1))
     for s in np.unique(site):
         here = site == s
-        own, often, power = (np.bincount(pixel[here], w, len(pixels)) for w in (value[here], None, value[here] ** 2))
+        own, often, power = (np.bincount(pixel[here], w, len(number)) for w in (value[here], None, value[here] ** 2))
         both = (often > 0) & (count > often)
         alike += np.bincount(block[both], (own * (total - own))[both] / (count - often)[both], len(alike))
         squares += np.bincount(block[both], power[both], len(alike))
