@@ -99,6 +99,15 @@ def test_nothing_hidden_names_nothing(scene, tmp_path, seed):
     assert answer.verdict in ("nothing_significant", "cannot_tell")
 
 
+def test_an_ordinary_blur_is_rendered_so_that_others_are_judged_beside_it_and_is_no_cause(scene, tmp_path):
+    result = diagnose.run(_pairs(scene, tmp_path, {"psf_blur": {"sigma2_px2": 0.45}}))
+    assert not result.answer.causes
+    assert result.answer.rejected["psf_blur"][1].endswith("ordinary")
+    assert "psf_blur" not in result.answer.blind
+    assert "psf_blur.sigma2_px2" in result.outcome.view.plan.shared  # fitted along as what is rendered is
+    assert not result.state.causes  # the extended model is what is named
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", [{"banding": UNKNOWN["banding"]}, {"blooming": UNKNOWN["blooming"] | {"above": 1.1}}])
 def test_faults_outside_the_catalogue_are_unexplained(scene, tmp_path, fault):
