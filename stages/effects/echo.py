@@ -15,7 +15,7 @@ from stages.physics.formation.chain import Observation, State
 from stages.physics.formation.resampling import displace
 from stages.physics.photometry import Parameter
 
-CLEAR_LAG = 2  # px, beyond which an echo is no matter of the point spread function
+CLEAR_LAG = 3  # px, beyond which an echo is no matter of the point spread function, nor of charge that spills
 RESAMPLED = 4  # px, from which on the measured image, which resampling blurs near by, may be repeated
 
 
@@ -53,7 +53,7 @@ class Echo(Effect):
 
     @classmethod
     def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
-        """Nearer, an echo is not told from optics that are not alike before and behind, and from images that lie beside the ground."""
+        """Nearer, an echo is not told from optics and spilled charge that are not alike before and behind."""
         return abs(values["lag_px"]) > CLEAR_LAG
 
     def apply(self, state: State) -> None:
