@@ -25,7 +25,9 @@ def pattern_of_detector(every: Sequence[Innovation]) -> tuple[float, float]:
         return 0.0, 0.0
     first = place.min(0)
     wide = int(place[:, 1].max() - first[1]) + 1
-    number, pixel = np.unique((place - first) @ [wide, 1], return_inverse=True)  # of every pixel that is hit, row by row
+    number, pixel = np.unique(
+        (place - first) @ [wide, 1], return_inverse=True
+    )  # of every pixel that is hit, row by row
     total, count = np.bincount(pixel, value), np.bincount(pixel)
     _, block = np.unique(number // wide // BLOCK * wide + number % wide // BLOCK, return_inverse=True)
     alike, squares = np.zeros((2, int(block.max()) + 1))
