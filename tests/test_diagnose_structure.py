@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.ndimage import gaussian_filter
 from scipy.stats import chi2, norm
 
 from stages.diagnose.likelihood.covariance import Covariance
@@ -22,7 +21,6 @@ from stages.diagnose.structure.fields import field_of_images
 from stages.diagnose.structure.innovations import Innovation, innovations
 from stages.diagnose.structure.lines import line_of_brightness, line_of_displacement
 from stages.diagnose.structure.pixels import pixels_that_stand_out
-from stages.diagnose.structure.spilled import responses
 
 SIZE, FRAMES = 32, 6
 
@@ -153,45 +151,6 @@ def test_the_nearest_pixel_of_a_detector_leaves_lines_in_where_it_shows_the_grou
     chance, share = line_of_displacement(left(1, nearest), grid, FRAMES)
     assert chance > 25 and share > 0.005
     assert line_of_brightness(rows(0.0, 1), Covariance.white(grid.annuli, FRAMES), grid, FRAMES)[0] < 5
-
-
-def spilled_over(
-    kernel: tuple[int, int], turned: bool = False, power: int = 2, azimuths: float = 360.0
-) -> tuple[float, float]:
-    """Share of what a power of the brightness leaves on pixels about it (kernel: down, across) that only columns of one direction explain,
-    and their mean amount along the detector's samples; the detector may be turned by 90 deg. azimuths : deg over which Sun and camera are spread
-    """
-    grid = make_grid(SIZE, SIZE)
-    rough = gaussian_filter(np.random.default_rng(2).normal(size=(FRAMES, SIZE, SIZE)), (0, 1, 1))
-    bright = torch.from_numpy(np.exp(0.6 * rough / rough.std()))
-    y, x = np.mgrid[0:SIZE, 0:SIZE].astype(float)
-    detector = torch.from_numpy(np.stack([-x, y] if turned else [y, x]))[None].expand(FRAMES, -1, -1, -1)
-    azimuth = torch.arange(FRAMES).double() / FRAMES * math.radians(azimuths)
-    sun, camera = (torch.stack([(k * azimuth).cos(), (k * azimuth).sin(), azimuth * 0 + 1], 1) for k in (1, 2))
-    observation = SimpleNamespace(sun_direction=sun, camera_position=camera)
-    site = SimpleNamespace(on_detector=lambda: detector, observation=observation)
-    chain = SimpleNamespace(rendered=bright, site=site, lit=lambda: torch.ones_like(bright, dtype=torch.bool))
-    all_ = slice(0, SIZE)
-    patch = SimpleNamespace(
-        site=0, images=torch.arange(FRAMES), rows=all_, columns=all_, weight=torch.ones_like(bright)
-    )
-    columns = [c[0].flatten(1) for c in responses([SimpleNamespace(patch=patch)], [chain], grid)]
-    left = uniform_filter(bright.numpy() ** power, (0, *kernel), mode="wrap")
-    spread = (np.fft.rfft2(left).reshape(FRAMES, -1)[:, grid.keep] * grid.root.numpy()).flatten()
-    along, both, b = (np.concatenate([z.real, z.imag], -1).T for z in (columns[0], torch.cat(columns), spread))
-    without, amounts = np.linalg.lstsq(along, b, rcond=1e-9)[0], np.linalg.lstsq(both, b, rcond=1e-9)[0]
-    squares = [float((x**2).sum()) for x in (b, b - along @ without, b - both @ amounts)]
-    return (squares[1] - squares[2]) / squares[0], float(amounts[along.shape[1] :][: grid.annuli].mean())
-
-
-def test_what_spreads_along_one_direction_of_the_detector_is_told_from_what_spreads_everywhere():
-    down, across = spilled_over((9, 1)), spilled_over((1, 9))
-    assert min(down[0], across[0]) > 0.02
-    assert down[1] > 0.2 and across[1] < -0.2  # waves along the samples stay
-    assert spilled_over((9, 1), turned=True)[1] < -0.2  # samples run down there
-    assert spilled_over((5, 5))[0] < 0.002
-    assert spilled_over((9, 1), power=1)[0] < 0.005  # motion is no spilling
-    assert spilled_over((9, 1), azimuths=0.0)[0] < 1e-6  # the Sun's direction would explain it as well
 
 
 def test_many_values_are_as_far_from_nothing_as_chi_square_has_it():

@@ -50,9 +50,6 @@ HALVED = 0.5  # of the squared residual: laws that leave less take the place of 
 MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model says nothing about the images
 BROADEST = 3  # annuli: up to four waves across a piece of ground, what stray light and film differ by within one
 ALIKE = 0.03  # of the squares of these, surely (95 %): laws and flat fields that are not known to a few tenths of a per cent make up to 0.02 alike
-SPREAD = (
-    0.001  # of the weighted squares: images that were resampled seem to spread light along the detector by up to 0.0006
-)
 FLAT = 0.0025  # rms of lines, relative to brightness, that a good flat field leaves
 STANDS_OUT = 30.0  # times what lies about a pixel: shadows and bright facets below a pixel made up to 17
 LINE = 25.0  # -log10 of the chance of the strongest single wave: leakage of windows made up to 15 on development data, lines from 40

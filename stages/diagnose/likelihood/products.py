@@ -30,16 +30,6 @@ class Rows:
     own_mean: Tensor
     shared_dark: Tensor
 
-    def with_more(self, shared: Tensor) -> Rows:
-        """With further shared columns (k, n, K), which have neither means nor light in the dark."""
-        of_mean, of_dark = (x.new_zeros(len(shared), x.shape[1]) for x in (self.shared_mean, self.shared_dark))
-        return replace(
-            self,
-            shared=torch.cat([self.shared, shared]),
-            shared_mean=torch.cat([self.shared_mean, of_mean]),
-            shared_dark=torch.cat([self.shared_dark, of_dark]),
-        )
-
 
 Residual = tuple[
     Tensor, Tensor, Tensor

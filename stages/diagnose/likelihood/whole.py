@@ -210,12 +210,8 @@ class Whole:
         return [1 + k for k in self.plan.ordinary.get(effect, [])]
 
     def form_places(self) -> NDArray[np.int64]:
-        """Places of the columns of another form of the reflectance."""
-        return self.known_places([1 + k for k in self.plan.form])
-
-    def known_places(self, places: Sequence[int]) -> NDArray[np.int64]:
-        """Those of the places that the data say anything of."""
-        return np.array([p for p in places if self.seen[p]], dtype=np.int64)
+        """Places of the columns of another form of the reflectance that the data say anything of."""
+        return np.array([1 + k for k in self.plan.form if self.seen[1 + k]], dtype=np.int64)
 
     def expected_errors(self, guise: Guise) -> Array:
         """(J,) standard errors of the amounts, each alone, at least as wide as sham residuals scatter."""

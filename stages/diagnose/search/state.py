@@ -26,9 +26,6 @@ from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patc
 from stages.diagnose.settings import FAINT, GROUPS, SEEN, SHAMS
 from stages.effects import Effect, Survey, effect_names, get_effect
 
-# of every row (k, n, K): columns that are fitted along, and columns that are judged
-Further = Callable[[Sequence[Rows], Sequence[Chain], Grid], tuple[list[Tensor], list[Tensor]]]
-
 
 @dataclass
 class Cause:
@@ -241,26 +238,16 @@ class State:
         whole = self._scattered(Whole(view.whole.given, plan, self.frames))
         return View(whole, plan, view.rows, view.grid, view.model)
 
-    def again(
-        self, view: View, names: Sequence[str], model: Covariance | None = None, further: Further | None = None
-    ) -> View:
+    def again(self, view: View, names: Sequence[str], model: Covariance | None = None) -> View:
         """A look beside ordinary amounts of these effects. Only the residual and the causes' own columns are rendered, the rest is as in ``view``.
 
-        model : the covariance, estimated where None; further : shared columns that no effect has, which stand last
+        model : the covariance, estimated where None
         """
         chains = self.chains()
         plan = make_plan(chains[0], names, self.data, candidates=(), impossible=self.impossible)
-
-        rows = [
-            r for part in per_site(lambda k: self.moved(view, k, chains[k], plan), range(len(chains))) for r in part
-        ]
+        parts = per_site(lambda k: self.moved(view, k, chains[k], plan), range(len(chains)))
+        rows = [r for part in parts for r in part]
         model = model or self._covariance(rows, plan, view.grid)
-        if further:
-            known, asked = further(rows, chains, view.grid)
-            rows = [r.with_more(torch.cat(z)) for r, *z in zip(rows, known, asked, strict=True)]
-            first = len(plan.shared)
-            plan.prior |= dict.fromkeys(range(first, first + len(known[0])), math.inf)
-            plan.shared += ["further"] * len(torch.cat([known[0], asked[0]]))
         return View(self._whole(rows, [None] * len(rows), plan, view.grid, model), plan, rows, view.grid, model)
 
     def moved(self, view: View, site: int, chain: Chain, plan: Plan) -> list[Rows]:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from stages.diagnose.search.state import State, View
-from stages.diagnose.settings import ALIKE, FAINT, FLAT, LINE, NOTABLE, SPREAD
+from stages.diagnose.settings import ALIKE, FAINT, FLAT, LINE, NOTABLE
 from stages.diagnose.structure.detector import pattern_of_detector
 from stages.diagnose.structure.fields import field_of_images
 from stages.diagnose.structure.innovations import innovations
 from stages.diagnose.structure.lines import line_of_brightness, line_of_displacement
 from stages.diagnose.structure.pixels import pixels_that_stand_out
-from stages.diagnose.structure.spilled import spilled
 
 PILED = "brightness that piles up at one level"
 
@@ -40,9 +39,6 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
     count, share = pixels_that_stand_out(left)
     if share > FAINT**2:
         out["a single pixel that stands out" if count == 1 else f"{count} single pixels that stand out"] = share
-    spread, surely = spilled(state, view)
-    if surely > 0 and spread > SPREAD:
-        out["light of bright pixels that spreads along one direction of the detector"] = spread
     if piled:
         out[PILED] = piled
     return out
