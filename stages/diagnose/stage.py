@@ -150,6 +150,7 @@ def _fill(answer: Answer, state: State, outcome: Outcome, cut: Cut | None, befor
     ordinary = {c.effect.name for c in state.causes} - {c.effect.name for c in state.named}
     if ordinary:  # rendered to judge the others beside it; from here on the simulation is what is named, and no more
         before *= after / _without_ordinary(state)
+        doubted |= unconfirmed(state)
     placed, refused = by_registration(state)
     clipped = cut[0](state.data, state) if cut else None  # was taken out of the images before anything was sought
     if clipped:

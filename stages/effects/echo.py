@@ -15,7 +15,7 @@ from stages.physics.formation.chain import Observation, State
 from stages.physics.formation.resampling import displace
 from stages.physics.photometry import Parameter
 
-CLEAR_LAG = 3  # px, beyond which an echo is no matter of the point spread function, nor of charge that spills
+CLEAR_LAG = 4  # px, beyond which an echo is no matter of the point spread function, nor of charge that spills
 RESAMPLED = 4  # px, from which on the measured image, which resampling blurs near by, may be repeated
 
 
