@@ -10,6 +10,7 @@ from stages.diagnose.structure.innovations import innovations
 from stages.diagnose.structure.lines import line_of_brightness, line_of_displacement
 from stages.diagnose.structure.pixels import pixels_that_stand_out
 
+SPECKS = 3  # pixels that stand out: one or two are on any film, and make no data strange
 PILED = "brightness that piles up at one level"
 
 
@@ -37,8 +38,8 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
         if surely > ALIKE:
             out[what] = alike
     count, share = pixels_that_stand_out(left)
-    if share > FAINT**2:
-        out["a single pixel that stands out" if count == 1 else f"{count} single pixels that stand out"] = share
+    if count >= SPECKS and share > FAINT**2:
+        out[f"{count} single pixels that stand out"] = share
     if piled:
         out[PILED] = piled
     return out
