@@ -16,6 +16,7 @@ from stages.diagnose.likelihood.tails import together
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.rows.columns import Plan
 from stages.diagnose.rows.patches import make_grid
+from stages.diagnose.structure import kinds
 from stages.diagnose.structure.detector import pattern_of_detector
 from stages.diagnose.structure.fields import field_of_images
 from stages.diagnose.structure.innovations import Innovation, innovations
@@ -151,6 +152,32 @@ def test_the_nearest_pixel_of_a_detector_leaves_lines_in_where_it_shows_the_grou
     chance, share = line_of_displacement(left(1, nearest), grid, FRAMES)
     assert chance > 25 and share > 0.005
     assert line_of_brightness(rows(0.0, 1), Covariance.white(grid.annuli, FRAMES), grid, FRAMES)[0] < 5
+
+
+def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
+    """Two specks, a line that a flat field leaves, displacements that bilinear resampling leaves: none; beyond that, each has its words."""
+    nothing = {
+        "line_of_brightness": (0.0, 0.0, 0.0), "line_of_displacement": (0.0, 0.0), "field_of_images": (0.0, 0.0),
+        "pattern_of_detector": (0.0, 0.0), "pixels_that_stand_out": (0, 0.0),
+    }  # fmt: skip
+    state = SimpleNamespace(sites=[], frames=1)
+    view = SimpleNamespace(rows=[], model=None, grid=None)
+
+    def words(piled=0.0, **found):
+        for name, value in {**nothing, **found}.items():
+            monkeypatch.setattr(kinds, name, lambda *_, value=value: value)
+        return list(kinds.structure(state, view, piled))
+
+    assert words() == []
+    assert words(pixels_that_stand_out=(2, 0.1)) == []
+    assert words(pixels_that_stand_out=(3, 0.1)) == ["3 single pixels that stand out"]
+    assert words(line_of_brightness=(40.0, 0.01, 0.002)) == []
+    assert words(line_of_brightness=(40.0, 0.01, 0.003)) == ["lines across an image"]
+    assert words(line_of_displacement=(40.0, 0.005)) == []
+    assert len(words(line_of_displacement=(40.0, 0.02))) == 1
+    assert words(pattern_of_detector=(0.05, 0.02), field_of_images=(0.05, 0.02)) == []  # not surely
+    assert len(words(pattern_of_detector=(0.05, 0.04), field_of_images=(0.05, 0.04))) == 2
+    assert words(piled=0.01) == [kinds.PILED]
 
 
 def test_many_values_are_as_far_from_nothing_as_chi_square_has_it():
