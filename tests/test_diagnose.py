@@ -92,7 +92,8 @@ def test_large_gains_of_images_are_one_cause(scene, tmp_path):
     assert [c.effect.name for c in answer.causes] == ["image_gain"]
 
 
-@pytest.mark.parametrize("seed", [21, *(pytest.param(s, marks=pytest.mark.slow) for s in (22, 23, 24))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [21, 22, 23, 24])
 def test_nothing_hidden_names_nothing(scene, tmp_path, seed):
     answer = diagnose.run(_pairs(scene, tmp_path, {}, seed)).answer
     assert not answer.causes
@@ -102,6 +103,7 @@ def test_nothing_hidden_names_nothing(scene, tmp_path, seed):
 def test_an_ordinary_blur_is_rendered_so_that_others_are_judged_beside_it_and_is_no_cause(scene, tmp_path):
     result = diagnose.run(_pairs(scene, tmp_path, {"psf_blur": {"sigma2_px2": 0.45}}))
     assert not result.answer.causes
+    assert result.answer.verdict in ("nothing_significant", "cannot_tell")
     assert result.answer.rejected["psf_blur"][1].endswith("ordinary")
     assert "psf_blur" not in result.answer.blind
     assert "psf_blur.sigma2_px2" in result.outcome.view.plan.shared  # fitted along as what is rendered is
