@@ -49,9 +49,9 @@ def search(state: State, most: int) -> Outcome:
         # the data look as before where nothing was named
         view = state.without_impossible(view, state.open_names()) if view else state.look(state.open_names())
         if refused and not state.named and state.law_is_another(view, refused):  # before, it was not
-            refused = {
-                n: why for n, why in refused.items() if get_effect(n).of_law
-            }  # nothing was judged beside this law
+            rendered = {c.effect.name for c in state.causes}
+            # of the others nothing was judged beside this law
+            refused = {n: why for n, why in refused.items() if n in rendered or get_effect(n).of_law}
             state.impossible.clear()
             view = None
             continue

@@ -11,7 +11,6 @@ from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.structure.innovations import Innovation
 
-LARGEST = 5.0  # standard deviations: one pixel tells no more
 BLOCK = 32  # px of the detector, beyond which neither ground nor pattern is alike by chance
 FEWEST = 4  # blocks
 
@@ -51,7 +50,7 @@ def _on_pixels(every: Sequence[Innovation]) -> tuple[NDArray[np.int64], NDArray[
     for one in every:
         known = one.seen & one.detector.isfinite().all(1)
         place.append(np.stack([x[known].round().long().numpy() for x in one.detector.unbind(1)], 1))
-        value.append(one.value[known].clamp(-LARGEST, LARGEST).double().numpy())
+        value.append(one.limited[known].double().numpy())
         site.append(np.full(len(value[-1]), one.patch.site))
     return np.concatenate(place), np.concatenate(value), np.concatenate(site)
 

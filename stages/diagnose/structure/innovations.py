@@ -13,7 +13,8 @@ from stages.diagnose.likelihood.products import Rows, precision
 from stages.diagnose.model.sites import Site
 from stages.diagnose.rows.patches import Grid, Patch
 
-SEEN = 0.5  # of the window: pixels nearer to its border are too few to be told from it
+WITHIN = 0.5  # of the window: nearer to its border a pixel is mostly noise
+LARGEST = 5.0  # standard deviations: one pixel tells no more
 
 
 @dataclass
@@ -28,6 +29,11 @@ class Innovation:
     seen: Tensor
     detector: Tensor
 
+    @property
+    def limited(self) -> Tensor:
+        """(n, h, w) value, of which no single pixel decides."""
+        return self.value.clamp(-LARGEST, LARGEST)
+
 
 def innovations(rows: Sequence[Rows], model: Covariance, grid: Grid, sites: Sequence[Site]) -> list[Innovation]:
     """Residual of each image given all others, whitened, pixel by pixel."""
@@ -40,8 +46,8 @@ def innovations(rows: Sequence[Rows], model: Covariance, grid: Grid, sites: Sequ
         plane = torch.zeros(len(z), grid.height * (grid.width // 2 + 1), dtype=given.dtype)
         plane[:, grid.keep] = given / grid.root
         value = torch.fft.irfft2(plane.unflatten(1, (grid.height, -1)), s=(grid.height, grid.width))
-        seen = patch.weight > SEEN
-        value = torch.where(seen, value / patch.weight.clamp(min=SEEN), 0.0)
+        seen = patch.weight > WITHIN
+        value = torch.where(seen, value / patch.weight.clamp(min=WITHIN), 0.0)
         rms = (value.square().sum((-2, -1)) / seen.sum((-2, -1)).clamp(min=1)).sqrt().clamp(min=1e-9)
         detector = sites[patch.site].on_detector()[patch.images][:, :, patch.rows, patch.columns]
         out.append(Innovation(patch, value / rms[:, None, None], seen, detector))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from stages.diagnose.search.state import State, View
-from stages.diagnose.settings import ALIKE, FAINT, FLAT, LINE, NOTABLE
+from stages.diagnose.settings import ALIKE, FAINT, FLAT, LINE, NOTABLE, SPECKS
 from stages.diagnose.structure.detector import pattern_of_detector
 from stages.diagnose.structure.fields import field_of_images
 from stages.diagnose.structure.innovations import innovations
 from stages.diagnose.structure.lines import line_of_brightness, line_of_displacement
 from stages.diagnose.structure.pixels import pixels_that_stand_out
 
-SPECKS = 3  # pixels that stand out: one or two are on any film, and make no data strange
 PILED = "brightness that piles up at one level"
 
 

@@ -18,7 +18,7 @@ from stages.diagnose.rows.patches import Grid
 from stages.diagnose.settings import FAR, NEAR, PEAK
 from stages.diagnose.structure.innovations import Innovation
 
-LARGEST, STEEPEST = 5.0, 3.0  # standard deviations: a single pixel, or an edge, is no line
+STEEPEST = 3.0  # standard deviations: an edge is no line
 
 
 def line_of_brightness(rows: Sequence[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[float, float, float]:
@@ -51,7 +51,7 @@ def line_of_displacement(every: Sequence[Innovation], grid: Grid, frames: int) -
             bright = patch.scale / patch.scale.mean((-2, -1), keepdim=True)
             slope = torch.gradient(bright, dim=axis)[0]
             slope = slope / slope.square().mean().sqrt().clamp(min=1e-9)
-            moved = one.value.clamp(-LARGEST, LARGEST) * slope.clamp(-STEEPEST, STEEPEST) * patch.weight
+            moved = one.limited * slope.clamp(-STEEPEST, STEEPEST) * patch.weight
             z = torch.fft.rfft2(moved).flatten(-2)[:, grid.keep]
             size = (z.abs().square().mean(1)).clamp(min=1e-9).sqrt()
             spectra.append((patch.frames, z / size[:, None]))
