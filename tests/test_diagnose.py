@@ -242,6 +242,19 @@ def test_a_pile_of_a_tenth_of_all_pixels_is_clipping():
     assert saturation.read_off(values.clamp(max=level))[0] == pytest.approx(level, rel=0.002)
 
 
+def test_clipping_shows_where_the_histogram_falls_to_its_end():
+    """A pile in one image of several is no higher than the histogram of all is a few per cent further down."""
+    from stages.effects import get_effect
+
+    level = 0.07
+    below = [torch.linspace(u, u + 0.002, round(200 + 1e4 * (1 - u))) for u in torch.arange(0.8, 0.999, 0.002).tolist()]
+    falling = level * torch.cat(below)
+    saturation = get_effect("saturation")
+    assert saturation.read_off(falling) is None
+    pile = level * (1 + 0.0002 * torch.linspace(-1, 1, 900))
+    assert saturation.read_off(torch.cat([falling, pile]))[0] == pytest.approx(level, rel=0.001)
+
+
 def test_clipping_shows_after_bicubic_resampling():
     """It rings by a per cent above the level, in single images that are clipped in a few places."""
     import cv2

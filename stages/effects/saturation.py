@@ -14,7 +14,8 @@ from stages.physics.photometry import Parameter
 PILE = 150  # pixels
 STANDS_OUT = 3.0  # times the bins below
 RINGING = 0.01  # of the level, by which bicubic resampling of an edge of common contrast overshoots
-BINS = (0.02, 0.002)  # of the level: noise added later makes the pile wide, a crowded histogram asks for narrow ones
+BINS = (0.02, 0.002, 0.001)  # of the level: noise added later makes the pile wide, a crowded histogram asks for narrow ones
+BELOW = 8  # bins: further down a histogram that falls to its end is as high as a small pile
 
 
 @register
@@ -54,7 +55,7 @@ class Saturation(Effect):
             if width == BINS[0]:
                 before = counts[max(best - 5, 0) : best - 1].mean()
             else:  # whole numbers leave bins between them empty
-                before = counts[: best - 1].max()
+                before = counts[max(best - BELOW, 0) : best - 1].max()
             pile = float(counts[best - 1 : best + 2].sum())
             if pile >= PILE and counts[best] >= STANDS_OUT * before and above <= 0.05 * pile:
                 break

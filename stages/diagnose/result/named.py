@@ -225,7 +225,7 @@ def _clipped(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Squared relative residuals of every quarter of a site's ground, without and with the level of the other ground; their pixels.
 
-    Every image has its own gain in either, fitted to its other quarters, for the law may be extrapolated to it.
+    Every image has its own gain, fitted to its other quarters where these are not cut off, for the law may be extrapolated to it.
     """
     quarters = [(k, rows) for k, x in enumerate(images) for rows in range(4)]
 
@@ -254,8 +254,9 @@ def _clipped(
         image, plain = part(k, quarter, images[k]), part(k, quarter, predicted)
         level = images[k][masks[k]].mean()
         top = levels[g % FOLDS]
-        both = [(_own_gain(images[k], predicted, elsewhere, cut) * plain).clamp(max=cut) for cut in (math.inf, top)]
-        out.append([float((torch.where(lit, image - p, 0.0) / level).double().square().sum()) for p in both])
+        plain = _own_gain(images[k], predicted, elsewhere, top) * plain
+        both = [torch.where(lit, image - p, 0.0) / level for p in (plain, plain.clamp(max=top))]
+        out.append([float(left.double().square().sum()) for left in both])
         count += float(lit.sum())
     before, after = np.array(out).T
     return before, after, max(count, 1.0)
