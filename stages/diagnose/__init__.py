@@ -5,8 +5,9 @@ One likelihood, in six steps, each a folder:
 model         The nominal simulation of every site, rendered again with small changes. Where its law does not fit, the mean of measured lunar
               laws takes its place, with the directions in which these differ.
 registration  Where the images lie. Shifts of up to 8 px are captured by correlation with the rendering, then explained: by nothing, a
-              constant, waves over the lines, an affine map or a smooth field per frame, with or without relief displacement. The simplest form that no other
-              beats on held-out sites wins.
+              constant, an affine map or a smooth field per frame, with or without relief displacement. The simplest form that no other
+              beats on held-out sites wins. Beside it lines of every image may be shifted against each other, as far as one half of
+              their samples tells the other.
 rows          Residuals relative to brightness, and what a little of everything would add to them, in windows on pieces of ground, as
               Fourier coefficients. Deep shadow counts, shadow edges do not: which ground is dark is judged by itself, last (``search/shadows.py``).
 likelihood    The covariance of the residuals, estimated from them by wavelength: albedo and relief that all images of a place share,

@@ -139,7 +139,7 @@ def _fill(answer: Answer, state: State, outcome: Outcome, cut: Cut | None, befor
     doubted = unconfirmed(state) | contradicted(state)
     view = outcome.view
     assert view is not None
-    displaced = state.registration is not None and state.registration.form.name != "none"
+    displaced = state.registration is not None and state.registration.displaced
     if state.named and displaced:  # what looked like a displacement may have been a cause that is named by now
         _register(state)
     if doubted or (state.named and displaced):
@@ -176,7 +176,7 @@ def _fill(answer: Answer, state: State, outcome: Outcome, cut: Cut | None, befor
 def _register(state: State) -> None:
     """Find where the images lie beside the causes that are named so far, lay them there, and fit the nominal model."""
     state.registration = explain(state.sites, state.nominal, state.base, state.frames, state.data.elevation[0])
-    placed = state.registration.form.name != "none"
+    placed = state.registration.displaced
     for site, known in zip(state.sites, state.registration.known, strict=True):
         site.displacement = known if placed else None
     for site, found in zip(state.hidden, displacements(state, [])[1], strict=True):

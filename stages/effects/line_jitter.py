@@ -15,7 +15,7 @@ from stages.physics.photometry import Parameter
 ORDERS = (1, 2, 3)
 
 
-def line_waves(height: int) -> Tensor:
+def crop_waves(height: int) -> Tensor:
     """(len(ORDERS), height): cosines over the lines, of mean square 1."""
     u = (torch.arange(height) + 0.5) / height
     return math.sqrt(2) * torch.cos(math.pi * torch.tensor(ORDERS)[:, None] * u)
@@ -51,7 +51,7 @@ class LineJitter(Effect):
     def apply(self, state: State) -> None:
         none = torch.zeros(())
         east, south = state.displacement or (none, none)
-        waves = line_waves(state.elevation.shape[-2]).to(state.elevation)[:, :, None]
+        waves = crop_waves(state.elevation.shape[-2]).to(state.elevation)[:, :, None]
         for k, wave in zip(ORDERS, waves, strict=True):
             east = east + self.value(f"east{k}_px", state) * wave
             south = south + self.value(f"south{k}_px", state) * wave

@@ -14,7 +14,11 @@ from stages.physics.photometry import Parameter
 PILE = 150  # pixels
 STANDS_OUT = 3.0  # times the bins below
 RINGING = 0.01  # of the level, by which bicubic resampling of an edge of common contrast overshoots
-BINS = (0.02, 0.002, 0.001)  # of the level: noise added later makes the pile wide, a crowded histogram asks for narrow ones
+BINS = (
+    0.02,
+    0.002,
+    0.001,
+)  # of the level: noise added later makes the pile wide, a crowded histogram asks for narrow ones
 BELOW = 8  # bins: further down a histogram that falls to its end is as high as a small pile
 
 

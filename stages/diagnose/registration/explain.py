@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from stages.diagnose.likelihood.jackknife import gain_interval, jackknife_error
+from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import Nominal
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.forms import FORMS, TERMS, WAVES, Form, Frame, Matched, displacement, solve
+from stages.diagnose.registration.forms import FORMS, TERMS, Form, Frame, Matched, displacement, solve
+from stages.diagnose.registration.lines import STEADY, TREMBLING, Lines, lines
 from stages.diagnose.registration.own import beside, match_all, own_fields
 from stages.diagnose.registration.registered import Gain, Registration, shifted_frames
-from stages.diagnose.registration.squares import OWN, grounds, held_out, held_out_beside_own
+from stages.diagnose.registration.squares import OWN, compared, grounds, held_out
 from stages.diagnose.registration.start import start
 from stages.diagnose.rows.patches import cuts
 from stages.diagnose.settings import CORRELATED, SURE
@@ -48,34 +51,61 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     shares = [without[g] for g in group[:: pieces**2]]
     plain = own_fields(chains, fitted["constant"][0], [0.0] * len(sites), frame, level, 1)
     slanted = own_fields(chains, fitted["constant, leaning"][0], shares, frame, level, 1)
-    squares |= held_out_beside_own(matched, group, [plain, slanted], frames, pieces**2)
+    squares |= compared(matched, group, dict(zip(OWN, (plain, slanted), strict=True)), frames, pieces**2)
     gains = {k: Gain(*gain_interval(squares["none"].sum(1), q.sum(1))) for k, q in squares.items() if k in fitted}
     leaning = Gain(*gain_interval(squares[OWN[0]].sum(1), squares[OWN[1]].sum(1)))
     far = torch.cat([torch.stack(m.leaning).square().sum(0).flatten() for m in matched]).mean().sqrt()
     surely = leaning.low > 0 and abs(share) > SURE * error
     form = _best(squares, surely and abs(share) * float(far) > ORDINARY)
+    form, trembling, beside_lines = _lines(chains, matched, group, fitted, form, frames)
+    squares |= beside_lines
+    gains["lines"] = Gain(*gain_interval(squares[STEADY].sum(1), squares[TREMBLING].sum(1)))
     coefficients, share = fitted[form.name]
     told = [f for f in FORMS if f is form or f.terms == 1]
     by_rest = {
         f.name: [solve(m, f, frames, spread, without[g] if f.leaning else None)[0] for g, m in rest.items()]
         for f in told
     }
-    # what nothing explains is left alone: a wrong Sun looks like a shift of its own at every site
-    if form.terms or form.leaning:
-        known = beside(matched, coefficients, share, pieces**2)
-    else:
-        known = [displacement(m, coefficients, share) for m in matched[:: pieces**2]]
     pixels = sum(float(s.read_valid.sum()) for s in sites)
     rms = {k: math.sqrt(float(q.sum()) / max(pixels, 1.0)) for k, q in squares.items()}
-    axis = len(TERMS) + WAVES  # columns of an axis
-    shifts = [
-        torch.linalg.inv(m.gram[:, [0, axis]][:, :, [0, axis]] / CORRELATED + 1e-9 * torch.eye(2)) for m in matched
-    ]
+    constant = [0, len(TERMS)]
+    shifts = [torch.linalg.inv(m.gram[:, constant][:, :, constant] / CORRELATED + 1e-9 * torch.eye(2)) for m in matched]
     every = torch.cat([s.diagonal(dim1=1, dim2=2).sum(1) for s in shifts])
     shift_error = math.sqrt(float(every.median()) * frames / max(len(every), 1))
-    return Registration(
-        form, coefficients, share, error, gains, known, frame, level, squares, rms, shift_error, pixels, fitted, by_rest
-    )
+    found = Registration(
+        form, coefficients, share, error, gains, trembling.known, trembling, frame, level, squares, rms, shift_error, pixels,
+        fitted, by_rest,
+    )  # fmt: skip
+    if found.lines_tremble:
+        found.known = trembling.fields
+    return found
+
+
+def _lines(
+    chains: Sequence[Chain],
+    matched: Sequence[Matched],
+    group: Sequence[int],
+    fitted: Mapping[str, tuple[Tensor, float]],
+    form: Form,
+    frames: int,
+) -> tuple[Form, Lines, dict[str, NDArray[np.float64]]]:
+    """Whether lines tremble beside the form, and the squares without and with that. Where crops have their lines in common an affine map or a field
+    has a part of it: a shift per frame takes its place where beside it other samples of a line say more than such a form does.
+    """
+    pieces = len(matched) // len(chains)
+    forms = [form, *(f for f in FORMS if f.terms == 1 < form.terms and f.leaning == form.leaning)]
+    found: list[Lines] = []
+    for each in forms:
+        coefficients, share = fitted[each.name]
+        # what nothing explains is left alone: a wrong Sun looks like a shift of its own at every site
+        if each.terms or each.leaning:
+            found.append(lines(chains, beside(matched, coefficients, share, pieces)))
+        else:
+            found.append(lines(chains, [displacement(m, coefficients, share) for m in matched[::pieces]]))
+    fields = {name: x for k, f in enumerate(found) for name, x in ((f"{k} known", f.known), (f"{k} across", f.across))}
+    squares = compared(matched, group, fields, frames, pieces)
+    best = int(len(found) > 1 and squares["1 across"].sum() < squares["0 known"].sum())
+    return forms[best], found[best], {STEADY: squares[f"{best} known"], TREMBLING: squares[f"{best} across"]}
 
 
 def _frame(sites: Sequence[Site]) -> Frame:

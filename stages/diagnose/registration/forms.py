@@ -1,8 +1,7 @@
-"""Forms of displacement: nothing, a constant, waves over the lines, an affine map or a smooth field per frame, with or without relief
-displacement.
+"""Forms of displacement: nothing, a constant, an affine map or a smooth field per frame, with or without relief displacement.
 
 Every pixel says, to first order, how far its image lies beside the ground: residual = gradient x displacement. A form is a sum of
-polynomials over the scene and of waves over a crop's lines per frame, and of h tan(emission), so that fitting one is linear least squares.
+polynomials over the scene per frame, and of h tan(emission), so that fitting one is linear least squares.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,50 +18,29 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.sites import Site
 from stages.diagnose.settings import BROAD, FIELD_ORDER
 from stages.effects.filters import fine, gradients
-from stages.effects.line_jitter import ORDERS, line_waves
 from stages.effects.relief_displacement import lean
 from stages.physics.formation.resampling import displace
 
 TERMS = tuple((i, k - i) for k in range(FIELD_ORDER + 1) for i in range(k + 1))  # powers of x and y
-WAVES = len(ORDERS)
 
 
 @dataclass(frozen=True)
 class Form:
-    """``terms`` of the polynomial and of the waves over the lines, per frame; ``leaning``: with relief displacement."""
+    """``terms`` of the polynomial per frame; ``leaning``: with relief displacement."""
 
     name: str
     terms: int
-    waves: int = 0
     leaning: bool = False
 
     @property
-    def places(self) -> list[int]:
-        """Of its columns among all of an axis, the polynomial's first."""
-        return [*range(self.terms), *range(len(TERMS), len(TERMS) + self.waves)]
-
-    def beside(self, **changes: Any) -> Form:
-        """The form that differs in so much."""
-        wanted = {"terms": self.terms, "waves": self.waves, "leaning": self.leaning, **changes}
-        return next(f for f in FORMS if all(getattr(f, k) == v for k, v in wanted.items()))
+    def upright(self) -> Form:
+        """The same without relief displacement."""
+        return next(f for f in PLAIN if f.terms == self.terms)
 
 
-PLAIN = (
-    Form("none", 0),
-    Form("constant", 1),
-    Form("lines", 1, WAVES),
-    Form("affine", 3),
-    Form("field", len(TERMS)),
-)
-LEANING = tuple(Form(f"{f.name}, leaning" if f.terms else "leaning", f.terms, f.waves, True) for f in PLAIN)
+PLAIN = (Form("none", 0), Form("constant", 1), Form("affine", 3), Form("field", len(TERMS)))
+LEANING = tuple(Form(f"{f.name}, leaning" if f.terms else "leaning", f.terms, True) for f in PLAIN)
 FORMS = PLAIN + LEANING
-
-
-def basis(frame: Frame, site: Site) -> Tensor:
-    """(T, H, W): what every frame has an amount of, in either direction."""
-    height, width = site.read.shape[-2:]
-    waves = line_waves(height)[:, :, None].expand(-1, -1, width)
-    return torch.cat([frame.basis(site.place, height, width), waves])
 
 
 @dataclass
@@ -73,8 +50,9 @@ class Frame:
     centre: tuple[float, float]
     half: float
 
-    def basis(self, place: tuple[float, float], height: int, width: int) -> Tensor:
-        """(T, H, W): the polynomials at every pixel of a crop at ``place``."""
+    def basis(self, site: Site) -> Tensor:
+        """(T, H, W): the polynomials at every pixel of a site, which every frame has an amount of in either direction."""
+        place, (height, width) = site.place, site.read.shape[-2:]
         y = ((place[0] + torch.arange(height) - self.centre[0]) / self.half)[:, None]
         x = (place[1] + torch.arange(width) - self.centre[1]) / self.half
         return torch.stack([(x**i * y**j).expand(height, width) for i, j in TERMS])
@@ -110,8 +88,28 @@ def match(
 
     terms : how many of the basis are asked for, all where None
     """
-    rendered = chain.predict()
     site = chain.site
+    residual, east, south, weight = asked(chain, lit, known)
+    target = residual + east * known[0] + south * known[1]
+    fields = frame.basis(site)[:terms]
+    leaning = lean(site.observation, level)
+    along = (east * leaning[0] + south * leaning[1])[:, None]
+    columns = torch.cat([east[:, None] * fields, south[:, None] * fields, along], 1)
+    out = []
+    for rows, across in _parts(residual.shape[-2], residual.shape[-1], pieces):
+        own = columns[:, :, rows, across].flatten(2)
+        weighted = own * weight[:, rows, across].flatten(1)[:, None]
+        gram = (weighted @ own.transpose(1, 2)).double()
+        score = torch.einsum("npx,nx->np", weighted, target[:, rows, across].flatten(1)).double()
+        out.append(Matched(chain, gram, score, fields, leaning, (rows, across)))
+    return out
+
+
+def asked(chain: Chain, lit: Tensor, known: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Of images that are displaced by about ``known``, four (n, H, W): the residual, what a px further east and south adds to it, and the
+    inverse of its variance where it counts. What is broad is left out.
+    """
+    rendered, site = chain.predict(), chain.site
     image, valid = aligned(site.read, site.read_valid, *known, displace)  # only linearised about: a quick one does
     mask = (valid & lit).float()
     measured, predicted, *slopes = fine(torch.stack([image, rendered, *gradients(rendered)]), mask, BROAD)
@@ -119,20 +117,7 @@ def match(
     residual = measured - scale[:, None, None] * predicted
     east, south = (g * scale[:, None, None] for g in slopes)
     variance = residual.square().sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
-    weight = mask / variance.clamp(min=1e-20)[:, None, None]
-    target = residual + east * known[0] + south * known[1]
-    fields = basis(frame, site)[:terms]
-    leaning = lean(site.observation, level)
-    along = (east * leaning[0] + south * leaning[1])[:, None]
-    columns = torch.cat([east[:, None] * fields, south[:, None] * fields, along], 1)
-    out = []
-    for rows, across in _parts(image.shape[-2], image.shape[-1], pieces):
-        own = columns[:, :, rows, across].flatten(2)
-        weighted = own * weight[:, rows, across].flatten(1)[:, None]
-        gram = (weighted @ own.transpose(1, 2)).double()
-        score = torch.einsum("npx,nx->np", weighted, target[:, rows, across].flatten(1)).double()
-        out.append(Matched(chain, gram, score, fields, leaning, (rows, across)))
-    return out
+    return residual, east, south, mask / variance.clamp(min=1e-20)[:, None, None]
 
 
 def _parts(height: int, width: int, pieces: int) -> list[tuple[slice, slice]]:
@@ -149,10 +134,10 @@ def solve(
     """Coefficients (frames, 2, T) and the share of leaning, or the former beside a given ``share``; ``spread`` px is what is expected of a
     coefficient.
     """
-    places, count = form.places, len(TERMS) + WAVES
-    if not sites or not (places or form.leaning):
+    count = len(TERMS)
+    if not sites or not (form.terms or form.leaning):
         return torch.zeros(frames, 2, count, dtype=torch.float64), 0.0
-    chosen = torch.tensor([*places, *(count + p for p in places)], dtype=torch.long)
+    chosen = torch.tensor([*range(form.terms), *range(count, count + form.terms)], dtype=torch.long)
     every = torch.cat([torch.from_numpy(s.chain.site.frames) for s in sites])
     gram = torch.zeros(frames, 2 * count + 1, 2 * count + 1, dtype=torch.float64)
     gram.index_add_(0, every, torch.cat([s.gram for s in sites]))
@@ -168,7 +153,7 @@ def solve(
             wanted = score[:, -1].sum() - (border * alone).sum()
             share = float(wanted / (gram[:, -1, -1].sum() + 1e-6 - (border * by_share).sum()))
     out = torch.zeros(frames, 2, count, dtype=torch.float64)
-    out[..., places] = (alone - share * by_share).view(frames, 2, len(places))
+    out[..., : form.terms] = (alone - share * by_share).view(frames, 2, form.terms)
     return out, share
 
 

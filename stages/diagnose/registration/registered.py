@@ -15,11 +15,13 @@ from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, nat
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import Nominal
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.forms import FORMS, TERMS, Form, Frame, basis, displacement
+from stages.diagnose.registration.forms import FORMS, Form, Frame, displacement
+from stages.diagnose.registration.lines import STEADY, TREMBLING, Lines, lines
 from stages.diagnose.registration.own import match_all, own_fields
 from stages.diagnose.registration.squares import OWN, left
 from stages.diagnose.registration.start import Field
 from stages.diagnose.settings import CORRELATED, DISCOVERY
+from stages.effects.line_jitter import LineJitter
 from stages.effects.relief_displacement import lean
 
 
@@ -36,9 +38,11 @@ class Gain:
 class Registration:
     """What explains where the images lie.
 
+    lines : of each image against each other, beside ``known``
     coefficients : (frames, 2, T), px; share : of the relief displacement; gains : of each form over nothing
     fitted : coefficients and share of every form; without : coefficients by all ground but one piece, of the form and of constant ones
-    squares : of the residual, (pieces of ground, frames) for every form, and in OWN without and with relief displacement; tested : of the test pairs
+    squares : of the residual, (pieces of ground, frames) for every form, in OWN without and with relief displacement, in STEADY and TREMBLING without
+    and with what other samples say of a line; tested : of the test pairs
     """
 
     form: Form
@@ -46,7 +50,8 @@ class Registration:
     share: float
     share_error: float
     gains: dict[str, Gain]
-    known: list[tuple[Tensor, Tensor]]
+    known: list[Field]
+    lines: Lines
     frame: Frame
     level: float
     squares: dict[str, NDArray[np.float64]]  # (pieces of ground, frames)
@@ -57,6 +62,17 @@ class Registration:
     without: dict[str, list[Tensor]]
     tested: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
+    @property
+    def displaced(self) -> bool:
+        """Whether images lie anywhere but where the file says."""
+        return self.form.name != "none" or self.lines_tremble
+
+    @property
+    def lines_tremble(self) -> bool:
+        """Whether lines are surely shifted against each other, and by more than is ordinary."""
+        ordinary = LineJitter.tolerance["rms_px"]
+        return self.gains["lines"].low > 0 and self.lines.rms**2 - self.lines.error**2 > ordinary**2
+
     def test(self, sites: Sequence[Site], nominal: Nominal) -> None:
         """Squares of every form on ground that nothing was fitted to, into ``tested``: relief displacement beside each image's own field."""
         if not sites:
@@ -65,10 +81,11 @@ class Registration:
         known = [self.at(c) for c in chains]
         matched = match_all(chains, known, self.frame, self.level, 1)
         fields = {f.name: [displacement(m, *self.fitted[f.name]) for m in matched] for f in FORMS}
-        own = {leans: self.settled(chains, self.share if leans else 0.0, 1) for leans in (False, True)}
-        for m, k in zip(matched, range(len(sites)), strict=True):
-            every = [*(fields[f.name][k] for f in FORMS), own[False][k], own[True][k]]
-            for name, (squares,) in zip([*fields, *OWN], left([m], every), strict=True):
+        fields |= {n: self.settled(chains, share, 1) for n, share in zip(OWN, (0.0, self.share), strict=True)}
+        fields[STEADY] = fields[OWN[self.form.leaning]]
+        fields[TREMBLING] = lines(chains, fields[STEADY], self.lines.variance).across
+        for k, m in enumerate(matched):
+            for name, (squares,) in zip(fields, left([m], [f[k] for f in fields.values()]), strict=True):
                 total = self.tested.setdefault(name, np.zeros((len(sites), len(self.coefficients))))
                 np.add.at(total[k], m.chain.site.frames, squares)
 
@@ -110,23 +127,20 @@ class Registration:
         share = float(before.sum() / self.squares[first].sum())
         return Gain(*(share * g for g in gain_interval(before, after)))
 
-    def at(self, chain: Chain, waves: bool = True) -> tuple[Tensor, Tensor]:
-        """Where the form has the images of any site look, (n, H, W) px each; ``waves``: those over the lines with it."""
+    def at(self, chain: Chain) -> Field:
+        """Where the form has the images of any site look, (n, H, W) px each."""
         site = chain.site
         own = self.coefficients[torch.from_numpy(site.frames)].float()
-        if not waves:
-            own = own[..., : len(TERMS)]
-        field = torch.einsum("nat,thw->anhw", own, basis(self.frame, site)[: own.shape[-1]])
+        field = torch.einsum("nat,thw->anhw", own, self.frame.basis(site))
         east, south = lean(site.observation, self.level)
         return field[0] + self.share * east, field[1] + self.share * south
 
     def mean_shifts(self, sites: Sequence[Site], coefficients: Tensor) -> Tensor:
         """(frames, 2) px east and south: of a form's polynomial over the places that show each frame. coefficients : (frames, 2, T)"""
-        coefficients = coefficients[..., : len(TERMS)]
         total, count = torch.zeros(coefficients.shape[:2], dtype=torch.float64), torch.zeros(len(coefficients))
         for site in sites:
             frames = torch.from_numpy(site.frames)
-            here = basis(self.frame, site)[: len(TERMS)].double().mean((-2, -1))
+            here = self.frame.basis(site).double().mean((-2, -1))
             total.index_add_(0, frames, coefficients[frames] @ here)
             count.index_add_(0, frames, torch.ones(len(frames)))
         return (total / count.clamp(min=1)[:, None]).float()
@@ -135,6 +149,10 @@ class Registration:
         """Relief displacement by ``share`` plus each image's own shift and affine map, captured beside it: a nuisance of any comparison."""
         shifts, _ = self.fitted["constant, leaning" if share else "constant"]
         return own_fields(chains, shifts, [share] * len(chains), self.frame, self.level, terms)
+
+    def beside_lines(self, chains: Sequence[Chain], fields: list[Field]) -> list[Field]:
+        """Displacements of sites that nothing was fitted to, with what other samples of their images say of a line where lines tremble."""
+        return lines(chains, fields, self.lines.variance).across if self.lines_tremble else fields
 
 
 def shifted_frames(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 
 import numpy as np
@@ -42,17 +42,17 @@ def held_out(matched: list[Matched], group: Sequence[int], frames: int, spread: 
     return out
 
 
-def held_out_beside_own(
-    matched: Sequence[Matched], group: Sequence[int], fields: Sequence[Sequence[Field]], frames: int, pieces: int
+def compared(
+    matched: Sequence[Matched], group: Sequence[int], fields: Mapping[str, Sequence[Field]], frames: int, pieces: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Squares (pieces of ground, frames) without and with relief displacement, its share by other ground, beside each image's own shift.
+    """Squares (pieces of ground, frames) of several displacements, each a field per site, on the pixels that all of them keep.
 
-    Unlike a form of the whole scene such shifts need no other ground to be known.
+    Unlike a form of the whole scene an image's own displacement needs no other ground to be known.
     """
-    out = {name: np.zeros((max(group) + 1, frames)) for name in OWN}
-    for site, own in enumerate(zip(*fields, strict=True)):
+    out = {name: np.zeros((max(group) + 1, frames)) for name in fields}
+    for site, own in enumerate(zip(*fields.values(), strict=True)):
         of = slice(site * pieces, (site + 1) * pieces)
-        for name, every in zip(OWN, left(matched[of], own), strict=True):
+        for name, every in zip(fields, left(matched[of], own), strict=True):
             for g, squares in zip(group[of], every, strict=True):
                 np.add.at(out[name][g], matched[of.start].chain.site.frames, squares)
     return out
@@ -96,4 +96,4 @@ def grounds(matched: Sequence[Matched]) -> list[int]:
     return [numbers.index(m.chain.site.number) if len(numbers) > 3 else k for k, m in enumerate(matched)]
 
 
-__all__ = ["OWN", "grounds", "held_out", "held_out_beside_own", "left"]
+__all__ = ["OWN", "compared", "grounds", "held_out", "left"]

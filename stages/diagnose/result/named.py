@@ -13,12 +13,13 @@ from torch import Tensor
 from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, jackknife_error, nats
 from stages.diagnose.model.nominal import full_light
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.forms import FORMS, TERMS
+from stages.diagnose.registration.forms import FORMS
+from stages.diagnose.registration.lines import STEADY, TREMBLING
 from stages.diagnose.registration.registered import Registration, shifted_frames
 from stages.diagnose.registration.squares import OWN
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CORRELATED, FOLDS, ROUNDS, STILL
+from stages.diagnose.settings import CORRELATED, FOLDS, ROUNDS
 from stages.effects import Effect, Survey, effect_names, get_effect
 from stages.effects.filters import gaussian
 
@@ -90,7 +91,7 @@ def _leaning(state: State, r: Registration, name: str) -> tuple[Named | None, st
         "share": (r.share, r.share_error, "1"),
         "rms_px": (size, r.share_error * state.data.lean_px, "px"),
     }
-    plain = r.form.beside(leaning=False)
+    plain = r.form.upright
     compared = (plain.name, r.form.name)
     if not plain.terms or r.doubt(*compared, OWN):  # beside each image's own shift it was found sure
         compared = OWN
@@ -98,20 +99,16 @@ def _leaning(state: State, r: Registration, name: str) -> tuple[Named | None, st
 
 
 def _lines(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
-    """Named where waves over the lines explain more than any other form, and are more than ordinary."""
+    """Named where other samples surely tell how far a line is shifted, by more than is ordinary."""
+    if not r.lines_tremble:
+        return None, ""
     cls = get_effect(name)
-    if not r.form.waves:
-        return None, ""
-    amounts = r.coefficients[:, :, len(TERMS) :].float()  # (frames, 2, waves), as the effect's coordinates are ordered
-    effect = cls({p.name: amounts.flatten(1)[:, k] for k, p in enumerate(cls.fitted())}, state.data)
-    size, error = cls.size(effect.values), r.shift_error * math.sqrt(2 * r.form.waves)
-    if _ordinary(size, error, cls):
-        return None, ""
-    plain = r.form.beside(waves=0)
-    made = _named(effect, {"rms_px": (size, error, "px")}, r, plain.name, r.form.name)
-    if size < STILL * error:
-        return made, f"it comes out {size / error:.1f} errors from nothing"
-    return made, r.doubt(plain.name, r.form.name, (plain.name, r.form.name))
+    amounts = r.lines.over_the_crop(state.sites, state.frames)
+    effect = cls({p.name: amounts[:, k] for k, p in enumerate(cls.fitted())}, state.data)
+    compared, size = (STEADY, TREMBLING), r.lines.rms
+    ordinary = size - math.sqrt(size**2 - cls.tolerance["rms_px"] ** 2)  # part of what was found
+    made = _named(effect, {"rms_px": (size, math.hypot(r.lines.error, ordinary), "px")}, r, *compared)
+    return made, r.doubt(*compared, compared)
 
 
 def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
@@ -122,9 +119,7 @@ def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str
 
     def judge(leaning: bool) -> tuple[str, str, NDArray[np.int64] | None, str]:
         """The forms without and with a shift, the frames that are shifted (None for all), and why that is not sure."""
-        first, form = (
-            next(f.name for f in FORMS if f.terms == n and f.leaning == leaning and not f.waves) for n in (0, 1)
-        )
+        first, form = (next(f.name for f in FORMS if f.terms == n and f.leaning == leaning) for n in (0, 1))
         why = r.doubt(first, form, (first, form))
         some = shifted_frames(r.squares[first], r.squares[form])
         if why and len(some):

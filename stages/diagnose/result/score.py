@@ -89,18 +89,20 @@ def displacements(state: State, named: Sequence[Effect]) -> tuple[Fields, Fields
     Beyond one shift per frame a field is a nuisance: either model then has each image's own.
     """
     r, nothing = state.registration, [None] * len(state.hidden)
-    if r is None or r.form.name == "none":
+    if r is None or not r.displaced:
         return nothing, nothing
     chains = [state.nominal.chain(site, []) for site in state.hidden]
     leans = any(e.leans for e in named)
+    plain: Fields
     if leans or r.form.terms > 1:
-        share = r.share if r.form.leaning else 0.0
-        last = r.settled(chains, share)
-        return (r.settled(chains, 0.0) if leans else last), last
-    last = [r.at(chain) for chain in chains]
-    if any(e.along_lines for e in named):
-        return [r.at(chain, waves=False) for chain in chains], last
-    return (nothing if named else last), last
+        last = r.settled(chains, r.share if r.form.leaning else 0.0)
+        plain = r.settled(chains, 0.0) if leans else last
+    else:
+        last = [r.at(chain) for chain in chains]
+        plain = nothing if any(not e.along_lines for e in named) else last
+    moved = r.beside_lines(chains, last)
+    unnamed = plain is last and not any(e.along_lines for e in named)
+    return (moved if unnamed else plain), moved
 
 
 Fields = list[tuple[torch.Tensor, torch.Tensor]] | list[None]

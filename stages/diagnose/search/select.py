@@ -21,7 +21,7 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.search.tested import hidden_look, hidden_rows
-from stages.diagnose.settings import DISCOVERY, FAINT, NOTABLE, SIMPLER, SURE, TRIED, TRIES
+from stages.diagnose.settings import DISCOVERY, FAINT, NOTABLE, SIMPLER, STILL, SURE, TRIED, TRIES
 from stages.effects import Effect, get_effect
 
 ODD = "nothing real has the values that fit best"
@@ -309,7 +309,20 @@ def _doubt_any(state: State, cause: Cause) -> tuple[str, Cause | None]:
     for c in state.named:
         if why := doubt(state, c):
             return f"beside it {c.effect.name} is no cause any more: {why}", c
+        # each may stand for the other: together they are sure, and how much there is of either is not known
+        alike = c.effect.name in cause.effect.confused_with and c is not cause
+        if alike and not (_known_by_itself(cause) or _known_by_itself(c)):
+            return f"beside it {c.effect.name}, which it is confused with, is not known any more", None
     return "", None
+
+
+def _known_by_itself(cause: Cause) -> bool:
+    """Whether any of its values is surely not nothing, whatever all the others are."""
+    null = type(cause.effect).null()
+    amounts = [
+        (float(cause.effect.values[n]) - null[n], e) for n, e in cause.errors.items() if n not in cause.effect.shaped
+    ]
+    return type(cause.effect).scope != "scene" or any(abs(value) > STILL * error for value, error in amounts)
 
 
 def contradicted(gains: np.ndarray) -> str:
