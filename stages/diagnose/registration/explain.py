@@ -53,13 +53,15 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     slanted = own_fields(chains, fitted["constant, leaning"][0], shares, frame, level, 1)
     squares |= compared(matched, group, dict(zip(OWN, (plain, slanted), strict=True)), frames, pieces**2)
     gains = {k: Gain(*gain_interval(squares["none"].sum(1), q.sum(1))) for k, q in squares.items() if k in fitted}
+    gains["lines"] = Gain(0.0, 0.0, 0.0)
     leaning = Gain(*gain_interval(squares[OWN[0]].sum(1), squares[OWN[1]].sum(1)))
     far = torch.cat([torch.stack(m.leaning).square().sum(0).flatten() for m in matched]).mean().sqrt()
     surely = leaning.low > 0 and abs(share) > SURE * error
     form = _best(squares, surely and abs(share) * float(far) > ORDINARY)
     form, trembling, beside_lines = _lines(chains, matched, group, fitted, form, frames)
     squares |= beside_lines
-    gains["lines"] = Gain(*gain_interval(squares[STEADY].sum(1), squares[TREMBLING].sum(1)))
+    if beside_lines:
+        gains["lines"] = Gain(*gain_interval(squares[STEADY].sum(1), squares[TREMBLING].sum(1)))
     coefficients, share = fitted[form.name]
     told = [f for f in FORMS if f is form or f.terms == 1]
     by_rest = {
@@ -89,8 +91,9 @@ def _lines(
     form: Form,
     frames: int,
 ) -> tuple[Form, Lines, dict[str, NDArray[np.float64]]]:
-    """Whether lines tremble beside the form, and the squares without and with that. Where crops have their lines in common an affine map or a field
-    has a part of it: a shift per frame takes its place where beside it other samples of a line say more than such a form does.
+    """How lines tremble beside the form, and the squares without and with that; none where that is ordinary. Where crops have their lines in common
+    an affine map or a field has a part of it: a shift per frame takes its place where beside it other samples of a line say more than such a
+    form does.
     """
     pieces = len(matched) // len(chains)
     forms = [form, *(f for f in FORMS if f.terms == 1 < form.terms and f.leaning == form.leaning)]
@@ -102,6 +105,8 @@ def _lines(
             found.append(lines(chains, beside(matched, coefficients, share, pieces)))
         else:
             found.append(lines(chains, [displacement(m, coefficients, share) for m in matched[::pieces]]))
+    if all(each.ordinary for each in found):
+        return form, found[0], {}
     fields = {name: x for k, f in enumerate(found) for name, x in ((f"{k} known", f.known), (f"{k} across", f.across))}
     squares = compared(matched, group, fields, frames, pieces)
     best = int(len(found) > 1 and squares["1 across"].sum() < squares["0 known"].sum())

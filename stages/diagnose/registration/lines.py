@@ -22,7 +22,7 @@ from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.forms import asked
 from stages.diagnose.registration.start import Field
-from stages.effects.line_jitter import ORDERS, crop_waves
+from stages.effects.line_jitter import ORDERS, LineJitter, crop_waves
 
 SHORTEST = 16  # px: on shorter waves the samples of a line scatter more than it is shifted
 FAR = 5.0  # px: no line is shifted by more
@@ -45,6 +45,11 @@ class Lines:
     fields: list[Field]
     across: list[Field]
 
+    @property
+    def ordinary(self) -> bool:
+        """Whether lines are shifted no more than any camera's."""
+        return self.rms**2 - self.error**2 <= LineJitter.tolerance["rms_px"] ** 2
+
     def over_the_crop(self, sites: Sequence[Site], frames: int) -> Tensor:
         """(frames, coordinates of ``line_jitter``) px: the part that goes with the rows of a crop, the mean of all that show a frame."""
         total, count = torch.zeros(frames, 2, len(ORDERS)), torch.zeros(frames)
@@ -58,14 +63,17 @@ class Lines:
 
 
 def lines(chains: Sequence[Chain], known: Sequence[Field], variance: Tensor | None = None) -> Lines:
-    """Beside a displacement ``known`` per site, each image's own shift open. variance : of the waves, estimated where None"""
+    """Beside a displacement ``known`` per site, each image's own shift open; what is ordinary is left alone.
+
+    variance : of the waves, estimated where None
+    """
     waves = per_site(lambda chain: _line_waves(chain.site), chains)
     given, count = variance, waves[0].shape[1]
     variance = torch.full((count,), 0.01, dtype=torch.float64) if given is None else given
     halves = [_first_half(chain.site) for chain in chains]
-    fields, across, scatter = list(known), list(known), torch.zeros(0)
+    found = Lines(variance, 0.0, 0.0, list(known), list(known), list(known))
     for _ in range(STEPS):
-        every = list(zip(chains, fields, known, waves, halves, strict=True))
+        every = list(zip(chains, found.fields, known, waves, halves, strict=True))
         asks = per_site(lambda site: _equations(*site), every)
         unlike = float(np.median(np.concatenate([_differences(*site) for site in asks])))  # pixels per independent one
         asks = [(gram / unlike, score / unlike) for gram, score in asks]
@@ -75,18 +83,21 @@ def lines(chains: Sequence[Chain], known: Sequence[Field], variance: Tensor | No
             scatter = torch.stack([(mean.square() + spread).mean((0, 1)) for mean, spread in solved])
             if given is None:
                 variance = scatter.mean(0).clamp(min=1e-8)
-        fields = [_moved(near, mean, w) for near, (mean, _), w in zip(known, solved, waves, strict=True)]
-        across = []
+        without = [_size((scatter.sum(0) - own) / max(len(chains) - 1, 1)) for own in scatter]
+        found.variance, found.rms, found.error = variance, _size(variance), float(jackknife_error(np.array(without)))
+        if given is None and found.ordinary:
+            break
+        found.fields = [_moved(near, mean, w) for near, (mean, _), w in zip(known, solved, waves, strict=True)]
+        found.across = []
         for (gram, score), near, w, first in zip(asks, known, waves, halves, strict=True):
             one, other = (_moved(near, _solve(g, s, variance)[0], w) for g, s in zip(gram, score, strict=True))
-            across.append((torch.where(first, other[0], one[0]), torch.where(first, other[1], one[1])))
+            found.across.append((torch.where(first, other[0], one[0]), torch.where(first, other[1], one[1])))
+    return found
 
-    def size(of: Tensor) -> float:
-        return math.sqrt(2 * float(of.sum()))
 
-    without = [size((scatter.sum(0) - own) / max(len(chains) - 1, 1)) for own in scatter]
-    error = float(jackknife_error(np.array(without)))
-    return Lines(variance, size(variance), error, list(known), fields, across)
+def _size(variance: Tensor) -> float:
+    """px rms of the waves, either direction taken together."""
+    return math.sqrt(2 * float(variance.sum()))
 
 
 def _line_waves(site: Site) -> Tensor:

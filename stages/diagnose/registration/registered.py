@@ -21,7 +21,6 @@ from stages.diagnose.registration.own import match_all, own_fields
 from stages.diagnose.registration.squares import OWN, left
 from stages.diagnose.registration.start import Field
 from stages.diagnose.settings import CORRELATED, DISCOVERY
-from stages.effects.line_jitter import LineJitter
 from stages.effects.relief_displacement import lean
 
 
@@ -70,8 +69,7 @@ class Registration:
     @property
     def lines_tremble(self) -> bool:
         """Whether lines are surely shifted against each other, and by more than is ordinary."""
-        ordinary = LineJitter.tolerance["rms_px"]
-        return self.gains["lines"].low > 0 and self.lines.rms**2 - self.lines.error**2 > ordinary**2
+        return self.gains["lines"].low > 0 and not self.lines.ordinary
 
     def test(self, sites: Sequence[Site], nominal: Nominal) -> None:
         """Squares of every form on ground that nothing was fitted to, into ``tested``: relief displacement beside each image's own field."""
@@ -82,8 +80,9 @@ class Registration:
         matched = match_all(chains, known, self.frame, self.level, 1)
         fields = {f.name: [displacement(m, *self.fitted[f.name]) for m in matched] for f in FORMS}
         fields |= {n: self.settled(chains, share, 1) for n, share in zip(OWN, (0.0, self.share), strict=True)}
-        fields[STEADY] = fields[OWN[self.form.leaning]]
-        fields[TREMBLING] = lines(chains, fields[STEADY], self.lines.variance).across
+        if self.lines_tremble:
+            fields[STEADY] = fields[OWN[self.form.leaning]]
+            fields[TREMBLING] = lines(chains, fields[STEADY], self.lines.variance).across
         for k, m in enumerate(matched):
             for name, (squares,) in zip(fields, left([m], [f[k] for f in fields.values()]), strict=True):
                 total = self.tested.setdefault(name, np.zeros((len(sites), len(self.coefficients))))
