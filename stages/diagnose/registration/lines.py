@@ -68,36 +68,42 @@ def lines(chains: Sequence[Chain], known: Sequence[Field], variance: Tensor | No
     variance : of the waves, estimated where None
     """
     waves = per_site(lambda chain: _line_waves(chain.site), chains)
-    given, count = variance, waves[0].shape[1]
-    variance = torch.full((count,), 0.01, dtype=torch.float64) if given is None else given
     halves = [_first_half(chain.site) for chain in chains]
-    found = Lines(variance, 0.0, 0.0, list(known), list(known), list(known))
+    some = torch.full((waves[0].shape[1],), 0.01, dtype=torch.float64)
+    found = Lines(some if variance is None else variance, 0.0, 0.0, list(known), list(known), list(known))
     for _ in range(STEPS):
         every = list(zip(chains, found.fields, known, waves, halves, strict=True))
         asks = per_site(lambda site: _equations(*site), every)
         unlike = float(np.median(np.concatenate([_differences(*site) for site in asks])))  # pixels per independent one
         asks = [(gram / unlike, score / unlike) for gram, score in asks]
-        scatter = torch.zeros(len(chains), count, dtype=torch.float64)
-        for _ in range(ROUNDS):
-            solved = [_solve(gram.sum(0), score.sum(0), variance) for gram, score in asks]
-            scatter = torch.stack([(mean.square() + spread).mean((0, 1)) for mean, spread in solved])
-            if given is None:
-                variance = scatter.mean(0).clamp(min=1e-8)
-        without = [_size((scatter.sum(0) - own) / max(len(chains) - 1, 1)) for own in scatter]
-        found.variance, found.rms, found.error = variance, _size(variance), float(jackknife_error(np.array(without)))
-        if given is None and found.ordinary:
-            break
-        found.fields = [_moved(near, mean, w) for near, (mean, _), w in zip(known, solved, waves, strict=True)]
+        if variance is None:
+            found.variance, found.rms, found.error = _scatter(asks, found.variance)
+            if found.ordinary:
+                break
+        amounts = [_solve(gram.sum(0), score.sum(0), found.variance)[0] for gram, score in asks]
+        found.fields = [_moved(near, mean, w) for near, mean, w in zip(known, amounts, waves, strict=True)]
         found.across = []
         for (gram, score), near, w, first in zip(asks, known, waves, halves, strict=True):
-            one, other = (_moved(near, _solve(g, s, variance)[0], w) for g, s in zip(gram, score, strict=True))
+            one, other = (_moved(near, _solve(g, s, found.variance)[0], w) for g, s in zip(gram, score, strict=True))
             found.across.append((torch.where(first, other[0], one[0]), torch.where(first, other[1], one[1])))
     return found
 
 
-def _size(variance: Tensor) -> float:
-    """px rms of the waves, either direction taken together."""
-    return math.sqrt(2 * float(variance.sum()))
+def _scatter(asks: Sequence[tuple[Tensor, Tensor]], variance: Tensor) -> tuple[Tensor, float, float]:
+    """Variance of every wave (K,), px2, by expectation-maximisation from a first guess; rms of all waves in both directions, px, and its error over
+    ground. asks : products of every site, as :func:`_equations` has them
+    """
+
+    def size(of: Tensor) -> float:
+        return math.sqrt(2 * float(of.sum()))
+
+    squares = variance.expand(len(asks), -1)
+    for _ in range(ROUNDS):
+        solved = [_solve(gram.sum(0), score.sum(0), variance) for gram, score in asks]
+        squares = torch.stack([(mean.square() + spread).mean((0, 1)) for mean, spread in solved])
+        variance = squares.mean(0).clamp(min=1e-8)
+    without = [size((squares.sum(0) - own) / max(len(asks) - 1, 1)) for own in squares]
+    return variance, size(variance), float(jackknife_error(np.array(without)))
 
 
 def _line_waves(site: Site) -> Tensor:
