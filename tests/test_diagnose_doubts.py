@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from stages.diagnose.likelihood.covariance import Covariance, shadow_variance
 from stages.diagnose.likelihood.dem_errors import kept_share
 from stages.diagnose.likelihood.found import Found, interval
-from stages.diagnose.likelihood.jackknife import jackknife_error
+from stages.diagnose.likelihood.jackknife import folds, jackknife_error
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.aligned import aligned
 from stages.diagnose.rows.columns import Guise, Plan
@@ -22,6 +22,7 @@ from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
 from stages.diagnose.search.select import ODD, ORDINARY, beyond_bounds, choose, doubt, judge, may_be_another
 from stages.diagnose.search.state import Cause
+from stages.diagnose.settings import FOLDS
 from stages.effects import get_effect
 from stages.effects.base import Survey
 from stages.effects.filters import gaussian, seams
@@ -291,3 +292,14 @@ def test_images_that_are_laid_elsewhere_keep_their_noise() -> None:
     hole[:, 40:50, 30:60] = False
     moved, valid = aligned(flat * hole, hole, half, half)
     assert not valid[:, 40:50, 31:60].any() and (moved[valid] - 5.0).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("period", [2, 3, 4, 6, 8, 12])
+def test_images_that_come_back_every_so_many_grounds_are_known_from_other_parts(period):
+    """Else their own gains and shifts would be known from no ground but that which they are judged on."""
+    alone = []
+    for count in range(2 * period, 6 * period):
+        part = folds(count)
+        assert sorted(np.bincount(part))[0] >= count // FOLDS
+        alone += [len(set(part[k::period])) == 1 for k in range(period)]
+    assert np.mean(alone) < 0.15

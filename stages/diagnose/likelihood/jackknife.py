@@ -9,6 +9,15 @@ from numpy.typing import NDArray
 
 from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.tails import student_tail
+from stages.diagnose.settings import FOLDS
+
+
+def folds(count: int) -> NDArray[np.int64]:
+    """(count,) of so many pieces of ground, the numbers of those that are left out together.
+
+    In no order: every eighth piece may be one that the same images show, and their own values would be known from no other ground.
+    """
+    return np.random.default_rng(count).permutation(count) % FOLDS
 
 
 def jackknife_error(without: NDArray[np.float64], left: NDArray[np.float64] | None = None) -> NDArray[np.float64]:

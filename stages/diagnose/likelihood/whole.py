@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve
 
 from stages.diagnose.likelihood.found import Found, interval
-from stages.diagnose.likelihood.jackknife import jackknife_error
+from stages.diagnose.likelihood.jackknife import folds, jackknife_error
 from stages.diagnose.likelihood.products import Array, Products
 from stages.diagnose.likelihood.solving import cholesky, scaled_to_one, solve
 from stages.diagnose.rows.columns import Guise, Plan
-from stages.diagnose.settings import FOLDS, SIMPLER, UNITS
+from stages.diagnose.settings import SIMPLER, UNITS
 from stages.effects import Effect, get_effect
 
 
@@ -52,8 +52,8 @@ class Whole:
         self.precision = self._precision()
         self.labels = self._labels()
         self.sizes = np.bincount(self.labels, weights=[u.gram[0, 0] for u in self.units]).astype(np.float64)
-        self.folds = [np.flatnonzero(np.array([u % FOLDS for u in self.labels]) == k) for k in range(FOLDS)]
-        self.folds = [f for f in self.folds if len(f)]
+        fold = folds(len(self.sizes))[self.labels]
+        self.folds = [np.flatnonzero(fold == k) for k in np.unique(fold)]
 
     def _labels(self) -> list[int]:
         """Which units are left out together: all of a site, or each by itself where sites are few."""

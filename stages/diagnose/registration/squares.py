@@ -10,21 +10,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stages.diagnose.likelihood.jackknife import folds
 from stages.diagnose.model.aligned import aligned
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import full_light
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.registration.forms import FORMS, Matched, displacement, solve
 from stages.diagnose.registration.start import Field
-from stages.diagnose.settings import FOLDS
 
 OWN = "own", "own, leaning"  # each image's own shift, without and with relief displacement
 
 
 def held_out(matched: list[Matched], group: Sequence[int], frames: int, spread: float) -> list[NDArray[np.float64]]:
     """Squared residual per piece of ground and frame, (pieces, frames) for each form, fitted to other ground."""
-    folds = [[k for k, g in enumerate(group) if g % FOLDS == fold] for fold in range(FOLDS)]
-    folds = [f for f in folds if f]
+    fold = folds(max(group) + 1)
+    together = [[k for k, g in enumerate(group) if fold[g] == f] for f in np.unique(fold)]
     out = [np.zeros((max(group) + 1, frames)) for _ in FORMS]
 
     def of(fold: list[int]) -> list[tuple[list[int], list[list[NDArray[np.float64]]]]]:
@@ -35,7 +35,7 @@ def held_out(matched: list[Matched], group: Sequence[int], frames: int, spread: 
         fields = [[displacement(matched[own[0]], *f) for f in found] for own in sites]
         return [(own, left([matched[k] for k in own], f)) for own, f in zip(sites, fields, strict=True)]
 
-    for places, forms in (site for fold in per_site(of, folds) for site in fold):
+    for places, forms in (site for fold in per_site(of, together) for site in fold):
         for into, every in zip(out, forms, strict=True):
             for k, squares in zip(places, every, strict=True):
                 np.add.at(into[group[k]], matched[k].chain.site.frames, squares)

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, jackknife_error, nats
+from stages.diagnose.likelihood.jackknife import folds, gain_chance, gain_interval, jackknife_error, nats
 from stages.diagnose.model.nominal import full_light
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.forms import FORMS
@@ -19,7 +19,7 @@ from stages.diagnose.registration.registered import Registration, shifted_frames
 from stages.diagnose.registration.squares import OWN
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CORRELATED, FOLDS, ROUNDS
+from stages.diagnose.settings import CORRELATED, ROUNDS
 from stages.effects import Effect, Survey, effect_names, get_effect
 from stages.effects.filters import gaussian
 
@@ -230,11 +230,10 @@ def _clipped(
 
     levels = []
     group = [k if len(images) > 3 else n for n, (k, _) in enumerate(quarters)]
-    for fold in range(FOLDS):
+    of = folds(max(group) + 1)
+    for fold in range(of.max() + 1):
         rest = [
-            part(*q, images[q[0]])[part(*q, masks[q[0]])]
-            for q, g in zip(quarters, group, strict=True)
-            if g % FOLDS != fold
+            part(*q, images[q[0]])[part(*q, masks[q[0]])] for q, g in zip(quarters, group, strict=True) if of[g] != fold
         ]
         found = cls.read_off(torch.cat([r.flatten() for r in rest])) if rest else None
         levels.append(found[0] if found else math.inf)
@@ -248,7 +247,7 @@ def _clipped(
         part(k, quarter, elsewhere)[:] = False
         image, plain = part(k, quarter, images[k]), part(k, quarter, predicted)
         level = images[k][masks[k]].mean()
-        top = levels[g % FOLDS]
+        top = levels[of[g]]
         plain = _own_gain(images[k], predicted, elsewhere, top) * plain
         both = [torch.where(lit, image - p, 0.0) / level for p in (plain, plain.clamp(max=top))]
         out.append([float(left.double().square().sum()) for left in both])

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.common.arrays import Floats
-from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, jackknife_error, nats
+from stages.diagnose.likelihood.jackknife import folds, gain_chance, gain_interval, jackknife_error, nats
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.edges import PARTS, Edges, Horizons, move, squares
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CORRELATED, FOLDS, OPEN, SHADED, UNITS
+from stages.diagnose.settings import CORRELATED, OPEN, SHADED, UNITS
 from stages.effects import Effect, effect_names, get_effect
 
 ROUNDS = 5  # at most, in which the horizons' errors are fitted at a value's best
@@ -50,7 +50,7 @@ class Tried:
 
     def held_out(self) -> Floats:
         """(pieces,) squares at the value, and beside the errors of horizons, that other ground likes best."""
-        fold = np.arange(self.products.shape[1]) % FOLDS
+        fold = folds(self.products.shape[1])
         out = np.zeros(len(fold))
         for f in set(fold):
             left, moves = self.left(fold != f)
