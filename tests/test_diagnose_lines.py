@@ -24,11 +24,12 @@ def registered(tmp_path_factory):
     """What registration finds where pixels show ground that lies further east, by a function of (generator, rows, columns), px."""
 
     def register(shift):
-        with PairReader(semi_real(tmp_path_factory.mktemp("lines") / "pairs.h5", 4713, size=SIZE)) as reader:
+        with PairReader(semi_real(tmp_path_factory.mktemp("lines") / "pairs.h5", 4713, images=4, size=SIZE)) as reader:
             sites = [load_site(reader, np.flatnonzero(reader.site == k)) for k in np.unique(reader.site)[:4]]
             frames = len(reader.image_ids)
         rng, (rows, columns) = np.random.default_rng(1), np.indices((SIZE, SIZE))
-        for site in sites:
+        for k, site in enumerate(sites):
+            site.place = (100.0 * k, 80.0 * (3 * k % 4))
             moved = [
                 map_coordinates(one, [rows, columns + shift(rng, rows, columns)], order=3, mode="nearest")
                 for one in site.read.numpy()
