@@ -20,7 +20,8 @@ from stages.diagnose.model.aligned import aligned
 from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
-from stages.diagnose.search.select import ODD, ORDINARY, beyond_bounds, choose, doubt, judge, may_be_another
+from stages.diagnose.search.doubts import ODD, ORDINARY, beyond_bounds, doubt
+from stages.diagnose.search.rivals import choose, judge, may_be_another
 from stages.diagnose.search.state import Cause
 from stages.diagnose.settings import FOLDS
 from stages.effects import get_effect

@@ -27,9 +27,10 @@ from stages.diagnose.result.answer import Answer, Named
 from stages.diagnose.result.files import write_diagnosis
 from stages.diagnose.result.named import Cut, by_histogram, by_registration, by_search
 from stages.diagnose.result.score import beside_shadows, blind_effects, displacements, score, unconfirmed
+from stages.diagnose.search.doubts import doubt_all
 from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
-from stages.diagnose.search.select import Outcome, doubt_all, search
+from stages.diagnose.search.select import Outcome, search
 from stages.diagnose.search.shadows import by_shadows, contradicted
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import MISFIT, STILL

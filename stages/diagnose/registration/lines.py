@@ -22,12 +22,11 @@ from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.forms import asked
 from stages.diagnose.registration.start import Field
+from stages.diagnose.settings import CAPTURE, ROUNDS
 from stages.effects.line_jitter import ORDERS, LineJitter, crop_waves
 
 SHORTEST = 16  # px: on shorter waves the samples of a line scatter more than it is shifted
-FAR = 5.0  # px: no line is shifted by more
-STEPS = 3  # of Gauss and Newton
-ROUNDS = 10  # of expectation-maximisation
+TURNS = 3  # of rendering where the lines lie and asking again
 STEADY, TREMBLING = "steady", "trembling"  # names of the squares without and with what other samples say of a line
 
 
@@ -71,7 +70,7 @@ def lines(chains: Sequence[Chain], known: Sequence[Field], variance: Tensor | No
     halves = [_first_half(chain.site) for chain in chains]
     some = torch.full((waves[0].shape[1],), 0.01, dtype=torch.float64)
     found = Lines(some if variance is None else variance, 0.0, 0.0, list(known), list(known), list(known))
-    for _ in range(STEPS):
+    for _ in range(TURNS):
         every = list(zip(chains, found.fields, known, waves, halves, strict=True))
         asks = per_site(lambda site: _equations(*site), every)
         unlike = float(np.median(np.concatenate([_differences(*site) for site in asks])))  # pixels per independent one
@@ -142,7 +141,7 @@ def _differences(gram: Tensor, score: Tensor) -> NDArray[np.float64]:
     """(n,) squares of what is between the values that either half says, over those that pixels without correlation would make; of (2, n, P, P)
     and (2, n, P).
     """
-    known = torch.linalg.inv(gram + FAR**-2 * torch.eye(gram.shape[-1]))
+    known = torch.linalg.inv(gram + CAPTURE**-2 * torch.eye(gram.shape[-1]))
     one, other = torch.einsum("hnab,hnb->hna", known, score)
     apart = torch.einsum("na,nab,nb->n", one - other, torch.linalg.inv(known.sum(0)), one - other)
     return (apart / gram.shape[-1]).numpy()

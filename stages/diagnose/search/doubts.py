@@ -1,0 +1,121 @@
+"""Why a cause, as it is fitted, is none: values that are impossible, ordinary, not sure, or known from no image but some."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stages.common.intervals import student_quantile
+from stages.diagnose.likelihood.found import Found, interval
+from stages.diagnose.likelihood.tails import together
+from stages.diagnose.search.refine import settle
+from stages.diagnose.search.state import Cause, State, View
+from stages.diagnose.settings import STILL, SURE
+from stages.effects import Effect, get_effect
+
+ODD = "nothing real has the values that fit best"
+ORDINARY = "is ordinary"
+
+
+def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
+    """Why the fitted values cannot be a cause, or ''."""
+    cls = type(cause.effect)
+    if cls.scope == "image":
+        size, error = cause.rms, cause.errors.get("rms", math.inf)
+        least = max(cls.tolerance.values(), default=0.0)
+        return f"it is {size:.2g}, and less than {least:.2g} {ORDINARY}" if size - 2 * error < least else ""
+    values = {k: float(v) for k, v in cause.effect.values.items()}
+    if not cls.plausible(values, state.data):
+        return ODD
+    for name in [n for n in cause.errors if n not in cls.shaped]:  # a shape may end anywhere
+        value, near = values[name], cause.of_given_shape.get(name, 1e-9)
+        bounds = [b for b in cls.bounds(name) if b != cls.null()[name]]
+        if any(abs(value - b) < near for b in bounds):
+            return f"{ODD}: {name} ends at {value:.3g}, within an error of a bound of what is possible"
+
+    # an effect that may be nothing has no shape that could be uncertain
+    if cause.away < together(sure, len(cause.of_given_shape)):
+        return f"it comes out {cause.away:.1f} errors from nothing"
+    if cause.share_error * student_quantile(cause.share_freedom) > 1:
+        return f"other images give it other values: {1 / cause.share_error:.1f} errors over images from nothing"
+    errors = cause.larger_errors
+    reported = cls.report(values, errors)
+    for name, least in cls.tolerance.items():
+        size, error = reported[name]
+        if name in values:
+            size, error = abs(values[name] - cls.null()[name]), errors.get(name, 0.0)
+        if size - 2 * error < least:
+            return f"{name} is {size:.2g}, and less than {least:.2g} {ORDINARY}"
+    return ""
+
+
+def doubt_any(state: State, cause: Cause) -> tuple[str, Cause | None]:
+    """Why the cause, or another beside it, cannot be one, or ''; and which other."""
+    if why := doubt(state, cause):
+        return why, None
+    for c in state.named:
+        if why := doubt(state, c):
+            return f"beside it {c.effect.name} is no cause any more: {why}", c
+        # each may stand for the other: together they are sure, and how much there is of either is not known
+        alike = c.effect.name in cause.effect.confused_with and c is not cause
+        if alike and not (_known_by_itself(cause) or _known_by_itself(c)):
+            return f"beside it {c.effect.name}, which it is confused with, is not known any more", None
+    return "", None
+
+
+def _known_by_itself(cause: Cause) -> bool:
+    """Whether any of its values is surely not nothing, whatever all the others are."""
+    null = type(cause.effect).null()
+    amounts = [
+        (float(cause.effect.values[n]) - null[n], e) for n, e in cause.errors.items() if n not in cause.effect.shaped
+    ]
+    return type(cause.effect).scope != "scene" or any(abs(value) > STILL * error for value, error in amounts)
+
+
+def doubt_all(state: State, view: View, sure: float = SURE) -> dict[str, tuple[float, str]]:
+    """Take out one by one the causes that cannot be any, as they are fitted now; effect -> nats, why.
+
+    sure : standard errors from nothing that are asked
+    """
+    out = {}
+    while doubted := [(c, why) for c in state.named if (why := doubt(state, c, sure))]:
+        cause, why = doubted[-1]  # what was found last stands on the rest
+        state.causes.remove(cause)
+        out[cause.effect.name] = cause.found.gain, f"fitted with everything else {why}"
+        settle(state, view)
+    return out
+
+
+def beyond_bounds(found: Found) -> bool:
+    """Whether a coordinate of the first estimate is surely not within its bounds: what these allow is not what was found."""
+    cls = get_effect(found.effect)
+    for amount, error, column in zip(found.amount, found.error, found.guise.trial.columns, strict=True):
+        for name, at in column.items():
+            null, (low, high) = cls.null()[name], cls.bounds(name)
+            value, least = null + amount * (at - null), SURE * error * abs(at - null)
+            if value < low - least or value > high + least:
+                return True
+    return False
+
+
+def ordinary(first: Effect) -> str:
+    """Why the effect is nothing special already at a first estimate of its values, or ''."""
+    cls = type(first)
+    if cls.scope == "scene":
+        for name, least in cls.tolerance.items():
+            size = cls.size(first.values) if name not in first.values else abs(first.values[name] - cls.null()[name])
+            if size < least / 2:
+                return f"{name} is {size:.2g}, and less than {least:.2g} {ORDINARY}"
+    return ""
+
+
+def contradicted(gains: np.ndarray) -> str:
+    """Why test pairs that gain so many nats on each piece of ground take a name back, or ''."""
+    low, high = interval(gains)
+    if high < 0:
+        return f"the test pairs contradict it: it gains {gains.sum():.3g} nats there ({low:.3g} .. {high:.3g})"
+    return ""
+
+
+__all__ = ["ODD", "ORDINARY", "beyond_bounds", "contradicted", "doubt", "doubt_all", "doubt_any", "ordinary"]

@@ -1,0 +1,75 @@
+"""Clipping, read off the histogram of all pixels: where brightness piles up at one level."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from stages.diagnose.likelihood.jackknife import gain_interval
+from stages.diagnose.result import named
+from stages.effects import get_effect
+
+
+def test_a_pile_of_a_tenth_of_all_pixels_is_clipping():
+    """Of a narrow histogram a tenth lies within two per cent of brightness anyway; values that are all the same do not."""
+    saturation = get_effect("saturation")
+    values = torch.from_numpy(np.random.default_rng(2).normal(160.0, 25.0, 100_000)).float().clamp(min=1)
+    assert saturation.read_off(values) is None
+    assert saturation.read_off(values.round()) is None
+    level = float(values.quantile(0.9))
+    assert saturation.read_off(values.clamp(max=level))[0] == pytest.approx(level, rel=0.002)
+
+
+def test_clipping_shows_where_the_histogram_falls_to_its_end():
+    """A pile in one image of several is no higher than the histogram of all is a few per cent further down."""
+    level = 0.07
+    below = [torch.linspace(u, u + 0.002, round(200 + 1e4 * (1 - u))) for u in torch.arange(0.8, 0.999, 0.002).tolist()]
+    falling = level * torch.cat(below)
+    saturation = get_effect("saturation")
+    assert saturation.read_off(falling) is None
+    pile = level * (1 + 0.0002 * torch.linspace(-1, 1, 900))
+    assert saturation.read_off(torch.cat([falling, pile]))[0] == pytest.approx(level, rel=0.001)
+
+
+def test_clipping_shows_after_bicubic_resampling():
+    """It rings by a per cent above the level, in single images that are clipped in a few places."""
+    rng, level = np.random.default_rng(8), 0.06
+    ground = cv2.GaussianBlur(rng.normal(size=(4, 160, 160, 1)).reshape(640, 160), (0, 0), 2.0).reshape(4, 160, 160)
+    images = 0.045 + 0.007 * ground / ground.std()
+    turned = cv2.getRotationMatrix2D((80, 80), 7.0, 0.93)
+
+    def laid(images):
+        every = [cv2.warpAffine(k.astype(np.float32), turned, (160, 160), flags=cv2.INTER_CUBIC) for k in images]
+        return torch.from_numpy(np.stack(every)[:, 20:-20, 20:-20].copy()).flatten()
+
+    saturation = get_effect("saturation")
+    clipped = laid(images.clip(max=level))
+    assert 0.01 < float((clipped > 0.998 * level).float().mean()) < 0.03
+    assert float((clipped > 1.002 * level).float().mean()) > 0.0005  # it does ring
+    assert saturation.read_off(clipped)[0] == pytest.approx(level, rel=0.003)
+    assert saturation.read_off(laid(images)) is None
+
+
+def test_images_that_are_cut_off_as_a_whole_are_clipping(monkeypatch):
+    """Nothing of them is left to fit, and the law that is extrapolated to them may be too dark: their own brightness is not asked."""
+    rng, level = np.random.default_rng(6), 0.085
+    for bright, gains in ((0.12, True), (0.07, False)):
+        shading = 1 + 0.05 * rng.normal(size=(4, 6, 64, 64))
+        light = torch.from_numpy(shading * np.array([0.02, 0.03, 0.04, 0.05, bright, bright])[:, None, None]).float()
+        predicted = light.clone()
+        predicted[:, 4:] *= 0.5
+        images = (light + 0.0005 * torch.randn(light.shape, generator=torch.manual_seed(1))).clamp(max=level)
+        chains = [
+            SimpleNamespace(predict=lambda p=p: p, site=SimpleNamespace(gain=torch.ones(6), offset=torch.zeros(6)))
+            for p in predicted
+        ]
+        monkeypatch.setattr(named, "full_light", lambda chain: torch.ones(6, 64, 64, dtype=torch.bool))
+        masks = [torch.ones(6, 64, 64, dtype=torch.bool)] * 4
+        before, after, _ = named._clipped(
+            SimpleNamespace(chains=lambda c=chains: c), list(images), masks, get_effect("saturation")
+        )
+        assert (gain_interval(before, after)[1] > 0) == gains
