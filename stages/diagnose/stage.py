@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,11 +32,11 @@ from stages.diagnose.search.doubts import doubt_all
 from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, search
-from stages.diagnose.search.shadows import by_shadows, contradicted
+from stages.diagnose.search.shadows import by_shadows, contradicted, leave_out_dark
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import MISFIT, STILL
 from stages.diagnose.structure.kinds import PILED, structure
-from stages.effects import effect_names
+from stages.effects import effect_names, get_effect
 from stages.pairs.reader import PairReader
 
 
@@ -109,6 +110,10 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     )
     state.reference = copy.copy(nominal)
     state.leave_out_rare_images()
+    known = [site.read_valid for site in sites]
+    if leave_out_dark(state):
+        nominal.laws = other_laws(nominal, sites, units)
+        state.reference = copy.copy(nominal)
     before = _residual(state)
     if not before > 0:
         answer.note, answer.blind = "too few pixels of the pairs show fully lit ground", effect_names()
@@ -125,19 +130,32 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         return Result(answer, state, None)
     progress(2, 5, "search")
     outcome = search(state, config.most_causes)
+    doubted = unconfirmed(state) | contradicted(state)
+    # what the test pairs refuse may have stood for another law
+    if any(get_effect(name).of_law for name in doubted) and state.choose_law(doubted):
+        outcome = search(state, config.most_causes)
+        doubted = unconfirmed(state) | contradicted(state)
     if isinstance(state.nominal.model, LunarLaws):
         answer.form = state.nominal.model.title
         say(f"{config.model} has not the form of the ground's law: {answer.form} took its place")
-    _fill(answer, state, outcome, cut, before)
+    _fill(answer, state, outcome, doubted, cut, before, known)
     return Result(answer, state, outcome)
 
 
-def _fill(answer: Answer, state: State, outcome: Outcome, cut: Cut | None, before: float) -> None:
+def _fill(
+    answer: Answer,
+    state: State,
+    outcome: Outcome,
+    doubted: dict[str, tuple[float, str]],
+    cut: Cut | None,
+    before: float,
+    known: Sequence[torch.Tensor],
+) -> None:
     """Doubt what the search found once more, look at what is judged apart, and write all of it into the answer.
 
-    cut : what the histogram shows; before : mean square of the residual when nothing was known
+    doubted : what was taken back already; cut : what the histogram shows; before : mean square of the residual when nothing was known;
+    known : pixels of each site that the file has, walls or no
     """
-    doubted = unconfirmed(state) | contradicted(state)
     view = outcome.view
     assert view is not None
     displaced = state.registration is not None and state.registration.displaced
@@ -147,7 +165,7 @@ def _fill(answer: Answer, state: State, outcome: Outcome, cut: Cut | None, befor
         settle(state, view)
         doubted |= doubt_all(state, view, STILL)
     after = _residual(state)
-    left = structure(state, view, cut[1] if cut else 0.0)
+    left = _faults(state) | structure(state, view, cut[1] if cut else 0.0)
     ordinary = {c.effect.name for c in state.causes} - {c.effect.name for c in state.named}
     if ordinary:  # rendered to judge the others beside it; from here on the simulation is what is named, and no more
         before *= after / _without_ordinary(state)
@@ -157,10 +175,14 @@ def _fill(answer: Answer, state: State, outcome: Outcome, cut: Cut | None, befor
     if clipped:
         left.pop(PILED, None)
     ground, shown = by_ground(state)
+    for site, whole in zip(state.sites, known, strict=True):
+        site.keep(whole)
     shaded, extended, contrary = _by_shadows(state)
-    answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + shaded + ground
+    answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + [*shaded] + ground
     rejected = refused | outcome.rejected | doubted | contrary
-    answer.rejected = {k: v for k, v in rejected.items() if k not in {c.effect.name for c in answer.causes}}
+    answer.rejected = {
+        k: v for k, v in rejected.items() if k in effect_names() and k not in {c.effect.name for c in answer.causes}
+    }
     if state.registration is not None:
         answer.registration = {k: (g.percent, g.low, g.high) for k, g in state.registration.gains.items()}
     # what a better law or registration took away is no cause where none is named
@@ -174,6 +196,14 @@ def _fill(answer: Answer, state: State, outcome: Outcome, cut: Cut | None, befor
     answer.held_out = score(state, answer, extended)
 
 
+def _faults(state: State) -> dict[str, float]:
+    """What was found and stands in no catalogue, in words, and the share of the squares that it takes away; it is no cause from here on."""
+    found = [c for c in state.named if not c.effect.listed]
+    for cause in found:
+        cause.ordinary = True
+    return {c.effect.title: c.gain_percent / 100 for c in found}
+
+
 def _register(state: State) -> None:
     """Find where the images lie beside the causes that are named so far, lay them there, and fit the nominal model."""
     state.registration = explain(state.sites, state.nominal, state.base, state.frames, state.data.elevation[0])
@@ -185,13 +215,12 @@ def _register(state: State) -> None:
     state.fit()
 
 
-def _by_shadows(state: State) -> tuple[list[Named], Nominal, dict[str, tuple[float, str]]]:
-    """What shadows tell and the test pairs do not refuse, the nominal model as it is fitted beside that, and what they refuse."""
+def _by_shadows(state: State) -> tuple[Sequence[Named], Nominal, dict[str, tuple[float, str]]]:
+    """What shadows tell and the test pairs do not refuse, the nominal model as it is fitted beside that, and what is refused."""
     found = by_shadows(state)
     if not found:
         return [], state.nominal, {}
-    extended, contrary = beside_shadows(state, found)
-    return [c for c in found if c.effect.name not in contrary], extended, contrary
+    return beside_shadows(state, found)
 
 
 def _verdict(answer: Answer) -> str:

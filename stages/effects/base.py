@@ -83,6 +83,8 @@ class Effect(ABC):
     judged_apart    whether a step of its own judges it, not the search: registration, or a histogram of all pixels
     leans           of those that displace: relief by its height, not images as a whole
     along_lines     of those that displace: the lines of an image against each other
+    raises_horizon  whether it is terrain that the DEM has not
+    listed          whether it is in the catalogue: of others, which are in none, `diagnose` tells by their title what they leave
     keep_below      of a level that was read off a histogram: what is brighter than this times the level says nothing more
     one_sided       a fixed coordinate; the effect acts on one side of a pixel only, and by its sign it is told from what acts on both
     shadow_error    how far its first coordinate may be off where shadows alone tell it, since the DEM's horizons are
@@ -114,6 +116,8 @@ class Effect(ABC):
     leans: ClassVar[bool] = False
     along_lines: ClassVar[bool] = False
     one_sided: ClassVar[str] = ""
+    listed: ClassVar[bool] = True
+    raises_horizon: ClassVar[bool] = False
     of_law: ClassVar[bool] = False
     shadow_error: ClassVar[float] = 0.0
     keep_below: ClassVar[float] = 1.0
@@ -271,6 +275,7 @@ def get_effect(name: str) -> type[Effect]:
         raise RegistryError.unknown("effect", name, effect_names()) from None
 
 
-def effect_names() -> list[str]:
-    """All effects, in the order of their slots."""
-    return sorted(_EFFECTS, key=lambda n: (SLOTS.index(_EFFECTS[n].slot), n))
+def effect_names(unlisted: bool = False) -> list[str]:
+    """All effects of the catalogue, in the order of their slots; and those in none."""
+    names = [n for n, cls in _EFFECTS.items() if cls.listed or unlisted]
+    return sorted(names, key=lambda n: (SLOTS.index(_EFFECTS[n].slot), n))

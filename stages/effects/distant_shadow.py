@@ -13,10 +13,22 @@ from stages.physics.photometry import Parameter
 
 SIDES = ("any", "north", "east", "south", "west")
 
-TANGENTS = (0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8)
-USUAL = 0.5  # crops from the border: where a wall is sought first
+TANGENTS = (0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8, 1.1, 1.6, 2.2)
+USUAL = 0.5  # crops from the border: where a wall is sought first,
+NEAR, LOW = 0.1, (0.03, 0.045, 0.07, 0.1, 0.14)  # and low ones, whose shadow does not reach far into the crop
 FINER = tuple(2.0 ** (k / 8) for k in range(-8, 9))  # times the height that was found first
-DISTANCES = (0.25, 0.35, USUAL, 0.7, 1.0, 1.4, 2.0, 2.8)  # crops: beyond them a ridge hides the Sun everywhere alike
+DISTANCES = (
+    NEAR,
+    0.17,
+    0.25,
+    0.35,
+    USUAL,
+    0.7,
+    1.0,
+    1.4,
+    2.0,
+    2.8,
+)  # crops: beyond them a ridge hides the Sun everywhere alike
 
 
 @register
@@ -30,6 +42,7 @@ class DistantShadow(Effect):
     )
     reference = "Mazarico et al. (2011), Icarus 211, 1066 (horizons of the lunar poles need far terrain)"
     confused_with = ("penumbra", "saturation")
+    raises_horizon = True
     separate = "an image with the Sun below 10 deg of elevation on the same side"
     parameters = (Parameter("height_m", "m", 0.0, 20000.0, 0.0, "height of the ridge above the crop's mean height"),)
     coordinates = (
@@ -51,7 +64,8 @@ class DistantShadow(Effect):
 
     @classmethod
     def shadow_trials(cls, survey: Survey) -> list[Trial]:
-        return list(cls.trials(survey))
+        near = [cls.trial(survey, tangent, NEAR, side) for side in range(1, len(SIDES)) for tangent in LOW]
+        return [*cls.trials(survey), *near]
 
     def shadow_neighbours(self, survey: Survey) -> list[Trial]:
         """A low wall that is near ends its shadow on the crop where a high one that is far does, but not under a Sun of another elevation."""

@@ -6,12 +6,10 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
-from torch import Tensor
-from torch.utils.weak import WeakTensorKeyDictionary
 
 from stages.effects.base import Effect, Survey, Trial, register
-from stages.effects.fields import detector_axes
-from stages.physics.formation.chain import Observation, State
+from stages.effects.fields import kept_axes
+from stages.physics.formation.chain import State
 from stages.physics.formation.resampling import displace
 from stages.physics.photometry import Parameter
 
@@ -58,7 +56,7 @@ class Echo(Effect):
 
     def apply(self, state: State) -> None:
         observation = state.observation
-        step = _axes(observation, len(state.image))[int(self.values["axis"])]
+        step = kept_axes(observation, len(state.image))[int(self.values["axis"])]
         lag = torch.as_tensor(self.values["lag_px"], dtype=state.image.dtype)
         source = state.image
         # the DEM does not know where shadows end as well as the image does, whose resampling, though, blurs near by
@@ -67,16 +65,3 @@ class Echo(Effect):
             source = torch.where(measured.isfinite(), measured, source)
         repeated = displace(source, -(lag * step[:, 0])[:, None, None], -(lag * step[:, 1])[:, None, None])
         state.image = state.image + self.value("fraction", state) * repeated
-
-
-def _axes(observation: Observation, count: int) -> tuple[Tensor, Tensor]:
-    """Of the detector, kept: the same observation is asked again for every lag."""
-    sample = observation.detector_sample
-    if sample is None:
-        return detector_axes(None, None, count)
-    if sample not in _known:
-        _known[sample] = detector_axes(sample, observation.detector_line, count)
-    return _known[sample]
-
-
-_known = WeakTensorKeyDictionary()

@@ -6,9 +6,11 @@ import math
 
 import torch
 from torch import Tensor
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from stages.effects.filters import filtered, gaussian, laplacian
 from stages.physics.formation import geometry
+from stages.physics.formation.chain import Observation
 
 CURVATURE_SIGMA2 = 4.0  # px^2: curvature of the raw DEM is mostly its noise
 # px, wavelengths between which waves of the DEM count more and more: of finer ones few are those of the ground
@@ -56,6 +58,19 @@ def detector_axes(sample: Tensor | None, line: Tensor | None, batch: int) -> tup
     safe = torch.where((determinant.abs() > 1e-6)[:, None, None], jacobian, identity.to(jacobian))
     inverse = torch.linalg.inv(safe)
     return inverse[:, :, 0], inverse[:, :, 1]
+
+
+def kept_axes(observation: Observation, batch: int) -> tuple[Tensor, Tensor]:
+    """:func:`detector_axes` of an observation, kept: the same one is asked again for every trial."""
+    sample = observation.detector_sample
+    if sample is None:
+        return detector_axes(None, None, batch)
+    if sample not in _known:
+        _known[sample] = detector_axes(sample, observation.detector_line, batch)
+    return _known[sample]
+
+
+_known = WeakTensorKeyDictionary()
 
 
 def _mean_step(field: Tensor, dim: int) -> Tensor:

@@ -35,6 +35,11 @@ def gaussian(image: Tensor, sigma2: Tensor | float, limit: float = 4.0, slopes: 
 
 def filtered(image: Tensor, gain: Callable[[Tensor], Tensor], slopes: bool = False) -> Tensor:
     """Every wave of (..., H, W) times its ``gain``, a function of wave numbers, rad/px; ``slopes``: as of :func:`gaussian`."""
+    return directed(image, lambda kx, ky: gain(torch.hypot(kx, ky)), slopes)
+
+
+def directed(image: Tensor, gain: Callable[[Tensor, Tensor], Tensor], slopes: bool = False) -> Tensor:
+    """The same with a ``gain`` that is a function of wave numbers along columns (1, K) and along rows (H, 1)."""
     margin = min(MARGIN, image.shape[-1] - 1, image.shape[-2] - 1)
     if slopes:
         wide = _turned(_turned(image, margin).transpose(-2, -1), margin).transpose(-2, -1)
@@ -44,7 +49,7 @@ def filtered(image: Tensor, gain: Callable[[Tensor], Tensor], slopes: bool = Fal
     height, width = wide.shape[-2:]
     ky = torch.fft.fftfreq(height, device=image.device)[:, None] * (2 * math.pi)
     kx = torch.fft.rfftfreq(width, device=image.device) * (2 * math.pi)
-    changed = torch.fft.irfft2(torch.fft.rfft2(wide) * gain(torch.hypot(kx, ky)), s=(height, width))
+    changed = torch.fft.irfft2(torch.fft.rfft2(wide) * gain(kx, ky), s=(height, width))
     return changed[..., margin : height - margin, margin : width - margin]
 
 

@@ -63,6 +63,11 @@ class Site:
         _, laid_image, self.valid = self._laid
         self.image = (laid_image - self.offset[:, None, None]) / self.gain[:, None, None]
 
+    def keep(self, valid: Tensor) -> None:
+        """Read these pixels (n, H, W) of the images, and no others, from now on."""
+        self.read_valid, self._laid = valid, None
+        self.align()
+
     def on_detector(self) -> Tensor:
         """(n, 2, H, W) line and sample of every pixel as the images lie now; row and column of the crop where the detector is not known."""
         line, sample = self.observation.detector_line, self.observation.detector_sample

@@ -48,7 +48,7 @@ def by_search(state: State) -> list[Named]:
                 cause.rms_before,
                 cause.rms_after,
                 (cause.gain_percent, cause.gain_low, cause.gain_high),
-                cause.group,
+                [n for n in cause.group if get_effect(n).listed],
             )
         )
     return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -18,30 +19,71 @@ from stages.diagnose.result.answer import Answer, HeldOut, Named
 from stages.diagnose.rows.patches import cuts
 from stages.diagnose.search.select import Outcome
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import SURE
+from stages.diagnose.settings import CORRELATED, SURE
 from stages.effects import Effect, effect_names, get_effect
 
+NEARER = (
+    0.0,
+    0.5,
+    1.0,
+    1.5,
+    2.0,
+)  # errors that a value which shadows tell may be nearer to nothing, if lit ground likes it
 
-def beside_shadows(state: State, shaded: Sequence[Named]) -> tuple[Nominal, dict[str, tuple[float, str]]]:
-    """The nominal model, fitted again beside what shadows tell; and effect -> nats, why, where the test pairs surely lose by that all the same.
 
-    Shadows are judged whatever the law: nothing was fitted beside their cause yet, and a Sun that stands higher makes all ground brighter.
+def beside_shadows(
+    state: State, shaded: Sequence[Named]
+) -> tuple[Sequence[Named], Nominal, dict[str, tuple[float, str]]]:
+    """The causes that shadows tell, the nominal model as it is fitted beside them; and effect -> nats, why, where the test pairs surely lose by that.
+
+    Shadows are judged whatever the law: nothing was fitted beside their cause yet, and a Sun that stands higher makes all ground brighter. What is found
+    because it is large is found too large: up to two errors nearer to nothing the value is the one that lit ground makes likeliest.
     """
-    known = [state.base, [*state.base, *(c.effect for c in shaded)]]
-    models = [copy.copy(state.nominal) for _ in known]
-    for nominal, effects in zip(models, known, strict=True):
-        fit(nominal, state.sites, effects, state.units, [s.laid for s in state.sites])
-    squares: list[list[np.ndarray]] = [[np.zeros(0)], [np.zeros(0)]]
-    for site in state.hidden:
-        site.align()
-        chains = [nominal.chain(site, effects) for nominal, effects in zip(models, known, strict=True)]
-        mask = lit_mask(chains[0]) & lit_mask(chains[1])
-        for part, chain in zip(squares, chains, strict=True):
-            part.append(_squares(site, chain, site.laid, mask, state)[0])
-    gain, _, high = gain_interval(*(np.concatenate(part) for part in squares))
+    tried = [[_nearer(cause, errors) for cause in shaded] for errors in NEARER]
+    models = [(_fitted_beside(state, causes), causes) for causes in tried]
+    squares, pixels = _squares_of(state, state.sites, models)
+    cost = [pixels / CORRELATED * math.log(x.sum()) + e**2 for x, e in zip(squares, NEARER, strict=True)]
+    best, kept = models[int(np.argmin(cost))]
+    (before, after), _ = _squares_of(state, state.hidden, [(_fitted_beside(state, []), []), (best, kept)])
+    gain, _, high = gain_interval(before, after)
     if not high < 0:
-        return models[1], {}
-    return state.nominal, {c.effect.name: (c.gain, _contradiction(gain, high)) for c in shaded}
+        return kept, best, {}
+    return [], state.nominal, {c.effect.name: (c.gain, _contradiction(gain, high)) for c in shaded}
+
+
+def _fitted_beside(state: State, shaded: Sequence[Named]) -> Nominal:
+    """The nominal model, fitted again beside all causes and these."""
+    nominal = copy.copy(state.nominal)
+    effects = [*state.base, *(c.effect for c in shaded)]
+    fit(nominal, state.sites, effects, state.units, [s.laid for s in state.sites])
+    return nominal
+
+
+def _squares_of(
+    state: State, sites: Sequence[Site], models: Sequence[tuple[Nominal, Sequence[Named]]]
+) -> tuple[list[np.ndarray], float]:
+    """Squared errors on every piece of ground of every model, beside causes that shadows tell, on the same pixels; and how many these are."""
+    out: list[list[np.ndarray]] = [[np.zeros(0)] for _ in models]
+    count = 0.0
+    for site in sites:
+        site.align()
+        chains = [nominal.chain(site, [*state.base, *(c.effect for c in shaded)]) for nominal, shaded in models]
+        mask = torch.stack([lit_mask(chain) for chain in chains]).all(0)
+        for part, chain in zip(out, chains, strict=True):
+            squares, pixels = _squares(site, chain, site.laid, mask, state)
+            part.append(squares)
+        count += pixels
+    return [np.concatenate(part) for part in out], count
+
+
+def _nearer(cause: Named, errors: float) -> Named:
+    """The cause with its first value so many errors nearer to nothing."""
+    effect = cause.effect
+    name = effect.fitted()[0].name
+    value, error, unit = cause.parameters[name]
+    value -= math.copysign(errors * error, value - effect.null()[name])
+    made = type(effect)({**effect.values, name: value}, effect.survey)
+    return dataclasses.replace(cause, effect=made, parameters={**cause.parameters, name: (value, error, unit)})
 
 
 def _contradiction(gain: float, high: float) -> str:

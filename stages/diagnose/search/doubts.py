@@ -118,4 +118,13 @@ def contradicted(gains: np.ndarray) -> str:
     return ""
 
 
-__all__ = ["ODD", "ORDINARY", "beyond_bounds", "contradicted", "doubt", "doubt_all", "doubt_any", "ordinary"]
+__all__ = [
+    "ODD",
+    "ORDINARY",
+    "beyond_bounds",
+    "contradicted",
+    "doubt",
+    "doubt_all",
+    "doubt_any",
+    "ordinary",
+]

@@ -70,6 +70,7 @@ class Edges:
         self.near, self.every = _Facets(near, distance, measured), _Facets(use, distance, measured)
         # only a wall beyond the DEM darkens what the Sun stands well above
         away = torch.where(use & ~near, measured - (above > 0).float(), 0.0).double()
+        self.dark = int((away < -0.5).sum())
         self.away = torch.stack([p.square().sum() for p in torch.tensor_split(away, PARTS, 1)])
 
     def products(self, effects: Sequence[Effect], beside: Sequence[Effect], about: Horizons) -> Floats:

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from stages.common.arrays import Floats
 from stages.diagnose.likelihood.jackknife import folds, gain_chance, gain_interval, jackknife_error, nats
 from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.nominal import fit
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.edges import PARTS, Edges, Horizons, move, squares
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CORRELATED, OPEN, SHADED, UNITS
+from stages.diagnose.settings import CLEAR, CORRELATED, FAINT, OPEN, SHADED, UNITS
 from stages.effects import Effect, effect_names, get_effect
 
 ROUNDS = 5  # at most, in which the horizons' errors are fitted at a value's best
@@ -79,7 +80,7 @@ class Tried:
         return max(scatter, min(a for a in apart if a > 0) / math.sqrt(12))
 
     def open_between(self, more: float) -> tuple[Effect, float]:
-        """The middle of what is left open, and the first coordinate's standard deviation there.
+        """The middle of what is left open, and half of what two thirds of it span in the first coordinate.
 
         Of each value of the further coordinates the best counts, if it leaves at most so many squares ``more`` than the least.
         """
@@ -92,7 +93,8 @@ class Tried:
                 best[at] = k
         kept = [self.effects[k] for k in best.values() if total[k] <= total.min() + more]
         values = np.array([float(e.values[first]) for e in kept])
-        return kept[int(np.argmin(np.abs(values - np.median(values))))], float(values.std())
+        low, high = np.quantile(values, (1 / 6, 5 / 6))
+        return kept[int(np.argmin(np.abs(values - np.median(values))))], float(high - low) / 2
 
 
 class Shadows:
@@ -140,7 +142,11 @@ class Shadows:
             for n, effects in self.every.items()
             if n not in named
         }
-        return [self.tried(e, [t.best for t in usual], usual[-1].about) for e in beyond.values() if e]
+        best = [t.best for t in usual]
+        # a wall that leaves whole images in the dark drives the errors of horizons, where they stand for it, to where no wall helps
+        starts = (usual[-1].about, Horizons())
+        both = [[self.tried(e, best, about) for about in starts] for e in beyond.values() if e]
+        return [min(tried, key=lambda t: float(t.left()[0].min())) for tried in both]
 
     def in_turn(self, effects: list[Effect]) -> Tried:
         """The same where what all ground does was fitted without these effects and took a part of them: the two are fitted in turn."""
@@ -150,6 +156,37 @@ class Shadows:
             usual = self.usual([kept.best])
             found = self.tried(effects, [t.best for t in usual], usual[-1].about)
         return kept
+
+
+def leave_out_dark(state: State) -> bool:
+    """Take ground out of the images that is dark though the DEM has the Sun well above it, if a wall beyond the DEM surely makes it so, and fit the law
+    again: whole images that lie in its shadow would pass for another law, or for gains of theirs.
+    """
+    chains = [c for c in state.chains() if c.state.sun_horizon is not None]
+    if not chains or state.free_gains:
+        return False
+    edges = per_site(Edges, chains)
+    if sum(e.dark for e in edges) < FAINT * sum(len(e.every.measured) for e in edges):
+        return False
+    shadows = Shadows(state, edges)
+    raising = [c for c in map(get_effect, shadows.every) if c.raises_horizon]
+    tried = [shadows.tried(shadows.every[c.name], []) for c in raising]
+    first = min(tried, key=lambda t: float(t.held_out().sum()), default=None)
+    if first is None:
+        return False
+    before = shadows.tried([type(first.best)({}, state.data)], []).held_out()
+    percent = gain_interval(before[before > 0], first.held_out()[before > 0])
+    if not percent[1] > 100 * SHADED:
+        return False
+    for chain in chains:
+        sun, horizon, _ = chain.sunlight([first.best])
+        known = chain.sunlight([])[1]
+        assert horizon is not None and known is not None
+        # as far off as the wall itself may be
+        chain.site.keep(chain.site.read_valid & ~((horizon > known) & (horizon > sun[:, None, None] - CLEAR)))
+    state.leave_out_rare_images()
+    fit(state.nominal, state.sites, [], state.units, [s.read for s in state.sites], start=True)
+    return True
 
 
 def by_shadows(state: State) -> list[Named]:
@@ -184,11 +221,13 @@ def by_shadows(state: State) -> list[Named]:
     most = max(abs(float(e.values[name])) for e in whole.effects)
     if abs(value) >= most:
         return []
+    known = error
     if around := effect.shadow_neighbours(state.data):
         near = shadows.in_turn([type(effect)({**t.fixed, **t.columns[0]}, state.data) for t in around])
         effect, scatter = near.open_between(OPEN * float(before.sum()))
         value, error = float(effect.values[name]), math.hypot(error, scatter)
-    nearer = math.copysign(max(abs(value) - 2 * math.hypot(error, effect.shadow_error), 0.0), value)
+    # how far away a wall stands is open, and whether there is one is not
+    nearer = math.copysign(max(abs(value) - 2 * math.hypot(known, effect.shadow_error), 0.0), value)
     if effect.shadows_ordinarily({**effect.values, name: nearer}):
         return []
     made = type(effect)({**effect.values, name: value}, state.data)

@@ -125,11 +125,15 @@ class State:
         base = self.base
         return per_site(lambda site: self.nominal.chain(site, base), self.sites)
 
-    def choose_law(self) -> None:
-        """Let measured laws take the nominal one's place before anything else is looked at: what that takes is soon rendered."""
-        if may_be_exchanged(self.nominal):
-            names = self.open_names()
-            self.law_is_another(self.look(names, 0, [n for n in names if get_effect(n).of_law]))
+    def choose_law(self, refused: Container[str] = ()) -> bool:
+        """Let measured laws take the nominal one's place before anything else is looked at (what that takes is soon rendered), and whether they do.
+
+        refused : effects that stand for nothing any more
+        """
+        if not may_be_exchanged(self.nominal):
+            return False
+        names = self.open_names()
+        return self.law_is_another(self.look(names, 0, [n for n in names if get_effect(n).of_law]), refused)
 
     def law_is_another(self, view: View, refused: Container[str] = ()) -> bool:
         """Whether another law surely gains on held-out ground whatever effect of the law stands beside it; measured ones take the nominal one's place then.
@@ -183,7 +187,7 @@ class State:
     def open_names(self) -> list[str]:
         """Effects that are not rendered yet and that data of this kind can show."""
         known = {c.effect.name for c in self.causes}
-        every = [n for n in effect_names() if n not in known]
+        every = [n for n in effect_names(unlisted=True) if n not in known]
         return [n for n in every if get_effect(n).visible(self.data, self.has)]
 
     def patches(self, number: int, chain: Chain) -> list[Patch]:
@@ -259,7 +263,9 @@ class State:
     def _covariance(self, rows: Sequence[Rows], plan: Plan, grid: Grid) -> Covariance:
         model = estimate([r.patch for r in rows], [(r.shared[0], r.shared_mean[0]) for r in rows], grid, self.frames)
         light = [
-            1 + k for k, name in enumerate(plan.shared) if name in effect_names() and get_effect(name).lights_shadows
+            1 + k
+            for k, name in enumerate(plan.shared)
+            if name in effect_names(unlisted=True) and get_effect(name).lights_shadows
         ]
         residuals, lights = [r.shared_dark[0] for r in rows], [r.shared_dark[light] for r in rows]
         shadow_variance(model, [r.patch for r in rows], residuals, lights)

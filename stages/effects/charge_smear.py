@@ -1,0 +1,47 @@
+"""Each column of a frame adds a share of its mean to all of its pixels."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from stages.effects.base import Effect, register
+from stages.physics.formation.chain import State
+from stages.physics.photometry import Parameter
+
+
+@register
+class ChargeSmear(Effect):
+    name = "charge_smear"
+    listed = False
+    slot = "sensor"
+    linear = True
+    title = "light of a whole column in each of its pixels, as a frame that is read without a shutter has it"
+    mechanism = (
+        "A frame that is shifted through the light while it is read collects a share of what falls on all of the column. Of what lies beyond the "
+        "crop nothing is known: it is taken to be as bright."
+    )
+    reference = "Robinson et al. (2010), Space Sci. Rev. 150, 81 (readout of framing cameras); Bell et al. (2003), JGR 108, 8063 (frame-transfer smear)"
+    confused_with = ("dark_bias", "column_pattern")
+    separate = "a frame with deep shadow in some columns and sunlit ground in others"
+    parameters = (Parameter("share", "1", -0.3, 0.5, 0.0, "of the column's mean brightness"),)
+    strong: ClassVar = {"share": 0.03}
+
+    def apply(self, state: State) -> None:
+        mean = column_means(state.image, state.observation.detector_sample)
+        state.image = state.image + self.value("share", state) * mean
+
+
+def column_means(image: Tensor, sample: Tensor | None) -> Tensor:
+    """(B, H, W) of the detector's column that each pixel is of; of the crop's columns without ``sample`` (B, H, W)."""
+    if sample is None:
+        return image.mean(-2, keepdim=True).expand_as(image)
+    known = torch.isfinite(sample)
+    first = torch.where(known, sample, torch.inf).amin((-2, -1), keepdim=True)
+    column = torch.where(known, sample - first, 0.0).round().long().flatten(1)
+    total, count = torch.zeros(2, len(image), int(column.max()) + 1, dtype=image.dtype)
+    total = total.scatter_add(1, column, torch.where(known, image, 0.0).flatten(1))
+    count = count.scatter_add(1, column, known.to(image).flatten(1))
+    return (total / count.clamp(min=1)).gather(1, column).view_as(image)
