@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from stages.common.arrays import Floats
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.settings import CLEAR, DARKEST
+from stages.diagnose.settings import CLEAR, DARKEST, LIT_MARGIN
 from stages.effects import Effect
 from stages.physics.horizon import occluder_distance
 from stages.physics.light.sun_disc import sun_visibility, visibility_slope
@@ -36,15 +37,25 @@ class Horizons:
 
 
 class _Facets:
-    """Some facets of a site, part after part: where they lie, how near what casts shadow on them stands, the measured share of light."""
+    """The facets of a site that count, part after part: where they lie, how near what casts shadow on them stands, the measured share of light, what of
+    that is left where the DEM's horizon is sharp, and whether it is so near the Sun that its errors tell.
+    """
 
-    def __init__(self, use: Tensor, distance: Tensor, measured: Tensor) -> None:
+    def __init__(self, use: Tensor, distance: Tensor, measured: Tensor, above: Tensor) -> None:
         row, image, column = torch.nonzero(use.transpose(0, 1), as_tuple=True)
         self.at = image, row, column
         ends = torch.tensor([int(part[-1]) for part in np.array_split(np.arange(use.shape[1]), PARTS)])
-        self.counts = torch.searchsorted(row, ends, right=True).diff(prepend=torch.zeros(1, dtype=torch.long)).tolist()
+        self.ends = [0, *torch.searchsorted(row, ends, right=True).tolist()]
         self.nearness = 1 / distance[self.at].clamp(min=NEAREST)
         self.measured = measured[self.at]
+        high = above[self.at]
+        self.near = high.abs() < CLEAR
+        self.sharp = self.measured - (high > 0).to(high.dtype)
+        self.sunlit = high > LIT_MARGIN
+
+    def of_parts(self, chosen: Tensor) -> list[int]:
+        """How many of these (M,) bool every part has."""
+        return [int(chosen[a:b].sum()) for a, b in pairwise(self.ends)]
 
 
 class Edges:
@@ -65,13 +76,14 @@ class Edges:
         above = chain.height_above_horizon()
         assert above is not None
         use &= (distance >= NEAREST) | (above.abs() > CLEAR)
-        near = use & (above.abs() < CLEAR)
         measured = (known + (site.image - chain.predict()) / facet.clamp(min=1e-9)).clamp(0, 1)
-        self.near, self.every = _Facets(near, distance, measured), _Facets(use, distance, measured)
-        # only a wall beyond the DEM darkens what the Sun stands well above
-        away = torch.where(use & ~near, measured - (above > 0).float(), 0.0).double()
-        self.dark = int((away < -0.5).sum())
-        self.away = torch.stack([p.square().sum() for p in torch.tensor_split(away, PARTS, 1)])
+        self.facets = _Facets(use, distance, measured, above)
+
+    @property
+    def dark(self) -> float:
+        """Share of the facets that should be sunlit for sure and lie in the dark."""
+        facets = self.facets
+        return float((facets.sunlit & (facets.sharp < -0.5)).sum()) / max(int(facets.sunlit.sum()), 1)
 
     def products(self, effects: Sequence[Effect], beside: Sequence[Effect], about: Horizons) -> Floats:
         """(effects, PARTS, 3, 3) of the residual share of sunlight and of what a little more blur and lift would add to the expected one."""
@@ -82,19 +94,21 @@ class Edges:
         sun, horizon, disc = self.chain.sunlight(effects)
         known = self.chain.sunlight([e for e in effects if e.slot == "geometry"])[1]
         assert known is not None and horizon is not None
-        raised = horizon > known  # what an effect raises above the DEM stands far off, as it was given
-        facets = self.every if bool(raised.any()) else self.near
-        above = sun[facets.at[0]] - horizon[facets.at]
-        nearness = torch.where(raised[facets.at], 0.0, facets.nearness)
+        facets = self.facets
+        raised = (horizon > known)[facets.at]  # what an effect raises above the DEM stands far off, as it was given
+        told = facets.near | raised
+        above = (sun[facets.at[0]] - horizon[facets.at])[told]
+        nearness = torch.where(raised, 0.0, facets.nearness)[told]
         radius = torch.hypot(disc, about.blur * nearness)
         t = (about.lift * nearness - above) / radius
         slope = visibility_slope(t) / radius
         wider = -slope * t * about.blur * nearness.square() / radius
-        left = facets.measured - sun_visibility(above, about.lift * nearness, radius)
+        left = facets.measured[told] - sun_visibility(above, about.lift * nearness, radius)
         x = torch.stack([left, wider, slope * nearness]).double()
-        out = torch.stack([own @ own.T for own in x.split(facets.counts, 1)])
-        if facets is self.near:
-            out[:, 0, 0] += self.away
+        out = torch.stack([own @ own.T for own in x.split(facets.of_parts(told), 1)])
+        # only a wall beyond the DEM darkens what the Sun stands well above
+        rest = torch.where(told, 0.0, facets.sharp).double().square()
+        out[:, 0, 0] += torch.stack([rest[a:b].sum() for a, b in pairwise(facets.ends)])
         return out
 
 

@@ -27,6 +27,7 @@ from stages.diagnose.settings import CLEAR, CORRELATED, FAINT, OPEN, SHADED, UNI
 from stages.effects import Effect, effect_names, get_effect
 
 ROUNDS = 5  # at most, in which the horizons' errors are fitted at a value's best
+LARGEST = 1.0  # rad px: heights are off by no more than a pixel, however dark a wall leaves the images
 SETTLED = 1e-3  # of the squares: what less would be gained by is the end
 
 
@@ -80,7 +81,7 @@ class Tried:
         return max(scatter, min(a for a in apart if a > 0) / math.sqrt(12))
 
     def open_between(self, more: float) -> tuple[Effect, float]:
-        """The middle of what is left open, and half of what two thirds of it span in the first coordinate.
+        """The middle of what is left open, and the scatter of the first coordinate there, which is one of factors.
 
         Of each value of the further coordinates the best counts, if it leaves at most so many squares ``more`` than the least.
         """
@@ -92,9 +93,9 @@ class Tried:
             if at not in best or total[k] < total[best[at]]:
                 best[at] = k
         kept = [self.effects[k] for k in best.values() if total[k] <= total.min() + more]
-        values = np.array([float(e.values[first]) for e in kept])
-        low, high = np.quantile(values, (1 / 6, 5 / 6))
-        return kept[int(np.argmin(np.abs(values - np.median(values))))], float(high - low) / 2
+        values = np.array([float(e.values[first]) for e in kept])  # heights, above nothing
+        middle = float(np.median(values))
+        return kept[int(np.argmin(np.abs(values - middle)))], middle * float(np.log(values).std())
 
 
 class Shadows:
@@ -120,7 +121,7 @@ class Shadows:
             k = int(np.argmin(left))
             if left[k] > (1 - SETTLED) * total[k].sum(0)[0, 0]:
                 break
-            blur = float(np.clip(about.blur + moves[k, 0], about.blur / 2, 2 * about.blur))
+            blur = float(np.clip(about.blur + moves[k, 0], about.blur / 2, min(2 * about.blur, LARGEST)))
             about = Horizons(blur, about.lift + float(np.clip(moves[k, 1], -blur, blur)))
         return found
 
@@ -142,11 +143,7 @@ class Shadows:
             for n, effects in self.every.items()
             if n not in named
         }
-        best = [t.best for t in usual]
-        # a wall that leaves whole images in the dark drives the errors of horizons, where they stand for it, to where no wall helps
-        starts = (usual[-1].about, Horizons())
-        both = [[self.tried(e, best, about) for about in starts] for e in beyond.values() if e]
-        return [min(tried, key=lambda t: float(t.left()[0].min())) for tried in both]
+        return [self.tried(e, [t.best for t in usual], usual[-1].about) for e in beyond.values() if e]
 
     def in_turn(self, effects: list[Effect]) -> Tried:
         """The same where what all ground does was fitted without these effects and took a part of them: the two are fitted in turn."""
@@ -166,7 +163,7 @@ def leave_out_dark(state: State) -> bool:
     if not chains or state.free_gains:
         return False
     edges = per_site(Edges, chains)
-    if sum(e.dark for e in edges) < FAINT * sum(len(e.every.measured) for e in edges):
+    if max(e.dark for e in edges) < FAINT:
         return False
     shadows = Shadows(state, edges)
     raising = [c for c in map(get_effect, shadows.every) if c.raises_horizon]
