@@ -10,8 +10,10 @@ import pytest
 import torch
 
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.search.shadows import by_shadows
-from stages.effects import Survey
+from stages.diagnose.result import score
+from stages.diagnose.result.answer import Named
+from stages.diagnose.search.shadows import by_shadows, leave_out_dark
+from stages.effects import Survey, get_effect
 from stages.physics.horizon import horizon, occluder_distance
 from stages.physics.light.sun_disc import sun_visibility, visibility_slope
 
@@ -64,6 +66,8 @@ class ShadowedGround:
         ({"dem_px": 0.2}, None, "", 0.0),
         ({"wall": (110.0, 320.0)}, "distant_shadow", "height_m", 110.0),
         ({"wall": (200.0, 768.0)}, "distant_shadow", "height_m", 200.0),
+        ({"wall": (40.0, 110.0)}, "distant_shadow", "height_m", 40.0),
+        ({"wall": (400.0, 200.0)}, "distant_shadow", "height_m", 400.0),
         ({"sun_deg": 1.5}, "sun_elevation", "error_deg", 1.5),
         ({"sun_deg": -1.5, "dem_px": 0.2}, "sun_elevation", "error_deg", -1.5),
         ({"radius_deg": 2.0}, "penumbra", "radius_deg", 2.0),
@@ -95,6 +99,54 @@ def test_a_horizon_is_known_where_the_sun_was_said_to_be():
         )
     state = SimpleNamespace(chains=lambda: chains, causes=[], data=Survey(crop_px=64, gsd=10.0), free_gains=False)
     assert not by_shadows(state)
+
+
+@pytest.mark.parametrize("wall", [None, (150.0, 200.0)])
+def test_images_that_a_wall_leaves_in_the_dark_are_no_part_of_what_the_law_is_fitted_to(monkeypatch, wall):
+    rng = np.random.default_rng(5)
+    chains = [ShadowedGround(rng, k, wall=wall, dem_px=0.2) for k in range(4)]
+    for chain in chains:
+        chain.site.read_valid, chain.site.read = chain.site.valid, chain.site.image
+        chain.site.keep = lambda valid, site=chain.site: setattr(site, "read_valid", valid)
+    fitted = []
+    monkeypatch.setattr("stages.diagnose.search.shadows.fit", lambda *args, **options: fitted.append(args))
+    state = SimpleNamespace(
+        chains=lambda: chains, data=Survey(crop_px=64, gsd=10.0), free_gains=False, sites=[c.site for c in chains],
+        nominal=None, units="iof", leave_out_rare_images=lambda: None,
+    )  # fmt: skip
+    assert leave_out_dark(state) == bool(wall) == bool(fitted)
+    if wall:
+        kept = torch.stack([c.site.read_valid for c in chains])
+        dark = torch.stack([c.site.image < 0.2 * c.predict() for c in chains]) & torch.stack([c.lit() for c in chains])
+        assert dark[:, 0].float().mean() > 0.5  # a Sun of 8 deg behind a wall of 10 to 37 deg
+        assert (kept & dark).float().mean() < 0.01 < 0.2 < kept[:, 2].float().mean()
+    else:
+        assert all(c.site.read_valid.all() for c in chains)
+
+
+def test_lit_ground_says_how_much_nearer_to_nothing_a_value_is_that_shadows_tell(monkeypatch):
+    """It is found where it is large, and so too large: a DEM of 1.106 +- 0.02 whose lit ground looks as with 1.07 has 1.066, and the test pairs judge that."""
+    effect = get_effect("dem_scale")({"relative": 0.106})
+    cause = Named(
+        effect, {"relative": (0.106, 0.02, "1")}, 0.01, 500.0, 100.0, 1.0, 0.9, (5.0, 1.0, 9.0), ["dem_scale"]
+    )
+    monkeypatch.setattr(score, "_fitted_beside", lambda state, causes: causes)
+    state = SimpleNamespace(sites="learned", hidden="tested", nominal=None)
+
+    def squares_where_nothing_leaves(worst):
+        def squares(state, sites, models):
+            away = [float(c[0].effect.values["relative"]) - 0.07 if c else worst for _, c in models]
+            return [np.full(8, 1 + 30 * x * x) + np.arange(8) / 1e6 for x in away], 1e5
+
+        return squares
+
+    monkeypatch.setattr(score, "_squares_of", squares_where_nothing_leaves(0.0))  # test pairs like it best
+    found, _, refused = score.beside_shadows(state, [cause])
+    assert not found and "contradict" in refused["dem_scale"][1]
+    monkeypatch.setattr(score, "_squares_of", squares_where_nothing_leaves(0.07))
+    (found,), _, refused = score.beside_shadows(state, [cause])
+    assert found.parameters["relative"] == (pytest.approx(0.066), 0.02, "1") and not refused
+    assert float(found.effect.values["relative"]) == pytest.approx(0.066)
 
 
 @pytest.mark.parametrize("azimuth_deg", [0, 37, 90, 135, 200, 270, 333])

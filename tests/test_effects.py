@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -13,11 +14,11 @@ from stages.diagnose.result.answer import Answer, Named
 from stages.diagnose.result.files import write_diagnosis
 from stages.effects import Effect, Survey, effect_names, fields, get_effect, load_extension, register
 from stages.effects.filters import gaussian
-from stages.physics.formation.chain import Observation, form
+from stages.physics.formation.chain import Observation, State, form
 from stages.physics.formation.resampling import displace, displace_anywhere
 from stages.physics.photometry import get_model
 
-CATALOGUE = effect_names()
+CATALOGUE, EVERY = effect_names(), effect_names(unlisted=True)
 
 
 def _scene() -> Observation:
@@ -61,7 +62,7 @@ def test_unknown_names_list_the_choices():
         get_effect("phase")
 
 
-@pytest.mark.parametrize("name", CATALOGUE)
+@pytest.mark.parametrize("name", EVERY)
 def test_effect(name):
     cls = get_effect(name)
     plain = form(SCENE, M2, COEFFICIENTS)
@@ -78,9 +79,10 @@ def test_effect(name):
     assert {p.name for p in cls.fitted()} >= set(cls.strong), "a size worth knowing of what is not fitted"
     assert cls.mechanism and cls.reference and cls.separate and cls.confused_with, name
     assert set(cls.confused_with) <= set(CATALOGUE), name
+    assert cls.listed == (name in CATALOGUE)
 
 
-@pytest.mark.parametrize("name", [n for n in CATALOGUE if n != "distant_shadow"])
+@pytest.mark.parametrize("name", [n for n in EVERY if n != "distant_shadow"])
 def test_effect_has_a_gradient(name):
     cls = get_effect(name)
     trial = cls.trials(SURVEY)[-1]
@@ -111,6 +113,43 @@ def test_closed_forms():
     assert float((spread.sum(0) * x * x).sum()) == pytest.approx(1.5, rel=1e-3)
     moved = displace(impulse, torch.tensor(2.0), torch.tensor(-3.0))
     assert divmod(int(moved.argmax()), 41) == (23, 18)
+
+
+def _detector(turn_deg: float, scale: float = 1.0) -> Observation:
+    """Both images of the scene, on a detector that lies turned against the crop and has smaller pixels."""
+    row, column = torch.meshgrid(torch.arange(32.0), torch.arange(32.0), indexing="ij")
+    c, s = scale * math.cos(math.radians(turn_deg)), scale * math.sin(math.radians(turn_deg))
+    sample, line = c * column - s * row, s * column + c * row
+    return dataclasses.replace(
+        SCENE, detector_sample=sample.expand(2, -1, -1).clone(), detector_line=line.expand(2, -1, -1).clone()
+    )
+
+
+def _exposed(observation: Observation) -> State:
+    return State(observation, SCENE.elevation, SCENE.sun_direction, SCENE.camera_position, SCENE.sun_horizon)
+
+
+@pytest.mark.parametrize(("turn_deg", "axis", "sign"), [(0.0, -2, 1), (0.0, -1, -1), (90.0, -1, 1), (180.0, -2, 1)])
+def test_motion_blurs_along_lines_what_it_sharpens_along_samples(turn_deg, axis, sign):
+    """A wave along either axis of the detector is damped by exp(-v k^2 / 2), or grows by it; k in its pixels, two thirds of the crop's."""
+    state = _exposed(_detector(turn_deg, 1.5))
+    wave = 2 * math.pi / 8
+    phase = wave * torch.arange(32.0)
+    state.image = 1 + 0.1 * torch.cos(phase[:, None] if axis == -2 else phase).expand(2, 32, 32)
+    get_effect("motion_blur")({"sigma2_px2": 0.3}).apply(state)
+    inner = state.image[:, 12:20, 12:20] - 1
+    kept = float(inner.amax()) / 0.1
+    assert kept == pytest.approx(math.exp(-sign * 0.3 * (wave / 1.5) ** 2 / 2), rel=0.01)
+
+
+@pytest.mark.parametrize(("turn_deg", "axis"), [(0.0, -2), (90.0, -1), (180.0, -2)])
+def test_a_column_of_a_frame_adds_its_own_mean(turn_deg, axis):
+    state = _exposed(_detector(turn_deg))
+    state.image = torch.rand(2, 32, 32, generator=torch.Generator().manual_seed(3))
+    mean = state.image.mean(axis, keepdim=True).expand(2, 32, 32)
+    plain = state.image
+    get_effect("charge_smear")({"share": 0.1}).apply(state)
+    torch.testing.assert_close(state.image, plain + 0.1 * mean)
 
 
 def test_slots_fix_the_order():

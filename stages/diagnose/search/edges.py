@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -36,26 +35,45 @@ class Horizons:
     lift: float = 0.0
 
 
+@dataclass
 class _Facets:
-    """The facets of a site that count, part after part: where they lie, how near what casts shadow on them stands, the measured share of light, what of
-    that is left where the DEM's horizon is sharp, and whether it is so near the Sun that its errors tell.
+    """Some facets of a site, part after part. pixel : (M,) numbers among those of all images; image, part : (M,) of which image and band of lines
+
+    nearness : of what casts shadow on them, 1/px; measured : share of light; sharp : what of that is left where the DEM's horizon is sharp
     """
 
-    def __init__(self, use: Tensor, distance: Tensor, measured: Tensor, above: Tensor) -> None:
-        row, image, column = torch.nonzero(use.transpose(0, 1), as_tuple=True)
-        self.at = image, row, column
-        ends = torch.tensor([int(part[-1]) for part in np.array_split(np.arange(use.shape[1]), PARTS)])
-        self.ends = [0, *torch.searchsorted(row, ends, right=True).tolist()]
-        self.nearness = 1 / distance[self.at].clamp(min=NEAREST)
-        self.measured = measured[self.at]
-        high = above[self.at]
-        self.near = high.abs() < CLEAR
-        self.sharp = self.measured - (high > 0).to(high.dtype)
-        self.sunlit = high > LIT_MARGIN
+    pixel: Tensor
+    image: Tensor
+    part: Tensor
+    nearness: Tensor
+    measured: Tensor
+    sharp: Tensor
 
-    def of_parts(self, chosen: Tensor) -> list[int]:
-        """How many of these (M,) bool every part has."""
-        return [int(chosen[a:b].sum()) for a, b in pairwise(self.ends)]
+    def those(self, chosen: Tensor) -> _Facets:
+        """Some of them, (M,) bool or numbers in order."""
+        return _Facets(*(x[chosen] for x in vars(self).values()))
+
+    @property
+    def counts(self) -> list[int]:
+        """Of every part."""
+        return torch.bincount(self.part, minlength=PARTS).tolist()
+
+    def squares(self) -> Tensor:
+        """(PARTS,) of what is left where the DEM's horizon is sharp."""
+        return torch.zeros(PARTS, dtype=torch.float64).index_add_(0, self.part, self.sharp.double().square())
+
+
+def _facets(use: Tensor, distance: Tensor, measured: Tensor, above: Tensor) -> _Facets:
+    """Those in use, (n, H, W) each."""
+    pixel = torch.nonzero(use.flatten())[:, 0]
+    _, height, width = use.shape
+    bands = np.repeat(np.arange(PARTS), [len(rows) for rows in np.array_split(np.arange(height), PARTS)])
+    part = torch.from_numpy(bands)[pixel // width % height]
+    part, order = torch.sort(part, stable=True)
+    pixel = pixel[order]
+    near, share, high = (x.flatten()[pixel] for x in (distance, measured, above))
+    nearness = 1 / near.clamp(min=NEAREST)
+    return _Facets(pixel, pixel // (width * height), part, nearness, share, share - (high > 0).to(share.dtype))
 
 
 class Edges:
@@ -77,13 +95,11 @@ class Edges:
         assert above is not None
         use &= (distance >= NEAREST) | (above.abs() > CLEAR)
         measured = (known + (site.image - chain.predict()) / facet.clamp(min=1e-9)).clamp(0, 1)
-        self.facets = _Facets(use, distance, measured, above)
-
-    @property
-    def dark(self) -> float:
-        """Share of the facets that should be sunlit for sure and lie in the dark."""
-        facets = self.facets
-        return float((facets.sunlit & (facets.sharp < -0.5)).sum()) / max(int(facets.sunlit.sum()), 1)
+        near = above.abs() < CLEAR
+        self.near, self.far = (_facets(use & here, distance, measured, above) for here in (near, ~near))
+        self.far_squares = self.far.squares()
+        sunlit = use & (above > LIT_MARGIN)
+        self.dark = float((sunlit & (measured < 0.5)).sum()) / max(int(sunlit.sum()), 1)
 
     def products(self, effects: Sequence[Effect], beside: Sequence[Effect], about: Horizons) -> Floats:
         """(effects, PARTS, 3, 3) of the residual share of sunlight and of what a little more blur and lift would add to the expected one."""
@@ -92,23 +108,29 @@ class Edges:
 
     def _products(self, effects: Sequence[Effect], about: Horizons) -> Tensor:
         sun, horizon, disc = self.chain.sunlight(effects)
-        known = self.chain.sunlight([e for e in effects if e.slot == "geometry"])[1]
-        assert known is not None and horizon is not None
-        facets = self.facets
-        raised = (horizon > known)[facets.at]  # what an effect raises above the DEM stands far off, as it was given
-        told = facets.near | raised
-        above = (sun[facets.at[0]] - horizon[facets.at])[told]
-        nearness = torch.where(raised, 0.0, facets.nearness)[told]
-        radius = torch.hypot(disc, about.blur * nearness)
-        t = (about.lift * nearness - above) / radius
-        slope = visibility_slope(t) / radius
-        wider = -slope * t * about.blur * nearness.square() / radius
-        left = facets.measured[told] - sun_visibility(above, about.lift * nearness, radius)
-        x = torch.stack([left, wider, slope * nearness]).double()
-        out = torch.stack([own @ own.T for own in x.split(facets.of_parts(told), 1)])
+        known = self.chain.sunlight([e for e in effects if not e.raises_horizon])[1]
+        assert horizon is not None and known is not None
+        raised = (horizon > known).flatten()  # what stands beyond the DEM stands far off, as it was given
+
+        def of(facets: _Facets) -> Tensor:
+            """(PARTS, 3, 3) of some facets."""
+            nearness = torch.where(raised[facets.pixel], 0.0, facets.nearness)
+            above = sun[facets.image] - horizon.flatten()[facets.pixel]
+            radius = torch.hypot(disc, about.blur * nearness)
+            t = (about.lift * nearness - above) / radius
+            slope = visibility_slope(t) / radius
+            wider = -slope * t * about.blur * nearness.square() / radius
+            left = facets.measured - sun_visibility(above, about.lift * nearness, radius)
+            x = torch.stack([left, wider, slope * nearness]).double()
+            return torch.stack([own @ own.T for own in x.split(facets.counts, 1)])
+
+        out = of(self.near)
         # only a wall beyond the DEM darkens what the Sun stands well above
-        rest = torch.where(told, 0.0, facets.sharp).double().square()
-        out[:, 0, 0] += torch.stack([rest[a:b].sum() for a, b in pairwise(facets.ends)])
+        out[:, 0, 0] += self.far_squares
+        if bool((hidden := raised[self.far.pixel]).any()):
+            hidden_far = self.far.those(hidden)
+            out += of(hidden_far)
+            out[:, 0, 0] -= hidden_far.squares()
         return out
 
 

@@ -133,7 +133,7 @@ class Shadows:
                 continue
             if ordinary := [e for e in effects if e.shadows_ordinarily(e.values)]:
                 about = out[-1].about if out else Horizons()
-                out.append(self.tried(ordinary, [*(t.best for t in out), *beside], about))
+                out.append(self.tried(ordinary, [*_best(out), *beside], about))
         return out
 
     def unusual(self, usual: Sequence[Tried], named: Container[str]) -> list[Tried]:
@@ -143,7 +143,7 @@ class Shadows:
             for n, effects in self.every.items()
             if n not in named
         }
-        return [self.tried(e, [t.best for t in usual], usual[-1].about) for e in beyond.values() if e]
+        return [self.tried(e, _best(usual), usual[-1].about) for e in beyond.values() if e]
 
     def in_turn(self, effects: list[Effect]) -> Tried:
         """The same where what all ground does was fitted without these effects and took a part of them: the two are fitted in turn."""
@@ -151,8 +151,13 @@ class Shadows:
         while (least := float(found.left()[0].min())) < best:
             best, kept = least, found
             usual = self.usual([kept.best])
-            found = self.tried(effects, [t.best for t in usual], usual[-1].about)
+            found = self.tried(effects, _best(usual), usual[-1].about)
         return kept
+
+
+def _best(every: Sequence[Tried]) -> list[Effect]:
+    """Of each the best values, where these do anything."""
+    return [t.best for t in every if any(t.best.values[k] != v for k, v in t.best.null().items())]
 
 
 def leave_out_dark(state: State) -> bool:
