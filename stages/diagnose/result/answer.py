@@ -122,7 +122,8 @@ class Answer:
             return self._finding()
         asked = self.config.get("model", "the model")
         return (
-            f"The reflectance does not have the form of {asked}: {self.form} was fitted in its place. {self._finding()}"
+            f"The reflectance does not have the form of {asked}: {self.form} was fitted in its place, and follows whatever changes the law; "
+            f"where the ground's law is known, name it (--model, --free). {self._finding()}"
         )
 
     def _finding(self) -> str:
