@@ -123,7 +123,7 @@ class Answer:
         asked = self.config.get("model", "the model")
         return (
             f"The reflectance does not have the form of {asked}: {self.form} was fitted in its place, and follows whatever changes the law; "
-            f"where the ground's law is known, name it (--model, --free). {self._finding()}"
+            f"where that is known, ask for it as the model. {self._finding()}"
         )
 
     def _finding(self) -> str:
