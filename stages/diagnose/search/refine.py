@@ -16,6 +16,10 @@ from stages.diagnose.settings import LONGEST, SETTLED, SHORTEST, STEPS
 from stages.effects import Survey, get_effect
 
 
+EXTRAPOLATED = 3.0  # multiples of a column, beyond which it says little of how large an effect is
+HALVINGS = 5  # of such an estimate
+
+
 def as_effect(found, data: Survey, frames: int, whole):
     """The effect at the first estimate of its values, within bounds."""
     cls = get_effect(found.effect)
@@ -73,6 +77,27 @@ def refine(state: State, view: View) -> View:
     state.fit()
     assert look is not None
     return look
+
+
+def start_nearer(state: State, view: View, cause: Cause) -> None:
+    """Halve the first estimate of a single amount for all images while that leaves less, where its column was extrapolated to many times its size:
+    effects that grow faster than their column come out far too large at first, and are not found back from there.
+    """
+    cls = type(cause.effect)
+    if not cause.single or cls.linear or abs(float(cause.found.amount[0])) < EXTRAPOLATED:
+        return
+    names = [n for column in cause.found.guise.trial.columns for n in column]
+    kept, least = cause.effect, math.inf
+    for _ in range(HALVINGS):
+        state.fit()
+        left = _left(state, state.again(view, along(state, view), view.model))
+        if left > least:
+            break
+        kept, least = cause.effect, left
+        halved = {n: 0.5 * (float(kept.values[n]) + cls.null()[n]) for n in names}
+        cause.effect = cls({**kept.values, **halved}, state.data)
+        cause.effect.held = kept.held
+    cause.effect = kept
 
 
 def _left(state: State, view: View) -> float:
@@ -261,4 +286,4 @@ def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     return float(np.sqrt((move**2).mean() / max(inverse.diagonal().mean(), 1e-12)))
 
 
-__all__ = ["as_effect", "errors_over_images", "refine", "settle"]
+__all__ = ["as_effect", "errors_over_images", "refine", "settle", "start_nearer"]

@@ -18,7 +18,7 @@ from stages.diagnose.search.doubts import (
     ordinary,
 )
 from stages.diagnose.search.gains import secant_gains
-from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle
+from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle, start_nearer
 from stages.diagnose.search.rivals import another_law, choose, judge, may_be_another, shows_in_shade
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.search.tested import hidden_look
@@ -132,6 +132,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     saved = [(c, c.copy()) for c in causes]
     cause = Cause(first, found, group=group)
     state.causes.append(cause)
+    start_nearer(state, view, cause)
     look, why = _fit_beside(state, view, cause)
     if not why:
         gains, sizes, total, test_gains = secant_gains(state, cause, look, tested)
