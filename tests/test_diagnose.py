@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from schemas import ArtefactError
 from stages import diagnose
+from stages.diagnose.result.answer import HeldOut
 from stages.effects import effect_names, load_extension
 
 # What two sites of 64 px in ten images can show, with the first parameter's relative error where it is recovered;
@@ -205,6 +206,18 @@ def test_of_many_crops_those_that_are_diagnosed_lie_all_over_the_scene():
     gaps = np.diff([0, *places, 1000])
     assert gaps.max() < 2 * 1000 / len(places)
     assert all(a is b for a, b in zip(all_over(crops[:100], 384, 128), crops[:100], strict=True))
+
+
+def test_what_is_displaced_is_no_cause_where_the_test_pairs_lose_by_it(scene, tmp_path, monkeypatch):
+    """Albedo that follows relief looks like a shift: the simulation of other ground is worse with it."""
+
+    def worse(state, answer, extended):
+        return HeldOut(8, 2, 1.0, 1.4, -50.0, -25.0) if answer.causes else HeldOut()
+
+    monkeypatch.setattr("stages.diagnose.stage.score", worse)
+    answer = diagnose.run(_pairs(scene, tmp_path, {"misregistration": PLANTS["misregistration"]})).answer
+    assert not answer.causes and answer.verdict != "named"
+    assert answer.rejected["misregistration"][1] == "the test pairs contradict it: it gains -40.0 % there (up to -25.0)"
 
 
 def test_the_test_pairs_take_back_a_name_that_they_contradict():

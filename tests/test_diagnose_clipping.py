@@ -54,6 +54,16 @@ def test_clipping_shows_after_bicubic_resampling():
     assert saturation.read_off(laid(images)) is None
 
 
+def test_the_brightest_image_of_smooth_ground_is_no_pile():
+    """It lies within two per cent, with nothing below it; a level that noise widens as much has ground below."""
+    rng, saturation = np.random.default_rng(4), get_effect("saturation")
+    images = [rng.normal(level, 0.018 * level, 20_000) for level in (0.03, 0.04, 0.09, 0.12, 0.155, 0.222)]
+    assert saturation.read_off(torch.from_numpy(np.concatenate(images)).float()) is None
+    wide = rng.normal(0.2, 0.04, 20_000).clip(max=0.222) + rng.normal(0, 0.0022, 20_000)
+    found = saturation.read_off(torch.from_numpy(np.concatenate([*images[:-1], wide])).float())
+    assert found[0] == pytest.approx(0.222, rel=0.02)
+
+
 def test_images_that_are_cut_off_as_a_whole_are_clipping(monkeypatch):
     """Nothing of them is left to fit, and the law that is extrapolated to them may be too dark: their own brightness is not asked."""
     rng, level = np.random.default_rng(6), 0.085

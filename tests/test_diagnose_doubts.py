@@ -25,7 +25,7 @@ from stages.diagnose.search.rivals import choose, judge, may_be_another
 from stages.diagnose.search.state import Cause
 from stages.diagnose.settings import FOLDS
 from stages.effects import get_effect
-from stages.effects.base import Survey
+from stages.effects.base import Survey, Trial
 from stages.effects.filters import gaussian, seams
 from stages.effects.saturation import BINS
 from stages.physics.formation.resampling import displace
@@ -304,3 +304,22 @@ def test_images_that_come_back_every_so_many_grounds_are_known_from_other_parts(
         assert sorted(np.bincount(part))[0] >= count // FOLDS
         alone += [len(set(part[k::period])) == 1 for k in range(period)]
     assert np.mean(alone) < 0.15
+
+
+def test_a_first_estimate_that_is_extrapolated_is_halved_while_that_leaves_less(monkeypatch):
+    """A DEM is sharpened faster than by its first-order column: ten times this is too much, and twice that enough."""
+    cls = get_effect("dem_smoothing")
+    guise = Guise("dem_smoothing", Trial(({"sigma2_px2": 0.5},)), (0,))
+    state = SimpleNamespace(data=Survey(), fit=lambda: None, again=lambda view, names, model: None)
+    view = SimpleNamespace(model=None)
+    monkeypatch.setattr(refine, "along", lambda state, view: [])
+    for amount, kept in ((8.0, 1.0), (2.0, 1.0), (4.0, 1.0), (40.0, 1.25)):
+        found = Found("dem_smoothing", guise, np.array([amount]), np.array([0.1]), 9.0)
+        cause = Cause(cls({"sigma2_px2": min(0.5 * amount, 5.0)}), found)
+        cause.effect.held = ("nothing",)
+        monkeypatch.setattr(
+            refine, "_left", lambda state, now, cause=cause: (float(cause.effect.values["sigma2_px2"]) - 1.1) ** 2
+        )
+        refine.start_nearer(state, view, cause)
+        assert float(cause.effect.values["sigma2_px2"]) == kept
+        assert cause.effect.held == ("nothing",)

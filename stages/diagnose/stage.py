@@ -27,7 +27,7 @@ from stages.diagnose.registration.explain import explain
 from stages.diagnose.result.answer import Answer, Named
 from stages.diagnose.result.files import write_diagnosis
 from stages.diagnose.result.named import Cut, by_histogram, by_registration, by_search
-from stages.diagnose.result.score import beside_shadows, blind_effects, displacements, score, unconfirmed
+from stages.diagnose.result.score import beside_shadows, blind_effects, contradiction, displacements, score, unconfirmed
 from stages.diagnose.search.doubts import doubt_all
 from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
@@ -179,6 +179,11 @@ def _fill(
         site.keep(whole)
     shaded, extended, contrary = _by_shadows(state)
     answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + [*shaded] + ground
+    answer.held_out = score(state, answer, extended)
+    if placed and answer.held_out.high < 0:  # albedo that follows relief, of which nobody is sure, looks like a shift
+        refused |= {c.effect.name: (c.gain, contradiction(answer.held_out.gain, answer.held_out.high)) for c in placed}
+        answer.causes = [c for c in answer.causes if c not in placed]
+        answer.held_out = score(state, answer, extended)
     rejected = refused | outcome.rejected | doubted | contrary
     answer.rejected = {
         k: v for k, v in rejected.items() if k in effect_names() and k not in {c.effect.name for c in answer.causes}
@@ -193,7 +198,6 @@ def _fill(
     if not answer.causes and outcome.sure:
         answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)
     answer.verdict = _verdict(answer)
-    answer.held_out = score(state, answer, extended)
 
 
 def _faults(state: State) -> dict[str, float]:

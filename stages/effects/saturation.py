@@ -19,6 +19,7 @@ BINS = (
     0.002,
     0.001,
 )  # of the level: noise added later makes the pile wide, a crowded histogram asks for narrow ones
+GAP = 0.01  # of a wide pile: where next to nothing lies below it, it may be an image of its own, of smooth ground
 BELOW = 8  # bins: further down a histogram that falls to its end is as high as a small pile
 
 
@@ -57,7 +58,8 @@ class Saturation(Effect):
             # resampling rings a little over the level, noise added later blurs it: the pile is three bins wide
             above = float((bright >= edges[best] * (1 + max(2 * width, RINGING))).sum())
             if width == BINS[0]:
-                before = counts[max(best - 5, 0) : best - 1].mean()
+                near = counts[max(best - 5, 0) : best - 1]
+                before = near.mean() if near.min() > GAP * counts[best] else torch.inf
             else:  # whole numbers leave bins between them empty
                 before = counts[max(best - BELOW, 0) : best - 1].max()
             pile = float(counts[best - 1 : best + 2].sum())

@@ -48,7 +48,7 @@ def beside_shadows(
     gain, _, high = gain_interval(before, after)
     if not high < 0:
         return kept, best, {}
-    return [], state.nominal, {c.effect.name: (c.gain, _contradiction(gain, high)) for c in shaded}
+    return [], state.nominal, {c.effect.name: (c.gain, contradiction(gain, high)) for c in shaded}
 
 
 def _fitted_beside(state: State, shaded: Sequence[Named]) -> Nominal:
@@ -86,7 +86,7 @@ def _nearer(cause: Named, errors: float) -> Named:
     return dataclasses.replace(cause, effect=made, parameters={**cause.parameters, name: (value, error, unit)})
 
 
-def _contradiction(gain: float, high: float) -> str:
+def contradiction(gain: float, high: float) -> str:
     """Why a cause is none: percent that the squared error of the test pairs shrinks by, and the upper bound of that."""
     return f"the test pairs contradict it: it gains {gain:.1f} % there (up to {high:.1f})"
 
@@ -192,7 +192,7 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
         without = _hidden_squares(state)
         gain, _, high = gain_interval(without, with_cause)
         if high < 0:
-            out[cause.effect.name] = cause.found.gain, _contradiction(gain, high)
+            out[cause.effect.name] = cause.found.gain, contradiction(gain, high)
             continue
         state.causes[:], state.nominal = kept, nominal
         state.fit()
@@ -249,4 +249,4 @@ def _could_not_show(state: State, outcome: Outcome, name: str) -> bool:
     return SURE * max(found, error) > 1
 
 
-__all__ = ["beside_shadows", "blind_effects", "score", "unconfirmed"]
+__all__ = ["beside_shadows", "blind_effects", "contradiction", "score", "unconfirmed"]

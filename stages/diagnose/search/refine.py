@@ -15,7 +15,6 @@ from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import LONGEST, SETTLED, SHORTEST, STEPS
 from stages.effects import Survey, get_effect
 
-
 EXTRAPOLATED = 3.0  # multiples of a column, beyond which it says little of how large an effect is
 HALVINGS = 5  # of such an estimate
 
