@@ -111,10 +111,12 @@ def test_an_ordinary_blur_is_rendered_so_that_others_are_judged_beside_it_and_is
 
 
 @pytest.mark.slow
-def test_a_fault_outside_the_catalogue_is_unexplained(scene, tmp_path):
-    answer = diagnose.run(_pairs(scene, tmp_path, {"banding": UNKNOWN["banding"]})).answer
+@pytest.mark.parametrize(("fault", "words"), [("banding", "lines"), ("motion", "motion")])
+def test_a_fault_outside_the_catalogue_is_unexplained(scene, tmp_path, fault, words):
+    answer = diagnose.run(_pairs(scene, tmp_path, {fault: UNKNOWN[fault]})).answer
     assert answer.unexplained_fraction > 0
     assert answer.verdict == "unexplained" and not answer.causes
+    assert any(words in what for what in answer.structure)
 
 
 def test_every_name_has_a_gain_that_is_sure_and_the_budget_adds_up(diagnosed):

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 from hidden.laws import LAWS
+from laboratory.cases import Deal, make_case
 from orbital_angles import orbital_cosines
 from planted import semi_real
 
+from stages import diagnose
 from stages.diagnose.model.form import better_form, other_laws
 from stages.diagnose.model.laws import LunarLaws, lunar_laws
 from stages.diagnose.model.nominal import fit, load_nominal
@@ -101,3 +103,13 @@ def test_pieces_of_one_place_are_left_out_side_by_side(tmp_path, monkeypatch):
             found = explain(sites, nominal, [], frames, 0.0)
     assert "valid" not in changed
     assert found.squares["none"].shape == (len(sites) * cuts(sites[0].image.shape[-1], len(sites)) ** 2, frames)
+
+
+@pytest.mark.slow
+def test_what_the_test_pairs_refuse_of_the_law_was_another_law(tmp_path):
+    """Another laboratory's ground, seen obliquely: limb darkening of a half takes 17,000 nats away, and makes ground that was not learned worse."""
+    path = tmp_path / "pairs.h5"
+    make_case(95, Deal("b", effect="albedo_map"), 20261126, path)
+    answer = diagnose.run(path).answer
+    assert answer.form == "measured lunar laws"
+    assert "limb_darkening" not in {c.effect.name for c in answer.causes}

@@ -8,7 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from laboratory.cases import Deal, make_case
 
+from stages import diagnose
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.result import score
 from stages.diagnose.result.answer import Named
@@ -174,3 +176,14 @@ def test_the_flux_along_the_horizon_is_that_of_a_limb_darkened_disc():
         expected = -chord / (math.pi * (1 - 0.6 / 3))
         assert float(visibility_slope(torch.tensor(t, dtype=torch.float64))) == pytest.approx(expected, abs=1e-6)
     assert not visibility_slope(torch.tensor([-1.5, 1.0, 3.0])).any()
+
+
+@pytest.mark.slow
+def test_a_wall_that_leaves_whole_images_dark_is_named_and_not_their_gains(tmp_path):
+    """Another laboratory's ridge of 438 m beyond the DEM: under a third of its Suns nothing is lit."""
+    path = tmp_path / "pairs.h5"
+    truth = make_case(53, Deal("a", effect="distant_shadow"), 20261126, path)
+    (found,) = diagnose.run(path).answer.causes
+    assert found.effect.name == "distant_shadow"
+    value, error, _ = found.parameters["height_m"]
+    assert abs(value - truth["planted"]["distant_shadow"]["height_m"]) < 2 * error
