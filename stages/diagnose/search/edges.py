@@ -23,6 +23,7 @@ from stages.effects import Effect
 from stages.physics.horizon import occluder_distance
 from stages.physics.light.sun_disc import sun_visibility, visibility_slope
 
+LIMIT = 0.3  # of a share of light, beyond 0 and 1: noise that is cut off there alone would make all edges look wide
 NEAREST = 3.0  # px: edges of shadows cast from nearer by hang on the slope of the ground itself
 PARTS = 4  # bands of a site's lines that are judged apart, where grounds are few
 
@@ -94,7 +95,7 @@ class Edges:
         above = chain.height_above_horizon()
         assert above is not None
         use &= (distance >= NEAREST) | (above.abs() > CLEAR)
-        measured = (known + (site.image - chain.predict()) / facet.clamp(min=1e-9)).clamp(0, 1)
+        measured = (known + (site.image - chain.predict()) / facet.clamp(min=1e-9)).clamp(-LIMIT, 1 + LIMIT)
         near = above.abs() < CLEAR
         self.near, self.far = (_facets(use & here, distance, measured, above) for here in (near, ~near))
         self.far_squares = self.far.squares()
