@@ -92,29 +92,35 @@ def contradiction(gain: float, high: float) -> str:
 
 
 def score(state: State, answer: Answer, extended: Nominal) -> HeldOut:
-    """Squared errors of both models on the same pixels, with the same nuisance: the albedo of every pixel that several images show, gains
-    of dn images, smooth fields of displacement.
+    """Squared errors of both models on the same pixels, with the same nuisance: a law that was fitted last to the same images, the albedo of every
+    pixel that several images show, gains of dn images, smooth fields of displacement.
 
     extended : as it was fitted beside the causes
 
     Relative to brightness for dn images, else in I/F. What registration found counts where it is named, else both have it.
     """
-    if not state.hidden or not answer.causes or state.reference is None:
+    if not state.hidden or not answer.causes:
         return HeldOut()
+    nominal = copy.copy(state.nominal)
+    fit(nominal, state.sites, [], state.units, [s.laid for s in state.sites])
     named = [c.effect for c in answer.causes if c.effect.displaces and c.effect.judged_apart]
-    effects = [c.effect for c in answer.causes if c.effect not in named]
+    cut = [c.effect for c in answer.causes if c.effect.keep_below < 1]
+    effects = [c.effect for c in answer.causes if c.effect not in [*named, *cut]]
     plain, moved = displacements(state, named)
     before: list[np.ndarray] = []
     after: list[np.ndarray] = []
     count = 0.0
     for site, was, now in zip(state.hidden, plain, moved, strict=True):
         images = [aligned(site.read, site.read_valid, *d) if d else (site.read, site.read_valid) for d in (was, now)]
-        mask = full_light(state.reference.chain(site, [])) & images[0][1] & images[1][1]
-        for part, chain, (image, _) in (
-            (before, state.reference.chain(site, []), images[0]),
-            (after, extended.chain(site, effects), images[1]),
+        mask = full_light(nominal.chain(site, [])) & images[0][1] & images[1][1]
+        for effect in cut:  # of an image that is cut off nearly everywhere nobody knows how bright it would be
+            below = mask & (images[1][0] < effect.keep_below * _level(effect, state))
+            mask &= (2 * below.sum((-2, -1)) > mask.sum((-2, -1)))[:, None, None]
+        for part, chain, (image, _), off in (
+            (before, nominal.chain(site, []), images[0], []),
+            (after, extended.chain(site, effects), images[1], cut),
         ):
-            squares, pixels = _squares(site, chain, image, mask, state)
+            squares, pixels = _squares(site, chain, image, mask, state, off)
             part.append(squares)
         count += pixels
     if not count > 0:
@@ -151,33 +157,53 @@ Fields = list[tuple[torch.Tensor, torch.Tensor]] | list[None]
 
 
 def _squares(
-    site: Site, chain: Chain, image: torch.Tensor, mask: torch.Tensor, state: State
+    site: Site, chain: Chain, image: torch.Tensor, mask: torch.Tensor, state: State, cut: Sequence[Effect] = ()
 ) -> tuple[np.ndarray, float]:
     """Squared errors of the pieces of one ground, and its number of pixels. Where several images show a pixel its own albedo is a nuisance: one
     factor for all of them.
 
     Without it albedo, which no cause is about, would drown what the images of a place disagree on.
+    cut : effects that cut off what is brighter than a level of the detector, which says nothing of albedo and gain
     """
+    known = mask
+    for effect in cut:
+        known = known & (image < effect.keep_below * _level(effect, state))
     site.image = image
     predicted = chain.predict()
     free = state.free_gains
     if free:
-        scale_images(site, image, predicted, mask)
+        scale_images(site, image, predicted, known)
     weight = mask.double()
     measured = site.image
+    relative = torch.ones_like(measured[:, :1, :1])
     if free:  # relative to the image as it was read: one that lies beside the ground has a low gain, and says little
         level = (image * weight).sum((-2, -1)) / weight.sum((-2, -1)).clamp(min=1)
         relative = (site.gain / level.clamp(min=1e-9))[:, None, None]
         measured, predicted = measured * relative, predicted * relative
     if len(weight) > 1:
         weight = weight * (weight.sum(0) > 1)
-        seen = (weight * predicted.square()).sum(0).clamp(min=1e-12)
-        predicted = predicted * ((weight * predicted * measured).sum(0) / seen)
+        tells = weight * known
+        seen = (tells * predicted.square()).sum(0)
+        predicted = predicted * torch.where(
+            seen > 0, (tells * predicted * measured).sum(0) / seen.clamp(min=1e-12), 1.0
+        )
+    for effect in cut:
+        top = (_level(effect, state) - site.offset) / site.gain
+        predicted = torch.minimum(predicted, top[:, None, None] * relative)
     squares = ((measured - predicted).double() * weight).square().sum(0)
     # one or two grounds are cut, as those are that are learned from: there would be no interval
     pieces = cuts(min(squares.shape), len(state.hidden)) if len(state.hidden) < 3 else 1
     parts = [part.sum() for rows in squares.tensor_split(pieces) for part in rows.tensor_split(pieces, 1)]
     return torch.stack(parts).numpy(), float(weight.sum())
+
+
+def _level(effect: Effect, state: State) -> float:
+    """At which it cuts images off as they were read, whatever their own gains; its value is in I/F by the middle one."""
+    ((_, value),) = effect.values.items()
+    if not state.free_gains:
+        return float(value)
+    gain, offset = (torch.cat([getattr(s, k) for s in state.sites]) for k in ("gain", "offset"))
+    return float(value) * float(gain.median()) + float(offset.median())
 
 
 def unconfirmed(state: State) -> dict[str, tuple[float, str]]:

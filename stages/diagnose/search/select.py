@@ -160,7 +160,7 @@ def _fit_beside(state: State, view: View, cause: Cause) -> tuple[View, str]:
     """Fit everything with the new cause; why it, or another beside it, cannot be one, or ''.
 
     One that is nothing beside the new one makes way for it: the new one is something beside either. Values per frame, which mimic what
-    one value for all does, drive none out.
+    one value for all does, drive none out, nor does what is in no catalogue.
     """
     while True:
         look = refine(state, view)
@@ -168,7 +168,7 @@ def _fit_beside(state: State, view: View, cause: Cause) -> tuple[View, str]:
         if not why:
             errors_over_images(state, look)
             why, other = doubt_any(state, cause)
-        if other is None or cause.found.guise.per_frame or ODD in why:
+        if other is None or cause.found.guise.per_frame or not cause.effect.listed or ODD in why:
             return look, why
         state.causes.remove(other)
 
