@@ -3,7 +3,7 @@
 One likelihood, in six steps, each a folder:
 
 model         The nominal simulation of every site, rendered again with small changes. Where its law does not fit, the mean of measured lunar
-              laws takes its place, with the directions in which these differ.
+              laws takes its place, with the directions in which these differ. Ground that a wall beyond the DEM darkens is left out.
 registration  Where the images lie. Shifts of up to 8 px are captured by correlation with the rendering, then explained: by nothing, a
               constant, an affine map or a smooth field per frame, with or without relief displacement. The simplest form that no other
               beats on held-out sites wins. Beside it lines of every image may be shifted against each other, as far as one half of
@@ -19,7 +19,8 @@ search        The effect that gains most on held-out ground, if shams hardly do 
               again. It is named if it is real (its own file says what is plausible and what is ordinary), if it is there
               whichever images are left out, and if its held-out gain is above zero for sure. What is surely there and ordinary is rendered
               and not named. Then the next. Shadows and ground that images share are looked at by themselves, last.
-structure     What is left that neither ground nor noise has, and nothing in the catalogue explains: lines, patterns of the detector, single pixels.
+structure     What is left that neither ground nor noise has, and nothing in the catalogue explains: lines, patterns of the detector, single pixels
+              (and effects that are in no catalogue, which the search finds).
 result        What is named, how much of the residual is what, what was refused and why, what these data could not have shown.
 
 Whatever is special about one effect stands in its own file under ``stages/effects``; the numbers set by hand that decide what is found stand in ``settings.py``.

@@ -33,7 +33,7 @@ from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, search
 from stages.diagnose.search.shadows import by_shadows, contradicted, leave_out_dark
-from stages.diagnose.search.state import State
+from stages.diagnose.search.state import Cause, State
 from stages.diagnose.settings import MISFIT, STILL
 from stages.diagnose.structure.kinds import PILED, structure
 from stages.effects import effect_names, get_effect
@@ -205,7 +205,15 @@ def _faults(state: State) -> dict[str, float]:
     found = [c for c in state.named if not c.effect.listed]
     for cause in found:
         cause.ordinary = True
-    return {c.effect.title: c.gain_percent / 100 for c in found}
+    return {_in_words(c): c.gain_percent / 100 for c in found}
+
+
+def _in_words(cause: Cause) -> str:
+    """What it does, and its first value with its error."""
+    first = type(cause.effect).parameters[0]
+    value, error = float(cause.effect.values[first.name]), cause.reported_errors.get(first.name, math.nan)
+    unit = "" if first.unit == "1" else f" {first.unit}"
+    return f"{cause.effect.title} ({value:.2g} +- {error:.1g}{unit})"
 
 
 def _register(state: State) -> None:

@@ -140,7 +140,7 @@ class Answer:
             )
             return f"The simulation lacks {' and '.join(parts)}{rest if self.budget else ''}{more}."
         if self.verdict == "unexplained":
-            return f"The residual holds {' and '.join(self.structure) or 'structure'} that nothing in the catalogue explains."
+            return f"The residual holds {' and '.join(self.structure) or 'structure'}, which nothing in the catalogue explains."
         if self.verdict == "cannot_tell":
             return f"Nothing significant was found, but these data could not show: {', '.join(self.blind)}."
         return "Nothing in the catalogue explains a significant part of the residual, and no structure is left over."
