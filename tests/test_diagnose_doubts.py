@@ -310,7 +310,7 @@ def test_a_first_estimate_that_is_extrapolated_is_halved_while_that_leaves_less(
     """A DEM is sharpened faster than by its first-order column: ten times this is too much, and twice that enough."""
     cls = get_effect("dem_smoothing")
     guise = Guise("dem_smoothing", Trial(({"sigma2_px2": 0.5},)), (0,))
-    state = SimpleNamespace(data=Survey(), fit=lambda: None, again=lambda view, names, model: None)
+    state = SimpleNamespace(data=Survey(), free_gains=False, fit=lambda: None, again=lambda view, names, model: None)
     view = SimpleNamespace(model=None)
     monkeypatch.setattr(refine, "along", lambda state, view: [])
     for amount, kept in ((8.0, 1.0), (2.0, 1.0), (4.0, 1.0), (40.0, 1.25)):

@@ -14,7 +14,8 @@ from stages import diagnose
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.result import score
 from stages.diagnose.result.answer import Named
-from stages.diagnose.search.shadows import by_shadows, leave_out_dark
+from stages.diagnose.search.shadows import by_shadows
+from stages.diagnose.search.walls import hide_dark
 from stages.effects import Survey, get_effect
 from stages.physics.horizon import horizon, occluder_distance
 from stages.physics.light.sun_disc import sun_visibility, visibility_slope
@@ -108,22 +109,22 @@ def test_images_that_a_wall_leaves_in_the_dark_are_no_part_of_what_the_law_is_fi
     rng = np.random.default_rng(5)
     chains = [ShadowedGround(rng, k, wall=wall, dem_px=0.2) for k in range(4)]
     for chain in chains:
-        chain.site.read_valid, chain.site.read = chain.site.valid, chain.site.image
-        chain.site.keep = lambda valid, site=chain.site: setattr(site, "read_valid", valid)
+        chain.site.read, chain.site.hidden = chain.site.image, torch.zeros_like(chain.site.valid)
+        chain.site.hide = lambda dark, site=chain.site: setattr(site, "hidden", dark)
     fitted = []
-    monkeypatch.setattr("stages.diagnose.search.shadows.fit", lambda *args, **options: fitted.append(args))
+    monkeypatch.setattr("stages.diagnose.search.walls.fit", lambda *args, **options: fitted.append(args))
     state = SimpleNamespace(
         chains=lambda: chains, data=Survey(crop_px=64, gsd=10.0), free_gains=False, sites=[c.site for c in chains],
         nominal=None, units="iof", leave_out_rare_images=lambda: None,
     )  # fmt: skip
-    assert leave_out_dark(state) == bool(wall) == bool(fitted)
+    assert hide_dark(state) == bool(wall) == bool(fitted)
     if wall:
-        kept = torch.stack([c.site.read_valid for c in chains])
+        kept = ~torch.stack([c.site.hidden for c in chains])
         dark = torch.stack([c.site.image < 0.2 * c.predict() for c in chains]) & torch.stack([c.lit() for c in chains])
         assert dark[:, 0].float().mean() > 0.5  # a Sun of 8 deg behind a wall of 10 to 37 deg
         assert (kept & dark).float().mean() < 0.01 < 0.2 < kept[:, 2].float().mean()
     else:
-        assert all(c.site.read_valid.all() for c in chains)
+        assert not any(c.site.hidden.any() for c in chains)
 
 
 def test_lit_ground_says_how_much_nearer_to_nothing_a_value_is_that_shadows_tell(monkeypatch):

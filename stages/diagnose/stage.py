@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -26,14 +25,15 @@ from stages.diagnose.model.sites import Site, all_over, grounds, load_site, surv
 from stages.diagnose.registration.explain import explain
 from stages.diagnose.result.answer import Answer, Named
 from stages.diagnose.result.files import write_diagnosis
-from stages.diagnose.result.named import Cut, by_histogram, by_registration, by_search
+from stages.diagnose.result.named import Cut, by_histogram, by_registration, by_search, outside_catalogue
 from stages.diagnose.result.score import beside_shadows, blind_effects, contradiction, displacements, score, unconfirmed
 from stages.diagnose.search.doubts import doubt_all
 from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, search
-from stages.diagnose.search.shadows import by_shadows, contradicted, leave_out_dark
-from stages.diagnose.search.state import Cause, State
+from stages.diagnose.search.shadows import by_shadows, contradicted
+from stages.diagnose.search.state import State
+from stages.diagnose.search.walls import hide_dark
 from stages.diagnose.settings import MISFIT, STILL
 from stages.diagnose.structure.kinds import PILED, structure
 from stages.effects import effect_names, get_effect
@@ -108,12 +108,9 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     state = State(
         nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, hidden, say=say, progress=progress
     )
-    state.reference = copy.copy(nominal)
     state.leave_out_rare_images()
-    known = [site.read_valid for site in sites]
-    if leave_out_dark(state):
+    if hide_dark(state):
         nominal.laws = other_laws(nominal, sites, units)
-        state.reference = copy.copy(nominal)
     before = _residual(state)
     if not before > 0:
         answer.note, answer.blind = "too few pixels of the pairs show fully lit ground", effect_names()
@@ -138,7 +135,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     if isinstance(state.nominal.model, LunarLaws):
         answer.form = state.nominal.model.title
         say(f"{config.model} has not the form of the ground's law: {answer.form} took its place")
-    _fill(answer, state, outcome, doubted, cut, before, known)
+    _fill(answer, state, outcome, doubted, cut, before)
     return Result(answer, state, outcome)
 
 
@@ -149,12 +146,10 @@ def _fill(
     doubted: dict[str, tuple[float, str]],
     cut: Cut | None,
     before: float,
-    known: Sequence[torch.Tensor],
 ) -> None:
     """Doubt what the search found once more, look at what is judged apart, and write all of it into the answer.
 
-    doubted : what was taken back already; cut : what the histogram shows; before : mean square of the residual when nothing was known;
-    known : pixels of each site that the file has, walls or no
+    doubted : what was taken back already; cut : what the histogram shows; before : mean square of the residual when nothing was known
     """
     view = outcome.view
     assert view is not None
@@ -165,7 +160,7 @@ def _fill(
         settle(state, view)
         doubted |= doubt_all(state, view, STILL)
     after = _residual(state)
-    left = _faults(state) | structure(state, view, cut[1] if cut else 0.0)
+    left = outside_catalogue(state) | structure(state, view, cut[1] if cut else 0.0)
     ordinary = {c.effect.name for c in state.causes} - {c.effect.name for c in state.named}
     if ordinary:  # rendered to judge the others beside it; from here on the simulation is what is named, and no more
         before *= after / _without_ordinary(state)
@@ -175,8 +170,6 @@ def _fill(
     if clipped:
         left.pop(PILED, None)
     ground, shown = by_ground(state)
-    for site, whole in zip(state.sites, known, strict=True):
-        site.keep(whole)
     shaded, extended, contrary = _by_shadows(state)
     answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + [*shaded] + ground
     answer.held_out = score(state, answer, extended)
@@ -200,22 +193,6 @@ def _fill(
     answer.verdict = _verdict(answer)
 
 
-def _faults(state: State) -> dict[str, float]:
-    """What was found and stands in no catalogue, in words, and the share of the squares that it takes away; it is no cause from here on."""
-    found = [c for c in state.named if not c.effect.listed]
-    for cause in found:
-        cause.ordinary = True
-    return {_in_words(c): c.gain_percent / 100 for c in found}
-
-
-def _in_words(cause: Cause) -> str:
-    """What it does, and its first value with its error."""
-    first = type(cause.effect).parameters[0]
-    value, error = float(cause.effect.values[first.name]), cause.reported_errors.get(first.name, math.nan)
-    unit = "" if first.unit == "1" else f" {first.unit}"
-    return f"{cause.effect.title} ({value:.2g} +- {error:.1g}{unit})"
-
-
 def _register(state: State) -> None:
     """Find where the images lie beside the causes that are named so far, lay them there, and fit the nominal model."""
     state.registration = explain(state.sites, state.nominal, state.base, state.frames, state.data.elevation[0])
@@ -229,6 +206,8 @@ def _register(state: State) -> None:
 
 def _by_shadows(state: State) -> tuple[Sequence[Named], Nominal, dict[str, tuple[float, str]]]:
     """What shadows tell and the test pairs do not refuse, the nominal model as it is fitted beside that, and what is refused."""
+    for site in state.sites:
+        site.show()
     found = by_shadows(state)
     if not found:
         return [], state.nominal, {}

@@ -23,7 +23,7 @@ class ChargeSmear(Effect):
         "A frame that is shifted through the light while it is read collects a share of what falls on all of the column. Of what lies beyond the "
         "crop nothing is known: it is taken to be as bright."
     )
-    reference = "Robinson et al. (2010), Space Sci. Rev. 150, 81 (readout of framing cameras); Bell et al. (2003), JGR 108, 8063 (frame-transfer smear)"
+    reference = "Caldwell et al. (2010), Astrophys. J. Lett. 713, L92 (a camera without a shutter)"
     confused_with = ("dark_bias", "column_pattern")
     separate = "a frame with deep shadow in some columns and sunlit ground in others"
     parameters = (Parameter("share", "1", -0.3, 0.5, 0.0, "of the column's mean brightness"),)

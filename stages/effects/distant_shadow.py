@@ -17,18 +17,8 @@ TANGENTS = (0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8, 1.1, 1.6, 2.2)
 USUAL = 0.5  # crops from the border: where a wall is sought first,
 NEAR, LOW = 0.1, (0.03, 0.045, 0.07, 0.1, 0.14)  # and low ones, whose shadow does not reach far into the crop
 FINER = tuple(2.0 ** (k / 8) for k in range(-8, 9))  # times the height that was found first
-DISTANCES = (
-    NEAR,
-    0.17,
-    0.25,
-    0.35,
-    USUAL,
-    0.7,
-    1.0,
-    1.4,
-    2.0,
-    2.8,
-)  # crops: beyond them a ridge hides the Sun everywhere alike
+# crops: beyond the last a ridge hides the Sun everywhere alike
+DISTANCES = (NEAR, 0.17, 0.25, 0.35, USUAL, 0.7, 1.0, 1.4, 2.0, 2.8)
 
 
 @register

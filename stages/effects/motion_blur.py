@@ -25,18 +25,13 @@ class MotionBlur(Effect):
         "direction than in the other is told here, the rest is a blur of the optics: an even motion over m pixels has a variance of m^2 / 12, half of "
         "it either way. A line camera's own line leaves 1/24; less than 0.1 is not told, since oblique views leave as much."
     )
-    reference = "Holst (2011), CCD Arrays, Cameras and Displays, ch. 10 (transfer function of linear motion)"
+    reference = (
+        "Boreman (2001), Modulation Transfer Function in Optical and Electro-Optical Systems, SPIE (image motion)"
+    )
     confused_with = ("psf_blur", "dem_smoothing")
     separate = "an image turned against the others"
     parameters = (
-        Parameter(
-            "sigma2_px2",
-            "px2",
-            -4.0,
-            4.0,
-            0.0,
-            "variance added along lines and taken away along samples, detector pixels",
-        ),
+        Parameter("sigma2_px2", "px2", -4.0, 4.0, 0.0, "variance added along lines and taken away along samples"),
     )
     strong: ClassVar = {"sigma2_px2": 0.5}
     tolerance: ClassVar = {"sigma2_px2": 0.1}

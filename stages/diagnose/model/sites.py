@@ -48,6 +48,7 @@ class Site:
     displacement: tuple[Tensor, Tensor] | None = None
     left_out: frozenset[int] = frozenset()
     latest: Chain | None = None
+    _shown: Tensor | None = None  # what ``read_valid`` was before pixels were hidden
     _laid: tuple[object, Tensor, Tensor] | None = None  # for one displacement: image and mask over the ground
 
     @property
@@ -63,10 +64,16 @@ class Site:
         _, laid_image, self.valid = self._laid
         self.image = (laid_image - self.offset[:, None, None]) / self.gain[:, None, None]
 
-    def keep(self, valid: Tensor) -> None:
-        """Read these pixels (n, H, W) of the images, and no others, from now on."""
-        self.read_valid, self._laid = valid, None
+    def hide(self, dark: Tensor) -> None:
+        """Leave pixels (n, H, W) of the images out until they are shown again."""
+        self._shown, self.read_valid, self._laid = self.read_valid, self.read_valid & ~dark, None
         self.align()
+
+    def show(self) -> None:
+        """Take all pixels in again."""
+        if self._shown is not None:
+            self.read_valid, self._shown, self._laid = self._shown, None, None
+            self.align()
 
     def on_detector(self) -> Tensor:
         """(n, 2, H, W) line and sample of every pixel as the images lie now; row and column of the crop where the detector is not known."""

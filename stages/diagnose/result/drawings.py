@@ -44,9 +44,8 @@ def draw(state: State, image_ids: Sequence[str]) -> dict[str, list[Markup]]:
 
 
 def _models(state: State, site: Site) -> tuple[Chain, Chain]:
-    """Under the nominal model as it was fitted alone, and under everything that was named."""
-    reference = state.reference or state.nominal
-    return reference.chain(site, []), state.nominal.chain(site, state.base)
+    """Under the nominal model as it is fitted alone, and under everything that was named."""
+    return state.plain().chain(site, []), state.nominal.chain(site, state.base)
 
 
 def _crops(state: State, image_ids: Sequence[str]) -> list[Crop]:

@@ -54,6 +54,18 @@ def by_search(state: State) -> list[Named]:
     return out
 
 
+def outside_catalogue(state: State) -> dict[str, float]:
+    """What was found and stands in no catalogue, in words, and the share of the squares that it takes away; it is no cause from here on."""
+    out = {}
+    for cause in [c for c in state.named if not c.effect.listed]:
+        cause.ordinary = True
+        first = type(cause.effect).parameters[0]
+        value, error = float(cause.effect.values[first.name]), cause.reported_errors.get(first.name, math.nan)
+        unit = "" if first.unit == "1" else f" {first.unit}"
+        out[f"{cause.effect.title} ({value:.2g} +- {error:.1g}{unit})"] = cause.gain_percent / 100
+    return out
+
+
 def by_registration(state: State) -> tuple[list[Named], dict[str, tuple[float, str]]]:
     """What explains where the images lie: relief displacement, and shifts of whole images beyond ordinary ones; and what was refused."""
     r = state.registration
@@ -185,15 +197,11 @@ def by_histogram(sites: Sequence[Site], units: str) -> Cut | None:
             percent = gain_interval(before, after)
             if not percent[1] > 0:
                 return None
-            scale = 1.0
-            if units == "dn":
-                gains = torch.cat([s.gain for s in state.sites])
-                offsets = torch.cat([s.offset for s in state.sites])
-                scale = float(gains.median())
-                level = level - float(offsets.median())
+            gain, offset = state.exposure
             (parameter,) = cls.parameters
-            effect = cls({parameter.name: level / scale}, data)
-            values = {parameter.name: (level / scale, error / scale, parameter.unit)}
+            value = (level - offset) / gain
+            effect = cls({parameter.name: value}, data)
+            values = {parameter.name: (value, error / gain, parameter.unit)}
             total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
             spread = total * (percent[2] - percent[1]) / (4 * percent[0])
             was, now = (math.sqrt(float(x.sum()) / pixels) for x in (before, after))
@@ -256,4 +264,4 @@ def _clipped(
     return before, after, max(count, 1.0)
 
 
-__all__ = ["Cut", "by_histogram", "by_registration", "by_search"]
+__all__ = ["Cut", "by_histogram", "by_registration", "by_search", "outside_catalogue"]

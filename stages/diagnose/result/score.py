@@ -22,13 +22,8 @@ from stages.diagnose.search.state import State
 from stages.diagnose.settings import CORRELATED, SURE
 from stages.effects import Effect, effect_names, get_effect
 
-NEARER = (
-    0.0,
-    0.5,
-    1.0,
-    1.5,
-    2.0,
-)  # errors that a value which shadows tell may be nearer to nothing, if lit ground likes it
+# errors that a value which shadows tell may be nearer to nothing, if lit ground likes it
+NEARER = np.linspace(0, 2, 5)
 
 
 def beside_shadows(
@@ -101,8 +96,7 @@ def score(state: State, answer: Answer, extended: Nominal) -> HeldOut:
     """
     if not state.hidden or not answer.causes:
         return HeldOut()
-    nominal = copy.copy(state.nominal)
-    fit(nominal, state.sites, [], state.units, [s.laid for s in state.sites])
+    nominal = state.plain()
     named = [c.effect for c in answer.causes if c.effect.displaces and c.effect.judged_apart]
     cut = [c.effect for c in answer.causes if c.effect.keep_below < 1]
     effects = [c.effect for c in answer.causes if c.effect not in [*named, *cut]]
@@ -200,10 +194,8 @@ def _squares(
 def _level(effect: Effect, state: State) -> float:
     """At which it cuts images off as they were read, whatever their own gains; its value is in I/F by the middle one."""
     ((_, value),) = effect.values.items()
-    if not state.free_gains:
-        return float(value)
-    gain, offset = (torch.cat([getattr(s, k) for s in state.sites]) for k in ("gain", "offset"))
-    return float(value) * float(gain.median()) + float(offset.median())
+    gain, offset = state.exposure
+    return float(value) * gain + offset
 
 
 def unconfirmed(state: State) -> dict[str, tuple[float, str]]:

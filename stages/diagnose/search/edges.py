@@ -85,22 +85,12 @@ class Edges:
 
     def __init__(self, chain: Chain, ground: Chain | None = None) -> None:
         self.chain = ground or chain
-        site, facet = chain.site, chain.state.reflectance
-        known = chain.state.sun_visibility
-        assert known is not None
-        lit = chain.lit() & site.valid
-        level = (facet * lit).sum((-2, -1), keepdim=True) / lit.sum((-2, -1), keepdim=True).clamp(min=1)
-        use = site.valid & (facet > DARKEST * level)
+        use, above, measured = _light(chain)
         distance = _distances(chain, use)
-        above = chain.height_above_horizon()
-        assert above is not None
         use &= (distance >= NEAREST) | (above.abs() > CLEAR)
-        measured = (known + (site.image - chain.predict()) / facet.clamp(min=1e-9)).clamp(-LIMIT, 1 + LIMIT)
         near = above.abs() < CLEAR
         self.near, self.far = (_facets(use & here, distance, measured, above) for here in (near, ~near))
         self.far_squares = self.far.squares()
-        sunlit = use & (above > LIT_MARGIN)
-        self.dark = float((sunlit & (measured < 0.5)).sum()) / max(int(sunlit.sum()), 1)
 
     def products(self, effects: Sequence[Effect], beside: Sequence[Effect], about: Horizons) -> Floats:
         """(effects, PARTS, 3, 3) of the residual share of sunlight and of what a little more blur and lift would add to the expected one."""
@@ -135,6 +125,24 @@ class Edges:
         return out
 
 
+def _light(chain: Chain) -> tuple[Tensor, Tensor, Tensor]:
+    """Of every facet, three (n, H, W): whether the Sun would shine on it, its height above the horizon, and the share of its light that arrives."""
+    site, facet = chain.site, chain.state.reflectance
+    known, above = chain.state.sun_visibility, chain.height_above_horizon()
+    assert known is not None and above is not None
+    lit = chain.lit() & site.valid
+    level = (facet * lit).sum((-2, -1), keepdim=True) / lit.sum((-2, -1), keepdim=True).clamp(min=1)
+    measured = (known + (site.image - chain.predict()) / facet.clamp(min=1e-9)).clamp(-LIMIT, 1 + LIMIT)
+    return site.valid & (facet > DARKEST * level), above, measured
+
+
+def dark_share(chain: Chain) -> float:
+    """Of the facets of a site that should be sunlit for sure, the share that lies in the dark."""
+    use, above, measured = _light(chain)
+    sunlit = use & (above > LIT_MARGIN)
+    return float((sunlit & (measured < 0.5)).sum()) / max(int(sunlit.sum()), 1)
+
+
 def _distances(chain: Chain, use: Tensor) -> Tensor:
     """(n, H, W) px to what makes the horizon; 0 where not in use."""
     state, gsd = chain.state, chain.site.observation.gsd
@@ -160,4 +168,4 @@ def squares(products: Floats, moved: Floats) -> Floats:
     return np.asarray(change @ products @ change)
 
 
-__all__ = ["PARTS", "Edges", "Horizons", "move", "squares"]
+__all__ = ["PARTS", "Edges", "Horizons", "dark_share", "move", "squares"]

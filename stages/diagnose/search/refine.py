@@ -16,7 +16,6 @@ from stages.diagnose.settings import LONGEST, SETTLED, SHORTEST, STEPS
 from stages.effects import Survey, get_effect
 
 EXTRAPOLATED = 3.0  # multiples of a column, beyond which it says little of how large an effect is
-HALVINGS = 5  # of such an estimate
 
 
 def as_effect(found, data: Survey, frames: int, whole):
@@ -79,15 +78,17 @@ def refine(state: State, view: View) -> View:
 
 
 def start_nearer(state: State, view: View, cause: Cause) -> None:
-    """Halve the first estimate of a single amount for all images while that leaves less, where its column was extrapolated to many times its size:
-    effects that grow faster than their column come out far too large at first, and are not found back from there.
+    """Halve the first estimate of a single amount for all images while that leaves less, where its column was extrapolated to many times its size
+    and until it is not any more: effects that grow faster than their column come out far too large at first, and are not found back from there.
     """
     cls = type(cause.effect)
+    if state.free_gains:  # they follow what is rendered, and squares of different values are no measure of it
+        return
     if not cause.single or cls.linear or abs(float(cause.found.amount[0])) < EXTRAPOLATED:
         return
     names = [n for column in cause.found.guise.trial.columns for n in column]
-    kept, least = cause.effect, math.inf
-    for _ in range(HALVINGS):
+    kept, least, amount = cause.effect, math.inf, 2 * abs(float(cause.found.amount[0]))
+    while (amount := amount / 2) > 1:
         state.fit()
         left = _left(state, state.again(view, along(state, view), view.model))
         if left > least:

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from stages.common.arrays import Floats
 from stages.diagnose.likelihood.jackknife import folds, gain_chance, gain_interval, jackknife_error, nats
 from stages.diagnose.model.chain import Chain
-from stages.diagnose.model.nominal import fit
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.edges import PARTS, Edges, Horizons, move, squares
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CLEAR, CORRELATED, FAINT, OPEN, SHADED, UNITS
+from stages.diagnose.settings import CORRELATED, OPEN, SHADED, UNITS
 from stages.effects import Effect, effect_names, get_effect
 
 ROUNDS = 5  # at most, in which the horizons' errors are fitted at a value's best
@@ -160,37 +159,6 @@ def _best(every: Sequence[Tried]) -> list[Effect]:
     return [t.best for t in every if any(t.best.values[k] != v for k, v in t.best.null().items())]
 
 
-def leave_out_dark(state: State) -> bool:
-    """Take ground out of the images that is dark though the DEM has the Sun well above it, if a wall beyond the DEM surely makes it so, and fit the law
-    again: whole images that lie in its shadow would pass for another law, or for gains of theirs.
-    """
-    chains = [c for c in state.chains() if c.state.sun_horizon is not None]
-    if not chains or state.free_gains:
-        return False
-    edges = per_site(Edges, chains)
-    if max(e.dark for e in edges) < FAINT:
-        return False
-    shadows = Shadows(state, edges)
-    raising = [c for c in map(get_effect, shadows.every) if c.raises_horizon]
-    tried = [shadows.tried(shadows.every[c.name], []) for c in raising]
-    first = min(tried, key=lambda t: float(t.held_out().sum()), default=None)
-    if first is None:
-        return False
-    before = shadows.tried([type(first.best)({}, state.data)], []).held_out()
-    percent = gain_interval(before[before > 0], first.held_out()[before > 0])
-    if not percent[1] > 100 * SHADED:
-        return False
-    for chain in chains:
-        sun, horizon, _ = chain.sunlight([first.best])
-        known = chain.sunlight([])[1]
-        assert horizon is not None and known is not None
-        # as far off as the wall itself may be
-        chain.site.keep(chain.site.read_valid & ~((horizon > known) & (horizon > sun[:, None, None] - CLEAR)))
-    state.leave_out_rare_images()
-    fit(state.nominal, state.sites, [], state.units, [s.read for s in state.sites], start=True)
-    return True
-
-
 def by_shadows(state: State) -> list[Named]:
     """The cause that moves shadows surely, more than is ordinary and more than any other does; [] where there is none."""
     chains = [c for c in state.chains() if c.state.sun_horizon is not None]
@@ -223,19 +191,18 @@ def by_shadows(state: State) -> list[Named]:
     most = max(abs(float(e.values[name])) for e in whole.effects)
     if abs(value) >= most:
         return []
-    known = error
+    scatter = 0.0  # how far away a wall stands is open, and whether there is one is not
     if around := effect.shadow_neighbours(state.data):
         near = shadows.in_turn([type(effect)({**t.fixed, **t.columns[0]}, state.data) for t in around])
         effect, scatter = near.open_between(OPEN * float(before.sum()))
-        value, error = float(effect.values[name]), math.hypot(error, scatter)
-    # how far away a wall stands is open, and whether there is one is not
-    nearer = math.copysign(max(abs(value) - 2 * math.hypot(known, effect.shadow_error), 0.0), value)
+        value = float(effect.values[name])
+    nearer = math.copysign(max(abs(value) - 2 * math.hypot(error, effect.shadow_error), 0.0), value)
     if effect.shadows_ordinarily({**effect.values, name: nearer}):
         return []
     made = type(effect)({**effect.values, name: value}, state.data)
     rivals = [t.best.name for t in found if t is not first and not gain_interval(t.held_out()[shown], after)[1] > 0]
     pixels = float(sum(c.site.valid.sum() for c in chains))
-    return [_named(made, error, before, after, pixels, rivals)]
+    return [_named(made, math.hypot(error, scatter), before, after, pixels, rivals)]
 
 
 def _turned(chain: Chain) -> bool:
@@ -292,4 +259,4 @@ def contradicted(state: State) -> dict[str, tuple[float, str]]:
     return out
 
 
-__all__ = ["by_shadows", "contradicted"]
+__all__ = ["Shadows", "by_shadows", "contradicted"]

@@ -99,7 +99,6 @@ class State:
     impossible: set[str] = field(default_factory=set)
     # effects that were fitted and refused -> their largest error, in sizes worth knowing
     open: dict[str, float] = field(default_factory=dict)
-    reference: Nominal | None = None
     # share of the DEM's waves that is relief if all that images show beside it is its errors
     kept: Callable[[Tensor], Tensor] = torch.ones_like
     say: Callable[[str], None] = lambda text: None
@@ -157,7 +156,6 @@ class State:
             return False
         self.nominal = other
         self.fit()
-        self.reference = copy.copy(other)
         return True
 
     def grid(self) -> tuple[Grid, int]:
@@ -175,6 +173,21 @@ class State:
         """Fit the nominal model (and gain and offset of dn images) to the aligned images."""
         self.align()
         fit(self.nominal, self.sites, self.base, self.units, [s.laid for s in self.sites], start=start)
+
+    def plain(self) -> Nominal:
+        """The nominal model as it is fitted to the same images without any cause. Gains and offsets of dn images stay as they are."""
+        nominal = copy.copy(self.nominal)
+        known = [(s.gain, s.offset, s.image) for s in self.sites]
+        fit(nominal, self.sites, [], self.units, [s.laid for s in self.sites])
+        for site, (gain, offset, image) in zip(self.sites, known, strict=True):
+            site.gain, site.offset, site.image = gain, offset, image
+        return nominal
+
+    @property
+    def exposure(self) -> tuple[float, float]:
+        """Gain and offset of the middle image: of what is known in DN and told in I/F."""
+        gain, offset = (torch.cat([getattr(s, name) for s in self.sites]) for name in ("gain", "offset"))
+        return float(gain.median()), float(offset.median())
 
     def leave_out_rare_images(self) -> None:
         """Images that show too few pieces of ground, unless that is all there are."""
