@@ -244,6 +244,27 @@ def test_jackknife_intervals_cover():
     assert held > 270
 
 
+def test_intervals_of_skewed_gains_cover_and_see_what_every_piece_gains():
+    """Few pieces gain much, most little, all of them something: there is a gain, which Student's t takes for scatter."""
+    from stages.common.intervals import student_quantile
+    from stages.diagnose.likelihood.found import interval
+    from stages.diagnose.likelihood.typical import typical_bounds
+
+    rng = np.random.default_rng(5)
+    held = 0
+    for _ in range(400):
+        sizes = rng.gamma(4.0, 1.0, 12)
+        low, high = typical_bounds(sizes * rng.exponential(size=12), sizes)
+        held += low < 1.0 < high
+    assert held > 340  # 85 %: a skewed law is not symmetric about its ratio
+    gains = np.array([100.0, *np.full(11, 1.0)])
+    scatter = float(gains.std(ddof=1)) / len(gains) ** 0.5
+    assert gains.mean() - student_quantile(11) * scatter < 0 < interval(gains)[0]
+    assert interval(gains * np.where(np.arange(12) % 2, -1, 1))[0] < 0  # signs that chance gives
+    assert typical_bounds(gains[:5], np.ones(5)) is None
+    assert typical_bounds(gains, np.array([1.0, *np.full(11, 1e-6)])) is None  # one piece says it all
+
+
 def test_one_amount_for_all_images_stands_for_the_gains_that_it_explains():
     """A pattern over images explains gains that follow it; gains that follow nothing stay what they are."""
     from stages.diagnose.likelihood.weigh import beside_gains

@@ -13,14 +13,14 @@ from scipy.ndimage import gaussian_filter
 
 from stages.diagnose.likelihood.covariance import Covariance, shadow_variance
 from stages.diagnose.likelihood.dem_errors import kept_share
-from stages.diagnose.likelihood.found import Found, interval
+from stages.diagnose.likelihood.found import Found, beyond_bounds, interval
 from stages.diagnose.likelihood.jackknife import folds, jackknife_error
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.aligned import aligned
 from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
-from stages.diagnose.search.doubts import ODD, ORDINARY, beyond_bounds, doubt
+from stages.diagnose.search.doubts import ODD, ORDINARY, doubt
 from stages.diagnose.search.rivals import choose, judge, may_be_another
 from stages.diagnose.search.state import Cause
 from stages.diagnose.settings import FOLDS

@@ -9,7 +9,10 @@ import numpy as np
 
 from stages.common.intervals import effective_units, student_quantile
 from stages.diagnose.likelihood.products import Array
+from stages.diagnose.likelihood.typical import typical_bounds
 from stages.diagnose.rows.columns import Guise
+from stages.diagnose.settings import SURE
+from stages.effects import get_effect
 
 
 @dataclass
@@ -46,13 +49,15 @@ class Found:
 
 
 def interval(gains: Array, sizes: Array | None = None) -> tuple[float, float]:
-    """95 % interval of a sum of gains over independent pieces of ground, by Student's t.
+    """95 % interval of a sum of gains over independent pieces of ground, by their typical values, or Student's t where they are few.
 
     sizes : of the pieces, to which gains are in proportion but for chance (a ratio estimate: Cochran 1977, ch. 6); alike where None
     """
     if sizes is None or len(sizes) != len(gains):
         sizes = np.ones(len(gains))
     share = sizes / max(float(sizes.sum()), 1e-30)
+    if bounds := typical_bounds(gains, share):
+        return bounds
     units = effective_units(share) if share.any() else 0.0
     if units < 2 or len(gains) < 3:
         return -math.inf, math.inf
@@ -62,4 +67,16 @@ def interval(gains: Array, sizes: Array | None = None) -> tuple[float, float]:
     return total - half, total + half
 
 
-__all__ = ["Found", "interval"]
+def beyond_bounds(found: Found) -> bool:
+    """Whether a coordinate of the first estimate is surely not within its bounds: what these allow is not what was found."""
+    cls = get_effect(found.effect)
+    for amount, error, column in zip(found.amount, found.error, found.guise.trial.columns, strict=True):
+        for name, at in column.items():
+            null, (low, high) = cls.null()[name], cls.bounds(name)
+            value, least = null + amount * (at - null), SURE * error * abs(at - null)
+            if value < low - least or value > high + least:
+                return True
+    return False
+
+
+__all__ = ["Found", "beyond_bounds", "interval"]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.tails import student_tail
+from stages.diagnose.likelihood.typical import typical_bounds
 from stages.diagnose.settings import FOLDS
 
 
@@ -36,24 +37,30 @@ def jackknife_error(without: NDArray[np.float64], left: NDArray[np.float64] | No
 
 
 def gain_interval(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Percent by which sums of squares per unit (U,) get smaller in total, and the 95 % interval of that by Student's t."""
+    """Percent by which sums of squares per unit (U,) get smaller in total, and the 95 % interval of that."""
     total = float(before.sum())
     if len(before) < 3 or not total > 0:
         return math.nan, math.nan, math.nan
-    gain = 100 * (1 - float(after.sum()) / total)
-    without = 100 * (1 - (after.sum() - after) / np.maximum(total - before, 1e-30))
-    half = student_quantile(len(before) - 1) * float(jackknife_error(without))
+    gain, error = _gain(before, after)
+    if bounds := typical_bounds(before - after, before):
+        return gain, 100 * bounds[0], 100 * bounds[1]
+    half = student_quantile(len(before) - 1) * error
     return gain, gain - half, gain + half
 
 
 def gain_chance(before: NDArray[np.float64], after: NDArray[np.float64]) -> float:
     """One-sided chance of such a gain where there is none, by Student's t over the units (U,)."""
-    gain, low, _ = gain_interval(before, after)
-    units = len(before)
-    if not math.isfinite(low):
+    if len(before) < 3 or not float(before.sum()) > 0:
         return math.nan
-    error = (gain - low) / student_quantile(units - 1)
-    return student_tail(gain / max(error, 1e-30), units - 1)
+    gain, error = _gain(before, after)
+    return student_tail(gain / max(error, 1e-30), len(before) - 1)
+
+
+def _gain(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[float, float]:
+    """Percent by which sums of squares get smaller, and its standard error."""
+    total = float(before.sum())
+    without = 100 * (1 - (after.sum() - after) / np.maximum(total - before, 1e-30))
+    return 100 * (1 - float(after.sum()) / total), float(jackknife_error(without))
 
 
 def nats(before: float, after: float, pixels: float, per_sample: float) -> float:

@@ -52,14 +52,15 @@ def own_fields(
             matched = match_all(chains, known, frame, level, 1, terms)
             known = beside(matched, none, shares, 1, terms)
         ends.append(known)
-    out = []
-    for k, m in enumerate(matched):
+
+    def nearest(k: int) -> Field:
+        """Of every image at one site the displacement that leaves least."""
         every = [end[k] for end in ends]
-        best = torch.from_numpy(np.argmin([squares for (squares,) in left([m], every)], 0))
-        n = torch.arange(len(best))
-        east, south = (torch.stack([field[axis] for field in every])[best, n] for axis in (0, 1))
-        out.append((east, south))
-    return out
+        best = torch.from_numpy(np.argmin([squares for (squares,) in left(matched[k : k + 1], every)], 0))
+        east, south = (torch.stack([field[axis] for field in every])[best, torch.arange(len(best))] for axis in (0, 1))
+        return east, south
+
+    return per_site(nearest, range(len(matched)))
 
 
 def _near(first: Sequence[Field], second: Sequence[Field]) -> bool:

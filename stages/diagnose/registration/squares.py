@@ -50,11 +50,12 @@ def compared(
     Unlike a form of the whole scene an image's own displacement needs no other ground to be known.
     """
     out = {name: np.zeros((max(group) + 1, frames)) for name in fields}
-    for site, own in enumerate(zip(*fields.values(), strict=True)):
-        of = slice(site * pieces, (site + 1) * pieces)
-        for name, every in zip(fields, left(matched[of], own), strict=True):
-            for g, squares in zip(group[of], every, strict=True):
-                np.add.at(out[name][g], matched[of.start].chain.site.frames, squares)
+    sites = [slice(k, k + pieces) for k in range(0, len(matched), pieces)]
+    every = per_site(lambda k: left(matched[sites[k]], [f[k] for f in fields.values()]), range(len(sites)))
+    for of, squares in zip(sites, every, strict=True):
+        for name, parts in zip(fields, squares, strict=True):
+            for g, part in zip(group[of], parts, strict=True):
+                np.add.at(out[name][g], matched[of.start].chain.site.frames, part)
     return out
 
 

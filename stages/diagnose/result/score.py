@@ -19,7 +19,7 @@ from stages.diagnose.result.answer import Answer, HeldOut, Named
 from stages.diagnose.rows.patches import cuts
 from stages.diagnose.search.select import Outcome
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CORRELATED, SURE
+from stages.diagnose.settings import CORRELATED, FAINT, SURE
 from stages.effects import Effect, effect_names, get_effect
 
 # errors that a value which shadows tell may be nearer to nothing, if lit ground likes it
@@ -111,10 +111,10 @@ def score(state: State, answer: Answer, extended: Nominal) -> HeldOut:
             below = mask & (images[1][0] < effect.keep_below * _level(effect, state))
             mask &= (2 * below.sum((-2, -1)) > mask.sum((-2, -1)))[:, None, None]
         for part, chain, (image, _), off in (
-            (before, nominal.chain(site, []), images[0], []),
-            (after, extended.chain(site, effects), images[1], cut),
+            (before, nominal.chain(site, []), images[0], False),
+            (after, extended.chain(site, effects), images[1], True),
         ):
-            squares, pixels = _squares(site, chain, image, mask, state, off)
+            squares, pixels = _squares(site, chain, image, mask, state, cut, off)
             part.append(squares)
         count += pixels
     if not count > 0:
@@ -151,13 +151,19 @@ Fields = list[tuple[torch.Tensor, torch.Tensor]] | list[None]
 
 
 def _squares(
-    site: Site, chain: Chain, image: torch.Tensor, mask: torch.Tensor, state: State, cut: Sequence[Effect] = ()
+    site: Site,
+    chain: Chain,
+    image: torch.Tensor,
+    mask: torch.Tensor,
+    state: State,
+    cut: Sequence[Effect] = (),
+    off: bool = False,
 ) -> tuple[np.ndarray, float]:
     """Squared errors of the pieces of one ground, and its number of pixels. Where several images show a pixel its own albedo is a nuisance: one
     factor for all of them.
 
     Without it albedo, which no cause is about, would drown what the images of a place disagree on.
-    cut : effects that cut off what is brighter than a level of the detector, which says nothing of albedo and gain
+    cut : effects that cut off what is brighter than a level of the detector, which says nothing of albedo and gain; off : whether the model does so
     """
     known = mask
     for effect in cut:
@@ -181,7 +187,7 @@ def _squares(
         predicted = predicted * torch.where(
             seen > 0, (tells * predicted * measured).sum(0) / seen.clamp(min=1e-12), 1.0
         )
-    for effect in cut:
+    for effect in cut if off else ():
         top = (_level(effect, state) - site.offset) / site.gain
         predicted = torch.minimum(predicted, top[:, None, None] * relative)
     squares = ((measured - predicted).double() * weight).square().sum(0)
@@ -209,7 +215,7 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
         state.fit()
         without = _hidden_squares(state)
         gain, _, high = gain_interval(without, with_cause)
-        if high < 0:
+        if high < -100 * FAINT**2:  # less is not known of the law
             out[cause.effect.name] = cause.found.gain, contradiction(gain, high)
             continue
         state.causes[:], state.nominal = kept, nominal

@@ -7,12 +7,12 @@ import math
 import numpy as np
 
 from stages.common.intervals import student_quantile
-from stages.diagnose.likelihood.found import Found, interval
+from stages.diagnose.likelihood.found import interval
 from stages.diagnose.likelihood.tails import together
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import STILL, SURE
-from stages.effects import Effect, get_effect
+from stages.effects import Effect
 
 ODD = "nothing real has the values that fit best"
 ORDINARY = "is ordinary"
@@ -87,18 +87,6 @@ def doubt_all(state: State, view: View, sure: float = SURE) -> dict[str, tuple[f
     return out
 
 
-def beyond_bounds(found: Found) -> bool:
-    """Whether a coordinate of the first estimate is surely not within its bounds: what these allow is not what was found."""
-    cls = get_effect(found.effect)
-    for amount, error, column in zip(found.amount, found.error, found.guise.trial.columns, strict=True):
-        for name, at in column.items():
-            null, (low, high) = cls.null()[name], cls.bounds(name)
-            value, least = null + amount * (at - null), SURE * error * abs(at - null)
-            if value < low - least or value > high + least:
-                return True
-    return False
-
-
 def ordinary(first: Effect) -> str:
     """Why the effect is nothing special already at a first estimate of its values, or ''."""
     cls = type(first)
@@ -121,7 +109,6 @@ def contradicted(gains: np.ndarray) -> str:
 __all__ = [
     "ODD",
     "ORDINARY",
-    "beyond_bounds",
     "contradicted",
     "doubt",
     "doubt_all",

@@ -52,9 +52,9 @@ def secant_gains(
         for more in _with_cause(state, chain, others, rows, look)
     ]
     gains = whole.gains_on(tested, place, form)
-    grounds = [u.site for u in tested]
-    if len(set(grounds)) >= 3:  # else pieces of ground, where there are too few grounds for an interval
-        gains = np.bincount(grounds, weights=gains).astype(np.float64)
+    grounds, of = np.unique([u.site for u in tested], return_inverse=True)
+    if len(grounds) >= 3:  # else pieces of ground, where there are too few grounds for an interval
+        gains = np.bincount(of, weights=gains).astype(np.float64)
     if not cause.single:
         return cause.found.gains, cause.found.sizes, total, gains
     shades = type(cause.effect).lights_shadows

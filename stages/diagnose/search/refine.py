@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from stages.common.intervals import effective_units
+from stages.diagnose.likelihood.found import Found, beyond_bounds
 from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.search.state import Cause, State, View
@@ -53,6 +54,9 @@ def refine(state: State, view: View) -> View:
     state.fit()  # from here on the coefficients move along as columns
     for _ in range(STEPS):
         now = state.again(view, along(state, view), look.model if look else None)
+        if strange := _impossible(state, now):
+            state.impossible |= strange
+            now, least, last = state.again(view, along(state, view), now.model), math.inf, math.inf
         left = _left(state, now)
         if look is not None and abs(left - least) < SETTLED:
             break
@@ -89,7 +93,6 @@ def start_nearer(state: State, view: View, cause: Cause) -> None:
     names = [n for column in cause.found.guise.trial.columns for n in column]
     kept, least, amount = cause.effect, math.inf, 2 * abs(float(cause.found.amount[0]))
     while (amount := amount / 2) > 1:
-        state.fit()
         left = _left(state, state.again(view, along(state, view), view.model))
         if left > least:
             break
@@ -109,6 +112,20 @@ def _left(state: State, view: View) -> float:
     _, score, _, _ = whole.reduce(np.zeros(1, dtype=np.int64), _stood_for(state, whole))
     whole.precision = kept
     return float(score[0])
+
+
+def _impossible(state: State, view: View) -> set[str]:
+    """Effects fitted beside the causes of which nothing real has as much as fits best: what they stand for is the causes' own."""
+    whole, out = view.whole, set()
+    for guise in view.plan.guises:
+        places = whole.places(guise)
+        if guise.effect in state.impossible or list(guise.columns) != view.plan.ordinary.get(guise.effect):
+            continue
+        information, score, _, _ = whole.reduce(places, _stood_for(state, whole))
+        covariance = np.linalg.inv(information + np.diag(whole.weight(places)))
+        if beyond_bounds(Found(guise.effect, guise, covariance @ score, np.sqrt(covariance.diagonal()), 0.0)):
+            out.add(guise.effect)
+    return out
 
 
 def settle(state: State, view: View) -> None:

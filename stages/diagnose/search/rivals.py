@@ -8,7 +8,7 @@ import numpy as np
 
 from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.likelihood.whole import Whole
-from stages.diagnose.search.doubts import ORDINARY
+from stages.diagnose.search.doubts import ODD, ORDINARY
 from stages.diagnose.settings import SIMPLER
 from stages.effects import get_effect
 
@@ -70,10 +70,13 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
         if refused[other.effect].endswith(ORDINARY):
             if not sure(whole.gains_beside(found, other)):
                 return f"{other.effect}, of which there is an ordinary amount, explains as much of it"
-        elif found.guise.per_frame:  # which stands for what one value for all does, sure or not
-            judge(whole, other)
+            continue
+        judge(whole, other)
+        if found.guise.per_frame:  # which stands for what one value for all does, sure or not
             if found.more_than(other)[0] <= 0:
                 return f"{other.effect}, of which {UNSURE}, explains as much of it"
+        elif not other.guise.per_frame and not refused[other.effect].startswith(ODD) and other.more_than(found)[0] > 0:
+            return f"{other.effect}, of which {UNSURE}, explains more of it"
     if (mirrored := whole.mirrored(found.guise)) and not sure(
         found.gains - whole.held_out(whole.places(mirrored), whole.exclude(mirrored))
     ):

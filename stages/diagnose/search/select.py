@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from stages.diagnose.likelihood.found import Found, interval
+from stages.diagnose.likelihood.found import Found, beyond_bounds, interval
 from stages.diagnose.likelihood.weigh import weigh_all
 from stages.diagnose.search.doubts import (
     ODD,
     ORDINARY,
-    beyond_bounds,
     contradicted,
     doubt,
     doubt_all,
@@ -22,8 +22,10 @@ from stages.diagnose.search.refine import as_effect, errors_over_images, refine,
 from stages.diagnose.search.rivals import another_law, choose, judge, may_be_another, shows_in_shade
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.search.tested import hidden_look
-from stages.diagnose.settings import DISCOVERY, FAINT, NOTABLE, TRIED, TRIES
+from stages.diagnose.settings import DISCOVERY, FAINT, NOTABLE, SHAMS, TRIED, TRIES
 from stages.effects import get_effect
+
+TAKEN, STRANGE, LIKELY = "rendered", "nothing real has its values", "to be fitted"  # how a look at the candidates ends
 
 
 @dataclass
@@ -36,78 +38,116 @@ class Outcome:
     sure: bool = False  # whether something stands out that no plausible effect explains
 
 
+@dataclass
+class Weighed:
+    """Every effect's evidence in one look, the candidates whose gains on held-out ground were computed, those that gain for sure, and why others do not."""
+
+    best: dict[str, Found]
+    tried: list[Found]
+    sure: list[Found]
+    rejected: dict[str, tuple[float, str]]
+
+
 def search(state: State, most: int) -> Outcome:
     """Name causes until no candidate is left."""
     out = Outcome()
     refused: dict[str, str] = {}  # effect -> why
-    view: View | None = None
     state.choose_law()
+    view = state.look(state.open_names())
+    fresh = True  # whether all of it was rendered beside the causes as they are
     while True:
-        # the data look as before where nothing was named
-        view = state.without_impossible(view, state.open_names()) if view else state.look(state.open_names())
         if refused and not state.named and state.law_is_another(view, refused):  # before, it was not
             rendered = {c.effect.name for c in state.causes}
             # of the others nothing was judged beside this law
             refused = {n: why for n, why in refused.items() if n in rendered or get_effect(n).of_law}
             state.impossible.clear()
-            view = None
+            view, fresh = state.look(state.open_names()), True
             continue
-        best, _ = weigh_all(view.whole)
-        out.rejected = {k: v for k, v in out.rejected.items() if k in refused}
-        out.view, out.best = view, best
-        # values per image of a cause are weighed as well: what is left of them is no further cause
-        done = {*refused, *(c.effect.name for c in state.causes)}
-        strong = [f for f in best.values() if f.p <= DISCOVERY and f.effect not in done]
-        strong.sort(key=lambda f: -f.surprise)
-        tried: list[Found] = []
-        for found in strong:
-            judge(view.whole, found)
-            if why := another_law(view.whole, found):
-                out.rejected[found.effect] = (found.gain, why)
-            else:
-                tried.append(found)
-            if len(tried) == TRIED:
-                break
-        tried.sort(key=lambda f: -f.gain)
-        faint = FAINT**2 / 2 * float(view.whole.gram[0, 0])
-        sure = [f for f in tried if f.gain_interval()[0] > 0 and (f.gain > faint or shows_in_shade(view.whole, f))]
-        out.rejected |= {f.effect: (f.gain, _why_not_sure(f, faint)) for f in tried if f not in sure}
+        weighed = _weigh(state, view, refused)
+        out.rejected = {k: v for k, v in out.rejected.items() if k in refused} | weighed.rejected
+        out.view, out.best = view, weighed.best
         if len(state.named) >= most:
             break
-        taken = strange = False
-        for _ in range(TRIES):
-            if not sure or taken or strange:
-                break
-            chosen, group = choose(sure, tried)
-            sure = [f for f in sure if f is not chosen]
-            before = list(state.causes)
-            why = may_be_another(view.whole, chosen, best, refused) or take(state, view, chosen, group)
-            taken, strange = not why, why.startswith(ODD)
-            for gone in [c for c in before if c not in state.causes]:
-                refused[gone.effect.name] = f"beside {chosen.effect} it is no cause any more"
-                out.rejected[gone.effect.name] = (gone.found.gain, refused[gone.effect.name])
-            if taken:
-                state.say(f"{chosen.effect} gains {chosen.gain:.0f} nats on held-out ground")
-                continue
-            state.say(f"{chosen.effect} is not taken: {why}")
-            refused[chosen.effect] = why
-            taken = any(c.effect.name == chosen.effect for c in state.causes)  # rendered, and not named
-            out.rejected[chosen.effect] = (chosen.gain, why)
-            if strange:  # the others were judged beside amounts of it that nothing has
-                out.sure |= chosen.gain > NOTABLE * float(view.whole.gram[0, 0])
-                state.impossible.add(chosen.effect)
-        if not (taken or strange):
-            odd = {f.effect for f in tried if not f.guise.per_frame and beyond_bounds(f)} - state.impossible
+        before = list(state.causes)
+        end = _take_one(state, view, weighed, refused, out, fresh)
+        if end == LIKELY:
+            view, fresh = state.look(state.open_names()), True
+            continue
+        if end == TAKEN:
+            # what was rendered without the new cause shows as well whether anything is left; of one that made way nothing was
+            fresh = not all(c in state.causes for c in before)
+            names = state.open_names()
+            view = state.look(names) if fresh else state.again(view, names, shams=SHAMS, candidates=None)
+            continue
+        if end != STRANGE:
+            odd = {f.effect for f in weighed.tried if not f.guise.per_frame and beyond_bounds(f)} - state.impossible
             if not odd:
                 break
             state.impossible |= odd  # what it gains may not be sure, and it hides others all the same
-        if taken:
-            view = None
+        view = state.without_impossible(view, state.open_names())  # the data look as before
     settle(state, view)
     out.rejected |= doubt_all(state, view)
     for cause in state.named:
         out.rejected.pop(cause.effect.name, None)
     return out
+
+
+def _weigh(state: State, view: View, refused: Mapping[str, str]) -> Weighed:
+    """Which effects have evidence, and of these, which surely gain on held-out ground."""
+    best, _ = weigh_all(view.whole)
+    # values per image of a cause are weighed as well: what is left of them is no further cause
+    done = {*refused, *(c.effect.name for c in state.causes)}
+    strong = [f for f in best.values() if f.p <= DISCOVERY and f.effect not in done]
+    strong.sort(key=lambda f: -f.surprise)
+    tried: list[Found] = []
+    rejected: dict[str, tuple[float, str]] = {}
+    for found in strong:
+        judge(view.whole, found)
+        if why := another_law(view.whole, found):
+            rejected[found.effect] = (found.gain, why)
+        else:
+            tried.append(found)
+        if len(tried) == TRIED:
+            break
+    tried.sort(key=lambda f: -f.gain)
+    faint = FAINT**2 / 2 * float(view.whole.gram[0, 0])
+    sure = [f for f in tried if f.gain_interval()[0] > 0 and (f.gain > faint or shows_in_shade(view.whole, f))]
+    rejected |= {f.effect: (f.gain, _why_not_sure(f, faint)) for f in tried if f not in sure}
+    return Weighed(best, tried, sure, rejected)
+
+
+def _take_one(state: State, view: View, weighed: Weighed, refused: dict[str, str], out: Outcome, fresh: bool) -> str:
+    """Try the candidates that gain for sure until one is rendered; how that ended.
+
+    fresh : whether the look was rendered beside all causes, or has to be before a candidate is fitted that nothing speaks against
+    """
+    sure = weighed.sure
+    for _ in range(TRIES):
+        if not sure:
+            break
+        chosen, group = choose(sure, weighed.tried)
+        sure = [f for f in sure if f is not chosen]
+        before = list(state.causes)
+        why = may_be_another(view.whole, chosen, weighed.best, refused) or unlikely(state, view, chosen)
+        if not why and not fresh:
+            return LIKELY
+        why = why or take(state, view, chosen, group)
+        for gone in [c for c in before if c not in state.causes]:
+            refused[gone.effect.name] = f"beside {chosen.effect} it is no cause any more"
+            out.rejected[gone.effect.name] = (gone.found.gain, refused[gone.effect.name])
+        if not why:
+            state.say(f"{chosen.effect} gains {chosen.gain:.0f} nats on held-out ground")
+            return TAKEN
+        state.say(f"{chosen.effect} is not taken: {why}")
+        refused[chosen.effect] = why
+        out.rejected[chosen.effect] = (chosen.gain, why)
+        if why.startswith(ODD):  # the others were judged beside amounts of it that nothing has
+            out.sure |= chosen.gain > NOTABLE * float(view.whole.gram[0, 0])
+            state.impossible.add(chosen.effect)
+            return STRANGE
+        if any(c.effect.name == chosen.effect for c in state.causes):  # rendered, and not named
+            return TAKEN
+    return ""
 
 
 def _why_not_sure(found: Found, faint: float) -> str:
@@ -117,16 +157,21 @@ def _why_not_sure(found: Found, faint: float) -> str:
     return f"on ground that it was not fitted to it gains {found.gain:.0f} nats ({low:.0f} .. {high:.0f}), which may be nothing"
 
 
-def take(state: State, view: View, found: Found, group: list[str]) -> str:
-    """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
+def unlikely(state: State, view: View, found: Found) -> str:
+    """Why the effect is none already at the first estimate of its values, or ''."""
     cls = get_effect(found.effect)
     if cls.linear and not found.guise.per_frame and beyond_bounds(found):
         return ODD
     first = as_effect(found, state.data, state.frames, view.whole)
     if cls.scope == "scene" and not cls.plausible({k: float(v) for k, v in first.values.items()}, state.data):
         return ODD
-    if why := ordinary(first):
-        return why
+    return ordinary(first)
+
+
+def take(state: State, view: View, found: Found, group: list[str]) -> str:
+    """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
+    cls = get_effect(found.effect)
+    first = as_effect(found, state.data, state.frames, view.whole)
     tested = hidden_look(state, view)
     vector, causes = state.nominal.vector, list(state.causes)
     saved = [(c, c.copy()) for c in causes]

@@ -241,13 +241,7 @@ class State:
         patches = per_site(lambda k: self.patches(k, chains[k]), range(len(chains)))
         self.kept = self.kept_share(chains, patches, grid)
         every = per_site(lambda k: self.rows(patches[k], chains[k], plan), range(len(chains)))
-        rows = [r for part in every for r in part]
-        model = self._covariance(rows, plan, grid)
-        tricks: list[Residual | None] = [None] * len(rows)
-        if shams:
-            tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
-        whole = self._whole(rows, tricks, plan, grid, model)
-        return View(whole, plan, rows, grid, model)
+        return self._view([r for part in every for r in part], plan, grid, None, shams)
 
     def without_impossible(self, view: View, names: Sequence[str]) -> View:
         """The same look beside ordinary amounts of no effect that is impossible by now."""
@@ -255,17 +249,29 @@ class State:
         whole = self._scattered(Whole(view.whole.given, plan, self.frames))
         return View(whole, plan, view.rows, view.grid, view.model)
 
-    def again(self, view: View, names: Sequence[str], model: Covariance | None = None) -> View:
+    def again(
+        self,
+        view: View,
+        names: Sequence[str],
+        model: Covariance | None = None,
+        shams: int = 0,
+        candidates: Container[str] | None = (),
+    ) -> View:
         """A look beside ordinary amounts of these effects. Only the residual and the causes' own columns are rendered, the rest is as in ``view``.
 
-        model : the covariance, estimated where None
+        model : the covariance, estimated where None; candidates : as of :meth:`look`
         """
         chains = self.chains()
-        plan = make_plan(chains[0], names, self.data, candidates=(), impossible=self.impossible)
+        plan = make_plan(chains[0], names, self.data, candidates, self.impossible)
         parts = per_site(lambda k: self.moved(view, k, chains[k], plan), range(len(chains)))
-        rows = [r for part in parts for r in part]
-        model = model or self._covariance(rows, plan, view.grid)
-        return View(self._whole(rows, [None] * len(rows), plan, view.grid, model), plan, rows, view.grid, model)
+        return self._view([r for part in parts for r in part], plan, view.grid, model, shams)
+
+    def _view(self, rows: list[Rows], plan: Plan, grid: Grid, model: Covariance | None, shams: int) -> View:
+        model = model or self._covariance(rows, plan, grid)
+        tricks: list[Residual | None] = [None] * len(rows)
+        if shams:
+            tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
+        return View(self._whole(rows, tricks, plan, grid, model), plan, rows, grid, model)
 
     def moved(self, view: View, site: int, chain: Chain, plan: Plan) -> list[Rows]:
         """Rows of one site of a look under another plan: the residual and the causes' columns by ``chain``, all others as they are."""
