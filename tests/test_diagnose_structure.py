@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, shift
 from scipy.stats import chi2, norm
 
 from stages.diagnose.likelihood.covariance import Covariance
@@ -16,12 +17,15 @@ from stages.diagnose.likelihood.tails import together
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.rows.columns import Plan
 from stages.diagnose.rows.patches import make_grid
+from stages.diagnose.settings import LINE, NOTABLE, PEAK
 from stages.diagnose.structure import kinds
+from stages.diagnose.structure.blocks import blocks_of_compression
 from stages.diagnose.structure.detector import pattern_of_detector
 from stages.diagnose.structure.fields import field_of_images
 from stages.diagnose.structure.innovations import Innovation, innovations
 from stages.diagnose.structure.lines import line_of_brightness, line_of_displacement
 from stages.diagnose.structure.pixels import pixels_that_stand_out
+from stages.diagnose.structure.steps import steps_of_brightness
 
 SIZE, FRAMES = 32, 6
 
@@ -154,14 +158,50 @@ def test_the_nearest_pixel_of_a_detector_leaves_lines_in_where_it_shows_the_grou
     assert line_of_brightness(rows(0.0, 1), Covariance.white(grid.annuli, FRAMES), grid, FRAMES)[0] < 5
 
 
+def test_blocks_of_compression_are_told_from_anything_else():
+    """Each block of eight pixels of the detector has a level of its own, as strongly compressed images have; blocks of seven have no reason."""
+    levels = np.random.default_rng(4).normal(0, 3, (16, 16))
+
+    def compressed(images, slopes, line, sample, side=8):
+        return images + levels[(line // side).astype(int), (sample // side).astype(int)]
+
+    assert max(blocks_of_compression(left(seed), FRAMES)[0] for seed in range(20)) < PEAK
+    ratio, share = blocks_of_compression(left(1, compressed), FRAMES)
+    assert ratio > PEAK and share > NOTABLE
+    assert blocks_of_compression(left(1, partial(compressed, side=7)), FRAMES)[0] < 1
+
+
+def test_steps_of_brightness_survive_resampling_and_smooth_brightness_has_none():
+    rng = np.random.default_rng(8)
+    rough = gaussian_filter(rng.normal(size=(FRAMES, 128, 128)), (0, 6, 6))
+    noisy = 0.05 * (1 + 0.05 * rough / rough.std() + 0.004 * rng.normal(size=rough.shape))
+
+    def found(step: float, resampled: bool = True) -> tuple[float, float, int]:
+        read = np.round(noisy / step) * step if step else noisy
+        read = shift(read, (0, 0.3, 0.4), order=3, mode="nearest") if resampled else read
+        read = torch.from_numpy(read)
+        return steps_of_brightness(
+            [SimpleNamespace(read=read, read_valid=torch.ones_like(read).bool(), frames=np.arange(FRAMES))], FRAMES
+        )
+
+    assert found(0.0)[0] < 5
+    for resampled in (False, True):
+        chance, rms, _ = found(0.001, resampled)
+        assert chance > LINE and rms == pytest.approx(0.001 / 0.05 / 12**0.5, rel=0.3)
+
+
 def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
     """Two specks, a line that a flat field leaves, displacements that bilinear resampling leaves: none; beyond that, each has its words."""
     nothing = {
         "line_of_brightness": (0.0, 0.0, 0.0), "line_of_displacement": (0.0, 0.0), "field_of_images": (0.0, 0.0),
         "pattern_of_detector": (0.0, 0.0), "pixels_that_stand_out": (0, 0.0),
+        "steps_of_brightness": (0.0, 0.0, -1), "blocks_of_compression": (0.0, 0.0),
     }  # fmt: skip
     state = SimpleNamespace(sites=[], frames=1)
-    view = SimpleNamespace(rows=[], model=None, grid=None)
+    grid = make_grid(SIZE, SIZE)
+    view = SimpleNamespace(
+        rows=[], model=Covariance(*[None] * 2, 1e-4 * torch.ones(grid.annuli, 1), *[0.0] * 3), grid=grid
+    )
 
     def words(piled=0.0, **found):
         for name, value in {**nothing, **found}.items():
@@ -177,6 +217,10 @@ def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
     assert len(words(line_of_displacement=(40.0, 0.02))) == 1
     assert words(pattern_of_detector=(0.05, 0.02), field_of_images=(0.05, 0.02)) == []  # not surely
     assert len(words(pattern_of_detector=(0.05, 0.04), field_of_images=(0.05, 0.04))) == 2
+    assert words(steps_of_brightness=(20.0, 0.002, 0)) == [] == words(steps_of_brightness=(40.0, 0.0009, 0))
+    assert words(steps_of_brightness=(40.0, 0.002, 0)) == ["brightness that comes in equal steps"]
+    assert words(blocks_of_compression=(5.0, 0.05)) == [] == words(blocks_of_compression=(9.0, 0.005))
+    assert len(words(blocks_of_compression=(9.0, 0.05))) == 1
     assert words(piled=0.01) == [kinds.PILED]
 
 

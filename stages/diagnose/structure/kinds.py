@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import torch
+
 from stages.diagnose.search.state import State, View
-from stages.diagnose.settings import ALIKE, FAINT, FLAT, LINE, NOTABLE, SPECKS
+from stages.diagnose.settings import ALIKE, FAINT, FLAT, LINE, NOTABLE, PEAK, SPECKS
+from stages.diagnose.structure.blocks import blocks_of_compression
 from stages.diagnose.structure.detector import pattern_of_detector
 from stages.diagnose.structure.fields import field_of_images
 from stages.diagnose.structure.innovations import innovations
 from stages.diagnose.structure.lines import line_of_brightness, line_of_displacement
 from stages.diagnose.structure.pixels import pixels_that_stand_out
+from stages.diagnose.structure.steps import steps_of_brightness
 
 PILED = "brightness that piles up at one level"
 
@@ -39,9 +43,21 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
     count, share = pixels_that_stand_out(left)
     if count >= SPECKS and share > FAINT**2:
         out[f"{count} single pixels that stand out"] = share
+    line, rms, frame = steps_of_brightness(state.sites, state.frames)
+    if line > LINE and (share := rms**2 / _own(view, frame)) > NOTABLE:
+        out["brightness that comes in equal steps"] = min(share, 1.0)
+    ratio, share = blocks_of_compression(left, state.frames)
+    if ratio > PEAK and share > NOTABLE:
+        out["edges every eight pixels of the detector, as compression leaves them"] = share
     if piled:
         out[PILED] = piled
     return out
+
+
+def _own(view: View, frame: int) -> float:
+    """Variance of what an image has of its own, relative to brightness squared."""
+    waves = torch.bincount(view.grid.annulus, minlength=view.grid.annuli)
+    return float((view.model.own[:, frame] * waves).sum() / waves.sum())
 
 
 __all__ = ["structure"]

@@ -1,0 +1,45 @@
+"""Brightness that comes in equal steps: images that were digitised with few levels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.ndimage import median_filter
+
+from stages.diagnose.model.sites import Site
+
+BINS = 8192  # of the histogram
+BRIGHTEST = 4.0  # times the mean: a histogram ends there
+WIDEST = 1 / 30  # of the mean: a step of more is a shape of the histogram
+FINEST = 1 / 600  # of the mean
+AROUND = 513  # waves of the histogram's spectrum that a peak is compared with: it is as wide as the histogram is narrow
+
+
+def steps_of_brightness(sites: Sequence[Site], frames: int) -> tuple[float, float, int]:
+    """-log10 of the chance of the strongest wave in the histogram of any frame's pixels, and what such steps are rms, relative to its mean; which frame (-1: none).
+
+    Flat ground keeps the levels of a detector wherever resampling mixes equal pixels; smooth brightness has a smooth histogram.
+    """
+    best, size, which = 0.0, 0.0, -1
+    per_mean = np.arange(BINS // 2 + 1) / BRIGHTEST  # cycles per mean brightness
+    sought = (per_mean > 1 / WIDEST) & (per_mean < 1 / FINEST)
+    for frame in range(frames):
+        pixels = [s.read[k][s.read_valid[k]] for s in sites for k in np.flatnonzero(s.frames == frame)]
+        values = torch.cat(pixels).numpy() if pixels else np.zeros(0)
+        mean = float(values.mean()) if len(values) else 0.0
+        if not mean > 0:
+            continue
+        counts = np.histogram(values, BINS, (0.0, BRIGHTEST * mean))[0]
+        power = np.abs(np.fft.rfft(counts)) ** 2 / max(counts.sum(), 1)  # of chance alone exponential, with mean 1
+        excess = np.where(sought, power / np.maximum(median_filter(power, AROUND) / math.log(2), 1.0), 0.0)
+        top = int(excess.argmax())
+        chance = excess[top] / math.log(10) - math.log10(sought.sum() * frames)
+        if chance > best:
+            best, size, which = float(chance), 1 / float(per_mean[top]) / math.sqrt(12), frame
+    return best, size, which
+
+
+__all__ = ["steps_of_brightness"]
