@@ -32,7 +32,7 @@ class Penumbra(Effect):
 
     @classmethod
     def shadow_trials(cls, survey: Survey) -> list[Trial]:
-        radii = (0.2666, 0.4, 0.55, 0.7, NARROW, 1.05, 1.3, 1.6, 2.0, 2.5, 3.0, 3.6)
+        radii = (0.2666, 0.4, 0.55, 0.7, NARROW, 1.05, 1.3, 1.6, 2.0, 2.5, 3.0, 3.5, 4.0)
         return [Trial(({"radius_deg": r},)) for r in radii]
 
     @classmethod

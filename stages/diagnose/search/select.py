@@ -173,7 +173,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     cls = get_effect(found.effect)
     first = as_effect(found, state.data, state.frames, view.whole)
     tested = hidden_look(state, view)
-    vector, causes = state.nominal.vector, list(state.causes)
+    vector, causes, impossible = state.nominal.vector, list(state.causes), set(state.impossible)
     saved = [(c, c.copy()) for c in causes]
     cause = Cause(first, found, group=group)
     state.causes.append(cause)
@@ -193,7 +193,7 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         return why
     if why:
         state.open[cause.effect.name] = cause.worst_error
-        state.causes[:] = causes
+        state.causes[:], state.impossible = causes, impossible
         for c, before in saved:
             vars(c).update(vars(before))
         state.nominal.vector = vector
