@@ -15,6 +15,7 @@ from stages.diagnose.likelihood.covariance import Covariance, shadow_variance
 from stages.diagnose.likelihood.dem_errors import kept_share
 from stages.diagnose.likelihood.found import Found, beyond_bounds, interval
 from stages.diagnose.likelihood.jackknife import folds, jackknife_error
+from stages.diagnose.likelihood.products import Products
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.aligned import aligned
 from stages.diagnose.rows.columns import Guise, Plan
@@ -143,6 +144,49 @@ def test_values_per_image_do_not_stand_for_what_one_value_for_all_does():
 
     assert "not sure" in refused([11, 10, 12, 9])
     assert not refused([21, 22, 20, 22])
+
+
+def test_what_another_surely_explains_better_has_no_name_though_that_one_is_not_sure():
+    """Light from the Earth, whose direction images disagree on, leaves a pedestal a part of what it explains."""
+    earth, pedestal = (
+        Guise(name, get_effect(name).trials(Survey())[0], columns)
+        for name, columns in (("earthshine", (0, 1, 2)), ("dark_bias", (3,)))
+    )
+
+    def refused(of_earth, why):
+        both = {g.effect: Found(g.effect, g, np.ones(1), np.ones(1), 9.0) for g in (earth, pedestal)}
+        held = {0: np.array(of_earth, float), 3: np.array([10.0, 12, 9, 11])}
+        whole = _whole(
+            held_out=lambda places, *rest, **kind: held[int(places[0])],
+            power=lambda *rest: np.ones(4),
+            gains_beside=lambda found, other: np.full(4, 10.0),
+        )
+        judge(whole, both["dark_bias"])
+        return may_be_another(whole, both["dark_bias"], both, {"earthshine": why})
+
+    unsure = "other images give it other values: 2.1 errors over images from nothing"
+    assert "explains more" in refused([60, 70, 65, 62], unsure)
+    assert not refused([12, 11, 10, 12], unsure)
+    assert not refused([60, 70, 65, 62], ODD)  # it stands for something that is none of the two
+
+
+def test_optics_that_nothing_real_has_do_not_stand_beside_a_cause():
+    """Of blur there may be any ordinary amount; images that are sharper than their pixels by 0.8 px2 there are none."""
+    trial = get_effect("psf_blur").trials(Survey())[0]
+    guise = Guise("psf_blur", trial, (0,))
+    ((_, size),) = trial.columns[0].items()
+    rng = np.random.default_rng(7)
+    for blur, impossible in ((-0.8, True), (-0.2, False), (0.5, False)):
+        column, noise = rng.normal(0, 1, (2, 4000))
+        every = np.stack([blur / size * column + noise, column])
+        plan = Plan(shared=["psf_blur"], guises=[guise], ordinary={"psf_blur": [0]}, prior={0: 1.2})
+        whole = Whole(
+            [Products(every @ every.T, np.arange(2), np.zeros((2, 0)), np.zeros(0), 0)], plan, 1, drifting=False
+        )
+        state = SimpleNamespace(impossible=set(), causes=[])
+        assert refine._impossible(state, SimpleNamespace(whole=whole, plan=plan)) == (
+            {"psf_blur"} if impossible else set()
+        )
 
 
 def test_light_from_above_alone_is_a_pedestal():
