@@ -21,12 +21,22 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import better_form, other_laws, relative_misfit
 from stages.diagnose.model.laws import LunarLaws
 from stages.diagnose.model.nominal import Nominal, fit, lit_mask, load_nominal
+from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site, all_over, grounds, load_site, survey
 from stages.diagnose.registration.explain import explain
+from stages.diagnose.registration.mimicked import mimicked_shift
 from stages.diagnose.result.answer import Answer, Named
 from stages.diagnose.result.files import write_diagnosis
 from stages.diagnose.result.named import Cut, by_histogram, by_registration, by_search, outside_catalogue
-from stages.diagnose.result.score import beside_shadows, blind_effects, contradiction, displacements, score, unconfirmed
+from stages.diagnose.result.score import (
+    beside_shadows,
+    blind_effects,
+    contradiction,
+    contradicts,
+    displacements,
+    score,
+    unconfirmed,
+)
 from stages.diagnose.search.doubts import doubt_all
 from stages.diagnose.search.ground import by_ground
 from stages.diagnose.search.refine import settle
@@ -153,10 +163,9 @@ def _fill(
     """
     view = outcome.view
     assert view is not None
-    displaced = state.registration is not None and state.registration.displaced
-    if state.named and displaced:  # what looked like a displacement may have been a cause that is named by now
+    if again := _mimics_displacement(state):  # what looked like one may have been a cause that is named by now
         _register(state)
-    if doubted or (state.named and displaced):
+    if doubted or again:
         settle(state, view)
         doubted |= doubt_all(state, view, STILL)
     after = _residual(state)
@@ -173,7 +182,9 @@ def _fill(
     shaded, extended, contrary = _by_shadows(state)
     answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + [*shaded] + ground
     answer.held_out = score(state, answer, extended)
-    if placed and answer.held_out.high < 0:  # albedo that follows relief, of which nobody is sure, looks like a shift
+    if placed and contradicts(
+        answer.held_out.high
+    ):  # albedo that follows relief, of which nobody is sure, looks like a shift
         refused |= {c.effect.name: (c.gain, contradiction(answer.held_out.gain, answer.held_out.high)) for c in placed}
         answer.causes = [c for c in answer.causes if c not in placed]
         answer.held_out = score(state, answer, extended)
@@ -202,6 +213,15 @@ def _register(state: State) -> None:
     for site, found in zip(state.hidden, displacements(state, [])[1], strict=True):
         site.displacement = found if placed else None
     state.fit()
+
+
+def _mimics_displacement(state: State) -> bool:
+    """Whether the named causes look like a displacement by more than the error of one, where images are displaced."""
+    if not state.named or state.registration is None or not state.registration.displaced:
+        return False
+    ordinary = [c.effect for c in state.causes if c.ordinary]
+    without = per_site(lambda site: state.nominal.chain(site, ordinary), state.sites)
+    return mimicked_shift(state.chains(), without) > state.registration.shift_error
 
 
 def _by_shadows(state: State) -> tuple[Sequence[Named], Nominal, dict[str, tuple[float, str]]]:

@@ -41,7 +41,7 @@ def beside_shadows(
     best, kept = models[int(np.argmin(cost))]
     (before, after), _ = _squares_of(state, state.hidden, [(_fitted_beside(state, []), []), (best, kept)])
     gain, _, high = gain_interval(before, after)
-    if not high < 0:
+    if not contradicts(high):
         return kept, best, {}
     return [], state.nominal, {c.effect.name: (c.gain, contradiction(gain, high)) for c in shaded}
 
@@ -79,6 +79,11 @@ def _nearer(cause: Named, errors: float) -> Named:
     value -= math.copysign(errors * error, value - effect.null()[name])
     made = type(effect)({**effect.values, name: value}, effect.survey)
     return dataclasses.replace(cause, effect=made, parameters={**cause.parameters, name: (value, error, unit)})
+
+
+def contradicts(high: float) -> bool:
+    """Whether test pairs surely lose by a cause: by more than the law is not known. high : upper bound of their gain, percent"""
+    return high < -100 * FAINT**2
 
 
 def contradiction(gain: float, high: float) -> str:
@@ -215,7 +220,7 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
         state.fit()
         without = _hidden_squares(state)
         gain, _, high = gain_interval(without, with_cause)
-        if high < -100 * FAINT**2:  # less is not known of the law
+        if contradicts(high):
             out[cause.effect.name] = cause.found.gain, contradiction(gain, high)
             continue
         state.causes[:], state.nominal = kept, nominal
@@ -273,4 +278,4 @@ def _could_not_show(state: State, outcome: Outcome, name: str) -> bool:
     return SURE * max(found, error) > 1
 
 
-__all__ = ["beside_shadows", "blind_effects", "contradiction", "score", "unconfirmed"]
+__all__ = ["beside_shadows", "blind_effects", "contradiction", "contradicts", "score", "unconfirmed"]

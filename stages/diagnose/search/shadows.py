@@ -180,10 +180,12 @@ def by_shadows(state: State) -> list[Named]:
     if first is None or not shown.any():
         return []
     before, after = every[shown], first.held_out()[shown]
-    percent = gain_interval(before, after)
-    if not percent[1] > 0 or percent[0] < 100 * SHADED:
-        return []
     effect = first.best
+    around = effect.shadow_neighbours(state.data)
+    percent = gain_interval(before, after)
+    least = 100 * SHADED if around else 0.0  # of several values some would fit by chance
+    if not percent[1] > least or percent[0] < 100 * SHADED:
+        return []
     whole = shadows.in_turn([e for e in shadows.every[effect.name] if _on_one_line(e, effect)])
     effect, value = whole.best, whole.value()
     name = effect.fitted()[0].name
@@ -192,7 +194,7 @@ def by_shadows(state: State) -> list[Named]:
     if abs(value) >= most:
         return []
     scatter = 0.0  # how far away a wall stands is open, and whether there is one is not
-    if around := effect.shadow_neighbours(state.data):
+    if around:
         near = shadows.in_turn([type(effect)({**t.fixed, **t.columns[0]}, state.data) for t in around])
         effect, scatter = near.open_between(OPEN * float(before.sum()))
         value = float(effect.values[name])
