@@ -161,13 +161,13 @@ def _fill(
 
     doubted : what was taken back already; cut : what the histogram shows; before : mean square of the residual when nothing was known
     """
-    view = outcome.view
-    assert view is not None
+    view, beside = outcome.view, outcome.beside
+    assert view is not None and beside is not None
     if again := _mimics_displacement(state):  # what looked like one may have been a cause that is named by now
         _register(state)
     if doubted or again:
-        settle(state, view)
-        doubted |= doubt_all(state, view, STILL)
+        settle(state, beside)
+        doubted |= doubt_all(state, beside, STILL)
     after = _residual(state)
     left = outside_catalogue(state) | structure(state, view, cut[1] if cut else 0.0)
     ordinary = {c.effect.name for c in state.causes} - {c.effect.name for c in state.named}

@@ -30,8 +30,10 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
         return ODD
     for name in [n for n in cause.errors if n not in cls.shaped]:  # a shape may end anywhere
         value, near = values[name], cause.of_given_shape.get(name, 1e-9)
-        bounds = [b for b in cls.bounds(name) if b != cls.null()[name]]
-        if any(abs(value - b) < near for b in bounds):
+        low, high = (
+            math.inf * side if b == cls.null()[name] else b for b, side in zip(cls.bounds(name), (-1, 1), strict=True)
+        )
+        if not low + near <= value <= high - near:
             return f"{ODD}: {name} ends at {value:.3g}, within an error of a bound of what is possible"
 
     # an effect that may be nothing has no shape that could be uncertain

@@ -303,4 +303,4 @@ def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     return float(np.sqrt((move**2).mean() / max(inverse.diagonal().mean(), 1e-12)))
 
 
-__all__ = ["as_effect", "errors_over_images", "refine", "settle", "start_nearer"]
+__all__ = ["along", "as_effect", "errors_over_images", "refine", "settle", "start_nearer"]

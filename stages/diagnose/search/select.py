@@ -18,7 +18,7 @@ from stages.diagnose.search.doubts import (
     ordinary,
 )
 from stages.diagnose.search.gains import secant_gains
-from stages.diagnose.search.refine import as_effect, errors_over_images, refine, settle, start_nearer
+from stages.diagnose.search.refine import along, as_effect, errors_over_images, refine, settle, start_nearer
 from stages.diagnose.search.rivals import another_law, choose, judge, may_be_another, shows_in_shade
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.search.tested import hidden_look
@@ -30,9 +30,13 @@ TAKEN, STRANGE, LIKELY = "rendered", "nothing real has its values", "to be fitte
 
 @dataclass
 class Outcome:
-    """The last look, every effect's evidence there, and what had strong evidence and was not named (name -> nats, why)."""
+    """The last look, every effect's evidence there, and what had strong evidence and was not named (name -> nats, why).
+
+    beside : what is fitted along, as it was rendered beside the causes
+    """
 
     view: View | None = None
+    beside: View | None = None
     best: dict[str, Found] = field(default_factory=dict)
     rejected: dict[str, tuple[float, str]] = field(default_factory=dict)
     sure: bool = False  # whether something stands out that no plausible effect explains
@@ -85,8 +89,9 @@ def search(state: State, most: int) -> Outcome:
                 break
             state.impossible |= odd  # what it gains may not be sure, and it hides others all the same
         view = state.without_impossible(view, state.open_names())  # the data look as before
-    settle(state, view)
-    out.rejected |= doubt_all(state, view)
+    out.beside = view if fresh or not state.named else state.look(along(state, view), 0, ())
+    settle(state, out.beside)
+    out.rejected |= doubt_all(state, out.beside)
     for cause in state.named:
         out.rejected.pop(cause.effect.name, None)
     return out
@@ -160,12 +165,13 @@ def _why_not_sure(found: Found, faint: float) -> str:
 def unlikely(state: State, view: View, found: Found) -> str:
     """Why the effect is none already at the first estimate of its values, or ''."""
     cls = get_effect(found.effect)
-    if cls.linear and not found.guise.per_frame and beyond_bounds(found):
+    beyond = not found.guise.per_frame and beyond_bounds(found)
+    if beyond and cls.linear:
         return ODD
     first = as_effect(found, state.data, state.frames, view.whole)
     if cls.scope == "scene" and not cls.plausible({k: float(v) for k, v in first.values.items()}, state.data):
         return ODD
-    return ordinary(first)
+    return "" if beyond else ordinary(first)  # a bound is no estimate of its size
 
 
 def take(state: State, view: View, found: Found, group: list[str]) -> str:
