@@ -23,7 +23,7 @@ from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
 from stages.diagnose.search.doubts import ODD, ORDINARY, doubt
 from stages.diagnose.search.rivals import choose, judge, may_be_another
-from stages.diagnose.search.state import Cause
+from stages.diagnose.search.state import Cause, State
 from stages.diagnose.settings import FOLDS
 from stages.effects import get_effect
 from stages.effects.base import Survey, Trial
@@ -187,6 +187,24 @@ def test_optics_that_nothing_real_has_do_not_stand_beside_a_cause():
         assert refine._impossible(state, SimpleNamespace(whole=whole, plan=plan)) == (
             {"psf_blur"} if impossible else set()
         )
+
+
+@pytest.mark.parametrize(
+    ("shown", "kept"),
+    [
+        ([[0, 1, 2]] * 5 + [[3]], {0, 1, 2}),  # one image beside them: its own variance is not known
+        ([[k % 8] for k in range(18)], set(range(8))),  # two images show three places and all others two
+        ([[k] for k in range(12)], set(range(12))),
+    ],
+)
+def test_images_that_show_little_ground_are_left_out_unless_most_ground_is_shown_by_such(shown, kept):
+    sites = [SimpleNamespace(frames=np.array(of), left_out=frozenset()) for of in shown]
+    state = SimpleNamespace(
+        chains=lambda: sites, frames=12, sites=sites,
+        patches=lambda number, chain: [SimpleNamespace(frames=torch.tensor(shown[number]))],
+    )  # fmt: skip
+    State.leave_out_rare_images(state)
+    assert {int(f) for s in sites for k, f in enumerate(s.frames) if k not in s.left_out} == kept
 
 
 def test_light_from_above_alone_is_a_pedestal():

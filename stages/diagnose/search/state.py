@@ -190,10 +190,13 @@ class State:
         return float(gain.median()), float(offset.median())
 
     def leave_out_rare_images(self) -> None:
-        """Images that show too few pieces of ground, unless that is all there are."""
+        """Images that show too few pieces of ground, unless most ground is shown by such."""
         patches = [p for k, chain in enumerate(self.chains()) for p in self.patches(k, chain)]
-        seen = torch.bincount(torch.cat([p.frames for p in patches]), minlength=self.frames) if patches else None
-        if seen is not None and int(seen.max()) >= SEEN:
+        if not patches:
+            return
+        frames = torch.cat([p.frames for p in patches])
+        seen = torch.bincount(frames, minlength=self.frames)
+        if int((seen[frames] >= SEEN).sum()) > len(frames) / 2:
             for site in self.sites:
                 site.left_out = frozenset(k for k, f in enumerate(site.frames) if seen[f] < SEEN)
 
