@@ -216,12 +216,12 @@ def _register(state: State) -> None:
 
 
 def _mimics_displacement(state: State) -> bool:
-    """Whether the named causes look like a displacement by more than the error of one, where images are displaced."""
+    """Whether the named causes look like a displacement by more than a tenth of the error of one, where images are displaced: it has a part of them."""
     if not state.named or state.registration is None or not state.registration.displaced:
         return False
     ordinary = [c.effect for c in state.causes if c.ordinary]
     without = per_site(lambda site: state.nominal.chain(site, ordinary), state.sites)
-    return mimicked_shift(state.chains(), without) > state.registration.shift_error
+    return mimicked_shift(state.chains(), without) > 0.1 * state.registration.shift_error
 
 
 def _by_shadows(state: State) -> tuple[Sequence[Named], Nominal, dict[str, tuple[float, str]]]:
