@@ -29,6 +29,7 @@ FEWEST_PIXELS = 400  # of an image in a crop: fewer do not give a spectrum
 CAPTURE = 8  # px: displacements are sought up to here; further off, neighbouring craters match as well
 BROAD = 6.0  # px, sigma: broader structure (albedo, film) is taken out before images are matched
 FIELD_ORDER = 3  # degree of the polynomial over the scene that stands for a smooth field per frame
+MIMICKED = 0.1  # of the error of a shift: where causes looked like a quarter, registration had a tenth of them
 
 # --- covariance ---
 SECTORS = 6  # directions of waves that are told apart: relief shows by its direction to the Sun

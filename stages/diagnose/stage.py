@@ -44,7 +44,7 @@ from stages.diagnose.search.select import Outcome, search
 from stages.diagnose.search.shadows import by_shadows, contradicted
 from stages.diagnose.search.state import State
 from stages.diagnose.search.walls import hide_dark
-from stages.diagnose.settings import MISFIT, STILL
+from stages.diagnose.settings import MIMICKED, MISFIT, STILL
 from stages.diagnose.structure.kinds import PILED, structure
 from stages.effects import effect_names, get_effect
 from stages.pairs.reader import PairReader
@@ -182,9 +182,8 @@ def _fill(
     shaded, extended, contrary = _by_shadows(state)
     answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + [*shaded] + ground
     answer.held_out = score(state, answer, extended)
-    if placed and contradicts(
-        answer.held_out.high
-    ):  # albedo that follows relief, of which nobody is sure, looks like a shift
+    # albedo that follows relief, of which nobody is sure, looks like a shift
+    if placed and contradicts(answer.held_out.high):
         refused |= {c.effect.name: (c.gain, contradiction(answer.held_out.gain, answer.held_out.high)) for c in placed}
         answer.causes = [c for c in answer.causes if c not in placed]
         answer.held_out = score(state, answer, extended)
@@ -216,12 +215,12 @@ def _register(state: State) -> None:
 
 
 def _mimics_displacement(state: State) -> bool:
-    """Whether the named causes look like a displacement by more than a tenth of the error of one, where images are displaced: it has a part of them."""
+    """Whether images are displaced and that has a part of what the named causes do."""
     if not state.named or state.registration is None or not state.registration.displaced:
         return False
     ordinary = [c.effect for c in state.causes if c.ordinary]
     without = per_site(lambda site: state.nominal.chain(site, ordinary), state.sites)
-    return mimicked_shift(state.chains(), without) > 0.1 * state.registration.shift_error
+    return mimicked_shift(state.chains(), without) > MIMICKED * state.registration.shift_error
 
 
 def _by_shadows(state: State) -> tuple[Sequence[Named], Nominal, dict[str, tuple[float, str]]]:

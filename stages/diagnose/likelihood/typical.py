@@ -12,13 +12,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.common.intervals import effective_units
+from stages.common.intervals import LEVEL, effective_units
 
 FEWEST = 6  # pieces, whose 63 subsets leave 3 % outside of them all; of fewer no interval holds 95 %
 EQUAL = 4.0  # ... and of pieces that say as much as fewer equal ones (Kish) most subsets say nothing
-ALL = 12  # pieces of which every subset is taken
-DRAWN = 4000  # subsets of more pieces: the chance beyond a bound is known to a tenth
-OUTSIDE = 0.025  # chance beyond either bound
+ALL = 12  # pieces of which every subset is taken, and of more as many, drawn: the chance beyond a bound is known to a tenth
 
 
 def typical_bounds(values: NDArray[np.float64], sizes: NDArray[np.float64]) -> tuple[float, float] | None:
@@ -28,7 +26,7 @@ def typical_bounds(values: NDArray[np.float64], sizes: NDArray[np.float64]) -> t
         return None
     subsets = _subsets(int(says.sum()))
     ratios = np.sort((subsets @ values[says]) / (subsets @ sizes[says]))
-    beyond = max(int(OUTSIDE * (len(ratios) + 1)), 1)
+    beyond = max(int((1 - LEVEL) / 2 * (len(ratios) + 1)), 1)
     return float(ratios[beyond - 1]), float(ratios[-beyond])
 
 
@@ -37,7 +35,7 @@ def _subsets(count: int) -> NDArray[np.float64]:
     """(subsets, count) of 0 and 1, none of them empty."""
     if count <= ALL:
         return ((np.arange(1, 2**count)[:, None] >> np.arange(count)) & 1).astype(np.float64)
-    drawn = np.random.default_rng(count).random((DRAWN, count)) < 0.5
+    drawn = np.random.default_rng(count).random((2**ALL, count)) < 0.5
     return drawn[drawn.any(1)].astype(np.float64)
 
 
