@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -90,6 +91,16 @@ def test_the_test_pairs_take_a_name_back(answers):
         state.causes[:] = [c for c in state.causes if c.effect is not invented]
     assert list(refused) == ["image_gain"] and "test pairs" in refused["image_gain"][1]
     assert [c.effect.name for c in state.causes] == before
+
+
+@pytest.mark.parametrize(("alone", "refused"), [(100.01, False), (150.0, True)])
+def test_the_test_pairs_judge_what_an_effect_does_there_and_not_the_law_beside_it(monkeypatch, alone, refused):
+    """They lose one in a hundred by it. Albedo that all their images share makes no difference to them; the law, fitted again without it, does."""
+    cause = SimpleNamespace(effect=SimpleNamespace(name="one"), found=SimpleNamespace(gain=1.0))
+    state = SimpleNamespace(causes=[cause], named=[cause], nominal=None, fit=lambda: None)
+    squares = iter([101.0, alone + 1.0, 100.0])
+    monkeypatch.setattr(score, "_hidden_squares", lambda _: np.full(8, next(squares)))
+    assert bool(unconfirmed(state)) == refused
 
 
 def test_a_single_test_ground_has_pieces_and_an_interval(answers, monkeypatch):

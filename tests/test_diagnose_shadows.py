@@ -25,14 +25,15 @@ class ShadowedGround:
     """A site that a Sun in the west shines on, whose horizon stands at the border of its DEM and is rough.
 
     wall : (height, distance from the crop), m; sun_deg : too high by so much; radius_deg : of the disc
-    dem_px : px by which errors of the DEM, as they are seen from a pixel away, blur its horizons, rad px
+    dem_px : errors of the DEM's horizons as they are seen from a pixel away, rad; fall : power of the distance with which they fall
     """
 
-    def __init__(self, rng, number, wall=None, sun_deg=0.0, radius_deg=0.2666, dem_px=0.0):
+    def __init__(self, rng, number, wall=None, sun_deg=0.0, radius_deg=0.2666, dem_px=0.0, fall=1.0):
         suns = [[-np.cos(a), 0.0, np.sin(a)] for a in np.radians([8.0, 14.0, 30.0])]
         self.suns = torch.tensor(suns, dtype=torch.float32)
         known = torch.from_numpy(np.radians(rng.normal(2.0, 6.0, (1, 64, 64)))).float().expand(3, 64, 64)
-        true = known + dem_px * torch.from_numpy(rng.normal(size=(1, 64, 64))).float() / torch.arange(1.0, 65.0)
+        wrong = dem_px * torch.from_numpy(rng.normal(size=(1, 64, 64))).float()
+        true = known + wrong / torch.arange(1.0, 65.0) ** fall
         if wall:
             east = torch.linspace(-315.0, 315.0, 64).expand(3, 64, 64)
             true = torch.maximum(true, torch.atan2(torch.tensor(wall[0]), wall[1] + 320.0 + east))
@@ -67,6 +68,7 @@ class ShadowedGround:
     [
         ({}, None, "", 0.0),
         ({"dem_px": 0.2}, None, "", 0.0),
+        ({"dem_px": 0.2, "fall": 0.5}, None, "", 0.0),
         ({"wall": (110.0, 320.0)}, "distant_shadow", "height_m", 110.0),
         ({"wall": (200.0, 768.0)}, "distant_shadow", "height_m", 200.0),
         ({"wall": (40.0, 110.0)}, "distant_shadow", "height_m", 40.0),
@@ -75,6 +77,7 @@ class ShadowedGround:
         ({"sun_deg": -1.5, "dem_px": 0.2}, "sun_elevation", "error_deg", -1.5),
         ({"radius_deg": 2.0}, "penumbra", "radius_deg", 2.0),
         ({"radius_deg": 2.0, "dem_px": 0.2}, "penumbra", "radius_deg", 2.0),
+        ({"radius_deg": 3.0, "dem_px": 0.05, "fall": 0.5}, "penumbra", "radius_deg", 3.0),
     ],
 )
 def test_shadows_tell_a_wall_the_sun_and_its_disc_whatever_the_law(planted, name, parameter, truth):

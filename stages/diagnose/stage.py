@@ -111,10 +111,10 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
     cut = by_histogram(sites, units)
     fit(nominal, sites, [], units, [s.read for s in sites], start=True)
     nominal.laws = other_laws(nominal, sites, units)
-    if other := better_form(nominal, sites, units):
+    data = survey(sites, frames, units)
+    if other := better_form(nominal, sites, data):
         nominal = other
         fit(nominal, sites, [], units, [s.read for s in sites])
-    data = survey(sites, frames, units)
     state = State(
         nominal, sites, data, frames, units, frozenset({"sun_horizon"}), config.seed, hidden, say=say, progress=progress
     )

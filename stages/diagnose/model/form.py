@@ -16,7 +16,8 @@ from stages.diagnose.model.nominal import Nominal, fit, lit_mask
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sampled import draw
 from stages.diagnose.model.sites import Site
-from stages.diagnose.settings import CORRELATED, HALVED
+from stages.diagnose.settings import CORRELATED, FAINT, HALVED
+from stages.effects import Survey, effect_names, get_effect
 
 
 def relative_misfit(nominal: Nominal, sites: Sequence[Site], varied: bool = False, whole: bool = False) -> float:
@@ -49,20 +50,48 @@ def other_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> LunarLaws
     return lunar_laws(cosines.flatten(1), float(measured.mean()) if units == "iof" else None)
 
 
-def better_form(nominal: Nominal, sites: Sequence[Site], units: str) -> Nominal | None:
+def better_form(nominal: Nominal, sites: Sequence[Site], data: Survey) -> Nominal | None:
     """Measured lunar laws, fitted, if they leave surely less than the nominal one; or None. The sites are as they were.
 
-    Of calibrated images they leave less than half, for a single cause may be what the nominal law lacks. Of images with free gains, beside which
-    no cause is known by what it does to the law, they leave surely less of ground that neither law was fitted to.
+    Of calibrated images they leave less than half, and less than the nominal law beside any one effect of the law, for that may be what it
+    lacks. Of images with free gains, beside which no cause is known by what it does to the law, they leave surely less of ground that
+    neither law was fitted to.
     """
-    other = measured_laws(nominal, sites, units)
+    other = measured_laws(nominal, sites, data.units)
     if other is None:
         return None
-    if units == "dn":
+    if data.units == "dn":
         sure = gain_interval(left_elsewhere(nominal, sites), left_elsewhere(other, sites))[1] > 0
     else:
-        sure = relative_misfit(other, sites) ** 2 <= HALVED * relative_misfit(nominal, sites) ** 2
+        left = (relative_misfit(other, sites) / relative_misfit(nominal, sites)) ** 2
+        sure = left <= HALVED and left * (1 + FAINT) ** 2 < left_beside_one(nominal, sites, data)
     return other if sure else None
+
+
+def left_beside_one(nominal: Nominal, sites: Sequence[Site], data: Survey) -> float:
+    """Share of the squared residuals that the nominal law leaves beside the one effect of the law that takes most of them away, to first order."""
+    classes = [c for c in map(get_effect, effect_names()) if c.of_law and c.scope == "scene"]
+    trials = [(c, trial) for c in classes for trial in c.trials(data)]
+
+    def of(site: Site) -> Tensor:
+        """Products of the residual, of what each coefficient adds to it, and of what each column of a trial adds."""
+        chain = nominal.chain(site, [])
+        columns = [site.image - chain.rendered, *chain.surface_tangents()]
+        columns += [
+            chain.render(c({**t.fixed, **column}, data)) - chain.rendered for c, t in trials for column in t.columns
+        ]
+        flat = (torch.stack(columns) * lit_mask(chain)).flatten(1).double()
+        return flat @ flat.T
+
+    gram = torch.stack(per_site(of, sites)).sum(0).numpy()
+    first = 1 + int(nominal.free.sum())
+    shares, at = [1.0], first
+    for _, trial in trials:
+        free = [*range(1, first), *range(at, at + len(trial.columns))]
+        at += len(trial.columns)
+        amounts = np.linalg.lstsq(gram[np.ix_(free, free)], gram[free, 0], rcond=1e-12)[0]
+        shares.append(float(1 - amounts @ gram[free, 0] / gram[0, 0]))
+    return min(shares)
 
 
 def left_elsewhere(nominal: Nominal, sites: Sequence[Site]) -> Floats:
@@ -131,4 +160,12 @@ def measured_laws(nominal: Nominal, sites: Sequence[Site], units: str) -> Nomina
     return other
 
 
-__all__ = ["better_form", "left_elsewhere", "may_be_exchanged", "measured_laws", "other_laws", "relative_misfit"]
+__all__ = [
+    "better_form",
+    "left_beside_one",
+    "left_elsewhere",
+    "may_be_exchanged",
+    "measured_laws",
+    "other_laws",
+    "relative_misfit",
+]

@@ -216,11 +216,13 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
         with_cause = _hidden_squares(state)
         kept, nominal = list(state.causes), state.nominal
         state.causes[:] = [c for c in kept if c is not cause]
+        by_itself = abs(float((_hidden_squares(state) - with_cause).sum()))  # beside the same law
         state.nominal = copy.copy(nominal)
         state.fit()
         without = _hidden_squares(state)
         gain, _, high = gain_interval(without, with_cause)
-        if contradicts(high):
+        # what all images of a place share, albedo say, these pairs do not judge: a law that was fitted without it makes the difference
+        if contradicts(high) and 2 * by_itself > float((with_cause - without).sum()):
             out[cause.effect.name] = cause.found.gain, contradiction(gain, high)
             continue
         state.causes[:], state.nominal = kept, nominal

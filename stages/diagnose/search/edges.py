@@ -1,9 +1,10 @@
 """Where shadows end, and how well a DEM can know it.
 
 What casts a shadow is off by some height, and so is the ground that it falls on: seen from there, the horizon is off by an angle
-that goes with one over the distance. So errors of the DEM, and relief finer than it, widen the edges of shadows cast from near by and
+that falls with the distance, as one over it where heights are as wrong far apart as near by, and as one over its root where they go apart
+like terrain itself. So errors of the DEM, and relief finer than it, widen the edges of shadows cast from near by and
 lengthen them (a horizon is the highest of all that stands in a direction), while a wide Sun widens all edges by the same angle and a wrong
-one moves all by the same. Two lengths say how much: ``blur`` and ``lift``, fitted wherever shadows are compared.
+one moves all by the same. Two numbers say how much: ``blur`` and ``lift``, fitted wherever shadows are compared.
 """
 
 from __future__ import annotations
@@ -24,16 +25,21 @@ from stages.physics.horizon import occluder_distance
 from stages.physics.light.sun_disc import sun_visibility, visibility_slope
 
 LIMIT = 0.3  # of a share of light, beyond 0 and 1: noise that is cut off there alone would make all edges look wide
+FALLS = 1.0, 0.5  # which of the two holds for a DEM nobody knows; on ten other DEMs edges were between them
 NEAREST = 3.0  # px: edges of shadows cast from nearer by hang on the slope of the ground itself
 PARTS = 4  # bands of a site's lines that are judged apart, where grounds are few
 
 
 @dataclass(frozen=True)
 class Horizons:
-    """What errors of the DEM do to its horizons, for terrain at a distance of one pixel: radius of the blur and lift, rad px."""
+    """What errors of the DEM do to its horizons, for terrain at a distance of one pixel: radius of the blur and lift, rad.
+
+    fall : power of the distance with which they fall, between FALLS
+    """
 
     blur: float = 0.15
     lift: float = 0.0
+    fall: float = 1.0
 
 
 @dataclass
@@ -105,7 +111,7 @@ class Edges:
 
         def of(facets: _Facets) -> Tensor:
             """(PARTS, 3, 3) of some facets."""
-            nearness = torch.where(raised[facets.pixel], 0.0, facets.nearness)
+            nearness = torch.where(raised[facets.pixel], 0.0, facets.nearness**about.fall)
             above = sun[facets.image] - horizon.flatten()[facets.pixel]
             radius = torch.hypot(disc, about.blur * nearness)
             t = (about.lift * nearness - above) / radius
@@ -168,4 +174,4 @@ def squares(products: Floats, moved: Floats) -> Floats:
     return np.asarray(change @ products @ change)
 
 
-__all__ = ["PARTS", "Edges", "Horizons", "dark_share", "move", "squares"]
+__all__ = ["FALLS", "PARTS", "Edges", "Horizons", "dark_share", "move", "squares"]

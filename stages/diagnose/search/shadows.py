@@ -20,7 +20,7 @@ from stages.diagnose.likelihood.jackknife import folds, gain_chance, gain_interv
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.result.answer import Named
-from stages.diagnose.search.edges import PARTS, Edges, Horizons, move, squares
+from stages.diagnose.search.edges import FALLS, PARTS, Edges, Horizons, move, squares
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import CORRELATED, OPEN, SHADED, UNITS
 from stages.effects import Effect, effect_names, get_effect
@@ -121,17 +121,17 @@ class Shadows:
             if left[k] > (1 - SETTLED) * total[k].sum(0)[0, 0]:
                 break
             blur = float(np.clip(about.blur + moves[k, 0], about.blur / 2, min(2 * about.blur, LARGEST)))
-            about = Horizons(blur, about.lift + float(np.clip(moves[k, 1], -blur, blur)))
+            about = Horizons(blur, about.lift + float(np.clip(moves[k, 1], -blur, blur)), about.fall)
         return found
 
-    def usual(self, beside: Sequence[Effect] = ()) -> list[Tried]:
-        """What all ground does, one effect after the other, each beside those before it and beside these."""
+    def usual(self, beside: Sequence[Effect] = (), fall: float = FALLS[0]) -> list[Tried]:
+        """What all ground does, one effect after the other, each beside those before it and beside these. fall : of :class:`Horizons`"""
         out: list[Tried] = []
         for name, effects in self.every.items():
             if name in {e.name for e in beside}:
                 continue
             if ordinary := [e for e in effects if e.shadows_ordinarily(e.values)]:
-                about = out[-1].about if out else Horizons()
+                about = out[-1].about if out else Horizons(fall=fall)
                 out.append(self.tried(ordinary, [*_best(out), *beside], about))
         return out
 
@@ -144,12 +144,12 @@ class Shadows:
         }
         return [self.tried(e, _best(usual), usual[-1].about) for e in beyond.values() if e]
 
-    def in_turn(self, effects: list[Effect]) -> Tried:
+    def in_turn(self, effects: list[Effect], fall: float = FALLS[0]) -> Tried:
         """The same where what all ground does was fitted without these effects and took a part of them: the two are fitted in turn."""
-        best, found = math.inf, self.tried(effects, [])
+        best, found = math.inf, self.tried(effects, [], Horizons(fall=fall))
         while (least := float(found.left()[0].min())) < best:
             best, kept = least, found
-            usual = self.usual([kept.best])
+            usual = self.usual([kept.best], fall)
             found = self.tried(effects, _best(usual), usual[-1].about)
         return kept
 
@@ -184,27 +184,28 @@ def by_shadows(state: State) -> list[Named]:
     around = effect.shadow_neighbours(state.data)
     percent = gain_interval(before, after)
     least = 100 * SHADED if around else 0.0  # of several values some would fit by chance
-    if not percent[1] > least or percent[0] < 100 * SHADED:
+    if not percent[1] > least:
         return []
-    whole = shadows.in_turn([e for e in shadows.every[effect.name] if _on_one_line(e, effect)])
-    effect, value = whole.best, whole.value()
+    line = [e for e in shadows.every[effect.name] if _on_one_line(e, effect)]
+    wholes = [shadows.in_turn(line, fall) for fall in FALLS]
+    values = np.array([w.value() for w in wholes])
+    effect, value, apart = wholes[0].best, float(values.mean()), float(np.ptp(values)) / 2
     name = effect.fitted()[0].name
-    error = whole.error(np.flatnonzero(shown))
-    most = max(abs(float(e.values[name])) for e in whole.effects)
-    if abs(value) >= most:
+    error = wholes[0].error(np.flatnonzero(shown))
+    if abs(value) >= max(abs(float(e.values[name])) for e in line):
         return []
     scatter = 0.0  # how far away a wall stands is open, and whether there is one is not
     if around:
         near = shadows.in_turn([type(effect)({**t.fixed, **t.columns[0]}, state.data) for t in around])
         effect, scatter = near.open_between(OPEN * float(before.sum()))
         value = float(effect.values[name])
-    nearer = math.copysign(max(abs(value) - 2 * math.hypot(error, effect.shadow_error), 0.0), value)
+    nearer = math.copysign(max(abs(value) - apart - 2 * math.hypot(error, effect.shadow_error), 0.0), value)
     if effect.shadows_ordinarily({**effect.values, name: nearer}):
         return []
     made = type(effect)({**effect.values, name: value}, state.data)
     rivals = [t.best.name for t in found if t is not first and not gain_interval(t.held_out()[shown], after)[1] > 0]
     pixels = float(sum(c.site.valid.sum() for c in chains))
-    return [_named(made, math.hypot(error, scatter), before, after, pixels, rivals)]
+    return [_named(made, math.hypot(error, scatter, apart), before, after, pixels, rivals)]
 
 
 def _turned(chain: Chain) -> bool:
