@@ -196,9 +196,12 @@ class Chain:
         ways = (SCATTER, 0.0), (-SCATTER, 0.0), (0.0, SCATTER), (0.0, -SCATTER)
         return 0.25 * sum((self._with_slopes(*by) for by in ways), start=-4 * self.rendered)
 
-    def without_dem_errors(self, kept: Callable[[Tensor], Tensor]) -> Tensor:
-        """What the rendering changes by if of the DEM's waves only a share is relief, (n, H, W); ``kept``: of wave numbers, rad/px."""
-        return self.render(ShareOfRelief(kept)) - self.rendered
+    def without_dem_errors(self, kept: Callable[[Tensor], Tensor]) -> list[Tensor]:
+        """What the rendering changes by if of the DEM's waves only a share is relief, three (n, H, W): of all alike, and more of
+        those that run to the east, or the southeast, than of those across. ``kept``: of wave numbers, rad/px
+        """
+        ways = (None, lambda east, south: east**2 - south**2, lambda east, south: 2 * east * south)
+        return [self.render(ShareOfRelief(kept, way)) - self.rendered for way in ways]
 
     def brighter(self) -> list[Tensor]:
         """Two (n, H, W): what albedo adds that grows over the crop to the east, and to the south.

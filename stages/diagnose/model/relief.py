@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import torch
 from torch import Tensor
 
-from stages.effects.filters import filtered, plane
+from stages.effects.filters import directed, plane
 from stages.physics.formation import geometry
 from stages.physics.formation.chain import State
 
@@ -39,18 +40,32 @@ class SharpSlopes:
 
 
 class ShareOfRelief:
-    """Of every wave of the DEM a share, as an extension of the model. kept : of wave numbers, rad/px"""
+    """Of every wave of the DEM a share, as an extension of the model.
+
+    kept : of wave numbers, rad/px; towards : of the part that is not kept, what is taken away of waves along (east, south), unit vectors
+    """
 
     slot = "geometry"
 
-    def __init__(self, kept: Callable[[Tensor], Tensor]) -> None:
-        self.kept = kept
+    def __init__(
+        self, kept: Callable[[Tensor], Tensor], towards: Callable[[Tensor, Tensor], Tensor] | None = None
+    ) -> None:
+        self.kept, self.towards = kept, towards
 
     def apply(self, state: State) -> None:
         """Filter what is not plane."""
         z = state.elevation
         flat = plane(z)
-        state.elevation = flat + filtered(z - flat, self.kept, slopes=True)
+
+        def gain(kx: Tensor, ky: Tensor) -> Tensor:
+            number = torch.hypot(kx, ky)
+            share = self.kept(number)
+            if self.towards is None:
+                return share
+            length = number.clamp(min=1e-9)
+            return 1 - (1 - share) * self.towards(kx / length, ky / length)
+
+        state.elevation = flat + directed(z - flat, gain, slopes=True)
 
 
 __all__ = ["ShareOfRelief", "SharpSlopes"]
