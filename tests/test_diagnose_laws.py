@@ -54,6 +54,22 @@ def test_a_law_is_followed_with_coefficients_that_are_no_surprise(laws, angles, 
     assert np.abs(found[1:] / found[0] / scatter[1:]).max() < 4
 
 
+def test_between_the_angles_of_a_steep_crater_and_of_all_other_ground_no_law_runs_away():
+    """In three images a few of its facets have angles that no others have, and nothing holds polynomials between them and the rest."""
+    rng = np.random.default_rng(8)
+    angles = torch.from_numpy(orbital_cosines(rng, np.radians([30, 50, 75]), 0.1, 1500))
+    incidence, emission = rng.uniform(0.2, 1.4, (2, 4000))
+    phase = rng.uniform(np.abs(incidence - emission), incidence + emission)
+    every = np.cos([incidence, emission, phase])
+    steep = every[:, (emission > 1.05) & (emission < 1.1)][:, :5]
+    low, high = np.minimum(steep.min(1), angles.numpy().min(1)), np.maximum(steep.max(1), angles.numpy().max(1))
+    between = every[:, (every > low[:, None]).all(0) & (every < high[:, None]).all(0)]
+    laws = lunar_laws(torch.cat([angles, torch.from_numpy(steep)], 1))
+    parts = laws.parts(Angles(*torch.from_numpy(between).unbind(0)))
+    mean = parts[0].numpy() / LAWS["akimov"](*between, 1.0)
+    assert mean.min() > 0.4 * np.median(mean) and mean.max() < 2.5 * np.median(mean)
+
+
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
     """Four places in eight images each, to be filled."""

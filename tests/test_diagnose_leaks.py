@@ -93,13 +93,14 @@ def test_the_test_pairs_take_a_name_back(answers):
     assert [c.effect.name for c in state.causes] == before
 
 
-@pytest.mark.parametrize(("alone", "refused"), [(100.01, False), (150.0, True)])
+@pytest.mark.parametrize(("alone", "refused"), [(1e-9, False), (5.0, True)])
 def test_the_test_pairs_judge_what_an_effect_does_there_and_not_the_law_beside_it(monkeypatch, alone, refused):
     """They lose one in a hundred by it. Albedo that all their images share makes no difference to them; the law, fitted again without it, does."""
     cause = SimpleNamespace(effect=SimpleNamespace(name="one"), found=SimpleNamespace(gain=1.0))
     state = SimpleNamespace(causes=[cause], named=[cause], nominal=None, fit=lambda: None)
-    squares = iter([101.0, alone + 1.0, 100.0])
-    monkeypatch.setattr(score, "_hidden_squares", lambda _: np.full(8, next(squares)))
+    squares = iter([101.0, alone, 100.0])
+    monkeypatch.setattr(score, "_hidden_chains", lambda _: [])
+    monkeypatch.setattr(score, "_hidden_squares", lambda *_: np.full(8, next(squares)))
     assert bool(unconfirmed(state)) == refused
 
 

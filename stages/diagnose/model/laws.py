@@ -26,6 +26,7 @@ DIRECTIONS = 24  # in which laws may differ: further ones change brightness by l
 DEGREE = 6  # of the polynomials in both cosines and the root of the phase angle that stand for a law
 ROUGH = math.radians(20), math.radians(38)  # Hapke's roughness bends where no polynomial does ...
 ROUGH_DEGREE = 2  # ... and is another one for other parameters: of the polynomials that multiply it
+SPREAD = 10  # angles of the data for one between them
 SEED = 1
 BLOCK = 1 << 16  # pixels whose products are held at a time
 Term = tuple[int, int, int]  # degrees in the three factors
@@ -97,33 +98,46 @@ def lunar_laws(cosines: Tensor, brightness: float | None = None) -> LunarLaws:
     cosines : (3, N) of incidence, emission and phase, all facets lit and seen
     brightness : mean I/F at a level of 1; that of the mean law where None
     """
-    angles = Angles(*cosines.double().unbind(0))
-    at = [angles.cos_incidence.numpy(), angles.cos_emission.numpy(), np.sqrt(angles.phase.numpy())]
-    low = np.array([x.min() for x in at])
-    high = np.maximum(np.array([x.max() for x in at]), low + 1e-3)
+    here = cosines.double()
+    at = torch.stack([here[0], here[1], Angles(*here).phase.sqrt()])
+    low = at.amin(1).numpy()
+    high = np.maximum(at.amax(1).numpy(), low + 1e-3)
+    angles = Angles(*torch.cat([here, _between(low, high, here.shape[1] // SPREAD)], 1))
+    known = slice(here.shape[1])
     laws = _draw(angles)
-    laws = laws / laws.mean(1, keepdims=True)
+    laws = laws / laws[:, known].mean(1, keepdims=True)
     mean = laws.mean(0)
-    departures = laws / mean - 1
-    sizes, axes = _main_directions(departures)
-    count = len(sizes)
+    sizes, axes = _main_directions(laws / mean - 1, here.shape[1])
     seeliger = (angles.cos_incidence / (angles.cos_incidence + angles.cos_emission)).numpy()
-    shapes = np.concatenate([np.ones((1, len(mean))), axes[:count] * math.sqrt(len(mean))]) * mean / seeliger
-    shapes *= (brightness or 0.06) / (mean * shapes[0] / shapes[0]).mean()
-    factors = _factors(angles, low, high)
-    terms = _terms(factors).numpy()
+    shapes = np.concatenate([np.ones((1, len(mean))), axes * math.sqrt(here.shape[1])]) * mean / seeliger
+    shapes *= (brightness or 0.06) / mean[known].mean()
+    terms = _terms(_factors(angles, low, high)).numpy()
     # by what is wrong with brightness, since at grazing light laws go apart without bound
     weights = np.linalg.lstsq((terms * seeliger).T, (shapes * seeliger).T, rcond=1e-10)[0].T
-    return LunarLaws(low, high, weights, sizes[:count])
+    return LunarLaws(low, high, weights, sizes)
 
 
-def _main_directions(departures: Floats) -> tuple[Floats, Floats]:
-    """Standard deviations (K,) and directions (K, N), unit vectors, of the scatter of (laws, N) about nothing, the largest first."""
-    among = departures @ departures.T / departures.size  # far fewer laws than angles
-    count = min(DIRECTIONS, *departures.shape)
+def _between(low: Floats, high: Floats, count: int) -> Tensor:
+    """(3, at most count) cosines spread evenly between the lowest and highest of the data: where one steep crater has its angles to itself
+    polynomials that nothing held there would run away.
+    """
+    rng = np.random.default_rng(SEED)
+    mu0, mu, root = rng.uniform(low[:, None], high[:, None], (3, 4 * count))
+    incidence, emission, phase = np.arccos(mu0), np.arccos(mu), root**2
+    possible = (np.abs(incidence - emission) <= phase) & (phase <= incidence + emission)
+    return torch.from_numpy(np.stack([mu0, mu, np.cos(phase)])[:, possible][:, :count])
+
+
+def _main_directions(departures: Floats, known: int) -> tuple[Floats, Floats]:
+    """Standard deviations (K,) and directions (K, N) of the scatter of (laws, N) about nothing, the largest first: unit vectors over the
+    first ``known``, among which it is sought.
+    """
+    data = departures[:, :known]
+    among = data @ data.T / data.size  # far fewer laws than angles
+    count = min(DIRECTIONS, *data.shape)
     squares, mixtures = eigh(among, subset_by_index=[len(among) - count, len(among) - 1])
     sizes = np.sqrt(np.maximum(squares[::-1], 0.0))
-    axes = mixtures.T[::-1] @ departures / (np.maximum(sizes, 1e-12)[:, None] * math.sqrt(departures.size))
+    axes = mixtures.T[::-1] @ departures / (np.maximum(sizes, 1e-12)[:, None] * math.sqrt(data.size))
     return sizes, axes
 
 

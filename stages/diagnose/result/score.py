@@ -213,16 +213,16 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
     """Take out causes of the search that surely lose on the test pairs, the last one first; name -> its gain in nats where it was learned, and why."""
     out: dict[str, tuple[float, str]] = {}
     for cause in state.named[::-1]:  # what was found last stands on what was found before
-        with_cause = _hidden_squares(state)
+        with_cause, predicted = _hidden_squares(state), [c.predict() for c in _hidden_chains(state)]
         kept, nominal = list(state.causes), state.nominal
         state.causes[:] = [c for c in kept if c is not cause]
-        by_itself = abs(float((_hidden_squares(state) - with_cause).sum()))  # beside the same law
+        by_itself = _hidden_squares(state, predicted)  # what it changes beside the same law
         state.nominal = copy.copy(nominal)
         state.fit()
         without = _hidden_squares(state)
         gain, _, high = gain_interval(without, with_cause)
-        # what all images of a place share, albedo say, these pairs do not judge: a law that was fitted without it makes the difference
-        if contradicts(high) and 2 * by_itself > float((with_cause - without).sum()):
+        # what all images of a place share, albedo say, these pairs do not judge: it is the law that makes a difference, fitted without it
+        if contradicts(high) and by_itself.sum() > FAINT**2 * with_cause.sum():
             out[cause.effect.name] = cause.found.gain, contradiction(gain, high)
             continue
         state.causes[:], state.nominal = kept, nominal
@@ -230,13 +230,20 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
     return out
 
 
-def _hidden_squares(state: State) -> np.ndarray:
-    """Squared errors on every piece of ground of the test pairs."""
-    out = [np.zeros(0)]
+def _hidden_chains(state: State) -> list[Chain]:
+    """The test pairs under the model so far."""
     for site in state.hidden:
         site.align()
-        chain = state.nominal.chain(site, state.base)
-        out.append(_squares(site, chain, site.laid, lit_mask(chain), state)[0])
+    return [state.nominal.chain(site, state.base) for site in state.hidden]
+
+
+def _hidden_squares(state: State, images: Sequence[torch.Tensor] | None = None) -> np.ndarray:
+    """Squared errors on every piece of ground of the test pairs; ``images`` in the place of theirs, in I/F."""
+    out = [np.zeros(0)]
+    for k, chain in enumerate(_hidden_chains(state)):
+        site = chain.site
+        image = site.laid if images is None else images[k] * site.gain[:, None, None] + site.offset[:, None, None]
+        out.append(_squares(site, chain, image, lit_mask(chain), state)[0])
     return np.concatenate(out)
 
 

@@ -25,6 +25,8 @@ from stages.diagnose.settings import (
     UNITS,
 )
 
+USUAL = 2.0  # standard deviations of an image's noise in deep shadow
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -194,7 +196,7 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
     level = (image * lit).sum((-2, -1)) / lit.sum((-2, -1)).clamp(min=1)
     scale = torch.maximum(image, DARKEST * level[:, None, None]).clamp(min=1e-6)
     # what is bright all the same is lit ground that the DEM does not know of
-    deep &= chain.site.image < DARKEST * level[:, None, None]
+    deep = _without_lit(deep & (chain.site.image < DARKEST * level[:, None, None]), chain.site.image)
     east, north = chain.slope_tangents
     detector = chain.site.on_detector()
     h, w = height // pieces, width // pieces
@@ -238,6 +240,22 @@ def make_patches(number: int, chain: Chain, pieces: int, free: bool) -> list[Pat
                 )
             )
     return out
+
+
+def _without_lit(deep: Tensor, image: Tensor) -> Tensor:
+    """Deep shadow (N, H, W) bool without pixels that stand out in their cell: facets that the DEM has not catch some sunlight there, and none less than none.
+
+    What noise does to an image (N, H, W) is seen below the medians of its cells, where no light is.
+    """
+    height, width = deep.shape[-2:]
+    wide = torch.full((len(deep), -(-height // CELL) * CELL, -(-width // CELL) * CELL), torch.nan)
+    wide[:, :height, :width] = torch.where(deep, image.float(), torch.nan)
+    cells = wide.unflatten(1, (-1, CELL)).unflatten(3, (-1, CELL))  # (N, rows of cells, CELL, columns of cells, CELL)
+    away = cells - cells.movedim(2, 3).flatten(3).nanmedian(-1).values[:, :, None, :, None]
+    below = torch.where(away < 0, away.square(), torch.nan)
+    noise = below.flatten(1).nanmean(1).sqrt().nan_to_num(0.0)
+    usual = away.abs() <= USUAL * noise[:, None, None, None, None]
+    return usual.flatten(3).flatten(1, 2)[:, :height, :width]
 
 
 def _cells(deep: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
