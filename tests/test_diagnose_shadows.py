@@ -14,6 +14,7 @@ from stages import diagnose
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.result import score
 from stages.diagnose.result.answer import Named
+from stages.diagnose.rows.patches import _without_lit
 from stages.diagnose.search.shadows import by_shadows
 from stages.diagnose.search.walls import hide_dark
 from stages.effects import Survey, get_effect
@@ -153,6 +154,20 @@ def test_lit_ground_says_how_much_nearer_to_nothing_a_value_is_that_shadows_tell
     (found,), _, refused = score.beside_shadows(state, [cause])
     assert found.parameters["relative"] == (pytest.approx(0.066), 0.02, "1") and not refused
     assert float(found.effect.values["relative"]) == pytest.approx(0.066)
+
+
+def test_sunlit_specks_in_deep_shadow_are_no_light_that_falls_into_it():
+    """The DEM has not all facets: some stand up into sunlight. The mean of what is left is that of the shadow, whose noise goes both ways."""
+    rng = np.random.default_rng(6)
+    deep = torch.from_numpy(rng.random((3, 50, 61)) < 0.7)
+    shadow = rng.normal(0.004, 0.003, deep.shape)
+    specks = rng.random(deep.shape) < 0.1
+    image = torch.from_numpy(np.where(specks, shadow + rng.uniform(0.01, 0.3, deep.shape), shadow))
+    kept = _without_lit(deep, image)
+    assert not (kept & ~deep).any() and kept.sum() > 0.8 * deep.sum()
+    assert float(image[deep].mean()) > 0.01
+    assert abs(float(image[kept].mean()) - 0.004) < 0.0006
+    assert (_without_lit(deep, torch.full_like(image, 0.5)) == deep).all()
 
 
 @pytest.mark.parametrize("azimuth_deg", [0, 37, 90, 135, 200, 270, 333])
