@@ -256,8 +256,10 @@ def _clipped(
         image, plain = part(k, quarter, images[k]), part(k, quarter, predicted)
         level = images[k][masks[k]].mean()
         top = levels[of[g]]
-        plain = _own_gain(images[k], predicted, elsewhere, top) * plain
-        both = [torch.where(lit, image - p, 0.0) / level for p in (plain, plain.clamp(max=top))]
+        gain = _own_gain(images[k], predicted, elsewhere, top)
+        # without the level an image that it cuts off as a whole is as bright as it looks
+        without = torch.where(gain < ENDLESS, gain, _own_gain(images[k], predicted, elsewhere))
+        both = [torch.where(lit, image - p, 0.0) / level for p in (without * plain, (gain * plain).clamp(max=top))]
         out.append([float(left.double().square().sum()) for left in both])
         count += float(lit.sum())
     before, after = np.array(out).T
