@@ -200,7 +200,11 @@ class Chain:
         """What the rendering changes by if of the DEM's waves only a share is relief, three (n, H, W): of all alike, and more of
         those that run to the east, or the southeast, than of those across. ``kept``: of wave numbers, rad/px
         """
-        ways = (None, lambda east, south: east**2 - south**2, lambda east, south: 2 * east * south)
+        ways = (
+            lambda east, south: east**2 + south**2,
+            lambda east, south: east**2 - south**2,
+            lambda east, south: 2 * east * south,
+        )
         return [self.render(ShareOfRelief(kept, way)) - self.rendered for way in ways]
 
     def brighter(self) -> list[Tensor]:

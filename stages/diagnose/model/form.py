@@ -63,8 +63,8 @@ def better_form(nominal: Nominal, sites: Sequence[Site], data: Survey) -> Nomina
     if data.units == "dn":
         sure = gain_interval(left_elsewhere(nominal, sites), left_elsewhere(other, sites))[1] > 0
     else:
-        left = (relative_misfit(other, sites) / relative_misfit(nominal, sites)) ** 2
-        sure = left <= HALVED and left * (1 + FAINT) ** 2 < left_beside_one(nominal, sites, data)
+        left, before = relative_misfit(other, sites) ** 2, relative_misfit(nominal, sites) ** 2
+        sure = left < HALVED * before and left * (1 + FAINT) ** 2 < before * left_beside_one(nominal, sites, data)
     return other if sure else None
 
 

@@ -47,9 +47,7 @@ class ShareOfRelief:
 
     slot = "geometry"
 
-    def __init__(
-        self, kept: Callable[[Tensor], Tensor], towards: Callable[[Tensor, Tensor], Tensor] | None = None
-    ) -> None:
+    def __init__(self, kept: Callable[[Tensor], Tensor], towards: Callable[[Tensor, Tensor], Tensor]) -> None:
         self.kept, self.towards = kept, towards
 
     def apply(self, state: State) -> None:
@@ -59,11 +57,8 @@ class ShareOfRelief:
 
         def gain(kx: Tensor, ky: Tensor) -> Tensor:
             number = torch.hypot(kx, ky)
-            share = self.kept(number)
-            if self.towards is None:
-                return share
             length = number.clamp(min=1e-9)
-            return 1 - (1 - share) * self.towards(kx / length, ky / length)
+            return 1 - (1 - self.kept(number)) * self.towards(kx / length, ky / length)
 
         state.elevation = flat + directed(z - flat, gain, slopes=True)
 

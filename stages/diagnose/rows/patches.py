@@ -23,9 +23,8 @@ from stages.diagnose.settings import (
     SHADOWED,
     TAPER,
     UNITS,
+    USUAL,
 )
-
-USUAL = 2.0  # standard deviations of an image's noise in deep shadow
 
 
 @dataclass(frozen=True)

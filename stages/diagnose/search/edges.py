@@ -25,7 +25,6 @@ from stages.physics.horizon import occluder_distance
 from stages.physics.light.sun_disc import sun_visibility, visibility_slope
 
 LIMIT = 0.3  # of a share of light, beyond 0 and 1: noise that is cut off there alone would make all edges look wide
-FALLS = 1.0, 0.5  # which of the two holds for a DEM nobody knows; on ten other DEMs edges were between them
 NEAREST = 3.0  # px: edges of shadows cast from nearer by hang on the slope of the ground itself
 PARTS = 4  # bands of a site's lines that are judged apart, where grounds are few
 
@@ -34,7 +33,7 @@ PARTS = 4  # bands of a site's lines that are judged apart, where grounds are fe
 class Horizons:
     """What errors of the DEM do to its horizons, for terrain at a distance of one pixel: radius of the blur and lift, rad.
 
-    fall : power of the distance with which they fall, between FALLS
+    fall : power of the distance with which they fall, between those of ``settings.FALLS``
     """
 
     blur: float = 0.15
@@ -174,4 +173,4 @@ def squares(products: Floats, moved: Floats) -> Floats:
     return np.asarray(change @ products @ change)
 
 
-__all__ = ["FALLS", "PARTS", "Edges", "Horizons", "dark_share", "move", "squares"]
+__all__ = ["PARTS", "Edges", "Horizons", "dark_share", "move", "squares"]

@@ -20,9 +20,9 @@ from stages.diagnose.likelihood.jackknife import folds, gain_chance, gain_interv
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.result.answer import Named
-from stages.diagnose.search.edges import FALLS, PARTS, Edges, Horizons, move, squares
+from stages.diagnose.search.edges import PARTS, Edges, Horizons, move, squares
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CORRELATED, OPEN, SHADED, UNITS
+from stages.diagnose.settings import CORRELATED, FALLS, OPEN, SHADED, UNITS
 from stages.effects import Effect, effect_names, get_effect
 
 ROUNDS = 5  # at most, in which the horizons' errors are fitted at a value's best
