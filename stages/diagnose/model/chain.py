@@ -47,9 +47,15 @@ class Chain:
         self._sharp: SharpSlopes = sharp
         self._state: State = self._illuminate(self.base, known._state if known else None)
         self._tilted: dict[tuple[float, float], Tensor] = {}  # (n, H, W) reflectance at other slopes, by how much
+        self._parts: dict[LunarLaws, Tensor] = {}  # what measured laws are sums of at these angles
         alike = known is not None and known.model is model and torch.equal(known.coefficients, coefficients)
-        if known is not None and alike and self._state.angles is known._state.angles:
+        here = known is not None and self._state.angles is known._state.angles
+        if known is not None and here:
+            self._parts = known._parts
+        if known is not None and alike and here:
             self._state.reflectance, self._tilted = known._state.reflectance, known._tilted
+        elif isinstance(model, LunarLaws) and model in self._parts:
+            self._state.reflectance = torch.tensordot(coefficients[0, :, 0, 0], self._parts[model], 1)
         else:
             self._state.reflectance = self._surface(self._state)
         self.rendered = self.render()
@@ -136,9 +142,7 @@ class Chain:
         """d image / d coefficient, one (n, H, W) per free coefficient: the nominal model's own freedom."""
         columns: list[Tensor] = []
         reflectance = self._state.reflectance
-        angles = self._state.angles
-        facing = (angles.cos_incidence > 0) & (angles.cos_emission > 0)
-        parts = self.model.parts(angles) if isinstance(self.model, LunarLaws) else None
+        parts = self._parts_of(self.model) if isinstance(self.model, LunarLaws) else None
         for k in range(self.coefficients.shape[1]):
             if self.free is not None and not bool(self.free[k]):
                 continue
@@ -150,16 +154,25 @@ class Chain:
                 moved = self._surface(self._state, c)
             else:  # a sum of parts, of which 1 is the mean law: a small step would drown in rounding
                 step = 0.05 * max(size, 1.0)
-                moved = reflectance + step * torch.where(facing, parts[k], 0.0)
+                moved = reflectance + step * parts[k]
             columns.append((self._expose(self._state, moved, self.base) - self.rendered) / step)
         return columns
+
+    def _parts_of(self, laws: LunarLaws) -> Tensor:
+        """(C, n, H, W) I/F that a coefficient of 1 adds to each facet that the Sun and the camera are above of."""
+        if laws not in self._parts:
+            angles = self._state.angles
+            facing = (angles.cos_incidence > 0) & (angles.cos_emission > 0)
+            self._parts.clear()
+            self._parts[laws] = torch.where(facing, laws.parts(angles), 0.0)
+        return self._parts[laws]
 
     def form_tangents(self) -> list[Tensor]:
         """What another law of the ground adds, (n, H, W) for a standard deviation in each direction in which measured laws differ."""
         if self.laws is None or isinstance(self.model, LunarLaws):
             return []
         out = []
-        parts = self.laws.parts(self._state.angles)
+        parts = self._parts_of(self.laws)
         for part, size in zip(parts[1:], self.laws.scatter[1:], strict=True):
             more = self._state.reflectance * (part / parts[0].clamp(min=1e-9) * size)
             out.append(self._expose(self._state, self._state.reflectance + more, self.base) - self.rendered)

@@ -203,7 +203,7 @@ def _normal_equations(
         residual = (site.image - predicted).double() * weight
         flat = residual.new_zeros(count_free, 1)
         if fitted:
-            flat = (torch.stack(chain.surface_tangents()).double() * weight).flatten(1)
+            flat = (torch.stack(chain.surface_tangents()) * weight).flatten(1)
         on = flat @ residual.flatten() if fitted else flat[:, 0]
         return flat @ flat.T, on, float(residual.square().sum()), float((weight > 0).sum())
 
