@@ -93,7 +93,7 @@ def test_what_is_ordinary_explains_as_much_or_the_rival_is_refused():
         judge(whole, both["interreflection"])
         return may_be_another(whole, both["interreflection"], both, {"dark_bias": because})
 
-    small = f"iof is 5e-05, and less than 0.0001 {ORDINARY}"
+    small = f"{ORDINARY}: iof = 5e-05"
     assert "as much" in refused([1, -1, 2, 0], small)
     assert not refused([1, -1, 2, 0], "the test pairs contradict it")
     assert not refused([1, -1, 2, 0], ODD)
@@ -139,10 +139,10 @@ def test_values_per_image_do_not_stand_for_what_one_value_for_all_does():
         )
         judge(whole, both["image_gain"])
         return may_be_another(
-            whole, both["image_gain"], both, {"column_pattern": "it comes out 1.4 errors from nothing"}
+            whole, both["image_gain"], both, {"column_pattern": "its value is only 1.4 standard errors from zero"}
         )
 
-    assert "not sure" in refused([11, 10, 12, 9])
+    assert "do not prove" in refused([11, 10, 12, 9])
     assert not refused([21, 22, 20, 22])
 
 

@@ -22,7 +22,7 @@ def answer() -> Answer:
         "named",
         [cause],
         {"named": 0.12, "common_to_images": 0.8, "own_to_image": 0.06, "noise": 0.02},
-        {"echo": (151.4, "nothing real has the values <that> fit best")},
+        {"echo": (151.4, "the values <that> fit best are impossible")},
         {"none": (0.0, 0.0, 0.0), "constant": (0.85, 0.26, 1.44)},
         blind=["penumbra"],
         held_out=HeldOut(54, 5, 2e-5, 1e-5, 40.0, 60.0),

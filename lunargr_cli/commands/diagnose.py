@@ -93,10 +93,10 @@ def command(
         shares = ", ".join(f"{name.replace('_', ' ')} {100 * share:.0f} %" for name, share in answer["budget"].items())
         write_out(f"Variance of the residual: {shares}.")
     for r in answer["rejected"]:
-        write_out(f"Not named: {r['effect']}, since {r['why']}.")
+        write_out(f"{r['effect']} is not named: {r['why']}.")
     write_out(f"{answer['verdict']}: {answer['sentence']}")
     if answer["blind"] and answer["verdict"] != "cannot_tell":
-        write_out(f"These data could not show: {', '.join(answer['blind'])}.")
+        write_out(f"Whether any of these is there, the data cannot tell: {', '.join(answer['blind'])}.")
 
 
 def _percent(value: float | None, low: float | None, high: float | None) -> str:

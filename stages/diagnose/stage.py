@@ -144,7 +144,7 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         doubted = unconfirmed(state) | contradicted(state)
     if isinstance(state.nominal.model, LunarLaws):
         answer.form = state.nominal.model.title
-        say(f"{config.model} has not the form of the ground's law: {answer.form} took its place")
+        say(f"{config.model} is not the ground's law: {answer.form} took its place")
     _fill(answer, state, outcome, doubted, cut, before)
     return Result(answer, state, outcome)
 

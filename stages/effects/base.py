@@ -88,6 +88,7 @@ class Effect(ABC):
     keep_below      of a level that was read off a histogram: what is brighter than this times the level says nothing more
     one_sided       a fixed coordinate; the effect acts on one side of a pixel only, and by its sign it is told from what acts on both
     shadow_error    how far its first coordinate may be off where shadows alone tell it, since the DEM's horizons are
+    possible        in words, what ``plausible`` asks of the values
     table           (variable, second dimension or None) of diagnosis.h5 for values per image or site; without it they stand in
                     `frame_values` or `site_values`
     """
@@ -121,6 +122,7 @@ class Effect(ABC):
     of_law: ClassVar[bool] = False
     shadow_error: ClassVar[float] = 0.0
     keep_below: ClassVar[float] = 1.0
+    possible: ClassVar[str] = ""
     table: ClassVar[tuple[str, str | None] | None] = None
 
     def __init__(self, values: Mapping[str, Any] | None = None, survey: Survey | None = None) -> None:

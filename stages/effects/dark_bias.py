@@ -24,6 +24,7 @@ class DarkBias(Effect):
     separate = "an image with deep shadow, where nothing else is bright"
     parameters = (Parameter("iof", "1", -0.1, 0.1, 0.0, "added I/F, truth minus given"),)
     strong: ClassVar = {"iof": 0.004}
+    possible = "-10 to 50 % of the brightness"
     tolerance: ClassVar = {
         "iof": 1e-4
     }  # half a step of 12 bits, and the stray light of good optics: 0.1 % of a bright scene

@@ -37,6 +37,7 @@ class Earthshine(Effect):
         Parameter("north", "1", -0.1, 0.1, 0.0, "irradiance times the direction's north component"),
         Parameter("up", "1", 0.0, 0.1, 0.0, "irradiance times the direction's up component"),
     )
+    possible = "a source above the horizon"
     strong: ClassVar = {"east": 0.004, "north": 0.004, "up": 0.004}
     tolerance: ClassVar = {"irradiance": 1e-4}  # of the full Earth, and of noise that is cut off at nothing in the dark
 

@@ -34,6 +34,7 @@ class Echo(Effect):
         Parameter("lag_px", "px", -64.0, 64.0, 4.0, "how much later the echo appears"),
     )
     coordinates = (*parameters, Parameter("axis", "1", 0.0, 1.0, 0.0, "0 along samples, 1 along lines"))
+    possible = f"a lag of more than {CLEAR_LAG} px, since nearer it is not told from optics and spilled charge"
     strong: ClassVar = {"fraction": 0.05}
     one_sided: ClassVar = "lag_px"  # blur and relief that the DEM has not are alike before and behind
     tolerance: ClassVar = {"fraction": 0.003}

@@ -29,6 +29,7 @@ class Nonlinearity(Effect):
         Parameter("quadratic", "1", -10.0, 10.0, 0.0, "coefficient of I^2, per unit of I/F"),
         Parameter("log", "1", -0.5, 0.5, 0.0, "coefficient of I ln I"),
     )
+    possible = "a response that rises, nowhere four times as steep as elsewhere"
     strong: ClassVar = {"quadratic": 1.0, "log": 0.05}
 
     @classmethod

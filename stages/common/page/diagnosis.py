@@ -86,7 +86,7 @@ def chapters(
 
 
 def _blind_sentence(effects: list[str]) -> str:
-    return f"These data could not show, whether it is there or not: {listed(effects)}."
+    return f"Whether any of these is there, the data cannot tell: {listed(effects)}."
 
 
 def _budget(budget: dict[str, float | None]) -> list[Markup]:
@@ -141,7 +141,9 @@ def _rejected(result: dict[str, Any]) -> list[Markup]:
         for r in result.get("rejected") or []
     ]
     if rows:
-        parts.append(page.table("Evidence that got no name", ["effect", "gain, nats", "why not"], rows))
+        parts.append(
+            page.table("Evidence that got no name", ["effect", "gain on held-out ground, nats", "why not"], rows)
+        )
     forms = [
         [str(r["form"]), percent(r.get("held_out_gain_percent"), r.get("low"), r.get("high"))]
         for r in result.get("registration") or []

@@ -50,7 +50,7 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     squares = dict(zip((f.name for f in FORMS), held_out(matched, group, frames, spread), strict=True))
     shares = [without[g] for g in group[:: pieces**2]]
     plain = own_fields(chains, fitted["constant"][0], [0.0] * len(sites), frame, level, 1)
-    slanted = own_fields(chains, fitted["constant, leaning"][0], shares, frame, level, 1)
+    slanted = own_fields(chains, fitted["constant and relief displacement"][0], shares, frame, level, 1)
     squares |= compared(matched, group, dict(zip(OWN, (plain, slanted), strict=True)), frames, pieces**2)
     gains = {k: Gain(*gain_interval(squares["none"].sum(1), q.sum(1))) for k, q in squares.items() if k in fitted}
     gains["lines"] = Gain(0.0, 0.0, 0.0)

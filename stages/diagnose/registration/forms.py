@@ -39,7 +39,9 @@ class Form:
 
 
 PLAIN = (Form("none", 0), Form("constant", 1), Form("affine", 3), Form("field", len(TERMS)))
-LEANING = tuple(Form(f"{f.name}, leaning" if f.terms else "leaning", f.terms, True) for f in PLAIN)
+LEANING = tuple(
+    Form(f"{f.name} and relief displacement" if f.terms else "relief displacement", f.terms, True) for f in PLAIN
+)
 FORMS = PLAIN + LEANING
 
 

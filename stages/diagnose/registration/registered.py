@@ -93,7 +93,7 @@ class Registration:
         learned = shown(*(of_frames(self.squares[name], frames) for name in (first, second)))
         low, high = gain_interval(*learned)[1:]
         if not low > 0:
-            return f"its held-out gain is {low:.0f} .. {high:.0f} %, which may be nothing"
+            return f"no sure gain on held-out ground (95 %: {low:.0f} .. {high:.0f} %)"
         if not self.tested:
             return ""
         before, after = shown(*(of_frames(self.tested[t], frames) for t in tested))
@@ -108,7 +108,7 @@ class Registration:
         return (
             ""
             if low > 0
-            else f"with the test pairs its held-out gain is {part:.0f} % ({low:.0f} .. {high:.0f}), which may be nothing"
+            else f"no sure gain on held-out ground once the test pairs count as well ({part:.0f} %; 95 %: {low:.0f} .. {high:.0f})"
         )
 
     def evidence(self, first: str, second: str, frames: NDArray[np.int64] | None = None) -> tuple[float, float, float]:
@@ -146,7 +146,7 @@ class Registration:
 
     def settled(self, chains: Sequence[Chain], share: float, terms: int = 3) -> list[Field]:
         """Relief displacement by ``share`` plus each image's own shift and affine map, captured beside it: a nuisance of any comparison."""
-        shifts, _ = self.fitted["constant, leaning" if share else "constant"]
+        shifts, _ = self.fitted["constant and relief displacement" if share else "constant"]
         return own_fields(chains, shifts, [share] * len(chains), self.frame, self.level, terms)
 
     def beside_lines(self, chains: Sequence[Chain], fields: list[Field]) -> list[Field]:

@@ -122,8 +122,8 @@ class Answer:
             return self._finding()
         asked = self.config.get("model", "the model")
         return (
-            f"The reflectance does not have the form of {asked}: {self.form} was fitted in its place, and follows whatever changes the law; "
-            f"where that is known, ask for it as the model. {self._finding()}"
+            f"The ground's reflectance does not follow {asked}: {self.form} were fitted in its place, and take up whatever changes the law "
+            f"(phase slope, opposition, limb, roughness); if the law is known, give it as the model. {self._finding()}"
         )
 
     def _finding(self) -> str:
@@ -142,7 +142,7 @@ class Answer:
         if self.verdict == "unexplained":
             return f"The residual holds {' and '.join(self.structure) or 'structure'}, which nothing in the catalogue explains."
         if self.verdict == "cannot_tell":
-            return f"Nothing significant was found, but these data could not show: {', '.join(self.blind)}."
+            return f"Nothing significant was found, but the data cannot tell whether any of these is there: {', '.join(self.blind)}."
         return "Nothing in the catalogue explains a significant part of the residual, and no structure is left over."
 
 

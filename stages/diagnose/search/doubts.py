@@ -14,8 +14,9 @@ from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.settings import STILL, SURE
 from stages.effects import Effect
 
-ODD = "nothing real has the values that fit best"
-ORDINARY = "is ordinary"
+# what reasons start with, for those who ask what kind of reason it was
+ODD = "the values that fit best are impossible"
+ORDINARY = "no more than is ordinary"
 
 
 def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
@@ -24,23 +25,23 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     if cls.scope == "image":
         size, error = cause.rms, cause.errors.get("rms", math.inf)
         least = max(cls.tolerance.values(), default=0.0)
-        return f"it is {size:.2g}, and less than {least:.2g} {ORDINARY}" if size - 2 * error < least else ""
+        return as_ordinary("rms", size, least, error) if size - 2 * error < least else ""
     values = {k: float(v) for k, v in cause.effect.values.items()}
     if not cls.plausible(values, state.data):
-        return ODD
+        return impossible(cause.effect)
     for name in [n for n in cause.errors if n not in cls.shaped]:  # a shape may end anywhere
         value, near = values[name], cause.of_given_shape.get(name, 1e-9)
         low, high = (
             math.inf * side if b == cls.null()[name] else b for b, side in zip(cls.bounds(name), (-1, 1), strict=True)
         )
         if not low + near <= value <= high - near:
-            return f"{ODD}: {name} ends at {value:.3g}, within an error of a bound of what is possible"
+            return f"{ODD} ({name} = {value:.3g}, at a bound of what is physical)"
 
     # an effect that may be nothing has no shape that could be uncertain
     if cause.away < together(sure, len(cause.of_given_shape)):
-        return f"it comes out {cause.away:.1f} errors from nothing"
+        return f"its value is only {cause.away:.1f} standard errors from zero"
     if cause.share_error * student_quantile(cause.share_freedom) > 1:
-        return f"other images give it other values: {1 / cause.share_error:.1f} errors over images from nothing"
+        return f"its value hangs on a few images (only {1 / cause.share_error:.1f} standard errors from zero where images are left out)"
     errors = cause.larger_errors
     reported = cls.report(values, errors)
     for name, least in cls.tolerance.items():
@@ -48,8 +49,21 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
         if name in values:
             size, error = abs(values[name] - cls.null()[name]), errors.get(name, 0.0)
         if size - 2 * error < least:
-            return f"{name} is {size:.2g}, and less than {least:.2g} {ORDINARY}"
+            return as_ordinary(name, size, least, error)
     return ""
+
+
+def as_ordinary(name: str, size: float, least: float, error: float = math.nan) -> str:
+    """The reason that a size is not surely more than what every data set has."""
+    found = f"{size:.2g}" if math.isnan(error) else f"{size:.2g} +- {error:.1g}"
+    return f"{ORDINARY} ({name} = {found}; any data may have {least:.2g})"
+
+
+def impossible(effect: Effect) -> str:
+    """The reason that an effect's values cannot be."""
+    values = ", ".join(f"{k} = {float(v):.3g}" for k, v in effect.values.items())
+    expected = f"; expected: {effect.possible}" if effect.possible else ""
+    return f"{ODD} ({values}{expected})"
 
 
 def doubt_any(state: State, cause: Cause) -> tuple[str, Cause | None]:
@@ -58,11 +72,11 @@ def doubt_any(state: State, cause: Cause) -> tuple[str, Cause | None]:
         return why, None
     for c in state.named:
         if why := doubt(state, c):
-            return f"beside it {c.effect.name} is no cause any more: {why}", c
+            return f"with it {c.effect.name} would lose its name ({why})", c
         # each may stand for the other: together they are sure, and how much there is of either is not known
         alike = c.effect.name in cause.effect.confused_with and c is not cause
         if alike and not (_known_by_itself(cause) or _known_by_itself(c)):
-            return f"beside it {c.effect.name}, which it is confused with, is not known any more", None
+            return f"with it neither its own size nor that of {c.effect.name} is known: each explains the other", None
     return "", None
 
 
@@ -84,7 +98,7 @@ def doubt_all(state: State, view: View, sure: float = SURE) -> dict[str, tuple[f
     while doubted := [(c, why) for c in state.named if (why := doubt(state, c, sure))]:
         cause, why = doubted[-1]  # what was found last stands on the rest
         state.causes.remove(cause)
-        out[cause.effect.name] = cause.found.gain, f"fitted with everything else {why}"
+        out[cause.effect.name] = cause.found.gain, f"fitted together with all other causes, {why}"
         settle(state, view)
     return out
 
@@ -96,7 +110,7 @@ def ordinary(first: Effect) -> str:
         for name, least in cls.tolerance.items():
             size = cls.size(first.values) if name not in first.values else abs(first.values[name] - cls.null()[name])
             if size < least / 2:
-                return f"{name} is {size:.2g}, and less than {least:.2g} {ORDINARY}"
+                return as_ordinary(name, size, least)
     return ""
 
 
@@ -115,5 +129,6 @@ __all__ = [
     "doubt",
     "doubt_all",
     "doubt_any",
+    "impossible",
     "ordinary",
 ]

@@ -12,7 +12,7 @@ from stages.diagnose.search.doubts import ODD, ORDINARY
 from stages.diagnose.settings import SIMPLER
 from stages.effects import get_effect
 
-UNSURE = "these data are not sure"
+UNSURE = "which these data do not prove"
 
 
 def judge(whole: Whole, found: Found) -> None:
@@ -67,20 +67,22 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
         return interval(gains, found.sizes)[0] > 0
 
     for other in [best[n] for n in get_effect(found.effect).confused_with if n in refused and n in best]:
-        if refused[other.effect].endswith(ORDINARY):
+        if refused[other.effect].startswith(ORDINARY):
             if not sure(whole.gains_beside(found, other)):
-                return f"{other.effect}, of which there is an ordinary amount, explains as much of it"
+                return f"an ordinary amount of {other.effect} explains as much of it"
             continue
         judge(whole, other)
         if found.guise.per_frame:  # which stands for what one value for all does, sure or not
             if found.more_than(other)[0] <= 0:
-                return f"{other.effect}, of which {UNSURE}, explains as much of it"
+                return f"{other.effect}, {UNSURE}, explains as much of it"
         elif not other.guise.per_frame and not refused[other.effect].startswith(ODD) and other.more_than(found)[0] > 0:
-            return f"{other.effect}, of which {UNSURE}, explains more of it"
+            return f"{other.effect}, {UNSURE}, explains more of it"
     if (mirrored := whole.mirrored(found.guise)) and not sure(
         found.gains - whole.held_out(whole.places(mirrored), whole.exclude(mirrored))
     ):
-        return "what lies on the other side explains as much of it"
+        return (
+            "the same on the other side of each pixel explains as much of it, as blur and relief finer than the DEM do"
+        )
     own = whole.ordinary_places(found.effect)
     if get_effect(found.effect).lights_shadows and not sure(whole.held_out(whole.places(found.guise), own)):
         return "ordinary amounts of other light in shadows would explain it as well"
@@ -88,7 +90,7 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
         for other in best.values():
             likely = not other.guise.per_frame and other.surprise >= found.surprise
             if likely and not sure(whole.gains_beside(found, other)):
-                return f"{other.effect}, of which {UNSURE}, would explain it as well"
+                return f"{other.effect}, {UNSURE}, would explain it as well"
     return ""
 
 
@@ -97,9 +99,9 @@ def another_law(whole: Whole, found: Found) -> str:
     if not get_effect(found.effect).of_law:
         return ""
     if not len(whole.form_places()):
-        return "the law is fitted to these images, and what is left of it has no form of its own"
+        return "the fitted law already follows it: what it would add has no other form"
     if added := whole.another_law(found.guise):
-        return f"the nominal law has another form, which gains {added:.0f} nats more beside it; the effect stands for a part of that"
+        return f"another law of the ground gains {added:.0f} nats more beside it, of which this is only a part"
     return ""
 
 

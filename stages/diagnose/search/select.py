@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -15,6 +16,7 @@ from stages.diagnose.search.doubts import (
     doubt,
     doubt_all,
     doubt_any,
+    impossible,
     ordinary,
 )
 from stages.diagnose.search.gains import secant_gains
@@ -138,7 +140,7 @@ def _take_one(state: State, view: View, weighed: Weighed, refused: dict[str, str
             return LIKELY
         why = why or take(state, view, chosen, group)
         for gone in [c for c in before if c not in state.causes]:
-            refused[gone.effect.name] = f"beside {chosen.effect} it is no cause any more"
+            refused[gone.effect.name] = f"no longer needed once {chosen.effect} is in the model"
             out.rejected[gone.effect.name] = (gone.found.gain, refused[gone.effect.name])
         if not why:
             state.say(f"{chosen.effect} gains {chosen.gain:.0f} nats on held-out ground")
@@ -158,19 +160,29 @@ def _take_one(state: State, view: View, weighed: Weighed, refused: dict[str, str
 def _why_not_sure(found: Found, faint: float) -> str:
     low, high = found.gain_interval()
     if low > 0:
-        return f"it gains {found.gain:.0f} nats, and less than {faint:.0f} is ordinary in so many pixels"
-    return f"on ground that it was not fitted to it gains {found.gain:.0f} nats ({low:.0f} .. {high:.0f}), which may be nothing"
+        return f"too faint (it gains {found.gain:.0f} nats, less than the {faint:.0f} that errors of the law and of the covariance may gain in so many pixels)"
+    return no_sure_gain(found.gain, low, high)
+
+
+def no_sure_gain(gain: float, low: float, high: float) -> str:
+    """The reason that a gain on held-out ground may be chance."""
+    within = (
+        f"95 %: {low:.0f} .. {high:.0f}"
+        if math.isfinite(low)
+        else "too few pieces of ground tell of it for an interval"
+    )
+    return f"no sure gain on held-out ground ({gain:.0f} nats; {within})"
 
 
 def unlikely(state: State, view: View, found: Found) -> str:
     """Why the effect is none already at the first estimate of its values, or ''."""
     cls = get_effect(found.effect)
     beyond = not found.guise.per_frame and beyond_bounds(found)
-    if beyond and cls.linear:
-        return ODD
     first = as_effect(found, state.data, state.frames, view.whole)
+    if beyond and cls.linear:
+        return impossible(first)
     if cls.scope == "scene" and not cls.plausible({k: float(v) for k, v in first.values.items()}, state.data):
-        return ODD
+        return impossible(first)
     return "" if beyond else ordinary(first)  # a bound is no estimate of its size
 
 
@@ -191,9 +203,9 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         cause.gain_percent, cause.gain_low, cause.gain_high = (200 * x / total for x in (float(gains.sum()), low, high))
         cause.found = dataclasses.replace(cause.found, gains=gains, sizes=sizes)
         if low <= 0:
-            why = f"fitted with everything else it gains {gains.sum():.0f} nats on held-out ground ({low:.0f} .. {high:.0f}), which may be nothing"
+            why = f"fitted together with all other causes, {no_sure_gain(float(gains.sum()), low, high)}"
         why = why or contradicted(test_gains)
-    ordinary_alone = why.endswith(ORDINARY) and why == doubt(state, cause)
+    ordinary_alone = why.startswith(ORDINARY) and why == doubt(state, cause)
     cause.ordinary = ordinary_alone and cls.scope == "scene" and not (cls.of_law or cls.lights_shadows)
     if cause.ordinary:  # a first-order column of a blur is wrong by more than the noise
         return why
