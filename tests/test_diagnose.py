@@ -146,6 +146,15 @@ def test_errors_of_a_dem_whose_relief_runs_one_way_are_no_wrong_sun(tmp_path):
     assert not diagnose.run(tmp_path / "pairs.h5").answer.causes
 
 
+@pytest.mark.slow
+def test_a_high_wall_close_to_the_border_is_named(tmp_path):
+    """It stood beyond the highest that was tried so near, and nothing was said of shadows on half of some images."""
+    truth = make_case(7, Deal("b", "distant_shadow"), 1836542769, tmp_path / "pairs.h5")["planted"]["distant_shadow"]
+    (cause,) = diagnose.run(tmp_path / "pairs.h5").answer.causes
+    height, error, _ = cause.parameters["height_m"]
+    assert cause.effect.name == "distant_shadow" and abs(height - truth["height_m"]) < 3 * error
+
+
 def test_no_effect_is_named_in_the_method():
     """Whatever is special about an effect stands in its own file."""
     folder = Path(diagnose.__file__).parent

@@ -11,7 +11,7 @@ import torch
 from hidden.terrain import red_noise, units
 
 from stages.diagnose.likelihood.covariance import Covariance
-from stages.diagnose.likelihood.products import Rows, make_shams, products
+from stages.diagnose.likelihood.products import Rows, Shams, products
 from stages.diagnose.rows.patches import make_grid, make_patches
 from stages.diagnose.search import ground
 from stages.effects import get_effect
@@ -73,8 +73,7 @@ def test_shadow_of_an_image_left_out_is_left_out():
     assert light.gram[-1, -1] == pytest.approx(0.04 * 32) and np.allclose(light.gram[-1, :2], 0.2 * dark.sum(1))
     assert np.allclose(light.without(0).gram[-1], 0) and np.allclose(light.without(1).gram[-1], light.gram[-1])
     white = [(z[0], mean[0], torch.tensor([2.0])), (z[0], mean[0], torch.zeros(0))]
-    for _, _, sham in make_shams(white, grid, 3, 0)[:1]:
-        assert sham.abs().tolist() == [[2.0]] * 3
+    assert Shams(white, grid, 3, 0).of(0)[2].abs().tolist() == [[2.0]] * 3
 
 
 @pytest.mark.parametrize("kind", ["fractal", "borders", "rays"])

@@ -49,7 +49,10 @@ def command(
         int, typer.Option("--causes", min=1, max=100, help="Most causes to name.")
     ] = Config.most_causes,
     most_pairs: Annotated[
-        int, typer.Option("--pairs", min=1, max=MOST, help="Most pairs that the search uses.")
+        int,
+        typer.Option(
+            "--pairs", min=1, max=MOST, help="Most pairs of 128 px that the search uses; of larger ones fewer, by area."
+        ),
     ] = Config.most_pairs,
     seed: Seed = Config.seed,
     json_file: Json = None,
@@ -113,5 +116,9 @@ def _list_effects() -> None:
         for p in effect.parameters:
             unit = "" if p.unit == "1" else f" {p.unit}"
             write_out(f"  {p.name}: {p.description}; {p.lower:g} .. {p.upper:g}{unit}, null {p.default:g}")
+        units = {p.name: "" if p.unit == "1" else f" {p.unit}" for p in (*effect.fitted(), *effect.parameters)}
+        if effect.tolerance:
+            ordinary = ", ".join(f"{k} up to {v:.2g}{units.get(k, '')}" for k, v in effect.tolerance.items())
+            write_out(f"  any data may have, and gets no name: {ordinary}")
         write_out(f"  reference: {effect.reference}")
         write_out(f"  confused with: {', '.join(effect.confused_with) or '-'}; told apart by {effect.separate}\n")

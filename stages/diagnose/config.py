@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Config:
-    """model : fitted where there is no checkpoint, in its coefficients ``free`` (() for all); most_pairs, most_sites : used for the search."""
+    """model : fitted where there is no checkpoint, in its coefficients ``free`` (() for all); most_pairs (of 128 px; of larger ones fewer, by area), most_sites : used for the search."""
 
     model: str = "M2"
     free: tuple[str, ...] = ()

@@ -49,6 +49,8 @@ from stages.diagnose.structure.kinds import PILED, structure
 from stages.effects import effect_names, get_effect
 from stages.pairs.reader import PairReader
 
+CROP = 128  # px: so large are the pairs that are counted, and of larger ones fewer are taken, for the memory that they need
+
 
 @dataclass
 class Result:
@@ -246,8 +248,9 @@ def _load(reader: PairReader, pairs: np.ndarray, config: Config) -> list[Site]:
     sites: list[Site] = []
     used = 0
     every = grounds(reader, pairs, config.most_images)
-    for members in all_over(every, config.most_pairs, config.most_sites):
-        if used and (used + len(members) > config.most_pairs or len(sites) >= config.most_sites):
+    most_pairs = int(config.most_pairs * min(1.0, CROP**2 / math.prod(reader.size)))
+    for members in all_over(every, most_pairs, config.most_sites):
+        if used and (used + len(members) > most_pairs or len(sites) >= config.most_sites):
             break
         site = load_site(reader, members)
         if site is not None:

@@ -15,7 +15,7 @@ SIDES = ("any", "north", "east", "south", "west")
 
 TANGENTS = (0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8, 1.1, 1.6, 2.2)
 USUAL = 0.5  # crops from the border: where a wall is sought first,
-NEAR, LOW = 0.1, (0.03, 0.045, 0.07, 0.1, 0.14)  # and low ones, whose shadow does not reach far into the crop
+NEAR, LOW = 0.1, (0.03, 0.045, 0.07)  # and near by; low ones, whose shadow does not reach far into the crop, only there
 FINER = tuple(2.0 ** (k / 8) for k in range(-8, 9))  # times the height that was found first
 # crops: beyond the last a ridge hides the Sun everywhere alike
 DISTANCES = (NEAR, 0.17, 0.25, 0.35, USUAL, 0.7, 1.0, 1.4, 2.0, 2.8)
@@ -54,7 +54,9 @@ class DistantShadow(Effect):
 
     @classmethod
     def shadow_trials(cls, survey: Survey) -> list[Trial]:
-        near = [cls.trial(survey, tangent, NEAR, side) for side in range(1, len(SIDES)) for tangent in LOW]
+        near = [
+            cls.trial(survey, tangent, NEAR, side) for side in range(1, len(SIDES)) for tangent in (*LOW, *TANGENTS)
+        ]
         return [*cls.trials(survey), *near]
 
     def shadow_neighbours(self, survey: Survey) -> list[Trial]:

@@ -236,32 +236,43 @@ class _Columns:
         return torch.cat([first, second.flatten(0, 1), self.own_dark @ dark.double().T]).numpy(), squares.numpy()
 
 
-def make_shams(white: Sequence[Residual], grid: Grid, count: int, seed: int) -> list[Residual]:
-    """Sham residuals for every patch: the whitened residual of another one, its images shuffled, mirrored, of either sign."""
-    rng = np.random.default_rng(seed)
-    mirror = _mirror(grid)
-    out = [
-        (torch.empty(count, *z.shape, dtype=z.dtype), torch.empty(count, len(m)), torch.empty(count, len(d)))
-        for z, m, d in white
-    ]
-    pieces = len(white)
-    shadows = np.concatenate([d.numpy() for _, _, d in white])
-    for r in range(count):
-        drawn = torch.from_numpy(rng.permutation(shadows)).split([len(d) for _, _, d in white])
-        shift = int(rng.integers(1, pieces)) if pieces > 1 else 0
-        for p in range(pieces):
-            z, mean, _ = white[(p + shift) % pieces]
-            n = len(out[p][0][0])
-            images = torch.from_numpy(np.concatenate([rng.permutation(len(z)) for _ in range(-(-n // len(z)))])[:n])
-            w = z[images]
-            if rng.random() < 0.5:
-                w = w[:, mirror]
-            if rng.random() < 0.5:
-                w = w.conj()
-            sign = float(rng.choice([-1.0, 1.0]))
-            for into, sham in zip(out[p], (w, mean[images], drawn[p]), strict=True):
-                into[r] = sign * sham
-    return out
+class Shams:
+    """Sham residuals for every patch: the whitened residual of another one, its images shuffled, mirrored, of either sign.
+
+    Only how each is made is kept: all of them together would be ``count`` times as large as the data.
+    """
+
+    def __init__(self, white: Sequence[Residual], grid: Grid, count: int, seed: int) -> None:
+        self.white, self.mirror = white, _mirror(grid)
+        rng = np.random.default_rng(seed)
+        pieces = len(white)
+        shadows = np.concatenate([d.numpy() for _, _, d in white])
+        # of every sham and piece: means in deep shadow, whose residual, its images, mirrored, conjugate, sign
+        self.made: list[list[tuple[Tensor, int, Tensor, bool, bool, float]]] = []
+        for _ in range(count):
+            drawn = torch.from_numpy(rng.permutation(shadows)).split([len(d) for _, _, d in white])
+            shift = int(rng.integers(1, pieces)) if pieces > 1 else 0
+            made = []
+            for p, (own, _, _) in enumerate(white):
+                other = (p + shift) % pieces
+                images = len(white[other][0])
+                order = np.concatenate([rng.permutation(images) for _ in range(-(-len(own) // images))])[: len(own)]
+                flips = rng.random() < 0.5, rng.random() < 0.5
+                made.append((drawn[p], other, torch.from_numpy(order), *flips, float(rng.choice([-1.0, 1.0]))))
+            self.made.append(made)
+
+    def of(self, piece: int) -> Residual:
+        """All shams of one patch."""
+        z, means, dark = [], [], []
+        for made in self.made:
+            drawn, other, order, mirrored, conjugate, sign = made[piece]
+            wave, mean = (x[order] for x in self.white[other][:2])
+            if mirrored:
+                wave = wave[:, self.mirror]
+            z.append(sign * (wave.conj() if conjugate else wave))
+            means.append(sign * mean)
+            dark.append(sign * drawn)
+        return torch.stack(z), torch.stack(means).float(), torch.stack(dark).float()
 
 
 def _mirror(grid: Grid) -> Tensor:
@@ -274,4 +285,4 @@ def _mirror(grid: Grid) -> Tensor:
     return back[flipped]
 
 
-__all__ = ["Products", "Rows", "make_shams", "precision", "products", "whitened_residual"]
+__all__ = ["Products", "Rows", "Shams", "precision", "products", "whitened_residual"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -119,27 +119,24 @@ def make_plan(
     return plan
 
 
-def shared_columns(chain: Chain, plan: Plan, data: Survey, kept: Callable[[Tensor], Tensor]) -> Tensor:
-    """(1 + m, n, H, W): the residual first, then the shared columns in the plan's order. kept : share of the DEM's waves without its errors
+def shared_columns(chain: Chain, plan: Plan, data: Survey, kept: Callable[[Tensor], Tensor]) -> Iterator[Tensor]:
+    """(n, H, W) each: the residual first, then the shared columns in the plan's order. kept : share of the DEM's waves without its errors
 
     Albedo that all images of a place share is part of the residual's covariance.
     """
     moved = moved_columns(chain, plan, data)
-    out = [
-        *moved[:1],
-        *chain.surface_tangents(),
-        *chain.form_tangents(),
-        chain.unresolved_slopes(),
-        *chain.without_dem_errors(kept),
-        *chain.brighter(),
-        *moved[1:],
-    ]
+    yield moved[0]
+    yield from chain.surface_tangents()
+    yield from chain.form_tangents()
+    yield chain.unresolved_slopes()
+    yield from chain.without_dem_errors(kept)
+    yield from chain.brighter()
+    yield from moved[1:]
     for guise in plan.guises:
         if not guise.per_frame:
             cls = get_effect(guise.effect)
             for column in guise.trial.columns:
-                out.append(chain.render(cls({**guise.trial.fixed, **column}, data)) - chain.rendered)
-    return torch.stack(out)
+                yield chain.render(cls({**guise.trial.fixed, **column}, data)) - chain.rendered
 
 
 def moved_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:

@@ -6,14 +6,16 @@ import copy
 import math
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import torch
 from torch import Tensor
 
+from stages.common.memory import return_freed_memory
 from stages.diagnose.likelihood.covariance import Covariance, estimate, shadow_variance
 from stages.diagnose.likelihood.dem_errors import kept_share
 from stages.diagnose.likelihood.found import Found
-from stages.diagnose.likelihood.products import Residual, Rows, make_shams, products, whitened_residual
+from stages.diagnose.likelihood.products import Rows, Shams, products, whitened_residual
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import may_be_exchanged, measured_laws
@@ -25,6 +27,8 @@ from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, moved_c
 from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patches
 from stages.diagnose.settings import FAINT, GROUPS, SEEN, SHAMS
 from stages.effects import Effect, Survey, effect_names, get_effect
+
+TOGETHER = 16  # columns that are transformed at a time: all at once take as much memory again as they do
 
 
 @dataclass
@@ -227,12 +231,17 @@ class State:
     def rows(self, patches: Sequence[Patch], chain: Chain, plan: Plan) -> list[Rows]:
         """Of one site, piece by piece."""
         grid, _ = self.grid()
-        shared, own = shared_columns(chain, plan, self.data, self.kept), frame_columns(chain, plan, self.data)
+        parts: list[list[tuple[Tensor, ...]]] = [[] for _ in patches]
+        columns = shared_columns(chain, plan, self.data, self.kept)
+        while some := list(islice(columns, TOGETHER)):
+            fields = torch.stack(some)
+            for patch, part in zip(patches, parts, strict=True):
+                part.append((*patch.transform(fields, grid), patch.shadow(fields)))
+        own = frame_columns(chain, plan, self.data)
         out = []
-        for patch in patches:
-            z, mean = patch.transform(shared, grid)
-            z_own, mean_own = patch.transform(own, grid)
-            out.append(Rows(patch, z, mean, z_own, mean_own, patch.shadow(shared)))
+        for patch, part in zip(patches, parts, strict=True):
+            z, mean, dark = (torch.cat(x) for x in zip(*part, strict=True))
+            out.append(Rows(patch, z, mean, *patch.transform(own, grid), dark))
         return out
 
     def look(self, names: Sequence[str], shams: int = SHAMS, candidates: Container[str] | None = None) -> View:
@@ -243,7 +252,9 @@ class State:
 
         patches = per_site(lambda k: self.patches(k, chains[k]), range(len(chains)))
         self.kept = self.kept_share(chains, patches, grid)
+        return_freed_memory()  # of the look before, whose pieces have other sizes
         every = per_site(lambda k: self.rows(patches[k], chains[k], plan), range(len(chains)))
+        return_freed_memory()
         return self._view([r for part in every for r in part], plan, grid, None, shams)
 
     def without_impossible(self, view: View, names: Sequence[str]) -> View:
@@ -271,10 +282,8 @@ class State:
 
     def _view(self, rows: list[Rows], plan: Plan, grid: Grid, model: Covariance | None, shams: int) -> View:
         model = model or self._covariance(rows, plan, grid)
-        tricks: list[Residual | None] = [None] * len(rows)
-        if shams:
-            tricks = list(make_shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed))
-        return View(self._whole(rows, tricks, plan, grid, model), plan, rows, grid, model)
+        false = Shams([whitened_residual(r, model, grid) for r in rows], grid, shams, self.seed) if shams else None
+        return View(self._whole(rows, false, plan, grid, model), plan, rows, grid, model)
 
     def moved(self, view: View, site: int, chain: Chain, plan: Plan) -> list[Rows]:
         """Rows of one site of a look under another plan: the residual and the causes' columns by ``chain``, all others as they are."""
@@ -310,10 +319,10 @@ class State:
         frames = sorted(set(torch.cat(every).tolist()))  # most deep shadow is in images that show little lit ground
         return [frames[k::GROUPS] for k in range(min(GROUPS, len(frames)))] if len(frames) > 2 else []
 
-    def _whole(
-        self, rows: Sequence[Rows], shams: Sequence[Residual | None], plan: Plan, grid: Grid, model: Covariance
-    ) -> Whole:
-        units = per_site(lambda k: products(rows[k], model, grid, self.frames, shams[k]), range(len(rows)))
+    def _whole(self, rows: Sequence[Rows], shams: Shams | None, plan: Plan, grid: Grid, model: Covariance) -> Whole:
+        units = per_site(
+            lambda k: products(rows[k], model, grid, self.frames, shams.of(k) if shams else None), range(len(rows))
+        )
         return self._scattered(Whole(units, plan, self.frames))
 
     def _scattered(self, whole: Whole) -> Whole:
