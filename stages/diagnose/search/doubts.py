@@ -73,11 +73,18 @@ def doubt_any(state: State, cause: Cause) -> tuple[str, Cause | None]:
     for c in state.named:
         if why := doubt(state, c):
             return f"with it {c.effect.name} would lose its name ({why})", c
-        # each may stand for the other: together they are sure, and how much there is of either is not known
+    return unknown_beside(state, cause), None
+
+
+def unknown_beside(state: State, cause: Cause) -> str:
+    """Why the cause is none beside another that it is confused with, or ''. Each may stand for the other: together they are sure, and how much
+    there is of either is not known.
+    """
+    for c in state.named:
         alike = c.effect.name in cause.effect.confused_with and c is not cause
         if alike and not (_known_by_itself(cause) or _known_by_itself(c)):
-            return f"with it neither its own size nor that of {c.effect.name} is known: each explains the other", None
-    return "", None
+            return f"with it neither its own size nor that of {c.effect.name} is known: each explains the other"
+    return ""
 
 
 def _known_by_itself(cause: Cause) -> bool:
@@ -95,7 +102,7 @@ def doubt_all(state: State, view: View, sure: float = SURE) -> dict[str, tuple[f
     sure : standard errors from nothing that are asked
     """
     out = {}
-    while doubted := [(c, why) for c in state.named if (why := doubt(state, c, sure))]:
+    while doubted := [(c, why) for c in state.named if (why := doubt(state, c, sure) or unknown_beside(state, c))]:
         cause, why = doubted[-1]  # what was found last stands on the rest
         state.causes.remove(cause)
         out[cause.effect.name] = cause.found.gain, f"fitted together with all other causes, {why}"
