@@ -159,7 +159,7 @@ class Chain:
         return columns
 
     def _parts_of(self, laws: LunarLaws) -> Tensor:
-        """(C, n, H, W) I/F that a coefficient of 1 adds to each facet that the Sun and the camera are above of."""
+        """(C, n, H, W) I/F that a coefficient of 1 adds to facets that face the Sun and the camera; kept for one law, and for chains of the same angles."""
         if laws not in self._parts:
             angles = self._state.angles
             facing = (angles.cos_incidence > 0) & (angles.cos_emission > 0)

@@ -192,6 +192,7 @@ def by_shadows(state: State) -> list[Named]:
     effect, value, apart = wholes[0].best, float(values.mean()), float(np.ptp(values)) / 2
     name = effect.fitted()[0].name
     error = wholes[0].error(np.flatnonzero(shown))
+    # a wall is looked at further than the highest that was tried; where others end there, it is no estimate
     if not around and abs(value) >= max(abs(float(e.values[name])) for e in line):
         return []
     scatter = 0.0  # how far away a wall stands is open, and whether there is one is not
