@@ -53,10 +53,13 @@ HALVED = 0.5  # of the squared residual: laws that leave less take the place of 
 MISFIT = 0.5  # rms residual over rms signal, beyond which the nominal model says nothing about the images
 BROADEST = 3  # annuli: up to four waves across a piece of ground, what stray light and film differ by within one
 ALIKE = 0.03  # of the squares of these, surely (95 %): laws and flat fields that are not known to a few tenths of a per cent make up to 0.02 alike
-FLAT = 0.0025  # rms of lines, relative to brightness, that a good flat field leaves
-STANDS_OUT = 30.0  # times what lies about a pixel: shadows and bright facets below a pixel made up to 17
+FLAT = 0.0025  # rms of lines across the detector's columns, relative to brightness, that a good flat field leaves
+STANDS_OUT = (
+    20.0,
+    30.0,
+)  # times what lies about a bright or dark pixel: facets below a pixel made up to 11, their shadows up to 22
 SPECKS = 3  # pixels that stand out: one or two are on any film, and make no data strange
-LINE = 25.0  # -log10 of the chance of the strongest single wave: leakage of windows made up to 15 on development data, lines from 40
+LINE = 18.0  # -log10 of the chance of the strongest single wave: leakage of windows made up to 15 on development data, lines from 21
 BORROWED = 20.0  # waves' worth of the mean over frames in each frame's own variance: broad annuli have few waves
 ADDED = 50.0  # waves' worth of a size of 1 in each piece of ground's own size
 FOLDS = 16  # parts of the ground, one left out at a time: of fields over a scene an eighth of it says too much

@@ -183,7 +183,7 @@ def _normal_equations(
     score = torch.zeros(count_free, dtype=torch.float64)
     cost, count = 0.0, 0.0
     chains = per_site(lambda site: nominal.chain(site, base), sites)
-    masks = [lit_mask(chain) for chain in chains]
+    masks = [lit_mask(chain) & chain.site.counts for chain in chains]
     if units == "dn":
         for chain, raw, mask in zip(chains, measured, masks, strict=True):
             scale_images(chain.site, raw, chain.rendered, mask)

@@ -32,6 +32,7 @@ class Site:
     gain, offset : (n,), measured = gain x I/F + offset; 1 and 0 for calibrated images
     displacement : where each image looks for its pixels, (columns east, rows south), px, broadcastable to it
     left_out : of the images, those too seldom seen for a covariance of their own
+    unknown : of the images, those of which no values are known while causes have values per image: neither law nor score counts them
     latest : its last rendering, of which the next one takes over what is the same
     """
 
@@ -47,6 +48,7 @@ class Site:
     offset: Tensor
     displacement: tuple[Tensor, Tensor] | None = None
     left_out: frozenset[int] = frozenset()
+    unknown: frozenset[int] = frozenset()
     latest: Chain | None = None
     _shown: Tensor | None = None  # what ``read_valid`` was before pixels were hidden
     _laid: tuple[object, Tensor, Tensor] | None = None  # for one displacement: image and mask over the ground
@@ -87,6 +89,11 @@ class Site:
             down, across = torch.gradient(out, dim=(-2, -1))
             out = out + down * south + across * east
         return out
+
+    @property
+    def counts(self) -> Tensor:
+        """(n, 1, 1) bool: images that are not unknown."""
+        return torch.tensor([k not in self.unknown for k in range(self.count)])[:, None, None]
 
     @property
     def count(self) -> int:

@@ -111,7 +111,7 @@ def score(state: State, answer: Answer, extended: Nominal) -> HeldOut:
     count = 0.0
     for site, was, now in zip(state.hidden, plain, moved, strict=True):
         images = [aligned(site.read, site.read_valid, *d) if d else (site.read, site.read_valid) for d in (was, now)]
-        mask = full_light(nominal.chain(site, [])) & images[0][1] & images[1][1]
+        mask = full_light(nominal.chain(site, [])) & images[0][1] & images[1][1] & site.counts
         for effect in cut:  # of an image that is cut off nearly everywhere nobody knows how bright it would be
             below = mask & (images[1][0] < effect.keep_below * _level(effect, state))
             mask &= (2 * below.sum((-2, -1)) > mask.sum((-2, -1)))[:, None, None]
@@ -243,7 +243,7 @@ def _hidden_squares(state: State, images: Sequence[torch.Tensor] | None = None) 
     for k, chain in enumerate(_hidden_chains(state)):
         site = chain.site
         image = site.laid if images is None else images[k] * site.gain[:, None, None] + site.offset[:, None, None]
-        out.append(_squares(site, chain, image, lit_mask(chain), state)[0])
+        out.append(_squares(site, chain, image, lit_mask(chain) & site.counts, state)[0])
     return np.concatenate(out)
 
 

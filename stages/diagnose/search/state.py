@@ -99,6 +99,7 @@ class State:
     hidden: list[Site] = field(default_factory=list)  # of the test pairs, which nothing is fitted to
     registration: Registration | None = None
     causes: list[Cause] = field(default_factory=list)
+    seldom: frozenset[int] = frozenset()  # frames that show too few pieces of ground for values of their own
     # effects whose best values nothing real has: of them the others have no ordinary amounts beside them
     impossible: set[str] = field(default_factory=set)
     # effects that were fitted and refused -> their largest error, in sizes worth knowing
@@ -176,6 +177,9 @@ class State:
     def fit(self, start: bool = False) -> None:
         """Fit the nominal model (and gain and offset of dn images) to the aligned images."""
         self.align()
+        per_image = any(c.found.guise.per_frame and not c.effect.displaces for c in self.causes)
+        for site in [*self.sites, *self.hidden]:
+            site.unknown = frozenset(k for k, f in enumerate(site.frames) if per_image and f in self.seldom)
         fit(self.nominal, self.sites, self.base, self.units, [s.laid for s in self.sites], start=start)
 
     def plain(self) -> Nominal:
@@ -200,9 +204,10 @@ class State:
             return
         frames = torch.cat([p.frames for p in patches])
         seen = torch.bincount(frames, minlength=self.frames)
-        if int((seen[frames] >= SEEN).sum()) > len(frames) / 2:
-            for site in self.sites:
-                site.left_out = frozenset(k for k, f in enumerate(site.frames) if seen[f] < SEEN)
+        least = SEEN if int((seen[frames] >= SEEN).sum()) > len(frames) / 2 else 1
+        self.seldom = frozenset(torch.nonzero(seen < least)[:, 0].tolist())
+        for site in self.sites:
+            site.left_out = frozenset(k for k, f in enumerate(site.frames) if f in self.seldom)
 
     def open_names(self) -> list[str]:
         """Effects that are not rendered yet and that data of this kind can show."""

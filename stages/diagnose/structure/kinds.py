@@ -10,7 +10,7 @@ from stages.diagnose.structure.blocks import blocks_of_compression
 from stages.diagnose.structure.detector import pattern_of_detector
 from stages.diagnose.structure.fields import field_of_images
 from stages.diagnose.structure.innovations import innovations
-from stages.diagnose.structure.lines import line_of_brightness, line_of_displacement
+from stages.diagnose.structure.lines import across_columns, line_of_brightness, line_of_displacement
 from stages.diagnose.structure.pixels import pixels_that_stand_out
 from stages.diagnose.structure.steps import steps_of_brightness
 
@@ -25,9 +25,11 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
     """
     out: dict[str, float] = {}
     left = innovations(view.rows, view.model, view.grid, state.sites)
-    line, share, rms = line_of_brightness(view.rows, view.model, view.grid, state.frames)
-    if line > LINE and rms > FLAT:
-        out["lines across an image"] = share
+    columns = across_columns(state.sites, view.grid, state.frames)
+    for without, ordinary in ((columns, 0.0), (None, FLAT)):
+        line, share, rms = line_of_brightness(view.rows, view.model, view.grid, state.frames, without)
+        if line > LINE and rms > ordinary:
+            out.setdefault("lines across an image", share)
     line, share = line_of_displacement(left, view.grid, state.frames)
     if line > LINE and share > NOTABLE:  # bilinear resampling leaves half of that
         out["displacements that come back at equal distances"] = share

@@ -14,6 +14,7 @@ from torch import Tensor
 from stages.diagnose.likelihood.covariance import Covariance
 from stages.diagnose.likelihood.products import Rows, whitened_residual
 from stages.diagnose.likelihood.tails import surprise
+from stages.diagnose.model.sites import Site
 from stages.diagnose.rows.patches import Grid
 from stages.diagnose.settings import FAR, NEAR, PEAK
 from stages.diagnose.structure.innovations import Innovation
@@ -21,22 +22,44 @@ from stages.diagnose.structure.innovations import Innovation
 STEEPEST = 3.0  # standard deviations: an edge is no line
 
 
-def line_of_brightness(rows: Sequence[Rows], model: Covariance, grid: Grid, frames: int) -> tuple[float, float, float]:
+def line_of_brightness(
+    rows: Sequence[Rows], model: Covariance, grid: Grid, frames: int, without: Tensor | None = None
+) -> tuple[float, float, float]:
     """-log10 of the chance of the strongest single wave of any frame among all of them, its share of that frame's squares, and
     its rms relative to brightness.
+
+    without : (frames, K) bool, waves that are not looked at
     """
     spectra = []
     for row in rows:
         z, _, _ = whitened_residual(row, model, grid)
         size = (row.patch.weight.square().mean((-2, -1)) * model.size.get(row.patch.number, 1.0)).clamp(min=1e-6)
         spectra.append((row.patch.frames, z / size.sqrt()[:, None]))
-    chance, share, frame, waves = _strongest(spectra, grid, frames)
+    chance, share, frame, waves = _strongest(spectra, grid, frames, without)
     squares, pixels = 0.0, 0.0
     for row in rows:
         here = row.patch.frames == frame
         squares += float(row.shared[0][here][:, waves].abs().square().sum())
         pixels += float(row.patch.weight[here].square().sum())
     return chance, share, math.sqrt(squares / max(pixels, 1.0))
+
+
+def across_columns(sites: Sequence[Site], grid: Grid, frames: int) -> Tensor:
+    """(frames, K) bool: waves that lie across the columns of a frame's detector within the width of one wave, as a flat field's errors do; all waves
+    of a frame whose detector is not known.
+    """
+    out = torch.ones(frames, len(grid.keep), dtype=torch.bool)
+    waves = torch.stack(grid.waves, 1)
+    length = min(grid.height, grid.width)
+    for site in sites:
+        if site.observation.detector_line is None:
+            continue
+        down, across = (d.flatten(2).nanmedian(2).values for d in torch.gradient(site.on_detector(), dim=(-2, -1)))
+        for frame, jacobian in zip(site.frames.tolist(), torch.stack([down, across], 1), strict=True):
+            if bool(torch.linalg.det(jacobian).abs() > 1e-6):
+                along_lines = torch.linalg.solve(jacobian, waves.T)[0]  # cycles per line of the detector
+                out[frame] = (along_lines * length).abs() < 1
+    return out
 
 
 def line_of_displacement(every: Sequence[Innovation], grid: Grid, frames: int) -> tuple[float, float]:
@@ -59,10 +82,12 @@ def line_of_displacement(every: Sequence[Innovation], grid: Grid, frames: int) -
     return best
 
 
-def _strongest(spectra: Sequence[tuple[Tensor, Tensor]], grid: Grid, frames: int) -> tuple[float, float, int, Tensor]:
+def _strongest(
+    spectra: Sequence[tuple[Tensor, Tensor]], grid: Grid, frames: int, without: Tensor | None = None
+) -> tuple[float, float, int, Tensor]:
     """-log10 of its chance, its share of the squares, its frame (-1: none), and which waves it is, (K,) bool.
 
-    spectra : frames (n,) and coefficients (n, K) of every piece of ground
+    spectra : frames (n,) and coefficients (n, K) of every piece of ground; without : (frames, K) bool, waves that are not looked at
     """
     power = torch.zeros(frames, len(grid.keep), dtype=torch.float64)
     count = torch.zeros(frames, dtype=torch.float64)
@@ -78,7 +103,8 @@ def _strongest(spectra: Sequence[tuple[Tensor, Tensor]], grid: Grid, frames: int
         for a in range(grid.annuli):
             level[a] = p[grid.annulus == a].median()
         ratio = p / level[grid.annulus].clamp(min=1e-30)
-        ratio = torch.where(fine, ratio / _about(ratio, grid).clamp(min=1), 0.0)
+        sought = fine if without is None else fine & ~without[number]
+        ratio = torch.where(sought, ratio / _about(ratio, grid).clamp(min=1), 0.0)
         top = float(ratio.max())
         shape = max(float(n), 1.0)
         middle = float(gammaincinv(shape, 0.5))
@@ -102,4 +128,4 @@ def _about(power: Tensor, grid: Grid) -> Tensor:
     return torch.from_numpy(median_filter(plane, footprint=ring, mode="wrap")[row, column])
 
 
-__all__ = ["line_of_brightness", "line_of_displacement"]
+__all__ = ["across_columns", "line_of_brightness", "line_of_displacement"]

@@ -21,11 +21,12 @@ LARGEST = 100.0  # standard deviations of a neighbour: one that stands out itsel
 def pixels_that_stand_out(every: Sequence[Innovation]) -> tuple[int, float]:
     """How many there are, and their share of the squares. A place counts once, in the image that differs most."""
     found, out, total = 0, 0.0, 0.0
+    bright, dark = STANDS_OUT
     for one in every:
         ratio = _beside_neighbours(one)
-        size = ratio.abs().amax(0)
+        size = torch.maximum(ratio / bright, -ratio / dark).amax(0)
         peak = size == max_pool2d(size[None], 5, 1, 2)[0]
-        odd = peak & (size > STANDS_OUT)
+        odd = peak & (size > 1)
         found += int(odd.sum())
         out += float((one.value.square().amax(0) * odd).sum())
         total += float(one.value.square().sum())
