@@ -17,13 +17,14 @@ from stages.diagnose.likelihood.tails import together
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.rows.columns import Plan
 from stages.diagnose.rows.patches import make_grid
-from stages.diagnose.settings import LINE, NOTABLE, PEAK
+from stages.diagnose.settings import LINE, NOTABLE, PEAK, SURE
 from stages.diagnose.structure import kinds
+from stages.diagnose.structure.amplifiers import odd_and_even
 from stages.diagnose.structure.blocks import blocks_of_compression
 from stages.diagnose.structure.detector import pattern_of_detector
 from stages.diagnose.structure.fields import field_of_images
 from stages.diagnose.structure.innovations import Innovation, innovations
-from stages.diagnose.structure.lines import line_of_brightness, line_of_displacement
+from stages.diagnose.structure.lines import across_columns, line_of_brightness, line_of_displacement
 from stages.diagnose.structure.pixels import pixels_that_stand_out
 from stages.diagnose.structure.steps import steps_of_brightness
 
@@ -121,9 +122,9 @@ def _plane(z: torch.Tensor, grid) -> torch.Tensor:
 
 def test_a_pixel_stands_out_by_more_than_small_shadows_and_rough_ground_do():
     assert all(pixels_that_stand_out(left(seed)) == (0, 0.0) for seed in range(20))
-    for sign in (1, -1):
+    for sign, ordinary in ((1, 15.0), (-1, 25.0)):
         every = left(1)
-        every[3].value[2, 15, 16] = 20.0 * sign  # as a facet or a small shadow
+        every[3].value[2, 15, 16] = ordinary * sign  # as a facet or, darker, a small shadow
         assert pixels_that_stand_out(every) == (0, 0.0)
         every[3].value[2, 15, 16] = 45.0 * sign
         assert pixels_that_stand_out(every) == (1, pytest.approx(45**2 / (8 * FRAMES * SIZE**2), rel=0.05))
@@ -156,6 +157,40 @@ def test_the_nearest_pixel_of_a_detector_leaves_lines_in_where_it_shows_the_grou
     chance, share = line_of_displacement(left(1, nearest), grid, FRAMES)
     assert chance > 25 and share > 0.005
     assert line_of_brightness(rows(0.0, 1), Covariance.white(grid.annuli, FRAMES), grid, FRAMES)[0] < 5
+
+
+def test_odd_and_even_columns_differ_by_no_more_than_chance_unless_they_do():
+    def alternate(images, slopes, line, sample, size=0.15):
+        return images + size * np.cos(np.pi * sample)
+
+    flat = np.random.default_rng(6).normal(0, 0.3, 4 * SIZE)
+
+    def own_columns(images, slopes, line, sample):
+        return images + flat[np.round(sample).astype(int)]
+
+    chance = [odd_and_even(left(seed))[0] for seed in range(40)]
+    assert max(chance) < SURE and np.median(chance) < 2
+    assert max(odd_and_even(left(seed, own_columns))[0] for seed in range(20)) < SURE
+    for axis in (1, -1):  # columns, lines
+        surely, share = odd_and_even(
+            left(1, lambda images, slopes, *at, axis=axis: alternate(images, slopes, *at[::axis]))
+        )
+        assert surely > 2 * SURE and share == pytest.approx(0.15**2 / 2, rel=0.3)
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.3, 1.2])
+def test_waves_across_the_columns_of_a_turned_detector(turned):
+    grid = make_grid(SIZE, SIZE)
+    y, x = np.mgrid[0:SIZE, 0:SIZE].astype(float)
+    c, s = np.cos(turned), np.sin(turned)
+    detector = torch.tensor(0.9 * np.stack([c * y - s * x, s * y + c * x]))[None]
+    known = SimpleNamespace(detector_line=detector[:, 0])
+    site = SimpleNamespace(observation=known, on_detector=lambda: detector, frames=np.array([1]))
+    across = across_columns([site], grid, 2)
+    assert bool(across[0].all())  # nobody knows how its detector lies
+    down, along = grid.waves
+    per_line = (c * down - s * along) / 0.9
+    assert torch.equal(across[1], (per_line * SIZE).abs() < 1) and 0.01 < across[1].double().mean() < 0.15
 
 
 def test_blocks_of_compression_are_told_from_anything_else():
@@ -195,7 +230,7 @@ def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
     nothing = {
         "line_of_brightness": (0.0, 0.0, 0.0), "line_of_displacement": (0.0, 0.0), "field_of_images": (0.0, 0.0),
         "pattern_of_detector": (0.0, 0.0), "pixels_that_stand_out": (0, 0.0),
-        "steps_of_brightness": (0.0, 0.0, -1), "blocks_of_compression": (0.0, 0.0),
+        "steps_of_brightness": (0.0, 0.0, -1), "blocks_of_compression": (0.0, 0.0), "odd_and_even": (0.0, 0.0),
     }  # fmt: skip
     state = SimpleNamespace(sites=[], frames=1)
     grid = make_grid(SIZE, SIZE)
@@ -203,9 +238,11 @@ def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
         rows=[], model=Covariance(*[None] * 2, 1e-4 * torch.ones(grid.annuli, 1), *[0.0] * 3), grid=grid
     )
 
-    def words(piled=0.0, **found):
+    def words(piled=0.0, off_columns=(0.0, 0.0, 0.0), **found):
         for name, value in {**nothing, **found}.items():
             monkeypatch.setattr(kinds, name, lambda *_, value=value: value)
+        lines = found.get("line_of_brightness", off_columns)
+        monkeypatch.setattr(kinds, "line_of_brightness", lambda *given: lines if given[-1] is None else off_columns)
         return list(kinds.structure(state, view, piled))
 
     assert words() == []
@@ -213,12 +250,16 @@ def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
     assert words(pixels_that_stand_out=(3, 0.1)) == ["3 single pixels that stand out"]
     assert words(line_of_brightness=(40.0, 0.01, 0.002)) == []
     assert words(line_of_brightness=(40.0, 0.01, 0.003)) == ["lines across an image"]
+    assert words(off_columns=(40.0, 0.01, 0.002)) == ["lines across an image"]  # no flat field leaves those
+    assert words(off_columns=(15.0, 0.01, 0.002)) == []
     assert words(line_of_displacement=(40.0, 0.005)) == []
     assert len(words(line_of_displacement=(40.0, 0.02))) == 1
     assert words(pattern_of_detector=(0.05, 0.02), field_of_images=(0.05, 0.02)) == []  # not surely
     assert len(words(pattern_of_detector=(0.05, 0.04), field_of_images=(0.05, 0.04))) == 2
-    assert words(steps_of_brightness=(20.0, 0.002, 0)) == [] == words(steps_of_brightness=(40.0, 0.0009, 0))
+    assert words(steps_of_brightness=(15.0, 0.002, 0)) == [] == words(steps_of_brightness=(40.0, 0.0009, 0))
     assert words(steps_of_brightness=(40.0, 0.002, 0)) == ["brightness that comes in equal steps"]
+    assert words(odd_and_even=(3.0, 0.01)) == [] == words(odd_and_even=(9.0, 0.0001))
+    assert len(words(odd_and_even=(9.0, 0.01))) == 1
     assert words(blocks_of_compression=(5.0, 0.05)) == [] == words(blocks_of_compression=(9.0, 0.005))
     assert len(words(blocks_of_compression=(9.0, 0.05))) == 1
     assert words(piled=0.01) == [kinds.PILED]

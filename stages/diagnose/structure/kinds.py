@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 
 from stages.diagnose.search.state import State, View
-from stages.diagnose.settings import ALIKE, FAINT, FLAT, LINE, NOTABLE, PEAK, SPECKS
+from stages.diagnose.settings import ALIKE, FAINT, FLAT, LINE, NOTABLE, PEAK, SPECKS, SURE
+from stages.diagnose.structure.amplifiers import odd_and_even
 from stages.diagnose.structure.blocks import blocks_of_compression
 from stages.diagnose.structure.detector import pattern_of_detector
 from stages.diagnose.structure.fields import field_of_images
@@ -45,6 +46,9 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
     count, share = pixels_that_stand_out(left)
     if count >= SPECKS and share > FAINT**2:
         out[f"{count} single pixels that stand out"] = share
+    surely, share = odd_and_even(left)
+    if surely > SURE and share > FAINT**2:
+        out["odd and even columns of the detector that differ"] = share
     line, rms, frame = steps_of_brightness(state.sites, state.frames)
     if line > LINE and (share := rms**2 / _own(view, frame)) > NOTABLE:
         out["brightness that comes in equal steps"] = min(share, 1.0)

@@ -49,7 +49,7 @@ def across_columns(sites: Sequence[Site], grid: Grid, frames: int) -> Tensor:
     of a frame whose detector is not known.
     """
     out = torch.ones(frames, len(grid.keep), dtype=torch.bool)
-    waves = torch.stack(grid.waves, 1)
+    waves = torch.stack(grid.waves)
     length = min(grid.height, grid.width)
     for site in sites:
         if site.observation.detector_line is None:
@@ -57,7 +57,7 @@ def across_columns(sites: Sequence[Site], grid: Grid, frames: int) -> Tensor:
         down, across = (d.flatten(2).nanmedian(2).values for d in torch.gradient(site.on_detector(), dim=(-2, -1)))
         for frame, jacobian in zip(site.frames.tolist(), torch.stack([down, across], 1), strict=True):
             if bool(torch.linalg.det(jacobian).abs() > 1e-6):
-                along_lines = torch.linalg.solve(jacobian, waves.T)[0]  # cycles per line of the detector
+                along_lines = torch.linalg.solve(jacobian.to(waves), waves)[0]  # cycles per line of the detector
                 out[frame] = (along_lines * length).abs() < 1
     return out
 
