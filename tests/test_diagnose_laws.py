@@ -11,12 +11,15 @@ from orbital_angles import orbital_cosines
 from planted import semi_real
 
 from stages import diagnose
+from stages.diagnose.likelihood.found import Found
 from stages.diagnose.model.form import better_form, measured_laws, other_laws, relative_misfit
 from stages.diagnose.model.laws import LunarLaws, lunar_laws
 from stages.diagnose.model.nominal import fit, load_nominal
 from stages.diagnose.model.sites import Site, load_site, survey
 from stages.diagnose.registration.explain import explain
+from stages.diagnose.rows.columns import Guise
 from stages.diagnose.rows.patches import cuts
+from stages.diagnose.search.state import Cause, State
 from stages.effects import Survey, effect_names, get_effect
 from stages.pairs.reader import PairReader
 from stages.physics.formation.geometry import Angles
@@ -120,6 +123,30 @@ def test_what_one_effect_of_the_law_explains_is_no_other_law(places, name):
         assert relative_misfit(measured, places) ** 2 < 0.5 * relative_misfit(nominal, places) ** 2
         other = better_form(nominal, places, survey(places, 8, "iof"))
     assert (other is not None) == (name == "akimov")
+
+
+def test_an_image_whose_own_gain_is_not_known_does_not_fit_the_law(places):
+    """Beside gains of images one that shows too little lit ground for a gain of its own would bend the law; without such a cause it counts."""
+    nominal = load_nominal(None, "M2", "iof")
+    dim = places[0].frames[3]
+    with torch.no_grad():
+        for site in places:
+            image = nominal.chain(site, []).predict().clone()
+            image[site.frames == dim] *= 0.7
+            site.gain, site.offset = torch.ones(site.count), torch.zeros(site.count)
+            site.read = site.image = image
+        true = nominal.vector.clone()
+        gains = Guise("image_gain", get_effect("image_gain").trials(Survey())[0], (0,), per_frame=True)
+        moved = Guise("misregistration", get_effect("misregistration").trials(Survey())[0], (0,), per_frame=True)
+        state = State(nominal, places, Survey(), 8, "iof", frozenset(), 1, seldom=frozenset({int(dim)}))
+        off = {}
+        for guise in (gains, moved):
+            effect = get_effect(guise.effect)({}, Survey())
+            state.causes = [Cause(effect, Found(guise.effect, guise, np.zeros(1), np.ones(1), 0.0))]
+            state.fit()
+            off[guise.effect] = float((nominal.vector / true - 1).abs().max())
+            assert [site.unknown for site in places] == [frozenset({3} if guise is gains else ())] * len(places)
+    assert off["image_gain"] < 1e-3 < 0.02 < off["misregistration"]
 
 
 def test_beside_free_gains_no_effect_of_the_law_is_visible():
