@@ -19,6 +19,7 @@ from stages.diagnose.rows.patches import Grid
 from stages.diagnose.settings import FAR, NEAR, PEAK
 from stages.diagnose.structure.innovations import Innovation
 
+SHORTEST = 0.55  # cycles per pixel of the detector: it has none beyond 0.5, and a wave is that much wide
 STEEPEST = 3.0  # standard deviations: an edge is no line
 
 
@@ -49,16 +50,19 @@ def across_columns(sites: Sequence[Site], grid: Grid, frames: int) -> Tensor:
     of a frame whose detector is not known.
     """
     out = torch.ones(frames, len(grid.keep), dtype=torch.bool)
-    waves = torch.stack(grid.waves)
     length = min(grid.height, grid.width)
+    whole = torch.cartesian_prod(
+        *[torch.arange(-1.0, 2.0)] * 2
+    )  # waves shorter than two pixels of the map pass for longer ones
+    waves = torch.stack(grid.waves, 1)[:, None] + whole
     for site in sites:
         if site.observation.detector_line is None:
             continue
         down, across = (d.flatten(2).nanmedian(2).values for d in torch.gradient(site.on_detector(), dim=(-2, -1)))
-        for frame, jacobian in zip(site.frames.tolist(), torch.stack([down, across], 1), strict=True):
+        for frame, jacobian in zip(site.frames.tolist(), torch.stack([down, across], 1).to(waves), strict=True):
             if bool(torch.linalg.det(jacobian).abs() > 1e-6):
-                along_lines = torch.linalg.solve(jacobian.to(waves), waves)[0]  # cycles per line of the detector
-                out[frame] = (along_lines * length).abs() < 1
+                per_line, per_sample = (waves @ torch.linalg.inv(jacobian).T).unbind(-1)  # cycles on the detector
+                out[frame] = (((per_line * length).abs() < 1) & (per_sample.abs() < SHORTEST)).any(1)
     return out
 
 
