@@ -86,7 +86,7 @@ def test_shadows_tell_a_wall_the_sun_and_its_disc_whatever_the_law(planted, name
     rng = np.random.default_rng(5)
     chains = [ShadowedGround(rng, k, **planted) for k in range(4)]
     survey = Survey(crop_px=64, gsd=10.0)
-    found = by_shadows(SimpleNamespace(chains=lambda: chains, causes=[], data=survey, free_gains=False))
+    found, _ = by_shadows(SimpleNamespace(chains=lambda: chains, causes=[], data=survey, free_gains=False))
     assert [c.effect.name for c in found] == ([name] if name else [])
     if name:
         value, error, _ = found[0].parameters[parameter]
@@ -105,7 +105,7 @@ def test_a_horizon_is_known_where_the_sun_was_said_to_be():
             [[math.cos(turn), math.sin(turn), 0.0], [-math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]]
         )
     state = SimpleNamespace(chains=lambda: chains, causes=[], data=Survey(crop_px=64, gsd=10.0), free_gains=False)
-    assert not by_shadows(state)
+    assert by_shadows(state) == ([], {})
 
 
 @pytest.mark.parametrize("wall", [None, (150.0, 200.0)])

@@ -229,10 +229,8 @@ def _by_shadows(state: State) -> tuple[Sequence[Named], Nominal, dict[str, tuple
     """What shadows tell and the test pairs do not refuse, the nominal model as it is fitted beside that, and what is refused."""
     for site in state.sites:
         site.show()
-    found = by_shadows(state)
-    if not found:
-        return [], state.nominal, {}
-    return beside_shadows(state, found)
+    found, refused = by_shadows(state)
+    return beside_shadows(state, found) if found else ([], state.nominal, refused)
 
 
 def _verdict(answer: Answer) -> str:

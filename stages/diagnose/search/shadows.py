@@ -20,6 +20,7 @@ from stages.diagnose.likelihood.jackknife import folds, gain_chance, gain_interv
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.result.answer import Named
+from stages.diagnose.search.doubts import ORDINARY
 from stages.diagnose.search.edges import PARTS, Edges, Horizons, move, squares
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import CORRELATED, FALLS, OPEN, SHADED, UNITS
@@ -159,15 +160,18 @@ def _best(every: Sequence[Tried]) -> list[Effect]:
     return [t.best for t in every if any(t.best.values[k] != v for k, v in t.best.null().items())]
 
 
-def by_shadows(state: State) -> list[Named]:
-    """The cause that moves shadows surely, more than is ordinary and more than any other does; [] where there is none."""
+Refused = dict[str, tuple[float, str]]
+
+
+def by_shadows(state: State) -> tuple[list[Named], Refused]:
+    """The cause that moves shadows surely, more than is ordinary and more than any other does, if there is one; effect -> nats, why it has no name."""
     chains = [c for c in state.chains() if c.state.sun_horizon is not None]
     # how dark a shadow is nobody knows beside free offsets
     if not chains or state.free_gains:
-        return []
+        return [], {}
     shadows = Shadows(state, per_site(Edges, chains))
     if not shadows.every:
-        return []
+        return [], {}
     named = {type(c.effect).name for c in state.causes}
     if any(c.effect.slot == "geometry" and not c.effect.displaces for c in state.causes) or any(map(_turned, chains)):
         # relief that is wrong casts wrong shadows; a horizon is known in the direction where the Sun was said to be
@@ -178,23 +182,28 @@ def by_shadows(state: State) -> list[Named]:
     every = usual[-1].held_out()
     shown = every > 0
     if first is None or not shown.any():
-        return []
+        return [], {}
     before, after = every[shown], first.held_out()[shown]
     effect = first.best
     around = effect.shadow_neighbours(state.data)
     percent = gain_interval(before, after)
     least = 100 * SHADED if around else 0.0  # of several values some would fit by chance
     if not percent[1] > least:
-        return []
+        return [], {}
     line = [e for e in shadows.every[effect.name] if _on_one_line(e, effect)]
     wholes = [shadows.in_turn(line, fall) for fall in FALLS]
     values = np.array([w.value() for w in wholes])
     effect, value, apart = wholes[0].best, float(values.mean()), float(np.ptp(values)) / 2
     name = effect.fitted()[0].name
     error = wholes[0].error(np.flatnonzero(shown))
+    pixels = float(sum(c.site.valid.sum() for c in chains))
+
+    def refused(why: str) -> tuple[list[Named], Refused]:
+        return [], {effect.name: (nats(float(before.sum()), float(after.sum()), pixels, CORRELATED), why)}
+
     # a wall is looked at further than the highest that was tried; where others end there, it is no estimate
     if not around and abs(value) >= max(abs(float(e.values[name])) for e in line):
-        return []
+        return refused(f"shadows fit best at the end of what was tried ({name} = {value:.3g})")
     scatter = 0.0  # how far away a wall stands is open, and whether there is one is not
     if around:
         near = shadows.in_turn([type(effect)({**t.fixed, **t.columns[0]}, state.data) for t in around])
@@ -202,11 +211,10 @@ def by_shadows(state: State) -> list[Named]:
         value = float(effect.values[name])
     nearer = math.copysign(max(abs(value) - apart - 2 * math.hypot(error, effect.shadow_error), 0.0), value)
     if effect.shadows_ordinarily({**effect.values, name: nearer}):
-        return []
+        return refused(f"{ORDINARY} in shadows ({name} = {value:.3g} +- {math.hypot(error, effect.shadow_error):.1g})")
     made = type(effect)({**effect.values, name: value}, state.data)
     rivals = [t.best.name for t in found if t is not first and not gain_interval(t.held_out()[shown], after)[1] > 0]
-    pixels = float(sum(c.site.valid.sum() for c in chains))
-    return [_named(made, math.hypot(error, scatter, apart), before, after, pixels, rivals)]
+    return [_named(made, math.hypot(error, scatter, apart), before, after, pixels, rivals)], {}
 
 
 def _turned(chain: Chain) -> bool:
