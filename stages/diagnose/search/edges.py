@@ -99,35 +99,62 @@ class Edges:
 
     def products(self, effects: Sequence[Effect], beside: Sequence[Effect], about: Horizons) -> Floats:
         """(effects, PARTS, 3, 3) of the residual share of sunlight and of what a little more blur and lift would add to the expected one."""
-        out = [self._products([*(b for b in beside if b.name != e.name), e], about) for e in effects]
+        out, without = [], None
+        for effect in effects:
+            every = [*(b for b in beside if b.name != effect.name), effect]
+            if without is None or not effect.raises_horizon:  # without walls all the same
+                without = self._without_walls([e for e in every if not e.raises_horizon], about)
+            walls = any(e.raises_horizon for e in every)
+            out.append(self._products(every, *without, about) if walls else without[-1])
         return torch.stack(out).numpy()
 
-    def _products(self, effects: Sequence[Effect], about: Horizons) -> Tensor:
+    def _without_walls(self, effects: Sequence[Effect], about: Horizons) -> tuple[Tensor, Tensor, Tensor]:
+        """The DEM's horizon (n * H * W,), rows (3, M) of the facets near it, and the products of all."""
         sun, horizon, disc = self.chain.sunlight(effects)
-        known = self.chain.sunlight([e for e in effects if not e.raises_horizon])[1]
-        assert horizon is not None and known is not None
-        raised = (horizon > known).flatten()  # what stands beyond the DEM stands far off, as it was given
-
-        def of(facets: _Facets) -> Tensor:
-            """(PARTS, 3, 3) of some facets."""
-            nearness = torch.where(raised[facets.pixel], 0.0, facets.nearness**about.fall)
-            above = sun[facets.image] - horizon.flatten()[facets.pixel]
-            radius = torch.hypot(disc, about.blur * nearness)
-            t = (about.lift * nearness - above) / radius
-            slope = visibility_slope(t) / radius
-            wider = -slope * t * about.blur * nearness.square() / radius
-            left = facets.measured - sun_visibility(above, about.lift * nearness, radius)
-            x = torch.stack([left, wider, slope * nearness]).double()
-            return torch.stack([own @ own.T for own in x.split(facets.counts, 1)])
-
-        out = of(self.near)
-        # only a wall beyond the DEM darkens what the Sun stands well above
+        assert horizon is not None
+        nearness = self.near.nearness**about.fall
+        rows = _rows(self.near, sun, horizon.flatten(), disc, nearness, about)
+        out = _sums(rows, self.near)
         out[:, 0, 0] += self.far_squares
-        if bool((hidden := raised[self.far.pixel]).any()):
-            hidden_far = self.far.those(hidden)
-            out += of(hidden_far)
-            out[:, 0, 0] -= hidden_far.squares()
+        return horizon.flatten(), rows, out
+
+    def _products(
+        self, effects: Sequence[Effect], known: Tensor, rows: Tensor, plain: Tensor, about: Horizons
+    ) -> Tensor:
+        """(PARTS, 3, 3) with walls among the effects. known, rows, plain : of :meth:`_without_walls`"""
+        sun, horizon, disc = self.chain.sunlight(effects)
+        assert horizon is not None
+        horizon = horizon.flatten()
+        raised = horizon > known
+        out = plain.clone()
+        for facets in (self.near, self.far):  # only a wall beyond the DEM darkens what the Sun stands well above
+            behind = torch.nonzero(raised[facets.pixel])[:, 0]
+            if not len(behind):
+                continue
+            some = facets.those(behind)
+            far_off = torch.zeros_like(some.nearness)  # what stands beyond the DEM stands far off, as it was given
+            out += _sums(_rows(some, sun, horizon, disc, far_off, about), some)
+            if facets is self.near:
+                out -= _sums(rows[:, behind], some)
+            else:
+                out[:, 0, 0] -= some.squares()
         return out
+
+
+def _rows(facets: _Facets, sun: Tensor, horizon: Tensor, disc: Tensor, nearness: Tensor, about: Horizons) -> Tensor:
+    """(3, M) residual share of sunlight, and what a little more blur and lift would add to the expected one."""
+    above = sun[facets.image] - horizon[facets.pixel]
+    radius = torch.hypot(disc, about.blur * nearness)
+    t = (about.lift * nearness - above) / radius
+    slope = visibility_slope(t) / radius
+    wider = -slope * t * about.blur * nearness.square() / radius
+    left = facets.measured - sun_visibility(above, about.lift * nearness, radius)
+    return torch.stack([left, wider, slope * nearness]).double()
+
+
+def _sums(rows: Tensor, facets: _Facets) -> Tensor:
+    """(PARTS, 3, 3) products of the rows (3, M) of some facets."""
+    return torch.stack([own @ own.T for own in rows.split(facets.counts, 1)])
 
 
 def _light(chain: Chain) -> tuple[Tensor, Tensor, Tensor]:
