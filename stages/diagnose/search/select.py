@@ -27,6 +27,7 @@ from stages.diagnose.search.tested import hidden_look
 from stages.diagnose.settings import DISCOVERY, FAINT, NOTABLE, SHAMS, TRIED, TRIES
 from stages.effects import get_effect
 
+PART_OF_A_LAW = "another law of the ground surely gains beside it, of which this is only a part"
 TAKEN, STRANGE, LIKELY = "rendered", "nothing real has its values", "to be fitted"  # how a look at the candidates ends
 
 
@@ -62,10 +63,14 @@ def search(state: State, most: int) -> Outcome:
     view = state.look(state.open_names())
     fresh = True  # whether all of it was rendered beside the causes as they are
     while True:
-        if refused and not state.named and state.law_is_another(view, refused):  # before, it was not
+        law = [c for c in state.named if c.effect.of_law]
+        if (law or (refused and not state.named)) and state.law_is_another(view, refused):  # before, it was not
+            for cause in law:
+                out.rejected[cause.effect.name] = cause.found.gain, PART_OF_A_LAW
             rendered = {c.effect.name for c in state.causes}
             # of the others nothing was judged beside this law
             refused = {n: why for n, why in refused.items() if n in rendered or get_effect(n).of_law}
+            refused |= {c.effect.name: PART_OF_A_LAW for c in law}
             state.impossible.clear()
             view, fresh = state.look(state.open_names()), True
             continue

@@ -140,7 +140,8 @@ class State:
         return self.law_is_another(self.look(names, 0, [n for n in names if get_effect(n).of_law]), refused)
 
     def law_is_another(self, view: View, refused: Container[str] = ()) -> bool:
-        """Whether another law surely gains on held-out ground whatever effect of the law stands beside it; measured ones take the nominal one's place then.
+        """Whether another law surely gains on held-out ground whatever effect of the law stands beside it; measured ones take the place of the nominal one,
+        and of causes that are effects of the law, then.
 
         refused : effects that stand for nothing any more
         """
@@ -149,10 +150,14 @@ class State:
         if not len(places) or not may_be_exchanged(self.nominal):
             return False
         least = FAINT**2 / 2 * float(whole.gram[0, 0])
+        named = any(c.effect.of_law for c in self.causes)  # a second one would be a part of another law
         alone = [
             g
             for g in whole.plan.guises
-            if get_effect(g.effect).of_law and g.effect not in refused and whole.seen[whole.places(g)].all()
+            if get_effect(g.effect).of_law
+            and g.effect not in refused
+            and not named
+            and whole.seen[whole.places(g)].all()
         ]
         if min(whole.another_law(guise, surely=True) for guise in [None, *alone]) < least:
             return False
@@ -160,6 +165,7 @@ class State:
         if other is None:
             return False
         self.nominal = other
+        self.causes[:] = [c for c in self.causes if not c.effect.of_law]
         self.fit()
         return True
 
