@@ -201,6 +201,10 @@ def by_shadows(state: State) -> tuple[list[Named], Refused]:
     def refused(why: str) -> tuple[list[Named], Refused]:
         return [], {effect.name: (nats(float(before.sum()), float(after.sum()), pixels, CORRELATED), why)}
 
+    for fall, whole in zip(FALLS[1:], wholes[1:], strict=True):
+        usually = shadows.usual(fall=fall)[-1].held_out()
+        if not gain_interval(usually[shown], whole.held_out()[shown])[1] > least:
+            return refused("horizons whose errors fall more slowly with distance explain as much of it")
     # a wall is looked at further than the highest that was tried; where others end there, it is no estimate
     if not around and abs(value) >= max(abs(float(e.values[name])) for e in line):
         return refused(f"shadows fit best at the end of what was tried ({name} = {value:.3g})")
