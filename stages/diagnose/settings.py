@@ -43,6 +43,9 @@ PATCH = 32  # px: crops are not cut into smaller pieces than this
 SHAMS = 99  # sham residuals: p values go down to 1 %
 DISCOVERY = 0.05  # false discovery rate
 FAINT = 0.02  # of what images leave, rms: the covariance and the law are not known better, and many pixels would make that sure
+ROUGHLY = (
+    0.05  # of the same: beside an effect of the law with a name, whose formula is one of several for the same thing
+)
 SURE = 4.0  # standard errors: an effect found at this size is never called invisible
 STILL = 2.6  # standard errors (99 %) of a name that was found at four, once all is registered and fitted again
 CORRELATED = 16.0  # px^2 per independent sample of a residual: what is left of albedo and relief is some 4 px wide

@@ -25,7 +25,7 @@ from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.registered import Registration
 from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, moved_columns, shared_columns
 from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patches
-from stages.diagnose.settings import FAINT, GROUPS, SEEN, SHAMS
+from stages.diagnose.settings import FAINT, GROUPS, ROUGHLY, SEEN, SHAMS
 from stages.effects import Effect, Survey, effect_names, get_effect
 
 TOGETHER = 16  # columns that are transformed at a time: all at once take as much memory again as they do
@@ -149,8 +149,8 @@ class State:
         places = whole.form_places()
         if not len(places) or not may_be_exchanged(self.nominal):
             return False
-        least = FAINT**2 / 2 * float(whole.gram[0, 0])
         named = any(c.effect.of_law for c in self.causes)  # a second one would be a part of another law
+        least = (ROUGHLY if named else FAINT) ** 2 / 2 * float(whole.gram[0, 0])
         alone = [
             g
             for g in whole.plan.guises
