@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from types import SimpleNamespace
 
 import numpy as np
@@ -157,15 +158,22 @@ def test_an_effect_of_the_law_beside_which_another_law_gains_is_a_part_of_that_l
     guise = Guise("phase_slope", get_effect("phase_slope").trials(Survey())[0], (0,))
     whole = SimpleNamespace(
         form_places=lambda: np.array([1]), gram=np.array([[1e6]]), plan=SimpleNamespace(guises=[guise]), seen=np.ones(2, bool),
-        places=lambda guise: np.array([1]), another_law=lambda guise, surely: 0.0 if guise else adds,
+        places=lambda guise: np.array([1]), another_law=lambda guise, surely: 0.0 if guise else adds, exclude=lambda guise: [],
+        errors=lambda *_: (np.array([amount]), None, None),
     )  # fmt: skip
+    size = abs(next(iter(guise.trial.columns[0].values())))
     measured = object()
     monkeypatch.setattr("stages.diagnose.search.state.measured_laws", lambda *_: measured)
     monkeypatch.setattr(State, "fit", lambda self: None)
     nominal = load_nominal(None, "M2", "iof")
     nominal.laws = object()
     state = State(nominal, [], Survey(), 0, "iof", frozenset(), 1)
+    amount = 0.1 / size
     assert not state.law_is_another(SimpleNamespace(whole=whole))
+    amount = 0.7 / size  # more than any departure from a law is: another law
+    assert State(copy.copy(nominal), [], Survey(), 0, "iof", frozenset(), 1).law_is_another(
+        SimpleNamespace(whole=whole)
+    )
     of_law, other = (
         Cause(get_effect(name)({}, Survey()), Found(name, guise, np.ones(1), np.ones(1), 9.0))
         for name in ("limb_darkening", "column_pattern")

@@ -71,6 +71,7 @@ def search(state: State, most: int) -> Outcome:
             # of the others nothing was judged beside this law
             refused = {n: why for n, why in refused.items() if n in rendered or get_effect(n).of_law}
             refused |= {c.effect.name: PART_OF_A_LAW for c in law}
+            out.sure = False
             state.impossible.clear()
             view, fresh = state.look(state.open_names()), True
             continue

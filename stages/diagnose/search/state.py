@@ -23,7 +23,7 @@ from stages.diagnose.model.nominal import Nominal, fit
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.registered import Registration
-from stages.diagnose.rows.columns import Plan, frame_columns, make_plan, moved_columns, shared_columns
+from stages.diagnose.rows.columns import Guise, Plan, frame_columns, make_plan, moved_columns, shared_columns
 from stages.diagnose.rows.patches import Grid, Patch, cuts, make_grid, make_patches
 from stages.diagnose.settings import FAINT, GROUPS, ROUGHLY, SEEN, SHAMS
 from stages.effects import Effect, Survey, effect_names, get_effect
@@ -158,6 +158,7 @@ class State:
             and g.effect not in refused
             and not named
             and whole.seen[whole.places(g)].all()
+            and self._plausible(whole, g)
         ]
         if min(whole.another_law(guise, surely=True) for guise in [None, *alone]) < least:
             return False
@@ -168,6 +169,15 @@ class State:
         self.causes[:] = [c for c in self.causes if not c.effect.of_law]
         self.fit()
         return True
+
+    def _plausible(self, whole: Whole, guise: Guise) -> bool:
+        """Whether an effect may have the amounts that are estimated first; what is larger stands for another law."""
+        amounts, _, _ = whole.errors(whole.places(guise), whole.exclude(guise))
+        cls = get_effect(guise.effect)
+        values = {**cls.null(), **guise.trial.fixed}
+        for amount, column in zip(amounts, guise.trial.columns, strict=True):
+            values |= {name: cls.null()[name] + float(amount) * (at - cls.null()[name]) for name, at in column.items()}
+        return cls.plausible(values, self.data)
 
     def grid(self) -> tuple[Grid, int]:
         """The patches' frequencies, and into how many pieces a side a crop is cut."""
