@@ -159,7 +159,7 @@ def test_an_effect_of_the_law_beside_which_another_law_gains_is_a_part_of_that_l
     whole = SimpleNamespace(
         form_places=lambda: np.array([1]), gram=np.array([[1e6]]), plan=SimpleNamespace(guises=[guise]), seen=np.ones(2, bool),
         places=lambda guise: np.array([1]), another_law=lambda guise, surely: 0.0 if guise else adds, exclude=lambda guise: [],
-        errors=lambda *_: (np.array([amount]), None, None),
+        reduce=lambda *_: (np.eye(1), np.array([amount]), None, None),
     )  # fmt: skip
     size = abs(next(iter(guise.trial.columns[0].values())))
     measured = object()

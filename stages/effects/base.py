@@ -89,6 +89,7 @@ class Effect(ABC):
     one_sided       a fixed coordinate; the effect acts on one side of a pixel only, and by its sign it is told from what acts on both
     shadow_error    how far its first coordinate may be off where shadows alone tell it, since the DEM's horizons are
     possible        in words, what ``plausible`` asks of the values
+    largest         coordinate -> the size from which on it is nothing real, where no more is asked
     table           (variable, second dimension or None) of diagnosis.h5 for values per image or site; without it they stand in
                     `frame_values` or `site_values`
     """
@@ -123,6 +124,7 @@ class Effect(ABC):
     shadow_error: ClassVar[float] = 0.0
     keep_below: ClassVar[float] = 1.0
     possible: ClassVar[str] = ""
+    largest: ClassVar[Mapping[str, float]] = {}
     table: ClassVar[tuple[str, str | None] | None] = None
 
     def __init__(self, values: Mapping[str, Any] | None = None, survey: Survey | None = None) -> None:
@@ -203,7 +205,7 @@ class Effect(ABC):
     @classmethod
     def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
         """Whether anything real has these values; a fit that ends elsewhere stands for something else."""
-        return True
+        return all(abs(values[name]) < size for name, size in cls.largest.items())
 
     @classmethod
     def size(cls, values: Mapping[str, Any]) -> float:

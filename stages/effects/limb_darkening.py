@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
-from stages.effects.base import Effect, Survey, register
+from stages.effects.base import Effect, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
@@ -26,11 +25,7 @@ class LimbDarkening(Effect):
     parameters = (Parameter("share", "1", -1.0, 1.5, 0.0, "share of Lommel-Seeliger"),)
     strong: ClassVar = {"share": 0.3}
     possible = "a departure of less than 0.5 from the nominal law: one that is larger is another law"
-
-    @classmethod
-    def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
-        """It is the nominal law that is off by so much."""
-        return abs(values["share"]) < 0.5
+    largest: ClassVar = {"share": 0.5}
 
     def apply(self, state: State) -> None:
         total = (state.angles.cos_incidence.clamp(min=0) + state.angles.cos_emission.clamp(min=0)).clamp(min=0.05)

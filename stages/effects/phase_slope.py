@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
 
-from stages.effects.base import Effect, Survey, register
+from stages.effects.base import Effect, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
@@ -25,11 +24,7 @@ class PhaseSlope(Effect):
     parameters = (Parameter("per_radian", "1", -3.0, 3.0, 0.0, "beta in exp(-beta g)"),)
     strong: ClassVar = {"per_radian": 0.5}
     possible = "a departure of less than 0.5 from the nominal law: one that is larger is another law"
-
-    @classmethod
-    def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
-        """It is the nominal law that is off by so much."""
-        return abs(values["per_radian"]) < 0.5
+    largest: ClassVar = {"per_radian": 0.5}
 
     def apply(self, state: State) -> None:
         state.reflectance = state.reflectance * torch.exp(-self.value("per_radian", state) * state.angles.phase)

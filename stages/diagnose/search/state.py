@@ -8,6 +8,7 @@ from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -172,7 +173,8 @@ class State:
 
     def _plausible(self, whole: Whole, guise: Guise) -> bool:
         """Whether an effect may have the amounts that are estimated first; what is larger stands for another law."""
-        amounts, _, _ = whole.errors(whole.places(guise), whole.exclude(guise))
+        information, score, _, _ = whole.reduce(whole.places(guise), whole.exclude(guise))
+        amounts = np.linalg.pinv(information, rcond=1e-9, hermitian=True) @ score
         cls = get_effect(guise.effect)
         values = {**cls.null(), **guise.trial.fixed}
         for amount, column in zip(amounts, guise.trial.columns, strict=True):

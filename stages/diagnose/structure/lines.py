@@ -51,9 +51,8 @@ def across_columns(sites: Sequence[Site], grid: Grid, frames: int) -> Tensor:
     """
     out = torch.ones(frames, len(grid.keep), dtype=torch.bool)
     length = min(grid.height, grid.width)
-    whole = torch.cartesian_prod(
-        *[torch.arange(-1.0, 2.0)] * 2
-    )  # waves shorter than two pixels of the map pass for longer ones
+    # waves shorter than two pixels of the map pass for longer ones
+    whole = torch.cartesian_prod(*[torch.arange(-1.0, 2.0)] * 2)
     waves = torch.stack(grid.waves, 1)[:, None] + whole
     for site in sites:
         if site.observation.detector_line is None:
