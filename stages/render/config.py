@@ -150,6 +150,10 @@ def check(config: Config, trajectory: bool = False) -> None:
     if config.export not in (None, *EXPORTS):
         raise ConfigError(f"`export`: expected one of {', '.join(EXPORTS)}; found '{config.export}'.")
     if config.view == "ortho" or config.camera or trajectory:
+        if config.quaternion is not None or (config.look_at is not None and not trajectory):
+            name = "quaternion" if config.quaternion is not None else "look_at"
+            other = "a trajectory" if trajectory else "`camera`" if config.camera else "`view` ortho"
+            raise ConfigError(f"`{name}`: expected with `view` pinhole, found with {other}; leave one of them out.")
         return
     if config.position is None:
         raise ConfigError("`view` pinhole: expected `position` LON,LAT,ALT or `camera` FILE; found neither.")
