@@ -67,8 +67,9 @@ bench: $(TESTED) ## speed and memory, each beside a named peer in the same run; 
 campaign: $(TESTED) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
 	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign
 
-campaign-laboratory: $(TESTED) ## what diagnose names in files of another laboratory's simulator; SEED=N
-	$(BIN)/python tests/laboratory_campaign.py --seed $(or $(SEED),$(error make campaign-laboratory SEED=N)) --cases 44 --jobs $(or $(JOBS),2) --output results/laboratory
+LABORATORY = laboratory
+campaign-laboratory: $(TESTED) ## what diagnose names in files of another laboratory's simulator; SEED=N, LABORATORY=second_laboratory for another one
+	$(BIN)/python tests/laboratory_campaign.py --laboratory $(LABORATORY) --seed $(or $(SEED),$(error make campaign-laboratory SEED=N)) --cases 44 --jobs $(or $(JOBS),2) --output results/$(LABORATORY)
 
 # Pairs of real photographs; REGISTERED=pairs.h5 adds a registered set.
 campaign-real: $(TESTED) results/apollo15/diagnosis.h5 ## plant effects into real photographs and see what diagnose names (needs the reference data)

@@ -1,14 +1,15 @@
 """Judge `lunargr diagnose` by another laboratory's simulator: files of which it knows nothing, against what was hidden in them.
 
-    python tests/laboratory_campaign.py --seed N --cases 44 --jobs 2 --output results/laboratory
+    python tests/laboratory_campaign.py --seed N --cases 44 --jobs 2 --output results/laboratory [--laboratory second_laboratory]
 
-Makes each case in OUTPUT/ (see tests/laboratory), runs the command line on it, and writes OUTPUT.json (every case, as it comes)
+Makes each case in OUTPUT/ (see tests/laboratory and tests/second_laboratory: two authors, nothing in common), runs the command line on it, and writes OUTPUT.json (every case, as it comes)
 and OUTPUT.md (tables); cases that OUTPUT.json holds already are not done again. A seed is drawn once, after the code is frozen.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import math
 import os
@@ -22,8 +23,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from laboratory.cases import Deal, deal, make_case
-
+LABORATORIES = ("laboratory", "second_laboratory")
 ROOT = Path(__file__).parents[1]
 BINS = ((0.0, 0.08), (0.08, 0.15), (0.15, 0.4), (0.4, math.inf))  # of fid
 RIGHT, ANOTHER, BLIND, DENIED = "right", "another first", "no name, in `blind`", "no name, not in `blind`"
@@ -39,11 +39,11 @@ def diagnose(pairs: Path, answer: Path) -> dict:
     return json.loads(answer.read_text())
 
 
-def work(number: int, dealt: Deal, seed: int, folder: Path, keep: bool) -> dict:
+def work(laboratory: str, number: int, dealt: object, seed: int, folder: Path, keep: bool) -> dict:
     """One case from making its file to the answer, in a process of its own."""
     pairs, answer = folder / f"case_{number:03d}.h5", folder / f"case_{number:03d}.answer.json"
     try:
-        truth = make_case(number, dealt, seed, pairs)
+        truth = importlib.import_module(f"{laboratory}.cases").make_case(number, dealt, seed, pairs)
         started = time.perf_counter()
         found = diagnose(pairs, answer)
         return truth | {"seconds": time.perf_counter() - started, "answer": found}
@@ -211,6 +211,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--cases", type=int, default=44)
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--laboratory", choices=LABORATORIES, default=LABORATORIES[0])
     parser.add_argument("--keep", action="store_true", help="keep every case's file and answer in OUTPUT/")
     parser.add_argument("--output", type=Path, required=True)
     options = parser.parse_args()
@@ -221,11 +222,15 @@ def main() -> None:
     if any(case["seed"] != options.seed for case in cases):
         parser.error(f"{record} holds cases of another seed")
     known = {case["case"] for case in cases}
-    todo = [(number, dealt) for number, dealt in enumerate(deal(options.seed, options.cases)) if number not in known]
+    hands = importlib.import_module(f"{options.laboratory}.cases").deal(options.seed, options.cases)
+    todo = [(number, dealt) for number, dealt in enumerate(hands) if number not in known]
     os.environ["OMP_NUM_THREADS"] = "1"  # of the workers and of the commands they run
     failed = []
     with ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool:
-        jobs = {pool.submit(work, number, dealt, options.seed, folder, options.keep): number for number, dealt in todo}
+        jobs = {
+            pool.submit(work, options.laboratory, number, dealt, options.seed, folder, options.keep): number
+            for number, dealt in todo
+        }
         for job in as_completed(jobs):
             try:
                 done = job.result()

@@ -283,6 +283,22 @@ def test_intervals_of_skewed_gains_cover_and_see_what_every_piece_gains():
     assert typical_bounds(gains, np.array([1.0, *np.full(11, 1e-6)])) is None  # one piece says it all
 
 
+def test_small_pieces_of_ground_tell_how_much_gains_scatter_where_a_few_hold_nearly_all():
+    """Twelve craters, of which three lie in shadow for the most part: each gains its share, or only the largest does."""
+    from stages.diagnose.likelihood.typical import typical_bounds
+
+    sizes = np.array([800.0, 480.0, 140.0, 60.0, 20.0, 12.0, 12.0, 10.0, 3.0, 3.0, 3.0, 2.0])
+    rng, held = np.random.default_rng(6), 0
+    for _ in range(1000):
+        gains = sizes * (0.3 + 0.5 * rng.normal(size=12)) + 0.3 * np.sqrt(sizes) * rng.normal(size=12)
+        low, high = typical_bounds(gains, sizes)
+        held += low < 0.3 < high
+    assert held > 930
+    each = np.array([0.7, 0.3, 0.9, 0.85, 0.7, 0.8, 0.7, 0.8, 1.2, 1.0, 1.0, 0.5])
+    assert typical_bounds(each * sizes, sizes)[0] > 0.1
+    assert typical_bounds(np.where(sizes > 500, 0.7, 0.0) * sizes, sizes)[0] < 0
+
+
 def test_one_amount_for_all_images_stands_for_the_gains_that_it_explains():
     """A pattern over images explains gains that follow it; gains that follow nothing stay what they are."""
     from stages.diagnose.likelihood.weigh import beside_gains

@@ -5,9 +5,11 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 import torch
+from second_laboratory.cases import deal, make_case
 
 from stages.diagnose.likelihood.jackknife import gain_interval
 from stages.diagnose.result import named
@@ -52,6 +54,15 @@ def test_clipping_shows_after_bicubic_resampling():
     assert float((clipped > 1.002 * level).float().mean()) > 0.0005  # it does ring
     assert saturation.read_off(clipped)[0] == pytest.approx(level, rel=0.003)
     assert saturation.read_off(laid(images)) is None
+
+
+def test_clipping_of_noisy_images_shows_after_resampling(tmp_path):
+    """Another laboratory's images: noise that was cut off rings, and of the pile seven per cent lie more than a per cent above the level."""
+    path, seed = tmp_path / "pairs.h5", 1752317183
+    level = make_case(10, deal(seed, 44)[10], seed, path)["planted"]["saturation"]["iof"]
+    with h5py.File(path) as file:
+        bright = torch.from_numpy(file["image"][...][file["valid"][...] > 0])
+    assert get_effect("saturation").read_off(bright)[0] == pytest.approx(level, rel=0.005)
 
 
 def test_the_brightest_image_of_smooth_ground_is_no_pile():

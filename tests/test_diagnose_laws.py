@@ -152,6 +152,25 @@ def test_an_image_whose_own_gain_is_not_known_does_not_fit_the_law(places):
     assert off["image_gain"] < 1e-3 < 0.02 < off["misregistration"]
 
 
+def test_ground_that_is_darker_than_other_ground_does_not_bend_the_law(places):
+    """Two halves of a scene, one of them half as bright and shown under other Suns: what differs between grounds is their albedo."""
+    nominal = load_nominal(None, "M2", "iof")
+    kept = [site.valid for site in places]
+    with torch.no_grad():
+        suns = torch.stack([site.observation.sun_direction[:, 2] for site in places]).mean(0)
+        high = suns > suns.median()
+        for k, site in enumerate(places):
+            dark = k % 2 == 1
+            site.gain, site.offset = torch.ones(site.count), torch.zeros(site.count)
+            site.read = site.image = nominal.chain(site, []).predict() * (0.5 if dark else 1.0)
+            site.valid = kept[k] & (high == dark)[:, None, None]
+        true = nominal.vector / nominal.vector[0]
+        fit(nominal, places, [], "iof", [s.read for s in places], start=True)
+        for site, valid in zip(places, kept, strict=True):
+            site.valid = valid
+    assert float((nominal.vector / nominal.vector[0] / true - 1).abs().max()) < 0.05
+
+
 @pytest.mark.parametrize("adds", [500.0, 5000.0])
 def test_an_effect_of_the_law_beside_which_another_law_gains_is_a_part_of_that_law(monkeypatch, adds):
     """Without a name any one effect of the law has to leave as little as another law does; beside one with a name a second is no excuse, and 5 % rms of what is left are."""

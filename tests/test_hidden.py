@@ -12,24 +12,31 @@ from campaign import UNKNOWN
 from conftest import ROOT
 from hidden import departures, laws, sensor
 from hidden.faults import FAULTS
-from laboratory.cases import deal
+from laboratory import cases as laboratory_cases
 from laboratory.faults import FAULTS as LABORATORY_FAULTS
 from laboratory.plant import Plant
 from laboratory.planted import PLANTED
 from scipy.ndimage import gaussian_filter
+from second_laboratory import cases as second_cases
+from second_laboratory import light as second_light
+from second_laboratory.effects import EFFECTS as SECOND_EFFECTS
+from second_laboratory.faults import FAULTS as SECOND_FAULTS
+from second_laboratory.faults import Place
 
 from stages.effects import effect_names
 
+SIMULATORS = ("hidden", "laboratory", "second_laboratory")
 
-@pytest.mark.parametrize("simulator", ["hidden", "laboratory"])
+
+@pytest.mark.parametrize("simulator", SIMULATORS)
 def test_hidden_data_import_nothing_of_the_program(simulator):
-    others = {"hidden", "laboratory"} - {simulator}
+    others = {*SIMULATORS} - {simulator}
     paths = sorted((ROOT / "tests" / simulator).glob("*.py"))
     assert len(paths) > 5
     for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
             for name in names:
                 known = {"stages", "schemas", "lunargr_cli", *others}
                 assert name.split(".")[0] not in known, f"{path.name} imports {name}"
@@ -42,12 +49,46 @@ def test_every_plant_of_the_other_laboratory_says_what_it_does(kind):
     assert own & {"iof", "departure", "image", "given_sun", "given_dem"}
 
 
-def test_a_hand_of_the_other_laboratory_is_dealt_as_its_seed_says():
-    hand = deal(5, 44)
-    assert hand == deal(5, 44) != deal(6, 44)
+@pytest.mark.parametrize(
+    ("laboratory", "layouts"),
+    [(laboratory_cases, {*"abcd"}), (second_cases, {"4x12", "6x8", "12x4", "40x1"})],
+    ids=["first", "second"],
+)
+def test_a_hand_of_another_laboratory_is_dealt_as_its_seed_says(laboratory, layouts):
+    hand = laboratory.deal(5, 44)
+    assert hand == laboratory.deal(5, 44) != laboratory.deal(6, 44)
     assert sum(d.effect is None and d.fault is None for d in hand) == 14 and sum(d.fault is not None for d in hand) == 8
     assert {d.effect for d in hand if d.effect} <= set(effect_names())
-    assert {d.layout for d in hand if d.fault} == set("abcd")
+    assert {d.layout for d in hand if d.fault} == layouts
+
+
+def test_the_second_laboratory_plants_every_effect():
+    assert set(SECOND_EFFECTS) == set(effect_names())
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(90.0, 20.0), (270.0, 14.0), (0.0, 30.0), (180.0, 15.0)])
+def test_shadow_of_a_wall_of_the_second_laboratory_is_as_long_as_it_should_be(azimuth, elevation):
+    """Height over the tangent of the Sun's elevation, to half a cell and a step of the ray, which is 2 % of its length."""
+    ground = np.zeros((300, 300), np.float32)
+    ground[:, 150:170] = 10.0
+    if azimuth in (0.0, 180.0):
+        ground = np.ascontiguousarray(ground.T)
+    window = second_light.Window(40, 40, 220, 220)
+    tangent = second_light.horizon_tangent(ground, window, 0.5, azimuth)
+    light = second_light.visible_disc(elevation, tangent, second_light.SUN_RADIUS_DEG)
+    line = light[110] if azimuth in (90.0, 270.0) else light[:, 110]
+    beside = line[:110] if azimuth in (90.0, 180.0) else line[130:]  # rows run to the south: what lies behind the wall
+    assert 0.5 * (1 - beside).sum() == pytest.approx(10 / np.tan(np.radians(elevation)), rel=0.02, abs=0.25)
+
+
+@pytest.mark.parametrize("name", [n for n in SECOND_FAULTS if n != "nearest_resampling"])  # done where images are laid
+def test_faults_of_the_second_laboratory_change_images(name):
+    fault, rng = SECOND_FAULTS[name], np.random.default_rng(3)
+    image = 0.05 * (1 + 0.2 * gaussian_filter(rng.normal(size=(120, 128)), 2) / 0.14)
+    at = Place(np.arange(120) + 40, np.arange(128) + 700, (400.0, 600.0), 500.0)
+    changed = fault.act(image, at, max(fault.first, 0.02), np.random.default_rng(1), np.random.default_rng(2))
+    assert changed.shape == image.shape and np.isfinite(changed).all()
+    assert 1e-6 < np.abs(changed / image - 1).mean() < 0.2
 
 
 def test_an_answer_is_right_if_the_first_name_is_what_was_planted():

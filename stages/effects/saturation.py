@@ -13,7 +13,7 @@ from stages.physics.photometry import Parameter
 
 PILE = 150  # pixels
 STANDS_OUT = 3.0  # times the bins below
-RINGING = 0.01  # of the level, by which bicubic resampling of an edge of common contrast overshoots
+RINGING = 0.015  # of the level, by which bicubic resampling of an edge of common contrast, or of noise that was cut off, overshoots
 BINS = (
     0.02,
     0.002,

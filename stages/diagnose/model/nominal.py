@@ -26,6 +26,7 @@ PULL = 0.05
 SETTLED = 3e-4  # of the squared residual: a step that lowers it by less is the last
 DAMPING = 0.1  # at first: the coefficients of a curved model imitate each other
 DARK = 0.3  # of the predicted brightness
+BETWEEN = 0.03  # of a site's own level that the law answers for: the rest is the albedo of the ground, which differs from place to place by far more
 
 
 @dataclass
@@ -201,10 +202,14 @@ def _normal_equations(
         weight = (mask / level.clamp(min=1e-6)[:, None, None]).double()
         weight = weight * _near(site.image - predicted, weight)
         residual = (site.image - predicted).double() * weight
-        flat = residual.new_zeros(count_free, 1)
+        residual = residual.flatten()
+        flat = residual.new_zeros(count_free, len(residual) if fitted else 1)
         if fitted:
             flat = (torch.stack(chain.surface_tangents()) * weight).flatten(1)
-        on = flat @ residual.flatten() if fitted else flat[:, 0]
+            if units == "iof" and int(site.counts.sum()) > 1:
+                common = torch.nn.functional.normalize((predicted * weight).flatten(), dim=0)
+                residual, flat = (x - (1 - BETWEEN) * (x @ common)[..., None] * common for x in (residual, flat))
+        on = flat @ residual if fitted else flat[:, 0]
         return flat @ flat.T, on, float(residual.square().sum()), float((weight > 0).sum())
 
     for products, on, squares, pixels in per_site(of, range(len(chains))):

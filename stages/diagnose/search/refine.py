@@ -276,6 +276,8 @@ def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     if guise is None:
         return 0.0
     places = whole.places(guise)
+    if not len(places):  # no frame is seen well enough beside the other causes
+        return 0.0
     cls = type(cause.effect)
     names = [p.name for p in cls.fitted()]
     sizes = np.array([cls.strong[n] for n in names])

@@ -178,29 +178,39 @@ def by_shadows(state: State) -> tuple[list[Named], Refused]:
         named |= {n for n in shadows.every if get_effect(n).shadow_error}
     usual = shadows.usual()
     found = shadows.unusual(usual, named)
-    first = min(found, key=lambda t: float(t.held_out().sum()), default=None)
+    if not found or not usual[-1].held_out().any():
+        return [], {}
+    return _judged(state, shadows, usual, found)
+
+
+def _judged(
+    state: State, shadows: Shadows, usual: Sequence[Tried], found: Sequence[Tried]
+) -> tuple[list[Named], Refused]:
+    """The best of what was tried beside what is usual, if it is a cause; or why it is none."""
     every = usual[-1].held_out()
     shown = every > 0
-    if first is None or not shown.any():
-        return [], {}
-    before, after = every[shown], first.held_out()[shown]
-    effect = first.best
+    before, pixels = every[shown], float(sum(e.chain.site.valid.sum() for e in shadows.edges))
+    first = min(found, key=lambda t: float(t.held_out().sum()))
+    effect, after = first.best, first.held_out()[shown]
     around = effect.shadow_neighbours(state.data)
     percent = gain_interval(before, after)
     least = 100 * SHADED if around else 0.0  # of several values some would fit by chance
+
+    def refused(why: str) -> tuple[list[Named], Refused]:
+        return [], {effect.name: (nats(float(before.sum()), float(after.sum()), pixels, CORRELATED), why)}
+
     if not percent[1] > least:
-        return [], {}
+        if not percent[0] > least:
+            return [], {}
+        return refused(
+            f"no sure gain in shadows of other ground ({percent[0]:.0f} %; 95 %: {percent[1]:.1f} .. {percent[2]:.0f})"
+        )
     line = [e for e in shadows.every[effect.name] if _on_one_line(e, effect)]
     wholes = [shadows.in_turn(line, fall) for fall in FALLS]
     values = np.array([w.value() for w in wholes])
     effect, value, apart = wholes[0].best, float(values.mean()), float(np.ptp(values)) / 2
     name = effect.fitted()[0].name
     error = wholes[0].error(np.flatnonzero(shown))
-    pixels = float(sum(c.site.valid.sum() for c in chains))
-
-    def refused(why: str) -> tuple[list[Named], Refused]:
-        return [], {effect.name: (nats(float(before.sum()), float(after.sum()), pixels, CORRELATED), why)}
-
     for fall, whole in zip(FALLS[1:], wholes[1:], strict=True):
         usually = shadows.usual(fall=fall)[-1].held_out()
         if not gain_interval(usually[shown], whole.held_out()[shown])[1] > least:

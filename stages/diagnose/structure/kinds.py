@@ -15,6 +15,7 @@ from stages.diagnose.structure.lines import across_columns, line_of_brightness, 
 from stages.diagnose.structure.pixels import pixels_that_stand_out
 from stages.diagnose.structure.steps import steps_of_brightness
 
+REPEATED = 0.015  # of the squares: bilinear resampling leaves up to two thirds of that, the nearest pixel more
 PILED = "brightness that piles up at one level"
 
 
@@ -32,7 +33,7 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
         if line > LINE and rms > ordinary:
             out.setdefault("lines across an image", share)
     line, share = line_of_displacement(left, view.grid, state.frames)
-    if line > LINE and share > NOTABLE:  # bilinear resampling leaves half of that
+    if line > LINE and share > REPEATED:
         out["displacements that come back at equal distances"] = share
     for what, (alike, surely) in (
         (

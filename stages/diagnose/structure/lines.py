@@ -37,11 +37,12 @@ def line_of_brightness(
         size = (row.patch.weight.square().mean((-2, -1)) * model.size.get(row.patch.number, 1.0)).clamp(min=1e-6)
         spectra.append((row.patch.frames, z / size.sqrt()[:, None]))
     chance, share, frame, waves = _strongest(spectra, grid, frames, without)
-    squares, pixels = 0.0, 0.0
+    power, pixels = torch.zeros(len(grid.keep), dtype=torch.float64), 0.0
     for row in rows:
         here = row.patch.frames == frame
-        squares += float(row.shared[0][here][:, waves].abs().square().sum())
+        power += row.shared[0][here].abs().square().double().sum(0)
         pixels += float(row.patch.weight[here].square().sum())
+    squares = float((power - _about(power, grid)).clamp(min=0)[waves].sum())  # the ground has its part of every wave
     return chance, share, math.sqrt(squares / max(pixels, 1.0))
 
 
