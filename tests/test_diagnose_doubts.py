@@ -18,6 +18,7 @@ from stages.diagnose.likelihood.jackknife import folds, jackknife_error
 from stages.diagnose.likelihood.products import Products
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.aligned import aligned
+from stages.diagnose.registration.sunward import sunward
 from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
@@ -30,6 +31,32 @@ from stages.effects.base import Survey, Trial
 from stages.effects.filters import gaussian, seams
 from stages.effects.saturation import BINS
 from stages.physics.formation.resampling import displace
+
+
+def test_shifts_that_albedo_makes_lie_along_the_sun():
+    """Of a Lambert surface whose albedo goes with its curvature, shifts are those that a fit of the plain one's slopes finds; real ones lie anywhere."""
+    rng = np.random.default_rng(7)
+    height = gaussian_filter(rng.normal(size=(120, 120)), 3.0)
+    height *= 0.1 / np.hypot(*np.gradient(height)).std()
+    down, across = np.gradient(height)
+    bend = sum(np.gradient(g, axis=k) for k, g in enumerate((down, across)))
+    suns, shifts = [], []
+    for azimuth, elevation in np.radians([[100, 15], [250, 50], [310, 25], [20, 60]]):
+        sun = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+        plain = (sun[2] - across * sun[0] + down * sun[1]) / np.sqrt(1 + down**2 + across**2)
+        slopes = np.stack([g.ravel() for g in (*np.gradient(plain)[::-1], np.ones_like(plain))], 1)
+        change = plain * 0.05 * bend / bend.std()
+        shifts.append(np.linalg.lstsq(slopes, change.ravel(), rcond=None)[0][:2])
+        suns.append(sun)
+    sites = [
+        SimpleNamespace(frames=np.arange(4), observation=SimpleNamespace(sun_direction=torch.tensor(np.array(suns))))
+    ]
+    found = torch.tensor(np.array(shifts))
+    assert found.norm(dim=1).max() > 0.3 and sunward(found, sites)
+    single = torch.zeros(4, 2)
+    single[1] = torch.tensor([2.0, -2.0])
+    anywhere = [torch.tensor(rng.normal(size=(4, 2))) for _ in range(200)]
+    assert not sunward(single, sites) and sum(sunward(shift, sites) for shift in anywhere) < 6
 
 
 def test_a_seam_of_a_dem_is_not_sharpened():

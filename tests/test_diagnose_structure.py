@@ -211,6 +211,16 @@ def test_blocks_of_compression_are_told_from_anything_else():
     assert blocks_of_compression(left(1, partial(compressed, side=7)), FRAMES)[0] < 1
 
 
+def test_what_lies_between_pixels_every_eighth_of_which_is_alike_is_no_compression():
+    """Bilinear resampling smooths most half-way between pixels; where a pixel of the map is 8/7 of the detector's, that comes back every eight."""
+    every = left(2)
+    for ground, one in enumerate(every):  # crops of one map
+        sample = (8 / 7 * (torch.arange(SIZE, dtype=torch.float64) + 11 * ground) + 0.3).expand(FRAMES, SIZE, SIZE)
+        one.value = one.value * torch.hypot(sample % 1, 1 - sample % 1)
+        one.detector = torch.stack([one.detector[:, 0], sample], 1)
+    assert blocks_of_compression(every, FRAMES)[0] < PEAK
+
+
 def test_steps_of_brightness_survive_resampling_and_smooth_brightness_has_none():
     rng = np.random.default_rng(8)
     rough = gaussian_filter(rng.normal(size=(FRAMES, 128, 128)), (0, 6, 6))

@@ -17,6 +17,7 @@ from stages.diagnose.registration.forms import FORMS
 from stages.diagnose.registration.lines import STEADY, TREMBLING
 from stages.diagnose.registration.registered import Registration, shifted_frames
 from stages.diagnose.registration.squares import OWN
+from stages.diagnose.registration.sunward import sunward
 from stages.diagnose.result.answer import Named
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import CORRELATED, ROUNDS
@@ -158,6 +159,8 @@ def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str
     error = max(scatter, r.shift_error)
     if _ordinary(size, error, cls):
         return None, ""
+    if not why and sunward(r.mean_shifts(state.sites, r.fitted[form][0]), state.sites):
+        why = "albedo that follows the ground's curvature looks the same: shifts along the Sun's azimuth that grow with the tangent of its elevation"
     return _named(effect, {"rms_px": (size, error, "px")}, r, first, form, frames), why
 
 

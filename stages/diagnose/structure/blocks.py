@@ -11,6 +11,9 @@ from torch import Tensor
 from stages.diagnose.structure.innovations import Innovation
 
 BLOCK = 8  # pixels (ITU-T T.81, JPEG)
+PARTS = (
+    8  # of a pixel of the detector, along each axis: what lies between pixels is smoother where images are resampled
+)
 CONTROLS = 7, 9  # periods that no camera has
 
 
@@ -18,12 +21,29 @@ def blocks_of_compression(every: Sequence[Innovation], frames: int) -> tuple[flo
     """How many times more the roughness of a frame goes with the place within a block than with that in pieces of other lengths, of the frame and
     the axis that have most of it; and its share of the frame's squares of roughness.
     """
-    rough = [(one, *_roughness(one)) for one in every]
+    rough = _beside_resampling([(one, *_roughness(one)) for one in every], frames)
     best = 0.0, 0.0
     for axis in (0, 1):
         (block, share), *other = (_between(rough, frames, axis, period) for period in (BLOCK, *CONTROLS))
         best = max(best, (block / max(*(ratio for ratio, _ in other), 1.0), share))
     return best
+
+
+def _beside_resampling(
+    rough: Sequence[tuple[Innovation, Tensor, Tensor]], frames: int
+) -> list[tuple[Innovation, Tensor, Tensor]]:
+    """The same without what goes with where between the detector's pixels it was taken from, which may come back every eight pixels as well."""
+    sums, count = np.zeros((2, frames, PARTS * PARTS))
+    places = []
+    for one, value, seen in rough:
+        line, sample = (one.detector.frac() * PARTS).nan_to_num(0.0).floor().long().clamp(0, PARTS - 1).unbind(1)
+        place = torch.from_numpy(one.patch.frames.numpy())[:, None, None] * PARTS * PARTS + line * PARTS + sample
+        at, x = place[seen].numpy(), value[seen].double().numpy()
+        sums += np.bincount(at, x, sums.size).reshape(sums.shape)
+        count += np.bincount(at, minlength=sums.size).reshape(sums.shape)
+        places.append(place)
+    mean = torch.from_numpy(sums / np.maximum(count, 1)).flatten().float()
+    return [(one, value - mean[place], seen) for (one, value, seen), place in zip(rough, places, strict=True)]
 
 
 def _between(
