@@ -260,18 +260,27 @@ class Whole:
         return out
 
     def without_one(
-        self, places: NDArray[np.int64], exclude: Sequence[int] = (), spread: float = 0.0, now: Array | None = None
+        self,
+        places: NDArray[np.int64],
+        exclude: Sequence[int] = (),
+        spread: float = 0.0,
+        now: Array | None = None,
+        of: Sequence[int] = (),
     ) -> Array:
-        """(labels, J) amounts with one piece of ground left out each; ``spread`` draws them, beside ``now``, to nothing."""
+        """(labels, J) amounts with one piece of ground left out each; ``spread`` draws them, beside ``now``, to nothing.
+
+        of : of every unit, the number of its ground; its label if empty
+        """
+        labels = of or self.labels
         n = self.nuisance([*places, *exclude])
         every = np.concatenate([n, places])
         pull = spread**-2 if spread else 0.0
         more = np.diag(np.concatenate([self.weight(n), np.full(len(places), pull)]) + self._least(every))
         pulled = np.concatenate([np.zeros(len(n)), pull * now if now is not None else np.zeros(len(places))])
         out = []
-        for label in sorted(set(self.labels)):
+        for label in sorted(set(labels)):
             rest = self.gram.copy()
-            for u, own in zip(self.units, self.labels, strict=True):
+            for u, own in zip(self.units, labels, strict=True):
                 if own == label:
                     rest[np.ix_(u.place, u.place)] -= u.gram
             out.append(solve(rest[np.ix_(every, every)] + more, rest[every, 0] - pulled)[len(n) :])

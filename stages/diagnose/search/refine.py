@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from stages.common.arrays import Floats
 from stages.common.intervals import effective_units
 from stages.diagnose.likelihood.found import Found, beyond_bounds
 from stages.diagnose.likelihood.jackknife import jackknife_error
@@ -299,10 +300,22 @@ def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     def rms(values: NDArray[np.float64]) -> float:
         return math.sqrt(float(((values * sizes[column]) ** 2 + variance).sum()) / frames)
 
-    without = [rms(now + m) for m in whole.without_one(places, spread=cause.found.spread, now=now)]
+    # the law differs from site to site, and pieces of one site have that in common
+    sites = [u.site for u in whole.units]
+    without = [rms(now + m) for m in whole.without_one(places, spread=cause.found.spread, now=now, of=sites)]
     cause.rms = rms(now + move)
-    cause.errors["rms"] = float(jackknife_error(np.array(without)))
+    scatter = float(jackknife_error(np.array(without)))
+    cause.errors["rms"] = max(
+        scatter,
+        _error_of_rms((now + move) * sizes[column], inverse * np.outer(*2 * [sizes[column]]), cause.rms, frames),
+    )
     return float(np.sqrt((move**2).mean() / max(inverse.diagonal().mean(), 1e-12)))
+
+
+def _error_of_rms(mean: Floats, covariance: Floats, rms: float, frames: int) -> float:
+    """Of the rms of normal values about nothing: their squares scatter by what the values and what is left open of them do together."""
+    squares = 4 * mean @ covariance @ mean + 2 * float((covariance**2).sum())
+    return math.sqrt(squares) / frames / max(2 * rms, 1e-12)
 
 
 __all__ = ["along", "as_effect", "errors_over_images", "refine", "settle", "start_nearer"]
