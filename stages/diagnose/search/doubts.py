@@ -17,15 +17,12 @@ from stages.effects import Effect
 # what reasons start with, for those who ask what kind of reason it was
 ODD = "the values that fit best are impossible"
 ORDINARY = "no more than is ordinary"
-GROUNDS = 3  # sites: two agree by chance in how their law differs from that of all ground
 
 
 def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     """Why the fitted values cannot be a cause, or ''."""
     cls = type(cause.effect)
     if cls.scope == "image":
-        if not cls.displaces and (shown := _grounds(state)) < GROUNDS:
-            return f"an image shows {shown} pieces of ground: what is its own is not told from the law of that ground"
         size, error = cause.rms, cause.errors.get("rms", math.inf)
         least = max(cls.tolerance.values(), default=0.0)
         return as_ordinary("rms", size, least, error) if size - 2 * error < least else ""
@@ -54,13 +51,6 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
         if size - 2 * error < least:
             return as_ordinary(name, size, least, error)
     return ""
-
-
-def _grounds(state: State) -> int:
-    """Sites that most images show at least, of those that have values of their own."""
-    count = np.bincount(np.concatenate([s.frames for s in state.sites]), minlength=state.frames)
-    known = [n for frame, n in enumerate(count) if n and frame not in state.seldom]
-    return int(np.median(known)) if known else 0
 
 
 def as_ordinary(name: str, size: float, least: float, error: float = math.nan) -> str:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from stages.common.arrays import Floats
-from stages.common.intervals import effective_units
+from stages.common.intervals import effective_units, student_quantile
 from stages.diagnose.likelihood.found import Found, beyond_bounds
 from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.whole import Whole
@@ -300,15 +300,15 @@ def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     def rms(values: NDArray[np.float64]) -> float:
         return math.sqrt(float(((values * sizes[column]) ** 2 + variance).sum()) / frames)
 
-    # the law differs from site to site, and pieces of one site have that in common
+    # the law differs from site to site: pieces of one have that in common, and few sites agree in it by chance
     sites = [u.site for u in whole.units]
     without = [rms(now + m) for m in whole.without_one(places, spread=cause.found.spread, now=now, of=sites)]
+    show = np.bincount(np.concatenate([s.frames for s in state.sites]), minlength=whole.frames)[frame]
+    few = student_quantile(max(float(np.median(show)) - 1, 1.0)) / 2  # where two errors are asked for
     cause.rms = rms(now + move)
-    scatter = float(jackknife_error(np.array(without)))
-    cause.errors["rms"] = max(
-        scatter,
-        _error_of_rms((now + move) * sizes[column], inverse * np.outer(*2 * [sizes[column]]), cause.rms, frames),
-    )
+    covariance = np.asarray(inverse * np.outer(sizes[column], sizes[column]), np.float64)
+    left_open = _error_of_rms((now + move) * sizes[column], covariance, cause.rms, frames)
+    cause.errors["rms"] = max(few * float(jackknife_error(np.array(without))), left_open)
     return float(np.sqrt((move**2).mean() / max(inverse.diagonal().mean(), 1e-12)))
 
 
