@@ -59,6 +59,17 @@ def test_shifts_that_albedo_makes_lie_along_the_sun():
     assert not sunward(single, sites) and sum(sunward(shift, sites) for shift in anywhere) < 6
 
 
+@pytest.mark.parametrize("size", [0.02, 0.2])
+def test_the_error_of_an_rms_is_its_scatter_where_values_are_drawn_as_they_are_open(size):
+    rng = np.random.default_rng(8)
+    mean, mixed = size * rng.normal(size=6), 0.01 * rng.normal(size=(6, 6))
+    drawn = rng.multivariate_normal(mean, mixed @ mixed.T, 20_000)
+    squares = np.square(drawn).mean(1)
+    rms = math.sqrt(squares.mean())
+    scatter = float(squares.std()) / (2 * rms)
+    assert refine._error_of_rms(mean, mixed @ mixed.T, rms, 6) == pytest.approx(scatter, rel=0.05)
+
+
 def test_a_seam_of_a_dem_is_not_sharpened():
     """Pieces are put together after they were smoothed: sharpened, a step would be a ridge that no image shows."""
     for seed in range(5):
