@@ -235,6 +235,13 @@ def test_steps_of_brightness_survive_resampling_and_smooth_brightness_has_none()
         )
 
     assert found(0.0)[0] < 5
+    codes = 0.01 * np.sqrt(0.05)  # of a camera that compands its numbers
+    read = shift((np.round(np.sqrt(noisy) / codes) * codes) ** 2, (0, 0.3, 0.4), order=1, mode="nearest")
+    read = torch.from_numpy(read)
+    chance, rms, _ = steps_of_brightness(
+        [SimpleNamespace(read=read, read_valid=torch.ones_like(read).bool(), frames=np.arange(FRAMES))], FRAMES
+    )
+    assert chance > LINE and rms == pytest.approx(2 * 0.01 / 12**0.5, rel=0.3)
     for resampled in (False, True):
         chance, rms, _ = found(0.001, resampled)
         assert chance > LINE and rms == pytest.approx(0.001 / 0.05 / 12**0.5, rel=0.3)

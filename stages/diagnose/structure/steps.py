@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from stages.diagnose.model.sites import Site
@@ -21,25 +22,34 @@ AROUND = 513  # waves of the histogram's spectrum that a peak is compared with: 
 def steps_of_brightness(sites: Sequence[Site], frames: int) -> tuple[float, float, int]:
     """-log10 of the chance of the strongest wave in the histogram of any frame's pixels, and what such steps are rms, relative to its mean; which frame (-1: none).
 
-    Flat ground keeps the levels of a detector wherever resampling mixes equal pixels; smooth brightness has a smooth histogram.
+    Flat ground keeps the levels of a detector wherever resampling mixes equal pixels; smooth brightness has a smooth histogram. The same is
+    sought in the root of brightness, in which cameras that compress (compand) their numbers have equal steps.
     """
     best, size, which = 0.0, 0.0, -1
-    per_mean = np.arange(BINS // 2 + 1) / BRIGHTEST  # cycles per mean brightness
-    sought = (per_mean > 1 / WIDEST) & (per_mean < 1 / FINEST)
     for frame in range(frames):
         pixels = [s.read[k][s.read_valid[k]] for s in sites for k in np.flatnonzero(s.frames == frame)]
         values = torch.cat(pixels).numpy() if pixels else np.zeros(0)
         mean = float(values.mean()) if len(values) else 0.0
         if not mean > 0:
             continue
-        counts = np.histogram(values, BINS, (0.0, BRIGHTEST * mean))[0]
-        power = np.abs(np.fft.rfft(counts)) ** 2 / max(counts.sum(), 1)  # of chance alone exponential, with mean 1
-        excess = np.where(sought, power / np.maximum(median_filter(power, AROUND) / math.log(2), 1.0), 0.0)
-        top = int(excess.argmax())
-        chance = excess[top] / math.log(10) - math.log10(sought.sum() * frames)
-        if chance > best:
-            best, size, which = float(chance), 1 / float(per_mean[top]) / math.sqrt(12), frame
+        relative = values / mean
+        for scaled, per_step in ((relative, 1.0), (np.sqrt(np.maximum(relative, 0.0)), 2.0)):
+            chance, step = _strongest(scaled)
+            chance -= math.log10(2 * frames)
+            if chance > best:
+                best, size, which = chance, per_step * step / math.sqrt(12), frame
     return best, size, which
+
+
+def _strongest(values: NDArray[np.floating]) -> tuple[float, float]:
+    """-log10 of the chance of the strongest wave in a histogram of values about 1, and its length."""
+    per_unit = np.arange(BINS // 2 + 1) / BRIGHTEST  # cycles per mean brightness
+    sought = (per_unit > 1 / WIDEST) & (per_unit < 1 / FINEST)
+    counts = np.histogram(values, BINS, (0.0, BRIGHTEST))[0]
+    power = np.abs(np.fft.rfft(counts)) ** 2 / max(counts.sum(), 1)  # of chance alone exponential, with mean 1
+    excess = np.where(sought, power / np.maximum(median_filter(power, AROUND) / math.log(2), 1.0), 0.0)
+    top = int(excess.argmax())
+    return float(excess[top] / math.log(10) - math.log10(sought.sum())), 1 / max(float(per_unit[top]), 1e-9)
 
 
 __all__ = ["steps_of_brightness"]
