@@ -48,7 +48,6 @@ ROUGHLY = (
 )
 SURE = 4.0  # standard errors: an effect found at this size is never called invisible
 STILL = 2.6  # standard errors (99 %) of a name that was found at four, once all is registered and fitted again
-HANGING = 0.01  # chance that a value hangs on a few images: of two dozen effects one in four sets would have such a one
 CORRELATED = 16.0  # px^2 per independent sample of a residual: what is left of albedo and relief is some 4 px wide
 PEAK = 6.0  # times the median of its annulus: a single wave of one frame that the spectrum of ground and noise does not have
 NEAR = 1.5  # waves: the leakage of a window ends before ...

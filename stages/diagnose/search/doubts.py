@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from stages.common.intervals import two_sided_p
+from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.found import interval
 from stages.diagnose.likelihood.tails import together
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.settings import HANGING, STILL, SURE
+from stages.diagnose.settings import STILL, SURE
 from stages.effects import Effect
 
 # what reasons start with, for those who ask what kind of reason it was
@@ -40,7 +40,7 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     # an effect that may be nothing has no shape that could be uncertain
     if cause.away < together(sure, len(cause.of_given_shape)):
         return f"its value is only {cause.away:.1f} standard errors from zero"
-    if two_sided_p(1 / max(cause.share_error, 1e-9), cause.share_freedom) > HANGING:
+    if cause.share_error * student_quantile(cause.share_freedom) > 1:
         return f"its value hangs on a few images (only {1 / cause.share_error:.1f} standard errors from zero where images are left out)"
     errors = cause.larger_errors
     reported = cls.report(values, errors)
