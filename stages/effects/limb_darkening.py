@@ -25,9 +25,7 @@ class LimbDarkening(Effect):
     parameters = (Parameter("share", "1", -1.0, 1.5, 0.0, "share of Lommel-Seeliger"),)
     strong: ClassVar = {"share": 0.3}
     possible = "a departure of less than 0.3 from the nominal law: one that is larger is another law"
-    largest: ClassVar = {
-        "share": 0.3
-    }  # half of the measured laws (Hapke's, Akimov's, Minnaert's) are 0.25 to 0.45 from M2
+    largest: ClassVar = {"share": 0.3}  # half of the measured laws are 0.25 to 0.45 from M2
 
     def apply(self, state: State) -> None:
         total = (state.angles.cos_incidence.clamp(min=0) + state.angles.cos_emission.clamp(min=0)).clamp(min=0.05)

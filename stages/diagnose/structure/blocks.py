@@ -11,9 +11,7 @@ from torch import Tensor
 from stages.diagnose.structure.innovations import Innovation
 
 BLOCK = 8  # pixels (ITU-T T.81, JPEG)
-PARTS = (
-    8  # of a pixel of the detector, along each axis: what lies between pixels is smoother where images are resampled
-)
+PARTS = 8  # of a pixel along each axis: what lies between pixels is smoother where images are resampled
 CONTROLS = 7, 9  # periods that no camera has
 
 
@@ -37,7 +35,7 @@ def _beside_resampling(
     places = []
     for one, value, seen in rough:
         line, sample = (one.detector.frac() * PARTS).nan_to_num(0.0).floor().long().clamp(0, PARTS - 1).unbind(1)
-        place = torch.from_numpy(one.patch.frames.numpy())[:, None, None] * PARTS * PARTS + line * PARTS + sample
+        place = one.patch.frames[:, None, None] * PARTS * PARTS + line * PARTS + sample
         at, x = place[seen].numpy(), value[seen].double().numpy()
         sums += np.bincount(at, x, sums.size).reshape(sums.shape)
         count += np.bincount(at, minlength=sums.size).reshape(sums.shape)
