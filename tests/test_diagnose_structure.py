@@ -282,8 +282,8 @@ def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
     assert words(steps_of_brightness=(40.0, 0.002, 0)) == ["brightness that comes in equal steps"]
     assert words(odd_and_even=(3.0, 0.01)) == [] == words(odd_and_even=(9.0, 0.0001))
     assert len(words(odd_and_even=(9.0, 0.01))) == 1
-    assert words(blocks_of_compression=(5.0, 0.05)) == [] == words(blocks_of_compression=(9.0, 0.005))
-    assert len(words(blocks_of_compression=(9.0, 0.05))) == 1
+    assert words(blocks_of_compression=(5.0, 0.05)) == [] == words(blocks_of_compression=(9.0, 0.0003))
+    assert len(words(blocks_of_compression=(9.0, 0.005))) == 1
     assert words(piled=0.01) == [kinds.PILED]
 
 

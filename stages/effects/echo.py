@@ -36,13 +36,14 @@ class Echo(Effect):
     coordinates = (*parameters, Parameter("axis", "1", 0.0, 1.0, 0.0, "0 along samples, 1 along lines"))
     possible = f"a lag of more than {CLEAR_LAG} px, since nearer it is not told from optics and spilled charge"
     strong: ClassVar = {"fraction": 0.05}
+    shaped = ("lag_px",)
     one_sided: ClassVar = "lag_px"  # blur and relief that the DEM has not are alike before and behind
     tolerance: ClassVar = {"fraction": 0.003}
 
     @classmethod
     def trials(cls, survey: Survey) -> list[Trial]:
         # the nearest are there to lose to: blur and soft shadows, which look like them, would pass for an echo further off
-        lags = [k for k in (2, 3, 4, 6, 8, 12, 16, 24) if k < survey.crop_px / 3]
+        lags = [k for k in (2, 3, 4, 5, 6, 8, 10, 12, 16, 24) if k < survey.crop_px / 3]
         return [
             Trial(({"fraction": 0.03},), {"lag_px": float(sign * lag), "axis": float(axis)})
             for axis in (0, 1)

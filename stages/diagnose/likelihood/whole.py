@@ -66,9 +66,15 @@ class Whole:
         Their scatter is estimated along the main directions in which they change the images (expectation-maximisation), and
         the amounts of each unit are integrated out.
         """
-        free = [k for k, n in enumerate(self.plan.shared) if n.startswith("coefficient")]
-        places = 1 + np.array([*free, *self.plan.ground], dtype=np.int64)
-        total = np.sum([u.gram[np.ix_(places, places)] for u in self.units], 0)
+        known = np.sum([u.gram[: 1 + len(self.plan.shared), : 1 + len(self.plan.shared)] for u in self.units], 0)
+        told = (
+            known.diagonal() > 1e-12 * known.diagonal().max()
+        )  # images that are left out may be all that tells of the law
+        free = [k for k, n in enumerate(self.plan.shared) if n.startswith("coefficient") and told[1 + k]]
+        places = 1 + np.array([*free, *(k for k in self.plan.ground if told[1 + k])], dtype=np.int64)
+        if not len(places):
+            return
+        total = known[np.ix_(places, places)]
         scale = 1 / np.sqrt(np.maximum(total.diagonal(), 1e-30))
         axes = np.eye(len(places))
         if free:

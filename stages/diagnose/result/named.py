@@ -99,11 +99,9 @@ def _leaning(state: State, r: Registration, name: str) -> tuple[Named | None, st
     if not r.form.leaning:
         return None, ""
     effect = get_effect(name)({"share": r.share}, state.data)
-    size = abs(r.share) * state.data.lean_px
-    parameters = {
-        "share": (r.share, r.share_error, "1"),
-        "rms_px": (size, r.share_error * state.data.lean_px, "px"),
-    }
+    lean = state.data.lean_px
+    error = _with_ordinary(abs(r.share) * lean, r.share_error * lean, type(effect))
+    parameters = {"share": (r.share, error / lean, "1"), "rms_px": (abs(r.share) * lean, error, "px")}
     plain = r.form.upright
     compared = (plain.name, r.form.name)
     if not plain.terms or r.doubt(*compared, OWN):  # beside each image's own shift it was found sure
@@ -119,8 +117,7 @@ def _lines(state: State, r: Registration, name: str) -> tuple[Named | None, str]
     amounts = r.lines.over_the_crop(state.sites, state.frames)
     effect = cls({p.name: amounts[:, k] for k, p in enumerate(cls.fitted())}, state.data)
     compared, size = (STEADY, TREMBLING), r.lines.rms
-    ordinary = size - math.sqrt(size**2 - cls.tolerance["rms_px"] ** 2)  # part of what was found
-    made = _named(effect, {"rms_px": (size, math.hypot(r.lines.error, ordinary), "px")}, r, *compared)
+    made = _named(effect, {"rms_px": (size, _with_ordinary(size, r.lines.error, cls), "px")}, r, *compared)
     return made, r.doubt(*compared, compared)
 
 
@@ -161,7 +158,13 @@ def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str
         return None, ""
     if not why and sunward(r.mean_shifts(state.sites, r.fitted[form][0]), state.sites):
         why = "albedo that follows the ground's curvature looks the same: shifts along the Sun's azimuth that grow with the tangent of its elevation"
-    return _named(effect, {"rms_px": (size, error, "px")}, r, first, form, frames), why
+    return _named(effect, {"rms_px": (size, _with_ordinary(size, error, cls), "px")}, r, first, form, frames), why
+
+
+def _with_ordinary(size: float, error: float, cls: type[Effect]) -> float:
+    """Error of an rms displacement; what any data have of it is part of what was found, in quadrature."""
+    without = math.sqrt(max(size**2 - cls.tolerance["rms_px"] ** 2, 0.0))
+    return math.hypot(error, size - without)
 
 
 def _ordinary(size: float, error: float, cls: type[Effect]) -> bool:

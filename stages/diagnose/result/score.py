@@ -238,12 +238,15 @@ def _hidden_chains(state: State) -> list[Chain]:
 
 
 def _hidden_squares(state: State, images: Sequence[torch.Tensor] | None = None) -> np.ndarray:
-    """Squared errors on every piece of ground of the test pairs; ``images`` in the place of theirs, in I/F."""
+    """Squared errors on every piece of ground of the test pairs, on what the nominal model says is lit, as ``score`` has it: a shadow that a cause
+    casts where there is none counts against it. images : in the place of theirs, in I/F
+    """
     out = [np.zeros(0)]
     for k, chain in enumerate(_hidden_chains(state)):
         site = chain.site
         image = site.laid if images is None else images[k] * site.gain[:, None, None] + site.offset[:, None, None]
-        out.append(_squares(site, chain, image, lit_mask(chain) & site.counts, state)[0])
+        mask = site.valid & full_light(state.nominal.chain(site, [])) & site.counts
+        out.append(_squares(site, chain, image, mask, state)[0])
     return np.concatenate(out)
 
 

@@ -105,14 +105,29 @@ def start_nearer(state: State, view: View, cause: Cause) -> None:
 
 
 def _left(state: State, view: View) -> float:
-    """Whitened squares of the residual, all nuisance fitted along."""
+    """Whitened squares of the residual, all nuisance fitted along, and of values per frame over their scatter."""
     whole = view.whole
     kept = dict(whole.precision)
     for place in _scene_places(view)[0]:
         whole.precision.pop(int(place), None)
     _, score, _, _ = whole.reduce(np.zeros(1, dtype=np.int64), _stood_for(state, whole))
     whole.precision = kept
-    return float(score[0])
+    scattered = [c for c in state.causes if c.found.guise.per_frame]
+    return float(score[0]) + sum(
+        float(((_per_frame(c, whole.frames) / _sizes(c)[:, None] / c.found.spread) ** 2).sum()) for c in scattered
+    )
+
+
+def _per_frame(cause: Cause, frames: int) -> Floats:
+    """(coordinates, frames) the values of a cause."""
+    values = [np.asarray(cause.effect.values[p.name], np.float64) for p in type(cause.effect).fitted()]
+    return np.stack([np.broadcast_to(v, (frames,)) for v in values])
+
+
+def _sizes(cause: Cause) -> Floats:
+    """(coordinates,) sizes worth knowing, in which values per frame scatter."""
+    cls = type(cause.effect)
+    return np.array([cls.strong[p.name] for p in cls.fitted()])
 
 
 def _impossible(state: State, view: View) -> set[str]:
@@ -280,11 +295,10 @@ def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     if not len(places):  # no frame is seen well enough beside the other causes
         return 0.0
     cls = type(cause.effect)
-    names = [p.name for p in cls.fitted()]
-    sizes = np.array([cls.strong[n] for n in names])
+    names, sizes = [p.name for p in cls.fitted()], _sizes(cause)
     index = places - whole.first
     column, frame = index // whole.frames - min(guise.columns), index % whole.frames
-    table = np.stack([np.broadcast_to(np.asarray(cause.effect.values[n], float), (whole.frames,)) for n in names])
+    table = _per_frame(cause, whole.frames)
     now = table[column, frame] / sizes[column]
     prior = cause.found.spread**-2
     information, score, _, _ = whole.reduce(places)

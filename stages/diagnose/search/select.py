@@ -25,7 +25,7 @@ from stages.diagnose.search.rivals import another_law, choose, judge, may_be_ano
 from stages.diagnose.search.state import Cause, State, View
 from stages.diagnose.search.tested import hidden_look
 from stages.diagnose.settings import DISCOVERY, FAINT, NOTABLE, SHAMS, TRIED, TRIES
-from stages.effects import get_effect
+from stages.effects import Effect, get_effect
 
 PART_OF_A_LAW = "another law of the ground surely gains beside it, of which this is only a part"
 TAKEN, STRANGE, LIKELY = "rendered", "nothing real has its values", "to be fitted"  # how a look at the candidates ends
@@ -189,7 +189,14 @@ def unlikely(state: State, view: View, found: Found) -> str:
         return impossible(first)
     if cls.scope == "scene" and not cls.plausible({k: float(v) for k, v in first.values.items()}, state.data):
         return impossible(first)
+    if _is_rendered(cls) and found.gain > NOTABLE * float(view.whole.gram[0, 0]):
+        return ""  # however ordinary: what is left is no more than noise beside it, and the others are judged in that
     return "" if beyond else ordinary(first)  # a bound is no estimate of its size
+
+
+def _is_rendered(cls: type[Effect]) -> bool:
+    """Whether an ordinary amount of the effect is rendered to judge the others beside it: a first-order column of a blur is wrong by more than the noise."""
+    return cls.scope == "scene" and not (cls.of_law or cls.lights_shadows)
 
 
 def take(state: State, view: View, found: Found, group: list[str]) -> str:
@@ -212,8 +219,8 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
             why = f"fitted together with all other causes, {no_sure_gain(float(gains.sum()), low, high)}"
         why = why or contradicted(test_gains)
     ordinary_alone = why.startswith(ORDINARY) and why == doubt(state, cause)
-    cause.ordinary = ordinary_alone and cls.scope == "scene" and not (cls.of_law or cls.lights_shadows)
-    if cause.ordinary:  # a first-order column of a blur is wrong by more than the noise
+    cause.ordinary = ordinary_alone and _is_rendered(cls)
+    if cause.ordinary:
         return why
     if why:
         state.open[cause.effect.name] = cause.worst_error

@@ -54,7 +54,7 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
     if line > LINE and (share := rms**2 / _own(view, frame)) > NOTABLE:
         out["brightness that comes in equal steps"] = min(share, 1.0)
     ratio, share = blocks_of_compression(left, state.frames)
-    if ratio > PEAK and share > NOTABLE:
+    if ratio > PEAK and share > FAINT**2:
         out["edges every eight pixels of the detector, as compression leaves them"] = share
     if piled:
         out[PILED] = piled
