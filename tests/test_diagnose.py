@@ -21,7 +21,7 @@ from schemas import ArtefactError
 from stages import diagnose
 from stages.diagnose.result.answer import HeldOut
 from stages.diagnose.search.doubts import ORDINARY
-from stages.effects import effect_names, load_extension
+from stages.effects import Survey, effect_names, get_effect, load_extension
 
 # What two sites of 64 px in ten images can show, with the first parameter's relative error where it is recovered;
 # a wrong Sun stands in test_diagnose_leaks.py.
@@ -86,6 +86,17 @@ def test_planted_cause_is_named(scene, diagnosed, effect):
         planted = drawn(scene, _truth({effect: PLANTS[effect]}), 11).get(effect, PLANTS[effect][name])
         assert found["value"] == pytest.approx(planted, rel=SHOWN[effect])
         assert found["unit"]
+
+
+@pytest.mark.slow
+def test_an_echo_may_lag_by_what_was_not_tried(scene, tmp_path):
+    """Lags of 6 and 8 px are tried; between them the lag is fitted, with an error."""
+    tried = {abs(t.fixed["lag_px"]) for t in get_effect("echo").trials(Survey())}
+    assert 7.0 not in tried
+    answer = diagnose.run(_pairs(scene, tmp_path, {"echo": {"fraction": 0.05, "lag_px": 7}})).answer
+    assert [c.effect.name for c in answer.causes] == ["echo"]
+    lag, error, unit = answer.causes[0].parameters["lag_px"]
+    assert 0 < error < 0.5 and abs(abs(lag) - 7) < 3 * error and unit == "px"
 
 
 def test_large_gains_of_images_are_one_cause(scene, tmp_path):

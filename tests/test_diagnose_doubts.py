@@ -19,11 +19,13 @@ from stages.diagnose.likelihood.products import Products
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.aligned import aligned
 from stages.diagnose.registration.sunward import sunward
+from stages.diagnose.result.named import _with_ordinary
 from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
 from stages.diagnose.search.doubts import ODD, ORDINARY, doubt
 from stages.diagnose.search.rivals import choose, judge, may_be_another
+from stages.diagnose.search.select import unlikely
 from stages.diagnose.search.state import Cause, State
 from stages.diagnose.settings import FOLDS
 from stages.effects import get_effect
@@ -423,3 +425,25 @@ def test_a_first_estimate_that_is_extrapolated_is_halved_while_that_leaves_less(
         refine.start_nearer(state, view, cause)
         assert float(cause.effect.values["sigma2_px2"]) == kept
         assert cause.effect.held == ("nothing",)
+
+
+@pytest.mark.parametrize("name", ["misregistration", "relief_displacement", "line_jitter"])
+def test_what_any_data_have_of_a_displacement_is_part_of_what_was_found(name):
+    """In quadrature: of 0.5 px found beside an ordinary 0.3 are 0.4 hidden, and 0.1 is what it may be off by."""
+    cls = get_effect(name)
+    ordinary = cls.tolerance["rms_px"]
+    assert _with_ordinary(5 / 3 * ordinary, 0.0, cls) == pytest.approx(ordinary / 3)
+    assert _with_ordinary(100.0, 0.2, cls) == pytest.approx(0.2, rel=1e-2)
+    assert _with_ordinary(ordinary / 2, 0.0, cls) == pytest.approx(ordinary / 2)  # all of it may be ordinary
+
+
+@pytest.mark.parametrize(("gain", "rendered"), [(1100.0, True), (900.0, False)])
+def test_a_dem_that_is_hardly_too_smooth_is_rendered_where_that_gains_a_hundredth(gain, rendered):
+    """A blur that is rendered alone would make up for it."""
+    cls = get_effect("dem_smoothing")
+    guise = Guise(cls.name, cls.trials(Survey())[0], (0,))
+    small = 0.4 * cls.tolerance["sigma2_px2"] / guise.trial.columns[0]["sigma2_px2"]
+    found = Found(cls.name, guise, np.array([small]), np.array([0.01]), 9.0, gains=np.full(12, gain / 12))
+    view = SimpleNamespace(whole=SimpleNamespace(gram=np.full((1, 1), 1e5)))
+    why = unlikely(SimpleNamespace(data=Survey(), frames=1), view, found)
+    assert why == "" if rendered else why.startswith(ORDINARY)

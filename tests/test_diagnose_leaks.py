@@ -16,10 +16,14 @@ from test_diagnose import _pairs, scene  # noqa: F401
 
 from schemas.files.outputs import Output
 from stages import diagnose
-from stages.diagnose.likelihood.products import Rows, products
+from stages.diagnose.likelihood.found import Found
+from stages.diagnose.likelihood.products import Products, Rows, products
+from stages.diagnose.likelihood.whole import Whole
+from stages.diagnose.model.nominal import lit_mask
 from stages.diagnose.result import score
 from stages.diagnose.result.score import unconfirmed
-from stages.diagnose.search.refine import along, errors_over_images
+from stages.diagnose.search.refine import _left, along, errors_over_images
+from stages.diagnose.search.state import Cause
 from stages.diagnose.search.tested import hidden_look, hidden_rows
 from stages.effects import get_effect
 
@@ -103,6 +107,53 @@ def test_the_test_pairs_judge_what_an_effect_does_there_and_not_the_law_beside_i
     monkeypatch.setattr(score, "_hidden_chains", lambda _: [])
     monkeypatch.setattr(score, "_hidden_squares", lambda *_: np.full(8, next(squares)))
     assert bool(unconfirmed(state)) == refused
+
+
+def test_a_shadow_that_a_cause_casts_on_lit_ground_counts_against_it(answers, monkeypatch):
+    """Ground that is lit by either model alone would not show it: a Sun 8 deg lower darkens what the images have bright."""
+    state = answers[2]
+    seen = []
+    squares = score._squares
+    monkeypatch.setattr(score, "_squares", lambda *given: (seen.append(int(given[3].sum())), squares(*given))[1])
+    without = score._hidden_squares(state).sum()
+    low = replace(state.causes[0], effect=get_effect("sun_elevation")({"error_deg": -8.0}, state.data))
+    lower = replace(state, causes=[*state.causes, low])
+    assert score._hidden_squares(lower).sum() > without
+    half = len(seen) // 2
+    assert seen[:half] == seen[half:] and sum(seen) > 0
+    lit = [int(lit_mask(lower.nominal.chain(site, lower.base)).sum()) for site in lower.hidden]
+    assert sum(lit) < sum(seen[:half])
+
+
+def test_values_per_image_are_held_by_their_scatter(answers):
+    """Where the law hangs on a few images theirs ran away with it: squares fell and fell."""
+    state = answers[2]
+    view = state.look(["image_gain"], 0)
+    guise = next(g for g in view.plan.guises if g.effect == "image_gain")
+    found = Found("image_gain", guise, np.zeros(1), np.ones(1), 9.0, spread=0.5)
+
+    def left(gain: float) -> float:
+        effect = get_effect("image_gain")({"gain": torch.full((state.frames,), gain)}, state.data)
+        return _left(replace(state, causes=[*state.causes, Cause(effect, found)]), view)
+
+    worth = get_effect("image_gain").strong["gain"]
+    assert left(0.3) - left(0.0) == pytest.approx(state.frames * (0.3 / worth / 0.5) ** 2, rel=1e-6)
+
+
+def test_images_without_the_only_ones_that_tell_of_the_law(answers):
+    """What is left says nothing of its coefficients: they do not drift, and nothing is inverted that is nothing."""
+    state = answers[2]
+    whole = state.look(["image_gain"], 0).whole
+    law = [1 + k for k, n in enumerate(whole.plan.shared) if n.startswith("coefficient")]
+
+    def without(unit: Products) -> Products:
+        gram = unit.gram.copy()
+        gram[law] = gram[:, law] = 0.0
+        return replace(unit, gram=gram, level=None)
+
+    dark = Whole([without(u) for u in whole.given], whole.plan, whole.frames)
+    assert dark.drift is not None and not set(dark.drift[0]) & set(law)
+    assert np.isfinite(dark.gram).all()
 
 
 def test_a_single_test_ground_has_pieces_and_an_interval(answers, monkeypatch):
