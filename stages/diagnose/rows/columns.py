@@ -46,6 +46,8 @@ class Plan:
     pull: dict[int, float] = field(default_factory=dict)
     guises: list[Guise] = field(default_factory=list)
     steps: list[tuple[int, str, float]] = field(default_factory=list)  # base effect, coordinate, step: tangents
+    # base effects that act on one side: beside them stands what is alike on both, which is a matter of optics and of relief
+    one_sided: list[int] = field(default_factory=list)
 
     def shared_keys(self) -> list[tuple[str, int]]:
         """What each shared column is, to find it in another plan: a name, and of effects its number among their columns."""
@@ -96,6 +98,10 @@ def make_plan(
                     step = type(effect).step(p.name, data)
                     plan.steps.append((place, p.name, step))
                     shared(f"{effect.name}.{p.name}", float("inf"))
+    for place, effect in enumerate(chain.base):
+        if effect.one_sided:
+            plan.one_sided.append(place)
+            shared(f"both sides.{effect.name}", math.inf)
     named = [e.name for e in chain.base if e.scope == "image"]
     for name in [*named, *(n for n in names if n not in named)]:
         cls = get_effect(name)
@@ -140,12 +146,20 @@ def shared_columns(chain: Chain, plan: Plan, data: Survey, kept: Callable[[Tenso
 
 
 def moved_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
-    """(1 + steps, n, H, W): the residual, and what a small step of every value of the causes in the chain changes."""
+    """(1 + steps + one-sided effects, n, H, W): the residual, what a small step of every value of the causes in the chain changes, and what they would
+    change if they were alike on both sides.
+    """
     out = [chain.site.image - chain.rendered]
     for place, coordinate, step in plan.steps:
         effect = chain.base[place]
         moved = type(effect)({**effect.values, coordinate: float(effect.values[coordinate]) + step}, data)
         out.append((chain.replace(place, moved) - chain.rendered) / step)
+    for place in plan.one_sided:
+        effect = chain.base[place]
+        cls, side = type(effect), effect.one_sided
+        here = {**effect.values, **cls.trials(data)[0].columns[0]}
+        both = [cls(values, data) for values in (here, {**here, side: -float(here[side])})]
+        out.append(sum((chain.render(e) - chain.rendered for e in both), torch.zeros_like(chain.rendered)))
     return torch.stack(out)
 
 

@@ -240,6 +240,11 @@ def _step(state: State, view: View, share: float) -> float:
             cause = state.causes[place]
             cls = type(cause.effect)
             low, high = cls.bounds(name)
+            if (
+                cause.ordinary and name in cls.tolerance
+            ):  # what is no more than ordinary stays so, whatever it stands for beside another cause
+                middle, least = cls.null()[name], cls.tolerance[name]
+                low, high = max(low, middle - least), min(high, middle + least)
             now = float(cause.effect.values[name])
             limit = max(abs(now - cls.null()[name]), 10 * cls.step(name, state.data))
             moved = min(max(now + share * float(np.clip(amount, -limit, limit)), low), high)
