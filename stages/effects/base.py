@@ -131,6 +131,7 @@ class Effect(ABC):
         self.values: Values = {**self.null(), **(values or {})}
         self.survey = survey or Survey()
         self.held: tuple[str, ...] = ()  # coordinates that a fit leaves alone
+        self.of_model = False  # whether it acts on what is rendered alone, and takes nothing from the measured image
         for name in self.values:
             if name not in self.null():
                 raise RegistryError.unknown(f"parameter of effect {self.name}", name, self.null())

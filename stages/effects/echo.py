@@ -62,7 +62,7 @@ class Echo(Effect):
         lag = torch.as_tensor(self.values["lag_px"], dtype=state.image.dtype)
         source = state.image
         # the DEM does not know where shadows end as well as the image does, whose resampling, though, blurs near by
-        if state.measured is not None and abs(float(lag)) >= RESAMPLED:
+        if state.measured is not None and not self.of_model and abs(float(lag)) >= RESAMPLED:
             measured = state.measured()
             source = torch.where(measured.isfinite(), measured, source)
         repeated = displace(source, -(lag * step[:, 0])[:, None, None], -(lag * step[:, 1])[:, None, None])

@@ -159,6 +159,10 @@ def moved_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
         cls, side = type(effect), effect.one_sided
         here = {**effect.values, **cls.trials(data)[0].columns[0]}
         both = [cls(values, data) for values in (here, {**here, side: -float(here[side])})]
+        for e in (
+            both
+        ):  # the measured image has the echo in it: laid over itself from the other side, it would explain as much
+            e.of_model = True
         out.append(sum((chain.render(e) - chain.rendered for e in both), torch.zeros_like(chain.rendered)))
     return torch.stack(out)
 
