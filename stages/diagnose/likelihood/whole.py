@@ -67,9 +67,8 @@ class Whole:
         the amounts of each unit are integrated out.
         """
         known = np.sum([u.gram[: 1 + len(self.plan.shared), : 1 + len(self.plan.shared)] for u in self.units], 0)
-        told = (
-            known.diagonal() > 1e-12 * known.diagonal().max()
-        )  # images that are left out may be all that tells of the law
+        # images that are left out may be all that tells of the law
+        told = known.diagonal() > 1e-12 * known.diagonal().max()
         free = [k for k, n in enumerate(self.plan.shared) if n.startswith("coefficient") and told[1 + k]]
         places = 1 + np.array([*free, *(k for k in self.plan.ground if told[1 + k])], dtype=np.int64)
         if not len(places):

@@ -96,10 +96,10 @@ def _named(effect, parameters, r: Registration, first: str, second: str, frames=
 
 
 def _leaning(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
-    if not r.form.leaning:
+    lean = state.data.lean_px
+    if not r.form.leaning or not lean > 0:
         return None, ""
     effect = get_effect(name)({"share": r.share}, state.data)
-    lean = state.data.lean_px
     error = _with_ordinary(abs(r.share) * lean, r.share_error * lean, type(effect))
     parameters = {"share": (r.share, error / lean, "1"), "rms_px": (abs(r.share) * lean, error, "px")}
     plain = r.form.upright

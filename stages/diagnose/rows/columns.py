@@ -98,7 +98,7 @@ def make_plan(
                     step = type(effect).step(p.name, data)
                     plan.steps.append((place, p.name, step))
                     shared(f"{effect.name}.{p.name}", float("inf"))
-    for place, effect in enumerate(chain.base):
+    for place, effect in enumerate(chain.base):  # after all steps, which stand together
         if effect.one_sided:
             plan.one_sided.append(place)
             shared(f"both sides.{effect.name}", math.inf)
@@ -158,12 +158,13 @@ def moved_columns(chain: Chain, plan: Plan, data: Survey) -> Tensor:
         effect = chain.base[place]
         cls, side = type(effect), effect.one_sided
         here = {**effect.values, **cls.trials(data)[0].columns[0]}
-        both = [cls(values, data) for values in (here, {**here, side: -float(here[side])})]
-        for e in (
-            both
-        ):  # the measured image has the echo in it: laid over itself from the other side, it would explain as much
-            e.of_model = True
-        out.append(sum((chain.render(e) - chain.rendered for e in both), torch.zeros_like(chain.rendered)))
+        both = torch.zeros_like(chain.rendered)
+        for at in (float(here[side]), -float(here[side])):
+            one = cls({**here, side: at}, data)
+            # the measured image has the echo in it: laid over itself from the other side, it would explain as much
+            one.of_model = True
+            both += chain.render(one) - chain.rendered
+        out.append(both)
     return torch.stack(out)
 
 

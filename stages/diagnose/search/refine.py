@@ -240,9 +240,8 @@ def _step(state: State, view: View, share: float) -> float:
             cause = state.causes[place]
             cls = type(cause.effect)
             low, high = cls.bounds(name)
-            if (
-                cause.ordinary and name in cls.tolerance
-            ):  # what is no more than ordinary stays so, whatever it stands for beside another cause
+            # what is no more than ordinary stays so, whatever it stands for beside another cause
+            if cause.ordinary and name in cls.tolerance:
                 middle, least = cls.null()[name], cls.tolerance[name]
                 low, high = max(low, middle - least), min(high, middle + least)
             now = float(cause.effect.values[name])
