@@ -30,6 +30,7 @@ from hidden.laws import LAWS
 from hidden.scene import Layout, Scene, Truth, write_pairs
 from hidden.size import strength
 from hidden.worlds import WORLDS
+from sure_names import doubtful
 
 # effect -> parameters at full strength; weaker plants multiply the first one
 PLANTS: dict[str, dict] = {
@@ -179,6 +180,7 @@ def summarise(cases: list[dict]) -> str:
     lines.append(f"| outside the catalogue: `unexplained` | {_share(len(said), len(strange))} |")
     lines.append(f"| outside the catalogue: a name | {_share(len(wrong), len(strange))} |")
     lines += [f"| ... {_of_unknown(name, strange)}" for name in UNKNOWN if any(name in c["planted"] for c in strange)]
+    lines += doubtful([c["answer"] for c in cases])
     seconds = [c["seconds"] for c in cases]
     lines.append(f"| seconds per diagnosis, median / largest | {np.median(seconds):.1f} / {max(seconds):.1f} |")
     lines += [

@@ -22,6 +22,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
+from sure_names import doubtful
 
 LABORATORIES = ("laboratory", "second_laboratory")
 ROOT = Path(__file__).parents[1]
@@ -97,6 +98,7 @@ def summarise(cases: list[dict]) -> str:
     lines += [
         f"| outside the catalogue: {kind} | {_share(kinds[kind], len(faults))} |" for kind in (HONEST, BARE, NOTHING)
     ]
+    lines += doubtful([case["answer"] for case in cases])
     return "\n".join([*lines, *_by_strength(single), *_single(single), *_faults(faults), *_nulls(nulls)]) + "\n"
 
 

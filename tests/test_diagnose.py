@@ -251,14 +251,6 @@ def test_what_is_displaced_is_no_cause_where_the_test_pairs_lose_by_it(scene, tm
     assert answer.rejected["misregistration"][1] == "the test pairs contradict it: it gains -40.0 % there (up to -25.0)"
 
 
-def test_the_test_pairs_take_back_a_name_that_they_contradict():
-    from stages.diagnose.search.doubts import contradicted
-
-    assert "contradict" in contradicted(np.array([-3.0, -4.0, -5.0, -4.0]))
-    assert not contradicted(np.array([-3.0, 4.0, -5.0, 2.0]))
-    assert not contradicted(np.zeros(0))
-
-
 def test_jackknife_intervals_cover():
     """Of ratios of sums over twelve unequal pieces of ground, at least nine in ten intervals hold the truth."""
     from stages.diagnose.likelihood.jackknife import gain_interval

@@ -76,6 +76,7 @@ class ShadowedGround:
         ({"wall": (400.0, 200.0)}, "distant_shadow", "height_m", 400.0),
         ({"sun_deg": 1.5}, "sun_elevation", "error_deg", 1.5),
         ({"sun_deg": -1.5, "dem_px": 0.2}, "sun_elevation", "error_deg", -1.5),
+        ({"sun_deg": 7.0, "dem_px": 0.2}, "sun_elevation", "error_deg", 7.0),
         ({"radius_deg": 2.0}, "penumbra", "radius_deg", 2.0),
         ({"radius_deg": 2.0, "dem_px": 0.2}, "penumbra", "radius_deg", 2.0),
         ({"radius_deg": 3.0, "dem_px": 0.05, "fall": 0.5}, "penumbra", "radius_deg", 3.0),

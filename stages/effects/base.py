@@ -74,6 +74,7 @@ class Effect(ABC):
     relative        whether its values per image are known beside those of the other images only: what all share is the ground's
     lights_shadows  whether it brings light into deep shadow; one kind of light is told from another there
     linear          whether the image is linear in the coordinates: a first estimate beyond their bounds stays there
+    law_error       coordinate -> its standard error where the law of the ground is not known, whose form passes for it
     of_law          whether another reflectance law could do the same: it is a cause only where no other law has anything to add
     in_simulation   coordinate -> what is added to it in the extended model: `diagnose` judges with slopes of fourth order, while the
                     simulation's smooth the ground by about a quarter of a squared pixel themselves
@@ -120,6 +121,7 @@ class Effect(ABC):
     one_sided: ClassVar[str] = ""
     listed: ClassVar[bool] = True
     raises_horizon: ClassVar[bool] = False
+    law_error: ClassVar[Mapping[str, float]] = {}
     of_law: ClassVar[bool] = False
     shadow_error: ClassVar[float] = 0.0
     keep_below: ClassVar[float] = 1.0

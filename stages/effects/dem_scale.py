@@ -29,6 +29,8 @@ class DemScale(Effect):
     parameters = (Parameter("relative", "1", -0.5, 1.0, 0.0, "relative error of heights, truth minus given"),)
     strong: ClassVar = {"relative": 0.1}
     tolerance: ClassVar = {"relative": 0.02}
+    # rms of what was found by shading on 53 files of two other simulators that have no such error, by formal errors of 0.01
+    law_error: ClassVar = {"relative": 0.075}
     shadow_error = ORDINARY
 
     @classmethod

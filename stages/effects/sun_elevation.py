@@ -40,7 +40,7 @@ class SunElevation(Effect):
 
     @classmethod
     def shadow_trials(cls, survey: Survey) -> list[Trial]:
-        errors = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
+        errors = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0)
         return [Trial(({"error_deg": e},)) for e in (*(-x for x in errors[:0:-1]), *errors)]
 
     @classmethod

@@ -29,7 +29,6 @@ class Whole:
         # brightness of images as wholes, which what is not known of their insides must not decide on
         self.levels = Whole(levels, plan, frames, drifting=False) if levels else None
         self.first = 1 + len(plan.shared)
-        self.drift: tuple[NDArray[np.int64], Array, Array] | None = None  # places, main directions, their scatter
         if drifting:
             self._let_coefficients_drift()
         lit = self.first + len(plan.per_frame) * frames
@@ -95,28 +94,7 @@ class Whole:
             own = np.array([c @ (s - g @ mean) for c, g, s in zip(posterior, squares, score, strict=True)])
             variance = own**2 + np.array([c.diagonal() for c in posterior])
             spread = np.sqrt(np.maximum(variance.mean(0), 1e-8))
-        self.drift = places, main, spread
-        self.units = [self._without_drift(u) for u in self.units]
-
-    def _without_drift(self, u: Products) -> Products:
-        """The unit with its own amounts of the coefficients integrated out."""
-        if self.drift is None:
-            return u
-        places, main, spread = self.drift
-        r, sham = main.T @ u.gram[places], main.T @ u.sham[places]
-        inner = np.linalg.inv(main.T @ u.gram[np.ix_(places, places)] @ main + np.diag(spread**-2))
-        return dataclasses.replace(u, gram=u.gram - r.T @ inner @ r, sham=u.sham - r.T @ inner @ sham)
-
-    def gains_on(self, units: Sequence[Products], places: NDArray[np.int64], exclude: Sequence[int] = ()) -> Array:
-        """(len(units),) nats that the columns gain on other ground, all that is fitted here taken over."""
-        n = self.nuisance([*places, *exclude, *self.own_light])
-        every = np.concatenate([n, places])
-        more = np.concatenate([self.weight(n), np.zeros(len(places))])
-        b1, b0 = np.zeros(self.size), np.zeros(self.size)
-        b1[every] = solve(self.gram[np.ix_(every, every)] + np.diag(more), self.gram[every, 0])
-        b0[n] = solve(self.gram[np.ix_(n, n)] + np.diag(self.weight(n)), self.gram[n, 0])
-        held = [self._without_drift(u) for u in units]
-        return np.array([0.5 * (_left(u, b0) - _left(u, b1)) for u in held])
+        self.units = [_integrated_out(u, places, main, spread) for u in self.units]
 
     def frame_places(self, columns: Sequence[int]) -> NDArray[np.int64]:
         """Places of columns per frame in the whole, frame by frame within a column."""
@@ -331,6 +309,13 @@ class Whole:
         gains = self.held_out(places, exclude, spread)
         self.precision = kept
         return gains
+
+
+def _integrated_out(u: Products, places: NDArray[np.int64], main: Array, spread: Array) -> Products:
+    """The unit without its own amounts, along the directions ``main`` of the columns at ``places``, which scatter by ``spread``."""
+    r, sham = main.T @ u.gram[places], main.T @ u.sham[places]
+    inner = np.linalg.inv(main.T @ u.gram[np.ix_(places, places)] @ main + np.diag(spread**-2))
+    return dataclasses.replace(u, gram=u.gram - r.T @ inner @ r, sham=u.sham - r.T @ inner @ sham)
 
 
 def _left(unit: Products, b: Array, shade: bool = False) -> float:

@@ -35,9 +35,9 @@ def by_search(state: State) -> list[Named]:
         units = {p.name: p.unit for p in cls.parameters}
         if cls.scope == "scene":
             values = {k: float(v) for k, v in cause.effect.values.items()}
-            found = cls.report(values, cause.reported_errors)
+            found = cls.report(values, state.reported_errors(cause))
         else:
-            found = {cls.parameters[0].name: (cause.rms, cause.reported_errors.get("rms", math.inf))}
+            found = {cls.parameters[0].name: (cause.rms, state.reported_errors(cause).get("rms", math.inf))}
         low, high = cause.found.gain_interval()
         out.append(
             Named(
@@ -61,7 +61,7 @@ def outside_catalogue(state: State) -> dict[str, float]:
     for cause in [c for c in state.named if not c.effect.listed]:
         cause.ordinary = True
         first = type(cause.effect).parameters[0]
-        value, error = float(cause.effect.values[first.name]), cause.reported_errors.get(first.name, math.nan)
+        value, error = float(cause.effect.values[first.name]), state.reported_errors(cause).get(first.name, math.nan)
         unit = "" if first.unit == "1" else f" {first.unit}"
         out[f"{cause.effect.title} ({value:.2g} +- {error:.1g}{unit})"] = cause.gain_percent / 100
     return out

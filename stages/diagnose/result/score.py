@@ -213,18 +213,23 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
     """Take out causes of the search that surely lose on the test pairs, the last one first; name -> its gain in nats where it was learned, and why."""
     out: dict[str, tuple[float, str]] = {}
     for cause in state.named[::-1]:  # what was found last stands on what was found before
-        with_cause, predicted = _hidden_squares(state), [c.predict() for c in _hidden_chains(state)]
         kept, nominal = list(state.causes), state.nominal
-        state.causes[:] = [c for c in kept if c is not cause]
+        if not cause.found.guise.per_frame and not any(bool(site.counts.any()) for site in state.hidden):
+            # no values per image are known of images that the test pairs alone are of: without these it is judged all the same
+            state.causes[:] = [c for c in kept if not c.found.guise.per_frame]
+            state.nominal = copy.copy(nominal)
+            state.fit()
+        with_cause, predicted = _hidden_squares(state), [c.predict() for c in _hidden_chains(state)]
+        state.causes[:] = [c for c in state.causes if c is not cause]
         by_itself = _hidden_squares(state, predicted)  # what it changes beside the same law
-        state.nominal = copy.copy(nominal)
+        state.nominal = copy.copy(state.nominal)
         state.fit()
         without = _hidden_squares(state)
         gain, _, high = gain_interval(without, with_cause)
         # what all images of a place share, albedo say, these pairs do not judge: it is the law that makes a difference, fitted without it
         if contradicts(high) and by_itself.sum() > FAINT**2 * with_cause.sum():
             out[cause.effect.name] = cause.found.gain, contradiction(gain, high)
-            continue
+            kept.remove(cause)
         state.causes[:], state.nominal = kept, nominal
         state.fit()
     return out
@@ -278,7 +283,8 @@ def _could_not_show(state: State, outcome: Outcome, name: str) -> bool:
         for column, error in zip(guise.trial.columns, every, strict=True):
             ((coordinate, at),) = column.items()
             size = abs(at - cls.null()[coordinate])
-            error = float(error) * size / (cls.strong.get(coordinate, 0.0) or size)
+            error = math.hypot(float(error) * size, state.law_errors(cls).get(coordinate, 0.0))
+            error /= cls.strong.get(coordinate, 0.0) or size
             expected[coordinate] = min(expected.get(coordinate, math.inf), error)
     error = max(expected.values(), default=math.inf)
     judged = outcome.best[name]

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from stages.common.intervals import student_quantile
-from stages.diagnose.likelihood.found import interval
 from stages.diagnose.likelihood.tails import together
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.state import Cause, State, View
@@ -50,6 +47,10 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
             size, error = abs(values[name] - cls.null()[name]), errors.get(name, 0.0)
         if size - 2 * error < least:
             return as_ordinary(name, size, least, error)
+    for name, more in state.law_errors(cls).items():
+        size, error = abs(values[name] - cls.null()[name]), math.hypot(errors[name], more)
+        if size - 2 * error < cls.tolerance.get(name, 0.0):
+            return f"the law of the ground, which is not known, passes for as much ({name} = {values[name]:.2g} +- {error:.1g})"
     return ""
 
 
@@ -121,18 +122,9 @@ def ordinary(first: Effect) -> str:
     return ""
 
 
-def contradicted(gains: np.ndarray) -> str:
-    """Why test pairs that gain so many nats on each piece of ground take a name back, or ''."""
-    low, high = interval(gains)
-    if high < 0:
-        return f"the test pairs contradict it: it gains {gains.sum():.3g} nats there ({low:.3g} .. {high:.3g})"
-    return ""
-
-
 __all__ = [
     "ODD",
     "ORDINARY",
-    "contradicted",
     "doubt",
     "doubt_all",
     "doubt_any",

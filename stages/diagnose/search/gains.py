@@ -1,4 +1,4 @@
-"""What a cause, as it is rendered, gains on held-out ground and on the test pairs."""
+"""What a cause, as it is rendered, gains on held-out ground."""
 
 from __future__ import annotations
 
@@ -14,18 +14,14 @@ from stages.diagnose.likelihood.products import Products, Rows, products
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.search.tested import hidden_rows
 from stages.effects import Effect
 
 
-def secant_gains(
-    state: State, cause: Cause, look: View, before: View | None
-) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Nats that the cause, as it was rendered, gains beside everything else: on held-out ground, and what they go with (labels,); the squares
-    without it; its gains on the test pairs, which are ``before`` as they were without it.
+def secant_gains(state: State, cause: Cause, look: View) -> tuple[np.ndarray, np.ndarray, float]:
+    """Nats that the cause, as it was rendered, gains beside everything else on held-out ground, and what they go with (labels,); the squares
+    without it.
 
-    Effects with several values keep the gain that their columns had on held-out ground: one amount for all would not be held out. On the
-    test pairs it is, but of values per image.
+    Effects with several values keep the gain that their columns had on held-out ground: one amount for all would not be held out.
     """
     others = [c.effect for c in state.causes if c is not cause]
     few = 1 + sum(n.startswith("coefficient") for n in look.plan.shared)
@@ -40,25 +36,14 @@ def secant_gains(
     units = [products(more, look.model, look.grid, state.frames) for more in pieces]
     whole = _beside(units, cause, look, state.frames)
     total = float(whole.gram[0, 0])
-    if type(cause.effect).scope != "scene":
-        return cause.found.gains, cause.found.sizes, total, np.zeros(0)
+    if not cause.single:
+        return cause.found.gains, cause.found.sizes, total
     form = whole.stood_for([type(cause.effect)])
     if cause.found.beside:
         form += (look.whole.scattered + 1).tolist()  # one shared column more
     place = np.array([whole.first - 1])
-    tested = [
-        products(more, look.model, look.grid, state.frames)
-        for chain, rows in hidden_rows(state, before, look.plan)
-        for more in _with_cause(state, chain, others, rows, look)
-    ]
-    gains = whole.gains_on(tested, place, form)
-    grounds, of = np.unique([u.site for u in tested], return_inverse=True)
-    if len(grounds) >= 3:  # else pieces of ground, where there are too few grounds for an interval
-        gains = np.bincount(of, weights=gains).astype(np.float64)
-    if not cause.single:
-        return cause.found.gains, cause.found.sizes, total, gains
     shades = type(cause.effect).lights_shadows
-    return whole.held_out(place, form), whole.power(place, np.ones(1)) if shades else cause.found.sizes, total, gains
+    return whole.held_out(place, form), whole.power(place, np.ones(1)) if shades else cause.found.sizes, total
 
 
 def _few(rows: Rows, count: int) -> Rows:

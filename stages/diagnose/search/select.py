@@ -12,7 +12,6 @@ from stages.diagnose.likelihood.weigh import weigh_all
 from stages.diagnose.search.doubts import (
     ODD,
     ORDINARY,
-    contradicted,
     doubt,
     doubt_all,
     doubt_any,
@@ -23,7 +22,6 @@ from stages.diagnose.search.gains import secant_gains
 from stages.diagnose.search.refine import along, as_effect, errors_over_images, refine, settle, start_nearer
 from stages.diagnose.search.rivals import another_law, choose, judge, may_be_another, shows_in_shade
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.search.tested import hidden_look
 from stages.diagnose.settings import DISCOVERY, FAINT, NOTABLE, SHAMS, TRIED, TRIES
 from stages.effects import Effect, get_effect
 
@@ -203,7 +201,6 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     """Put the effect into the model and fit everything again; '' if it stays, or why it does not (all is as before then)."""
     cls = get_effect(found.effect)
     first = as_effect(found, state.data, state.frames, view.whole)
-    tested = hidden_look(state, view)
     vector, causes, impossible = state.nominal.vector, list(state.causes), set(state.impossible)
     saved = [(c, c.copy()) for c in causes]
     cause = Cause(first, found, group=group)
@@ -211,13 +208,12 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
     start_nearer(state, view, cause)
     look, why = _fit_beside(state, view, cause)
     if not why:
-        gains, sizes, total, test_gains = secant_gains(state, cause, look, tested)
+        gains, sizes, total = secant_gains(state, cause, look)
         low, high = interval(gains, sizes)
         cause.gain_percent, cause.gain_low, cause.gain_high = (200 * x / total for x in (float(gains.sum()), low, high))
         cause.found = dataclasses.replace(cause.found, gains=gains, sizes=sizes)
         if low <= 0:
             why = f"fitted together with all other causes, {no_sure_gain(float(gains.sum()), low, high)}"
-        why = why or contradicted(test_gains)
     ordinary_alone = why.startswith(ORDINARY) and why == doubt(state, cause)
     cause.ordinary = ordinary_alone and _is_rendered(cls)
     if cause.ordinary:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -20,6 +20,7 @@ from stages.diagnose.likelihood.products import Rows, Shams, products, whitened_
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.form import may_be_exchanged, measured_laws
+from stages.diagnose.model.laws import LunarLaws
 from stages.diagnose.model.nominal import Nominal, fit
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
@@ -78,13 +79,6 @@ class Cause:
         """Over ground or over images."""
         return {k: max(e, self.over_images.get(k, 0.0)) for k, e in self.errors.items()}
 
-    @property
-    def reported_errors(self) -> dict[str, float]:
-        """The larger ones, and what every data set has of the effect, which is part of what was found."""
-        cls = type(self.effect)
-        ordinary = cls.tolerance if cls.scope == "scene" else {"rms": max(cls.tolerance.values(), default=0.0)}
-        return {k: math.hypot(e, ordinary.get(k, 0.0)) for k, e in self.larger_errors.items()}
-
 
 @dataclass
 class State:
@@ -119,6 +113,17 @@ class State:
     def named(self) -> list[Cause]:
         """Those that are more than ordinary."""
         return [c for c in self.causes if not c.ordinary]
+
+    def law_errors(self, effect: type[Effect]) -> Mapping[str, float]:
+        """Standard errors of its values that no measured law took away, where such laws had to take the nominal one's place."""
+        return effect.law_error if isinstance(self.nominal.model, LunarLaws) else {}
+
+    def reported_errors(self, cause: Cause) -> dict[str, float]:
+        """The larger ones, those of a law that is not known, and what every data set has of the effect, which is part of what was found."""
+        cls = type(cause.effect)
+        ordinary = cls.tolerance if cls.scope == "scene" else {"rms": max(cls.tolerance.values(), default=0.0)}
+        law = self.law_errors(cls)
+        return {k: math.hypot(e, law.get(k, 0.0), ordinary.get(k, 0.0)) for k, e in cause.larger_errors.items()}
 
     @property
     def free_gains(self) -> bool:
