@@ -25,7 +25,7 @@ from stages.diagnose.rows.patches import make_grid
 from stages.diagnose.search import refine
 from stages.diagnose.search.doubts import ODD, ORDINARY, doubt
 from stages.diagnose.search.rivals import choose, judge, may_be_another
-from stages.diagnose.search.select import unlikely
+from stages.diagnose.search.select import Weighed, _hiding, unlikely
 from stages.diagnose.search.state import Cause, State
 from stages.diagnose.settings import FOLDS
 from stages.effects import get_effect
@@ -315,7 +315,20 @@ def test_a_fit_that_ends_beside_a_bound_is_nothing_real():
     for value, possible in ((-0.294, False), (-0.3, False), (0.8, True)):
         cause = Cause(get_effect("psf_blur")({"sigma2_px2": value}), found=None)
         cause.errors = cause.of_given_shape = cause.over_images = {"sigma2_px2": 0.01}
-        assert doubt(SimpleNamespace(data=None, frames=8), cause).startswith(ODD) != possible
+        assert (
+            doubt(SimpleNamespace(data=None, frames=8, law_errors=lambda effect: {}), cause).startswith(ODD) != possible
+        )
+
+
+def test_a_blur_below_nothing_hides_no_smooth_dem():
+    """A DEM smoothed by 1.9 px2 looks like images sharper than any optics. That blur was refused, and stood beside the DEM all the same."""
+    trial = get_effect("psf_blur").trials(Survey())[0]
+    at = trial.columns[0]["sigma2_px2"]
+    for value, hides in ((-0.7, True), (-0.12, False), (0.4, False)):
+        found = Found("psf_blur", Guise("psf_blur", trial, (0,)), np.array([value / at]), np.array([0.06 / at]), 32.0)
+        assert _hiding(Weighed({"psf_blur": found}, tried=[], sure=[], rejected={})) == (
+            {"psf_blur"} if hides else set()
+        )
 
 
 def test_light_from_below_is_no_earthshine():
@@ -333,7 +346,19 @@ def test_a_shape_that_is_open_does_not_make_an_effect_nothing():
     cause.errors, cause.share_error, cause.share_freedom = {"B0": 0.2, "h": 0.01}, 0.05 / 0.6, 7
     for error, sure in ((0.05, True), (0.2, False)):
         cause.of_given_shape, cause.away = {"B0": error}, 0.6 / error
-        assert (doubt(SimpleNamespace(data=None, frames=8), cause) == "") == sure
+        assert (doubt(SimpleNamespace(data=None, frames=8, law_errors=lambda effect: {}), cause) == "") == sure
+
+
+def test_a_vertical_scale_is_known_no_better_than_the_law():
+    """Contrast that another law of the ground has passes for it, unless the law is the one that was given."""
+    cause = Cause(get_effect("dem_scale")({"relative": -0.12}), found=None)
+    cause.errors, cause.away = {"relative": 0.01}, 12.0
+    known = SimpleNamespace(data=None, frames=8, law_errors=lambda effect: {})
+    unknown = SimpleNamespace(data=None, frames=8, law_errors=lambda effect: effect.law_error)
+    assert doubt(known, cause) == ""
+    assert "law of the ground, which is not known" in doubt(unknown, cause)
+    cause.effect = get_effect("dem_scale")({"relative": -0.3})
+    assert doubt(unknown, cause) == ""
 
 
 def test_values_that_stand_for_each_other_are_sure_together():

@@ -84,6 +84,7 @@ class Effect(ABC):
     judged_apart    whether a step of its own judges it, not the search: registration, or a histogram of all pixels
     leans           of those that displace: relief by its height, not images as a whole
     along_lines     of those that displace: the lines of an image against each other
+    edges_tell      whether shadow edges alone tell it, not lit ground or deep shadow
     raises_horizon  whether it is terrain that the DEM has not
     listed          whether it is in the catalogue: of others, which are in none, `diagnose` tells by their title what they leave
     keep_below      of a level that was read off a histogram: what is brighter than this times the level says nothing more
@@ -120,6 +121,7 @@ class Effect(ABC):
     along_lines: ClassVar[bool] = False
     one_sided: ClassVar[str] = ""
     listed: ClassVar[bool] = True
+    edges_tell: ClassVar[bool] = False
     raises_horizon: ClassVar[bool] = False
     law_error: ClassVar[Mapping[str, float]] = {}
     of_law: ClassVar[bool] = False

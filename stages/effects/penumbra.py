@@ -29,6 +29,7 @@ class Penumbra(Effect):
     parameters = (Parameter("radius_deg", "degree", 0.02, 4.0, 0.2666, "effective angular radius of the Sun"),)
     strong: ClassVar = {"radius_deg": 2.0}
     shadow_error = 0.1
+    edges_tell = True  # light that a wide disc brings into deep shadow passes for any other light there
 
     @classmethod
     def shadow_trials(cls, survey: Survey) -> list[Trial]:

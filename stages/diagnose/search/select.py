@@ -90,10 +90,10 @@ def search(state: State, most: int) -> Outcome:
             view = state.look(names) if fresh else state.again(view, names, shams=SHAMS, candidates=None)
             continue
         if end != STRANGE:
-            odd = {f.effect for f in weighed.tried if not f.guise.per_frame and beyond_bounds(f)} - state.impossible
+            odd = _hiding(weighed) - state.impossible
             if not odd:
                 break
-            state.impossible |= odd  # what it gains may not be sure, and it hides others all the same
+            state.impossible |= odd
         view = state.without_impossible(view, state.open_names())  # the data look as before
     out.beside = view if fresh or not state.named else state.look(along(state, view), 0, ())
     settle(state, out.beside)
@@ -108,6 +108,7 @@ def _weigh(state: State, view: View, refused: Mapping[str, str]) -> Weighed:
     best, _ = weigh_all(view.whole)
     # values per image of a cause are weighed as well: what is left of them is no further cause
     done = {*refused, *(c.effect.name for c in state.causes)}
+    done |= {n for n in best if get_effect(n).edges_tell}
     strong = [f for f in best.values() if f.p <= DISCOVERY and f.effect not in done]
     strong.sort(key=lambda f: -f.surprise)
     tried: list[Found] = []
@@ -159,6 +160,13 @@ def _take_one(state: State, view: View, weighed: Weighed, refused: dict[str, str
         if any(c.effect.name == chosen.effect for c in state.causes):  # rendered, and not named
             return TAKEN
     return ""
+
+
+def _hiding(weighed: Weighed) -> set[str]:
+    """Effects of which nothing real has as much as fits best beside the others, and that hide what they stand for. What they gain need not be sure, and
+    they may be refused: a blur below nothing comes to nothing once it is fitted within its bounds, and is all that a DEM which is too smooth looks like.
+    """
+    return {f.effect for f in weighed.best.values() if not f.guise.per_frame and beyond_bounds(f)}
 
 
 def _why_not_sure(found: Found, faint: float) -> str:
