@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -150,6 +151,23 @@ def test_a_column_of_a_frame_adds_its_own_mean(turn_deg, axis):
     plain = state.image
     get_effect("charge_smear")({"share": 0.1}).apply(state)
     torch.testing.assert_close(state.image, plain + 0.1 * mean)
+
+
+def test_wings_of_optics_fall_with_the_cube_of_the_distance():
+    """A point's light, all but the 3 % beyond the crop; where a law is fitted to lit ground the dark alone tells."""
+    size, core = 256, 4.0
+    point = torch.zeros(1, size, size)
+    point[0, size // 2, size // 2] = 1.0
+    state = SimpleNamespace(image=point, elevation=point, sun_visibility=None, law_fitted=False)
+    get_effect("stray_light")({"share": 0.1}).apply(state)
+    wings = state.image[0, size // 2] - point[0, size // 2]
+    away = torch.arange(8, 48)
+    expected = 0.1 * core / (2 * math.pi * (away**2 + core**2) ** 1.5)
+    torch.testing.assert_close(wings[size // 2 + away], expected.float(), rtol=0.05, atol=2e-8)
+    assert 0.097 < float(state.image.sum()) - 1 < 0.1
+    lit = SimpleNamespace(image=point, elevation=point, sun_visibility=torch.ones_like(point), law_fitted=True)
+    get_effect("stray_light")({"share": 0.1}).apply(lit)
+    torch.testing.assert_close(lit.image, point)
 
 
 def test_slots_fix_the_order():
