@@ -97,11 +97,13 @@ def test_the_test_pairs_take_a_name_back(answers):
     assert [c.effect.name for c in state.causes] == before
 
 
-@pytest.mark.parametrize(("alone", "refused"), [(1e-9, False), (5.0, True)])
-def test_the_test_pairs_judge_what_an_effect_does_there_and_not_the_law_beside_it(monkeypatch, alone, refused):
-    """They lose one in a hundred by it. Albedo that all their images share makes no difference to them; the law, fitted again without it, does."""
+@pytest.mark.parametrize(("alone", "lights", "refused"), [(1e-9, False, False), (5.0, False, True), (1e-9, True, True)])
+def test_the_test_pairs_judge_what_an_effect_does_there_and_not_the_law_beside_it(monkeypatch, alone, lights, refused):
+    """They lose one in a hundred by it. Albedo that all their images share makes no difference to them; the law, fitted again without it, does.
+    Light in shadows, which they do not look at, is to leave lit ground as it is.
+    """
     found = SimpleNamespace(gain=1.0, guise=SimpleNamespace(per_frame=False))
-    cause = SimpleNamespace(effect=SimpleNamespace(name="one"), found=found)
+    cause = SimpleNamespace(effect=SimpleNamespace(name="one", lights_shadows=lights), found=found)
     shown = SimpleNamespace(counts=torch.ones(3, 1, 1, dtype=torch.bool))
     state = SimpleNamespace(causes=[cause], named=[cause], nominal=None, fit=lambda: None, hidden=[shown])
     squares = iter([101.0, alone, 100.0])
@@ -114,7 +116,8 @@ def test_gains_of_images_that_only_the_test_pairs_are_of_hide_no_other_cause(mon
     """Beside values per image such images judge nothing; without these they refuse what they lose by."""
     causes = [
         SimpleNamespace(
-            effect=SimpleNamespace(name=name), found=SimpleNamespace(gain=1.0, guise=SimpleNamespace(per_frame=own))
+            effect=SimpleNamespace(name=name, lights_shadows=False),
+            found=SimpleNamespace(gain=1.0, guise=SimpleNamespace(per_frame=own)),
         )
         for name, own in (("one", False), ("gains", True))
     ]

@@ -226,8 +226,10 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
         state.fit()
         without = _hidden_squares(state)
         gain, _, high = gain_interval(without, with_cause)
-        # what all images of a place share, albedo say, these pairs do not judge: it is the law that makes a difference, fitted without it
-        if contradicts(high) and by_itself.sum() > FAINT**2 * with_cause.sum():
+        # what all images of a place share, albedo say, these pairs do not judge: it is the law that makes a difference, fitted without it.
+        # Light in shadows is none of that, though it changes next to nothing on lit ground
+        judged = cause.effect.lights_shadows or by_itself.sum() > FAINT**2 * with_cause.sum()
+        if contradicts(high) and judged:
             out[cause.effect.name] = cause.found.gain, contradiction(gain, high)
             kept.remove(cause)
         state.causes[:], state.nominal = kept, nominal

@@ -216,8 +216,9 @@ def _judged(
         if not gain_interval(usually[shown], whole.held_out()[shown])[1] > least:
             return refused("horizons whose errors fall more slowly with distance explain as much of it")
     # a wall is looked at further than the highest that was tried; where others end there, it is no estimate
-    if not around and abs(value) >= max(abs(float(e.values[name])) for e in line):
-        return refused(f"shadows fit best at the end of what was tried ({name} = {value:.3g})")
+    largest = max(abs(float(e.values[name])) for e in line)
+    if not around and np.abs(values).max() >= largest:
+        return refused(f"shadows fit best at the end of what was tried ({name} = {math.copysign(largest, value):.3g})")
     scatter = 0.0  # how far away a wall stands is open, and whether there is one is not
     if around:
         near = shadows.in_turn([type(effect)({**t.fixed, **t.columns[0]}, state.data) for t in around])
