@@ -6,6 +6,7 @@ import ast
 from pathlib import Path
 
 import pytest
+from sure_names import doubtful
 
 TESTS = Path(__file__).parent
 # They run examples that hold their own assertions.
@@ -57,3 +58,13 @@ def test_tests_that_ask_for_reference_data_are_marked(request):
 @pytest.mark.usefixtures("shared")
 def test_this_one_asks_for_reference_data(request):
     assert request.node.get_closest_marker("shared")
+
+
+def test_names_that_may_be_no_gain_are_counted():
+    """One cause in doubt makes an answer doubtful; test pairs count where their upper bound is below zero, and not where there were none."""
+
+    def answer(lows, high):
+        return {"causes": [{"held_out_low": low} for low in lows], "held_out": {"gain_percent_high": high}}
+
+    unsure, losing = doubtful([answer([0.2], 1.0), answer([0.2, None], -0.3), answer([0.1], None), answer([], None)])
+    assert "1 of 3" in unsure and "1 of 3 (up to 0.3 %)" in losing

@@ -48,7 +48,7 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
         if size - 2 * error < least:
             return as_ordinary(name, size, least, error)
     for name, more in state.law_errors(cls).items():
-        size, error = abs(values[name] - cls.null()[name]), math.hypot(errors[name], more)
+        size, error = abs(values[name] - cls.null()[name]), math.hypot(errors.get(name, 0.0), more)
         if size - 2 * error < cls.tolerance.get(name, 0.0):
             return f"the law of the ground, which is not known, passes for as much ({name} = {values[name]:.2g} +- {error:.1g})"
     return ""
