@@ -9,12 +9,14 @@ import torch
 
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.effects.fields import kept_axes
+from stages.effects.filters import gaussian
 from stages.physics.formation.chain import State
 from stages.physics.formation.resampling import displace
 from stages.physics.photometry import Parameter
 
 CLEAR_LAG = 4  # px, beyond which an echo is no matter of the point spread function, nor of charge that spills
 RESAMPLED = 4  # px, from which on the measured image, which resampling blurs near by, may be repeated
+SMOOTH = 2.0  # px2, variance: noise of what is repeated would make the share of it look smaller
 
 
 @register
@@ -63,7 +65,7 @@ class Echo(Effect):
         source = state.image
         # the DEM does not know where shadows end as well as the image does, whose resampling, though, blurs near by
         if state.measured is not None and not self.of_model and abs(float(lag)) >= RESAMPLED:
-            measured = state.measured()
-            source = torch.where(measured.isfinite(), measured, source)
+            unforeseen = state.measured() - source
+            source = source + gaussian(torch.where(unforeseen.isfinite(), unforeseen, 0.0), SMOOTH)
         repeated = displace(source, -(lag * step[:, 0])[:, None, None], -(lag * step[:, 1])[:, None, None])
         state.image = state.image + self.value("fraction", state) * repeated

@@ -33,6 +33,7 @@ class Found:
     sizes: Array = field(default_factory=lambda: np.ones(1))  # squares of the residual on these units
     spread: float = 0.0
     beside: float = 0.0  # scatter of the gains per frame beside it, where that is less than without
+    instead: bool = False  # whether it stands for gains per frame: beside it they are no larger than all data have
 
     @property
     def gain(self) -> float:

@@ -12,7 +12,7 @@ from stages.diagnose.likelihood.found import Found
 from stages.diagnose.likelihood.products import Array
 from stages.diagnose.likelihood.tails import surprise
 from stages.diagnose.likelihood.whole import Whole
-from stages.diagnose.rows.columns import Guise
+from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.settings import LEVELS
 from stages.effects import get_effect
 
@@ -72,7 +72,7 @@ def weigh(whole: Whole, guise: Guise) -> tuple[Found, Array]:
         beside, spread, instead = beside_gains(whole.levels or whole, places, whole.exclude(guise))
         if beside > ratio:
             found.surprise = max(found.surprise, float(surprise(np.array([beside / inflation]), len(places))[0]))
-            found.beside = spread
+            found.beside, found.instead = spread, instead is not None
             found.amount = amount if instead is None else instead
     return found, surprises[1:]
 
@@ -81,8 +81,8 @@ def beside_gains(whole: Whole, places: NDArray[np.int64], exclude: Sequence[int]
     """Twice the log likelihood that the columns gain if the scatter of the gains is estimated with and without them, and it;
     their amounts where they stand for the gains.
 
-    Columns that alone explain what gains of every image do, less two for each of their values (Akaike 1974), stand for
-    these: nothing is taken off for what gains would explain.
+    Columns that alone, or beside gains no larger than all data have, explain what gains of every image do, less two for each of their
+    values (Akaike 1974), stand for these. Alone, nothing is taken off for what gains would explain; else what ordinary gains would.
     """
     gains = whole.scattered
     j = len(places)
@@ -90,12 +90,29 @@ def beside_gains(whole: Whole, places: NDArray[np.int64], exclude: Sequence[int]
     own = np.linalg.pinv(information[:j, :j], rcond=1e-9, hermitian=True)
     with_ = information[j:, j:] - information[j:, :j] @ own @ information[:j, j:]
     left = score[j:] - information[j:, :j] @ own @ score[:j]
+    explained = float(score[:j] @ own @ score[:j])
     best, spread = _scatter(with_, left)
     none, _ = _scatter(information[j:, j:], score[j:])
-    explained = float(score[:j] @ own @ score[:j])
     if explained - 2 * j > none:
         return explained, spread, own @ score[:j]
+    usual = _usual(whole.plan)
+    beside, usually = _scatter(with_, left, usual)
+    if explained + beside - 2 * j > none:
+        less, _ = _scatter(information[j:, j:], score[j:], usual)
+        known = information + np.diag([0.0] * j + [usually**-2] * len(gains))
+        return (
+            max(explained + beside - less, 0.0),
+            usually,
+            (np.linalg.pinv(known, rcond=1e-9, hermitian=True) @ score)[:j],
+        )
     return max(explained + best - none, 0.0), spread, None
+
+
+def _usual(plan: Plan) -> float:
+    """Scatter of the images' gains that all data have, in the sizes worth knowing in which these are counted."""
+    (gains,) = {c for c in map(get_effect, plan.per_frame) if c.scatters and not c.displaces}
+    ((ordinary,), (size,)) = gains.tolerance.values(), gains.strong.values()
+    return ordinary / size
 
 
 def _weigh_frames(guise: Guise, information: Array, score: Array, shams: Array) -> tuple[Found, Array]:
@@ -117,13 +134,13 @@ def _weigh_frames(guise: Guise, information: Array, score: Array, shams: Array) 
     return found, null / 2 / math.log(10)
 
 
-def _scatter(information: Array, score: Array) -> tuple[float, float]:
-    """Twice the log likelihood of values that scatter about nothing, at the best of their standard deviations, and it."""
+def _scatter(information: Array, score: Array, most: float = 10.0) -> tuple[float, float]:
+    """Twice the log likelihood of values that scatter about nothing, at the best of their standard deviations up to ``most``, and it."""
     power, axes = np.linalg.eigh((information + information.T) / 2)
     power, squares = np.maximum(power, 0.0), (axes.T @ score) ** 2
     every = [
         (float((squares / (power + v**-2)).sum() - np.log1p(v * v * power).sum()), v)
-        for v in np.geomspace(1e-3, 10.0, 25)
+        for v in np.geomspace(1e-3, most, 25)
     ]
     return max(every)
 

@@ -42,7 +42,7 @@ def choose(sure: list[Found], tried: Sequence[Found] = ()) -> tuple[Found, list[
     """
     best = max(sure, key=lambda f: f.gain)
     if best.guise.per_frame:
-        simple = [f for f in sure if not f.guise.per_frame and _as_good(f, best)]
+        simple = [f for f in sure if not f.guise.per_frame and (_as_good(f, best) or stands_for(f, best))]
         best = max(simple, key=lambda f: f.gain, default=best)
     alike = get_effect(best.effect).confused_with
     fewer = [f for f in sure if f.effect in alike and not f.guise.per_frame and len(f.amount) < len(best.amount)]
@@ -58,6 +58,12 @@ def choose(sure: list[Found], tried: Sequence[Found] = ()) -> tuple[Found, list[
 
 def _as_good(found: Found, best: Found) -> bool:
     return found.gain > SIMPLER * best.gain or best.more_than(found)[0] <= 0
+
+
+def stands_for(found: Found, other: Found) -> bool:
+    """Whether one value for all explains the gains of the images, which other ground does not tell: they know there how bright each is."""
+    cls = get_effect(other.effect)
+    return found.instead and cls.scatters and not cls.displaces
 
 
 def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refused: Mapping[str, str]) -> str:
@@ -89,7 +95,7 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
     if found.guise.per_frame:
         for other in best.values():
             likely = not other.guise.per_frame and other.surprise >= found.surprise
-            if likely and not sure(whole.gains_beside(found, other)):
+            if stands_for(other, found) or (likely and not sure(whole.gains_beside(found, other))):
                 return f"{other.effect}, {UNSURE}, would explain it as well"
     return ""
 

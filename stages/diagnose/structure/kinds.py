@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from stages.diagnose.search.state import State, View
@@ -10,12 +12,14 @@ from stages.diagnose.structure.amplifiers import odd_and_even
 from stages.diagnose.structure.blocks import blocks_of_compression
 from stages.diagnose.structure.detector import pattern_of_detector
 from stages.diagnose.structure.fields import field_of_images
-from stages.diagnose.structure.innovations import innovations
+from stages.diagnose.structure.innovations import Innovation, innovations
 from stages.diagnose.structure.lines import across_columns, line_of_brightness, line_of_displacement
 from stages.diagnose.structure.pixels import pixels_that_stand_out
+from stages.diagnose.structure.profiles import bands, columns_that_stand_out, profiles, seam
 from stages.diagnose.structure.steps import steps_of_brightness
 
 REPEATED = 0.015  # of the squares: bilinear resampling leaves up to two thirds of that, the nearest pixel more
+STRAIGHT = 8.0  # robust standard deviations of columns from their neighbours: flat fields and noise made up to 5
 PILED = "brightness that piles up at one level"
 
 
@@ -56,8 +60,26 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
     ratio, share = blocks_of_compression(left, state.frames)
     if ratio > PEAK and share > FAINT**2:
         out["edges every eight pixels of the detector, as compression leaves them"] = share
+    out |= _on_columns([one for one in left if state.sites[one.patch.site].observation.detector_line is not None])
     if piled:
         out[PILED] = piled
+    return out
+
+
+def _on_columns(left: Sequence[Innovation]) -> dict[str, float]:
+    """What images of a known detector have in common on its columns and lines."""
+    out: dict[str, float] = {}
+    for axis, what in ((1, "columns"), (0, "lines")):
+        along = profiles(left, axis)
+        chance, share = seam(along)
+        if chance > LINE:
+            out[f"a seam between {what} of the detector, where each image has a step of its own"] = share
+        chance, share = bands(along)
+        if chance > LINE:
+            out[f"bands over the {what} of the detector, at the same distance in all images"] = share
+        away, share = columns_that_stand_out(along)
+        if away > STRAIGHT:
+            out[f"single {what} of the detector that stand out"] = share
     return out
 
 

@@ -1,0 +1,159 @@
+"""What all images have on the same columns, or lines, of their detector: seams between its parts, bands at one distance, single columns that stand out.
+
+Each by itself is too faint to be seen in one image. What is left of every piece of ground is added up along the columns of the detector that it falls
+on; what the images then have in common is where a step lies, how far apart bands are, and how bright a column is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.ndimage import median_filter
+from scipy.stats import chi2
+
+from stages.common.arrays import Floats
+from stages.diagnose.structure.innovations import Innovation
+
+LONG = 8  # pixels of a column on a piece of ground, at least
+OFTEN = 6  # pieces of ground that a column is seen on: of fewer nobody knows how far they scatter
+SIDE = 8  # columns on either side of a step that are compared
+BESIDE = -3, -2, 2, 3  # columns that one column is compared with: resampling spreads it over the next
+AROUND = 31  # waves of a spectrum that a band is compared with
+WAVES = 256  # columns that profiles are extended to for their spectra
+FIRST = (
+    13  # of these waves, 20 columns long: on a piece of ground longer ones are not told from what ground and film have
+)
+
+
+@dataclass
+class Profile:
+    """Of one piece of ground in one image. first : number of the first column; total, count : (L,) sum of what is left, in standard deviations,
+    and number of its pixels
+    """
+
+    first: int
+    total: Floats
+    count: Floats
+
+    @property
+    def columns(self) -> np.ndarray:
+        """(L,) their numbers."""
+        return self.first + np.arange(len(self.count))
+
+    @property
+    def mean(self) -> Floats:
+        """(L,) of every column; 0 where it has no pixels."""
+        return self.total / np.maximum(self.count, 1)
+
+
+def profiles(every: Sequence[Innovation], axis: int) -> list[Profile]:
+    """Over the detector's lines (0) or samples (1)."""
+    out = []
+    for one in every:
+        for value, seen, detector in zip(one.limited, one.seen, one.detector, strict=True):
+            known = seen & detector.isfinite().all(0)
+            if not bool(known.any()):
+                continue
+            place = detector[axis][known].round().long()
+            first = int(place.min())
+            count = torch.bincount(place - first).double()
+            total = torch.bincount(place - first, value[known].double(), len(count))
+            out.append(Profile(first, total.numpy(), count.numpy()))
+    return out
+
+
+def seam(every: Sequence[Profile]) -> tuple[float, float]:
+    """-log10 of the chance that steps, of whatever sign, scatter so much more on one column than on the others, and their share of the squares there.
+
+    A step that is the same in all images is a matter of the flat field.
+    """
+    place, step, pixels = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)]
+    for one in every:
+        at = np.arange(SIDE, len(one.count) - SIDE + 1)
+        total, count = (np.concatenate([[0.0], np.cumsum(x)]) for x in (one.total, one.count))
+        left, right = count[at] - count[at - SIDE], count[at + SIDE] - count[at]
+        known = (left > SIDE * LONG) & (right > SIDE * LONG)
+        if known.sum() < SIDE:
+            continue
+        at, left, right = at[known], left[known], right[known]
+        away = (total[at] - total[at - SIDE]) / left - (total[at + SIDE] - total[at]) / right
+        place.append(one.first + at)
+        step.append(away / np.sqrt(1 / left + 1 / right))
+        pixels.append(left + right)
+    column, number = np.unique(np.concatenate(place), return_inverse=True)
+    steps = np.concatenate(step)
+    often = np.bincount(number, minlength=len(column))
+    mean = np.bincount(number, steps, len(column)) / np.maximum(often, 1)
+    scatter = np.bincount(number, (steps - mean[number]) ** 2, len(column)) / np.maximum(often - 1, 1)
+    wide = np.bincount(number, np.concatenate(pixels), len(column)) / np.maximum(often, 1)
+    known = often >= OFTEN
+    if known.sum() < SIDE:
+        return 0.0, 0.0
+    scatter, often, wide = scatter[known] / float(np.median(scatter[known])), often[known], wide[known]
+    chance = -chi2.logsf(scatter * (often - 1), often - 1) / math.log(10) - math.log10(len(often))
+    top = int(chance.argmax())
+    return float(chance[top]), max(float((scatter[top] - 1) / wide[top]), 0.0)
+
+
+def bands(every: Sequence[Profile]) -> tuple[float, float]:
+    """-log10 of the chance of the strongest wave over the detector that all images have, at whatever phase, and its share of the squares."""
+    fixed, _ = _fixed(every)
+    power, squares, count, pixels = np.zeros(WAVES // 2 + 1), np.zeros(WAVES // 2 + 1), 0, 0.0
+    for one in every:
+        weight = np.where(one.count >= LONG, np.hanning(len(one.count) + 2)[1:-1], 0.0)[:WAVES]
+        if (weight > 0).sum() < 2 * SIDE:
+            continue
+        varies = one.mean - fixed[one.columns - min(p.first for p in every)]
+        wave = varies[:WAVES] * weight
+        wave -= weight * wave.sum() / weight.sum()
+        z = np.abs(np.fft.rfft(wave, WAVES)) ** 2
+        fine = float(z[FIRST:].mean())
+        if not fine > 0:
+            continue
+        power += z / fine
+        # of a wave of this length, half the square of its amplitude in every pixel
+        squares += 2 * z / weight.sum() ** 2 * one.count.sum()
+        count, pixels = count + 1, pixels + float(one.count.sum())
+    if not count:
+        return 0.0, 0.0
+    ratio = power / np.maximum(median_filter(power, AROUND, mode="nearest"), 1e-9)
+    ratio[:FIRST] = 0.0
+    top = int(ratio.argmax())
+    chance = -chi2.logsf(2 * count * ratio[top], 2 * count) / math.log(10) - math.log10(len(ratio) - FIRST)
+    return float(chance), float(squares[top] / pixels * (1 - 1 / max(ratio[top], 1.0)))
+
+
+def columns_that_stand_out(every: Sequence[Profile]) -> tuple[float, float]:
+    """How many robust standard deviations the column that is furthest from its neighbours in all images is from them, and its share of all squares."""
+    fixed, often = _fixed(every)
+    known = often >= OFTEN
+    for k in BESIDE:
+        known = known & (np.roll(often, k) >= OFTEN)
+    known[: max(BESIDE)] = known[len(known) - max(BESIDE) :] = False
+    if known.sum() < 4 * SIDE:
+        return 0.0, 0.0
+    away = (fixed - np.mean([np.roll(fixed, k) for k in BESIDE], 0))[known]
+    sure = np.abs(away) * np.sqrt(often[known])
+    top = int(sure.argmax())
+    robust = float(np.median(sure)) / math.sqrt(chi2.median(1))
+    return float(sure[top] / max(robust, 1e-9)), float(away[top] ** 2 * often[known][top] / often.sum())
+
+
+def _fixed(every: Sequence[Profile]) -> tuple[Floats, Floats]:
+    """Mean of what is left on every column, from the first to the last, and the number of pieces of ground that it is seen on."""
+    first = min((p.first for p in every), default=0)
+    last = max((p.first + len(p.count) for p in every), default=0)
+    total, often = np.zeros((2, last - first))
+    for one in every:
+        long = one.count >= LONG
+        at = one.columns[long] - first
+        total[at] += one.mean[long]
+        often[at] += 1
+    return np.where(often >= OFTEN, total / np.maximum(often, 1), 0.0), often
+
+
+__all__ = ["Profile", "bands", "columns_that_stand_out", "profiles", "seam"]
