@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from stages.effects.base import Effect, register
+from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
@@ -27,11 +28,29 @@ class ChargeSmear(Effect):
     confused_with = ("dark_bias", "column_pattern")
     separate = "a frame with deep shadow in some columns and sunlit ground in others"
     parameters = (Parameter("share", "1", -0.3, 0.5, 0.0, "of the column's mean brightness"),)
+    coordinates = (*parameters, Parameter("axis", "1", -1.0, 1.0, 1.0, "1: of columns, -1: of lines"))
+    possible = "light of columns; broad relief that the DEM has not looks like that of lines as well"
     strong: ClassVar = {"share": 0.03}
+    one_sided: ClassVar = "axis"
+
+    @classmethod
+    def trials(cls, survey: Survey) -> list[Trial]:
+        return [Trial(({"share": 0.03},), {"axis": axis}) for axis in (1.0, -1.0)]
+
+    @classmethod
+    def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
+        """No camera adds up light along its lines."""
+        return values["axis"] > 0
 
     def apply(self, state: State) -> None:
-        mean = column_means(state.image, state.observation.detector_sample)
-        state.image = state.image + self.value("share", state) * mean
+        observation, image = state.observation, state.image
+        if float(self.values.get("axis", 1.0)) > 0:
+            mean = column_means(image, observation.detector_sample)
+        elif observation.detector_line is None:
+            mean = image.mean(-1, keepdim=True).expand_as(image)
+        else:
+            mean = column_means(image, observation.detector_line)
+        state.image = image + self.value("share", state) * mean
 
 
 def column_means(image: Tensor, sample: Tensor | None) -> Tensor:

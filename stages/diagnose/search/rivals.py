@@ -90,6 +90,8 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
             "the same on the other side of each pixel explains as much of it, as blur and relief finer than the DEM do"
         )
     own = whole.ordinary_places(found.effect)
+    if get_effect(found.effect).lights_shadows and (more := _other_light(found, best)):
+        return f"{more}, {UNSURE}, explains more of it"
     if get_effect(found.effect).lights_shadows and not sure(whole.held_out(whole.places(found.guise), own)):
         return "ordinary amounts of other light in shadows would explain it as well"
     if found.guise.per_frame:
@@ -98,6 +100,15 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
             if stands_for(other, found) or (likely and not sure(whole.gains_beside(found, other))):
                 return f"{other.effect}, {UNSURE}, would explain it as well"
     return ""
+
+
+def _other_light(found: Found, best: Mapping[str, Found]) -> str:
+    """Another light in shadows of which there is far more evidence, though it be unsure on other ground; '' if there is none."""
+    lights = [f for f in best.values() if get_effect(f.effect).lights_shadows]
+    most = max(lights, key=lambda f: f.surprise)
+    if found.surprise >= SIMPLER * most.surprise:
+        return ""
+    return most.effect if get_effect(most.effect).listed else get_effect(most.effect).title
 
 
 def another_law(whole: Whole, found: Found) -> str:
