@@ -19,7 +19,7 @@ search        The effect that gains most on held-out ground, if shams hardly do 
               again. It is named if it is real (its own file says what is plausible and what is ordinary), if it is there
               whichever images are left out, and if its held-out gain is above zero for sure. What is surely there and ordinary is rendered
               and not named. Then the next. Shadows and ground that images share are looked at by themselves, last.
-structure     What is left that neither ground nor noise has, and nothing in the catalogue explains: lines, patterns of the detector, single pixels
+structure     What is left that neither ground nor noise has, and nothing in the catalogue explains: lines, seams and patterns of the detector, single pixels
               (and effects that are in no catalogue, which the search finds).
 result        What is named, how much of the residual is what, what was refused and why, what these data could not have shown.
 

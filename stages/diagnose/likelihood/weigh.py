@@ -92,10 +92,12 @@ def beside_gains(whole: Whole, places: NDArray[np.int64], exclude: Sequence[int]
     left = score[j:] - information[j:, :j] @ own @ score[:j]
     explained = float(score[:j] @ own @ score[:j])
     best, spread = _scatter(with_, left)
-    none, _ = _scatter(information[j:, j:], score[j:])
+    none, large = _scatter(information[j:, j:], score[j:])
     if explained - 2 * j > none:
         return explained, spread, own @ score[:j]
     usual = _usual(whole.plan)
+    if large <= usual:  # nothing more has to be explained
+        return max(explained + best - none, 0.0), spread, None
     beside, usually = _scatter(with_, left, usual)
     if explained + beside - 2 * j > none:
         less, _ = _scatter(information[j:, j:], score[j:], usual)

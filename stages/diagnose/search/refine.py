@@ -321,13 +321,25 @@ def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     # the law differs from site to site: pieces of one have that in common, and few sites agree in it by chance
     sites = [u.site for u in whole.units]
     without = [rms(now + m) for m in whole.without_one(places, spread=cause.found.spread, now=now, of=sites)]
-    show = np.bincount(np.concatenate([s.frames for s in state.sites]), minlength=whole.frames)[frame]
-    few = student_quantile(max(float(np.median(show)) - 1, 1.0)) / 2  # where two errors are asked for
+    show = float(np.median(np.bincount(np.concatenate([s.frames for s in state.sites]), minlength=whole.frames)[frame]))
+    scatter = float(jackknife_error(np.array(without)))
     cause.rms = rms(now + move)
     covariance = np.asarray(inverse * np.outer(sizes[column], sizes[column]), np.float64)
     left_open = _error_of_rms((now + move) * sizes[column], covariance, cause.rms, frames)
-    cause.errors["rms"] = max(few * float(jackknife_error(np.array(without))), left_open)
+    cause.errors["rms"] = max(
+        _error_over_sites(scatter, show, len(without), max(cls.tolerance.values(), default=0.0)), left_open
+    )
     return float(np.sqrt((move**2).mean() / max(inverse.diagonal().mean(), 1e-12)))
+
+
+def _error_over_sites(scatter: float, show: float, sites: int, ordinary: float) -> float:
+    """Of an rms whose jackknife error over sites is ``scatter``, where two errors are asked for; show : sites that show a frame.
+
+    Sites that show the same frame tell by themselves what the law does in it. Where one or two do, an image has of its law no more than is ordinary
+    of the effect: up to 1.1 % of gain in other people's files.
+    """
+    told, ground = (student_quantile(max(count - 1, 1.0)) / 2 * scatter for count in (show, sites))
+    return min(told, math.hypot(ground, ordinary / math.sqrt(show)))
 
 
 def _error_of_rms(mean: Floats, covariance: Floats, rms: float, frames: int) -> float:

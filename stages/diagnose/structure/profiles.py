@@ -102,12 +102,13 @@ def seam(every: Sequence[Profile]) -> tuple[float, float]:
 def bands(every: Sequence[Profile]) -> tuple[float, float]:
     """-log10 of the chance of the strongest wave over the detector that all images have, at whatever phase, and its share of the squares."""
     fixed, _ = _fixed(every)
+    first = min((p.first for p in every), default=0)
     power, squares, count, pixels = np.zeros(WAVES // 2 + 1), np.zeros(WAVES // 2 + 1), 0, 0.0
     for one in every:
         weight = np.where(one.count >= LONG, np.hanning(len(one.count) + 2)[1:-1], 0.0)[:WAVES]
         if (weight > 0).sum() < 2 * SIDE:
             continue
-        varies = one.mean - fixed[one.columns - min(p.first for p in every)]
+        varies = one.mean - fixed[one.columns - first]
         wave = varies[:WAVES] * weight
         wave -= weight * wave.sum() / weight.sum()
         z = np.abs(np.fft.rfft(wave, WAVES)) ** 2
