@@ -13,7 +13,7 @@ from stages.diagnose.likelihood.products import Array
 from stages.diagnose.likelihood.tails import surprise
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.rows.columns import Guise, Plan
-from stages.diagnose.settings import LEVELS
+from stages.diagnose.settings import LEVELS, SURE
 from stages.effects import get_effect
 
 
@@ -72,9 +72,14 @@ def weigh(whole: Whole, guise: Guise) -> tuple[Found, Array]:
         beside, spread, instead = beside_gains(whole.levels or whole, places, whole.exclude(guise))
         if beside > ratio:
             found.surprise = max(found.surprise, float(surprise(np.array([beside / inflation]), len(places))[0]))
-            found.beside, found.instead = spread, instead is not None
+            found.beside, found.instead = spread, instead is not None and _agree(instead, amount, error)
             found.amount = amount if instead is None else instead
     return found, surprises[1:]
+
+
+def _agree(instead: Array, amount: Array, error: Array) -> bool:
+    """Whether amounts that stand for gains may be those that the insides of the images, beside free gains, tell of the effect."""
+    return bool((np.abs(instead - amount) <= SURE * error).all())
 
 
 def beside_gains(whole: Whole, places: NDArray[np.int64], exclude: Sequence[int]) -> tuple[float, float, Array | None]:

@@ -9,7 +9,7 @@ import numpy as np
 from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.search.doubts import ODD, ORDINARY
-from stages.diagnose.settings import SIMPLER
+from stages.diagnose.settings import DISCOVERY, SIMPLER
 from stages.effects import get_effect
 
 UNSURE = "which these data do not prove"
@@ -63,7 +63,7 @@ def _as_good(found: Found, best: Found) -> bool:
 def stands_for(found: Found, other: Found) -> bool:
     """Whether one value for all explains the gains of the images, which other ground does not tell: they know there how bright each is."""
     cls = get_effect(other.effect)
-    return found.instead and cls.scatters and not cls.displaces
+    return found.instead and found.p <= DISCOVERY and cls.scatters and not cls.displaces
 
 
 def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refused: Mapping[str, str]) -> str:
@@ -103,12 +103,10 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
 
 
 def _other_light(found: Found, best: Mapping[str, Found]) -> str:
-    """Another light in shadows of which there is far more evidence, though it be unsure on other ground; '' if there is none."""
-    lights = [f for f in best.values() if get_effect(f.effect).lights_shadows]
-    most = max(lights, key=lambda f: f.surprise)
-    if found.surprise >= SIMPLER * most.surprise:
-        return ""
-    return most.effect if get_effect(most.effect).listed else get_effect(most.effect).title
+    """Another light in shadows of the catalogue of which there is far more evidence, though it be unsure on other ground, or ''."""
+    lights = [f for f in best.values() if get_effect(f.effect).lights_shadows and get_effect(f.effect).listed]
+    most = max(lights, key=lambda f: f.surprise, default=found)
+    return most.effect if found.surprise < SIMPLER * most.surprise else ""
 
 
 def another_law(whole: Whole, found: Found) -> str:
