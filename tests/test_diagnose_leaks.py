@@ -17,6 +17,7 @@ from test_diagnose import _pairs, scene  # noqa: F401
 from schemas.files.outputs import Output
 from stages import diagnose
 from stages.diagnose.likelihood.found import Found
+from stages.diagnose.likelihood.jackknife import gain_interval
 from stages.diagnose.likelihood.products import Products, Rows, products
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.model.nominal import lit_mask
@@ -105,11 +106,24 @@ def test_the_test_pairs_judge_what_an_effect_does_there_and_not_the_law_beside_i
     found = SimpleNamespace(gain=1.0, guise=SimpleNamespace(per_frame=False))
     cause = SimpleNamespace(effect=SimpleNamespace(name="one", lights_shadows=lights), found=found)
     shown = SimpleNamespace(counts=torch.ones(3, 1, 1, dtype=torch.bool))
-    state = SimpleNamespace(causes=[cause], named=[cause], nominal=None, fit=lambda: None, hidden=[shown])
+    state = SimpleNamespace(causes=[cause], named=[cause], nominal=None, fit=lambda: None, hidden=[shown], frames=3)
     squares = iter([101.0, alone, 100.0])
     monkeypatch.setattr(score, "_hidden_chains", lambda _: [])
     monkeypatch.setattr(score, "_hidden_squares", lambda *_: np.full(8, next(squares)))
     assert bool(unconfirmed(state)) == refused
+
+
+def test_the_interval_of_test_pairs_is_that_of_their_images_where_these_differ_more():
+    """Twelve pieces of one ground all lose, by what two of its six images have of their own: nobody knows that of other images."""
+    images = np.full(6, 100.0), np.array([80.0, 150.0, 90.0, 160.0, 85.0, 95.0])
+    over_ground = gain_interval(np.full(12, 50.0), np.full(12, 55.0) + np.linspace(-1, 1, 12))
+    assert over_ground[2] < 0
+    low, high = score._wider(over_ground, images)
+    assert low < over_ground[1] and high > 0
+    alike = np.full(6, 100.0), np.full(6, 110.0) + np.linspace(-1, 1, 6)
+    assert score._wider(over_ground, alike)[1] < 0
+    nothing = np.zeros(6), np.zeros(6)
+    assert score._wider(over_ground, nothing) == over_ground[1:]
 
 
 def test_gains_of_images_that_only_the_test_pairs_are_of_hide_no_other_cause(monkeypatch):
@@ -122,7 +136,9 @@ def test_gains_of_images_that_only_the_test_pairs_are_of_hide_no_other_cause(mon
         for name, own in (("one", False), ("gains", True))
     ]
     unseen = SimpleNamespace(counts=torch.zeros(3, 1, 1, dtype=torch.bool))
-    state = SimpleNamespace(causes=causes, named=list(causes), nominal=None, fit=lambda: None, hidden=[unseen])
+    state = SimpleNamespace(
+        causes=causes, named=list(causes), nominal=None, fit=lambda: None, hidden=[unseen], frames=3
+    )
 
     def squares(state, images=None):
         left = {c.effect.name for c in state.causes}

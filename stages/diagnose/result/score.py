@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
@@ -65,7 +65,7 @@ def _squares_of(
         chains = [nominal.chain(site, [*state.base, *(c.effect for c in shaded)]) for nominal, shaded in models]
         mask = torch.stack([lit_mask(chain) for chain in chains]).all(0)
         for part, chain in zip(out, chains, strict=True):
-            squares, pixels = _squares(site, chain, site.laid, mask, state)
+            squares, _, pixels = _squares(site, chain, site.laid, mask, state)
             part.append(squares)
         count += pixels
     return [np.concatenate(part) for part in out], count
@@ -108,26 +108,37 @@ def score(state: State, answer: Answer, extended: Nominal) -> HeldOut:
     plain, moved = displacements(state, named)
     before: list[np.ndarray] = []
     after: list[np.ndarray] = []
+    images_before, images_after = np.zeros((2, state.frames))
     count = 0.0
     for site, was, now in zip(state.hidden, plain, moved, strict=True):
-        images = [aligned(site.read, site.read_valid, *d) if d else (site.read, site.read_valid) for d in (was, now)]
-        mask = full_light(nominal.chain(site, [])) & images[0][1] & images[1][1] & site.counts
+        laid = [aligned(site.read, site.read_valid, *d) if d else (site.read, site.read_valid) for d in (was, now)]
+        mask = full_light(nominal.chain(site, [])) & laid[0][1] & laid[1][1] & site.counts
         for effect in cut:  # of an image that is cut off nearly everywhere nobody knows how bright it would be
-            below = mask & (images[1][0] < effect.keep_below * _level(effect, state))
+            below = mask & (laid[1][0] < effect.keep_below * _level(effect, state))
             mask &= (2 * below.sum((-2, -1)) > mask.sum((-2, -1)))[:, None, None]
-        for part, chain, (image, _), off in (
-            (before, nominal.chain(site, []), images[0], False),
-            (after, extended.chain(site, effects), images[1], True),
+        for part, images, chain, (image, _), off in (
+            (before, images_before, nominal.chain(site, []), laid[0], False),
+            (after, images_after, extended.chain(site, effects), laid[1], True),
         ):
-            squares, pixels = _squares(site, chain, image, mask, state, cut, off)
+            squares, of_images, pixels = _squares(site, chain, image, mask, state, cut, off)
             part.append(squares)
+            np.add.at(images, site.frames, of_images)
         count += pixels
     if not count > 0:
         return HeldOut()
     first, last = np.concatenate(before), np.concatenate(after)
-    _, low, high = gain_interval(first, last)
+    low, high = _wider(gain_interval(first, last), (images_before, images_after))
     pairs = sum(s.count for s in state.hidden)
     return HeldOut(pairs, len(state.hidden), first.sum() / count, last.sum() / count, low, high)
+
+
+def _wider(over_ground: tuple[float, float, float], images: tuple[np.ndarray, np.ndarray]) -> tuple[float, float]:
+    """The interval of a gain that holds both the one over pieces of ground and the one over images: pieces of one ground share what each image has of
+    its own, its gain say, and images what the ground has. images : squares of every frame before and after
+    """
+    seen = images[0] > 0
+    over_images = gain_interval(images[0][seen], images[1][seen])
+    return float(np.fmin(over_ground[1], over_images[1])), float(np.fmax(over_ground[2], over_images[2]))
 
 
 def displacements(state: State, named: Sequence[Effect]) -> tuple[Fields, Fields]:
@@ -163,9 +174,9 @@ def _squares(
     state: State,
     cut: Sequence[Effect] = (),
     off: bool = False,
-) -> tuple[np.ndarray, float]:
-    """Squared errors of the pieces of one ground, and its number of pixels. Where several images show a pixel its own albedo is a nuisance: one
-    factor for all of them.
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Squared errors of the pieces of one ground and of its images, and its number of pixels. Where several images show a pixel its own albedo is
+    a nuisance: one factor for all of them.
 
     Without it albedo, which no cause is about, would drown what the images of a place disagree on.
     cut : effects that cut off what is brighter than a level of the detector, which says nothing of albedo and gain; off : whether the model does so
@@ -195,11 +206,12 @@ def _squares(
     for effect in cut if off else ():
         top = (_level(effect, state) - site.offset) / site.gain
         predicted = torch.minimum(predicted, top[:, None, None] * relative)
-    squares = ((measured - predicted).double() * weight).square().sum(0)
+    every = ((measured - predicted).double() * weight).square()
+    squares = every.sum(0)
     # one or two grounds are cut, as those are that are learned from: there would be no interval
     pieces = cuts(min(squares.shape), len(state.hidden)) if len(state.hidden) < 3 else 1
     parts = [part.sum() for rows in squares.tensor_split(pieces) for part in rows.tensor_split(pieces, 1)]
-    return torch.stack(parts).numpy(), float(weight.sum())
+    return torch.stack(parts).numpy(), every.sum((-2, -1)).numpy(), float(weight.sum())
 
 
 def _level(effect: Effect, state: State) -> float:
@@ -219,13 +231,15 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
             state.causes[:] = [c for c in kept if not c.found.guise.per_frame]
             state.nominal = copy.copy(nominal)
             state.fit()
-        with_cause, predicted = _hidden_squares(state), [c.predict() for c in _hidden_chains(state)]
+        with_cause, with_images = _hidden_squares(state), _of_images(state)
+        predicted = [c.predict() for c in _hidden_chains(state)]
         state.causes[:] = [c for c in state.causes if c is not cause]
         by_itself = _hidden_squares(state, predicted)  # what it changes beside the same law
         state.nominal = copy.copy(state.nominal)
         state.fit()
         without = _hidden_squares(state)
-        gain, _, high = gain_interval(without, with_cause)
+        over_ground = gain_interval(without, with_cause)
+        gain, (_, high) = over_ground[0], _wider(over_ground, (_of_images(state), with_images))
         # what all images of a place share, albedo say, these pairs do not judge: it is the law that makes a difference, fitted without it.
         # Light in shadows is none of that, though it changes next to nothing on lit ground
         judged = cause.effect.lights_shadows or by_itself.sum() > FAINT**2 * with_cause.sum()
@@ -248,13 +262,27 @@ def _hidden_squares(state: State, images: Sequence[torch.Tensor] | None = None) 
     """Squared errors on every piece of ground of the test pairs, on what the nominal model says is lit, as ``score`` has it: a shadow that a cause
     casts where there is none counts against it. images : in the place of theirs, in I/F
     """
-    out = [np.zeros(0)]
+    return np.concatenate([np.zeros(0), *(ground for ground, _, _ in _hidden(state, images))])
+
+
+def _of_images(state: State) -> np.ndarray:
+    """(frames,) the same of every image, on all ground together."""
+    out = np.zeros(state.frames)
+    for _, squares, frames in _hidden(state):
+        np.add.at(out, frames, squares)
+    return out
+
+
+def _hidden(
+    state: State, images: Sequence[torch.Tensor] | None = None
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of every test ground the squares of its pieces and of its images, and which frames these are."""
     for k, chain in enumerate(_hidden_chains(state)):
         site = chain.site
         image = site.laid if images is None else images[k] * site.gain[:, None, None] + site.offset[:, None, None]
         mask = site.valid & full_light(state.nominal.chain(site, [])) & site.counts
-        out.append(_squares(site, chain, image, mask, state)[0])
-    return np.concatenate(out)
+        ground, of_images, _ = _squares(site, chain, image, mask, state)
+        yield ground, of_images, site.frames
 
 
 def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:
