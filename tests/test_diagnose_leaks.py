@@ -109,7 +109,7 @@ def test_the_test_pairs_judge_what_an_effect_does_there_and_not_the_law_beside_i
     state = SimpleNamespace(causes=[cause], named=[cause], nominal=None, fit=lambda: None, hidden=[shown], frames=3)
     squares = iter([101.0, alone, 100.0])
     monkeypatch.setattr(score, "_hidden_chains", lambda _: [])
-    monkeypatch.setattr(score, "_hidden_squares", lambda *_: np.full(8, next(squares)))
+    monkeypatch.setattr(score, "_hidden_squares", lambda *_: (np.full(8, next(squares)), np.zeros(3)))
     assert bool(unconfirmed(state)) == refused
 
 
@@ -142,7 +142,8 @@ def test_gains_of_images_that_only_the_test_pairs_are_of_hide_no_other_cause(mon
 
     def squares(state, images=None):
         left = {c.effect.name for c in state.causes}
-        return np.full(8, 0.0 if "gains" in left else 101.0 if left else 100.0 if images is None else 5.0)
+        each = 0.0 if "gains" in left else 101.0 if left else 100.0 if images is None else 5.0
+        return np.full(8, each), np.zeros(3)
 
     monkeypatch.setattr(score, "_hidden_chains", lambda _: [])
     monkeypatch.setattr(score, "_hidden_squares", squares)
@@ -156,10 +157,10 @@ def test_a_shadow_that_a_cause_casts_on_lit_ground_counts_against_it(answers, mo
     seen = []
     squares = score._squares
     monkeypatch.setattr(score, "_squares", lambda *given: (seen.append(int(given[3].sum())), squares(*given))[1])
-    without = score._hidden_squares(state).sum()
+    without = score._hidden_squares(state)[0].sum()
     low = replace(state.causes[0], effect=get_effect("sun_elevation")({"error_deg": -8.0}, state.data))
     lower = replace(state, causes=[*state.causes, low])
-    assert score._hidden_squares(lower).sum() > without
+    assert score._hidden_squares(lower)[0].sum() > without
     half = len(seen) // 2
     assert seen[:half] == seen[half:] and sum(seen) > 0
     lit = [int(lit_mask(lower.nominal.chain(site, lower.base)).sum()) for site in lower.hidden]
@@ -202,10 +203,10 @@ def test_a_single_test_ground_has_pieces_and_an_interval(answers, monkeypatch):
     """Nothing else could take a name back where the test pairs show one place only."""
     state = answers[2]
     monkeypatch.setattr(state, "hidden", state.hidden[:1])
-    squares = score._hidden_squares(state)
+    squares, _ = score._hidden_squares(state)
     assert len(squares) >= 4
     monkeypatch.setattr(state, "hidden", state.hidden * 3)
-    assert len(score._hidden_squares(state)) == 3  # what lies apart is independent, pieces of one ground hardly are
+    assert len(score._hidden_squares(state)[0]) == 3  # what lies apart is independent, pieces of one ground hardly are
 
 
 def test_errors_are_those_over_images_where_these_are_larger(answers):

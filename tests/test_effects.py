@@ -151,6 +151,11 @@ def test_a_column_of_a_frame_adds_its_own_mean(turn_deg, axis):
     plain = state.image
     get_effect("charge_smear")({"share": 0.1}).apply(state)
     torch.testing.assert_close(state.image, plain + 0.1 * mean)
+    state.image = plain  # what it has to gain more than: light of lines, which nothing adds up
+    smear = get_effect("charge_smear")({"share": 0.1, "axis": -1.0})
+    smear.apply(state)
+    torch.testing.assert_close(state.image, plain + 0.1 * plain.mean(-3 - axis, keepdim=True).expand(2, 32, 32))
+    assert not smear.plausible({"share": 0.1, "axis": -1.0}, smear.survey)
 
 
 def test_wings_of_optics_fall_with_the_cube_of_the_distance():

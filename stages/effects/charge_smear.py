@@ -44,7 +44,7 @@ class ChargeSmear(Effect):
 
     def apply(self, state: State) -> None:
         observation, image = state.observation, state.image
-        if float(self.values.get("axis", 1.0)) > 0:
+        if float(self.values["axis"]) > 0:
             mean = column_means(image, observation.detector_sample)
         elif observation.detector_line is None:
             mean = image.mean(-1, keepdim=True).expand_as(image)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -231,15 +231,15 @@ def unconfirmed(state: State) -> dict[str, tuple[float, str]]:
             state.causes[:] = [c for c in kept if not c.found.guise.per_frame]
             state.nominal = copy.copy(nominal)
             state.fit()
-        with_cause, with_images = _hidden_squares(state), _of_images(state)
+        with_cause, with_images = _hidden_squares(state)
         predicted = [c.predict() for c in _hidden_chains(state)]
         state.causes[:] = [c for c in state.causes if c is not cause]
-        by_itself = _hidden_squares(state, predicted)  # what it changes beside the same law
+        by_itself, _ = _hidden_squares(state, predicted)  # what it changes beside the same law
         state.nominal = copy.copy(state.nominal)
         state.fit()
-        without = _hidden_squares(state)
+        without, without_images = _hidden_squares(state)
         over_ground = gain_interval(without, with_cause)
-        gain, (_, high) = over_ground[0], _wider(over_ground, (_of_images(state), with_images))
+        gain, (_, high) = over_ground[0], _wider(over_ground, (without_images, with_images))
         # what all images of a place share, albedo say, these pairs do not judge: it is the law that makes a difference, fitted without it.
         # Light in shadows is none of that, though it changes next to nothing on lit ground
         judged = cause.effect.lights_shadows or by_itself.sum() > FAINT**2 * with_cause.sum()
@@ -258,31 +258,19 @@ def _hidden_chains(state: State) -> list[Chain]:
     return [state.nominal.chain(site, state.base) for site in state.hidden]
 
 
-def _hidden_squares(state: State, images: Sequence[torch.Tensor] | None = None) -> np.ndarray:
-    """Squared errors on every piece of ground of the test pairs, on what the nominal model says is lit, as ``score`` has it: a shadow that a cause
-    casts where there is none counts against it. images : in the place of theirs, in I/F
+def _hidden_squares(state: State, images: Sequence[torch.Tensor] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Squared errors on every piece of ground of the test pairs and, (frames,), of every image, on what the nominal model says is lit, as ``score``
+    has it: a shadow that a cause casts where there is none counts against it. images : in the place of theirs, in I/F
     """
-    return np.concatenate([np.zeros(0), *(ground for ground, _, _ in _hidden(state, images))])
-
-
-def _of_images(state: State) -> np.ndarray:
-    """(frames,) the same of every image, on all ground together."""
-    out = np.zeros(state.frames)
-    for _, squares, frames in _hidden(state):
-        np.add.at(out, frames, squares)
-    return out
-
-
-def _hidden(
-    state: State, images: Sequence[torch.Tensor] | None = None
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of every test ground the squares of its pieces and of its images, and which frames these are."""
+    ground, of_frames = [np.zeros(0)], np.zeros(state.frames)
     for k, chain in enumerate(_hidden_chains(state)):
         site = chain.site
         image = site.laid if images is None else images[k] * site.gain[:, None, None] + site.offset[:, None, None]
         mask = site.valid & full_light(state.nominal.chain(site, [])) & site.counts
-        ground, of_images, _ = _squares(site, chain, image, mask, state)
-        yield ground, of_images, site.frames
+        squares, of_images, _ = _squares(site, chain, image, mask, state)
+        ground.append(squares)
+        np.add.at(of_frames, site.frames, of_images)
+    return np.concatenate(ground), of_frames
 
 
 def blind_effects(state: State, outcome: Outcome, named: set[str]) -> list[str]:

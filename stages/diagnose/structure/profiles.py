@@ -101,8 +101,7 @@ def seam(every: Sequence[Profile]) -> tuple[float, float]:
 
 def bands(every: Sequence[Profile]) -> tuple[float, float]:
     """-log10 of the chance of the strongest wave over the detector that all images have, at whatever phase, and its share of the squares."""
-    fixed, _ = _fixed(every)
-    first = min((p.first for p in every), default=0)
+    first, fixed, _ = _fixed(every)
     power, squares, count, pixels = np.zeros(WAVES // 2 + 1), np.zeros(WAVES // 2 + 1), 0, 0.0
     for one in every:
         weight = np.where(one.count >= LONG, np.hanning(len(one.count) + 2)[1:-1], 0.0)[:WAVES]
@@ -130,7 +129,7 @@ def bands(every: Sequence[Profile]) -> tuple[float, float]:
 
 def columns_that_stand_out(every: Sequence[Profile]) -> tuple[float, float]:
     """How many robust standard deviations the column that is furthest from its neighbours in all images is from them, and its share of all squares."""
-    fixed, often = _fixed(every)
+    _, fixed, often = _fixed(every)
     known = often >= OFTEN
     for k in BESIDE:
         known = known & (np.roll(often, k) >= OFTEN)
@@ -144,8 +143,8 @@ def columns_that_stand_out(every: Sequence[Profile]) -> tuple[float, float]:
     return float(sure[top] / max(robust, 1e-9)), float(away[top] ** 2 * often[known][top] / often.sum())
 
 
-def _fixed(every: Sequence[Profile]) -> tuple[Floats, Floats]:
-    """Mean of what is left on every column, from the first to the last, and the number of pieces of ground that it is seen on."""
+def _fixed(every: Sequence[Profile]) -> tuple[int, Floats, Floats]:
+    """The first column; mean of what is left on every one, from that to the last; and the number of pieces of ground that each is seen on."""
     first = min((p.first for p in every), default=0)
     last = max((p.first + len(p.count) for p in every), default=0)
     total, often = np.zeros((2, last - first))
@@ -154,7 +153,7 @@ def _fixed(every: Sequence[Profile]) -> tuple[Floats, Floats]:
         at = one.columns[long] - first
         total[at] += one.mean[long]
         often[at] += 1
-    return np.where(often >= OFTEN, total / np.maximum(often, 1), 0.0), often
+    return first, np.where(often >= OFTEN, total / np.maximum(often, 1), 0.0), often
 
 
 __all__ = ["Profile", "bands", "columns_that_stand_out", "profiles", "seam"]
