@@ -18,6 +18,7 @@ import sys
 import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -214,6 +215,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=44)
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--laboratory", choices=LABORATORIES, default=LABORATORIES[0])
+    parser.add_argument("--given-law", action="store_true", help="the ground follows M2, which diagnose is given")
     parser.add_argument("--keep", action="store_true", help="keep every case's file and answer in OUTPUT/")
     parser.add_argument("--output", type=Path, required=True)
     options = parser.parse_args()
@@ -225,6 +227,7 @@ def main() -> None:
         parser.error(f"{record} holds cases of another seed")
     known = {case["case"] for case in cases}
     hands = importlib.import_module(f"{options.laboratory}.cases").deal(options.seed, options.cases)
+    hands = [replace(dealt, given_law=options.given_law) for dealt in hands]
     todo = [(number, dealt) for number, dealt in enumerate(hands) if number not in known]
     os.environ["OMP_NUM_THREADS"] = "1"  # of the workers and of the commands they run
     failed = []

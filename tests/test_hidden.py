@@ -13,11 +13,14 @@ from conftest import ROOT
 from hidden import departures, laws, sensor
 from hidden.faults import FAULTS
 from laboratory import cases as laboratory_cases
+from laboratory import laws as laboratory_laws
 from laboratory.faults import FAULTS as LABORATORY_FAULTS
+from laboratory.layout import Needs
 from laboratory.plant import Plant
 from laboratory.planted import PLANTED
 from scipy.ndimage import gaussian_filter
 from second_laboratory import cases as second_cases
+from second_laboratory import laws as second_laws
 from second_laboratory import light as second_light
 from second_laboratory.effects import EFFECTS as SECOND_EFFECTS
 from second_laboratory.faults import FAULTS as SECOND_FAULTS
@@ -60,6 +63,20 @@ def test_a_hand_of_another_laboratory_is_dealt_as_its_seed_says(laboratory, layo
     assert sum(d.effect is None and d.fault is None for d in hand) == 14 and sum(d.fault is not None for d in hand) == 8
     assert {d.effect for d in hand if d.effect} <= set(effect_names())
     assert {d.layout for d in hand if d.fault} == layouts
+
+
+def test_the_law_that_diagnose_is_given_is_what_both_laboratories_draw_then():
+    """I/F = a cos(i) + b cos(g) + c (Lunar-G2R, M2), over that at the standard geometry."""
+    mu0, mu, phase = 0.4, 0.9, 1.1
+    first = laboratory_laws.draw_law(np.random.default_rng(2), Needs(), given=True)
+    b, c = first.parameters[5:7]
+    expected = (mu0 + b * np.cos(phase) + c) / ((1 + b) * np.cos(np.pi / 6) + c)
+    found = laboratory_laws.reflectance(mu0, mu, phase, first.code, first.parameters)
+    assert found / first.at_30_degrees() == pytest.approx(expected)
+    second = second_laws.draw_law(np.random.default_rng(2), given=True)
+    b, c = second.parameters["cos_phase"], second.parameters["constant"]
+    expected = (mu0 + b * np.cos(phase) + c) / ((1 + b) * np.cos(np.pi / 6) + c)
+    assert second.reflectance(np.array(mu0), np.array(mu), np.array(phase), 0.0) == pytest.approx(expected)
 
 
 def test_the_second_laboratory_plants_every_effect():

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation.chain import State
@@ -19,6 +21,7 @@ NEAR, LOW = 0.1, (0.03, 0.045, 0.07)  # and near by; low ones, whose shadow does
 FINER = tuple(2.0 ** (k / 8) for k in range(-8, 9))  # times the height that was found first
 # crops: beyond the last a ridge hides the Sun everywhere alike
 DISTANCES = (NEAR, 0.17, 0.25, 0.35, USUAL, 0.7, 1.0, 1.4, 2.0, 2.8)
+BEYOND = 1e9  # m: no ridge
 
 
 @register
@@ -73,24 +76,35 @@ class DistantShadow(Effect):
         if state.sun_horizon is None:
             return
         height = self.value("height_m", state)
-        gsd = state.observation.gsd
-        rows, columns = state.elevation.shape[-2:]
-        east, north = crop_axes(rows, columns, gsd)
-        half_x, half_y = columns * gsd / 2, rows * gsd / 2
-        far = self.value("distance_px", state) * gsd
+        if not height > 0:
+            return
         sun = state.sun_direction.to(state.elevation.dtype)
         level = torch.sqrt(sun[:, 0] ** 2 + sun[:, 1] ** 2).clamp(min=1e-6)
-        sx, sy = (sun[:, 0] / level)[:, None, None], (sun[:, 1] / level)[:, None, None]
-        never = torch.full((), 1e9)
-        north_d = torch.where(sy > 1e-3, (half_y + far - north[:, None]) / sy.clamp(min=1e-3), never)
-        south_d = torch.where(sy < -1e-3, (half_y + far + north[:, None]) / (-sy).clamp(min=1e-3), never)
-        east_d = torch.where(sx > 1e-3, (half_x + far - east) / sx.clamp(min=1e-3), never)
-        west_d = torch.where(sx < -1e-3, (half_x + far + east) / (-sx).clamp(min=1e-3), never)
-        side = int(self.values["side"])
-        if side == 0:
-            distance = torch.minimum(torch.minimum(north_d, south_d), torch.minimum(east_d, west_d))
-        else:
-            distance = (north_d, east_d, south_d, west_d)[side - 1]
+        distance = self._distance(sun[:, 0] / level, sun[:, 1] / level, state)
+        behind = torch.nonzero(distance.flatten(1).amin(1) < BEYOND)[:, 0]  # images whose Sun stands over the ridge
         above = state.elevation - state.elevation.mean(dim=(-2, -1), keepdim=True)
-        ridge = torch.atan2(height - above, distance.expand_as(above))
-        state.sun_horizon = torch.where(height > 0, torch.maximum(state.sun_horizon, ridge), state.sun_horizon)
+        above = above[behind] if len(above) > 1 else above
+        ridge = torch.atan2(height - above, distance[behind])
+        horizon = state.sun_horizon.clone()
+        horizon[behind] = torch.maximum(horizon[behind], ridge)
+        state.sun_horizon = horizon
+
+    def _distance(self, east: Tensor, north: Tensor, state: State) -> Tensor:
+        """(n, H or 1, W or 1) m to the ridge in the direction of each image's Sun, `BEYOND` where it does not stand there. east, north : (n,)"""
+        gsd, side = state.observation.gsd, int(self.values["side"])
+        rows, columns = state.elevation.shape[-2:]
+        x, y = crop_axes(rows, columns, gsd)
+        far = self.value("distance_px", state) * gsd
+        from_east, from_north = columns * gsd / 2 + far, rows * gsd / 2 + far
+        axes = {
+            "north": (north, from_north - y[:, None]),
+            "east": (east, from_east - x),
+            "south": (-north, from_north + y[:, None]),
+            "west": (-east, from_east + x),
+        }
+        every = [
+            torch.where(s[:, None, None] > 1e-3, away / s[:, None, None].clamp(min=1e-3), BEYOND)
+            for name, (s, away) in axes.items()
+            if SIDES[side] in ("any", name)
+        ]
+        return functools.reduce(torch.minimum, every)

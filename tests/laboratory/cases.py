@@ -34,6 +34,7 @@ class Deal:
     layout: str
     effect: str | None = None
     fault: str | None = None
+    given_law: bool = False  # the ground follows the law that `diagnose` is given
 
 
 def deal(seed: int, count: int) -> list[Deal]:
@@ -59,7 +60,7 @@ def make_case(number: int, dealt: Deal, seed: int, path: Path) -> dict:
     """Write pairs.h5 to `path`; what is true of it, as JSON holds it."""
     rng = np.random.default_rng([seed, 1000 + number])
     kind = _kind(dealt)
-    scene = draw_scene(rng, dealt.layout, _needs(rng, kind))
+    scene = draw_scene(rng, dealt.layout, _needs(rng, kind), dealt.given_law)
     pairs = list(range(len(scene.pairs)))
     suns = scene.geometry.sun
     horizons = scene.horizons(scene.dem, suns)

@@ -10,7 +10,7 @@ from numba import njit
 
 from .layout import Needs
 
-HAPKE, LUNAR_LAMBERT, AKIMOV, MINNAERT = 0, 1, 2, 3
+HAPKE, LUNAR_LAMBERT, AKIMOV, MINNAERT, POLYNOMIAL = 0, 1, 2, 3, 4
 PI = math.pi
 
 
@@ -62,6 +62,7 @@ def reflectance(mu0: float, mu: float, g: float, code: int, p: np.ndarray) -> fl
     lunar-Lambert   phase function (3 numbers), factor on McEwen's L(g) (1996, LPSC 27, 841)
     Akimov          phase function (3)
     Minnaert        phase function (3), k at g = 0, its slope per rad
+    polynomial      3 numbers not used, factors of cos(incidence) and cos(g), a constant
 
     where the phase function is exp(-p1 g) + p2 exp(-p3 g).
     """
@@ -101,6 +102,8 @@ def reflectance(mu0: float, mu: float, g: float, code: int, p: np.ndarray) -> fl
             return 0.0
         disc = math.cos(0.5 * g) * math.cos(x) * cos_lat ** (g / (PI - g)) / max(math.cos(lon), 1e-3)
         return p[0] * f * disc
+    if code == POLYNOMIAL:
+        return p[0] * max(p[4] * mu0 + p[5] * math.cos(g) + p[6], 0.0)
     k = p[4] + p[5] * g
     return p[0] * f * mu0**k * max(mu, 0.05) ** (k - 1.0)
 
@@ -134,14 +137,20 @@ class Law:
         return reflectance(math.cos(PI / 6), 1.0, PI / 6, self.code, self.parameters)
 
 
-def draw_law(rng: np.random.Generator, needs: Needs) -> Law:
-    """Dark mare or bright highland under one of four laws."""
+def draw_law(rng: np.random.Generator, needs: Needs, given: bool) -> Law:
+    """Dark mare or bright highland under one of four laws, or the polynomial that `diagnose` is given as the law."""
     code = int(rng.choice([0, 1, 2, 3], p=[0.36, 0.24, 0.24, 0.16]))
     if needs.no_hapke and code == HAPKE:
         code = int(rng.integers(1, 3))
     p = np.zeros(8)
     p[0] = 1.0
     bright = rng.random() < 0.5 or needs.bright_law
+    if given:
+        p[4:7] = 1.0, rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.25)
+        level = rng.uniform(0.08, 0.13) if bright else rng.uniform(0.04, 0.065)
+        law = Law(POLYNOMIAL, p, f"cos(i) + {p[5]:.2f} cos(g) + {p[6]:.2f}, I/F(30,0,30) = {level:.3f}")
+        p[0] = level / law.at_30_degrees()
+        return law
     if code == HAPKE:
         name = _draw_hapke(rng, p, bright)
         values = f"w={p[1]:.2f} b={p[2]:.2f} c={p[3]:.2f} B0={p[4]:.2f} h={p[5]:.3f} theta={math.degrees(p[6]):.1f}"

@@ -126,7 +126,7 @@ class Scene:
         return np.sqrt(self.read_variance + self.photon_variance * np.maximum(iof, 0))
 
 
-def draw_scene(rng: np.random.Generator, layout: str, needs: Needs) -> Scene:
+def draw_scene(rng: np.random.Generator, layout: str, needs: Needs, given_law: bool = False) -> Scene:
     """Everything of a case but what is planted."""
     chosen = LAYOUTS[layout]
     fine = 3 if (chosen.size == 128 or not chosen.shared) else int(rng.choice([3, 4, 4, 5]))
@@ -135,7 +135,7 @@ def draw_scene(rng: np.random.Generator, layout: str, needs: Needs) -> Scene:
     sites = draw_sites(rng, layout, images)
     ground = draw_ground(rng, needs, gsd, sites.grid, fine)
     errors = draw_dem_errors(rng, sites.grid, gsd)
-    law = draw_law(rng, needs)
+    law = draw_law(rng, needs, given_law)
     sky = draw_sky(rng, needs, images, sites.grid * gsd)
     camera = draw_camera(rng, needs, gsd, sites.grid, sky.emission, sky.view_azimuth)
     scene = Scene(

@@ -25,6 +25,7 @@ class Deal:
     layout: str
     effect: str | None = None
     fault: str | None = None
+    given_law: bool = False  # the ground follows the law that `diagnose` is given
 
 
 def endless(rng: np.random.Generator, names: list[str], count: int) -> list[str]:
@@ -62,7 +63,7 @@ def case_units(dealt: Deal, seed: int) -> str:
 def make_case(number: int, dealt: Deal, seed: int, path: Path) -> dict:
     """Write the pairs file of case `number` and return its truth."""
     case_seed = int(generator(seed, "case", number).integers(2**31))
-    world = make_world(case_seed, dealt.layout, dealt.effect)
+    world = make_world(case_seed, dealt.layout, dealt.effect, dealt.given_law)
     simulator = Simulator(world)
     name = dealt.effect or dealt.fault
     hidden, measured = choose(simulator, name, case_seed) if name else (NOTHING, "fid")

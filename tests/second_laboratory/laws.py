@@ -24,8 +24,11 @@ class Law:
         return shape(self.parameters, mu0, mu, phase, twist) / shape(self.parameters, *standard, 0.0)
 
 
-def draw_law(rng: np.random.Generator) -> Law:
-    """Lunar-Lambert in half of all draws, else Hapke, Minnaert or Akimov, with parameters of published spread."""
+def draw_law(rng: np.random.Generator, given: bool) -> Law:
+    """Lunar-Lambert in half of all draws, else Hapke, Minnaert or Akimov, with parameters of published spread.
+
+    given: the polynomial that `diagnose` is given as the law instead.
+    """
     name = str(rng.choice(["lunar-Lambert", "Hapke", "Minnaert", "Akimov"], p=[0.5, 0.2, 0.15, 0.15]))
     drawn = {
         "slope": rng.uniform(0.4, 0.8),
@@ -38,6 +41,9 @@ def draw_law(rng: np.random.Generator) -> Law:
         "lobe_width": rng.uniform(0.2, 0.3),
         "lobe_share": rng.uniform(0.2, 0.7),
     }
+    if given:
+        name = "polynomial"
+        drawn = {"cos_phase": rng.uniform(0.2, 0.5), "constant": rng.uniform(0.1, 0.25)}
     return Law(name, {key: float(value) for key, value in drawn.items()})
 
 
@@ -82,4 +88,15 @@ def hapke(p: dict[str, float], mu0: Field, mu: Field, phase: Field, twist: Field
     return w * mu0 / (mu0 + mu) * (surge * particle + multiple)
 
 
-FORMS = {"lunar-Lambert": lunar_lambert, "Minnaert": minnaert, "Akimov": akimov, "Hapke": hapke}
+def polynomial(p: dict[str, float], mu0: Field, mu: Field, phase: Field, twist: Field | float) -> Field:
+    """Linear in the cosines of incidence and of the phase angle."""
+    return np.maximum(mu0 + p["cos_phase"] * (1 + twist) * np.cos(phase) + p["constant"], 0)
+
+
+FORMS = {
+    "polynomial": polynomial,
+    "lunar-Lambert": lunar_lambert,
+    "Minnaert": minnaert,
+    "Akimov": akimov,
+    "Hapke": hapke,
+}

@@ -197,7 +197,7 @@ def draw_sites(rng: np.random.Generator, count: int, per_scene: int, size: int) 
     return sites, (2 * MARGIN + down * (size + gap), 2 * MARGIN + across * (size + gap))
 
 
-def make_world(seed: int, layout: str, effect: str | None) -> World:
+def make_world(seed: int, layout: str, effect: str | None, given_law: bool = False) -> World:
     """Draw a world; the effect only decides whether low Suns or oblique views, without which it cannot show."""
     rng = generator(seed, "world")
     count, images = LAYOUTS[layout]
@@ -229,7 +229,7 @@ def make_world(seed: int, layout: str, effect: str | None) -> World:
     text = f"{scene_count} scene(s) at {gsd_m:.1f} m, latitude {latitude:.0f} deg, crops of {size} px; {made[0][1]}"
     scenes = standardised([scene for scene, _ in made], sites, size)
     return World(
-        seed, layout, size, fine, gsd_m, draw_law(rng), scenes, frames, sites, pairs,
+        seed, layout, size, fine, gsd_m, draw_law(rng, given_law), scenes, frames, sites, pairs,
         dem_variance=rng.uniform(0.2, 0.6), dem_scale_error=rng.uniform(-0.012, 0.012),
         optics_variance=rng.uniform(0.1, 0.3), cubic=bool(rng.uniform() < 0.5), flat_rms=rng.uniform(0.001, 0.003),
         scattered=rng.uniform(0.05, 0.25), latitude_deg=float(latitude), text=text,

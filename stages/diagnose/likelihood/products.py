@@ -188,8 +188,8 @@ class _Columns:
         rows, k = self.rows, self.k
         n, m = factor.shape[-1], len(rows.shared)
         by_wave = factor[self.of_wave].to(self.shared.dtype)
-        white = by_wave @ self.shared
-        dense = (white.flatten(0, 1).T @ white.flatten(0, 1)).double()
+        white = (by_wave @ self.shared).flatten(0, 1)
+        dense = (white.T @ white).double()
         cross = torch.zeros(m, k, n, dtype=torch.float64)
         own = torch.zeros(k, n, k, n, dtype=torch.float64)
         if k:
@@ -198,8 +198,7 @@ class _Columns:
             if len(self.across):
                 cross = torch.einsum("bmrkn,brn->mkn", self.across, precision)
             else:
-                back = (by_wave.mT @ white).transpose(0, 1)  # (n, 2 K, m)
-                cross = (back.mT @ self.own.transpose(0, 1)).double().permute(1, 2, 0)
+                cross = (white.T @ self._own(by_wave)).double().view(m, n, k).mT
         if mean is not None:
             shared, others = rows.shared_mean.double() @ mean.T, mean.T @ mean
             dense += shared @ shared.T
@@ -214,6 +213,10 @@ class _Columns:
         across_light[:, :m] = light @ self.dark.T
         return torch.cat([torch.cat([lit, across_light.T], 1), torch.cat([across_light, light @ light.T], 1)]).numpy()
 
+    def _own(self, by_wave: Tensor) -> Tensor:
+        """(2 K r, n k) the columns of every frame, whitened by (2 K, r, n)."""
+        return (by_wave.unsqueeze(-1) * self.own.unsqueeze(1)).flatten(2).flatten(0, 1)
+
     def shade(self, shaded: Tensor) -> Tensor:
         """(1 + m, 1 + m) of the shared columns' means in deep shadow; shaded : (s,) 1 where it counts."""
         return (self.dark * shaded) @ self.dark.T
@@ -223,11 +226,11 @@ class _Columns:
         rows = self.rows
         z, means, dark = shams
         by_wave = factor[self.of_wave].to(self.shared.dtype)
-        white, sham = by_wave @ self.shared, _by_wave(z)
-        first = (white.flatten(0, 1).T @ sham.flatten(0, 1)).double()
+        white, sham = (by_wave @ self.shared).flatten(0, 1), _by_wave(z).flatten(0, 1)
+        first = (white.T @ sham).double()
         first += self.dark @ dark.double().T
-        back = by_wave.mT @ sham
-        second = (self.own.permute(1, 2, 0) @ back.transpose(0, 1)).double().transpose(0, 1)
+        n, k = rows.own.shape[1], self.k
+        second = (self._own(by_wave).T @ sham).double().view(n, k, sham.shape[1]).transpose(0, 1)
         squares = (z.real.square() + z.imag.square()).sum((1, 2)).double()
         if mean is not None:
             first += rows.shared_mean.double() @ mean.T @ means.double().T

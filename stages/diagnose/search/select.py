@@ -57,8 +57,9 @@ def search(state: State, most: int) -> Outcome:
     """Name causes until no candidate is left."""
     out = Outcome()
     refused: dict[str, str] = {}  # effect -> why
-    state.choose_law()
     view = state.look(state.open_names())
+    if state.law_is_another(view):  # before anything else is looked at: what that takes is soon rendered
+        view = state.look(state.open_names())
     fresh = True  # whether all of it was rendered beside the causes as they are
     while True:
         law = [c for c in state.named if c.effect.of_law]
