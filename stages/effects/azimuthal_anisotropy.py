@@ -5,12 +5,19 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from stages.effects.base import Effect, Survey, Trial, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
 LOWEST = 0.1  # sine of the Sun's elevation: lower, relief below a pixel lies in its own shadow
+
+
+def sun_cotangent(sun: Tensor) -> Tensor:
+    """(n,) of the Sun's elevation, no lower than ``LOWEST``; sun : (n, 3) unit vectors, east north up"""
+    level = torch.hypot(sun[:, 0], sun[:, 1]).clamp(min=1e-6)
+    return level / sun[:, 2].clamp(min=LOWEST)
 
 
 @register
@@ -41,8 +48,8 @@ class AzimuthalAnisotropy(Effect):
 
     def apply(self, state: State) -> None:
         sun = state.sun_direction.to(state.elevation.dtype)
-        level = torch.sqrt(sun[:, 0] ** 2 + sun[:, 1] ** 2).clamp(min=1e-6)
+        level = torch.hypot(sun[:, 0], sun[:, 1]).clamp(min=1e-6)
         east, north = (sun[:, 0] / level)[:, None, None], (sun[:, 1] / level)[:, None, None]
         across = self.value("east", state) * east + self.value("north", state) * north
-        height = (sun[:, 2].clamp(min=LOWEST) / level / self.survey.sun_tangent)[:, None, None]
-        state.reflectance = state.reflectance * (1 + across * height ** -self.value("shading", state))
+        lowness = (sun_cotangent(sun) / self.survey.sun_cotangent)[:, None, None]
+        state.reflectance = state.reflectance * (1 + across * lowness ** self.value("shading", state))

@@ -34,7 +34,7 @@ class Survey:
     curvature: tuple[float, float] = (0.0, 1.0)  # of the Laplacian after a 2 px blur, 1/m
     relief: float = 100.0  # largest range of heights in a crop, m
     columns: tuple[float, float] = (0.0, 127.0)  # first and last detector sample
-    sun_tangent: float = 1.0  # of the Sun's elevation, geometric mean over the images
+    sun_cotangent: float = 1.0  # of the Sun's elevation, mean over the images
     lean_px: float = 0.0  # rms of h tan(emission), heights from their mean
     units: str = "iof"
     has_detector: bool = False

@@ -14,6 +14,7 @@ from torch import Tensor
 from stages.diagnose.model.aligned import aligned
 from stages.diagnose.settings import FEWEST_PIXELS, TAPER
 from stages.effects import Survey, fields
+from stages.effects.azimuthal_anisotropy import sun_cotangent
 from stages.effects.relief_displacement import lean
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import Observation
@@ -187,19 +188,13 @@ def survey(sites: list[Site], frames: int, units: str) -> Survey:
         curvature=_moments([fields.curvature(z, first.gsd) for z in terrain]),
         relief=max(float(z.max() - z.min()) for z in terrain),
         columns=ends,
-        sun_tangent=float(torch.cat([_sun_tangent(s.observation) for s in sites]).log().mean().exp()),
+        sun_cotangent=float(torch.cat([sun_cotangent(s.observation.sun_direction) for s in sites]).mean()),
         lean_px=float(torch.stack(leaning).mean().sqrt()),
         units=units,
         has_detector=known,
         frames=frames,
         sites=len(sites),
     )
-
-
-def _sun_tangent(observation: Observation) -> Tensor:
-    """(n,) of the Sun's elevation, of images that it shines on from aside."""
-    east, north, up = observation.sun_direction.unbind(-1)
-    return (up / torch.hypot(east, north)).clamp(0.01, 100.0)
 
 
 def _moments(parts: list[Tensor]) -> tuple[float, float]:
