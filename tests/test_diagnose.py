@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -186,6 +187,28 @@ def test_a_shift_of_five_pixels_is_captured():
     shift, highest = peak(correlations(image, valid, rendered, torch.ones(2, 64, 64), 8, 6.0))
     assert torch.allclose(shift, torch.tensor([[5.0, -3.0]]).expand(2, 2), atol=0.1)
     assert float(highest.min()) > 0.9
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.5, 5.0), (0.1, 0.0)])
+def test_an_image_without_the_rendered_contrast_tells_nothing_of_where_it_lies(monkeypatch, share, found):
+    """Of two images that show a share of what is rendered, 5 px away and beside a texture of their own, the fainter match is one of the law."""
+    from stages.diagnose.registration import start
+    from stages.effects.filters import gaussian
+
+    torch.manual_seed(1)
+    ground = gaussian(torch.randn(1, 144, 144), 4.0)
+    rendered, shifted = ground[:, 8:136, 8:136], ground[:, 8:136, 13:141]
+    own = gaussian(torch.randn(1, 128, 128), 4.0) * 0.2
+    valid = torch.ones(1, 128, 128, dtype=torch.bool)
+    site = SimpleNamespace(
+        read=2 * (share * shifted + own + 1), read_valid=valid, gain=torch.tensor([2.0]), frames=np.array([0])
+    )
+    chain = SimpleNamespace(site=site, predict=lambda: rendered)
+    monkeypatch.setattr(start, "_lit", lambda chain: valid)
+    shift, _ = start._frame_shifts([chain], 1)
+    assert torch.allclose(shift, torch.tensor([[found, 0.0]]), atol=0.2)
+    (alone,) = start.captured([chain])
+    assert torch.allclose(alone, torch.tensor([[found, 0.0]]), atol=0.2)
 
 
 def test_relief_displacement_lies_along_the_view():

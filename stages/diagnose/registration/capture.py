@@ -40,6 +40,13 @@ def correlations(image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, mo
     return correlation(fine(image, valid, sigma), valid, fine(rendered, lit, sigma), lit, most)
 
 
+def contrast(image: Tensor, valid: Tensor, rendered: Tensor, lit: Tensor, sigma: float) -> Tensor:
+    """(n,) rms of images over that of their renderings, of what is finer than ``sigma`` px."""
+    both = (valid & lit).float()
+    measured, expected = fine(torch.stack([image, rendered]), both, sigma)
+    return (measured.square().sum((-2, -1)) / expected.square().sum((-2, -1)).clamp(min=1e-30)).sqrt()
+
+
 def peak(map_: Tensor) -> tuple[Tensor, Tensor]:
     """Where maps (n, S, S) of all shifts are highest, (n, 2) px east and south, and the value there, (n,)."""
     best, place = map_.flatten(1).max(1)
@@ -57,4 +64,4 @@ def peak(map_: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack([column - most + east, row - most + south], 1), best
 
 
-__all__ = ["correlation", "correlations", "peak"]
+__all__ = ["contrast", "correlation", "correlations", "peak"]

@@ -16,7 +16,7 @@ from torch import Tensor
 from stages.diagnose.model.aligned import aligned
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.sites import Site
-from stages.diagnose.settings import BROAD, FIELD_ORDER
+from stages.diagnose.settings import BROAD, CONTRAST, FIELD_ORDER
 from stages.effects.filters import fine, gradients
 from stages.effects.relief_displacement import lean
 from stages.physics.formation.resampling import displace
@@ -109,7 +109,7 @@ def match(
 
 def asked(chain: Chain, lit: Tensor, known: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Of images that are displaced by about ``known``, four (n, H, W): the residual, what a px further east and south adds to it, and the
-    inverse of its variance where it counts. What is broad is left out.
+    inverse of its variance where it counts. What is broad is left out, and images that show little of the rendered contrast do not count.
     """
     rendered, site = chain.predict(), chain.site
     image, valid = aligned(site.read, site.read_valid, *known, displace)  # only linearised about: a quick one does
@@ -119,7 +119,8 @@ def asked(chain: Chain, lit: Tensor, known: tuple[Tensor, Tensor]) -> tuple[Tens
     residual = measured - scale[:, None, None] * predicted
     east, south = (g * scale[:, None, None] for g in slopes)
     variance = residual.square().sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)
-    return residual, east, south, mask / variance.clamp(min=1e-20)[:, None, None]
+    told = (scale > CONTRAST * site.gain.abs()) / variance.clamp(min=1e-20)
+    return residual, east, south, mask * told[:, None, None]
 
 
 def _parts(height: int, width: int, pieces: int) -> list[tuple[slice, slice]]:

@@ -13,8 +13,8 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import lit_mask
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.model.sites import Site
-from stages.diagnose.registration.capture import correlations, peak
-from stages.diagnose.settings import BROAD, CAPTURE, CORRELATED, SURE
+from stages.diagnose.registration.capture import contrast, correlations, peak
+from stages.diagnose.settings import BROAD, CAPTURE, CONTRAST, CORRELATED, SURE
 from stages.effects.relief_displacement import lean
 from stages.physics.formation.resampling import displace
 
@@ -25,7 +25,8 @@ def start(chains: Sequence[Chain], frames: int, level: float) -> tuple[list[Fiel
     """Displacement of every site's images, and the rms shift, px.
 
     One image of a small crop may look like the next crater. All images of a frame together seldom do: their shift is taken from the sum of
-    their log likelihoods over all shifts, with relief displacement and without, whichever fits better for sure.
+    their log likelihoods over all shifts, with relief displacement and without, whichever fits better for sure. An image that shows little of
+    the contrast that is rendered, wherever it is laid, tells nothing of where it lies: under a high Sun another law looks like that, on all ground alike.
     """
     sites = [c.site for c in chains]
     found = []
@@ -68,7 +69,11 @@ def captured(chains: Sequence[Chain]) -> list[Tensor]:
             count / CORRELATED
         ).sqrt()
         border = (shift.abs() > CAPTURE - 0.5).any(1)
-        return shift, torch.where(border, 0.0, z), still
+        return (
+            shift,
+            torch.where(border | (highest * _relative_contrast(site, rendered, lit) < CONTRAST), 0.0, z),
+            still,
+        )
 
     out = []
     for shift, z, still in per_site(of, chains):
@@ -81,24 +86,33 @@ def captured(chains: Sequence[Chain]) -> list[Tensor]:
 def _frame_shifts(chains: Sequence[Chain], frames: int) -> tuple[Tensor, float]:
     """(frames, 2) px east and south, 0 where no shift is surely better, and the log likelihood of all frames there, nats."""
 
-    def of(chain: Chain) -> Tensor:
+    def of(chain: Chain) -> tuple[Tensor, Tensor, Tensor]:
         site, rendered, lit = chain.site, chain.predict(), _lit(chain)
         r = correlations(site.read, site.read_valid, rendered, lit, CAPTURE, BROAD).clamp(0, 0.999)
-        count = (site.read_valid & lit).sum((-2, -1)) / CORRELATED
-        return -0.5 * count[:, None, None] * torch.log1p(-r.square())
+        count = ((site.read_valid & lit).sum((-2, -1)) / CORRELATED)[:, None, None]
+        shown = r * _relative_contrast(site, rendered, lit)[:, None, None]
+        return -0.5 * count * torch.log1p(-r.square()), count * shown, count
 
     side = 2 * CAPTURE + 1
-    likelihood = torch.zeros(frames, side, side)
+    likelihood, shown = torch.zeros(2, frames, side, side)
+    count = torch.zeros(frames, 1, 1)
     for chain, own in zip(chains, per_site(of, chains), strict=True):
-        likelihood.index_add_(0, torch.from_numpy(chain.site.frames), own)
+        for total, part in zip((likelihood, shown, count), own, strict=True):
+            total.index_add_(0, torch.from_numpy(chain.site.frames), part)
     shifts, best = peak(likelihood)
     still = likelihood[:, CAPTURE, CAPTURE]
-    sure = best > still + SURE**2 / 2
+    there = shown.flatten(1).gather(1, likelihood.flatten(1).argmax(1, keepdim=True))[:, 0]
+    sure = (best > still + SURE**2 / 2) & (there > CONTRAST * count[:, 0, 0])
     return torch.where(sure[:, None], shifts, 0.0), float(torch.where(sure, best, still).sum())
 
 
 def _lit(chain: Chain) -> Tensor:
     return lit_mask(chain) | (chain.site.read_valid & chain.lit())
+
+
+def _relative_contrast(site: Site, rendered: Tensor, lit: Tensor) -> Tensor:
+    """(n,) of images over their renderings, both in I/F."""
+    return contrast(site.read, site.read_valid, rendered, lit, BROAD) / site.gain.abs().clamp(min=1e-9)
 
 
 def _leaning(site: Site, share: float, level: float) -> Field:
