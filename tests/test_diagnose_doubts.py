@@ -128,6 +128,30 @@ def test_values_per_image_do_not_stand_for_what_one_value_for_all_does():
     assert not refused([21, 22, 20, 22])
 
 
+def test_a_sun_that_stands_lower_is_compared_with_a_nonlinearity_without_another_law_beside_either():
+    """Beside another form of the law a nonlinearity has nothing left to explain, and a wrong Sun is judged without one."""
+    sun, bend = (
+        Guise(name, get_effect(name).trials(Survey())[0], (k,))
+        for k, name in enumerate(("sun_elevation", "nonlinearity"))
+    )
+
+    def refused(of_bend, because=""):
+        both = {g.effect: Found(g.effect, g, np.ones(1), np.ones(1), 9.0) for g in (sun, bend)}
+
+        def held_out(places, without, *rest):
+            if places[0] == 0:
+                return np.array([10.0, 12, 9, 11])
+            return np.array(of_bend, float) if 7 in without else np.zeros(4)
+
+        whole = _whole(held_out=held_out, form_places=lambda: np.array([7]))
+        judge(whole, both["sun_elevation"])
+        return may_be_another(whole, both["sun_elevation"], both, {"nonlinearity": because} if because else {})
+
+    assert "nonlinearity" in refused([13, 15, 12, 15])
+    assert not refused([13, 15, 12, 15], ODD)
+    assert not refused([9, 13, 8, 12])
+
+
 def test_what_another_surely_explains_better_has_no_name_though_that_one_is_not_sure():
     """Light from the Earth, whose direction images disagree on, leaves a pedestal a part of what it explains."""
     earth, pedestal = (

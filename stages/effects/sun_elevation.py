@@ -29,7 +29,7 @@ class SunElevation(Effect):
     reference = (
         "Acton (1996), Planet. Space Sci. 44, 65 (ephemerides); Archinal et al. (2018), CMDA 130, 22 (body frames)"
     )
-    confused_with = ("penumbra", "dem_scale")
+    confused_with = ("penumbra", "dem_scale", "nonlinearity")
     separate = "an image of the same ground with the Sun at least 20 deg higher or lower"
     parameters = (Parameter("error_deg", "degree", -10.0, 10.0, 0.0, "truth minus given, the same for all images"),)
     strong: ClassVar = {"error_deg": 0.5}

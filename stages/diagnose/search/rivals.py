@@ -89,6 +89,8 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
         return (
             "the same on the other side of each pixel explains as much of it, as blur and relief finer than the DEM do"
         )
+    if more := _as_another_law(whole, found, best, refused):
+        return f"{more}, {UNSURE}, explains more of it"
     own = whole.ordinary_places(found.effect)
     if get_effect(found.effect).lights_shadows and (more := _other_light(found, best)):
         return f"{more}, {UNSURE}, explains more of it"
@@ -99,6 +101,23 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
             likely = not other.guise.per_frame and other.surprise >= found.surprise
             if stands_for(other, found) or (likely and not sure(whole.gains_beside(found, other))):
                 return f"{other.effect}, {UNSURE}, would explain it as well"
+    return ""
+
+
+def _as_another_law(whole: Whole, found: Found, best: Mapping[str, Found], refused: Mapping[str, str]) -> str:
+    """Of what an effect of the law is confused with, one of the camera or of relief that explains surely more, or ''.
+
+    Effects of the law are judged without another form of it beside them, which would follow them; what passes for one has to be, too.
+    """
+    if not get_effect(found.effect).of_law:
+        return ""
+    for other in [best[n] for n in get_effect(found.effect).confused_with if n in best]:
+        if other.guise.per_frame or get_effect(other.effect).of_law or refused.get(other.effect, "").startswith(ODD):
+            continue
+        without = [*whole.exclude(other.guise), *whole.form_places().tolist()]
+        gains = whole.held_out(whole.places(other.guise), list(dict.fromkeys(without)))
+        if interval(gains - found.gains, whole.sizes)[0] > 0:
+            return other.effect
     return ""
 
 
