@@ -30,7 +30,7 @@ FEWEST_PIXELS = 400  # of an image in a crop: fewer do not give a spectrum
 # --- registration ---
 CAPTURE = 8  # px: displacements are sought up to here; further off, neighbouring craters match as well
 BROAD = 6.0  # px, sigma: broader structure (albedo, film) is taken out before images are matched
-# of the rendered contrast that an image shows where it matches: on data of four laboratories and in photographs from 0.3 where it lay there, up to 0.16 where it did not
+# of the rendered contrast that an image shows where it matches: in files of three simulators from 0.3 where it lay there, up to 0.16 where it did not
 CONTRAST = 0.25
 FIELD_ORDER = 3  # degree of the polynomial over the scene that stands for a smooth field per frame
 MIMICKED = 0.1  # of the error of a shift: where causes looked like a quarter, registration had a tenth of them

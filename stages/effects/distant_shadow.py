@@ -83,8 +83,7 @@ class DistantShadow(Effect):
         distance = self._distance(sun[:, 0] / level, sun[:, 1] / level, state)
         behind = torch.nonzero(distance.flatten(1).amin(1) < BEYOND)[:, 0]  # images whose Sun stands over the ridge
         above = state.elevation - state.elevation.mean(dim=(-2, -1), keepdim=True)
-        above = above[behind] if len(above) > 1 else above
-        ridge = torch.atan2(height - above, distance[behind])
+        ridge = torch.atan2(height - above.expand(len(sun), -1, -1)[behind], distance[behind])
         horizon = state.sun_horizon.clone()
         horizon[behind] = torch.maximum(horizon[behind], ridge)
         state.sun_horizon = horizon

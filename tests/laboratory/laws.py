@@ -147,10 +147,7 @@ def draw_law(rng: np.random.Generator, needs: Needs, given: bool) -> Law:
     bright = rng.random() < 0.5 or needs.bright_law
     if given:
         p[4:7] = 1.0, rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.25)
-        level = rng.uniform(0.08, 0.13) if bright else rng.uniform(0.04, 0.065)
-        law = Law(POLYNOMIAL, p, f"cos(i) + {p[5]:.2f} cos(g) + {p[6]:.2f}, I/F(30,0,30) = {level:.3f}")
-        p[0] = level / law.at_30_degrees()
-        return law
+        return _at_a_level(rng, bright, POLYNOMIAL, p, f"cos(i) + {p[5]:.2f} cos(g) + {p[6]:.2f}")
     if code == HAPKE:
         name = _draw_hapke(rng, p, bright)
         values = f"w={p[1]:.2f} b={p[2]:.2f} c={p[3]:.2f} B0={p[4]:.2f} h={p[5]:.3f} theta={math.degrees(p[6]):.1f}"
@@ -167,8 +164,13 @@ def draw_law(rng: np.random.Generator, needs: Needs, given: bool) -> Law:
         p[4] = rng.uniform(0.50, 0.58)
         p[5] = rng.uniform(0.05, 0.2)
         name = f"Minnaert k={p[4]:.2f}+{p[5]:.2f}g"
+    return _at_a_level(rng, bright, code, p, f"{name}, f = exp(-{p[1]:.2f} g) + {p[2]:.2f} exp(-{p[3]:.1f} g)")
+
+
+def _at_a_level(rng: np.random.Generator, bright: bool, code: int, p: np.ndarray, name: str) -> Law:
+    """With the scale, p[0], of dark mare or of bright highland."""
     level = rng.uniform(0.08, 0.13) if bright else rng.uniform(0.04, 0.065)
-    law = Law(code, p, f"{name}, f = exp(-{p[1]:.2f} g) + {p[2]:.2f} exp(-{p[3]:.1f} g), I/F(30,0,30) = {level:.3f}")
+    law = Law(code, p, f"{name}, I/F(30,0,30) = {level:.3f}")
     p[0] = level / law.at_30_degrees()
     return law
 

@@ -69,11 +69,8 @@ def captured(chains: Sequence[Chain]) -> list[Tensor]:
             count / CORRELATED
         ).sqrt()
         border = (shift.abs() > CAPTURE - 0.5).any(1)
-        return (
-            shift,
-            torch.where(border | (highest * _relative_contrast(site, rendered, lit) < CONTRAST), 0.0, z),
-            still,
-        )
+        faint = highest * _relative_contrast(site, rendered, lit) < CONTRAST
+        return shift, torch.where(border | faint, 0.0, z), still
 
     out = []
     for shift, z, still in per_site(of, chains):

@@ -114,8 +114,7 @@ def _as_another_law(whole: Whole, found: Found, best: Mapping[str, Found], refus
     for other in [best[n] for n in get_effect(found.effect).confused_with if n in best]:
         if other.guise.per_frame or get_effect(other.effect).of_law or refused.get(other.effect, "").startswith(ODD):
             continue
-        without = [*whole.exclude(other.guise), *whole.form_places().tolist()]
-        gains = whole.held_out(whole.places(other.guise), list(dict.fromkeys(without)))
+        gains = whole.held_out(whole.places(other.guise), [*whole.exclude(other.guise), *whole.form_places().tolist()])
         if interval(gains - found.gains, whole.sizes)[0] > 0:
             return other.effect
     return ""

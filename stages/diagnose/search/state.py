@@ -136,7 +136,7 @@ class State:
         return per_site(lambda site: self.nominal.chain(site, base), self.sites)
 
     def choose_law(self, refused: Container[str] = ()) -> bool:
-        """Let measured laws take the nominal one's place before anything else is looked at (what that takes is soon rendered), and whether they do.
+        """Let measured laws take the nominal one's place before a search begins again, and whether they do; effects of the law alone are looked at.
 
         refused : effects that stand for nothing any more
         """
