@@ -352,6 +352,36 @@ def test_one_amount_for_all_images_stands_for_the_gains_that_it_explains():
             assert nats < 15
 
 
+def test_one_amount_for_all_images_does_not_stand_for_gains_of_few():
+    """A pattern of two amounts explains any gains of four images nearly: of twelve it does so only where they follow it."""
+    from types import SimpleNamespace
+
+    from stages.diagnose.likelihood.weigh import odds_over_gains
+    from stages.diagnose.likelihood.whole import Whole
+    from stages.diagnose.settings import LIKELIER
+
+    rng = np.random.default_rng(4)
+
+    def odds(azimuth, measured):
+        """Nats, where the mean of all gains is nothing: it is the nominal law's."""
+        n = len(azimuth)
+        levels = np.eye(n) - 1 / n
+        pattern = np.stack([np.sin(azimuth), np.cos(azimuth)], 1)
+        columns = 10.0 * levels @ np.concatenate([pattern, np.eye(n)], 1)
+        seen = levels @ (10.0 * measured(pattern) + rng.normal(size=n))
+        whole = Whole.__new__(Whole)
+        whole.scattered, whole.plan = np.arange(2, 2 + n), SimpleNamespace(per_frame=["image_gain"])
+        whole.reduce = lambda places, exclude: (columns.T @ columns, columns.T @ seen, None, None)
+        return odds_over_gains(whole, np.arange(2), [])
+
+    few, many = np.array([0.3, 1.1, 3.5, 4.4]), np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    for _ in range(20):
+        assert odds(few, lambda p: rng.normal(0, 2.0, 4)) < LIKELIER
+        assert odds(few, lambda p: p @ rng.normal(0, 2.0, 2)) < LIKELIER
+        assert odds(many, lambda p: rng.normal(0, 2.0, 12)) < -LIKELIER
+        assert odds(many, lambda p: p @ [2.0, 1.0]) > LIKELIER
+
+
 def test_a_sharpened_dem_keeps_its_borders():
     """A tilted plane is sharp already: mirrored at its borders it would have creases there."""
     from types import SimpleNamespace

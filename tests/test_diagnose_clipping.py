@@ -97,3 +97,25 @@ def test_images_that_are_cut_off_as_a_whole_are_clipping(monkeypatch):
         assert (
             before.max() < 6 * 16 * 64
         )  # its brightness is off by less than all of it, or one such image would outweigh all others
+
+
+@pytest.mark.parametrize("cut", [True, False])
+def test_clipping_of_bright_ground_shows_beside_its_albedo(monkeypatch, cut):
+    """Where a law of one albedo stays below the level, the other images of a place say which ground is bright."""
+    rng, level = np.random.default_rng(3), 0.11
+    albedo = [1 + 0.06 * cv2.GaussianBlur(rng.normal(size=(64, 64)), (0, 0), 4.0) * 14 for _ in range(5)]
+    predicted = torch.tensor([0.05, 0.06, 0.07, 0.1])[:, None, None].expand(4, 64, 64).contiguous()
+    images = []
+    for ground in albedo:
+        image = predicted * torch.from_numpy(ground).float()
+        image = image * (1 + 0.01 * torch.from_numpy(rng.normal(size=(4, 64, 64))).float())
+        images.append(image.clamp(max=level) if cut else image)
+    chain = SimpleNamespace(predict=lambda: predicted, site=SimpleNamespace(gain=torch.ones(4), offset=torch.zeros(4)))
+    lit = torch.ones(4, 64, 64, dtype=torch.bool)
+    monkeypatch.setattr(named, "full_light", lambda chain: lit)
+    monkeypatch.setattr(get_effect("saturation"), "read_off", classmethod(lambda cls, bright: (level, 0.0, 1.0)))
+    before, after, _ = named._clipped(
+        SimpleNamespace(chains=lambda: [chain] * 5), images, [lit] * 5, get_effect("saturation")
+    )
+    assert (gain_interval(before, after)[1] > 0) == cut
+    assert float(predicted.max()) < level

@@ -49,6 +49,7 @@ ROUGHLY = (
     0.05  # of the same: beside an effect of the law with a name, whose formula is one of several for the same thing
 )
 SURE = 4.0  # standard errors: an effect found at this size is never called invisible
+LIKELIER = math.log(100)  # nats of one value for all images over one for each: as sure as 2.6 standard errors
 STILL = 2.6  # standard errors (99 %) of a name that was found at four, once all is registered and fitted again
 CORRELATED = 16.0  # px^2 per independent sample of a residual: what is left of albedo and relief is some 4 px wide
 PEAK = 6.0  # times the median of its annulus: a single wave of one frame that the spectrum of ground and noise does not have

@@ -39,7 +39,8 @@ class AlbedoMap(Effect):
     parameters = (Parameter("per_std", "1", 0.0, 1.0, 0.0, "rms of the field, relative to albedo"),)
     coordinates = tuple(Parameter(f"c{m}{n}", "1", -0.5, 0.5, 0.0, f"cosine {m} down, {n} across") for m, n in ORDERS)
     strong: ClassVar = {p.name: 0.05 for p in coordinates}
-    tolerance: ClassVar = {"per_std": 0.03}
+    # broad brightness within 64 to 128 px of a NAC frame of mare at nadir (M143947267L) varies by 2 to 7 % outside its fresh craters
+    tolerance: ClassVar = {"per_std": 0.08}
 
     @classmethod
     def read_off_ground(cls, albedo: Tensor, seen: Tensor) -> tuple[Values, Tensor, Tensor]:

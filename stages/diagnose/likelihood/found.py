@@ -34,6 +34,7 @@ class Found:
     spread: float = 0.0
     beside: float = 0.0  # scatter of the gains per frame beside it, where that is less than without
     instead: bool = False  # whether it stands for gains per frame: beside it they are no larger than all data have
+    odds: float = math.inf  # nats by which it is likelier than gains per frame that it stands for
 
     @property
     def gain(self) -> float:

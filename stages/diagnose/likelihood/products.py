@@ -40,7 +40,6 @@ Residual = tuple[
 class Products:
     """Sums over one patch. gram : (M, M), place : (M,) where its columns stand in the whole; sham : (M, R) with sham residuals
 
-    shade : (1 + m, 1 + m) what deep shadow adds to ``gram`` of the shared columns
     images : for every group of images (M, M), what is gone from ``gram`` without them: the squares of these images given the others
     The whole: residual, shared columns, then column by column the frames, then the light of its own in the shadows of every frame.
     """
@@ -52,7 +51,6 @@ class Products:
     site: int
     images: list[Array] = field(default_factory=list)
     level: Products | None = None  # of the means alone
-    shade: Array | None = None
 
     def without(self, group: int) -> Products:
         """The sums as if a group of images had not been taken."""
@@ -129,7 +127,7 @@ def products(
             own = np.concatenate([np.zeros(m, bool), np.tile(gone.numpy(), k), light])
             part[own], part[:, own] = gram[own], gram[:, own]  # to the last bit: nothing is left of them
         parts.append(part)
-    return Products(gram, place, sham, squares, patch.site, parts, level, columns.shade(every).numpy())
+    return Products(gram, place, sham, squares, patch.site, parts, level)
 
 
 def _of_means(rows: Rows, mean: Tensor, place: NDArray[np.int64], shams: Residual | None) -> Products:

@@ -74,6 +74,8 @@ def weigh(whole: Whole, guise: Guise) -> tuple[Found, Array]:
             found.surprise = max(found.surprise, float(surprise(np.array([beside / inflation]), len(places))[0]))
             found.beside, found.instead = spread, instead is not None and _agree(instead, amount, error)
             found.amount = amount if instead is None else instead
+        if found.instead:
+            found.odds = odds_over_gains(whole.levels or whole, places, whole.exclude(guise))
     return found, surprises[1:]
 
 
@@ -113,6 +115,23 @@ def beside_gains(whole: Whole, places: NDArray[np.int64], exclude: Sequence[int]
             (np.linalg.pinv(known, rcond=1e-9, hermitian=True) @ score)[:j],
         )
     return max(explained + best - none, 0.0), spread, None
+
+
+def odds_over_gains(whole: Whole, places: NDArray[np.int64], exclude: Sequence[int]) -> float:
+    """Nats by which columns, beside gains as all data have, are likelier than gains of any scatter alone. Either kind of value is drawn from about nothing
+    with one standard deviation, that which fits best: of few images as few gains explain as much as the columns do (Bayes factor: MacKay 2003, ch. 28).
+    """
+    gains, j = whole.scattered, len(places)
+    information, score, _, _ = whole.reduce(np.concatenate([places, gains]), exclude)
+    alone, _ = _scatter(information[j:, j:], score[j:])
+    columns, spread = _scatter(information[:j, :j], score[:j])
+    known = np.linalg.inv(information[:j, :j] + np.eye(j) * spread**-2)
+    rest, _ = _scatter(
+        information[j:, j:] - information[j:, :j] @ known @ information[:j, j:],
+        score[j:] - information[j:, :j] @ known @ score[:j],
+        _usual(whole.plan),
+    )
+    return (columns + rest - alone) / 2
 
 
 def _usual(plan: Plan) -> float:

@@ -217,10 +217,8 @@ class Whole:
         squares = [float(every[u.place] @ u.gram @ every[u.place]) for u in self.units]
         return np.bincount(self.labels, weights=squares).astype(np.float64)
 
-    def held_out(
-        self, places: NDArray[np.int64], exclude: Sequence[int] = (), spread: float = 0.0, shade: bool = False
-    ) -> Array:
-        """(labels,) nats that the columns gain on ground that they and the nuisance were not fitted to; ``shade``: in its deep shadow.
+    def held_out(self, places: NDArray[np.int64], exclude: Sequence[int] = (), spread: float = 0.0) -> Array:
+        """(labels,) nats that the columns gain on ground that they and the nuisance were not fitted to.
 
         Beside light of its own in every image nothing is left to gain: other ground tells how much that is.
         """
@@ -239,7 +237,7 @@ class Whole:
             b1, b0 = np.zeros(self.size), np.zeros(self.size)
             b1[every], b0[n] = with_, without
             for k in fold:
-                out[self.labels[k]] += 0.5 * (_left(self.units[k], b0, shade) - _left(self.units[k], b1, shade))
+                out[self.labels[k]] += 0.5 * (_left(self.units[k], b0) - _left(self.units[k], b1))
         return out
 
     def without_one(
@@ -318,10 +316,9 @@ def _integrated_out(u: Products, places: NDArray[np.int64], main: Array, spread:
     return dataclasses.replace(u, gram=u.gram - r.T @ inner @ r, sham=u.sham - r.T @ inner @ sham)
 
 
-def _left(unit: Products, b: Array, shade: bool = False) -> float:
-    gram = unit.gram if not shade or unit.shade is None else unit.shade
-    own = b[unit.place[: len(gram)]]
-    return float(gram[0, 0] - 2 * own @ gram[:, 0] + own @ gram @ own)
+def _left(unit: Products, b: Array) -> float:
+    own = b[unit.place]
+    return float(unit.gram[0, 0] - 2 * own @ unit.gram[:, 0] + own @ unit.gram @ own)
 
 
 __all__ = ["Whole"]

@@ -229,12 +229,20 @@ def _own_gain(image: Tensor, plain: Tensor, use: Tensor, top: float = math.inf) 
     return gain
 
 
+def _albedo(image: Tensor, plain: Tensor, tells: Tensor) -> Tensor:
+    """(n, H, W) factors on the predicted brightness of every image by which its ground is brighter in the other images; 1 where none tells."""
+    across, power = image * plain * tells, plain.square() * tells
+    across, power = across.sum(0) - across, power.sum(0) - power
+    return torch.where(power > 0, across / power.clamp(min=1e-12), 1.0)
+
+
 def _clipped(
     state: State, images: Sequence[Tensor], masks: Sequence[Tensor], cls: type[Effect]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Squared relative residuals of every quarter of a site's ground, without and with the level of the other ground; their pixels.
 
-    Every image has its own gain, fitted to its other quarters where these are not cut off, for the law may be extrapolated to it.
+    Every image has its own gain, fitted to its other quarters where these are not cut off, for the law may be extrapolated to it, and the albedo that
+    the other images of its ground show: it is bright ground that is cut off.
     """
     quarters = [(k, rows) for k, x in enumerate(images) for rows in range(4)]
 
@@ -265,6 +273,8 @@ def _clipped(
         gain = _own_gain(images[k], predicted, elsewhere, top)
         # without the level an image that it cuts off as a whole is as bright as it looks
         without = torch.where(gain < ENDLESS, gain, _own_gain(images[k], predicted, elsewhere))
+        tells = part(k, quarter, masks[k]) & lit & (image < cls.keep_below * top) & (gain < ENDLESS)
+        plain = plain * _albedo(image, gain * plain, tells)
         both = [torch.where(lit, image - p, 0.0) / level for p in (without * plain, (gain * plain).clamp(max=top))]
         out.append([float(left.double().square().sum()) for left in both])
         count += float(lit.sum())

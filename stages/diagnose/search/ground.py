@@ -52,7 +52,8 @@ def by_ground(state: State) -> tuple[list[Named], set[str]]:
         percent = gain_interval(before, after)
         if excess.mean() - half > least and percent[1] > 0:
             value = math.sqrt(float(size[known].mean()))
-            error = math.hypot(half / student_quantile(len(excess) - 1) / (2 * value), math.sqrt(least))
+            ordinary = value - math.sqrt(max(value**2 - least, 0.0))  # is part of what was found, in quadrature
+            error = math.hypot(half / student_quantile(len(excess) - 1) / (2 * value), ordinary)
             first = cls.parameters[0]
             total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
             spread = abs(total) * (percent[2] - percent[1]) / (4 * percent[0])

@@ -9,7 +9,7 @@ import numpy as np
 from stages.diagnose.likelihood.found import Found, interval
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.search.doubts import ODD, ORDINARY
-from stages.diagnose.settings import DISCOVERY, SIMPLER
+from stages.diagnose.settings import DISCOVERY, LIKELIER, SIMPLER
 from stages.effects import get_effect
 
 UNSURE = "which these data do not prove"
@@ -23,14 +23,6 @@ def judge(whole: Whole, found: Found) -> None:
     found.gains, found.sizes = whole.held_out(whole.places(found.guise), without, found.spread), whole.sizes
     if get_effect(found.effect).lights_shadows:  # much ground has no shadow, and nothing to gain
         found.sizes = whole.power(whole.places(found.guise), found.amount)
-
-
-def shows_in_shade(whole: Whole, found: Found) -> bool:
-    """Whether deep shadow of held-out ground surely gains: what light there is asks neither the law nor the covariance of lit ground."""
-    if found.guise.per_frame:
-        return False
-    gains = whole.held_out(whole.places(found.guise), whole.exclude(found.guise), found.spread, shade=True)
-    return interval(gains, found.sizes)[0] > 0
 
 
 def choose(sure: list[Found], tried: Sequence[Found] = ()) -> tuple[Found, list[str]]:
@@ -63,7 +55,7 @@ def _as_good(found: Found, best: Found) -> bool:
 def stands_for(found: Found, other: Found) -> bool:
     """Whether one value for all explains the gains of the images, which other ground does not tell: they know there how bright each is."""
     cls = get_effect(other.effect)
-    return found.instead and found.p <= DISCOVERY and cls.scatters and not cls.displaces
+    return found.instead and found.odds > -LIKELIER and found.p <= DISCOVERY and cls.scatters and not cls.displaces
 
 
 def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refused: Mapping[str, str]) -> str:
@@ -72,6 +64,8 @@ def may_be_another(whole: Whole, found: Found, best: Mapping[str, Found], refuse
     def sure(gains: np.ndarray) -> bool:
         return interval(gains, found.sizes)[0] > 0
 
+    if found.odds < LIKELIER:
+        return "values of its own for each of so few images are nearly as likely"
     for other in [best[n] for n in get_effect(found.effect).confused_with if n in refused and n in best]:
         if refused[other.effect].startswith(ORDINARY):
             if not sure(whole.gains_beside(found, other)):
@@ -138,4 +132,4 @@ def another_law(whole: Whole, found: Found) -> str:
     return ""
 
 
-__all__ = ["another_law", "choose", "judge", "may_be_another", "shows_in_shade"]
+__all__ = ["another_law", "choose", "judge", "may_be_another"]

@@ -20,9 +20,9 @@ from stages.diagnose.search.doubts import (
 )
 from stages.diagnose.search.gains import secant_gains
 from stages.diagnose.search.refine import along, as_effect, errors_over_images, refine, settle, start_nearer
-from stages.diagnose.search.rivals import another_law, choose, judge, may_be_another, shows_in_shade
+from stages.diagnose.search.rivals import another_law, choose, judge, may_be_another
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.settings import DISCOVERY, FAINT, NOTABLE, SHAMS, TRIED, TRIES
+from stages.diagnose.settings import DISCOVERY, NOTABLE, SHAMS, TRIED, TRIES
 from stages.effects import Effect, get_effect
 
 PART_OF_A_LAW = "another law of the ground surely gains beside it, of which this is only a part"
@@ -123,9 +123,8 @@ def _weigh(state: State, view: View, refused: Mapping[str, str]) -> Weighed:
         if len(tried) == TRIED:
             break
     tried.sort(key=lambda f: -f.gain)
-    faint = FAINT**2 / 2 * float(view.whole.gram[0, 0])
-    sure = [f for f in tried if f.gain_interval()[0] > 0 and (f.gain > faint or shows_in_shade(view.whole, f))]
-    rejected |= {f.effect: (f.gain, _why_not_sure(f, faint)) for f in tried if f not in sure}
+    sure = [f for f in tried if f.gain_interval()[0] > 0]
+    rejected |= {f.effect: (f.gain, no_sure_gain(f.gain, *f.gain_interval())) for f in tried if f not in sure}
     return Weighed(best, tried, sure, rejected)
 
 
@@ -168,13 +167,6 @@ def _hiding(weighed: Weighed) -> set[str]:
     they may be refused: a blur below nothing comes to nothing once it is fitted within its bounds, and is all that a DEM which is too smooth looks like.
     """
     return {f.effect for f in weighed.best.values() if not f.guise.per_frame and beyond_bounds(f)}
-
-
-def _why_not_sure(found: Found, faint: float) -> str:
-    low, high = found.gain_interval()
-    if low > 0:
-        return f"too faint (it gains {found.gain:.0f} nats, less than the {faint:.0f} that errors of the law and of the covariance may gain in so many pixels)"
-    return no_sure_gain(found.gain, low, high)
 
 
 def no_sure_gain(gain: float, low: float, high: float) -> str:
