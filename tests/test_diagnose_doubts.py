@@ -82,6 +82,27 @@ def test_what_is_ordinary_explains_as_much_or_the_rival_is_refused():
     assert not refused([3, 4, 3, 4], small)
 
 
+def test_neither_gains_of_few_images_nor_what_they_follow_by_chance_has_a_name():
+    """One dependence on the Sun's azimuth and values of each image explain the same: what is likelier by a hundred has its name."""
+    turns = Guise("azimuthal_anisotropy", get_effect("azimuthal_anisotropy").trials(Survey())[0], (0,))
+    gains = Guise("image_gain", get_effect("image_gain").trials(Survey())[0], (1,), per_frame=True)
+
+    def refused(name, odds):
+        both = {g.effect: Found(g.effect, g, np.ones(1), np.ones(1), 9.0, p=0.01) for g in (turns, gains)}
+        both["azimuthal_anisotropy"].instead, both["azimuthal_anisotropy"].odds = True, odds
+        whole = _whole(
+            held_out=lambda places, *rest: np.array([10.0, 12, 9, 11]),
+            gains_beside=lambda found, other: np.array([5.0, 6, 5, 6]),
+        )
+        for found in both.values():
+            judge(whole, found)
+        return may_be_another(whole, both[name], both, {})
+
+    assert "so few images" in refused("azimuthal_anisotropy", 2.0) and not refused("azimuthal_anisotropy", 6.0)
+    assert "do not prove" in refused("image_gain", 2.0) and "do not prove" in refused("image_gain", -2.0)
+    assert not refused("image_gain", -6.0)
+
+
 def test_an_echo_explains_more_than_what_lies_on_the_other_side():
     """Optics and relief that the DEM has not are alike before and behind."""
     before, behind = (
