@@ -62,6 +62,15 @@ def test_what_images_have_on_the_same_columns_of_the_detector_is_seen_and_nothin
         assert seam(lines)[0] < LINE / 2 and bands(columns)[0] < LINE / 2
 
 
+def test_one_steep_image_is_no_seam():
+    """What shading under a low Sun leaves is steep in one image: a seam is there in several."""
+    every = left(3)
+    y, x = np.mgrid[0:SIZE, 0:SIZE]
+    one = every[7]
+    one.value[...] += torch.from_numpy(np.sin(x / 4.0) + np.sin(y / 5.0)).float()
+    assert seam(profiles(every, 1))[0] < LINE / 2
+
+
 def test_shares_are_those_of_the_squares():
     """A wave of amplitude a has half of a square in units of the noise's variance; a step of +-s a square of s beside it."""
     assert bands(profiles(left(5, waves=0.4), 0))[1] == pytest.approx(0.08 / 1.08, rel=0.25)

@@ -71,7 +71,7 @@ def seam(every: Sequence[Profile]) -> tuple[float, float]:
 
     A step that is the same in all images is a matter of the flat field.
     """
-    place, step, pixels = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)]
+    place, step, pixels, usual = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     for one in every:
         at = np.arange(SIDE, len(one.count) - SIDE + 1)
         total, count = (np.concatenate([[0.0], np.cumsum(x)]) for x in (one.total, one.count))
@@ -84,19 +84,26 @@ def seam(every: Sequence[Profile]) -> tuple[float, float]:
         place.append(one.first + at)
         step.append(away / np.sqrt(1 / left + 1 / right))
         pixels.append(left + right)
+        usual.append(np.full(len(at), max(float(np.median(np.abs(step[-1]))), 1e-9)))
     column, number = np.unique(np.concatenate(place), return_inverse=True)
     steps = np.concatenate(step)
     often = np.bincount(number, minlength=len(column))
-    mean = np.bincount(number, steps, len(column)) / np.maximum(often, 1)
-    scatter = np.bincount(number, (steps - mean[number]) ** 2, len(column)) / np.maximum(often - 1, 1)
     wide = np.bincount(number, np.concatenate(pixels), len(column)) / np.maximum(often, 1)
     known = often >= OFTEN
     if known.sum() < SIDE:
         return 0.0, 0.0
-    scatter, often, wide = scatter[known] / float(np.median(scatter[known])), often[known], wide[known]
-    chance = -chi2.logsf(scatter * (often - 1), often - 1) / math.log(10) - math.log10(len(often))
+
+    def scatter(x: Floats) -> Floats:
+        """Of every column, over that of the middle one."""
+        mean = np.bincount(number, x, len(column)) / np.maximum(often, 1)
+        out = np.bincount(number, (x - mean[number]) ** 2, len(column)) / np.maximum(often - 1, 1)
+        return out[known] / float(np.median(out[known]))
+
+    # one image under a low Sun, whose shading the covariance has not, would be a seam by itself wherever it is steepest
+    unlikely, squares, often, wide = scatter(steps / np.concatenate(usual)), scatter(steps), often[known], wide[known]
+    chance = -chi2.logsf(unlikely * (often - 1), often - 1) / math.log(10) - math.log10(len(often))
     top = int(chance.argmax())
-    return float(chance[top]), max(float((scatter[top] - 1) / wide[top]), 0.0)
+    return float(chance[top]), max(float((squares[top] - 1) / wide[top]), 0.0)
 
 
 def bands(every: Sequence[Profile]) -> tuple[float, float]:
