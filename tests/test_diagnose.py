@@ -354,8 +354,6 @@ def test_one_amount_for_all_images_stands_for_the_gains_that_it_explains():
 
 def test_one_amount_for_all_images_does_not_stand_for_gains_of_few():
     """A pattern of two amounts explains any gains of four images nearly: of twelve it does so only where they follow it."""
-    from types import SimpleNamespace
-
     from stages.diagnose.likelihood.weigh import odds_over_gains
     from stages.diagnose.likelihood.whole import Whole
     from stages.diagnose.settings import LIKELIER

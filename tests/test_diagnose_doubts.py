@@ -14,10 +14,9 @@ from stages.diagnose.likelihood.found import Found, beyond_bounds
 from stages.diagnose.likelihood.products import Products
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.registration.sunward import sunward
-from stages.diagnose.result.named import _with_ordinary
 from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.search import refine
-from stages.diagnose.search.doubts import ODD, ORDINARY, doubt
+from stages.diagnose.search.doubts import ODD, ORDINARY, doubt, with_ordinary
 from stages.diagnose.search.rivals import choose, judge, may_be_another
 from stages.diagnose.search.select import Weighed, _hiding, unlikely
 from stages.diagnose.search.state import Cause, State
@@ -345,9 +344,9 @@ def test_what_any_data_have_of_a_displacement_is_part_of_what_was_found(name):
     """In quadrature: of 0.5 px found beside an ordinary 0.3 are 0.4 hidden, and 0.1 is what it may be off by."""
     cls = get_effect(name)
     ordinary = cls.tolerance["rms_px"]
-    assert _with_ordinary(5 / 3 * ordinary, 0.0, cls) == pytest.approx(ordinary / 3)
-    assert _with_ordinary(100.0, 0.2, cls) == pytest.approx(0.2, rel=1e-2)
-    assert _with_ordinary(ordinary / 2, 0.0, cls) == pytest.approx(ordinary / 2)  # all of it may be ordinary
+    assert with_ordinary(5 / 3 * ordinary, 0.0, cls) == pytest.approx(ordinary / 3)
+    assert with_ordinary(100.0, 0.2, cls) == pytest.approx(0.2, rel=1e-2)
+    assert with_ordinary(ordinary / 2, 0.0, cls) == pytest.approx(ordinary / 2)  # all of it may be ordinary
 
 
 @pytest.mark.parametrize(("gain", "rendered"), [(1100.0, True), (900.0, False)])

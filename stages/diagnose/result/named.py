@@ -19,6 +19,7 @@ from stages.diagnose.registration.registered import Registration, shifted_frames
 from stages.diagnose.registration.squares import OWN
 from stages.diagnose.registration.sunward import sunward
 from stages.diagnose.result.answer import Named
+from stages.diagnose.search.doubts import with_ordinary
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import CORRELATED, ROUNDS
 from stages.effects import Effect, Survey, effect_names, get_effect
@@ -100,7 +101,7 @@ def _leaning(state: State, r: Registration, name: str) -> tuple[Named | None, st
     if not r.form.leaning or not lean > 0:
         return None, ""
     effect = get_effect(name)({"share": r.share}, state.data)
-    error = _with_ordinary(abs(r.share) * lean, r.share_error * lean, type(effect))
+    error = with_ordinary(abs(r.share) * lean, r.share_error * lean, type(effect))
     parameters = {"share": (r.share, error / lean, "1"), "rms_px": (abs(r.share) * lean, error, "px")}
     plain = r.form.upright
     compared = (plain.name, r.form.name)
@@ -117,7 +118,7 @@ def _lines(state: State, r: Registration, name: str) -> tuple[Named | None, str]
     amounts = r.lines.over_the_crop(state.sites, state.frames)
     effect = cls({p.name: amounts[:, k] for k, p in enumerate(cls.fitted())}, state.data)
     compared, size = (STEADY, TREMBLING), r.lines.rms
-    made = _named(effect, {"rms_px": (size, _with_ordinary(size, r.lines.error, cls), "px")}, r, *compared)
+    made = _named(effect, {"rms_px": (size, with_ordinary(size, r.lines.error, cls), "px")}, r, *compared)
     return made, r.doubt(*compared, compared)
 
 
@@ -158,13 +159,7 @@ def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str
         return None, ""
     if not why and sunward(r.mean_shifts(state.sites, r.fitted[form][0]), state.sites):
         why = "albedo that follows the ground's curvature looks the same: shifts along the Sun's azimuth that grow with the tangent of its elevation"
-    return _named(effect, {"rms_px": (size, _with_ordinary(size, error, cls), "px")}, r, first, form, frames), why
-
-
-def _with_ordinary(size: float, error: float, cls: type[Effect]) -> float:
-    """Error of an rms displacement; what any data have of it is part of what was found, in quadrature."""
-    without = math.sqrt(max(size**2 - cls.tolerance["rms_px"] ** 2, 0.0))
-    return math.hypot(error, size - without)
+    return _named(effect, {"rms_px": (size, with_ordinary(size, error, cls), "px")}, r, first, form, frames), why
 
 
 def _ordinary(size: float, error: float, cls: type[Effect]) -> bool:

@@ -60,6 +60,12 @@ def as_ordinary(name: str, size: float, least: float, error: float = math.nan) -
     return f"{ORDINARY} ({name} = {found}; any data may have {least:.2g})"
 
 
+def with_ordinary(size: float, error: float, cls: type[Effect]) -> float:
+    """Error of the rms of an effect; what any data have of it is part of what was found, in quadrature."""
+    without = math.sqrt(max(size**2 - max(cls.tolerance.values(), default=0.0) ** 2, 0.0))
+    return math.hypot(error, size - without)
+
+
 def impossible(effect: Effect) -> str:
     """The reason that an effect's values cannot be."""
     values = ", ".join(f"{k} = {float(v):.3g}" for k, v in effect.values.items())
@@ -130,4 +136,5 @@ __all__ = [
     "doubt_any",
     "impossible",
     "ordinary",
+    "with_ordinary",
 ]

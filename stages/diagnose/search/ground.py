@@ -19,6 +19,7 @@ from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.result.answer import Named
 from stages.diagnose.rows.patches import judged
+from stages.diagnose.search.doubts import with_ordinary
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import CORRELATED
 from stages.effects import Effect, effect_names, get_effect
@@ -52,8 +53,7 @@ def by_ground(state: State) -> tuple[list[Named], set[str]]:
         percent = gain_interval(before, after)
         if excess.mean() - half > least and percent[1] > 0:
             value = math.sqrt(float(size[known].mean()))
-            ordinary = value - math.sqrt(max(value**2 - least, 0.0))  # is part of what was found, in quadrature
-            error = math.hypot(half / student_quantile(len(excess) - 1) / (2 * value), ordinary)
+            error = with_ordinary(value, half / student_quantile(len(excess) - 1) / (2 * value), cls)
             first = cls.parameters[0]
             total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
             spread = abs(total) * (percent[2] - percent[1]) / (4 * percent[0])
