@@ -102,6 +102,7 @@ PLANTS: dict[str, dict[str, Any]] = {
         ),
         "effect": "column_pattern",
     },
+    "film that varies by 4 %": {"do": lambda f: _developed(f, 0.04), "effect": "frame_field", "is": ("rms", 0.04)},
     "echo of 10 % at 6 px": {
         "do": lambda f: _images(f, lambda x, _: x + 0.1 * shift(x, (0, 6), order=1, mode="nearest")),
         "effect": "echo",
@@ -112,6 +113,19 @@ PLANTS: dict[str, dict[str, Any]] = {
         "effect": "saturation",
     },
 }
+
+
+def _developed(file: h5py.File, rms: float) -> None:
+    """Every crop of a frame has a broad wave of its own, 1.5 to 3 crops long, with this rms in the crop."""
+    rng = np.random.default_rng(17)
+
+    def wave(x: np.ndarray, _: int) -> np.ndarray:
+        rows, columns = np.indices(x.shape) / x.shape[0]
+        angle, phase, cycles = *rng.uniform(0, 2 * np.pi, 2), rng.uniform(1 / 3, 2 / 3)
+        field = np.cos(2 * np.pi * cycles * (columns * np.cos(angle) + rows * np.sin(angle)) + phase)
+        return x * (1 + rms * (field - field.mean()) / field.std())
+
+    _images(file, wave)
 
 
 def _clip(file: h5py.File, percent: float) -> None:

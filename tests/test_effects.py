@@ -50,7 +50,7 @@ def _values(cls, trial, factor: float = 1.0) -> dict:
     for column in trial.columns:
         values |= {k: cls.null()[k] + factor * (v - cls.null()[k]) for k, v in column.items()}
     if cls.scope != "scene":
-        values = {k: torch.full((2,), float(v)) for k, v in values.items()}
+        values = {k: torch.full((2, 2) if cls.scope == "pair" else (2,), float(v)) for k, v in values.items()}
     return values
 
 

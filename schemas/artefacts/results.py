@@ -92,9 +92,9 @@ DIAGNOSIS = declare(
             ),
             _value(
                 "frame_field",
-                ("frame", "field_term"),
+                ("frame", "site", "field_term"),
                 "1",
-                "frame_field: amplitudes of low cosines over a crop, relative to the response",
+                "frame_field: amplitudes of low cosines over each crop of a frame, relative to the response; 0 for crops not looked at",
             ),
             _value("image_gain", ("frame",), "1", "image_gain: relative gain of the image"),
             _value(

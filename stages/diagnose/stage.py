@@ -39,6 +39,7 @@ from stages.diagnose.result.score import (
 )
 from stages.diagnose.search.doubts import doubt_all
 from stages.diagnose.search.ground import by_ground
+from stages.diagnose.search.own import by_images
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, search
 from stages.diagnose.search.shadows import by_shadows, contradicted
@@ -181,8 +182,9 @@ def _fill(
     if clipped:
         left.pop(PILED, None)
     ground, shown = by_ground(state)
+    fields, fields_shown = by_images(state)
     shaded, extended, contrary = _by_shadows(state)
-    answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + [*shaded] + ground
+    answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + [*shaded] + ground + fields
     answer.held_out = score(state, answer, extended)
     # albedo that follows relief, of which nobody is sure, looks like a shift
     if placed and contradicts(answer.held_out.high):
@@ -198,7 +200,9 @@ def _fill(
     # what a better law or registration took away is no cause where none is named
     answer.budget = budget(view.rows, view.model, view.grid, before if answer.causes else after, after)
     answer.structure = left
-    answer.blind = blind_effects(state, outcome, shown | ordinary | {c.effect.name for c in answer.causes})
+    answer.blind = blind_effects(
+        state, outcome, shown | fields_shown | ordinary | {c.effect.name for c in answer.causes}
+    )
     answer.unexplained_fraction = max(answer.structure.values(), default=0.0)
     if not answer.causes and outcome.sure:
         answer.unexplained_fraction = max(answer.unexplained_fraction, 0.01)

@@ -14,8 +14,8 @@ from schemas.errors import ConfigError, RegistryError
 from stages.physics.formation.chain import SLOTS, State
 from stages.physics.photometry import Parameter
 
-SCOPES = ("scene", "image", "site")
-Values = dict[str, Any]  # coordinate -> float (scene), or tensor (frames,) or (sites,)
+SCOPES = ("scene", "image", "site", "pair")
+Values = dict[str, Any]  # coordinate -> float (scene), or tensor (frames,), (sites,) or (frames, sites)
 
 
 @dataclass
@@ -65,7 +65,8 @@ class Effect(ABC):
     """Base of every effect. Subclasses fill the class attributes and ``apply``; the default trial is one per parameter.
 
     slot            where in the chain it acts: geometry, illumination, reflectance, radiance or sensor
-    scope           'scene': one set of values; 'image': one per source image; 'site': one per ground site
+    scope           'scene': one set of values; 'image': one per source image; 'site': one per ground site; 'pair': one per
+                    image of a site
     parameters      what the report gives; ``default`` is the null value
     coordinates     what is fitted, where that is not the parameters themselves
     strong          coordinate -> a size that anybody would want to be told about: data that cannot show it are blind to the effect
@@ -208,6 +209,15 @@ class Effect(ABC):
         return None
 
     @classmethod
+    def read_off_image(cls, own: Tensor, seen: Tensor) -> tuple[Values, Tensor, Tensor] | None:
+        """(values per image, size^2, size^2 that goes with its finer waves) of an effect that shows in what an image has of its own, or None.
+
+        own, seen : (images, H, W) relative to the prediction, less what other images of the place show, and 1 where it is known;
+            both sizes are (images,)
+        """
+        return None
+
+    @classmethod
     def plausible(cls, values: Mapping[str, float], survey: Survey) -> bool:
         """Whether anything real has these values; a fit that ends elsewhere stands for something else."""
         return all(abs(values[name]) < size for name, size in cls.largest.items())
@@ -239,16 +249,18 @@ class Effect(ABC):
         """Change what the slot may change (see ``formation.State``), differentiable in the values."""
 
     def value(self, name: str, state: State) -> Tensor:
-        """A coordinate ready to multiply images: scalar, or (B, 1, 1) by image or site; null where not known."""
+        """A coordinate ready to multiply images: scalar, or (B, 1, 1) by image, site or both; null where not known."""
         given = self.values[name]
         like = state.elevation
         if not isinstance(given, Tensor) or given.ndim == 0:
             return torch.as_tensor(given, dtype=like.dtype, device=like.device)
-        index = state.observation.frame if self.scope == "image" else state.observation.site
-        if index is None:
+        numbers = {"image": ["frame"], "site": ["site"], "pair": ["frame", "site"]}[self.scope]
+        indices = [i for i in (getattr(state.observation, n) for n in numbers) if i is not None]
+        if len(indices) < given.ndim:
             return torch.as_tensor(self.null()[name], dtype=like.dtype, device=like.device)
-        known = (index >= 0) & (index < len(given))
-        picked = given.to(like)[index.clamp(0, len(given) - 1)]
+        inside = [(i >= 0) & (i < count) for i, count in zip(indices, given.shape, strict=True)]
+        known = torch.stack(inside).all(0)
+        picked = given.to(like)[tuple(i.clamp(0, count - 1) for i, count in zip(indices, given.shape, strict=True))]
         return torch.where(known, picked, torch.full_like(picked, self.null()[name]))[:, None, None]
 
 

@@ -47,7 +47,7 @@ def _effects(
     effects = []
     for entry in entries:
         cls = get_effect(entry["effect"])
-        if cls.scope == "site":
+        if cls.scope in ("site", "pair"):
             continue  # a pattern of the diagnosed ground says nothing about other ground
         values = {name: _finite(value) for name, value in entry["values"].items()}
         for coordinate, table in entry.get("tables", {}).items():

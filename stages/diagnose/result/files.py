@@ -22,6 +22,10 @@ def write_diagnosis(
     tables: dict[str, Any] = {}
     shared: dict[str, list[tuple[str, Tensor]]] = {"frame": [], "site": []}  # columns of effects without a variable
     sizes = {"frame": len(image_ids)}
+    sites = max(
+        (v.shape[-1] for c in answer.causes if c.effect.scope in ("site", "pair") for v in c.effect.values.values()),
+        default=0,
+    )
     for cause in answer.causes:
         effect = cause.effect
         entry: dict[str, Any] = {"effect": effect.name, "survey": effect.survey.to_json(), "values": {}}
@@ -36,21 +40,26 @@ def write_diagnosis(
             }
         else:
             variable, second = effect.table
-            data = torch.stack([torch.as_tensor(v) for v in effect.values.values()], 1).float().numpy()
-            tables[variable] = data if second else data[:, 0]
+            data = torch.stack([torch.as_tensor(v) for v in effect.values.values()], -1).float()
+            if effect.scope in ("site", "pair"):
+                sizes["site"] = sites
+                data = torch.nn.functional.pad(data, (0, 0, 0, sites - data.shape[-2]))
+            if (
+                effect.scope == "pair"
+            ):  # nothing is known of the last images where they are of sites that were not looked at
+                data = torch.nn.functional.pad(data, (0, 0, 0, 0, 0, len(image_ids) - len(data)))
+            tables[variable] = (data if second else data[..., 0]).numpy()
             entry["tables"] = {k: {"variable": variable, "column": j} for j, k in enumerate(effect.values)}
             if second:
-                sizes[second] = data.shape[1]
-            if effect.scope == "site":
-                sizes["site"] = len(data)
+                sizes[second] = data.shape[-1]
         for variable, (curve, dimension) in effect.curves().items():
             tables[variable], sizes[dimension] = curve, len(curve)
         entries.append(entry)
     for kind, columns in shared.items():
         if columns:
-            data = torch.stack(torch.broadcast_tensors(*(values for _, values in columns)), 1).numpy()
-            tables[f"{kind}_values"], tables[f"{kind}_value_name"] = data, [name for name, _ in columns]
-            sizes |= {kind: len(data), f"{kind}_value": len(columns)}
+            values = torch.stack(torch.broadcast_tensors(*(values for _, values in columns)), 1).numpy()
+            tables[f"{kind}_values"], tables[f"{kind}_value_name"] = values, [name for name, _ in columns]
+            sizes |= {kind: len(values), f"{kind}_value": len(columns)}
     attributes = {"report": json.dumps(answer.to_json()), "extension": json.dumps(entries)}
     with ArtefactWriter(
         path, DIAGNOSIS, sizes, config=answer.config, inputs=inputs, attributes=attributes, overwrite=overwrite

@@ -25,6 +25,7 @@ from stages.diagnose.settings import CORRELATED
 from stages.effects import Effect, effect_names, get_effect
 
 PARTS = 2  # of a site's images: what is read off from one is judged on the other
+WHOLE = 0.9  # of a crop: holes tear texture up, and what is torn has no spectrum
 
 
 def by_ground(state: State) -> tuple[list[Named], set[str]]:
@@ -34,7 +35,7 @@ def by_ground(state: State) -> tuple[list[Named], set[str]]:
     shown: set[str] = set()
     if len(chains) < 3:  # no interval
         return out, shown
-    left = per_site(_relative, chains)
+    left = per_site(relative, chains)
     for name in effect_names():
         cls = get_effect(name)
         whole = _read_off(cls, left, [slice(None)])
@@ -64,7 +65,7 @@ def by_ground(state: State) -> tuple[list[Named], set[str]]:
     return out, shown
 
 
-def _relative(chain: Chain) -> tuple[Tensor, Tensor]:
+def relative(chain: Chain) -> tuple[Tensor, Tensor]:
     """(n, H, W) residual over the prediction on fully lit ground, 0 elsewhere, and what it weighs there: the inverse of an image's variance."""
     lit, _ = judged(chain)
     residual = torch.where(lit, chain.site.image / chain.predict().clamp(min=1e-6) - 1, 0.0)
@@ -81,7 +82,12 @@ def _read_off(cls: type[Effect], left: Sequence[tuple[Tensor, Tensor]], parts: S
         total = weight[some].sum(0)
         maps.append((residual * weight)[some].sum(0) / total.clamp(min=1e-9))
         seen.append((total > 0).float())
-    return cls.read_off_ground(torch.stack(maps), torch.stack(seen))
+    found = cls.read_off_ground(torch.stack(maps), torch.stack(seen))
+    if found is None:
+        return None
+    values, size, usual = found
+    whole = torch.stack(seen).mean((-2, -1)) > WHOLE
+    return {k: torch.where(whole, v, 0.0) for k, v in values.items()}, torch.where(whole, size, torch.nan), usual
 
 
 def _of_sites(cls: type[Effect], values, state: State, chains: Sequence[Chain]) -> Effect:
@@ -110,4 +116,4 @@ def _on_other_images(
     return before, after, max(pixels, 1.0)
 
 
-__all__ = ["by_ground"]
+__all__ = ["WHOLE", "by_ground", "relative"]

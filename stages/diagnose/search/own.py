@@ -1,0 +1,170 @@
+"""What an image has of its own beside the other images of its place tells of its frame: patterns too broad for relief.
+
+Errors of the DEM and of the law are an image's own, too, and broad where they are large. They have finer waves as well, and more of both where shading
+is strong. So the broad power of every image is compared with that of its finer waves: what it has where there is nothing finer than noise is the frame's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stages.common.intervals import student_quantile
+from stages.diagnose.likelihood.jackknife import folds, gain_chance, gain_interval, jackknife_error, nats
+from stages.diagnose.model.chain import Chain
+from stages.diagnose.model.parallel import per_site
+from stages.diagnose.result.answer import Named
+from stages.diagnose.search.doubts import with_ordinary
+from stages.diagnose.search.ground import WHOLE, relative
+from stages.diagnose.search.state import State
+from stages.diagnose.settings import CELL, CORRELATED, ROUNDS
+from stages.effects import Effect, effect_names, get_effect
+from stages.effects.base import Survey, Values
+
+FEWEST = 6  # images of places: of fewer, the broad power that goes with finer waves is not known
+
+
+@dataclass
+class Own:
+    """Images of one site that show nearly all of the crop: what each has of its own beside the others, and where it is known, 1 or 0, (n, H, W);
+
+    number : (n,) of each among the site's images; share : (n,) of their broad power that does not go with finer waves
+    """
+
+    chain: Chain
+    number: Tensor
+    left: Tensor
+    seen: Tensor
+    share: Tensor
+
+    @property
+    def frames(self) -> NDArray[np.int64]:
+        """(n,) of the whole data set."""
+        return self.chain.site.frames[self.number.numpy()]
+
+
+def by_images(state: State) -> tuple[list[Named], set[str]]:
+    """Causes that show in what each image has of its own, and the effects that would show in it at a size worth knowing."""
+    out: list[Named] = []
+    shown: set[str] = set()
+    classes = [c for c in map(get_effect, effect_names()) if c.scope == "pair" and c.visible(state.data, state.has)]
+    sites = _own(state) if classes else []
+    if sum(len(site.number) for site in sites) < FEWEST:
+        return out, shown
+    frames = np.concatenate([site.frames for site in sites])
+    for cls in classes:
+        read = [cls.read_off_image(site.left, site.seen) for site in sites]
+        found = [x for x in read if x is not None]
+        if not found:
+            continue
+        # the others' mean, which was taken away, has a share of theirs
+        power = np.concatenate([(1 - 1 / s.chain.site.count) * x[1].numpy() for s, x in zip(sites, found, strict=True)])
+        finer = np.concatenate([x[2].numpy() for x in found])
+        size, error, freedom, share = without_finer(power, finer, frames)
+        half = student_quantile(freedom) * error
+        least = max(cls.tolerance.values(), default=0.0) ** 2
+        if half + least < cls.size(cls.strong) ** 2:
+            shown.add(cls.name)
+        if size - half <= least:
+            continue
+        ends = np.cumsum([len(site.number) for site in sites])
+        for site, part in zip(sites, np.split(share, ends[:-1]), strict=True):
+            site.share = torch.from_numpy(part).float()
+        was, now, pixels = _on_other_ground(cls, sites, state.data)
+        after = pixels * now / was  # weighted by the inverse of an image's variance
+        percent = gain_interval(pixels, after)
+        if not percent[1] > 0:
+            continue
+        value, first = math.sqrt(size), cls.parameters[0]
+        total = nats(float(pixels.sum()), float(after.sum()), float(pixels.sum()), CORRELATED)
+        spread = abs(total) * (percent[2] - percent[1]) / (4 * percent[0])
+        before, beside = (math.sqrt(float(x.sum() / pixels.sum())) for x in (was, now))
+        parameters = {first.name: (value, with_ordinary(value, error / (2 * value), cls), first.unit)}
+        effect = cls(_tables(sites, [x[0] for x in found]), state.data)
+        chance = gain_chance(pixels, after)
+        out.append(Named(effect, parameters, chance, total, spread, before, beside, percent, [cls.name]))
+    return out, shown
+
+
+def without_finer(power: NDArray, finer: NDArray, frame: NDArray) -> tuple[float, float, int, NDArray]:
+    """Mean power (N,) of images beside what goes with that of their finer waves; its standard error over frames, and the degrees of freedom of that;
+
+    and the share of it in each image's power, (N,).
+
+    A straight line, never falling, whose scatter goes with its height (gamma regression), read where there is least of the finer waves: that is noise.
+    """
+    least = float(np.quantile(finer, 1 / FEWEST))
+
+    def at_least(kept: NDArray) -> tuple[float, float]:
+        x, y = finer[kept] - least, power[kept]
+        height = finer[kept]
+        for _ in range(ROUNDS):
+            w = height**-2.0
+            middle, mean = np.average(x, weights=w), np.average(y, weights=w)
+            apart = x - middle
+            slope = max(float((w * apart * y).sum() / max((w * apart**2).sum(), 1e-300)), 0.0)
+            height = np.maximum(mean + slope * apart, 0.1 * mean)
+        return float(mean - slope * middle), slope
+
+    # images of three frames may be of thirty places
+    unit = np.unique(frame, return_inverse=True)[1] if len(np.unique(frame)) >= FEWEST else np.arange(len(frame))
+    part = folds(int(unit.max()) + 1)[unit]
+    parts = np.unique(part)
+    error = float(jackknife_error(np.array([at_least(part != k)[0] for k in parts])))
+    size, slope = at_least(np.ones(len(power), bool))
+    share = size / np.maximum(size + slope * np.maximum(finer - least, 0.0), 1e-300)
+    return size, error, len(parts) - 1, np.clip(share, 0.0, 1.0)
+
+
+def _own(state: State) -> list[Own]:
+    """Of every site that several images show."""
+    chains = [c for c in state.chains() if c.site.count > 1]
+    out = []
+    for chain, (left, weight) in zip(chains, per_site(relative, chains), strict=True):
+        others = weight.sum(0) - weight
+        mean = ((left * weight).sum(0) - left * weight) / others.clamp(min=1e-9)
+        seen = (weight > 0) & (others > 0)
+        whole = torch.nonzero(seen.float().mean((-2, -1)) > WHOLE)[:, 0]
+        if len(whole):
+            own = torch.where(seen, left - mean, 0.0)
+            out.append(Own(chain, whole, own[whole], seen[whole].float(), torch.ones(len(whole))))
+    return out
+
+
+def _tables(sites: Sequence[Own], values: Sequence[Values]) -> Values:
+    """Coordinate -> likeliest values by frame and site, (frames, sites): without what goes with finer waves."""
+    shape = [max(int(s.frames.max()) for s in sites) + 1, max(s.chain.site.number for s in sites) + 1]
+    tables = {name: torch.zeros(shape) for name in values[0]}
+    for site, found in zip(sites, values, strict=True):
+        for name, value in found.items():
+            tables[name][torch.from_numpy(site.frames), site.chain.site.number] = site.share * value
+    return tables
+
+
+def _on_other_ground(cls: type[Effect], sites: Sequence[Own], data: Survey) -> tuple[NDArray, NDArray, NDArray]:
+    """Squares of every image without the effect, and with what the other squares of a chessboard say of it; its pixels."""
+    out = []
+    for site in sites:
+        height, width = site.seen.shape[-2:]
+        board = (torch.arange(height)[:, None] // (2 * CELL) + torch.arange(width) // (2 * CELL)) % 2
+        sums = torch.zeros(3, len(site.number), dtype=torch.float64)
+        for colour in (0, 1):
+            here = site.seen * (board == colour)
+            found = cls.read_off_image(site.left, site.seen - here)
+            assert found is not None
+            more = site.chain.render(cls(_tables([site], [found[0]]), data)) / site.chain.render().clamp(min=1e-6) - 1
+            left = site.left - more[site.number]
+            each = [site.left.double().square() * here, left.double().square() * here, here.double()]
+            sums += torch.stack([x.sum((-2, -1)) for x in each])
+        out.append(sums.numpy())
+    was, now, pixels = np.concatenate(out, 1).astype(np.float64)
+    return np.maximum(was, 1e-30), now, pixels
+
+
+__all__ = ["by_images", "without_finer"]
