@@ -159,6 +159,18 @@ def test_a_column_of_a_frame_adds_its_own_mean(turn_deg, axis):
     assert not smear.plausible({"share": 0.1, "axis": -1.0}, smear.survey)
 
 
+@pytest.mark.parametrize(
+    ("turn_deg", "mirror", "flipped"), [(30.0, 0, (-2, -1)), (0.0, 1, (-1,)), (90.0, 1, (-2,)), (0.0, 2, (-2,))]
+)
+def test_a_ghost_is_the_image_mirrored_and_out_of_focus(turn_deg, mirror, flipped):
+    state = _exposed(_detector(turn_deg))
+    state.image = plain = torch.rand(2, 32, 32, generator=torch.Generator().manual_seed(3))
+    effect = get_effect("ghost")({"share": 0.1, "mirror": float(mirror)})
+    effect.apply(state)
+    torch.testing.assert_close(state.image, plain + 0.1 * gaussian(plain.flip(flipped), 4.0), atol=2e-4, rtol=0)
+    assert effect.plausible({"share": 0.1}, effect.survey) and not effect.plausible({"share": -0.1}, effect.survey)
+
+
 def test_wings_of_optics_fall_with_the_cube_of_the_distance():
     """A point's light, all but the 3 % beyond the crop; where a law is fitted to lit ground the dark alone tells."""
     size, core = 256, 4.0
