@@ -38,8 +38,8 @@ from stages.diagnose.result.score import (
     unconfirmed,
 )
 from stages.diagnose.search.doubts import doubt_all
+from stages.diagnose.search.frames import by_images
 from stages.diagnose.search.ground import by_ground
-from stages.diagnose.search.own import by_images
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.select import Outcome, search
 from stages.diagnose.search.shadows import by_shadows, contradicted

@@ -13,7 +13,7 @@ from hidden.terrain import red_noise
 
 from stages.diagnose.result.answer import Answer, Named
 from stages.diagnose.result.files import write_diagnosis
-from stages.diagnose.search import ground, own
+from stages.diagnose.search import frames, ground
 from stages.effects import Survey, get_effect
 
 SIZE, IMAGES = 64, 5
@@ -27,12 +27,14 @@ def test_broad_power_that_grows_with_finer_power_is_taken_off():
     finer = 1e-4 * (1 + 50 * rng.uniform(0, 1, 40) ** 4)  # noise, and what relief adds where shading is strong
     for constant in (0.0, 6e-4):
         power = (0.4 * (finer - 1e-4) + constant) * rng.lognormal(0, 0.2, 40)
-        size, error, freedom, share = own.without_finer(power, finer, frame)
+        size, error, freedom, share = frames.without_finer(power, finer, frame)
         assert size == pytest.approx(constant, abs=max(3 * error, 3e-5)) and freedom == 9
         assert share[finer.argmax()] == pytest.approx(
             constant / (constant + 0.4 * (finer.max() - finer.min())), abs=0.1
         )
-    assert own.without_finer(power, finer, frame % 3)[2] == 15  # of three frames the images are asked, not the frames
+    assert (
+        frames.without_finer(power, finer, frame % 3)[2] == 15
+    )  # of three frames the images are asked, not the frames
 
 
 def _chain(number: int, field: float, relief: float, rng):
@@ -48,17 +50,17 @@ def _chain(number: int, field: float, relief: float, rng):
         )
     image = torch.from_numpy(np.array(images)).float()
     plain = torch.full_like(image, 0.05)
-    frames = np.arange(IMAGES) + (number % 2) * IMAGES
+    numbers = np.arange(IMAGES) + (number % 2) * IMAGES
 
     def render(effect=None):
         state = SimpleNamespace(
-            elevation=plain, image=plain, observation=SimpleNamespace(frame=torch.from_numpy(frames), site=torch.full((IMAGES,), number))
+            elevation=plain, image=plain, observation=SimpleNamespace(frame=torch.from_numpy(numbers), site=torch.full((IMAGES,), number))
         )  # fmt: skip
         if effect is not None:
             effect.apply(state)
         return state.image
 
-    site = SimpleNamespace(count=IMAGES, number=number, image=image, frames=frames)
+    site = SimpleNamespace(count=IMAGES, number=number, image=image, frames=numbers)
     return SimpleNamespace(site=site, predict=lambda: plain, render=render)
 
 
@@ -69,13 +71,13 @@ def test_a_field_of_every_frame_is_named_and_relief_is_not(monkeypatch, field, r
     monkeypatch.setattr(ground, "judged", lambda chain: (lit, ~lit))
     chains = [_chain(k, field, relief, rng) for k in (0, 2, 3, 5)]
     state = SimpleNamespace(chains=lambda: chains, data=Survey(units="dn"), has=frozenset())
-    named, shown = own.by_images(state)
+    named, shown = frames.by_images(state)
     assert [c.effect.name for c in named] == (["frame_field"] if field else []) and shown == {"frame_field"}
     if field:
         value, error, _ = named[0].parameters["rms"]
         assert abs(value - field) < 3 * error and error < 0.008 and named[0].percent[1] > 0
     state.data = Survey(units="iof")
-    assert own.by_images(state) == ([], set())
+    assert frames.by_images(state) == ([], set())
 
 
 def test_values_per_image_of_a_site_are_written_and_act_on_that_crop_alone(tmp_path):
