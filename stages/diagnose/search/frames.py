@@ -99,6 +99,7 @@ def without_finer(power: NDArray, finer: NDArray, frame: NDArray) -> tuple[float
 
     A straight line, never falling, whose scatter goes with its height (gamma regression), read where there is least of the finer waves: that is noise.
     """
+    finer = np.maximum(finer, 1e-12)
     least = float(np.quantile(finer, 1 / FEWEST))
 
     def at_least(kept: NDArray) -> tuple[float, float]:
