@@ -25,7 +25,7 @@ def left(seed: int, **faults: float) -> list[Innovation]:
     y, x = np.mgrid[0:SIZE, 0:SIZE].astype(float)
     flat = np.random.default_rng(1).normal(0, 1, WIDE + SIZE)
     out = []
-    for _ in range(PIECES):
+    for piece in range(PIECES):
         turn = np.radians(rng.uniform(-4, 4))
         sample = 4 + rng.uniform(0, WIDE - SIZE) + x * np.cos(turn) - y * np.sin(turn)
         line = 4 + rng.uniform(0, 4000) + x * np.sin(turn) + y * np.cos(turn)
@@ -36,7 +36,7 @@ def left(seed: int, **faults: float) -> list[Innovation]:
         value += faults.get("pattern", 0.0) * flat[np.clip(np.round(sample).astype(int), 0, len(flat) - 1)]
         detector = torch.from_numpy(np.stack([line, sample]))[None].float()
         seen = torch.ones(1, SIZE, SIZE, dtype=torch.bool)
-        out.append(Innovation(SimpleNamespace(), torch.from_numpy(value)[None].float(), seen, detector))
+        out.append(Innovation(SimpleNamespace(site=piece // 4), torch.from_numpy(value)[None].float(), seen, detector))
     return out
 
 
@@ -77,3 +77,13 @@ def test_shares_are_those_of_the_squares():
     near = seam(profiles(left(5, steps=0.4), 1))[1]
     assert near == pytest.approx(0.16, rel=0.5)
     assert seam([])[1] == bands([])[1] == columns_that_stand_out([])[1] == 0.0
+
+
+def test_steps_of_one_ground_are_no_seam():
+    """Pieces of one ground that lie at the same place of the detector show the same step of it, however many images there are."""
+    every = left(4)
+    rng = np.random.default_rng(9)
+    for one in every[8:12]:
+        one.value[...] += 1.5 * rng.choice([-1, 1]) * torch.sign(one.detector[:, 1] - 101.5)
+    assert {one.patch.site for one in every[8:12]} == {2}
+    assert seam(profiles(every, 1))[0] < LINE / 2

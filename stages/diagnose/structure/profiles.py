@@ -32,12 +32,13 @@ FIRST = (
 @dataclass
 class Profile:
     """Of one piece of ground in one image. first : number of the first column; total, count : (L,) sum of what is left, in standard deviations,
-    and number of its pixels
+    and number of its pixels; site : number of the ground
     """
 
     first: int
     total: Floats
     count: Floats
+    site: int
 
     @property
     def columns(self) -> np.ndarray:
@@ -62,16 +63,17 @@ def profiles(every: Sequence[Innovation], axis: int) -> list[Profile]:
             first = int(place.min())
             count = torch.bincount(place - first).double()
             total = torch.bincount(place - first, value[known].double(), len(count))
-            out.append(Profile(first, total.numpy(), count.numpy()))
+            out.append(Profile(first, total.numpy(), count.numpy(), one.patch.site))
     return out
 
 
 def seam(every: Sequence[Profile]) -> tuple[float, float]:
     """-log10 of the chance that steps, of whatever sign, scatter so much more on one column than on the others, and their share of the squares there.
 
-    A step that is the same in all images is a matter of the flat field.
+    A step that is the same in all images is a matter of the flat field, and what images of one ground alone have is the ground's.
     """
     place, step, pixels, usual = [np.zeros(0, np.int64)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    ground = [np.zeros(0, np.int64)]
     for one in every:
         at = np.arange(SIDE, len(one.count) - SIDE + 1)
         total, count = (np.concatenate([[0.0], np.cumsum(x)]) for x in (one.total, one.count))
@@ -84,24 +86,38 @@ def seam(every: Sequence[Profile]) -> tuple[float, float]:
         place.append(one.first + at)
         step.append(away / np.sqrt(1 / left + 1 / right))
         pixels.append(left + right)
+        ground.append(np.full(len(at), one.site))
         usual.append(np.full(len(at), max(float(np.median(np.abs(step[-1]))), 1e-9)))
     column, number = np.unique(np.concatenate(place), return_inverse=True)
     steps = np.concatenate(step)
     often = np.bincount(number, minlength=len(column))
     wide = np.bincount(number, np.concatenate(pixels), len(column)) / np.maximum(often, 1)
-    known = often >= OFTEN
+    site = np.concatenate(ground)
+    sites = int(site.max(initial=0)) + 1
+    cell = number * sites + site
+    of_site = np.bincount(cell, minlength=len(column) * sites).reshape(-1, sites)
+    known = (often >= OFTEN) & ((of_site > 0).sum(1) > 2)
     if known.sum() < SIDE:
         return 0.0, 0.0
 
-    def scatter(x: Floats) -> Floats:
-        """Of every column, over that of the middle one."""
+    def scatter(x: Floats) -> tuple[Floats, Floats]:
+        """Of every column, over that of the middle one, without the ground that has most of it; and its degrees of freedom."""
+
+        def about(mean: Floats, weight: Floats) -> Floats:
+            squares = weight * (x - mean[number]) ** 2
+            return np.bincount(cell, squares, of_site.size).astype(np.float64).reshape(of_site.shape)
+
         mean = np.bincount(number, x, len(column)) / np.maximum(often, 1)
-        out = np.bincount(number, (x - mean[number]) ** 2, len(column)) / np.maximum(often - 1, 1)
-        return out[known] / float(np.median(out[known]))
+        kept = (about(mean, np.ones(len(x))).argmax(1)[number] != site).astype(float)
+        count = np.bincount(number, kept, len(column))
+        mean = np.bincount(number, kept * x, len(column)) / np.maximum(count, 1)
+        freedom = np.maximum(count - 1, 1)
+        out = (about(mean, kept).sum(1) / freedom)[known]
+        return out / float(np.median(out)), freedom[known]
 
     # one image under a low Sun, whose shading the covariance has not, would be a seam by itself wherever it is steepest
-    unlikely, squares, often, wide = scatter(steps / np.concatenate(usual)), scatter(steps), often[known], wide[known]
-    chance = -chi2.logsf(unlikely * (often - 1), often - 1) / math.log(10) - math.log10(len(often))
+    (unlikely, freedom), (squares, _), wide = scatter(steps / np.concatenate(usual)), scatter(steps), wide[known]
+    chance = -chi2.logsf(unlikely * freedom, freedom) / math.log(10) - math.log10(len(freedom))
     top = int(chance.argmax())
     return float(chance[top]), max(float((squares[top] - 1) / wide[top]), 0.0)
 
