@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import torch
@@ -49,6 +50,13 @@ def cosine_field(order: tuple[int, int], height: int, width: int) -> Tensor:
     x = (torch.arange(width, dtype=torch.float32) + 0.5) / width
     norm = math.sqrt(2.0) ** ((order[0] > 0) + (order[1] > 0))
     return norm * torch.cos(math.pi * order[0] * y)[:, None] * torch.cos(math.pi * order[1] * x)
+
+
+def broad_field(amounts: Sequence[Tensor], height: int, width: int) -> Tensor:
+    """The sum of the broad cosines with these amounts, in the order of ``BROAD_ORDERS``, each broadcasting to the crop."""
+    return sum(
+        (a * cosine_field(o, height, width) for a, o in zip(amounts, BROAD_ORDERS, strict=True)), torch.zeros(())
+    )
 
 
 def read_cosines(field: Tensor, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:

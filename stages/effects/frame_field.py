@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import torch
 from torch import Tensor
 
 from stages.effects.base import Effect, Survey, Values, register
-from stages.effects.fields import BROAD_ORDERS, cosine_field, read_cosines
+from stages.effects.fields import BROAD_ORDERS, broad_field, read_cosines
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
@@ -46,8 +45,5 @@ class FrameField(Effect):
         return {p.name: amounts[:, k].float() for k, p in enumerate(cls.coordinates)}, size, finer
 
     def apply(self, state: State) -> None:
-        height, width = state.image.shape[-2:]
-        factor = torch.ones_like(state.image)
-        for m, n in BROAD_ORDERS:
-            factor = factor + self.value(f"f{m}{n}", state) * cosine_field((m, n), height, width)
-        state.image = state.image * factor
+        amounts = [self.value(p.name, state) for p in self.coordinates]
+        state.image = state.image * (1 + broad_field(amounts, *state.image.shape[-2:]))

@@ -44,9 +44,7 @@ def write_diagnosis(
             if effect.scope in ("site", "pair"):
                 sizes["site"] = sites
                 data = torch.nn.functional.pad(data, (0, 0, 0, sites - data.shape[-2]))
-            if (
-                effect.scope == "pair"
-            ):  # nothing is known of the last images where they are of sites that were not looked at
+            if effect.scope == "pair":  # the last images may be of sites that were not looked at
                 data = torch.nn.functional.pad(data, (0, 0, 0, 0, 0, len(image_ids) - len(data)))
             tables[variable] = (data if second else data[..., 0]).numpy()
             entry["tables"] = {k: {"variable": variable, "column": j} for j, k in enumerate(effect.values)}

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stages.common.intervals import student_quantile
-from stages.diagnose.likelihood.jackknife import folds, gain_chance, gain_interval, jackknife_error, nats
+from stages.diagnose.likelihood.jackknife import folds, gain_interval, jackknife_error
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.parallel import per_site
 from stages.diagnose.result.answer import Named
-from stages.diagnose.search.doubts import with_ordinary
-from stages.diagnose.search.ground import WHOLE, relative
+from stages.diagnose.search.ground import WHOLE, read_off, relative
 from stages.diagnose.search.state import State
-from stages.diagnose.settings import CELL, CORRELATED, ROUNDS
+from stages.diagnose.settings import CELL, ROUNDS
 from stages.effects import Effect, effect_names, get_effect
 from stages.effects.base import Survey, Values
 
@@ -78,17 +77,12 @@ def by_images(state: State) -> tuple[list[Named], set[str]]:
             site.share = torch.from_numpy(part).float()
         was, now, pixels = _on_other_ground(cls, sites, state.data)
         after = pixels * now / was  # weighted by the inverse of an image's variance
-        percent = gain_interval(pixels, after)
-        if not percent[1] > 0:
+        if not gain_interval(pixels, after)[1] > 0:
             continue
-        value, first = math.sqrt(size), cls.parameters[0]
-        total = nats(float(pixels.sum()), float(after.sum()), float(pixels.sum()), CORRELATED)
-        spread = abs(total) * (percent[2] - percent[1]) / (4 * percent[0])
-        before, beside = (math.sqrt(float(x.sum() / pixels.sum())) for x in (was, now))
-        parameters = {first.name: (value, with_ordinary(value, error / (2 * value), cls), first.unit)}
+        value, every = math.sqrt(size), float(pixels.sum())
+        rms = (math.sqrt(float(was.sum()) / every), math.sqrt(float(now.sum()) / every))
         effect = cls(_tables(sites, [x[0] for x in found]), state.data)
-        chance = gain_chance(pixels, after)
-        out.append(Named(effect, parameters, chance, total, spread, before, beside, percent, [cls.name]))
+        out.append(read_off(effect, value, error / (2 * value), pixels, after, every, rms))
     return out, shown
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stages.common.arrays import Floats
 from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.jackknife import gain_chance, gain_interval, nats
 from stages.diagnose.model.chain import Chain
@@ -51,6 +52,29 @@ def by_ground(state: State) -> tuple[list[Named], set[str]]:
         if float(usual[known].mean()) + half + least < cls.size(cls.strong) ** 2:
             shown.add(name)
         before, after, pixels = _on_other_images(cls, state, chains, left)
+        if not (excess.mean() - half > least and gain_interval(before, after)[1] > 0):
+            continue
+        value = math.sqrt(float(size[known].mean()))
+        error = half / student_quantile(len(excess) - 1) / (2 * value)
+        rms = (math.sqrt(float(before.sum()) / pixels), math.sqrt(float(after.sum()) / pixels))
+        out.append(read_off(_of_sites(cls, values, state, chains), value, error, before, after, pixels, rms))
+    return out, shown
+    left = per_site(relative, chains)
+    for name in effect_names():
+        cls = get_effect(name)
+        whole = _read_off(cls, left, [slice(None)])
+        if whole is None:
+            continue
+        values, size, usual = whole
+        known = torch.isfinite(size)
+        excess = (size - usual)[known].numpy()
+        if len(excess) < 3:
+            continue
+        least = max(cls.tolerance.values(), default=0.0) ** 2
+        half = student_quantile(len(excess) - 1) * float(excess.std(ddof=1)) / math.sqrt(len(excess))
+        if float(usual[known].mean()) + half + least < cls.size(cls.strong) ** 2:
+            shown.add(name)
+        before, after, pixels = _on_other_images(cls, state, chains, left)
         percent = gain_interval(before, after)
         if excess.mean() - half > least and percent[1] > 0:
             value = math.sqrt(float(size[known].mean()))
@@ -63,6 +87,19 @@ def by_ground(state: State) -> tuple[list[Named], set[str]]:
             parameters = {first.name: (value, error, first.unit)}
             out.append(Named(effect, parameters, chance, total, spread, was, now, percent, [name]))
     return out, shown
+
+
+def read_off(
+    effect: Effect, value: float, error: float, before: Floats, after: Floats, pixels: float, rms: tuple[float, float]
+) -> Named:
+    """A cause whose size was read off images, with its error but for what is ordinary. before, after : squares per unit that say how sure the gain is"""
+    percent = gain_interval(before, after)
+    total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
+    spread = abs(total) * (percent[2] - percent[1]) / (4 * percent[0])
+    first = effect.parameters[0]
+    parameters = {first.name: (value, with_ordinary(value, error, type(effect)), first.unit)}
+    chance = gain_chance(before, after)
+    return Named(effect, parameters, chance, total, spread, *rms, percent, [effect.name])
 
 
 def relative(chain: Chain) -> tuple[Tensor, Tensor]:
@@ -116,4 +153,4 @@ def _on_other_images(
     return before, after, max(pixels, 1.0)
 
 
-__all__ = ["WHOLE", "by_ground", "relative"]
+__all__ = ["WHOLE", "by_ground", "read_off", "relative"]
