@@ -147,6 +147,28 @@ def test_what_stays_on_the_detector_is_told_from_what_goes_with_the_ground():
     assert pattern_of_detector(left(1, lambda images, *_: images + albedo.normal(0, 2, (SIZE, SIZE))))[1] < 0
 
 
+def test_dust_is_broader_than_a_pixel_and_no_matter_of_columns_and_lines():
+    """Rings that darken by a third of the noise are 1 to 2 % of the squares of pixels, and several times that of what is broader."""
+    where = np.hypot(*np.mgrid[-12:13, -12:13])
+    ring = np.exp(-0.5 * ((where - 6) / 1.5) ** 2)
+    detector = np.zeros((5 * SIZE, 5 * SIZE))
+    draw = np.random.default_rng(4)
+    for y, x in draw.integers(12, 5 * SIZE - 13, (30, 2)):
+        detector[y - 12 : y + 13, x - 12 : x + 13] -= 0.35 * ring
+
+    def dusty(images, slopes, line, sample):
+        return images + detector[np.round(line).astype(int), np.round(sample).astype(int)]
+
+    def striped(images, slopes, line, sample):
+        return images + 0.4 * np.sin(line / 3) + 0.4 * np.cos(sample / 4)
+
+    assert all(pattern_of_detector(left(seed), spots=True)[1] < NOTABLE for seed in range(10))
+    plain, spots = (pattern_of_detector(left(1, dusty), spots=kind) for kind in (False, True))
+    assert plain[1] < NOTABLE < spots[1] and spots[0] > 2 * plain[0]
+    assert pattern_of_detector(left(1, striped))[1] > 0.05
+    assert pattern_of_detector(left(1, striped), spots=True)[1] < NOTABLE
+
+
 def test_the_nearest_pixel_of_a_detector_leaves_lines_in_where_it_shows_the_ground_and_not_in_brightness():
     def nearest(images, slopes, line, sample):
         down, across = (x / x.std() for x in slopes)
@@ -260,9 +282,9 @@ def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
         rows=[], model=Covariance(*[None] * 2, 1e-4 * torch.ones(grid.annuli, 1), *[0.0] * 3), grid=grid
     )
 
-    def words(piled=0.0, off_columns=(0.0, 0.0, 0.0), **found):
+    def words(piled=0.0, off_columns=(0.0, 0.0, 0.0), dust=(0.0, 0.0), **found):
         for name, value in {**nothing, **found}.items():
-            monkeypatch.setattr(kinds, name, lambda *_, value=value: value)
+            monkeypatch.setattr(kinds, name, lambda *_, spots=False, value=value: dust if spots else value)
         lines = found.get("line_of_brightness", off_columns)
         monkeypatch.setattr(kinds, "line_of_brightness", lambda *given: lines if given[-1] is None else off_columns)
         return list(kinds.structure(state, view, piled))
@@ -278,6 +300,8 @@ def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
     assert len(words(line_of_displacement=(40.0, 0.02))) == 1
     assert words(pattern_of_detector=(0.05, 0.02), field_of_images=(0.05, 0.02)) == []  # not surely
     assert len(words(pattern_of_detector=(0.05, 0.04), field_of_images=(0.05, 0.04))) == 2
+    assert words(dust=(0.05, 0.009)) == []
+    assert words(dust=(0.05, 0.02)) == [kinds.STAYS] == words(pattern_of_detector=(0.05, 0.04), dust=(0.05, 0.02))
     assert words(steps_of_brightness=(15.0, 0.002, 0)) == [] == words(steps_of_brightness=(40.0, 0.0009, 0))
     assert words(steps_of_brightness=(40.0, 0.002, 0)) == ["brightness that comes in equal steps"]
     assert words(odd_and_even=(3.0, 0.01)) == [] == words(odd_and_even=(9.0, 0.0001))

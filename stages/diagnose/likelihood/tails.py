@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import erfc, gammaincc, gammainccinv, gammaln, stdtr
 
 
-def surprise(ratio: NDArray[np.float64], freedom: float) -> NDArray[np.float64]:
+def surprise(ratio: NDArray[np.float64], freedom: float | NDArray[np.float64]) -> NDArray[np.float64]:
     """-log10 of the upper tail of chi square, by its leading term where that underflows."""
     ratio = np.maximum(ratio, 1e-12)
     leading = ratio / 2 - (freedom / 2 - 1) * np.log(ratio / 2) + gammaln(freedom / 2)

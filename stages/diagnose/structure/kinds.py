@@ -21,6 +21,7 @@ from stages.diagnose.structure.steps import steps_of_brightness
 REPEATED = 0.015  # of the squares: bilinear resampling leaves up to two thirds of that, the nearest pixel more
 STRAIGHT = 8.0  # robust standard deviations of columns from their neighbours: flat fields and noise made up to 5
 PILED = "brightness that piles up at one level"
+STAYS = "a pattern that stays on the detector whatever ground it shows"
 
 
 def structure(state: State, view: View, piled: float) -> dict[str, float]:
@@ -39,15 +40,17 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
     line, share = line_of_displacement(left, view.grid, state.frames)
     if line > LINE and share > REPEATED:
         out["displacements that come back at equal distances"] = share
-    for what, (alike, surely) in (
+    for what, (alike, surely), least in (
         (
             "a broad field in each image that is the same on all ground",
             field_of_images(view.rows, view.model, view.grid),
+            ALIKE,
         ),
-        ("a pattern that stays on the detector whatever ground it shows", pattern_of_detector(left)),
+        (STAYS, pattern_of_detector(left), ALIKE),
+        (STAYS, pattern_of_detector(left, spots=True), NOTABLE),
     ):
-        if surely > ALIKE:
-            out[what] = alike
+        if surely > least:
+            out.setdefault(what, alike)
     count, share = pixels_that_stand_out(left)
     if count >= SPECKS and share > FAINT**2:
         out[f"{count} single pixels that stand out"] = share

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.ndimage import median_filter
-from scipy.stats import chi2
+from scipy.special import ndtri
 
 from stages.common.arrays import Floats
+from stages.diagnose.likelihood.tails import surprise
 from stages.diagnose.structure.innovations import Innovation
 
 LONG = 8  # pixels of a column on a piece of ground, at least
@@ -117,7 +118,7 @@ def seam(every: Sequence[Profile]) -> tuple[float, float]:
 
     # one image under a low Sun, whose shading the covariance has not, would be a seam by itself wherever it is steepest
     (unlikely, freedom), (squares, _), wide = scatter(steps / np.concatenate(usual)), scatter(steps), wide[known]
-    chance = -chi2.logsf(unlikely * freedom, freedom) / math.log(10) - math.log10(len(freedom))
+    chance = surprise(unlikely * freedom, freedom) - math.log10(len(freedom))
     top = int(chance.argmax())
     return float(chance[top]), max(float((squares[top] - 1) / wide[top]), 0.0)
 
@@ -146,7 +147,7 @@ def bands(every: Sequence[Profile]) -> tuple[float, float]:
     ratio = power / np.maximum(median_filter(power, AROUND, mode="nearest"), 1e-9)
     ratio[:FIRST] = 0.0
     top = int(ratio.argmax())
-    chance = -chi2.logsf(2 * count * ratio[top], 2 * count) / math.log(10) - math.log10(len(ratio) - FIRST)
+    chance = surprise(2 * count * ratio[top], 2 * count) - math.log10(len(ratio) - FIRST)
     return float(chance), float(squares[top] / pixels * (1 - 1 / max(ratio[top], 1.0)))
 
 
@@ -162,7 +163,7 @@ def columns_that_stand_out(every: Sequence[Profile]) -> tuple[float, float]:
     away = (fixed - np.mean([np.roll(fixed, k) for k in BESIDE], 0))[known]
     sure = np.abs(away) * np.sqrt(often[known])
     top = int(sure.argmax())
-    robust = float(np.median(sure)) / math.sqrt(chi2.median(1))
+    robust = float(np.median(sure)) / float(ndtri(0.75))
     return float(sure[top] / max(robust, 1e-9)), float(away[top] ** 2 * often[known][top] / often.sum())
 
 
