@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Callable, Sequence
 from functools import cached_property
 
@@ -126,8 +127,7 @@ class Chain:
 
         A finite one would bring in the image's curvature as well, and be taken for its sharpness.
         """
-        state = copy.copy(self._state)
-        state.displacement = None
+        state = dataclasses.replace(self._state, displacement=None)
         effect.apply(state)
         if state.displacement is None:
             return torch.zeros_like(self.rendered)

@@ -55,19 +55,6 @@ class _Facets:
     measured: Tensor
     sharp: Tensor
 
-    def those(self, chosen: Tensor) -> _Facets:
-        """Some of them, (M,) bool or numbers in order."""
-        return _Facets(*(x[chosen] for x in vars(self).values()))
-
-    @property
-    def counts(self) -> list[int]:
-        """Of every part."""
-        return torch.bincount(self.part, minlength=PARTS).tolist()
-
-    def squares(self) -> Tensor:
-        """(PARTS,) of what is left where the DEM's horizon is sharp."""
-        return torch.zeros(PARTS, dtype=torch.float64).index_add_(0, self.part, self.sharp.double().square())
-
 
 def _facets(use: Tensor, distance: Tensor, measured: Tensor, above: Tensor) -> _Facets:
     """Those in use, (n, H, W) each."""
@@ -95,7 +82,7 @@ class Edges:
         use &= (distance >= NEAREST) | (above.abs() > CLEAR)
         near = above.abs() < CLEAR
         self.near, self.far = (_facets(use & here, distance, measured, above) for here in (near, ~near))
-        self.far_squares = self.far.squares()
+        self.far_squares = _squares(self.far.sharp, self.far.part)
 
     def products(self, effects: Sequence[Effect], beside: Sequence[Effect], about: Horizons) -> Floats:
         """(effects, PARTS, 3, 3) of the residual share of sunlight and of what a little more blur and lift would add to the expected one."""
@@ -114,7 +101,7 @@ class Edges:
         assert horizon is not None
         nearness = self.near.nearness**about.fall
         rows = _rows(self.near, sun, horizon.flatten(), disc, nearness, about)
-        out = _sums(rows, self.near)
+        out = _sums(rows, self.near.part)
         out[:, 0, 0] += self.far_squares
         return horizon.flatten(), rows, out
 
@@ -124,20 +111,21 @@ class Edges:
         """(PARTS, 3, 3) with walls among the effects. known, rows, plain : of :meth:`_without_walls`"""
         sun, horizon, disc = self.chain.sunlight(effects)
         assert horizon is not None
+        hides = (horizon > (sun - disc)[:, None, None]).flatten()
         horizon = horizon.flatten()
         raised = horizon > known
         out = plain.clone()
-        for facets in (self.near, self.far):  # only a wall beyond the DEM darkens what the Sun stands well above
-            behind = torch.nonzero(raised[facets.pixel])[:, 0]
-            if not len(behind):
-                continue
-            some = facets.those(behind)
-            far_off = torch.zeros_like(some.nearness)  # what stands beyond the DEM stands far off, as it was given
-            out += _sums(_rows(some, sun, horizon, disc, far_off, about), some)
+        # only a wall beyond the DEM darkens what the Sun stands well above, and only one that is as high as the Sun
+        for facets, touched in ((self.near, raised), (self.far, raised & hides)):
+            behind = torch.nonzero(touched[facets.pixel])[:, 0]
+            pixel, image, part = facets.pixel[behind], facets.image[behind], facets.part[behind]
+            # what stands beyond the DEM stands far off, as it was given: errors of horizons do nothing there
+            left = facets.measured[behind] - sun_visibility(sun[image], horizon[pixel], disc)
+            out[:, 0, 0] += _squares(left, part)
             if facets is self.near:
-                out -= _sums(rows[:, behind], some)
+                out -= _sums(rows[:, behind], part)
             else:
-                out[:, 0, 0] -= some.squares()
+                out[:, 0, 0] -= _squares(facets.sharp[behind], part)
         return out
 
 
@@ -152,9 +140,14 @@ def _rows(facets: _Facets, sun: Tensor, horizon: Tensor, disc: Tensor, nearness:
     return torch.stack([left, wider, slope * nearness]).double()
 
 
-def _sums(rows: Tensor, facets: _Facets) -> Tensor:
-    """(PARTS, 3, 3) products of the rows (3, M) of some facets."""
-    return torch.stack([own @ own.T for own in rows.split(facets.counts, 1)])
+def _sums(rows: Tensor, part: Tensor) -> Tensor:
+    """(PARTS, 3, 3) products of the rows (3, M) of facets of these parts, in order."""
+    return torch.stack([own @ own.T for own in rows.split(torch.bincount(part, minlength=PARTS).tolist(), 1)])
+
+
+def _squares(left: Tensor, part: Tensor) -> Tensor:
+    """(PARTS,) of what is left (M,) at facets of these parts."""
+    return torch.zeros(PARTS, dtype=torch.float64).index_add_(0, part, left.double().square())
 
 
 def _light(chain: Chain) -> tuple[Tensor, Tensor, Tensor]:

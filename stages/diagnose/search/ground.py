@@ -59,34 +59,6 @@ def by_ground(state: State) -> tuple[list[Named], set[str]]:
         rms = (math.sqrt(float(before.sum()) / pixels), math.sqrt(float(after.sum()) / pixels))
         out.append(read_off(_of_sites(cls, values, state, chains), value, error, before, after, pixels, rms))
     return out, shown
-    left = per_site(relative, chains)
-    for name in effect_names():
-        cls = get_effect(name)
-        whole = _read_off(cls, left, [slice(None)])
-        if whole is None:
-            continue
-        values, size, usual = whole
-        known = torch.isfinite(size)
-        excess = (size - usual)[known].numpy()
-        if len(excess) < 3:
-            continue
-        least = max(cls.tolerance.values(), default=0.0) ** 2
-        half = student_quantile(len(excess) - 1) * float(excess.std(ddof=1)) / math.sqrt(len(excess))
-        if float(usual[known].mean()) + half + least < cls.size(cls.strong) ** 2:
-            shown.add(name)
-        before, after, pixels = _on_other_images(cls, state, chains, left)
-        percent = gain_interval(before, after)
-        if excess.mean() - half > least and percent[1] > 0:
-            value = math.sqrt(float(size[known].mean()))
-            error = with_ordinary(value, half / student_quantile(len(excess) - 1) / (2 * value), cls)
-            first = cls.parameters[0]
-            total = nats(float(before.sum()), float(after.sum()), pixels, CORRELATED)
-            spread = abs(total) * (percent[2] - percent[1]) / (4 * percent[0])
-            was, now = (math.sqrt(float(x.sum()) / pixels) for x in (before, after))
-            effect, chance = _of_sites(cls, values, state, chains), gain_chance(before, after)
-            parameters = {first.name: (value, error, first.unit)}
-            out.append(Named(effect, parameters, chance, total, spread, was, now, percent, [name]))
-    return out, shown
 
 
 def read_off(

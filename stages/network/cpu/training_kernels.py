@@ -80,7 +80,7 @@ def _put_into(out, j, value):
 
         def put(out, j, value):
             bits: Any = _as_bits(np.float32(value))  # type: ignore[call-arg]
-            out[j] = np.uint16(np.uint32(bits + np.uint32(0x7FFF) + ((bits >> np.uint32(16)) & np.uint32(1))) >> 16)
+            out[j] = np.uint16(np.uint32(bits + np.uint32(0x7FFF) + ((bits >> np.uint32(16)) & np.uint32(1))) >> 16)  # type: ignore[unreachable]
 
         return put
 
