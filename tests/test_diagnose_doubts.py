@@ -15,7 +15,7 @@ from stages.diagnose.likelihood.products import Products
 from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.registration.sunward import sunward
 from stages.diagnose.rows.columns import Guise, Plan
-from stages.diagnose.search import refine
+from stages.diagnose.search import refine, select
 from stages.diagnose.search.doubts import ODD, ORDINARY, doubt, with_ordinary
 from stages.diagnose.search.rivals import choose, judge, may_be_another
 from stages.diagnose.search.select import Weighed, _hiding, unlikely
@@ -100,6 +100,32 @@ def test_neither_gains_of_few_images_nor_what_they_follow_by_chance_has_a_name()
     assert "so few images" in refused("azimuthal_anisotropy", 2.0) and not refused("azimuthal_anisotropy", 6.0)
     assert "do not prove" in refused("image_gain", 2.0) and "do not prove" in refused("image_gain", -2.0)
     assert not refused("image_gain", -6.0)
+
+
+@pytest.mark.parametrize(("blur", "error", "listed", "left"), [
+    (0.48, 0.03, False, "ordinary"), (0.58, 0.03, False, "named"), (0.48, 0.09, False, "named"), (0.48, 0.03, True, "gone"),
+])  # fmt: skip
+def test_what_is_ordinary_for_sure_beside_a_fault_is_rendered_and_no_name(monkeypatch, blur, error, listed, left):
+    """3.4 px of motion had passed for a blur; what is left of that beside it, 0.48 of the 0.6 px2 of any data, took its words away."""
+
+    def cause(name, values, errors):
+        cls = get_effect(name)
+        guise = Guise(name, cls.trials(Survey())[0], (0,))
+        return Cause(cls(values, Survey()), Found(name, guise, np.ones(1), np.ones(1), 9.0), errors=errors)
+
+    optics = cause("psf_blur", {"sigma2_px2": blur}, {"sigma2_px2": error})
+    new = cause("dem_smoothing", {"sigma2_px2": 1.5}, {}) if listed else cause("motion_blur", {"sigma2_px2": 0.5}, {})
+    state = SimpleNamespace(causes=[optics, new])
+    monkeypatch.setattr(select, "refine", lambda state, view: view)
+    monkeypatch.setattr(select, "errors_over_images", lambda state, look: None)
+    lost = f"with it psf_blur would lose its name ({ORDINARY})", optics
+    monkeypatch.setattr(
+        select, "doubt_any", lambda state, cause: lost if optics in state.causes and not optics.ordinary else ("", None)
+    )
+    _, why = select._fit_beside(state, None, new)
+    assert (optics in state.causes, optics.ordinary, bool(why)) == {
+        "ordinary": (True, True, False), "named": (True, False, True), "gone": (False, False, False),
+    }[left]  # fmt: skip
 
 
 def test_an_echo_explains_more_than_what_lies_on_the_other_side():

@@ -54,6 +54,13 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     return ""
 
 
+def surely_ordinary(cause: Cause) -> bool:
+    """Whether a fitted effect of the scene is, two standard errors further off, still no more than what every data set has."""
+    cls, errors = type(cause.effect), cause.larger_errors
+    sizes = {n: abs(float(cause.effect.values[n]) - cls.null()[n]) for n in cls.tolerance if n in cause.effect.values}
+    return bool(sizes) and all(size + 2 * errors.get(n, 0.0) < cls.tolerance[n] for n, size in sizes.items())
+
+
 def as_ordinary(name: str, size: float, least: float, error: float = math.nan) -> str:
     """The reason that a size is not surely more than what every data set has."""
     found = f"{size:.2g}" if math.isnan(error) else f"{size:.2g} +- {error:.1g}"
@@ -136,5 +143,6 @@ __all__ = [
     "doubt_any",
     "impossible",
     "ordinary",
+    "surely_ordinary",
     "with_ordinary",
 ]

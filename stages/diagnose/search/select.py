@@ -17,6 +17,7 @@ from stages.diagnose.search.doubts import (
     doubt_any,
     impossible,
     ordinary,
+    surely_ordinary,
 )
 from stages.diagnose.search.gains import secant_gains
 from stages.diagnose.search.refine import along, as_effect, errors_over_images, refine, settle, start_nearer
@@ -139,12 +140,12 @@ def _take_one(state: State, view: View, weighed: Weighed, refused: dict[str, str
             break
         chosen, group = choose(sure, weighed.tried)
         sure = [f for f in sure if f is not chosen]
-        before = list(state.causes)
+        before = list(state.named)
         why = may_be_another(view.whole, chosen, weighed.best, refused) or unlikely(state, view, chosen)
         if not why and not fresh:
             return LIKELY
         why = why or take(state, view, chosen, group)
-        for gone in [c for c in before if c not in state.causes]:
+        for gone in [c for c in before if c not in state.named]:
             refused[gone.effect.name] = f"no longer needed once {chosen.effect} is in the model"
             out.rejected[gone.effect.name] = (gone.found.gain, refused[gone.effect.name])
         if not why:
@@ -233,7 +234,7 @@ def _fit_beside(state: State, view: View, cause: Cause) -> tuple[View, str]:
     """Fit everything with the new cause; why it, or another beside it, cannot be one, or ''.
 
     One that is nothing beside the new one makes way for it: the new one is something beside either. Values per frame, which mimic what
-    one value for all does, drive none out, nor does what is in no catalogue.
+    one value for all does, drive none out. Beside what is in no catalogue it has to be ordinary for sure, and stays as much.
     """
     while True:
         look = refine(state, view)
@@ -241,9 +242,14 @@ def _fit_beside(state: State, view: View, cause: Cause) -> tuple[View, str]:
         if not why:
             errors_over_images(state, look)
             why, other = doubt_any(state, cause)
-        if other is None or cause.found.guise.per_frame or not cause.effect.listed or ODD in why:
+        if other is None or cause.found.guise.per_frame or ODD in why:
             return look, why
-        state.causes.remove(other)
+        if cause.effect.listed:
+            state.causes.remove(other)
+        elif _is_rendered(type(other.effect)) and surely_ordinary(other):
+            other.ordinary = True
+        else:
+            return look, why
 
 
 __all__ = ["Outcome", "search"]
