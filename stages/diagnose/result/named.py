@@ -73,7 +73,8 @@ def by_registration(state: State) -> tuple[list[Named], dict[str, tuple[float, s
     r = state.registration
     if r is None:
         return [], {}
-    r.test(state.hidden, state.nominal)
+    if r.displaced:
+        r.test(state.hidden, state.nominal)
     out: list[Named] = []
     refused: dict[str, tuple[float, str]] = {}
     for name in effect_names():
