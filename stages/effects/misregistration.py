@@ -8,6 +8,8 @@ from stages.effects.base import Effect, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
+ORDINARY = 0.3 * 2**0.5  # px, rms: 0.3 either way are normal
+
 
 @register
 class Misregistration(Effect):
@@ -33,7 +35,7 @@ class Misregistration(Effect):
         Parameter("south_px", "px", -5.0, 5.0, 0.0, "the pixel shows ground this many rows further south"),
     )
     strong: ClassVar = {"east_px": 0.5, "south_px": 0.5}
-    tolerance: ClassVar = {"rms_px": 0.3 * 2**0.5}
+    tolerance: ClassVar = {"rms_px": ORDINARY}
 
     def apply(self, state: State) -> None:
         east, south = self.value("east_px", state), self.value("south_px", state)

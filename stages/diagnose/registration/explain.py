@@ -19,12 +19,15 @@ from stages.diagnose.registration.forms import FORMS, TERMS, Form, Frame, Matche
 from stages.diagnose.registration.lines import STEADY, TREMBLING, Lines, lines
 from stages.diagnose.registration.own import beside, match_all, own_fields
 from stages.diagnose.registration.registered import Gain, Registration, shifted_frames
-from stages.diagnose.registration.squares import OWN, compared, grounds, held_out
+from stages.diagnose.registration.squares import OWN, compared, grounds, held_out, shown_once
 from stages.diagnose.registration.start import start
 from stages.diagnose.rows.patches import cuts
-from stages.diagnose.settings import CORRELATED, SURE
+from stages.diagnose.settings import CORRELATED, PATCH, SURE
 from stages.effects import Effect
+from stages.effects.misregistration import ORDINARY as USUAL_SHIFT
 from stages.effects.relief_displacement import ORDINARY
+
+HALVES = 2  # pieces a side of crops that frames show one each of: a shift that one quarter has, the others have as well
 
 
 def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], frames: int, level: float) -> Registration:
@@ -32,7 +35,8 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     chains = per_site(lambda site: nominal.chain(site, base), sites)
     known, spread = start(chains, frames, level)
     frame = _frame(sites)
-    pieces = cuts(min(sites[0].image.shape[-2:]), len(sites))
+    once, size = shown_once(sites), min(sites[0].image.shape[-2:])
+    pieces = max(cuts(size, len(sites)), min(HALVES, size // PATCH) if once else 1)
     spread = max(spread, 0.3)
     matched: list[Matched] = []
     for _ in range(2):
@@ -40,7 +44,7 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
         coefficients, share = solve(matched, FORMS[-1], frames, spread)
         known = beside(matched, coefficients, share, pieces**2)
     matched = match_all(chains, known, frame, level, pieces)
-    group = grounds(matched)
+    group = grounds(matched, once)
     # by the form with most freedom: what else displaces images must not pass for relief
     share = solve(matched, FORMS[-1], frames, spread)[1]
     rest = {g: [m for m, k in zip(matched, group, strict=True) if k != g] for g in sorted(set(group))}
@@ -58,6 +62,9 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     far = torch.cat([torch.stack(m.leaning).square().sum(0).flatten() for m in matched]).mean().sqrt()
     surely = leaning.low > 0 and abs(share) > SURE * error
     form = _best(squares, surely and abs(share) * float(far) > ORDINARY)
+    if once and form.terms and _rms_shift(fitted["constant"][0]) < USUAL_SHIFT:
+        # one crop alone takes a wrong Sun, or relief that is off, for a small shift: as much is left to what explains it
+        form = next(f for f in FORMS if not f.terms and f.leaning == form.leaning)
     form, trembling, beside_lines = _lines(chains, matched, group, fitted, form, frames)
     squares |= beside_lines
     if beside_lines:
@@ -111,6 +118,12 @@ def _lines(
     squares = compared(matched, group, fields, frames, pieces)
     best = int(len(found) > 1 and squares["1 across"].sum() < squares["0 known"].sum())
     return forms[best], found[best], {STEADY: squares[f"{best} known"], TREMBLING: squares[f"{best} across"]}
+
+
+def _rms_shift(coefficients: Tensor) -> float:
+    """px, of all frames that lie anywhere else at all. coefficients : (frames, 2, T) of constant displacements"""
+    squares = coefficients[:, :, 0].square().sum(1)
+    return math.sqrt(float(squares[squares > 0].mean())) if bool((squares > 0).any()) else 0.0
 
 
 def _frame(sites: Sequence[Site]) -> Frame:

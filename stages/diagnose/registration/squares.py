@@ -15,6 +15,7 @@ from stages.diagnose.model.aligned import aligned
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import full_light
 from stages.diagnose.model.parallel import per_site
+from stages.diagnose.model.sites import Site
 from stages.diagnose.registration.forms import FORMS, Matched, displacement, solve
 from stages.diagnose.registration.start import Field
 
@@ -91,10 +92,17 @@ def _norm(chain: Chain) -> Tensor:
     return ((chain.site.read * mask).sum((-2, -1)) / mask.sum((-2, -1)).clamp(min=1)).square().clamp(min=1e-20)
 
 
-def grounds(matched: Sequence[Matched]) -> list[int]:
-    """Which pieces are left out together: all of a site, or each by itself where sites are few."""
+def grounds(matched: Sequence[Matched], once: bool) -> list[int]:
+    """Which pieces are left out together: all of a site, or each by itself where sites are few, or frames show one of them each (``once``)."""
     numbers = sorted({m.chain.site.number for m in matched})
-    return [numbers.index(m.chain.site.number) if len(numbers) > 3 else k for k, m in enumerate(matched)]
+    apart = once or len(numbers) <= 3
+    return [k if apart else numbers.index(m.chain.site.number) for k, m in enumerate(matched)]
 
 
-__all__ = ["OWN", "compared", "grounds", "held_out", "left"]
+def shown_once(sites: Sequence[Site]) -> bool:
+    """Whether most frames show a single site, so that no other tells where they lie."""
+    often = np.bincount(np.concatenate([s.frames for s in sites]))
+    return float(np.median(often[often > 0])) < 2
+
+
+__all__ = ["OWN", "compared", "grounds", "held_out", "left", "shown_once"]
