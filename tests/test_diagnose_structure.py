@@ -300,8 +300,8 @@ def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
     assert len(words(line_of_displacement=(40.0, 0.02))) == 1
     assert words(pattern_of_detector=(0.05, 0.02), field_of_images=(0.05, 0.02)) == []  # not surely
     assert len(words(pattern_of_detector=(0.05, 0.04), field_of_images=(0.05, 0.04))) == 2
-    assert words(dust=(0.05, 0.0003)) == []
-    assert words(dust=(0.05, 0.002)) == [kinds.STAYS] == words(pattern_of_detector=(0.05, 0.04), dust=(0.05, 0.02))
+    assert words(dust=(0.05, 0.009)) == []
+    assert words(dust=(0.05, 0.02)) == [kinds.STAYS] == words(pattern_of_detector=(0.05, 0.04), dust=(0.05, 0.02))
     assert words(steps_of_brightness=(15.0, 0.002, 0)) == [] == words(steps_of_brightness=(40.0, 0.0009, 0))
     assert words(steps_of_brightness=(40.0, 0.002, 0)) == ["brightness that comes in equal steps"]
     assert words(odd_and_even=(3.0, 0.01)) == [] == words(odd_and_even=(9.0, 0.0001))

@@ -12,7 +12,6 @@ from torch import Tensor
 from stages.common.arrays import Floats
 from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.jackknife import jackknife_error
-from stages.diagnose.settings import STILL
 from stages.diagnose.structure.innovations import Innovation
 from stages.effects.filters import blur_matrix
 
@@ -27,8 +26,7 @@ def pattern_of_detector(every: Sequence[Innovation], spots: bool = False) -> tup
     """Share of the squares that images of different ground have alike where they fall on the same pixel of the detector, and its
     lower bound (95 %). Ground has none of that, and of a line camera only images that lie on the same lines have it.
 
-    spots : of what is broader than a pixel, beside what whole columns and lines have, which is a matter of the flat field; its bound is one
-        of 99 %, since no ordinary camera has any
+    spots : of what is broader than a pixel, beside what whole columns and lines have, which is a matter of the flat field
     """
     place, value, site = _on_pixels(every, spots)
     if not len(place):
@@ -58,8 +56,7 @@ def pattern_of_detector(every: Sequence[Innovation], spots: bool = False) -> tup
         return 0.0, 0.0
     share = float(alike.sum() / squares.sum())
     without = (alike.sum() - alike) / (squares.sum() - squares)
-    errors = max(student_quantile(len(squares) - 1), STILL if spots else 0.0)
-    return share, share - errors * float(jackknife_error(without, squares.sum() - squares))
+    return share, share - student_quantile(len(squares) - 1) * float(jackknife_error(without, squares.sum() - squares))
 
 
 def _without(x: Floats, known: NDArray[np.bool_], along: Sequence[NDArray[np.int64]]) -> Floats:
