@@ -82,6 +82,7 @@ class Effect(ABC):
     shaped          coordinates that say what the effect looks like, not how strong it is: they are stepped through, and fitted once it is named
     always          standard deviation of values per image that every data set has, in multiples of ``strong``; 0: none
     scatters        whether that standard deviation is estimated from the data instead
+    about_mean      whether values per image are factors, less one, of which only those about their mean are told from the nominal model
     judged_apart    whether a step of its own judges it, not the search: registration, or a histogram of all pixels
     leans           of those that displace: relief by its height, not images as a whole
     along_lines     of those that displace: the lines of an image against each other
@@ -117,6 +118,7 @@ class Effect(ABC):
     shaped: ClassVar[tuple[str, ...]] = ()
     always: ClassVar[float] = 0.0
     scatters: ClassVar[bool] = False
+    about_mean: ClassVar[bool] = False
     judged_apart: ClassVar[bool] = False
     leans: ClassVar[bool] = False
     along_lines: ClassVar[bool] = False

@@ -17,6 +17,7 @@ class ImageGain(Effect):
     table = ("image_gain", None)
     always = 0.5
     scatters = True
+    about_mean = True
     title = "calibration scale of single images"
     mechanism = (
         "Exposure, temperature and decay of the detector leave every image with its own scale error. Images in dn have a free "

@@ -77,9 +77,24 @@ def refine(state: State, view: View) -> View:
         if look is now:  # steps that do not get shorter are too short: the squares are no parabola
             share = min(2 * share, LONGEST) if moved > max(0.5 * last, 1.0) else share
             last = moved
+    _take_out_means(state)
     state.fit()
     assert look is not None
     return look
+
+
+def _take_out_means(state: State) -> None:
+    """Of values per image whose mean is the nominal model's brightness: the fit may let both run off, each against the other."""
+    for cause in state.causes:
+        cls = type(cause.effect)
+        if not (cls.about_mean and cause.found.guise.per_frame):
+            continue
+        table = {p.name: torch.as_tensor(cause.effect.values[p.name]).clone() for p in cls.fitted()}
+        for values in table.values():
+            known = values != 0
+            if bool(known.any()):
+                values[known] = (1 + values[known]) / (1 + values[known].mean()) - 1
+        cause.effect = cls({**cause.effect.values, **table}, state.data)
 
 
 def start_nearer(state: State, view: View, cause: Cause) -> None:
@@ -312,11 +327,18 @@ def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     out[column, frame] = (now + move) * sizes[column]
     cause.effect = cls({n: torch.from_numpy(out[k].copy()).float() for k, n in enumerate(names)}, state.data)
     # the mean square of values is that of their estimates, which are drawn to nothing, and their variances
+    frames = max(len(set(frame.tolist())) - cls.about_mean, 1)
+    if cls.about_mean:
+        alike = (column[:, None] == column) / np.bincount(column)[column]
+        inverse = (np.eye(len(column)) - alike) @ inverse @ (np.eye(len(column)) - alike)
     variance = inverse.diagonal() * sizes[column] ** 2
-    frames = max(len(set(frame.tolist())), 1)
+
+    def apart(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        sized = values * sizes[column]
+        return (1 + sized) / (1 + alike @ sized) - 1 if cls.about_mean else sized
 
     def rms(values: NDArray[np.float64]) -> float:
-        return math.sqrt(float(((values * sizes[column]) ** 2 + variance).sum()) / frames)
+        return math.sqrt(float((apart(values) ** 2 + variance).sum()) / frames)
 
     # the law differs from site to site: pieces of one have that in common, and few sites agree in it by chance
     sites = [u.site for u in whole.units]
@@ -325,7 +347,7 @@ def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     scatter = float(jackknife_error(np.array(without)))
     cause.rms = rms(now + move)
     covariance = np.asarray(inverse * np.outer(sizes[column], sizes[column]), np.float64)
-    left_open = _error_of_rms((now + move) * sizes[column], covariance, cause.rms, frames)
+    left_open = _error_of_rms(apart(now + move), covariance, cause.rms, frames)
     cause.errors["rms"] = max(
         _error_over_sites(scatter, show, len(without), max(cls.tolerance.values(), default=0.0)), left_open
     )

@@ -41,6 +41,7 @@ def pattern_of_detector(every: Sequence[Innovation], spots: bool = False) -> tup
     along = [block * BLOCK + at % BLOCK for at in (line, sample)] if spots else []
     total, count = np.bincount(pixel, value), np.bincount(pixel)
     alike, squares = np.zeros((2, int(block.max()) + 1))
+    grounds: list[tuple[float, float]] = []
     for s in np.unique(site):
         here = site == s
         own, often, power = (np.bincount(pixel[here], w, len(number)) for w in (value[here], None, value[here] ** 2))
@@ -51,12 +52,19 @@ def pattern_of_detector(every: Sequence[Innovation], spots: bool = False) -> tup
         )
         alike += np.bincount(block, often * mean * other, len(alike))
         squares += np.bincount(block[both], power[both], len(alike))
+        grounds.append((float((often * mean * other).sum()), float(power[both].sum())))
     alike, squares = alike[squares > 0], squares[squares > 0]
-    if len(squares) < FEWEST:
+    of_ground, all_of_ground = np.array([g for g in grounds if g[1] > 0]).reshape(-1, 2).T
+    if len(squares) < FEWEST or len(all_of_ground) < 3:
         return 0.0, 0.0
     share = float(alike.sum() / squares.sum())
     without = (alike.sum() - alike) / (squares.sum() - squares)
-    return share, share - student_quantile(len(squares) - 1) * float(jackknife_error(without, squares.sum() - squares))
+    error = student_quantile(len(squares) - 1) * float(jackknife_error(without, squares.sum() - squares))
+    # two grounds that look alike by chance do so over many blocks; every product is one of two of them, and without one those that are left weigh more
+    shown = len(all_of_ground)
+    without = (share * squares.sum() - 2 * of_ground) / (squares.sum() - all_of_ground)
+    without = without * (shown - 1) / (shown - 2)
+    return share, share - max(error, student_quantile(shown - 1) * float(jackknife_error(without)))
 
 
 def _without(x: Floats, known: NDArray[np.bool_], along: Sequence[NDArray[np.int64]]) -> Floats:
