@@ -339,6 +339,20 @@ def test_values_that_stand_for_each_other_are_sure_together():
     assert cause.away == pytest.approx(math.sqrt(2) / 2)
 
 
+def test_gains_count_about_their_mean_which_is_the_brightness_of_the_ground():
+    """The law and the gains of all images ran off, each against the other: what is told of images is how they differ."""
+    gains = torch.tensor([0.0, -0.7, -0.71, -0.72, 0.0])  # the first and the last are not known
+    guise = Guise("image_gain", Trial(({"gain": 0.02},)), (0,), per_frame=True)
+    found = Found("image_gain", guise, np.ones(5), np.ones(5), 9.0)
+    shift = get_effect("misregistration")({"east_px": gains.clone(), "south_px": gains.clone()}, Survey())
+    causes = [Cause(get_effect("image_gain")({"gain": gains}, Survey()), found), Cause(shift, found)]
+    refine._take_out_means(SimpleNamespace(causes=causes, data=Survey()))
+    kept = causes[0].effect.values["gain"]
+    assert kept[[0, 4]].tolist() == [0.0, 0.0] and float(kept[1:4].mean()) == pytest.approx(0.0, abs=1e-6)
+    assert torch.allclose((1 + kept[1:4]) / (1 + kept[1]), (1 + gains[1:4]) / (1 + gains[1]))
+    assert torch.equal(causes[1].effect.values["east_px"], gains)  # where all images lie is no law's
+
+
 @pytest.mark.parametrize("width", BINS)
 def test_a_few_pixels_far_above_all_others_are_no_level(width):
     """... wherever they fall among the bins, the last one among them."""
