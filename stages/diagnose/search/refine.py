@@ -326,19 +326,20 @@ def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     out = table.copy()
     out[column, frame] = (now + move) * sizes[column]
     cause.effect = cls({n: torch.from_numpy(out[k].copy()).float() for k, n in enumerate(names)}, state.data)
-    # the mean square of values is that of their estimates, which are drawn to nothing, and their variances
+    # where the mean of the images is the nominal model's, they are told apart by values about it
+    alike = cls.about_mean * (column[:, None] == column) / np.bincount(column)[column]
     frames = max(len(set(frame.tolist())) - cls.about_mean, 1)
-    if cls.about_mean:
-        alike = (column[:, None] == column) / np.bincount(column)[column]
-        inverse = (np.eye(len(column)) - alike) @ inverse @ (np.eye(len(column)) - alike)
-    variance = inverse.diagonal() * sizes[column] ** 2
 
     def apart(values: NDArray[np.float64]) -> NDArray[np.float64]:
         sized = values * sizes[column]
-        return (1 + sized) / (1 + alike @ sized) - 1 if cls.about_mean else sized
+        return (1 + sized) / (1 + alike @ sized) - 1
+
+    own, scale = np.eye(len(places)) - alike, sizes[column] / (1 + alike @ ((now + move) * sizes[column]))
+    covariance = np.asarray(own @ inverse @ own * np.outer(scale, scale), np.float64)
 
     def rms(values: NDArray[np.float64]) -> float:
-        return math.sqrt(float((apart(values) ** 2 + variance).sum()) / frames)
+        # the mean square of values is that of their estimates, which are drawn to nothing, and their variances
+        return math.sqrt(float((apart(values) ** 2 + covariance.diagonal()).sum()) / frames)
 
     # the law differs from site to site: pieces of one have that in common, and few sites agree in it by chance
     sites = [u.site for u in whole.units]
@@ -346,7 +347,6 @@ def _step_frames(state: State, view: View, cause: Cause, share: float) -> float:
     show = float(np.median(np.bincount(np.concatenate([s.frames for s in state.sites]), minlength=whole.frames)[frame]))
     scatter = float(jackknife_error(np.array(without)))
     cause.rms = rms(now + move)
-    covariance = np.asarray(inverse * np.outer(sizes[column], sizes[column]), np.float64)
     left_open = _error_of_rms(apart(now + move), covariance, cause.rms, frames)
     cause.errors["rms"] = max(
         _error_over_sites(scatter, show, len(without), max(cls.tolerance.values(), default=0.0)), left_open
