@@ -61,19 +61,18 @@ def explain(sites: Sequence[Site], nominal: Nominal, base: Sequence[Effect], fra
     leaning = Gain(*gain_interval(squares[OWN[0]].sum(1), squares[OWN[1]].sum(1)))
     far = torch.cat([torch.stack(m.leaning).square().sum(0).flatten() for m in matched]).mean().sqrt()
     surely = leaning.low > 0 and abs(share) > SURE * error
-    form = _best(squares, surely and abs(share) * float(far) > ORDINARY)
-    if once and form.terms and _rms_shift(fitted["constant"][0]) < USUAL_SHIFT:
-        # one crop alone takes a wrong Sun, or relief that is off, for a small shift: as much is left to what explains it
-        form = next(f for f in FORMS if not f.terms and f.leaning == form.leaning)
+    # one crop alone takes a wrong Sun, or relief that is off, for a small shift: as much is left to what explains it
+    told = not once or _rms_shift(fitted["constant"][0]) >= USUAL_SHIFT
+    form = _best(squares, surely and abs(share) * float(far) > ORDINARY, told)
     form, trembling, beside_lines = _lines(chains, matched, group, fitted, form, frames)
     squares |= beside_lines
     if beside_lines:
         gains["lines"] = Gain(*gain_interval(squares[STEADY].sum(1), squares[TREMBLING].sum(1)))
     coefficients, share = fitted[form.name]
-    told = [f for f in FORMS if f is form or f.terms == 1]
+    simple = [f for f in FORMS if f is form or f.terms == 1]
     by_rest = {
         f.name: [solve(m, f, frames, spread, without[g] if f.leaning else None)[0] for g, m in rest.items()]
-        for f in told
+        for f in simple
     }
     pixels = sum(float(s.read_valid.sum()) for s in sites)
     rms = {k: math.sqrt(float(q.sum()) / max(pixels, 1.0)) for k, q in squares.items()}
@@ -134,12 +133,12 @@ def _frame(sites: Sequence[Site]) -> Frame:
     return Frame((float(centre[0]), float(centre[1])), float((high - low).max()) / 2)
 
 
-def _best(squares: dict[str, NDArray[np.float64]], leans: bool) -> Form:
+def _best(squares: dict[str, NDArray[np.float64]], leans: bool, told: bool) -> Form:
     """Of the forms with relief displacement, or of those without, the one that leaves least on held-out ground, of those that leave less than
-    nothing does for sure; else a shift of those frames that it surely places better; else the plain one.
+    nothing does for sure; else a shift of those frames that it surely places better; else the plain one. told : whether frames can be told to lie anywhere else
     """
     plain = next(f for f in FORMS if not f.terms and f.leaning == leans)
-    others = [f for f in FORMS if f.terms and f.leaning == leans]
+    others = [f for f in FORMS if told and f.terms and f.leaning == leans]
     sure = [f for f in others if gain_interval(squares["none"].sum(1), squares[f.name].sum(1))[1] > 0]
     sure = sure or [f for f in others if f.terms == 1 and len(shifted_frames(squares[plain.name], squares[f.name]))]
     return min(sure, key=lambda f: float(squares[f.name].sum()), default=plain)

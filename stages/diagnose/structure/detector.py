@@ -11,7 +11,7 @@ from torch import Tensor
 
 from stages.common.arrays import Floats
 from stages.common.intervals import student_quantile
-from stages.diagnose.likelihood.jackknife import jackknife_error
+from stages.diagnose.likelihood.jackknife import alike_half_width, jackknife_error
 from stages.diagnose.structure.innovations import Innovation
 from stages.effects.filters import blur_matrix
 
@@ -60,11 +60,8 @@ def pattern_of_detector(every: Sequence[Innovation], spots: bool = False) -> tup
     share = float(alike.sum() / squares.sum())
     without = (alike.sum() - alike) / (squares.sum() - squares)
     error = student_quantile(len(squares) - 1) * float(jackknife_error(without, squares.sum() - squares))
-    # two grounds that look alike by chance do so over many blocks; every product is one of two of them, and without one those that are left weigh more
-    shown = len(all_of_ground)
-    without = (share * squares.sum() - 2 * of_ground) / (squares.sum() - all_of_ground)
-    without = without * (shown - 1) / (shown - 2)
-    return share, share - max(error, student_quantile(shown - 1) * float(jackknife_error(without)))
+    # two grounds that look alike by chance do so over many blocks
+    return share, share - max(error, alike_half_width(of_ground, all_of_ground))
 
 
 def _without(x: Floats, known: NDArray[np.bool_], along: Sequence[NDArray[np.int64]]) -> Floats:
