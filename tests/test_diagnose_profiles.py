@@ -10,8 +10,8 @@ import torch
 
 from stages.diagnose.settings import LINE
 from stages.diagnose.structure.innovations import Innovation
-from stages.diagnose.structure.kinds import STRAIGHT
-from stages.diagnose.structure.profiles import bands, columns_that_stand_out, profiles, seam
+from stages.diagnose.structure.kinds import STRAIGHT, UNEVEN
+from stages.diagnose.structure.profiles import bands, columns_that_stand_out, lines_of_their_own, profiles, seam
 
 SIZE, PIECES, WIDE = 48, 40, 200
 
@@ -20,6 +20,7 @@ def left(seed: int, **faults: float) -> list[Innovation]:
     """White noise on pieces of ground that lie anywhere on a detector which is turned against the map by a few degrees, and a fault of the camera.
 
     steps : at column 101, another one in every image; waves : 14 lines long, of any phase; column : number 101; pattern : of every column
+    lines : each with a brightness of its own
     """
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[0:SIZE, 0:SIZE].astype(float)
@@ -34,6 +35,10 @@ def left(seed: int, **faults: float) -> list[Innovation]:
         value += faults.get("waves", 0.0) * np.sin(2 * np.pi * line / 14 + rng.uniform(0, 6.3))
         value += faults.get("column", 0.0) * (np.abs(sample - 101) < 0.5)
         value += faults.get("pattern", 0.0) * flat[np.clip(np.round(sample).astype(int), 0, len(flat) - 1)]
+        value += (
+            faults.get("lines", 0.0)
+            * np.random.default_rng([seed, piece]).normal(0, 1, 4200)[np.round(line).astype(int)]
+        )
         detector = torch.from_numpy(np.stack([line, sample]))[None].float()
         seen = torch.ones(1, SIZE, SIZE, dtype=torch.bool)
         out.append(Innovation(SimpleNamespace(site=piece // 4), torch.from_numpy(value)[None].float(), seen, detector))
@@ -45,7 +50,8 @@ def left(seed: int, **faults: float) -> list[Innovation]:
     [
         ({}, ()),
         ({"steps": 0.25}, ("seam",)),
-        ({"waves": 0.3}, ("bands",)),
+        ({"waves": 0.3}, ("bands", "lines")),
+        ({"lines": 0.15}, ("lines",)),
         ({"column": 0.5}, ("column",)),
         ({"pattern": 0.1}, ()),  # as a flat field that is off a little everywhere
     ],
@@ -57,6 +63,7 @@ def test_what_images_have_on_the_same_columns_of_the_detector_is_seen_and_nothin
             "seam": seam(columns)[0] > LINE,
             "bands": bands(lines)[0] > LINE,
             "column": columns_that_stand_out(columns)[0] > STRAIGHT,
+            "lines": lines_of_their_own(left(seed, **faults))[1] > UNEVEN,
         }
         assert {k for k, v in sure.items() if v} == set(found)
         assert seam(lines)[0] < LINE / 2 and bands(columns)[0] < LINE / 2

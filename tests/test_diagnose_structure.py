@@ -275,6 +275,7 @@ def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
         "line_of_brightness": (0.0, 0.0, 0.0), "line_of_displacement": (0.0, 0.0), "field_of_images": (0.0, 0.0),
         "pattern_of_detector": (0.0, 0.0), "pixels_that_stand_out": (0, 0.0),
         "steps_of_brightness": (0.0, 0.0, -1), "blocks_of_compression": (0.0, 0.0), "odd_and_even": (0.0, 0.0),
+        "lines_of_their_own": (0.0, 0.0),
     }  # fmt: skip
     state = SimpleNamespace(sites=[], frames=1)
     grid = make_grid(SIZE, SIZE)
@@ -308,6 +309,8 @@ def test_what_counts_as_structure_is_more_than_good_cameras_leave(monkeypatch):
     assert len(words(odd_and_even=(9.0, 0.01))) == 1
     assert words(blocks_of_compression=(5.0, 0.05)) == [] == words(blocks_of_compression=(9.0, 0.0003))
     assert len(words(blocks_of_compression=(9.0, 0.005))) == 1
+    assert words(lines_of_their_own=(0.01, 0.002)) == []
+    assert len(words(lines_of_their_own=(0.01, 0.008))) == 1
     assert words(piled=0.01) == [kinds.PILED]
 
 

@@ -15,11 +15,12 @@ from stages.diagnose.structure.fields import field_of_images
 from stages.diagnose.structure.innovations import Innovation, innovations
 from stages.diagnose.structure.lines import across_columns, line_of_brightness, line_of_displacement
 from stages.diagnose.structure.pixels import pixels_that_stand_out
-from stages.diagnose.structure.profiles import bands, columns_that_stand_out, profiles, seam
+from stages.diagnose.structure.profiles import bands, columns_that_stand_out, lines_of_their_own, profiles, seam
 from stages.diagnose.structure.steps import steps_of_brightness
 
 REPEATED = 0.015  # of the squares: bilinear resampling leaves up to two thirds of that, the nearest pixel more
 STRAIGHT = 8.0  # robust standard deviations of columns from their neighbours: flat fields and noise made up to 5
+UNEVEN = 0.003  # of the squares: images without a fault that are turned against the map had up to 0.001
 PILED = "brightness that piles up at one level"
 STAYS = "a pattern that stays on the detector whatever ground it shows"
 
@@ -60,6 +61,9 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
     line, rms, frame = steps_of_brightness(state.sites, state.frames)
     if line > LINE and (share := rms**2 / _own(view, frame)) > NOTABLE:
         out["brightness that comes in equal steps"] = min(share, 1.0)
+    share, surely = lines_of_their_own(left)
+    if surely > UNEVEN:
+        out["lines of the detector that are brighter or darker by themselves, others in every image"] = share
     ratio, share = blocks_of_compression(left, state.frames)
     if ratio > PEAK and share > FAINT**2:
         out["edges every eight pixels of the detector, as compression leaves them"] = share

@@ -1,7 +1,8 @@
-"""What all images have on the same columns, or lines, of their detector: seams between its parts, bands at one distance, single columns that stand out.
+"""What images have on whole columns, or lines, of their detector: seams between its parts, bands at one distance, single columns that stand out, and
+lines each of which has a brightness of its own.
 
 Each by itself is too faint to be seen in one image. What is left of every piece of ground is added up along the columns of the detector that it falls
-on; what the images then have in common is where a step lies, how far apart bands are, and how bright a column is.
+on; what the images then have in common is where a step lies, how far apart bands are, how bright a column is, and that lines scatter.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from scipy.ndimage import median_filter
 from scipy.special import ndtri
 
 from stages.common.arrays import Floats
+from stages.common.intervals import student_quantile
+from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.tails import surprise
 from stages.diagnose.structure.innovations import Innovation
 
@@ -28,6 +31,15 @@ WAVES = 256  # columns that profiles are extended to for their spectra
 FIRST = (
     13  # of these waves, 20 columns long: on a piece of ground longer ones are not told from what ground and film have
 )
+SMOOTH = 31  # lines: what is broader is ground or a field of the image
+ASLANT = (
+    0.05,
+    0.08,
+    0.11,
+    0.14,
+    0.17,
+    0.2,
+)  # of lines along which the same sums know nothing of the detector's, either way
 
 
 @dataclass
@@ -52,15 +64,16 @@ class Profile:
         return self.total / np.maximum(self.count, 1)
 
 
-def profiles(every: Sequence[Innovation], axis: int) -> list[Profile]:
-    """Over the detector's lines (0) or samples (1)."""
+def profiles(every: Sequence[Innovation], axis: int, aslant: float = 0.0) -> list[Profile]:
+    """Over the detector's lines (0) or samples (1), or over what lies ``aslant`` to them, px of one per px of the other."""
     out = []
     for one in every:
         for value, seen, detector in zip(one.limited, one.seen, one.detector, strict=True):
             known = seen & detector.isfinite().all(0)
             if not bool(known.any()):
                 continue
-            place = detector[axis][known].round().long()
+            along = detector[1 - axis][known]
+            place = (detector[axis][known] + aslant * (along - along.mean())).round().long()
             first = int(place.min())
             count = torch.bincount(place - first).double()
             total = torch.bincount(place - first, value[known].double(), len(count))
@@ -151,6 +164,34 @@ def bands(every: Sequence[Profile]) -> tuple[float, float]:
     return float(chance), float(squares[top] / pixels * (1 - 1 / max(ratio[top], 1.0)))
 
 
+def lines_of_their_own(every: Sequence[Innovation]) -> tuple[float, float]:
+    """Share of the squares by which means over the detector's lines scatter more than those over lines aslant, and its lower bound (95 % over grounds).
+
+    Ground, optics and what resampling leaves change slowly with direction. Lines that were read out with other offsets do not.
+    """
+    grounds = 1 + max((one.patch.site for one in every), default=0)
+    excess, pixels = np.zeros(grounds), np.zeros(grounds)
+    for aslant in (0.0, *ASLANT, *(-a for a in ASLANT)):
+        for profile in profiles(every, 0, aslant):
+            excess[profile.site] += _scatter(profile) * (1.0 if aslant == 0 else -0.5 / len(ASLANT))
+            pixels[profile.site] += float(profile.count.sum()) if aslant == 0 else 0.0
+    excess, pixels = excess[pixels > 0], pixels[pixels > 0]
+    if len(pixels) < 3:
+        return 0.0, 0.0
+    without = (excess.sum() - excess) / (pixels.sum() - pixels)
+    share = float(excess.sum() / pixels.sum())
+    half = student_quantile(len(pixels) - 1) * float(jackknife_error(without, pixels.sum() - pixels))
+    return share, share - half
+
+
+def _scatter(one: Profile) -> float:
+    """Sum of squares of the means of lines about those of their neighbours, pixel by pixel."""
+    weight = np.where(one.count >= LONG, one.count, 0.0)
+    window = np.ones(min(SMOOTH, len(weight)))
+    about = np.convolve(weight * one.mean, window, "same") / np.maximum(np.convolve(weight, window, "same"), 1.0)
+    return float((weight * (one.mean - about) ** 2).sum())
+
+
 def columns_that_stand_out(every: Sequence[Profile]) -> tuple[float, float]:
     """How many robust standard deviations the column that is furthest from its neighbours in all images is from them, and its share of all squares."""
     _, fixed, often = _fixed(every)
@@ -180,4 +221,4 @@ def _fixed(every: Sequence[Profile]) -> tuple[int, Floats, Floats]:
     return first, np.where(often >= OFTEN, total / np.maximum(often, 1), 0.0), often
 
 
-__all__ = ["Profile", "bands", "columns_that_stand_out", "profiles", "seam"]
+__all__ = ["Profile", "bands", "columns_that_stand_out", "lines_of_their_own", "profiles", "seam"]
