@@ -13,6 +13,7 @@ from hidden.terrain import red_noise
 
 from stages.diagnose.result.answer import Answer, Named
 from stages.diagnose.result.files import write_diagnosis
+from stages.diagnose.result.named import by_catalogue
 from stages.diagnose.search import frames, ground
 from stages.effects import Survey, get_effect
 
@@ -76,8 +77,15 @@ def test_a_field_of_every_frame_is_named_and_relief_is_not(monkeypatch, field, r
     if field:
         value, error, _ = named[0].parameters["rms"]
         assert abs(value - field) < 3 * error and error < 0.008 and named[0].percent[1] > 0
+    # a calibrated image has no response of its own: what is left is light, and has no name in the catalogue
     state.data = Survey(units="iof")
-    assert frames.by_images(state) == ([], set())
+    strays, _ = frames.by_images(state)
+    assert [c.effect.listed for c in strays] == [False] * bool(field)
+    listed, words = by_catalogue([*named, *strays])
+    assert listed == named and len(words) == len(strays)
+    for what in words:
+        value, error = (float(x) for x in what[what.rindex("(") + 1 : -1].split(" +- "))
+        assert abs(value - field) < 3 * error and error < 0.01
 
 
 def test_values_per_image_of_a_site_are_written_and_act_on_that_crop_alone(tmp_path):

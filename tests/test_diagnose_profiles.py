@@ -10,7 +10,7 @@ import torch
 
 from stages.diagnose.settings import LINE
 from stages.diagnose.structure.innovations import Innovation
-from stages.diagnose.structure.kinds import STRAIGHT, UNEVEN
+from stages.diagnose.structure.kinds import SEAM, STRAIGHT, UNEVEN
 from stages.diagnose.structure.profiles import bands, columns_that_stand_out, lines_of_their_own, profiles, seam
 
 SIZE, PIECES, WIDE = 48, 40, 200
@@ -60,13 +60,13 @@ def test_what_images_have_on_the_same_columns_of_the_detector_is_seen_and_nothin
     for seed in range(3):
         columns, lines = (profiles(left(seed, **faults), axis) for axis in (1, 0))
         sure = {
-            "seam": seam(columns)[0] > LINE,
+            "seam": seam(columns)[0] > SEAM,
             "bands": bands(lines)[0] > LINE,
             "column": columns_that_stand_out(columns)[0] > STRAIGHT,
             "lines": lines_of_their_own(left(seed, **faults))[1] > UNEVEN,
         }
         assert {k for k, v in sure.items() if v} == set(found)
-        assert seam(lines)[0] < LINE / 2 and bands(columns)[0] < LINE / 2
+        assert seam(lines)[0] < SEAM and bands(columns)[0] < LINE / 2
 
 
 def test_one_steep_image_is_no_seam():
@@ -75,7 +75,7 @@ def test_one_steep_image_is_no_seam():
     y, x = np.mgrid[0:SIZE, 0:SIZE]
     one = every[7]
     one.value[...] += torch.from_numpy(np.sin(x / 4.0) + np.sin(y / 5.0)).float()
-    assert seam(profiles(every, 1))[0] < LINE / 2
+    assert seam(profiles(every, 1))[0] < SEAM
 
 
 def test_shares_are_those_of_the_squares():
@@ -93,4 +93,4 @@ def test_steps_of_one_ground_are_no_seam():
     for one in every[8:12]:
         one.value[...] += 1.5 * rng.choice([-1, 1]) * torch.sign(one.detector[:, 1] - 101.5)
     assert {one.patch.site for one in every[8:12]} == {2}
-    assert seam(profiles(every, 1))[0] < LINE / 2
+    assert seam(profiles(every, 1))[0] < SEAM

@@ -27,7 +27,7 @@ from stages.diagnose.registration.explain import explain
 from stages.diagnose.registration.mimicked import mimicked_shift
 from stages.diagnose.result.answer import Answer, Named
 from stages.diagnose.result.files import write_diagnosis
-from stages.diagnose.result.named import Cut, by_histogram, by_registration, by_search, outside_catalogue
+from stages.diagnose.result.named import Cut, by_catalogue, by_histogram, by_registration, by_search, outside_catalogue
 from stages.diagnose.result.score import (
     beside_shadows,
     blind_effects,
@@ -183,6 +183,8 @@ def _fill(
         left.pop(PILED, None)
     ground, shown = by_ground(state)
     fields, fields_shown = by_images(state)
+    fields, more = by_catalogue(fields)
+    left |= more
     shaded, extended, contrary = _by_shadows(state)
     answer.causes = placed + ([clipped] if clipped else []) + by_search(state) + [*shaded] + ground + fields
     answer.held_out = score(state, answer, extended)

@@ -61,11 +61,25 @@ def outside_catalogue(state: State) -> dict[str, float]:
     out = {}
     for cause in [c for c in state.named if not c.effect.listed]:
         cause.ordinary = True
-        first = type(cause.effect).parameters[0]
-        value, error = float(cause.effect.values[first.name]), state.reported_errors(cause).get(first.name, math.nan)
-        unit = "" if first.unit == "1" else f" {first.unit}"
-        out[f"{cause.effect.title} ({value:.2g} +- {error:.1g}{unit})"] = cause.gain_percent / 100
+        first = type(cause.effect).parameters[0].name
+        value, error = float(cause.effect.values[first]), state.reported_errors(cause).get(first, math.nan)
+        out[_in_words(cause.effect, value, error)] = cause.gain_percent / 100
     return out
+
+
+def by_catalogue(found: Sequence[Named]) -> tuple[list[Named], dict[str, float]]:
+    """Those that stand in it, and the others like :func:`outside_catalogue`."""
+    out = {}
+    for cause in [c for c in found if not c.effect.listed]:
+        value, error, _ = cause.parameters[type(cause.effect).parameters[0].name]
+        out[_in_words(cause.effect, value, error)] = cause.percent[0] / 100
+    return [c for c in found if c.effect.listed], out
+
+
+def _in_words(effect: Effect, value: float, error: float) -> str:
+    """What an effect does, and the size of its first parameter."""
+    unit = type(effect).parameters[0].unit
+    return f"{effect.title} ({value:.2g} +- {error:.1g}{'' if unit == '1' else ' ' + unit})"
 
 
 def by_registration(state: State) -> tuple[list[Named], dict[str, tuple[float, str]]]:

@@ -52,7 +52,8 @@ def by_images(state: State) -> tuple[list[Named], set[str]]:
     """Causes that show in what each image has of its own, and the effects that would show in it at a size worth knowing."""
     out: list[Named] = []
     shown: set[str] = set()
-    classes = [c for c in map(get_effect, effect_names()) if c.scope == "pair" and c.visible(state.data, state.has)]
+    catalogue = map(get_effect, effect_names(unlisted=True))
+    classes = [c for c in catalogue if c.scope == "pair" and c.visible(state.data, state.has)]
     sites = _own(state) if classes else []
     if sum(len(site.number) for site in sites) < FEWEST:
         return out, shown
