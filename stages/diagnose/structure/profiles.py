@@ -33,13 +33,10 @@ FIRST = (
 )
 SMOOTH = 31  # lines: what is broader is ground or a field of the image
 ASLANT = (
-    0.05,
     0.08,
-    0.11,
     0.14,
-    0.17,
     0.2,
-)  # of lines along which the same sums know nothing of the detector's, either way
+)  # px per px: along lines at these slopes, either way, the same sums know nothing of the detector's
 
 
 @dataclass
