@@ -8,11 +8,10 @@ on; what the images then have in common is where a step lies, how far apart band
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.ndimage import median_filter
 from scipy.special import ndtri
 
@@ -61,21 +60,26 @@ class Profile:
         return self.total / np.maximum(self.count, 1)
 
 
-def profiles(every: Sequence[Innovation], axis: int, aslant: float = 0.0) -> list[Profile]:
-    """Over the detector's lines (0) or samples (1), or over what lies ``aslant`` to them, px of one per px of the other."""
-    out = []
+def profiles(every: Sequence[Innovation], axis: int) -> list[Profile]:
+    """Over the detector's lines (0) or samples (1)."""
+    return [_profile(detector[axis], value, site) for site, detector, value in _seen(every)]
+
+
+def _seen(every: Sequence[Innovation]) -> Iterator[tuple[int, Floats, Floats]]:
+    """Of every image of a piece of ground whose place on the detector is known: the ground's number, line and sample (2, N), what is left (N,)."""
     for one in every:
         for value, seen, detector in zip(one.limited, one.seen, one.detector, strict=True):
             known = seen & detector.isfinite().all(0)
-            if not bool(known.any()):
-                continue
-            along = detector[1 - axis][known]
-            place = (detector[axis][known] + aslant * (along - along.mean())).round().long()
-            first = int(place.min())
-            count = torch.bincount(place - first).double()
-            total = torch.bincount(place - first, value[known].double(), len(count))
-            out.append(Profile(first, total.numpy(), count.numpy(), one.patch.site))
-    return out
+            if bool(known.any()):
+                yield one.patch.site, detector[:, known].double().numpy(), value[known].double().numpy()
+
+
+def _profile(place: Floats, value: Floats, site: int) -> Profile:
+    """Of pixels at these places, px, (N,) each."""
+    column = np.round(place).astype(np.int64)
+    first = int(column.min())
+    count = np.bincount(column - first).astype(np.float64)
+    return Profile(first, np.bincount(column - first, value, len(count)).astype(np.float64), count, site)
 
 
 def seam(every: Sequence[Profile]) -> tuple[float, float]:
@@ -168,10 +172,11 @@ def lines_of_their_own(every: Sequence[Innovation]) -> tuple[float, float]:
     """
     grounds = 1 + max((one.patch.site for one in every), default=0)
     excess, pixels = np.zeros(grounds), np.zeros(grounds)
-    for aslant in (0.0, *ASLANT, *(-a for a in ASLANT)):
-        for profile in profiles(every, 0, aslant):
-            excess[profile.site] += _scatter(profile) * (1.0 if aslant == 0 else -0.5 / len(ASLANT))
-            pixels[profile.site] += float(profile.count.sum()) if aslant == 0 else 0.0
+    for site, detector, value in _seen(every):
+        line, along = detector[0], detector[1] - detector[1].mean()
+        slanting = [_scatter(_profile(line + a * along, value, site)) for by in ASLANT for a in (-by, by)]
+        excess[site] += _scatter(_profile(line, value, site)) - np.mean(slanting)
+        pixels[site] += len(value)
     excess, pixels = excess[pixels > 0], pixels[pixels > 0]
     if len(pixels) < 3:
         return 0.0, 0.0
