@@ -16,7 +16,7 @@ from stages.diagnose.likelihood.whole import Whole
 from stages.diagnose.registration.sunward import sunward
 from stages.diagnose.rows.columns import Guise, Plan
 from stages.diagnose.search import refine, select
-from stages.diagnose.search.doubts import ODD, ORDINARY, doubt, fainter_than_the_law, with_ordinary
+from stages.diagnose.search.doubts import ODD, ORDINARY, doubt, with_ordinary
 from stages.diagnose.search.rivals import choose, judge, may_be_another
 from stages.diagnose.search.select import Weighed, _hiding, unlikely
 from stages.diagnose.search.state import Cause, State
@@ -126,17 +126,6 @@ def test_what_is_ordinary_for_sure_beside_a_fault_is_rendered_and_no_name(monkey
     assert (optics in state.causes, optics.ordinary, bool(why)) == {
         "ordinary": (True, True, False), "named": (True, False, True), "gone": (False, False, False),
     }[left]  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "percent", "named"), [
-    ("sun_elevation", 0.012, False), ("limb_darkening", 0.052, True), ("echo", 0.031, True),
-])  # fmt: skip
-def test_an_effect_of_the_law_takes_more_away_than_the_law_is_known_to(name, percent, named):
-    """A Sun 2.3 deg lower, of a DEM stretched by a tenth, took 0.01 % of the squares away: many pixels had made that sure."""
-    cls = get_effect(name)
-    found = Found(name, Guise(name, cls.trials(Survey())[0], (0,)), np.ones(1), np.ones(1), 9.0)
-    cause = Cause(cls(cls.null(), Survey()), found, gain_percent=percent)
-    assert (fainter_than_the_law(cause) == "") == named
 
 
 def test_an_echo_explains_more_than_what_lies_on_the_other_side():

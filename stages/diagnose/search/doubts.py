@@ -8,7 +8,7 @@ from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.tails import together
 from stages.diagnose.search.refine import settle
 from stages.diagnose.search.state import Cause, State, View
-from stages.diagnose.settings import FAINT, STILL, SURE
+from stages.diagnose.settings import STILL, SURE
 from stages.effects import Effect
 
 # what reasons start with, for those who ask what kind of reason it was
@@ -52,13 +52,6 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
         if size - 2 * error < cls.tolerance.get(name, 0.0):
             return f"the law of the ground, which is not known, passes for as much ({name} = {values[name]:.2g} +- {error:.1g})"
     return ""
-
-
-def fainter_than_the_law(cause: Cause) -> str:
-    """Why an effect of the law that surely gains may stand for what the fitted law has wrong, or ''."""
-    if not cause.effect.of_law or cause.gain_percent > 100 * FAINT**2:
-        return ""
-    return f"it takes {cause.gain_percent:.1g} % of what is left away, and no law is known to less than {100 * FAINT**2:.1g} %"
 
 
 def surely_ordinary(cause: Cause) -> bool:

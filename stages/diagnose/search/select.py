@@ -15,7 +15,6 @@ from stages.diagnose.search.doubts import (
     doubt,
     doubt_all,
     doubt_any,
-    fainter_than_the_law,
     impossible,
     ordinary,
     surely_ordinary,
@@ -217,7 +216,6 @@ def take(state: State, view: View, found: Found, group: list[str]) -> str:
         cause.found = dataclasses.replace(cause.found, gains=gains, sizes=sizes)
         if low <= 0:
             why = f"fitted together with all other causes, {no_sure_gain(float(gains.sum()), low, high)}"
-        why = why or fainter_than_the_law(cause)
     ordinary_alone = why.startswith(ORDINARY) and why == doubt(state, cause)
     cause.ordinary = ordinary_alone and _is_rendered(cls)
     if cause.ordinary:
