@@ -26,6 +26,7 @@ from stages.diagnose.settings import CELL, ROUNDS
 from stages.effects import Effect, effect_names, get_effect
 from stages.effects.base import Survey, Values
 
+NEARBY = 10.0  # times the least finer power: with more an image tells of the law and relief alone, whose broad power need not go with their finer one
 FEWEST = 6  # images of places: of fewer, the broad power that goes with finer waves is not known
 
 
@@ -98,6 +99,7 @@ def without_finer(power: NDArray, finer: NDArray, frame: NDArray) -> tuple[float
     least = float(np.quantile(finer, 1 / FEWEST))
 
     def at_least(kept: NDArray) -> tuple[float, float]:
+        kept = kept & (finer <= NEARBY * least)
         x, y = finer[kept] - least, power[kept]
         height = finer[kept]
         for _ in range(ROUNDS):

@@ -25,7 +25,6 @@ SEAM = (
 )
 UNEVEN = 0.003  # of the squares: images without a fault that are turned against the map had up to 0.001
 PILED = "brightness that piles up at one level"
-STAYS = "a pattern that stays on the detector whatever ground it shows"
 
 
 def structure(state: State, view: View, piled: float) -> dict[str, float]:
@@ -44,17 +43,11 @@ def structure(state: State, view: View, piled: float) -> dict[str, float]:
     line, share = line_of_displacement(left, view.grid, state.frames)
     if line > LINE and share > REPEATED:
         out["displacements that come back at equal distances"] = share
-    for what, (alike, surely), least in (
-        (
-            "a broad field in each image that is the same on all ground",
-            field_of_images(view.rows, view.model, view.grid),
-            ALIKE,
-        ),
-        (STAYS, pattern_of_detector(left), ALIKE),
-        (STAYS, pattern_of_detector(left, spots=True), NOTABLE),  # pixels that differ by 0.2 % have up to that
-    ):
-        if surely > least:
-            out.setdefault(what, alike)
+    alike, surely = field_of_images(view.rows, view.model, view.grid)
+    if surely > ALIKE:
+        out["a broad field in each image that is the same on all ground"] = alike
+    if alike := pattern_of_detector(left, NOTABLE):  # pixels that differ by 0.2 % have up to that
+        out["a pattern that stays on the detector whatever ground it shows"] = alike
     count, share = pixels_that_stand_out(left)
     if count >= SPECKS and share > FAINT**2:
         out[f"{count} single pixels that stand out"] = share
