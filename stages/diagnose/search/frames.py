@@ -59,6 +59,9 @@ def by_images(state: State) -> tuple[list[Named], set[str]]:
     if sum(len(site.number) for site in sites) < FEWEST:
         return out, shown
     frames = np.concatenate([site.frames for site in sites])
+    # of frames that show one place each, images of a place are known from each other alone, and two of them tell the same
+    if len(np.unique(frames)) == len(frames):
+        frames = np.concatenate([np.full(len(site.frames), k) for k, site in enumerate(sites)])
     for cls in classes:
         read = [cls.read_off_image(site.left, site.seen) for site in sites]
         found = [x for x in read if x is not None]
@@ -93,14 +96,16 @@ def without_finer(power: NDArray, finer: NDArray, frame: NDArray) -> tuple[float
 
     and the share of it in each image's power, (N,).
 
-    A straight line, never falling, whose scatter goes with its height (gamma regression), read where there is least of the finer waves: that is noise.
+    A straight line, never falling, whose scatter goes with its height (gamma regression). How much of the least finer power is noise, beside which
+    an image has nothing broad, is open: the line is read at half of it, and what it may be at none and at all of it is part of the error.
     """
     finer = np.maximum(finer, 1e-12)
     least = float(np.quantile(finer, 1 / FEWEST))
+    noise = least / 2
 
-    def at_least(kept: NDArray) -> tuple[float, float]:
+    def at_noise(kept: NDArray) -> tuple[float, float]:
         kept = kept & (finer <= NEARBY * least)
-        x, y = finer[kept] - least, power[kept]
+        x, y = finer[kept] - noise, power[kept]
         height = finer[kept]
         for _ in range(ROUNDS):
             w = height**-2.0
@@ -114,9 +119,10 @@ def without_finer(power: NDArray, finer: NDArray, frame: NDArray) -> tuple[float
     unit = np.unique(frame, return_inverse=True)[1] if len(np.unique(frame)) >= FEWEST else np.arange(len(frame))
     part = folds(int(unit.max()) + 1)[unit]
     parts = np.unique(part)
-    error = float(jackknife_error(np.array([at_least(part != k)[0] for k in parts])))
-    size, slope = at_least(np.ones(len(power), bool))
-    share = size / np.maximum(size + slope * np.maximum(finer - least, 0.0), 1e-300)
+    error = float(jackknife_error(np.array([at_noise(part != k)[0] for k in parts])))
+    size, slope = at_noise(np.ones(len(power), bool))
+    error = math.hypot(error, slope * noise / math.sqrt(3))  # of a number that is anywhere up to as far away
+    share = size / np.maximum(size + slope * np.maximum(finer - noise, 0.0), 1e-300)
     return size, error, len(parts) - 1, np.clip(share, 0.0, 1.0)
 
 
