@@ -26,7 +26,7 @@ from stages.diagnose.settings import CELL, ROUNDS
 from stages.effects import Effect, effect_names, get_effect
 from stages.effects.base import Survey, Values
 
-NEARBY = 10.0  # times the least finer power: with more an image tells of the law and relief alone, whose broad power need not go with their finer one
+NEARBY = 30.0  # times the least finer power: with more an image tells of the law and relief alone, whose broad power need not go with their finer one
 FEWEST = 6  # images of places: of fewer, the broad power that goes with finer waves is not known
 
 
