@@ -36,16 +36,6 @@ def jackknife_error(without: NDArray[np.float64], left: NDArray[np.float64] | No
     return np.sqrt(units / (units - 1) * ((kept * apart) ** 2).sum(0))
 
 
-def alike_half_width(alike: NDArray[np.float64], squares: NDArray[np.float64]) -> float:
-    """Half of the 95 % interval of the share of the squares that grounds have alike; alike, squares : (U,) of each, at least three.
-
-    Every product is one of two grounds: without one of them those that are left are fewer, and weigh more.
-    """
-    units = len(squares)
-    without = (alike.sum() - 2 * alike) / (squares.sum() - squares) * (units - 1) / (units - 2)
-    return student_quantile(units - 1) * float(jackknife_error(without))
-
-
 def gain_interval(before: NDArray[np.float64], after: NDArray[np.float64]) -> tuple[float, float, float]:
     """Percent by which sums of squares per unit (U,) get smaller in total, and the 95 % interval of that."""
     total = float(before.sum())
@@ -78,4 +68,4 @@ def nats(before: float, after: float, pixels: float, per_sample: float) -> float
     return 0.5 * pixels / per_sample * math.log(before / after) if before > 0 and after > 0 else math.nan
 
 
-__all__ = ["alike_half_width", "gain_chance", "gain_interval", "jackknife_error", "nats"]
+__all__ = ["gain_chance", "gain_interval", "jackknife_error", "nats"]

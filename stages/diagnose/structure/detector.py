@@ -18,7 +18,7 @@ SPOT = 1.0  # px, sigma: dust is broader, noise of single pixels is not
 KNOWN = 0.2  # of the weight about a pixel, which it is a mean of at least
 PASSES = 3  # of taking out means of columns and lines in turn, where a block is not full
 SHIFTS = 12  # of the grounds against each other, that tell what is alike by chance
-FAR = 8, 40  # px of such a shift, either way: farther than dust is wide, and grounds still overlap
+APART = 8, 40  # px of such a shift, either way: farther than dust is wide, and grounds still overlap
 BEYOND = 6.0  # standard deviations of what is alike by chance: three grounds that look alike had 3.9
 
 
@@ -36,7 +36,7 @@ def pattern_of_detector(every: Sequence[Innovation], least: float) -> float:
     rng = np.random.default_rng(grounds)
     by_chance = []
     for _ in range(SHIFTS):
-        shift = rng.integers(*FAR, (grounds, 2)) * rng.choice([-1, 1], (grounds, 2))
+        shift = rng.integers(*APART, (grounds, 2)) * rng.choice([-1, 1], (grounds, 2))
         by_chance.append(_alike(place + shift[site], value, site))
     return share if share - BEYOND * float(np.std(by_chance)) > least else 0.0
 

@@ -6,8 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.covariance import Covariance
-from stages.diagnose.likelihood.jackknife import alike_half_width
+from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.likelihood.products import Rows, whitened_residual
 from stages.diagnose.rows.patches import Grid
 from stages.diagnose.settings import BROADEST
@@ -38,10 +39,13 @@ def field_of_images(rows: list[Rows], model: Covariance, grid: Grid) -> tuple[fl
         np.add.at(alike, ground.numpy(), (z.conj() * mean).real.sum(1).double().numpy())
         np.add.at(squares, ground[count > 0].numpy(), z[count > 0].abs().square().sum(1).double().numpy())
     alike, squares = alike[squares > 0], squares[squares > 0]
-    if len(squares) < 3:
+    grounds = len(squares)
+    if grounds < 3:
         return 0.0, 0.0
     share = float(alike.sum() / squares.sum())
-    return share, share - alike_half_width(alike, squares)
+    # every product is one of two pieces of ground: without one of them those that are left are fewer, and weigh more
+    without = (alike.sum() - 2 * alike) / (squares.sum() - squares) * (grounds - 1) / (grounds - 2)
+    return share, share - student_quantile(grounds - 1) * float(jackknife_error(without))
 
 
 __all__ = ["field_of_images"]

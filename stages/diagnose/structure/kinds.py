@@ -20,9 +20,8 @@ from stages.diagnose.structure.steps import steps_of_brightness
 
 REPEATED = 0.015  # of the squares: bilinear resampling leaves up to two thirds of that, the nearest pixel more
 STRAIGHT = 8.0  # robust standard deviations of columns from their neighbours: flat fields and noise made up to 5
-SEAM = (
-    9.0  # -log10 of the chance of its scatter: images of five simulators and photographs that have none had up to 6.3
-)
+# -log10 of the chance of its scatter: images of five simulators and photographs that have none had up to 6.3
+SEAM = 9.0
 UNEVEN = 0.003  # of the squares: images without a fault that are turned against the map had up to 0.001
 PILED = "brightness that piles up at one level"
 

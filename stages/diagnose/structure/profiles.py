@@ -16,8 +16,7 @@ from scipy.ndimage import median_filter
 from scipy.special import ndtri
 
 from stages.common.arrays import Floats
-from stages.common.intervals import student_quantile
-from stages.diagnose.likelihood.jackknife import jackknife_error
+from stages.common.intervals import ratio_interval
 from stages.diagnose.likelihood.tails import surprise
 from stages.diagnose.structure.innovations import Innovation
 
@@ -31,11 +30,8 @@ FIRST = (
     13  # of these waves, 20 columns long: on a piece of ground longer ones are not told from what ground and film have
 )
 SMOOTH = 31  # lines: what is broader is ground or a field of the image
-ASLANT = (
-    0.08,
-    0.14,
-    0.2,
-)  # px per px: along lines at these slopes, either way, the same sums know nothing of the detector's
+# px per px: along lines at these slopes, either way, the same sums know nothing of the detector's
+ASLANT = 0.08, 0.14, 0.2
 
 
 @dataclass
@@ -166,7 +162,7 @@ def bands(every: Sequence[Profile]) -> tuple[float, float]:
 
 
 def lines_of_their_own(every: Sequence[Innovation]) -> tuple[float, float]:
-    """Share of the squares by which means over the detector's lines scatter more than those over lines aslant, and its lower bound (95 % over grounds).
+    """Share of the squares by which means over the detector's lines scatter more than those over lines aslant, and its lower bound (95 % over grounds); NaN of too few.
 
     Ground, optics and what resampling leaves change slowly with direction. Lines that were read out with other offsets do not.
     """
@@ -177,13 +173,8 @@ def lines_of_their_own(every: Sequence[Innovation]) -> tuple[float, float]:
         slanting = [_scatter(_profile(line + a * along, value, site)) for by in ASLANT for a in (-by, by)]
         excess[site] += _scatter(_profile(line, value, site)) - np.mean(slanting)
         pixels[site] += len(value)
-    excess, pixels = excess[pixels > 0], pixels[pixels > 0]
-    if len(pixels) < 3:
-        return 0.0, 0.0
-    without = (excess.sum() - excess) / (pixels.sum() - pixels)
-    share = float(excess.sum() / pixels.sum())
-    half = student_quantile(len(pixels) - 1) * float(jackknife_error(without, pixels.sum() - pixels))
-    return share, share - half
+    found = ratio_interval(excess, pixels, np.arange(grounds))
+    return found.value, found.low
 
 
 def _scatter(one: Profile) -> float:
