@@ -1,8 +1,10 @@
-"""Write docs/cli.md: every command with its options, as `--help` tells them. Run: python examples/cli_page.py"""
+"""Write docs/cli.md: every command with its options, from the texts of `--help`. Run: python examples/cli_page.py"""
 
 from __future__ import annotations
 
+import re
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -13,53 +15,86 @@ sys.path.insert(0, str(ROOT))
 
 from lunargr_cli.main import app  # noqa: E402
 
+HEAD = """# Commands
+
+`python examples/cli_page.py` writes this page. `lunargr COMMAND --help` explains every option in full.
+"""
+SHARED_FROM = 3  # commands with the same option: then it is explained once, on top
+
 
 def cell(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
 
 
+STATED = re.compile(r"\s*\[default: (.*?)\]")  # in the text itself, where the default hangs on a recipe
+
+
 def default_of(option: Any) -> str:
     value = option.default
-    if option.required or value is None or callable(value) or value == () or str(value).startswith("Sentinel"):
-        return "required" if option.required else ""
-    return f"`{value}`" if not isinstance(value, bool) else ("on" if value else "off")
+    if stated := STATED.search(getattr(option, "help", "") or ""):
+        return f"`{stated[1]}`"
+    if option.required or value is None or callable(value) or value in ((), "") or str(value).startswith("Sentinel"):
+        return "required" if option.required and option.param_type_name == "option" else ""
+    return f"`{value}`" if not isinstance(value, bool) else ("on" if value else "")
 
 
-def section(name: str, command: Any) -> list[str]:
+def first_sentence(option: Any) -> str:
+    text = STATED.sub("", cell(getattr(option, "help", "") or ""))
+    return re.split(r"(?<=[\w)])\. (?=[A-Z])", text)[0].removesuffix(".")
+
+
+def spelled(option: Any) -> str:
+    """'`--view` ortho/pinhole': the names of an option, and what its value may be."""
+    if option.param_type_name == "argument":
+        return f"`{(option.metavar or option.name or '').upper()}`"
+    names = ", ".join(f"`{o}`" for o in [*option.opts, *option.secondary_opts])
+    choices = (option.metavar or "").strip("[]").split("|")
+    return f"{names} {'/'.join(choices)}" if option.metavar else names
+
+
+def key_of(option: Any) -> tuple[str, str]:
+    return option.opts[0], first_sentence(option)
+
+
+def options_of(name: str, command: Any) -> list[Any]:
     context = command.context_class(command, info_name=f"lunargr {name}")
+    return [p for p in command.get_params(context) if p.name != "help"]
+
+
+def section(name: str, command: Any, shared: set[tuple[str, str]]) -> list[str]:
+    """A command: what it does, its examples, its own options, and the names of those that it shares."""
     text = (command.help or "").replace("\b", "").strip()
     first, _, rest = text.partition("\n\n")
     lines = [f"## {name}", "", " ".join(first.split()), ""]
     for paragraph in rest.strip("\n").split("\n\n"):
         shown = paragraph.strip()
-        example = shown.startswith("lunargr ")
-        lines += ["```", *(line.rstrip() for line in shown.splitlines()), "```", ""] if example else [shown, ""]
-    lines += [f"    {' '.join(command.get_usage(context).split()).removeprefix('Usage: ')}", ""]
-    lines += ["| | default | |", "|---|---|---|"]
-    for parameter in command.get_params(context):
-        if parameter.name == "help":
-            continue
-        names = ", ".join(f"`{o}`" for o in [*parameter.opts, *parameter.secondary_opts])
-        if parameter.param_type_name == "argument":
-            names = f"`{(parameter.metavar or parameter.name or '').upper()}`"
-        lines.append(f"| {names} | {default_of(parameter)} | {cell(getattr(parameter, 'help', '') or '')} |")
-    return [*lines, ""]
+        if shown.startswith("lunargr "):
+            lines += ["```", *(line.rstrip() for line in shown.splitlines()), "```", ""]
+        elif shown:
+            lines += [shown, ""]
+    every = options_of(name, command)
+    own = [p for p in every if key_of(p) not in shared]
+    if own:
+        lines += ["| option | default | |", "|---|---|---|"]
+        lines += [f"|{spelled(p)}|{default_of(p)}|{first_sentence(p)}|" for p in own]
+        lines += [""]
+    also = [f"`{p.opts[0]}`" + (f" ({default_of(p)})" if default_of(p) else "") for p in every if key_of(p) in shared]
+    return [*lines, *([f"Also: {', '.join(also)}.", ""] if also else [])]
 
 
 def page() -> str:
     group: Any = typer.main.get_command(app)
-    lines = [
-        "# Commands",
-        "",
-        "Written by `examples/cli_page.py` from the program itself. All options: `lunargr COMMAND --help`.",
-        "",
-        "| every command | |",
-        "|---|---|",
-        *(f"| {', '.join(f'`{o}`' for o in p.opts)} | {cell(getattr(p, 'help', '') or '')} |" for p in group.params),
-        "",
-    ]
+    every = {name: options_of(name, command) for name, command in group.commands.items()}
+    count = Counter(key_of(p) for options in every.values() for p in options if p.param_type_name == "option")
+    shared = {key for key, number in count.items() if number >= SHARED_FROM}
+    first = {key_of(p): p for options in reversed(every.values()) for p in options}
+    lines = [HEAD, "| option of every command | |", "|---|---|"]
+    lines += [f"|{spelled(p)}|{first_sentence(p)}|" for p in group.params]
+    lines += ["", "| option of many commands | |", "|---|---|"]
+    lines += [f"|{spelled(first[key])}|{key[1]}|" for key in count if key in shared]
+    lines += [""]
     for name, command in group.commands.items():
-        lines += section(name, command)
+        lines += section(name, command, shared)
     return "\n".join(lines).rstrip() + "\n"
 
 

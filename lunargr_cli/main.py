@@ -87,7 +87,7 @@ def _with_safeguards(command: Callable[..., None], shared: bool) -> Callable[...
 
 app = typer.Typer(
     name="lunargr",
-    help="Learn a spatially varying reflectance of the Moon from terrain alone, and show what the simulation gets wrong.\n\n"
+    help="Learn the reflectance of the Moon from terrain and images, and find what a simulation of them gets wrong.\n\n"
     "simulate -> ingest -> sample -> project -> train -> infer -> render -> evaluate / match, and diagnose",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -112,7 +112,8 @@ def _options(
     verbose: Annotated[
         bool,
         typer.Option(
-            *VERBOSE, help="Let libraries say their own, and tell time and memory at the end; before or after COMMAND."
+            *VERBOSE,
+            help="Show messages of libraries, and print time and memory at the end. Works before or after COMMAND.",
         ),
     ] = False,
 ) -> None:

@@ -49,16 +49,18 @@ def configure(config: type[Config], options: Mapping[str, Any], **converted: Any
 
 OutputFile = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True), Writes.FILE]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on where an interrupted run stopped.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")]
 Shard = Annotated[
     str | None,
-    typer.Option("--shard", metavar="I/N", help="Do only part I of N (1-based); join the parts with 'lunargr merge'."),
+    typer.Option(
+        "--shard", metavar="I/N", help="Do only part I of N, counted from 1; 'lunargr merge' joins the parts."
+    ),
 ]
 ResumeParts = Annotated[
     bool,
     typer.Option(
         "--resume",
-        help="Work in parts that an interrupted run leaves finished; the same command then goes on with the rest.",
+        help="Keep finished parts after an interruption; the same command then does the rest.",
     ),
 ]
 Scheduler = Annotated[
@@ -67,7 +69,7 @@ Scheduler = Annotated[
         "--scheduler",
         metavar="ADDRESS|local:N",
         callback=check_scheduler,
-        help="Work in parts on Dask: N processes of this machine, or the workers of a scheduler; goes on like --resume.",
+        help="Run parts on Dask: N processes of this machine, or the workers of a scheduler. Keeps finished parts like --resume.",
     ),
 ]
 Parts = Annotated[
@@ -77,7 +79,7 @@ Parts = Annotated[
         metavar="N",
         min=1,
         max=MOST_PARTS,
-        help="With --scheduler or --resume: how many parts (default: by size).",
+        help="Number of parts with --scheduler or --resume (default: by size).",
     ),
 ]
 Seed = Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Seed of every random choice.")]
@@ -97,7 +99,7 @@ GeoTiff = Annotated[
     Writes.FILE,
 ]
 NoGeoTiff = Annotated[
-    bool, typer.Option("--no-geotiff", help="Write the HDF5 map only: on large maps a seventh of the time less.")
+    bool, typer.Option("--no-geotiff", help="Write only the HDF5 map; saves a seventh of the time on large maps.")
 ]
 # Of `train` and `compare`
 Epochs = Annotated[int, typer.Option("--epochs", min=1, max=100_000, help="Passes over the training pairs.")]
@@ -108,7 +110,7 @@ Widths = Annotated[
     str, typer.Option("--widths", help="Channels of each stage of the U-Net; Lunar-G2R: 16-32-64-128-256.")
 ]
 TrainingPrecision = Annotated[
-    str, typer.Option("--precision", help="fp32, bf16, or auto: bf16 where the processor is made for it.")
+    str, typer.Option("--precision", help="fp32, bf16, or auto: bf16 where the processor computes it faster.")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")]
 

@@ -21,18 +21,18 @@ def command(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="scene.h5 that the map was inferred from.")],
     leave_out: Annotated[
         str | None,
-        typer.Option("--leave-out", metavar="ID,...", help="Images that must not enter, to be evaluated on."),
+        typer.Option("--leave-out", metavar="ID,...", help="Images to leave out, for evaluation on them."),
     ] = None,
     fold: Annotated[
         str | None,
-        typer.Option("--fold", metavar="K/N", help="Leave out every N-th image from the K-th (1-based) on."),
+        typer.Option("--fold", metavar="K/N", help="Leave out every N-th image, starting with the K-th."),
     ] = None,
     register: Annotated[
         str | None,
         typer.Option(
             "--register",
             metavar="FORM",
-            help="Take off how far each image lies from its rendering: constant, affine or field, as 'lunargr project'.",
+            help="Align each image with its rendering: constant, affine or field, as in 'lunargr project'.",
         ),
     ] = Config.register,
     geotiff: options.GeoTiff = None,
@@ -47,8 +47,8 @@ def command(
 ) -> None:
     """Add per-pixel albedo to a reflectance map, from all photographs of the scene.
 
-    The albedo multiplies the I/F of the map. Where photographs agree it is theirs; where they do not, and where there are
-    none, it is 1 and the map stays as the terrain gave it. Rendering, evaluation and GeoTIFF take it into account.
+    The albedo multiplies the I/F of the map. It differs from 1 where the photographs agree on a difference, and is 1
+    elsewhere. Rendering, evaluation and the GeoTIFF use it.
     """
     converted = {"leave_out": options.read_names(leave_out), "fold": _fold(fold), "geotiff": not no_geotiff}
     config = options.configure(Config, locals(), **converted, shard=options.parse_shard(shard))

@@ -41,7 +41,7 @@ def command(
     widths: options.Widths = options.join_numbers(Config.widths),
     precision: options.TrainingPrecision = Config.precision,
     split: Annotated[
-        str, typer.Option("--split", help="Where models are compared: validation (as in the paper) or test.")
+        str, typer.Option("--split", help="Split to compare models on: validation (as in the paper) or test.")
     ] = "validation",
     device: options.Device = Config.device,
     json_file: options.Json = None,
@@ -49,9 +49,9 @@ def command(
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Train every model from several seeds on the same pairs and compare them, with the noise of seeds and ground.
+    """Train several models from several seeds on the same pairs, and test which differences exceed the noise.
 
-    With --resume, runs that the folder already holds are kept and an interrupted one goes on where it stopped.
+    With --resume, finished runs in the folder are kept and an interrupted one continues.
     """
     common = options.configure(Config, locals(), widths=options.read_numbers("--widths", widths, int))
     from stages import compare

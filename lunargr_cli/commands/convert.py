@@ -28,11 +28,11 @@ def command(
         typer.Option(
             "--bands",
             metavar="NAME,...|NAME=INDEX,...",
-            help="The input's bands, if its descriptions do not name them.",
+            help="Names of the input's bands, if the file does not name them.",
         ),
     ] = None,
     approximate: Annotated[
-        bool, typer.Option("--approximate", help="Convert although the target cannot hold everything.")
+        bool, typer.Option("--approximate", help="Convert even if the target convention loses information.")
     ] = False,
     overwrite: Overwrite = False,
     quiet: Quiet = False,

@@ -21,18 +21,19 @@ NAME, ORDER = "diagnose", 80
 def command(
     pairs: Annotated[Path | None, typer.Argument(help="Pairs from 'lunargr project'.")] = None,
     checkpoint: Annotated[
-        Path | None, typer.Argument(help="Checkpoint from 'lunargr train'; without it --model is fitted.")
+        Path | None,
+        typer.Argument(help="Checkpoint from 'lunargr train' to simulate with; without it --model is fitted."),
     ] = None,
     model: Annotated[
         str,
         typer.Option(
             "--model",
-            help="Reflectance model to fit where there is no checkpoint; M2 or hapke, whichever explains more alone, may take its place.",
+            help="Reflectance model to fit without a checkpoint; measured lunar laws replace it where they fit clearly better.",
         ),
     ] = Config.model,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="diagnosis.h5: the extended model for train, render, evaluate."),
+        typer.Option("--output", "-o", help="diagnosis.h5: the effects, for --extend of train, render and evaluate."),
         Writes.FILE,
     ] = None,
     report: Annotated[
@@ -42,16 +43,18 @@ def command(
     ] = None,
     free: Annotated[
         str,
-        typer.Option("--free", help="Coefficients of --model that are fitted, by commas; the others stay published."),
+        typer.Option(
+            "--free", help="Coefficients of --model to fit, separated by commas; the others keep published values."
+        ),
     ] = ",".join(Config.free),
     list_effects: Annotated[bool, typer.Option("--list", help="Explain every effect and stop.")] = False,
     most_causes: Annotated[
-        int, typer.Option("--causes", min=1, max=100, help="Most causes to name.")
+        int, typer.Option("--causes", min=1, max=100, help="Maximum number of causes to name.")
     ] = Config.most_causes,
     most_pairs: Annotated[
         int,
         typer.Option(
-            "--pairs", min=1, max=MOST, help="Most pairs of 128 px that the search uses; of larger ones fewer, by area."
+            "--pairs", min=1, max=MOST, help="Maximum number of pairs of 128 px to search; fewer if they are larger."
         ),
     ] = Config.most_pairs,
     seed: Seed = Config.seed,

@@ -23,18 +23,18 @@ def command(
         list[Path],
         typer.Argument(
             metavar="CHECKPOINT...",
-            help="From 'lunargr train', several being training runs of one model; with --held-out-images maps from 'lunargr albedo'.",
+            help="Training runs of one model, from 'lunargr train'; with --held-out-images maps from 'lunargr albedo'.",
         ),
     ],
     output: options.OutputFile = Path("evaluation.h5"),
     held_out_images: Annotated[
         bool,
-        typer.Option("--held-out-images", help="Score seen ground under images that did not make the map's albedo."),
+        typer.Option("--held-out-images", help="Score maps on images that were left out of their albedo."),
     ] = False,
     split: Annotated[str, typer.Option("--split", help="train, validation or test.")] = Config.split,
     extend: Annotated[
         Path | None,
-        typer.Option("--extend", metavar="FILE", help="Also score the extended model of 'lunargr diagnose'."),
+        typer.Option("--extend", metavar="FILE", help="diagnosis.h5: also score the model with its effects."),
     ] = None,
     figures: Annotated[
         Path | None,
@@ -44,7 +44,10 @@ def command(
     fit_pairs: Annotated[
         int,
         typer.Option(
-            "--fit-pairs", min=0, max=options.MOST, help="Most train pairs that baselines are fitted on (0: all)."
+            "--fit-pairs",
+            min=0,
+            max=options.MOST,
+            help="Maximum number of training pairs for fitting baselines (0: all).",
         ),
     ] = Config.fit_pairs,
     renderings: Annotated[
@@ -55,7 +58,7 @@ def command(
     ] = None,
     only: Annotated[
         list[str] | None,
-        typer.Option("--only", metavar="ROW", help="Score only this row of the table; may be repeated."),
+        typer.Option("--only", metavar="ROW", help="Score only this row of the table. May be repeated."),
     ] = None,
     batch: Annotated[
         int, typer.Option("--batch", min=1, max=options.MOST, help="Crops in memory at a time.")
@@ -70,9 +73,9 @@ def command(
 ) -> None:
     """Score the learned model and its baselines on one split: MSE, PSNR, SSIM, LPIPS, with 95 % intervals.
 
-    The result also goes to a JSON file beside the output. Images in DN get a gain and an offset per image, fitted on
-    the train split in the same way for every model; their errors are shares of the full DN range. Checkpoints of one
-    model from several seeds make the learned rows means over training runs, whose spread is part of the intervals.
+    A JSON file beside the output holds the same results. For images in DN every model gets a gain and an offset per
+    image, fitted on the training split; errors are then shares of the full DN range. With checkpoints from several
+    seeds the learned rows are means over training runs, and the intervals include the spread of the runs.
     """
     config = options.configure(Config, locals(), only=tuple(only or ()), extend=str(extend) if extend else None)
     from stages.evaluate.coverage import coverage_lines

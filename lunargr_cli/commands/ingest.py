@@ -31,7 +31,7 @@ def command(
     ] = None,
     crop: Annotated[
         int,
-        typer.Option("--crop", min=1, max=options.MOST, help="Crop size in pixels that valid positions are made for."),
+        typer.Option("--crop", min=1, max=options.MOST, help="Crop size in pixels for which valid centres are found."),
     ] = Config.crop,
     output: options.OutputFile = Path("scene.h5"),
     body: options.BodyOption = Config.body,
@@ -45,7 +45,7 @@ def command(
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Bring a DEM to a metric grid and find where crops of each image may be centred."""
+    """Put a DEM on a metric grid and find valid crop centres for each image."""
     config = options.configure(Config, locals(), shard=options.parse_shard(shard))
     console, to = Console(quiet), Output(output, overwrite)
     if options.in_parts(scheduler, resume, parts, shard):

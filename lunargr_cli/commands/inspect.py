@@ -26,7 +26,7 @@ def command(
     json_file: Json = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Say what an artefact is, who made it and from what; check it against its schema."""
+    """Show what a file holds and which commands and inputs made it; check it against its schema."""
     from schemas.provenance import chain
     from schemas.rasters import raster_kind
 

@@ -30,7 +30,7 @@ def command(
         list[str] | None,
         typer.Option(
             "--matcher",
-            help="daisy, sift, aliked, disk, or one that you added; may be repeated (default: daisy and sift).",
+            help="daisy, sift, aliked, disk, or your own. May be repeated (default: daisy and sift).",
         ),
     ] = None,
     split: Annotated[str, typer.Option("--split", help="train, validation or test (for pairs).")] = Config.split,
@@ -57,8 +57,8 @@ def command(
 ) -> None:
     """Match measured with rendered images at 512 x 384 and count the matches within 1, 3 and 5 px of the truth.
 
-    Both show the same ground, pixel for pixel, so every match should end where it began: the learned reflectance
-    beside Hapke matched to each crop's range, as in the Lunar-G2R paper.
+    Measured and rendered images show the same ground, pixel for pixel: a correct match has the same position in both.
+    The learned reflectance stands beside Hapke matched to each crop's range, as in the Lunar-G2R paper.
     """
     console = Console(quiet)
     if list_matchers:

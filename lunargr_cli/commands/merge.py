@@ -23,12 +23,12 @@ def command(
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write."), Writes.FILE],
     virtual: Annotated[
-        bool, typer.Option("--virtual", help="Do not copy: the output is a view of its parts, which must stay.")
+        bool, typer.Option("--virtual", help="Write links to the parts instead of copies; the parts must stay.")
     ] = Config.virtual,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Join the parts that shards wrote into the artefact that one run would have written."""
+    """Join the parts of a sharded command into one file, identical to that of a single run."""
     console = Console(quiet)
     schema = merge.run(parts, Output(output, overwrite), Config(virtual), console.say, console.progress)
     console.say(f"{output}: {len(parts)} parts of '{schema.name}' merged")

@@ -21,7 +21,7 @@ def command(
     conventions: Annotated[
         bool, typer.Option("--conventions", help="List the conventions that 'lunargr convert' knows.")
     ] = False,
-    cameras: Annotated[bool, typer.Option("--cameras", help="List the cameras that images may come with.")] = False,
+    cameras: Annotated[bool, typer.Option("--cameras", help="List the camera models that lunargr reads.")] = False,
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Print the reference part of docs/photometry.md.")
     ] = False,

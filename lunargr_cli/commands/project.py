@@ -49,27 +49,27 @@ def _is_value(following: list[str]) -> bool:
 def command(
     crops: Annotated[Path, typer.Argument(help="crops.h5 from 'lunargr sample'.")],
     scene: Annotated[
-        Path | None, typer.Option("--scene", help="scene.h5, where it is no longer where crops.h5 says.")
+        Path | None, typer.Option("--scene", help="scene.h5, if it moved since crops.h5 was written.")
     ] = None,
     register: Annotated[
         str | None,
         typer.Option(
             "--register",
             metavar="[constant|affine|field]",
-            help="Take off how far each image lies from its rendering: one shift (default); or as much as linear over the "
-            "ground, or a smooth field, and relief displacement, where held-out blocks say so.",
+            help="Align each image with its rendering. The value sets the most flexible correction allowed: one shift "
+            "(constant, the default), a linear one, or a smooth field.",
         ),
     ] = None,
     max_shift: Annotated[
-        float, typer.Option("--max-shift", help="How far to search when registering, px of the scene's grid.")
+        float, typer.Option("--max-shift", help="Search radius of --register, px of the scene's grid.")
     ] = Config.max_shift,
     blocks_csv: Annotated[
         Path | None,
-        typer.Option("--shifts", metavar="CSV", help="Also write each block's own shift to a table."),
+        typer.Option("--shifts", metavar="CSV", help="Also write the shift of each block to a table."),
         Writes.FILE,
     ] = None,
     exact: Annotated[
-        bool, typer.Option("--exact", help="Keep all digits of float32, not those that matter: three times the size.")
+        bool, typer.Option("--exact", help="Keep full float32 precision; the file is three times as large.")
     ] = Config.exact,
     shard: options.Shard = None,
     output: options.OutputFile = Path("pairs.h5"),
@@ -79,7 +79,7 @@ def command(
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Orthorectify the images onto the crops; add the Sun, the camera and the terrain's horizon."""
+    """Orthorectify the images onto the crops; add Sun, camera and terrain horizon."""
     config = options.configure(Config, locals(), scene=str(scene) if scene else None, shard=options.parse_shard(shard))
     console, to = Console(quiet), Output(output, overwrite)
     if blocks_csv is not None and register is None:

@@ -30,66 +30,81 @@ def command(
         typer.Option(
             "--output",
             "-o",
-            help="NAME.exr: EXR, PNG and, for ortho, GeoTIFF; .tif or .png: without the EXR. A folder with --trajectory.",
+            help="NAME.exr writes EXR, PNG and, for ortho views, GeoTIFF; NAME.tif or NAME.png leaves out the EXR. A folder with --trajectory.",
         ),
         Writes.EITHER,
     ] = Path("render.exr"),
     dem: Annotated[
         Path | None,
         typer.Option(
-            "--dem", metavar="DEM", help="Render a DEM (GeoTIFF, ..., scene.h5) with --model the same everywhere."
+            "--dem",
+            metavar="DEM",
+            help="Render this DEM (any GDAL format, or scene.h5) with one reflectance everywhere.",
         ),
     ] = None,
     model: Annotated[
-        str | None, typer.Option("--model", help="With --dem: reflectance model ('lunargr models' lists them).")
+        str | None, typer.Option("--model", help="Reflectance model for --dem; 'lunargr models' lists them.")
     ] = None,
     parameters: Annotated[
         list[str] | None,
         typer.Option(
             "--parameters",
             metavar="NAME=VALUE,...",
-            help="With --dem: parameters of the model; the rest take their defaults.",
+            help="Model parameters for --dem; the others take their defaults.",
         ),
     ] = None,
     view: Annotated[
-        str, typer.Option("--view", metavar="ortho|pinhole", help="The map's own grid, or a camera.")
+        str, typer.Option("--view", metavar="ortho|pinhole", help="ortho: the map's own grid; pinhole: a camera.")
     ] = Config.view,
     sun_azimuth_deg: Annotated[
         float | None,
-        typer.Option("--sun-azimuth", metavar="DEG", help="Sun over the map's middle: clockwise from north ..."),
+        typer.Option(
+            "--sun-azimuth", metavar="DEG", help="Azimuth of the Sun at the map centre, clockwise from north."
+        ),
     ] = None,
     sun_elevation_deg: Annotated[
-        float | None, typer.Option("--sun-elevation", metavar="DEG", help="... and above the horizon.")
+        float | None, typer.Option("--sun-elevation", metavar="DEG", help="Elevation of the Sun at the map centre.")
     ] = None,
     subsolar_longitude_deg: Annotated[
         float | None,
-        typer.Option("--subsolar-longitude", metavar="DEG", help="Or the sub-solar point: east longitude ..."),
+        typer.Option(
+            "--subsolar-longitude",
+            metavar="DEG",
+            help="East longitude of the sub-solar point, instead of azimuth and elevation.",
+        ),
     ] = None,
     subsolar_latitude_deg: Annotated[
-        float | None, typer.Option("--subsolar-latitude", metavar="DEG", help="... and latitude.")
+        float | None, typer.Option("--subsolar-latitude", metavar="DEG", help="Latitude of the sub-solar point.")
     ] = None,
     solar_distance_au: Annotated[
         float | None,
-        typer.Option("--solar-distance", metavar="AU", help="Distance of the Sun (widens the penumbra; default 1)."),
+        typer.Option("--solar-distance", metavar="AU", help="Distance of the Sun; sets the penumbra (default: 1)."),
     ] = None,
     time: Annotated[
-        str | None, typer.Option("--time", metavar="UTC", help="Or the time, such as 2010-11-09T13:06:40.")
+        str | None,
+        typer.Option(
+            "--time", metavar="UTC", help="Time, instead of a direction of the Sun, such as 2010-11-09T13:06:40."
+        ),
     ] = None,
     position: Annotated[
         str | None,
         typer.Option(
             metavar="LON,LAT,ALT",
-            help="Camera: degrees, and metres above the reference sphere. In ortho: where light goes.",
+            help="Camera position: degrees, and metres above the reference sphere. In ortho views: the point from which the ground is seen.",
         ),
     ] = None,
     look_at: Annotated[
         str | None,
         typer.Option(
-            "--look-at", metavar="LON,LAT[,ALT]", help="Place in the image's middle (default: straight down)."
+            "--look-at", metavar="LON,LAT[,ALT]", help="Ground point at the image centre (default: straight down)."
         ),
     ] = None,
     quaternion: Annotated[
-        str | None, typer.Option(metavar="W,X,Y,Z", help="Instead: camera axes (right, down, forward) to body-fixed.")
+        str | None,
+        typer.Option(
+            metavar="W,X,Y,Z",
+            help="Rotation from camera axes (right, down, forward) to body-fixed, instead of --look-at.",
+        ),
     ] = None,
     roll_deg: Annotated[
         float, typer.Option("--roll", metavar="DEG", help="Turn the camera clockwise about its line of sight.")
@@ -108,50 +123,61 @@ def command(
     ] = None,
     samples: Annotated[
         int | None,
-        typer.Option(metavar="N", help="N x N rays per pixel (default: as many as the ground in a pixel asks for)."),
+        typer.Option(metavar="N", help="N x N rays per pixel (default: one per DEM pixel and axis, 2 to 8)."),
     ] = None,
     trajectory: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="One view per row; see docs/render.md. --output names a folder.")
+        Path | None,
+        typer.Option(metavar="CSV", help="Table with one view per row (docs/render.md); --output then names a folder."),
     ] = None,
     export: Annotated[
         str | None,
-        typer.Option("--export", metavar="colmap|nerfstudio", help="With --trajectory: also its views as a data set."),
+        typer.Option(
+            "--export",
+            metavar="colmap|nerfstudio",
+            help="With --trajectory: also write the views as a COLMAP or Nerfstudio data set.",
+        ),
     ] = None,
     stereo: Annotated[
         int | None,
         typer.Option(
-            "--stereo", metavar="N", help="N stereo pairs with every correspondence into the folder --output."
+            "--stereo", metavar="N", help="Write N stereo pairs with dense correspondences into the folder --output."
         ),
     ] = None,
     altitude: Annotated[
-        float | None, typer.Option(metavar="M", help="With --stereo: of both cameras above the ground they look at.")
+        float | None, typer.Option(metavar="M", help="With --stereo: height of both cameras above the ground.")
     ] = None,
     convergence: Annotated[
-        str, typer.Option(metavar="LOW,HIGH", help="With --stereo: degrees between both lines of sight.")
+        str,
+        typer.Option(metavar="LOW,HIGH", help="With --stereo: range of the angle between both lines of sight, deg."),
     ] = CONVERGENCE,
     seed: Seed = StereoConfig.seed,
     extend: Annotated[
         Path | None,
-        typer.Option("--extend", metavar="FILE", help="diagnosis.h5: add the effects that 'lunargr diagnose' found."),
+        typer.Option("--extend", metavar="FILE", help="diagnosis.h5: add the effects that it names."),
     ] = None,
     shadows: Annotated[
-        bool, typer.Option("--shadows/--no-shadows", help="Cast shadows, with the Sun's disc.")
+        bool, typer.Option("--shadows/--no-shadows", help="Cast shadows with the Sun's disc.")
     ] = Config.shadows,
     bounce: Annotated[
-        bool, typer.Option("--bounce", help="Light that sunlit slopes throw on other terrain, into shadows too.")
+        bool, typer.Option("--bounce", help="Add light that sunlit terrain scatters onto other terrain, once.")
     ] = Config.bounce,
     earthshine: Annotated[
-        bool, typer.Option("--earthshine", help="The Earth's light, from where it stands at --time or ...")
+        bool,
+        typer.Option(
+            "--earthshine", help="Add light from the Earth, at --time or from --earth-azimuth and --earth-elevation."
+        ),
     ] = Config.earthshine,
     earth_azimuth_deg: Annotated[
         float | None,
-        typer.Option("--earth-azimuth", metavar="DEG", help="... over the map's middle: clockwise from north ..."),
+        typer.Option(
+            "--earth-azimuth", metavar="DEG", help="Azimuth of the Earth at the map centre, clockwise from north."
+        ),
     ] = None,
     earth_elevation_deg: Annotated[
-        float | None, typer.Option("--earth-elevation", metavar="DEG", help="... and above the horizon.")
+        float | None, typer.Option("--earth-elevation", metavar="DEG", help="Elevation of the Earth at the map centre.")
     ] = None,
     backplanes_in_tif: Annotated[
-        bool, typer.Option("--backplanes", help="Ortho: put the backplanes into the GeoTIFF, too.")
+        bool, typer.Option("--backplanes", help="Ortho views: also write the backplanes into the GeoTIFF.")
     ] = Config.backplanes_in_tif,
     png_only: Annotated[
         bool, typer.Option("--png-only", help="With --trajectory: write no EXR files.")

@@ -20,7 +20,7 @@ NAME, ORDER = "replay", 91
 
 
 def command(file: Annotated[Path, typer.Argument(help="Any artefact of lunargr: HDF5, GeoTIFF or EXR.")]) -> None:
-    """Print the chain of commands that makes an artefact again, as a shell script; nothing is run."""
+    """Print the commands that make a file again, as a shell script."""
     from schemas import open_artefact, read_kind
     from schemas.provenance import chain
     from schemas.rasters import raster_kind

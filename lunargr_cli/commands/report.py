@@ -30,7 +30,7 @@ def command(
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Put maps, tables, curves and pictures of a run on one HTML page that needs nothing else, in light or dark."""
+    """Put maps, tables, curves and pictures of a run on one self-contained HTML page."""
     console = Console(quiet)
     titles = report.run(files, Output(output, overwrite), Config(title), console.say, console.progress)
     console.say(f"{output}: {', '.join(titles)}")

@@ -32,7 +32,7 @@ def command(
             "--count",
             min=1,
             max=options.MOST,
-            help="Crops in all; with --stack, places in all (default: 100 per image).",
+            help="Number of crops, or of sites with --stack (default: 100 per image).",
         ),
     ] = None,
     density: Annotated[
@@ -42,7 +42,7 @@ def command(
         bool,
         typer.Option(
             "--stack",
-            help="Crop every image that covers a chosen place: pairs share a 'site'. Places lie side by side while there is room.",
+            help="Crop all images that cover each chosen site. Sites lie side by side while there is room.",
         ),
     ] = Config.stack,
     tile_m: Annotated[
@@ -57,7 +57,7 @@ def command(
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Choose crop centres per image and split them by ground tile, with no ground shared between the parts."""
+    """Choose crop centres and split them by ground tile; training, validation and test share no ground."""
     config = options.configure(Config, locals(), split=_shares(split), shard=options.parse_shard(shard))
     console, to = Console(quiet), Output(output, overwrite)
     if options.in_parts(scheduler, False, parts, shard):

@@ -13,9 +13,9 @@ NAME, ORDER = "schema", 91
 
 
 def command(
-    name: Annotated[str | None, typer.Argument(help="scene, crops, pairs, ...; nothing lists them all.")] = None,
+    name: Annotated[str | None, typer.Argument(help="scene, crops, pairs, ...; without a name: list all.")] = None,
 ) -> None:
-    """Print what an artefact holds: dimensions, variables, units, attributes."""
+    """Print what a kind of file holds: dimensions, variables, units, attributes."""
     console = Console()
     if name is None:
         rows = [(s.name, f"lunargr {s.stage}", s.title) for s in SCHEMAS.values()]

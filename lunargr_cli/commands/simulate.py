@@ -18,7 +18,7 @@ from stages.simulate import Config
 NAME, ORDER = "simulate", 10
 
 _HIDDEN_HELP = (
-    "Effect that the pipeline is not told of: none, NAME, NAME:PARAMETER=VALUE,... or several joined by '+'. "
+    "Hidden effect to plant: none, NAME, NAME:PARAMETER=VALUE,... or several joined by '+'. "
     "Names: dark_bias, nonlinearity, opposition_surge, phase_slope, psf_blur, sun_azimuth, sun_elevation, penumbra, "
     "earthshine, echo, column_pattern, image_gain, saturation, misregistration, line_jitter, dem_scale, dem_smoothing. "
     "[default: dark_bias]"
@@ -41,7 +41,7 @@ def command(
         float | None,
         typer.Option(
             "--gsd",
-            help=f"GSD in metres that the pipeline will work at; the DEM is twice as fine. [default: {Config.gsd:g}]",
+            help=f"Working GSD in metres; the DEM is twice as fine. [default: {Config.gsd:g}]",
         ),
     ] = None,
     images: Annotated[
@@ -62,7 +62,7 @@ def command(
 ) -> None:
     """Make a lunar-looking scene with known truth: DEM, map-projected images, images.csv, truth.h5, truth.tif.
 
-    Everything downstream treats it as real data. What the pipeline must find out is in truth.h5 alone.
+    The other commands treat the scene as real data. Only truth.h5 holds the true values.
     """
     changes = {"size_px": size_px, "images": images, "units": units, "seed": seed}
     config = _configure(recipe, changes, gsd, extent_m, hidden)

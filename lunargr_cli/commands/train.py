@@ -26,7 +26,7 @@ def command(
         typer.Option(
             "--maps",
             metavar="NAME,...",
-            help="Coefficients to predict place by place; the others are fitted globally. Default: the model's own choice.",
+            help="Coefficients to predict per pixel; the others get one global value (default: set by the model).",
         ),
     ] = None,
     positive: Annotated[
@@ -43,15 +43,16 @@ def command(
     brightness: Annotated[
         float,
         typer.Option(
-            "--brightness", help="Weight of each crop's overall brightness in the loss, 0 to 1; 1: squared errors."
+            "--brightness", help="Weight of each crop's mean brightness in the loss, 0 to 1 (1: plain squared error)."
         ),
     ] = Config.brightness,
     augment: Annotated[
-        bool, typer.Option("--augment/--no-augment", help="Turn and mirror crops, Sun and camera along.")
+        bool, typer.Option("--augment/--no-augment", help="Rotate and mirror crops together with Sun and camera.")
     ] = Config.augment,
     precision: options.TrainingPrecision = Config.precision,
     extend: Annotated[
-        Path | None, typer.Option("--extend", metavar="FILE", help="diagnosis.h5: train through the extended model.")
+        Path | None,
+        typer.Option("--extend", metavar="FILE", help="diagnosis.h5: train with the effects that it names."),
     ] = None,
     seed: options.Seed = Config.seed,
     device: options.Device = Config.device,
@@ -60,7 +61,7 @@ def command(
     resume: options.Resume = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Learn reflectance from terrain through the differentiable renderer. Several processes: run under torchrun."""
+    """Learn reflectance from terrain through the differentiable renderer. Run it under torchrun for several processes."""
     texts = {"maps": options.read_names(maps), "extend": str(extend) if extend else None}
     numbers = {
         "widths": options.read_numbers("--widths", widths, int),

@@ -23,22 +23,26 @@ def command(
         Path | None, typer.Option("--pairs", metavar="PAIRS.h5", help="Show measured photographs beside the map.")
     ] = None,
     photographs: Annotated[
-        int, typer.Option(metavar="N", help="With --pairs: how many of its crops.")
+        int, typer.Option(metavar="N", help="With --pairs: number of crops to show.")
     ] = Config.photographs,
     max_px: Annotated[
-        int, typer.Option("--max-px", metavar="PX", help="Larger maps are shown as means over blocks of pixels.")
+        int,
+        typer.Option("--max-px", metavar="PX", help="Largest edge; larger maps are averaged over blocks of pixels."),
     ] = Config.max_px,
     sun_azimuth_deg: Annotated[
-        float, typer.Option("--sun-azimuth", metavar="DEG", help="The first picture's Sun, clockwise from north ...")
+        float,
+        typer.Option(
+            "--sun-azimuth", metavar="DEG", help="Azimuth of the Sun in the first picture, clockwise from north."
+        ),
     ] = Config.sun_azimuth_deg,
     sun_elevation_deg: Annotated[
-        float, typer.Option("--sun-elevation", metavar="DEG", help="... and above the horizon.")
+        float, typer.Option("--sun-elevation", metavar="DEG", help="Elevation of the Sun in the first picture.")
     ] = Config.sun_elevation_deg,
     title: Annotated[str | None, typer.Option("--title", help="Title of the page (default: the map's name).")] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
-    """Make a page that relights a map: move the Sun and the camera, see every coefficient, read values. No network.
+    """Make an offline web page that relights a map: move the Sun and the camera, show every layer, read values.
 
     \b
     lunargr view svbrdf.h5 -o view.html
