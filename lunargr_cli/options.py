@@ -145,9 +145,25 @@ def join_numbers(numbers: Iterable[float]) -> str:
     return "-".join(f"{number:g}" for number in numbers)
 
 
-def read_names(text: str | None) -> tuple[str, ...]:
-    """'w, b' -> ('w', 'b'); None -> ()"""
-    return tuple(name.strip() for name in (text or "").split(",") if name.strip())
+def read_names(option: str, text: str | None) -> tuple[str, ...]:
+    """'w, b' -> ('w', 'b'); None -> (). Raises ConfigError for an empty name and one that comes twice."""
+    if text is None:
+        return ()
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise ConfigError(
+            f"{option}: expected names separated by commas, found '{text}'; leave the option out for none."
+        )
+    return check_once(option, names)
+
+
+def check_once(option: str, names: Iterable[str]) -> tuple[str, ...]:
+    """The names of an option that lists them or may be repeated. Raises ConfigError where one comes twice."""
+    found = tuple(names)
+    for name in found:
+        if found.count(name) > 1:
+            raise ConfigError(f"{option}: expected each name once, found '{name}' twice; name it once.")
+    return found
 
 
 def make_map_output(output: Path, overwrite: bool, geotiff: Path | None, no_geotiff: bool) -> Output:

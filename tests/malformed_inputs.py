@@ -384,13 +384,15 @@ TEXTS = {
     "--position": ["", "1,2", "nan,1,1", "a,b,c"],
     "--quaternion": ["", "0,0,0,0", "nan,0,0,0"],
     "--look-at": ["", "x", "1"],
-    "--time": ["", "yesterday", "2010-13-01", "nan"],
+    "--time": ["", "yesterday", "2010-13-01", "nan", "1700-01-01"],
     "--units": ["", "furlong"],
     "--hidden": ["nothing", "dark_bias:iof", "dark_bias:iof=nan", "dark_bias:nothing=1", "dark_bias+dark_bias"],
     "--matcher": ["", "nothing"],
     "--only": ["", "nothing"],
-    "--free": ["nothing"],
-    "--parameters": ["nothing", "w=", "=5", "w=nan"],
+    "--free": ["", ",", "nothing", "w,w"],
+    "--maps": ["", ",", "w,w"],
+    "--dropout": ["", "a", "1", "0.1-0.1-0.1"],
+    "--parameters": ["", "nothing", "w=", "=5", "w=nan", "w=0.2,w=0.3", "w=0.2,"],
 }
 
 

@@ -96,7 +96,18 @@ def test_the_spellings_of_a_time(text):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "yesterday", "2010-13-01T00:00:00", "2010-02-30", "2010-11-09T25:00:00", "09/11/2010"]
+    "text",
+    [
+        "",
+        "yesterday",
+        "2010-13-01T00:00:00",
+        "2010-02-30",
+        "2010-11-09T25:00:00",
+        "09/11/2010",
+        "1700-01-01",
+        "2100-01-01",
+        datetime(1959, 12, 31),
+    ],
 )
 def test_what_is_no_time(text):
     with pytest.raises(InputError, match="table: image 3: expected a UTC time"):

@@ -6,12 +6,16 @@ import dataclasses
 import importlib
 import inspect
 import pkgutil
+from types import SimpleNamespace
 from typing import get_type_hints
 
+import cv2
+import numpy as np
 import pytest
 
 from lunargr_cli import commands, spelling
 from lunargr_cli.options import join_numbers, parse_shard, read_names
+from schemas.errors import ConfigError
 
 MODULES = {
     m.name: importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)
@@ -25,8 +29,7 @@ CONFIGS = {
 # How commands write what a Config holds as a tuple.
 WRITTEN = {
     "widths": join_numbers, "dropout": join_numbers, "shard": lambda shard: None if shard == parse_shard(None) else shard,
-    "maps": lambda names: None if names == read_names(None) else names, "only": lambda rows: None if rows == () else rows,
-    "leave_out": lambda names: None if names == () else names, "free": ",".join,
+    **dict.fromkeys(("maps", "only", "leave_out", "free"), lambda names: names or None),
     "size_px": lambda size: ",".join(map(str, size)), "parameters": lambda values: values or None,
 }  # fmt: skip
 # Of the same name, but not the setting: where the GeoTIFF goes, not whether; left away for the stage's own choice.
@@ -93,3 +96,46 @@ def test_settings_are_spelled_as_the_options_of_the_command_that_runs():
         assert spelling.spell("run 'lunargr albedo' with `leave_out`") == "run 'lunargr albedo' with --leave-out"
     finally:
         spelling.running.reset(before)
+
+
+@pytest.mark.parametrize("text", ["", ",", "w,", "w,,b", " "])
+def test_a_list_of_names_has_no_empty_ones(text):
+    with pytest.raises(ConfigError, match=r"^--maps: expected names separated by commas, found '[^\n]*; leave"):
+        read_names("--maps", text)
+
+
+def test_lists_of_options_name_each_thing_once(tmp_path):
+    """Whichever came last would win, or everything would count twice."""
+    from stages.evaluate.held_out_images import _check_once
+    from stages.match.comparisons import from_images
+    from stages.simulate.hidden import hidden_from_option
+
+    assert read_names("--maps", "w, b") == ("w", "b") and read_names("--maps", None) == ()
+    assert MODULES["render"]._parameters(["w=0.2", "b=0.3,c=1"]) == {"w": 0.2, "b": 0.3, "c": 1.0}
+    first, copy = tmp_path / "a.png", tmp_path / "b.png"
+    cv2.imwrite(str(first), np.arange(256, dtype=np.uint8).reshape(16, 16))
+    copy.write_bytes(first.read_bytes())
+    for call in (
+        lambda: read_names("--maps", "w,b,w"),
+        lambda: MODULES["render"]._parameters(["w=0.2", "w=0.3"]),
+        lambda: MODULES["compare"]._models("M1,m1"),
+        lambda: hidden_from_option("echo:lag_px=3,lag_px=5"),
+        lambda: _check_once([first, copy]),
+        lambda: from_images(first, [copy, copy]),
+    ):
+        with pytest.raises(ConfigError, match="once"):
+            call()
+
+
+def test_lists_fit_what_they_are_for():
+    from stages import train
+    from stages.albedo.config import used_frames
+
+    frames = [SimpleNamespace(image_id=f"IMG{k}") for k in range(4)]
+    config = importlib.import_module("stages.albedo").Config
+    assert used_frames(frames, config(fold=(3, 9))) == [True, True, True, False]
+    with pytest.raises(ConfigError, match=r"`fold`: expected one of the first 4 folds.*found 5/9"):
+        used_frames(frames, config(fold=(4, 9)))
+    train.check(train.Config(widths=(4, 8, 8), dropout=(0.1,)))
+    with pytest.raises(ConfigError, match="`dropout`: expected one share, or 3 for as many `widths`, found 2"):
+        train.check(train.Config(widths=(4, 8, 8), dropout=(0.1, 0.2)))

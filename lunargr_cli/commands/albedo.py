@@ -50,7 +50,11 @@ def command(
     The albedo multiplies the I/F of the map. It differs from 1 where the photographs agree on a difference, and is 1
     elsewhere. Rendering, evaluation and the GeoTIFF use it.
     """
-    converted = {"leave_out": options.read_names(leave_out), "fold": _fold(fold), "geotiff": not no_geotiff}
+    converted = {
+        "leave_out": options.read_names("--leave-out", leave_out),
+        "fold": _fold(fold),
+        "geotiff": not no_geotiff,
+    }
     config = options.configure(Config, locals(), **converted, shard=options.parse_shard(shard))
     console, to = Console(quiet), options.make_map_output(output, overwrite, geotiff, no_geotiff)
     if options.in_parts(scheduler, resume, parts, shard):

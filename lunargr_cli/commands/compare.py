@@ -111,7 +111,7 @@ def _models(text: str) -> list[str]:
     """Names of at least two models from 'M1,M2'. Raises ConfigError, RegistryError."""
     from stages.physics.photometry import get_model
 
-    names = list(dict.fromkeys(get_model(name).name for name in options.read_names(text)))
+    names = list(options.check_once("--models", (get_model(n).name for n in options.read_names("--models", text))))
     if len(names) < 2:
         raise ConfigError(f"--models: expected at least two models, found '{text}'.")
     return names

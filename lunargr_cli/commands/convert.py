@@ -41,7 +41,7 @@ def command(
     from stages import convert
 
     console = Console(quiet)
-    config = convert.Config(start, end, None if bands is None else read_names(bands), approximate)
+    config = convert.Config(start, end, None if bands is None else read_names("--bands", bands), approximate)
     report = convert.run(source, Output(output, overwrite), config, console.say, console.progress)
     for loss in report.losses:
         console.say(f"lost: {loss}")

@@ -42,11 +42,13 @@ def command(
         Writes.FILE,
     ] = None,
     free: Annotated[
-        str,
+        str | None,
         typer.Option(
-            "--free", help="Coefficients of --model to fit, separated by commas; the others keep published values."
+            "--free",
+            metavar="NAME,...",
+            help="Coefficients of --model to fit, separated by commas (default: all); the others keep published values.",
         ),
-    ] = ",".join(Config.free),
+    ] = None,
     list_effects: Annotated[bool, typer.Option("--list", help="Explain every effect and stop.")] = False,
     most_causes: Annotated[
         int, typer.Option("--causes", min=1, max=100, help="Maximum number of causes to name.")
@@ -73,7 +75,7 @@ def command(
         raise ConfigError("diagnose: expected a file of pairs, found none; give pairs.h5, or --list.")
     from stages.diagnose.result.answer import describe
 
-    config = configure(Config, locals(), free=read_names(free))
+    config = configure(Config, locals(), free=read_names("--free", free))
     if scheduler:
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_diagnose

@@ -77,7 +77,9 @@ def command(
     image, fitted on the training split; errors are then shares of the full DN range. With checkpoints from several
     seeds the learned rows are means over training runs, and the intervals include the spread of the runs.
     """
-    config = options.configure(Config, locals(), only=tuple(only or ()), extend=str(extend) if extend else None)
+    config = options.configure(
+        Config, locals(), only=options.check_once("--only", only or ()), extend=str(extend) if extend else None
+    )
     from stages.evaluate.coverage import coverage_lines
     from stages.evaluate.table import basis, gain_lines, result_lines
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.console import Console
-from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Seed, configure
+from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Seed, check_once, configure
 from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
 from schemas.files.outputs import Output
@@ -66,7 +66,7 @@ def command(
         return
     if not files:
         raise ConfigError("match: expected files to match, found none; give pairs.h5 and checkpoint.h5, or --list.")
-    config = configure(Config, locals(), matchers=tuple(matchers or Config.matchers))
+    config = configure(Config, locals(), matchers=check_once("--matcher", matchers or Config.matchers))
     from stages.match.stage import result_lines
 
     to = Output(overwrite=overwrite, json=json_file, figures=figures)

@@ -9,7 +9,18 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.console import Console
-from lunargr_cli.options import BodyOption, Json, Overwrite, Quiet, Resume, Seed, Shard, configure, parse_shard
+from lunargr_cli.options import (
+    BodyOption,
+    Json,
+    Overwrite,
+    Quiet,
+    Resume,
+    Seed,
+    Shard,
+    check_once,
+    configure,
+    parse_shard,
+)
 from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
 from schemas.files.outputs import Output, write_json
@@ -321,11 +332,12 @@ def _size(text: str) -> tuple[int, int]:
 
 def _parameters(items: list[str]) -> dict[str, float]:
     """['w=0.25,b=0.3'] -> {'w': 0.25, 'b': 0.3}. Raises ConfigError."""
-    result: dict[str, float] = {}
-    for item in (part for text in items for part in text.split(",") if part.strip()):
+    names, values = [], []
+    for item in (part for text in items for part in text.split(",")):
         name, _, value = item.partition("=")
         try:
-            result[name.strip()] = float(value)
+            values.append(float(value))
         except ValueError:
             raise ConfigError(f"--parameters: expected NAME=VALUE with a number, found '{item}'.") from None
-    return result
+        names.append(name.strip())
+    return dict(zip(check_once("--parameters", names), values, strict=True))

@@ -62,7 +62,7 @@ def command(
     quiet: options.Quiet = False,
 ) -> None:
     """Learn reflectance from terrain through the differentiable renderer. Run it under torchrun for several processes."""
-    texts = {"maps": options.read_names(maps), "extend": str(extend) if extend else None}
+    texts = {"maps": options.read_names("--maps", maps), "extend": str(extend) if extend else None}
     numbers = {
         "widths": options.read_numbers("--widths", widths, int),
         "dropout": options.read_numbers("--dropout", dropout, float),

@@ -54,6 +54,11 @@ def used_frames(frames: Sequence[Frame], config: Config) -> list[bool]:
     used = [name not in config.leave_out for name in names]
     if config.fold is not None:
         fold, count = config.fold
+        if fold >= len(names):
+            raise ConfigError(
+                f"`fold`: expected one of the first {len(names)} folds, since the scene has {len(names)} images, "
+                f"found {fold + 1}/{count}, which leaves none out."
+            )
         used = [u and k % count != fold for k, u in enumerate(used)]
     if not any(used):
         raise ConfigError("`leave_out`, `fold`: expected to leave at least one image, found none; leave out fewer.")

@@ -19,9 +19,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from schemas import EVALUATION, SVBRDF, ArtefactError, ArtefactWriter, check_output, open_artefact, write_json
+from schemas import (
+    EVALUATION,
+    SVBRDF,
+    ArtefactError,
+    ArtefactWriter,
+    ConfigError,
+    check_output,
+    open_artefact,
+    write_json,
+)
 from schemas.files.companions import companions_of
 from schemas.files.outputs import Output
+from schemas.provenance import sha256
 from schemas.reading import read_strings
 from stages.common.arrays import Floats
 from stages.common.intervals import ERROR, choose_units, gain_interval, ratio_interval
@@ -93,6 +103,7 @@ def run(
     reports = report_files(output)
     for path in (output.file, *reports):
         check_output(path, [pairs, *maps], output.overwrite)
+    _check_once(maps)
     with PairReader(pairs) as reader, contextlib.ExitStack() as stack:
         opened = [_open(path, reader, stack) for path in maps]
         chosen = _choose(reader, opened, config.split)
@@ -123,6 +134,14 @@ def run(
                 for report in reports:
                     write_json(report, result)
     return result
+
+
+def _check_once(maps: Sequence[Path]) -> None:
+    """Raises ConfigError where two maps are the same, as copies or by name."""
+    seen: dict[str, Path] = {}
+    for path in maps:
+        if path.is_file() and (before := seen.setdefault(sha256(path), path)) is not path:
+            raise ConfigError(f"{path}: expected each map once, found the content of {before} again; name it once.")
 
 
 def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> AlbedoMap:

@@ -62,14 +62,16 @@ def from_images(measured: Path, rendered: list[Path]) -> Comparison:
         raise ConfigError(f"{measured}: expected at least one rendered image to match it with, found none.")
     picture = read_picture(measured)
     others = {}
-    for path in rendered:
+    for number, path in enumerate(rendered):
+        if path in rendered[:number]:
+            raise ConfigError(f"{path}: expected each rendered image once, found it twice; name it once.")
         image = read_picture(path)
         if image.shape != picture.shape:
             raise InputError(
                 f"{path}: expected {picture.shape[1]} x {picture.shape[0]} px as in {measured.name}, "
                 f"found {image.shape[1]} x {image.shape[0]}; render it on the same grid."
             )
-        others[path.stem if path.stem not in others else path.name] = image
+        others[path.stem if [p.stem for p in rendered].count(path.stem) == 1 else str(path)] = image
     return Comparison(measured.stem, picture, others, common_scale=False)
 
 

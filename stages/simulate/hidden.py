@@ -89,10 +89,10 @@ def hidden_from_option(text: str) -> list[dict[str, Any]]:
     for part in text.split("+"):
         name, _, rest = part.strip().partition(":")
         entry: dict[str, Any] = {"effect": name}
-        for pair in filter(None, rest.split(",")):
+        for pair in rest.split(",") if ":" in part else ():
             key, equals, value = pair.partition("=")
-            if not equals:
-                raise ConfigError(f"`hidden`: expected EFFECT:NAME=VALUE,..., found '{part}'.")
+            if not equals or key.strip() in entry:
+                raise ConfigError(f"`hidden`: expected EFFECT:NAME=VALUE,... with each name once, found '{part}'.")
             entry[key.strip()] = value
         entries.append(entry)
     parse_hidden(entries)

@@ -31,6 +31,10 @@ def check(config: Config) -> None:
         raise ConfigError(f"`brightness`: expected a number from 0 to 1, found {config.brightness}.")
     if not are_dropouts(config.dropout):
         raise ConfigError(f"`dropout`: expected shares from 0 to below 1, found {config.dropout}.")
+    if len(config.dropout) not in (1, len(config.widths)):
+        raise ConfigError(
+            f"`dropout`: expected one share, or {len(config.widths)} for as many `widths`, found {len(config.dropout)}."
+        )
     model = get_model(config.model)
     model.choose_maps(config.maps)
     if config.positive and not model.linear:

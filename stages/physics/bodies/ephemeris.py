@@ -48,6 +48,7 @@ class SubsolarPoint(NamedTuple):
 
 # --- time -----------------------------------------------------------------------------------------------------------
 
+FIRST_YEAR, LAST_YEAR = 1960, 2099  # UTC begins with 1960; ERFA's positions of the Earth end with 2100
 # year, month and day or day of year, hour, minute, second
 _UTC = re.compile(r"^(\d{4})-(?:(\d{2})-(\d{2})|(\d{3}))(?:[T ](\d{1,2}):(\d{2})(?::(\d{2}(?:\.\d*)?))?)?$")
 
@@ -64,12 +65,14 @@ def parse_utc(time_utc: str | datetime, where: str = "time") -> Time:
     if isinstance(time_utc, datetime):
         if time_utc.tzinfo is not None:
             time_utc = time_utc.astimezone(UTC).replace(tzinfo=None)
+        _check_year(time_utc.year, where)
         return Time(time_utc, scale="utc")
     text = str(time_utc).strip().strip('"')
     match = _UTC.match(re.sub(r"(?:Z|\s*UTC|\+00:?00)$", "", text))
     if match is None:
         raise InputError(f"{where}: expected a UTC time such as 2010-11-09T13:06:40.356, found '{text}'; write it so.")
     year, month, day, day_of_year, hour, minute, second = match.groups("00")
+    _check_year(int(year), where)
     clock = f"{hour}:{minute}:{second}".rstrip(".")
     try:
         if match[4]:
@@ -77,6 +80,13 @@ def parse_utc(time_utc: str | datetime, where: str = "time") -> Time:
         return Time(f"{year}-{month}-{day}T{clock}", format="isot", scale="utc")
     except ValueError:
         raise InputError(f"{where}: expected a UTC time that exists, found '{text}'; mend it.") from None
+
+
+def _check_year(year: int, where: str) -> None:
+    if not FIRST_YEAR <= year <= LAST_YEAR:
+        raise InputError(
+            f"{where}: expected a UTC time of the years {FIRST_YEAR} to {LAST_YEAR}, found {year}; mend it."
+        )
 
 
 def utc_to_et(time_utc: str | datetime) -> float:
