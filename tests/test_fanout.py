@@ -216,7 +216,7 @@ def test_a_plain_run_after_a_kill_starts_anew_and_ends_the_same(inputs, in_one_p
     output = tmp_path / "map.h5"
     command = [*stages(inputs)["infer"], "-o", output]
     process = start(command)
-    while not list(tmp_path.glob(".map.partial-*")):
+    while not list(tmp_path.glob(".map.h5.partial-*")):
         assert process.poll() is None, finish(process)
         time.sleep(0.002)
     process.kill()

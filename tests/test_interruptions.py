@@ -209,7 +209,7 @@ def test_an_input_that_is_lost_on_the_way_is_one_line(small_artefacts, tmp_path)
     crops, output = tmp_path / "crops.h5", tmp_path / "pairs.h5"  # a folder beside that of the artefacts
     crops.write_bytes(small_artefacts["crops"].read_bytes())
     process = start(["project", crops, "--scene", small_artefacts["scene"], "--quiet", "-o", output])
-    while not list(tmp_path.glob(".pairs.partial-*")):
+    while not list(tmp_path.glob(".pairs.h5.partial-*")):
         assert process.poll() is None, finish(process)
         time.sleep(0.002)
     os.truncate(crops, 4096)

@@ -143,7 +143,8 @@ COMPANIONS = [  # what is written beside the output, and under temporary names
     ("evaluate errors.png checkpoint.h5 -o x.h5 --figures .", "errors.png", "--figures"),
     ("compare comparison.json -o . --models M1,M2", "comparison.json", "--output"),
     ("sample .x.h5.lock -o x.h5", ".x.h5.lock", "--output"),
-    ("sample .x.partial-7.h5 -o x.h5", ".x.partial-7.h5", "--output"),
+    ("sample .x.h5.run -o x.h5", ".x.h5.run", "--output"),
+    ("sample .x.h5.partial-7.h5 -o x.h5", ".x.h5.partial-7.h5", "--output"),
     ("sample x.h5.parts/scene.h5 -o x.h5", "scene.h5", "--output"),
 ]
 
@@ -157,7 +158,7 @@ def test_nothing_beside_an_output_replaces_an_input(monkeypatch, capsys, inputs,
         made.parent.mkdir(exist_ok=True)
         if source.is_file():
             shutil.copy(source, made)
-        elif Path(word).suffix in (".h5", ".png", ".json", ".lock") and words[words.index(word) - 1] != "-o":
+        elif Path(word).suffix in (".h5", ".png", ".json", ".lock", ".run") and words[words.index(word) - 1] != "-o":
             shutil.copy(inputs / ("recipe.json" if word.endswith("json") else "scene.h5"), made)
     said = refused(monkeypatch, capsys, tmp_path, [*words, "--overwrite"], victim)
     assert option in said

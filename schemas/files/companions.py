@@ -1,7 +1,7 @@
 """Files that belong to an output, such as the GeoTIFF beside a map: a run that ends before the output is whole leaves none.
 
-Each is written down in the output's lock before it gets its name. The run that holds the lock reads it there when it
-ends, and so does the next run, where a killed one left its lock behind.
+Each is written down in the run's record (``locks.record_path``) before it gets its name. The run reads the record when
+it ends, and so does the next run, where a killed one left it behind.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ def current_output() -> Path | None:
     return _output.get()
 
 
-def note_companion(lock: Path, path: Path, partial: Path) -> None:
-    """Write into the output's lock that ``partial`` is about to be renamed to ``path``, unless that replaces a file."""
-    if path.exists() or not lock.exists():
+def note_companion(record: Path, path: Path, partial: Path) -> None:
+    """Write into the output's record that ``partial`` is about to be renamed to ``path``, unless that replaces a file."""
+    if path.exists() or not record.exists():
         return
-    with open(lock, "a") as stream:
-        stream.write("\n" + json.dumps({"file": os.path.abspath(path), "made": _identity(partial)}))
+    with open(record, "a") as stream:
+        stream.write(json.dumps({"file": os.path.abspath(path), "made": _identity(partial)}) + "\n")
 
 
 def remove_companions(noted: str, output: Path) -> None:
-    """Remove the companions that a lock's text names, where the output is absent, but no file put in their place."""
+    """Remove the companions that a record's text names where the output is absent; files put in their place stay."""
     if output.exists():
         return
     for line in noted.splitlines()[1:]:

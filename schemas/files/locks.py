@@ -1,52 +1,72 @@
-"""One run per output: a lock file beside it, made in a way that is safe on NFS and other network file systems too."""
+"""One run per output: a lock beside it, and the temporary names under which that run writes.
+
+The lock is one of the ``filelock`` package: the operating system lets go of it when its process ends, however it ends,
+and a network file system when the machine is lost. Where a file system has no locks (``flock``), filelock keeps a file
+in its place; after the loss of a machine somebody has to remove that, and the refusal names it.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import glob
-import json
 import os
+import re
 import shutil
 import socket
+import stat
 import threading
 import time
-import uuid
 from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from schemas.errors import ConfigError, InputError
 from schemas.files.companions import remove_companions
 
-# A process on another machine cannot be asked whether it lives: it touches its locks every HEARTBEAT seconds, and a lock
-# that was not touched for STALE_AFTER seconds is that of a machine that went down.
-HEARTBEAT = 30.0
-STALE_AFTER = 600.0
-EMPTY_FOR = 10.0  # seconds that a lock may be empty: its maker is about to write its name
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
 
-_held: dict[Path, int] = {}
+PATIENCE = 0.2  # seconds: another run may be letting go in this moment
+SHOWN = 120  # characters of who holds a lock
+
 _guard = threading.Lock()
 _unlocked: ContextVar[bool] = ContextVar("unlocked", default=False)
 
 
 def lock_path(output: Path) -> Path:
     """Where the lock of an output (a file or a folder) is."""
+    return _beside(output, "lock")
+
+
+def record_path(output: Path) -> Path:
+    """Where the run that holds an output's lock says who it is, and which companions of the output it wrote."""
+    return _beside(output, "run")
+
+
+def _beside(output: Path, what: str) -> Path:
     output = Path(os.path.abspath(output))
-    return output.with_name(f".{output.name}.lock")
+    return output.with_name(f".{output.name}.{what}")
 
 
-def partial_path(output: Path) -> Path:
-    """The temporary name under which this process, and no other on any machine, writes ``output``."""
-    mark = f"{host()}-{os.getpid()}-{threading.get_native_id()}"
-    return output.with_name(f".{output.stem}.partial-{mark}{output.suffix}")
+def partial_path(output: Path, purpose: str = "") -> Path:
+    """The temporary name under which this process, and no other on any machine, writes ``output``.
+
+    It holds the output's whole name and then a mark without a dot: it can be no other output's temporary name.
+    """
+    mark = f"{purpose}{_host()}-{os.getpid()}-{threading.get_native_id()}"
+    return output.with_name(f".{output.name}.partial-{mark}{output.suffix}")
+
+
+def is_partial(output: str, name: str) -> bool:
+    """Whether ``name`` is a temporary name, of any process, of the output of this name."""
+    pattern = re.escape(f".{output}.partial-") + r"[^.]+" + re.escape(Path(output).suffix)
+    return re.fullmatch(pattern, name) is not None
 
 
 @contextlib.contextmanager
 def scratch_path(output: Path, purpose: str) -> Iterator[Path]:
     """A temporary file beside ``output``, named after its purpose; removed at the end, or by the next run."""
-    path = partial_path(output)
-    path = path.with_name(f"{path.stem}.{purpose}{path.suffix}")
+    path = partial_path(output, f"{purpose}-")
     try:
         yield path
     finally:
@@ -54,16 +74,14 @@ def scratch_path(output: Path, purpose: str) -> Iterator[Path]:
 
 
 def is_beside(output: str, name: str) -> bool:
-    """Whether a file of this name would be taken for the lock of ``output`` or for another process' temporary file of it."""
-    stem, suffix = Path(output).stem, Path(output).suffix
-    own = partial_path(Path(output)).stem
-    partial = name.startswith(f".{stem}.partial-") and name.endswith(suffix) and not name.startswith(own)
-    return partial or name == f".{output}.lock" or name.startswith(f".{output}.lock-")
+    """Whether a file of this name would be taken for a lock, a record or another process' temporary file of ``output``."""
+    own = f"{_host()}-{os.getpid()}-{threading.get_native_id()}{Path(output).suffix}"
+    return name in (f".{output}.lock", f".{output}.run") or (is_partial(output, name) and not name.endswith(own))
 
 
-def host() -> str:
-    """This machine's name, as a lock names its holder."""
-    return socket.gethostname().split(".")[0]
+def _host() -> str:
+    """This machine's name without a dot."""
+    return re.sub(r"[^A-Za-z0-9_-]", "_", socket.gethostname().split(".")[0])
 
 
 @contextlib.contextmanager
@@ -84,12 +102,12 @@ def claim(output: Path) -> Iterator[None]:
     What killed runs left beside the output under temporary names is removed, and so are its companions where it is absent.
     A missing folder is made, and goes again where nothing was written into it.
     """
-    lock = lock_path(output)
-    with _folder(lock.parent):
+    output = Path(os.path.abspath(output))
+    with _folder(output.parent):
         if _unlocked.get():
             yield
         else:
-            with _hold(lock, output):
+            with _hold(output, lock_path(output)):
                 yield
 
 
@@ -109,158 +127,80 @@ def _folder(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _hold(lock: Path, output: Path) -> Iterator[None]:
+def _hold(output: Path, path: Path) -> Iterator[None]:
+    from filelock import FileLock
+
+    lock = FileLock(path, timeout=PATIENCE, poll_interval=PATIENCE / 10, thread_local=False, is_singleton=True)
     with _guard:
-        mine = lock in _held
-        if not mine:
-            noted = _acquire(lock, output)
-        _held[lock] = _held.get(lock, 0) + 1
-    if not mine:
-        _remove_partials(Path(os.path.abspath(output)))
-        remove_companions(noted, output)
-        _keep_alive()
+        if not lock.is_locked:
+            _acquire(output, path, lock)
+            _begin(output, lock)
+        else:
+            lock.acquire()
     try:
         yield
     finally:
         with _guard:
-            _held[lock] -= 1
-            if not _held[lock]:
-                del _held[lock]
-                with contextlib.suppress(OSError):
-                    remove_companions(lock.read_text(), output)
-                    lock.unlink()
+            if lock.lock_counter == 1:
+                _end(output, path)
+            lock.release()
 
 
-def _acquire(lock: Path, output: Path) -> str:
-    """Make the lock; returns the text of the lock of a dead run that it replaces, '' where there was none."""
-    noted = ""
-    for _ in range(5):
-        try:
-            number = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
-        except FileExistsError:
-            owner, seen = _read(lock)
-            if owner is None:
-                continue  # released in this moment
-            if not _is_stale(lock, owner):
-                raise ConfigError(_refusal(output, lock, owner)) from None
-            _discard(lock, seen)
-            noted = seen
-            continue
-        except OSError as error:
-            raise ConfigError(f"{output}: cannot be written ({error.strerror}); choose another `output`.") from None
-        own = {
-            "host": host(),
-            "pid": os.getpid(),
-            "began": _process_start(os.getpid()),
-            "since": time.strftime("%Y-%m-%d %H:%M:%S"),
-        }
-        try:
-            with os.fdopen(number, "w") as stream:
-                json.dump(own, stream)
-        except OSError as error:
-            lock.unlink(missing_ok=True)
-            raise InputError(
-                f"{output}: cannot be written ({error.strerror}); nothing is left. Free some space and run the command again."
-            ) from None
-        return noted
-    raise ConfigError(f"{output}: another run is taking this output at the same moment; let it finish.")
+def _acquire(output: Path, path: Path, lock: BaseFileLock) -> None:
+    from filelock import Timeout
 
-
-def _refusal(output: Path, lock: Path, owner: dict[str, Any]) -> str:
-    who = f"process {owner['pid']} on {owner['host']}, since {owner['since']}" if owner else "just started"
-    return (
-        f"{output}: another run is writing this output ({who}); wait for it or choose another `output` "
-        f"(if it cannot be alive any more, remove {lock})."
-    )
-
-
-def _read(lock: Path) -> tuple[dict[str, Any] | None, str]:
-    """The owner written in a lock ({} where it is not written yet), None where the lock is gone; and its text."""
+    with contextlib.suppress(FileNotFoundError):
+        if not stat.S_ISREG(path.lstat().st_mode):
+            raise ConfigError(f"{path}: expected the lock of {output.name}, found no regular file; remove it.")
     try:
-        text = lock.read_text()
+        lock.acquire()
+    except Timeout:
+        who = _read(record_path(output)).partition("\n")[0]
+        who = f" ({who[:SHOWN]})" if who else ""
+        raise ConfigError(
+            f"{output}: another run is writing this output{who}; wait for it or choose another `output` "
+            f"(if its machine is lost, remove {path})."
+        ) from None
+    except OSError as error:
+        raise ConfigError(f"{output}: cannot be written ({error.strerror}); choose another `output`.") from None
+
+
+def _begin(output: Path, lock: BaseFileLock) -> None:
+    """Tidy up after a killed run, and say who holds the lock now."""
+    record = record_path(output)
+    remove_companions(_read(record), output)
+    for name in os.listdir(output.parent):  # whoever holds the lock is the only one that writes
+        if is_partial(output.name, name):
+            _remove(output.with_name(name))
+    try:
+        _remove(record)
+        since = time.strftime("%Y-%m-%d %H:%M:%S")
+        record.write_text(f"process {os.getpid()} on {_host()}, since {since}\n")
+    except OSError as error:
+        _end(output, lock_path(output))
+        lock.release()
+        raise InputError(
+            f"{output}: cannot be written ({error.strerror}); nothing is left. Free some space and run the command again."
+        ) from None
+
+
+def _end(output: Path, path: Path) -> None:
+    record = record_path(output)
+    remove_companions(_read(record), output)
+    record.unlink(missing_ok=True)
+    path.unlink(missing_ok=True)  # before it is let go of: who waits for it sees that its file is gone
+
+
+def _read(record: Path) -> str:
+    try:
+        return record.read_text(errors="replace") if record.is_file() else ""
     except OSError:
-        return None, ""
-    try:
-        owner = json.loads(text.partition("\n")[0])  # companions may follow
-        return {"host": owner["host"], "pid": int(owner["pid"]), "began": owner["began"], "since": owner["since"]}, text
-    except (ValueError, KeyError, TypeError):
-        return {}, text
+        return ""
 
 
-def _is_stale(lock: Path, owner: dict[str, Any]) -> bool:
-    if owner and owner["host"] == host():
-        began = _process_start(owner["pid"])
-        return began is None or (owner["began"] is not None and began != owner["began"])
-    return _age(lock) > (STALE_AFTER if owner else EMPTY_FOR)
-
-
-def _age(lock: Path) -> float:
-    """Seconds since a lock was touched, by the clock of its file system."""
-    probe = lock.with_name(f"{lock.name}-{uuid.uuid4().hex}")
-    try:
-        probe.touch()
-        return probe.stat().st_mtime - lock.stat().st_mtime
-    except OSError:
-        return 0.0
-    finally:
-        probe.unlink(missing_ok=True)
-
-
-def _discard(lock: Path, seen: str) -> None:
-    """Take a stale lock away, unless another process has just done so and put its own there."""
-    aside = lock.with_name(f"{lock.name}-{uuid.uuid4().hex}")
-    try:
-        os.rename(lock, aside)
-    except OSError:
-        return
-    try:
-        if aside.read_text() != seen:
-            with contextlib.suppress(OSError):
-                os.link(aside, lock)
-    finally:
-        aside.unlink(missing_ok=True)
-
-
-def _process_start(pid: int) -> float | None:
-    """When a process of this machine began (clock ticks), 0 where the system does not tell, None where it is dead."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return None
-    except PermissionError:
-        pass
-    try:
-        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return 0.0
-    return None if after_name[0] in "ZX" else float(after_name[19])
-
-
-def _remove_partials(output: Path) -> None:
-    """Whoever holds the lock is the only one that writes: what lies there under temporary names is of killed runs."""
-    for left in output.parent.glob(f".{glob.escape(output.stem)}.partial-*{glob.escape(output.suffix)}"):
-        with contextlib.suppress(OSError):
-            if left.is_dir():
-                shutil.rmtree(left)
-            else:
-                left.unlink()
-
-
-_pulse: list[threading.Thread] = []
-
-
-def _keep_alive() -> None:
-    with _guard:
-        if not _pulse or not _pulse[0].is_alive():
-            _pulse[:] = [threading.Thread(target=_beat, name="lunargr-locks", daemon=True)]
-            _pulse[0].start()
-
-
-def _beat() -> None:
-    while True:
-        time.sleep(HEARTBEAT)
-        with _guard:
-            locks = list(_held)
-        for lock in locks:
-            with contextlib.suppress(OSError):
-                os.utime(lock)
+def _remove(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()

@@ -19,7 +19,7 @@ from typing import Any
 from schemas.errors import ConfigError, InputError, LunargrError
 from schemas.files.companions import current_output, note_companion
 from schemas.files.inputs import Inputs
-from schemas.files.locks import claim, lock_path, partial_path
+from schemas.files.locks import claim, partial_path, record_path
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _protected: ContextVar[Inputs | None] = ContextVar("protected", default=None)
@@ -194,7 +194,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         try:
             yield partial
             if (output := current_output()) is not None and output != path:
-                note_companion(lock_path(output), path, partial)
+                note_companion(record_path(output), path, partial)
             os.replace(partial, path)
         except BaseException as error:
             with contextlib.suppress(OSError):
