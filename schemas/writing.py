@@ -14,10 +14,11 @@ import h5py
 import numpy as np
 
 from schemas.declaration import STRING, Schema, Variable
-from schemas.errors import ConfigError, InputError
+from schemas.errors import ArtefactError, ConfigError, InputError
 from schemas.files.hdf5 import UNKNOWN, release_errors, silence_hdf5
 from schemas.files.outputs import atomic_path, check_output, is_full_disk, terminate_as_exception
 from schemas.provenance import describe_run
+from schemas.reading import open_artefact
 
 _STANDARD_NAMES = {"x": "projection_x_coordinate", "y": "projection_y_coordinate"}
 # The netCDF-4 format's marker for a dimension without a coordinate variable of its own.
@@ -26,9 +27,9 @@ _abandoned: list[h5py.File] = []
 
 
 class ArtefactWriter:
-    """Writes one artefact under a temporary name; use as a context manager.
+    """Writes one artefact under a temporary name, and checks it before it gets its own; use as a context manager.
 
-    Dimensions are sized on entry; ``None`` is not allowed. Variables are created on first use, from their declaration.
+    Raises ArtefactError where what was written is not what its schema declares; then nothing is left. Dimensions are sized on entry; ``None`` is not allowed. Variables are created on first use, from their declaration.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class ArtefactWriter:
         # A dataset that is released writes what it still holds, and no one hears of a failure: all are kept to the end.
         self._kept: list[h5py.Dataset] = []
         self._errors_before = len(release_errors)
-        self._failed = False
+        self._failed = True  # until its block has ended well
 
     def __enter__(self) -> ArtefactWriter:
         silence_hdf5()
@@ -140,6 +141,18 @@ class ArtefactWriter:
             _abandoned.append(self.file)
             if not self._failed:  # else the first error is the one to report
                 raise self._not_whole(error) from None
+        if not self._failed:
+            self._check()
+
+    def _check(self) -> None:
+        """Refuse what the next stage would refuse, while it has no name yet. Raises ArtefactError."""
+        try:
+            open_artefact(self._partial, self.schema).close()
+        except ArtefactError as error:
+            problem = str(error).replace(str(self._partial), str(self.path)).rpartition("; ")[0]
+            raise ArtefactError(
+                f"{problem}; nothing was written. Look for such values in the inputs; if there are none, report it."
+            ) from None
 
     def _create(
         self, variable: Variable, scale: bool = False, unit: str | None = None, decimals: int | None = None

@@ -7,15 +7,19 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
+import rasterio
 from cluster_scene import assert_same, environment, finish, lunargr, stages, start, write_inputs
+from small_scene import write_scene
 
 from lunargr_cli.options import in_parts
-from schemas import PAIRS, SCENE, ArtefactError, ConfigError, open_artefact
-from stages import ingest, merge, project
+from schemas import PAIRS, SCENE, ArtefactError, ConfigError, InputError, open_artefact
+from schemas.files.outputs import Output
+from stages import ingest, merge, project, sample
 
 
 @pytest.fixture(scope="module")
@@ -249,6 +253,52 @@ def test_a_scene_by_hand_is_a_dem_in_rows_and_then_its_images(small_files, tmp_p
     assert (found.elevation_range, found.dem_valid_share) == (whole.elevation_range, whole.dem_valid_share)
     with pytest.raises(ConfigError, match="the DEM comes first"):
         ingest.run(small_files.dem, small_files.images, tmp_path / "x.h5", ingest.Config(**config, shard=(0, 2)))
+
+
+def _blank(dem, *where):
+    """Put nodata into parts of a DEM."""
+    with rasterio.open(dem, "r+") as file:
+        heights = file.read(1)
+        for part in where:
+            heights[part] = file.nodata
+        file.write(heights, 1)
+
+
+def test_rows_on_nodata_are_a_part_like_any_other(tmp_path):
+    files = write_scene(tmp_path / "files", images=1)
+    _blank(files.dem, np.s_[:200])
+    config = ingest.Config(gsd=20, crop=32, block=64)
+    ingest.run(files.dem, None, tmp_path / "whole.h5", config)
+    parts = [tmp_path / f"{k}.h5" for k in range(8)]  # of six rows of blocks: two have no rows, three lie on nodata
+    found = [ingest.run(files.dem, None, part, replace(config, shard=(k, 8))) for k, part in enumerate(parts)]
+    assert [f.dem_valid_share > 0 for f in found] == [False] * 5 + [True] * 3
+    merge.run(parts, tmp_path / "merged.h5")
+    assert_same(tmp_path / "whole.h5", tmp_path / "merged.h5")
+    assert ingest.summarise(tmp_path / "merged.h5") == ingest.summarise(tmp_path / "whole.h5")
+    _blank(files.dem, np.s_[::2], np.s_[:, ::2])  # a quarter of each pixel of 40 m is known: too little for a mean
+    for k in range(2):
+        ingest.run(files.dem, None, Output(parts[k], overwrite=True), replace(config, gsd=40, shard=(k, 2)))
+    with pytest.raises(InputError, match="only nodata"):
+        merge.run(parts[:2], tmp_path / "nothing.h5")
+    assert not (tmp_path / "nothing.h5").exists()
+
+
+def test_more_parts_than_pairs(tmp_path):
+    """The first part of one pair in two is empty, and still says what the images hold."""
+    files = write_scene(tmp_path / "files", images=1, gain=[(100, 3)])
+    ingest.run(files.dem, files.images, tmp_path / "scene.h5", ingest.Config(gsd=20, crop=32))
+    settings = sample.Config(count=1, tile_m=1280)
+    sample.run(tmp_path / "scene.h5", tmp_path / "crops.h5", settings)
+    for k in range(2):
+        sample.run(tmp_path / "scene.h5", tmp_path / f"crops{k}.h5", replace(settings, shard=(k, 2)))
+        project.run(tmp_path / "crops.h5", tmp_path / f"pairs{k}.h5", project.Config(shard=(k, 2)))
+    project.run(tmp_path / "crops.h5", tmp_path / "pairs.h5", project.Config())
+    for name in ("crops", "pairs"):
+        merge.run([tmp_path / f"{name}{k}.h5" for k in range(2)], tmp_path / "merged.h5")
+        assert_same(tmp_path / f"{name}.h5", tmp_path / "merged.h5")
+        (tmp_path / "merged.h5").rename(tmp_path / f"merged_{name}.h5")
+    with open_artefact(tmp_path / "merged_pairs.h5", PAIRS) as file:
+        assert len(file["image"]) == 1 and file["image"].attrs["units"] == "dn"
 
 
 def test_a_view_says_so_when_a_part_is_gone(small_artefacts, tmp_path):

@@ -74,14 +74,14 @@ def file_size_limit(size):
 def test_a_disk_that_is_full_for_a_moment_leaves_nothing_that_looks_whole(tmp_path):
     """HDF5 writes what a dataset still holds when it is let go of, where a failure reaches nobody; then there is room again."""
     path, values = tmp_path / "map.h5", np.arange(3 * 64 * 64, dtype=np.float32).reshape(3, 64, 64)
-    attributes = {"gsd_m": 5.0, "body_radius_m": 1.0, "model": "M2", "quantity": "I/F"}
+    attributes = {"gsd_m": 5.0, "body_radius_m": 1737400.0, "model": "M2", "quantity": "I/F"}
     with (
         contextlib.suppress(InputError),
         ArtefactWriter(path, SVBRDF, {"coefficient": 3, "y": 64, "x": 64}, attributes=attributes) as writer,
     ):
         for name in ("x", "y", "elevation", "valid", "coefficient_name"):
             writer.write(name, ["a", "b", "c"] if name == "coefficient_name" else np.zeros(writer.dataset(name).shape))
-        writer.write_crs("", (1, 0, 0, 0, -1, 0))
+        writer.write_crs("LOCAL_CS[]", (5, 0, 0, 0, -5, 0))
         data = writer.write("coefficients", values)
         room = next(p for p in tmp_path.iterdir() if ".partial-" in p.name)
         with file_size_limit(room.stat().st_size):

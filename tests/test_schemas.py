@@ -15,10 +15,12 @@ import pytest
 from schemas import PAIRS, SCHEMAS, ArtefactError, ArtefactWriter, ConfigError, check_output, open_artefact, read_kind
 from schemas.reading import unpack
 
+PLACE = {"gsd_m": 5.0, "body_radius_m": 1737400.0}
 
-def write_pairs(path, **change):
+
+def write_pairs(path, place=PLACE, **change):
     sizes = {"pair": 2, "y": 4, "x": 4, "enu": 3, "frame": 1}
-    with ArtefactWriter(path, PAIRS, sizes, attributes={"gsd_m": 5.0, "body_radius_m": 1737400.0}, **change) as writer:
+    with ArtefactWriter(path, PAIRS, sizes, attributes=place, **change) as writer:
         for v in PAIRS.variables:
             if v.required:
                 shape = [sizes[d] for d in v.dims]
@@ -78,6 +80,15 @@ def test_an_incomplete_artefact_is_a_bug_and_leaves_nothing(tmp_path):
         ArtefactWriter(tmp_path / "p.h5", PAIRS, {"pair": 1, "y": 2, "x": 2, "enu": 3, "frame": 1}),
     ):
         pass
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name, value", [("gsd_m", np.inf), ("body_radius_m", -1.0)])
+def test_an_artefact_that_cannot_be_read_again_gets_no_name(tmp_path, name, value):
+    place = {"gsd_m": 5.0, "body_radius_m": 1737400.0, name: value}
+    with pytest.raises(ArtefactError, match=rf"pairs\.h5: root attribute '{name}'.*; nothing was written") as caught:
+        write_pairs(tmp_path / "pairs.h5", place)
+    assert "partial" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -115,7 +115,7 @@ def reuse_elevation(
         target = writer.dataset(name)
         for row in range(0, target.shape[0], 256):
             target[row : row + 256] = file[name][row : row + 256]
-    if "dem_valid_px" not in file.attrs:
+    if "elevation_low_m" not in file.attrs:
         raise ArtefactError(
             f"{scene}: expected the extremes of its elevations, found none; run 'lunargr ingest' again."
         )

@@ -44,7 +44,9 @@ LARGEST_CROP = 8192  # px: what a network can see at once, and more
 
 @dataclass(frozen=True)
 class Summary:
-    """What ingest found, for the table at the end. blank : images without a valid pixel on the DEM"""
+    """What ingest found, for the table at the end. elevation_range : (least, largest) m, NaN where all is nodata;
+    blank : images without a valid pixel on the DEM
+    """
 
     grid: Grid
     dem_valid_share: float
@@ -98,8 +100,9 @@ def run(
         ) as writer:
             _write_grid(writer, terrain.grid)
             known, low, high = terrain.write(writer, progress)
-            writer.file.attrs["elevation_low_m"], writer.file.attrs["elevation_high_m"] = low, high
             writer.file.attrs["dem_valid_px"] = known
+            if known:  # a shard may lie wholly on nodata
+                writer.file.attrs["elevation_low_m"], writer.file.attrs["elevation_high_m"] = low, high
             for name in ("valid", "valid_position", "frame_window"):  # also where there is no image at all
                 writer.dataset(name)
             elevation = terrain.file or writer.file
@@ -126,11 +129,11 @@ def summarise(scene: Path, skipped: tuple[str, ...] = ()) -> Summary:
     """What a scene holds, for the table at the end."""
     with open_artefact(scene, SCENE) as file:
         grid = read_grid(file, scene)
-        low, high, known = (file.attrs[k] for k in ("elevation_low_m", "elevation_high_m", "dem_valid_px"))
+        low, high = (file.attrs.get(k, math.nan) for k in ("elevation_low_m", "elevation_high_m"))
         frames = tuple(load_frames(file, scene))
         return Summary(
             grid,
-            float(known) / (grid.height * grid.width),
+            float(file.attrs["dem_valid_px"]) / (grid.height * grid.width),
             (float(low), float(high)),
             frames,
             tuple(float(a) / 1e6 for a in file["valid_area_m2"][...]),

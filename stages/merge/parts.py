@@ -11,7 +11,7 @@ from typing import Any
 
 import h5py
 
-from schemas import ArtefactError, Schema, open_artefact, read_config, read_kind
+from schemas import ArtefactError, InputError, Schema, open_artefact, read_config, read_kind
 from schemas.checks import parse_json
 from stages.physics.images.table import relative_path
 
@@ -26,7 +26,7 @@ STANDARD = {
 }  # fmt: skip
 # Root attributes that may differ between the parts of one whole.
 _OWN = {"history", "inputs", "config", "lunargr_version", "command", "folder", "provenance"}
-# What is joined rather than compared.
+# What parts of a DEM join rather than share. A part on nodata has no least and largest elevation.
 _JOINED: dict[str, Callable[[Sequence[Any]], Any]] = {
     "elevation_low_m": min,
     "elevation_high_m": max,
@@ -72,9 +72,11 @@ class Parts:
         """Root attributes that all parts have in common, or that are joined."""
         first = self.files[0].attrs
         common = {k: v for k, v in first.items() if k not in STANDARD and k != ROWS}
-        for name, join in _JOINED.items():
-            if name in common and self.by_rows:
-                common[name] = join([f.attrs[name] for f in self.files])
+        if self.by_rows:
+            found = {name: [f.attrs[name] for f in self.files if name in f.attrs] for name in _JOINED}
+            common |= {name: _JOINED[name](values) for name, values in found.items() if values}
+        if common.get("dem_valid_px") == 0:
+            raise InputError(f"{self.paths[0]}: expected elevations in one of the parts, found only nodata in all.")
         if "scene" in common:
             common["scene"] = moved(str(common["scene"]), self.paths[0], output)
         return common
@@ -93,7 +95,7 @@ def open_parts(paths: Sequence[Path]) -> Iterator[Parts]:
         opened.sort(key=lambda part: shard_of(part[1])[0])
         files = [file for _, file in opened]
         record = RECORD.get(schema.name)
-        if schema.name == "scene" and len(files) > 1 and not any(f["frame_window"].shape[0] for f in files):
+        if schema.name == "scene" and all(ROWS in f.attrs for f in files):
             record = None
         parts = Parts(schema, [path for path, _ in opened], files, record)
         _check_complete(parts)

@@ -43,7 +43,7 @@ def run(
         part = slice(*shard_range(total, config.shard))
         check_sources(crops, [frames[k] for k in sorted({int(k) for k in file["image_index"][part]})])
         check_places(crops, file, scene.elevation.shape)
-        units = _units(crops, file, frames, part)
+        units = _units(crops, file, frames)
         with ArtefactWriter(
             output.file,
             PAIRS,
@@ -93,8 +93,9 @@ class View:
     geometry: Geometry
 
 
-def _units(crops: Path, file: h5py.File, frames: list[Frame], part: slice) -> str:
-    units = {frames[int(k)].units for k in np.unique(file["image_index"][part])} or {"iof"}
+def _units(crops: Path, file: h5py.File, frames: list[Frame]) -> str:
+    """Of the images of all crops: shards share them, and one of few crops may be empty."""
+    units = {frames[int(k)].units for k in np.unique(file["image_index"][...])} or {"iof"}
     if len(units) > 1:
         raise InputError(f"{crops}: expected one kind of units, found both 'iof' and 'dn'; ingest them apart.")
     return units.pop()
