@@ -19,7 +19,10 @@ GRID = 41  # pixels a side
 
 
 def check(camera: Camera) -> tuple[float, float]:
-    """(largest distance of a pixel from where its ground is seen, px; metres a pixel in the middle). Raises InputError."""
+    """(largest ground distance of a pixel from where its ground is seen, px; metres a pixel in the middle).
+
+    On the ground, because framelets overlap: two pixels may rightly show the same place. Raises InputError.
+    """
     line, sample = np.meshgrid(
         np.linspace(0.5, camera.lines - 0.5, GRID), np.linspace(0.5, camera.samples - 0.5, GRID), indexing="ij"
     )
@@ -29,31 +32,36 @@ def check(camera: Camera) -> tuple[float, float]:
         raise InputError(
             f"{camera.kind}: expected unit directions {(*line.shape, 3)} of `rays`, found {direction.shape}."
         )
+    middle = camera.lines / 2, camera.samples / 2
+    near = camera.image_to_ground(
+        np.array([middle[0], middle[0]]), np.array([middle[1], middle[1] + 1]), missing="nearest"
+    )
+    sampling = float(np.linalg.norm(near[1] - near[0]))
     worst = 0.0
     for height in HEIGHTS:
         points = camera.image_to_ground(line, sample, height)
-        seen = np.isfinite(points).all(axis=-1)
-        if not seen.any():
+        points = points[np.isfinite(points).all(axis=-1)]
+        if not len(points):
             raise InputError(
                 f"{camera.kind}: expected pixels that see the body {height:g} m above its sphere, found none."
             )
-        back = camera.ground_to_image(points[seen])
-        away = np.hypot(back[0] - line[seen], back[1] - sample[seen])
+        again = camera.image_to_ground(*camera.ground_to_image(points), height)
+        away = np.linalg.norm(again - points, axis=-1) / sampling
         if not (np.isfinite(away).all() and away.max() < WITHIN_PX):
             raise InputError(
                 f"{camera.kind}: expected `ground_to_image` to undo `rays` within {WITHIN_PX:g} px, found pixels "
                 f"{np.nanmax(away, initial=np.inf if not np.isfinite(away).any() else 0):.3g} px away, {height:g} m above the sphere."
             )
         worst = max(worst, float(away.max()))
-    middle = camera.lines / 2, camera.samples / 2
-    near = camera.image_to_ground(np.array([middle[0], middle[0]]), np.array([middle[1], middle[1] + 1]))
-    return worst, float(np.linalg.norm(near[1] - near[0]))
+    return worst, sampling
 
 
 def main(path: Path) -> None:
     camera = open_camera(path)
     worst, sampling = check(camera)
     print(f"{path}: {camera.kind}, {camera.lines} x {camera.samples} px, {sampling:.4g} m a pixel in the middle")
+    for note in camera.notes:
+        print(f"note: {note}")
     print(f"round trip at {', '.join(f'{h:g}' for h in HEIGHTS)} m: {worst:.1e} px")
 
 

@@ -97,6 +97,146 @@ def test_line_times_may_change_within_the_image(shared, rng):
     np.testing.assert_allclose(camera.ground_to_image(points), [line, sample], atol=1e-6)
 
 
+# --- what ALE writes ------------------------------------------------------------------------------------------------
+
+REFUSED = {
+    "apolloPanImage": "expected 'instrument_position' to cover the image's times",
+    "cassis": "expected detector summing above 0",
+    "hayabusaamica": "found determinant 6944.44 and 0.1208; is the length in metres",
+    "mgsmocna": "expected 'instrument_pointing' to cover the image's times",
+    "msl": "expected a camera in orbit, found a CAHVOR model",
+}
+# what USGSCSM itself is not exact to, m: its undistortion stops early
+USGSCSM_ERROR = {"dawnfc": 0.02}
+# USGSCSM was run on the centre that the ISD gives, x and y of BORESIGHT
+CENTRE_TAKEN_ELSEWHERE = {"apollometric": (11450.5, 11450.5), "nhlorri": (511.5, 511.5)}
+ALE = sorted(
+    [
+        "apolloPanImage",
+        "apollometric",
+        "c1637937",
+        "cassiniiss",
+        "cassis",
+        "chandrayaan2_ohrc",
+        "chandrayaan2_tmc2",
+        "clem_hires",
+        "clem_nir",
+        "clem_uvvis",
+        "ctx",
+        "dawnfc",
+        "f004a47",
+        "f735a00",
+        "galileossi",
+        "hayabusa2",
+        "hayabusaamica",
+        "hirise",
+        "kaguyami_isis",
+        "kaguyatc",
+        "lohighcamera",
+        "lomediumcamera",
+        "lrolroc",
+        "mariner10",
+        "messmdis",
+        "mexsrc",
+        "mgsmocna",
+        "msi",
+        "msl",
+        "nhlorri",
+        "osirisrex",
+        "themisvis",
+    ]
+)
+
+
+@pytest.fixture(scope="module")
+def usgscsm_ground(shared):
+    """USGSCSM's ground points by ISD: (n, 10) of line, sample, height, ground, image coordinates back, camera's place."""
+    table = {}
+    for name in ("usgscsm_ale_isds_image_ground.csv", "usgscsm_apollo_cubes_image_ground.csv"):
+        with (shared / "oracles" / name).open() as file:
+            for isd, *numbers in csv.reader(file):
+                if isd != "isd":
+                    table.setdefault(isd.split("~")[0], []).append([float(n or "nan") for n in numbers])
+    return {name: np.array(rows) for name, rows in table.items()}
+
+
+@pytest.mark.parametrize("name", ALE)
+def test_what_ale_writes_is_read_as_usgscsm_reads_it_or_refused(shared, usgscsm_ground, name):
+    document = json.loads((shared / f"oracles/ale_isds/{name}.json").read_text())
+    if name in REFUSED:
+        with pytest.raises(LunargrError, match=REFUSED[name]) as caught:
+            camera_from_document(document, name)
+        assert "\n" not in str(caught.value)
+        return
+    if name in CENTRE_TAKEN_ELSEWHERE:
+        camera = camera_from_document(document, name)
+        assert camera.detector.centre == CENTRE_TAKEN_ELSEWHERE[name] and "CCD_CENTER" in camera.notes[0]
+        del document["naif_keywords"]
+    camera = camera_from_document(document, name)
+    assert not camera.notes
+    if name not in usgscsm_ground:  # no outside numbers: galileossi, lohighcamera
+        return
+    line, sample, height = usgscsm_ground[name][:, :3].T
+    ground, place = usgscsm_ground[name][:, 3:6], usgscsm_ground[name][:, 8:11]
+    # doubles hold 1e-16 of a distance, and grazing rays stretch that
+    tolerance = 1e-4 + 1e-12 * np.linalg.norm(place, axis=-1) + USGSCSM_ERROR.get(name, 0.0)
+    assert (np.linalg.norm(camera.position(line) - place, axis=-1) < tolerance).all()
+    assert (np.linalg.norm(camera.image_to_ground(line, sample, height) - ground, axis=-1) < tolerance).all()
+    again = camera.image_to_ground(*camera.ground_to_image(ground), height)  # framelets overlap: compare on the ground
+    assert (np.linalg.norm(again - ground, axis=-1) < tolerance).all()
+
+
+@pytest.mark.parametrize("number", [297, 298, 299])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_z_axis_away_from_the_ground_is_looked_along_backwards(shared, usgscsm_ground, number, sign):
+    """Apollo Metric ISDs, whether or not their author made the focal length negative."""
+    document = json.loads((shared / f"oracles/isd_variants/AS15-M-0{number}_negfocal.json").read_text())
+    document["focal_length_model"]["focal_length"] *= sign
+    rows = usgscsm_ground[f"AS15-M-0{number}_crop"]
+    points = camera_from_document(document, "apollo").image_to_ground(*rows[:, :3].T)
+    assert np.linalg.norm(points - rows[:, 3:6], axis=-1).max() < 1e-6
+
+
+def frame_isd(**changes):
+    """A camera 100 km above (0 E, 0 N): x east, y north, z up; 10 px/mm, focal length 50 mm."""
+    times, still = [0.0], {"quaternions": [[1.0, 0, 0, 0]], "ephemeris_times": [0.0]}
+    return {
+        "name_model": "USGS_ASTRO_FRAME_SENSOR_MODEL",
+        "image_lines": 100,
+        "image_samples": 100,
+        "center_ephemeris_time": 0.0,
+        "radii": {"semimajor": 1000.0, "semiminor": 1000.0, "unit": "km"},
+        "body_rotation": still,
+        "instrument_pointing": still | {"constant_rotation": [0, 1, 0, 0, 0, 1, 1, 0, 0]},
+        "instrument_position": {"positions": [[1100.0, 0, 0]], "ephemeris_times": times, "unit": "km"},
+        "sun_position": {"positions": [[1e8, 0, 0]], "ephemeris_times": times, "unit": "km"},
+        "focal_length_model": {"focal_length": 50.0},
+        "focal2pixel_lines": [0.0, 0.0, 10.0],
+        "focal2pixel_samples": [0.0, 10.0, 0.0],
+        "detector_center": {"line": 50.0, "sample": 50.0},
+        "detector_line_summing": 1,
+        "detector_sample_summing": 1,
+        "starting_detector_line": 0,
+        "starting_detector_sample": 0,
+        "optical_distortion": {"radial": {"coefficients": [0.0, 0.0, 0.0]}},
+    } | changes
+
+
+def test_the_optical_axis_decides_even_where_the_image_lies_beside_it():
+    """z up: east of the axis is at larger samples. A crop 50 degrees aside shows no ground behind the middle pixel."""
+    point = np.array([1e6 * math.cos(0.01), 1e6 * math.sin(0.01), 0.0])
+    expected = 50 + 500 * point[1] / (1.1e6 - point[0])
+    assert camera_from_document(frame_isd(), "up").ground_to_image(point)[1] == pytest.approx(expected)
+    aside = frame_isd(starting_detector_sample=600)
+    assert camera_from_document(aside, "aside").ground_to_image(point)[1] == pytest.approx(expected - 600)
+
+
+def test_no_ray_meets_ground_below_the_body_s_middle():
+    camera = camera_from_document(frame_isd(), "up")
+    assert np.isnan(camera.image_to_ground(50, 50, -1.1e6)).all()
+    assert np.isfinite(camera.image_to_ground(50, 50, -0.9e6)).all()
+
+
 # --- USGSCSM's unit tests -------------------------------------------------------------------------------------------
 
 
@@ -144,6 +284,11 @@ def test_usgscsm_unit_tests(shared, name, isd, line, sample, focal_length):
     document = json.loads((shared / f"oracles/usgscsm_{isd}.isd.json").read_text())
     if focal_length is not None:
         document["focal_length_model"]["focal_length"] = focal_length
+    if isd.startswith(
+        "orbital"
+    ):  # made for a camera that looks out of its back, along -(x, y, f): ISIS's is (x, y, -f)
+        for key in ("focal2pixel_lines", "focal2pixel_samples"):
+            document[key] = [-c for c in document[key]]
     camera = camera_from_document(document, isd)
     expected, tolerance = expected_ground(shared, name)
     ground = camera.image_to_ground(line, sample, missing="nearest")
@@ -161,6 +306,13 @@ def test_usgscsm_unit_tests(shared, name, isd, line, sample, focal_length):
         (distortion.LRO_NAC, [1.81e-5]),
         (distortion.DAWN_FC, [8.4e-6]),
         (distortion.KAGUYA_LISM, [0.01, -9.6e-4, 1e-4, 2e-6, 1e-8, -0.02, 1e-3, 2e-5, 3e-7, 0]),
+        (distortion.SHADOWCAM, [-1.741e-5]),
+        (distortion.LUNAR_ORBITER, [-3e-6, 8e-7, -1.11, 0.3, 2.7963e-4, -2.869e-8]),
+        (distortion.METRIC, [-6e-3, -2e-3, -1.3361854e-6, 5.2261757e-10, -5.07e-14, -5.4958195e-7, -4.6e-11, 2.965907]),
+        (distortion.UVVIS, [0.1, -0.2, 0.0, -2.422842e-5, 0.0, 2.255006e-5, 2.1089e-5]),
+        (distortion.CENTRED, [0.032, -0.032, 4.66e-3, 1.66e-7, -2.4e-9]),
+        (distortion.RADTAN, [-0.3, 0.1, 1e-3, -2e-3, -0.02, 0, 0, 0, 50.0]),
+        (distortion.FISHEYE, [-0.02, 0.01, -3e-3, 1e-4, 0, 0, 0, 0, 50.0]),
         (distortion.NONE, [0.0]),
     ],
 )
@@ -169,6 +321,27 @@ def test_distortion_comes_back(model, coefficients, rng):
     x, y = rng.uniform(-18, 18, (2, 200))
     back = distortion.undistort_arrays(model, k, *distortion.distort_arrays(model, k, x, y))
     np.testing.assert_allclose(back, [x, y], atol=1e-11)
+
+
+def test_distortions_by_their_kernels_formulas():
+    """ShadowCam as USGSCSM's own test has it, one radial coefficient as Galileo's kernel, Lunar Orbiter as ISIS has it."""
+    read = distortion.read_distortion
+    code, k = read({"optical_distortion": {"kplo_shadowcam": {"coefficients": [-1.741e-5]}}}, "isd")
+    np.testing.assert_allclose(
+        distortion.undistort_arrays(code, k, 0.0, -18.69), [0, -18.69 * (1 - 1.741e-5 * 18.69**2)], rtol=1e-14
+    )
+    code, k = read({"optical_distortion": {"radial": {"coefficients": [-2.5e-5]}}}, "isd")
+    np.testing.assert_allclose(distortion.undistort_arrays(code, k, 3.0, 4.0), np.array([3, 4]) * (1 + 2.5e-5 * 25))
+    high = {"perspective_x": -3e-6, "perspective_y": 8e-7, "center_point_x": -1.11, "center_point_y": 0.3}
+    isd = {"optical_distortion": {"lunarorbiter": high}, "naif_keywords": {"INS-533001_OD_K": [2.8e-4, -2.9e-8, 0.0]}}
+    code, k = read(isd, "isd")
+    px, py = np.array([60.0, -20.0]) * (1 - 3e-6 * 60 + 8e-7 * -20)
+    scale = 2.8e-4 - 2.9e-8 * ((px + 1.11) ** 2 + (py - 0.3) ** 2)
+    np.testing.assert_allclose(
+        distortion.undistort_arrays(code, k, 60.0, -20.0),
+        [px - scale * (px + 1.11), py - scale * (py - 0.3)],
+        rtol=1e-14,
+    )
 
 
 # --- the NAC frame that ISIS went over ------------------------------------------------------------------------------
@@ -279,7 +452,7 @@ def broken(name):
         elif name == "rate":
             d["line_scan_rate"] = [[0.5, -0.2, 0.0]]
         elif name == "distortion":
-            d["optical_distortion"] = {"cahvor": {"coefficients": [0]}}
+            d["optical_distortion"] = {"brown": {"coefficients": [0]}}
         elif name == "model":
             d["name_model"] = "USGS_ASTRO_SAR_SENSOR_MODEL"
         elif name == "nan":
@@ -304,7 +477,7 @@ def broken(name):
         ("lengths", InputError, "expected 401 entries in 'instrument_position.positions'"),
         ("order", InputError, "expected rising times in 'body_rotation.ephemeris_times'"),
         ("rate", InputError, "line times other than 0"),
-        ("distortion", RegistryError, "unknown distortion model 'cahvor'; choose one of: dawnfc"),
+        ("distortion", RegistryError, "unknown distortion model 'brown'; choose one of: centred"),
         ("model", RegistryError, "unknown camera 'USGS_ASTRO_SAR_SENSOR_MODEL'"),
         ("nan", InputError, "finite number in 'focal_length_model.focal_length'"),
         ("still", GeometryError, "expected a camera that moves over the ground"),

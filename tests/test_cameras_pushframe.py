@@ -48,8 +48,8 @@ def isd(
         "framelet_order_reversed": False,
         "detector_sample_summing": 1,
         "detector_line_summing": 1,
-        "focal2pixel_lines": [0.0, -10.0, 0.0],
-        "focal2pixel_samples": [0.0, 0.0, 10.0],
+        "focal2pixel_lines": [0.0, 10.0, 0.0],  # the camera's z axis points up: it looks along (x, y, -f)
+        "focal2pixel_samples": [0.0, 0.0, -10.0],
         "focal_length_model": {"focal_length": FOCAL_PX / 10},
         "image_lines": framelets * height,
         "image_samples": samples,

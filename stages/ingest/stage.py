@@ -82,7 +82,7 @@ def run(
         if frames and config.crop > min(terrain.grid.height, terrain.grid.width):
             raise _no_positions(images, config, terrain.grid.gsd)
         mine, skipped = check_frames(
-            frames[slice(*shard_range(len(frames), config.shard))], terrain.grid, config.skip_outside
+            frames[slice(*shard_range(len(frames), config.shard))], terrain.grid, config.skip_outside, say
         )
         if frames and not mine and alone:
             raise InputError(

@@ -11,7 +11,7 @@ import numpy as np
 
 from schemas import ArtefactWriter, GeometryError, InputError
 from schemas.provenance import sha256
-from stages.common.progress import Progress
+from stages.common.progress import Progress, Say, say_nothing
 from stages.ingest.config import Config
 from stages.ingest.plan import ANY_RELIEF
 from stages.physics.images.source_images import open_source
@@ -20,13 +20,20 @@ from stages.physics.maps.grid import Grid
 from stages.physics.maps.positions import blocks, valid_positions
 
 
-def check_frames(frames: Sequence[Frame], grid: Grid, skip_outside: bool) -> tuple[list[Frame], list[str]]:
-    """The images that touch the DEM, and the names of the others, which without ``skip_outside`` raise InputError."""
+def check_frames(
+    frames: Sequence[Frame], grid: Grid, skip_outside: bool, say: Say = say_nothing
+) -> tuple[list[Frame], list[str]]:
+    """The images that touch the DEM, and the names of the others, which without ``skip_outside`` raise InputError.
+
+    say : told what cameras took otherwise than their files say
+    """
     kept, skipped = [], []
     for frame in frames:
         # The DEM is not read yet: the ground that a camera image can show is sought within any body's relief.
         relief = ANY_RELIEF * grid.radius
         with open_source(frame, grid, None, (-relief, relief)) as source:
+            for note in source.notes:
+                say(f"note: {note}")
             if source.box() is None:
                 if not skip_outside:
                     raise InputError(

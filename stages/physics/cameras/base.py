@@ -30,6 +30,11 @@ class Camera(ABC):
     samples: int
     semi_axes: tuple[float, float]
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was taken otherwise than the camera's file says, one line each."""
+        return ()
+
     @classmethod
     @abstractmethod
     def from_document(cls, document: Mapping[str, Any], where: str) -> Camera:
@@ -120,9 +125,13 @@ def meet_ellipsoid(
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Where rays first meet an ellipsoid of revolution, (..., 3), and whether each does so ahead of the camera, (...,).
 
-    origin, direction : (..., 3); equatorial, polar : semi-axes. A ray that misses gives its point closest to the ellipsoid.
+    origin, direction : (..., 3); equatorial, polar : semi-axes; no ray meets an ellipsoid without extent. A ray that
+    misses gives its point closest to the ellipsoid.
     """
-    stretch = (np.asarray(equatorial, float) / np.asarray(polar, float)) ** 2
+    equatorial, polar = np.asarray(equatorial, float), np.asarray(polar, float)
+    exists = (equatorial > 0) & (polar > 0)
+    equatorial, polar = np.where(exists, equatorial, 1.0), np.where(exists, polar, 1.0)
+    stretch = (equatorial / polar) ** 2
     weight = np.stack(np.broadcast_arrays(np.ones_like(stretch), np.ones_like(stretch), stretch), axis=-1)
     a = (weight * direction * direction).sum(-1)
     half_b = (weight * direction * origin).sum(-1)
@@ -135,7 +144,7 @@ def meet_ellipsoid(
         distance = np.where(half_b < 0, c / (root - half_b), (-half_b - root) / a)
         closest = -half_b / a
     distance = np.where(discriminant < 0, closest, distance)
-    hit = (discriminant >= 0) & (distance >= 0)
+    hit = exists & (discriminant >= 0) & (distance >= 0)
     return origin + distance[..., None] * direction, hit
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -40,18 +40,21 @@ class Frame(Camera):
         now = np.zeros(1)
         exposure.check_covers(0.0, 0.0, where)
         body = exposure.body.at(now)[0]
-        camera = cls(
+        centre, rotation = body @ exposure.positions.at(now)[0], body @ exposure.pointing.at(now)[0].T
+        return cls(
             lines=exposure.lines,
             samples=exposure.samples,
             semi_axes=exposure.semi_axes,
-            detector=Detector.from_document(document, where),
-            centre=body @ exposure.positions.at(now)[0],
-            rotation=body @ exposure.pointing.at(now)[0].T,
+            detector=Detector.from_document(document, where).facing(centre, rotation[:, 2]),
+            centre=centre,
+            rotation=rotation,
             sun=body @ exposure.sun.at(now)[0],
             time=exposure.centre_time,
         )
-        origin, axis = camera.rays(camera.lines / 2, camera.samples / 2)
-        return replace(camera, detector=camera.detector.facing(origin, axis, camera.semi_axes[0]))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.detector.notes
 
     def rays(self, line: ArrayLike, sample: ArrayLike) -> tuple[Floats, Floats]:
         direction = self.detector.directions(line, sample) @ self.rotation.T

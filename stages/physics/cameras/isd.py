@@ -14,10 +14,9 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
-from schemas.errors import GeometryError
+from schemas.errors import GeometryError, InputError
 from stages.common.arrays import Floats
 from stages.physics.cameras import document as read
-from stages.physics.cameras.base import meet_ellipsoid
 from stages.physics.cameras.distortion import distort, distort_arrays, read_distortion, undistort_arrays
 from stages.physics.cameras.tables import (
     EvenTable,
@@ -30,6 +29,8 @@ from stages.physics.cameras.tables import (
     read_states,
 )
 
+LEAST_FOCAL_LENGTH = 1.0  # mm: below, an ISD gives metres
+
 
 @dataclass(frozen=True)
 class Detector:
@@ -37,6 +38,7 @@ class Detector:
 
     to_line, to_sample : (3,), detector px = c0 + c1 x + c2 y of focal-plane mm, about ``centre`` = (line, sample)
     start, summing : (line, sample) of the image's first pixel on the detector, and detector px per image px
+    notes : what was taken otherwise than the ISD says
     """
 
     focal_length: float
@@ -47,7 +49,7 @@ class Detector:
     summing: tuple[float, float]
     distortion: int
     coefficients: Floats
-    sense: float = 1.0  # -1: the optical axis points out of the back of the camera, see :meth:`facing`
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any], where: str) -> Detector:
@@ -55,24 +57,26 @@ class Detector:
         to_line = read.array(document, "focal2pixel_lines", where, (3,))
         to_sample = read.array(document, "focal2pixel_samples", where, (3,))
         determinant = to_line[1] * to_sample[2] - to_line[2] * to_sample[1]
-        if not determinant or not focal_length:
+        if not determinant or abs(focal_length) < LEAST_FOCAL_LENGTH:
             raise GeometryError(
-                f"{where}: expected 'focal2pixel_lines' and 'focal2pixel_samples' that span the detector and a focal "
-                f"length other than 0, found determinant {determinant:g} and {focal_length:g} mm; correct the ISD."
+                f"{where}: expected 'focal2pixel_lines' and 'focal2pixel_samples' that span the detector and a focal length "
+                f"in mm, found determinant {determinant:g} and {focal_length:g}; is the length in metres? Correct the ISD."
             )
         summing = _pair(document, "detector_line_summing", "detector_sample_summing", where)
         if min(summing) <= 0:
             raise GeometryError(f"{where}: expected detector summing above 0, found {summing}; correct the ISD.")
         code, coefficients = read_distortion(document, where)
+        centre, notes = _centre(document, where)
         return cls(
             focal_length=focal_length,
             to_line=to_line,
             to_sample=to_sample,
-            centre=_pair(document, "detector_center.line", "detector_center.sample", where),
+            centre=centre,
             start=_pair(document, "starting_detector_line", "starting_detector_sample", where),
             summing=summing,
             distortion=code,
             coefficients=coefficients,
+            notes=notes,
         )
 
     def directions(self, line: ArrayLike, sample: ArrayLike) -> Floats:
@@ -89,21 +93,23 @@ class Detector:
             (a * right - c * down) / determinant,
         )
         vectors = np.stack([x, y, np.full_like(x, self.focal_length)], axis=-1)
-        return vectors * (self.sense / np.linalg.norm(vectors, axis=-1, keepdims=True))
+        return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
-    def facing(self, origin: Floats, axis: Floats, radius: float) -> Detector:
-        """The detector turned towards the body, where the ISD's axis (3,) points straight away from it.
+    def facing(self, place: Floats, z_axis: Floats) -> Detector:
+        """The detector with its optical axis towards the body.
 
-        CSM cameras take the nearer of the two places where a line of sight meets the body, before or behind the camera;
-        ISDs exist that rely on it.
+        Some cameras are defined with their z axis away from the ground (Apollo Metric, Lunar Orbiter, LORRI): they look
+        along (x, y, -f), ISIS's zDirection = -1. Of an orbiter no axis more than 90 degrees from nadir meets the body.
+
+        place : (3,) of the camera, m; z_axis : (3,) of the camera; both body-fixed
         """
-        behind, ahead = (meet_ellipsoid(origin, sign * axis, radius, radius)[1] for sign in (-1.0, 1.0))
-        return replace(self, sense=-self.sense) if behind and not ahead else self
+        away = float(place @ z_axis) * self.focal_length > 0
+        return replace(self, focal_length=-self.focal_length) if away else self
 
     def places(self, vectors: Floats) -> tuple[Floats, Floats]:
         """(line, sample) in the image of camera vectors (..., 3); NaN behind the camera."""
         x, y, z = np.moveaxis(vectors, -1, 0)
-        scale = self.focal_length / np.where(z * self.focal_length * self.sense > 0, z, np.nan)
+        scale = self.focal_length / np.where(z * self.focal_length > 0, z, np.nan)
         dx, dy = distort_arrays(self.distortion, self.coefficients, x * scale, y * scale)
         line = self.to_line[0] + self.to_line[1] * dx + self.to_line[2] * dy + self.centre[0] - self.start[0]
         sample = self.to_sample[0] + self.to_sample[1] * dx + self.to_sample[2] * dy + self.centre[1] - self.start[1]
@@ -114,14 +120,13 @@ class Detector:
         """The same for numba kernels."""
         offset = self.centre[0] - self.start[0], self.centre[1] - self.start[1]
         axes = (self.to_line, self.to_sample)
-        return Optics(self.focal_length, self.sense, *axes, *offset, *self.summing, self.distortion, self.coefficients)
+        return Optics(self.focal_length, *axes, *offset, *self.summing, self.distortion, self.coefficients)
 
 
 class Optics(NamedTuple):
     """A :class:`Detector` as numba kernels take it; offsets : px from the image's first pixel to the detector's centre"""
 
     focal_length: float
-    sense: float
     to_line: Floats
     to_sample: Floats
     line_offset: float
@@ -135,7 +140,7 @@ class Optics(NamedTuple):
 @numba.njit(cache=True)
 def detector_place(x, y, z, optics):
     """Detector (line, sample) from the detector's centre of a camera vector; NaN behind the camera."""
-    if z * optics.focal_length * optics.sense <= 0:
+    if z * optics.focal_length <= 0:
         return math.nan, math.nan
     scale = optics.focal_length / z
     dx, dy = distort(optics.distortion, optics.coefficients, x * scale, y * scale)
@@ -193,6 +198,25 @@ class Exposure:
             even_positions(states, self.positions.times, self.body) for states in (self.positions, self.sun)
         )
         return positions, even_pointing(self.pointing, self.body), sun
+
+
+def _centre(document: Mapping[str, Any], where: str) -> tuple[tuple[float, float], tuple[str, ...]]:
+    """(line, sample) of the detector's centre, and what is to be said of it.
+
+    ALE gives x and y of BORESIGHT, a direction, for instruments whose kernel has the centre under CCD_CENTER (line and
+    sample to half a pixel, as kernels count from 0 or 1).
+    """
+    line, sample = _pair(document, "detector_center.line", "detector_center.sample", where)
+    keywords = document.get("naif_keywords") or {}
+    if not isinstance(keywords, Mapping):
+        raise InputError(f"{where}: expected an object in 'naif_keywords', found {keywords!r:.40}; correct the ISD.")
+    for key, boresight in keywords.items():
+        centre = keywords.get(str(key).removesuffix("BORESIGHT") + "CCD_CENTER")
+        if str(key).endswith("_BORESIGHT") and centre is not None and [*np.ravel(boresight)][:2] == [sample, line]:
+            x, y = read.array({"CCD_CENTER": centre}, "CCD_CENTER", where, (2,)).tolist()
+            note = f"{where}: 'detector_center' holds the boresight's direction; CCD_CENTER, line {y:g} and sample {x:g}, is taken"
+            return (y, x), (note,)
+    return (line, sample), ()
 
 
 def _pair(document: Mapping[str, Any], first: str, second: str, where: str) -> tuple[float, float]:

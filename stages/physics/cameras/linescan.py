@@ -75,9 +75,14 @@ class LineScan(Camera):
         )
         ends = camera.times([0.0, camera.lines])
         exposure.check_covers(float(ends.min()), float(ends.max()), where)
-        origin, axis = camera.rays(camera.lines / 2, camera.samples / 2)
-        camera = replace(camera, detector=detector.facing(origin, axis, camera.semi_axes[0]))
+        middle = float(ends.mean())
+        facing = detector.facing(positions.at(middle), camera.rotations(middle)[:, 2])
+        camera = replace(camera, detector=facing)
         return replace(camera, _search=_Search.for_camera(camera, where))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.detector.notes
 
     def times(self, line: ArrayLike) -> Floats:
         """Seconds from ``centre_time`` of image lines.

@@ -88,10 +88,13 @@ class PushFrame(Camera):
             suns=sun.at(times),
             times=np.asarray(exposure.centre_time + times, np.float64),
         )
-        middle = (framelets // 2 + 0.5) * camera.height
-        origin, axis = camera.rays(middle, camera.samples / 2)
-        camera = replace(camera, detector=detector.facing(origin, axis, camera.semi_axes[0]))
+        k = framelets // 2
+        camera = replace(camera, detector=detector.facing(camera.centres[k], camera.rotations[k, :, 2]))
         return replace(camera, slope=camera._slope(where))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.detector.notes
 
     def _slope(self, where: str) -> float:
         framelets = len(self.times)

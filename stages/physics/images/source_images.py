@@ -51,6 +51,10 @@ class Pixels:
 class Source(Protocol):
     """An image whose pixels can be read onto the grid of a scene."""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What its camera took otherwise than the camera's file says."""
+
     def box(self) -> Box | None:
         """(row, col, height, width) on the grid that holds all that the image shows, None where it lies elsewhere."""
 
@@ -91,6 +95,7 @@ class MapSource:
     grid: Grid
     elevation: Any
     camera_position: Floats
+    notes: tuple[str, ...] = ()
 
     def box(self) -> Box | None:
         """See :meth:`Source.box`."""
@@ -162,6 +167,11 @@ class CameraSource:
     grid: Grid
     heights: tuple[float, float]
     sun_position: Floats
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """See :attr:`Source.notes`."""
+        return self.camera.notes
 
     def box(self) -> Box | None:
         """See :meth:`Source.box`."""
