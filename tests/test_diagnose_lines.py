@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -13,7 +14,8 @@ from scipy.ndimage import map_coordinates
 from stages.diagnose.model.nominal import fit, load_nominal
 from stages.diagnose.model.sites import load_site
 from stages.diagnose.registration.explain import explain
-from stages.effects.line_jitter import ORDERS
+from stages.diagnose.search.doubts import ORDINARY, doubt_size
+from stages.effects.line_jitter import ORDERS, LineJitter
 from stages.pairs.reader import PairReader
 
 SIZE, RMS = 64, 0.4
@@ -21,10 +23,15 @@ SIZE, RMS = 64, 0.4
 
 @pytest.fixture(scope="module")
 def registered(tmp_path_factory):
-    """What registration finds where pixels show ground that lies further east, by a function of (generator, rows, columns), px."""
+    """What registration finds where pixels show ground that lies further east, by a function of (generator, rows, columns), px.
 
-    def register(shift):
-        with PairReader(semi_real(tmp_path_factory.mktemp("lines") / "pairs.h5", 4713, images=4, size=SIZE)) as reader:
+    dem_smooth : px, sigma of the Gaussian that the given DEM was smoothed with
+    """
+
+    def register(shift, dem_smooth=0.0):
+        pairs = tmp_path_factory.mktemp("lines") / "pairs.h5"
+        semi_real(pairs, 4713, images=4, size=SIZE, truth={"dem_smooth_px": dem_smooth})
+        with PairReader(pairs) as reader:
             sites = [load_site(reader, np.flatnonzero(reader.site == k)) for k in np.unique(reader.site)[:4]]
             frames = len(reader.image_ids)
         rng, (rows, columns) = np.random.default_rng(1), np.indices((SIZE, SIZE))
@@ -57,12 +64,13 @@ def test_lines_that_tremble_differently_in_every_crop_are_found_with_their_size(
     assert float(common.square().sum(1).mean().sqrt()) < 0.7 * RMS
 
 
-def test_lines_that_tremble_alike_in_every_crop_are_values_of_the_frame(registered):
+def test_jitter_that_all_crops_of_a_frame_share_becomes_values_of_the_frame(registered):
     rows = 2 * RMS * np.cos(math.pi * (np.arange(SIZE) + 0.5) / SIZE)[:, None]
-    found, sites, frames = registered(lambda rng, *_: rows)
+    side = itertools.cycle([1, -1])  # of the four frames of a place in turn: cameras do not shake alike twice
+    found, sites, frames = registered(lambda *_: next(side) * rows)
     common = found.lines.over_the_crop(sites, frames)
     assert found.lines_tremble
-    assert common[:, 0].numpy() == pytest.approx(np.full(frames, math.sqrt(2) * RMS), rel=0.2)
+    assert common[:, 0].abs().numpy() == pytest.approx(np.full(frames, math.sqrt(2) * RMS), rel=0.2)
 
 
 @pytest.mark.parametrize("name", ["nothing", "columns", "a bend of the whole crop"])
@@ -74,3 +82,17 @@ def test_what_is_not_alike_along_a_line_is_no_trembling(registered, name):
     }
     found, _, _ = registered(shifts[name])
     assert not found.lines_tremble
+
+
+def test_relief_that_a_smooth_dem_lacks_is_no_jitter(registered):
+    # the DEM's errors displace what is seen by 0.2 to 0.3 px in either half of a line, each half by an amount of its own
+    found, _, _ = registered(lambda rng, rows, columns: 0 * rows, dem_smooth=2.0)
+    assert abs(found.lines.square) < 3 * found.lines.square_error
+    assert found.lines.ordinary
+    assert not found.lines_tremble
+
+
+def test_a_registered_size_has_to_pass_the_rules_of_every_name():
+    assert doubt_size(0.5, 0.05, LineJitter) == ""
+    assert doubt_size(0.22, 0.05, LineJitter).startswith(ORDINARY)
+    assert "standard errors from zero" in doubt_size(0.5, 0.15, LineJitter)
