@@ -50,10 +50,10 @@ def quiet_interruptions() -> None:
 
 def _leave(number: int, frame: Any) -> None:
     os.write(2, f"{INTERRUPTED}\n".encode())
-    os._exit(130)
+    os._exit(128 + number)
 
 
-# Ctrl-C while the command is still being imported; `main` has its own way from then on. Only in the command's own process:
+# Ctrl-C or `kill` while the command is still being imported; `main` has its own way from then on. Only in the command's own process:
 # a program that uses this package as a library keeps its handlers.
 if (
     os.path.basename((sys.argv or [""])[0]) in ("lunargr", "-m")
@@ -61,4 +61,5 @@ if (
     and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 ):
     with contextlib.suppress(ValueError):  # not the main thread
-        signal.signal(signal.SIGINT, _leave)
+        for _number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(_number, _leave)

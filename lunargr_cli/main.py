@@ -69,7 +69,7 @@ def _with_safeguards(command: Callable[..., None], shared: bool) -> Callable[...
         try:
             check_numbers(command, options)
             made_by = _plain(_command_line()), _plain(_folder())
-            with recording(made_by), guarded(command, options), _lock(options.get("output")):
+            with recording(made_by), guarded(command, options, _lock(options.get("output"))):
                 command(**options)
         except LunargrError as error:
             raise type(error)(spell(str(error))) from None
@@ -160,10 +160,10 @@ def main() -> None:
     except BaseException as error:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # nothing is left to tidy while Python ends
         # What an interruption breaks may say something else: a library that was just being imported, for one.
-        if signal.SIGINT in signals or isinstance(error, KeyboardInterrupt):
+        if signals or isinstance(error, KeyboardInterrupt):
             print(INTERRUPTED, file=sys.stderr, flush=True)
             # Not sys.exit: Python would end itself by the signal where one of its own parts saw the interruption.
-            os._exit(130)
+            os._exit(128 + (signals or [signal.SIGINT])[0])
         if isinstance(error, BrokenPipeError):  # `lunargr inspect file | head`
             os._exit(141)
         if isinstance(error, Exception) and (line := _in_one_line(error)):

@@ -6,10 +6,10 @@ output which somebody forgot to mark cannot be written at all.
 
 from __future__ import annotations
 
-import contextlib
 import enum
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -48,11 +48,13 @@ def files_of(command: Callable[..., None], arguments: Mapping[str, Any]) -> File
     return files
 
 
-@contextlib.contextmanager
-def guarded(command: Callable[..., None], options: Mapping[str, Any]) -> Iterator[None]:
+@contextmanager
+def guarded(
+    command: Callable[..., None], options: Mapping[str, Any], lock: AbstractContextManager[None] = nullcontext()
+) -> Iterator[None]:
     """Refuse, before anything is done, outputs that cannot be written; within the block no input is replaced.
 
-    options : the command's parameters by name. Raises ConfigError, InputError.
+    options : the command's parameters by name; lock : of the output, held within the block. Raises ConfigError, InputError.
     """
     files = files_of(command, options)
     if not files.written:
@@ -63,11 +65,14 @@ def guarded(command: Callable[..., None], options: Mapping[str, Any]) -> Iterato
     replace = bool(options.get("overwrite") or options.get("resume"))  # what is resumed, stages say
     with protect(files.read):
         check_apart([Target(path, name) for name, path, _ in files.written])
-        check_outputs((Target(p, name) for name, p, kind in files.written if kind is Writes.FILE), overwrite=replace)
-        for name, path, kind in files.written:
-            if kind is Writes.FOLDER:
-                check_folder(Target(path, name))
-        yield
+        with lock:  # whoever gets it tidies up after a killed run
+            check_outputs(
+                (Target(p, name) for name, p, kind in files.written if kind is Writes.FILE), overwrite=replace
+            )
+            for name, path, kind in files.written:
+                if kind is Writes.FOLDER:
+                    check_folder(Target(path, name))
+            yield
 
 
 def _check_name(path: Path) -> None:

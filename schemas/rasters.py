@@ -27,6 +27,8 @@ class Raster:
 def raster_kind(path: Path) -> str:
     """'GeoTIFF', 'EXR' or '' by a file's first bytes."""
     try:
+        if not path.is_file():  # opening a pipe waits for who writes into it
+            return ""
         with open(path, "rb") as file:
             start = file.read(4)
     except OSError:

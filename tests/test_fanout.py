@@ -16,10 +16,12 @@ import rasterio
 from cluster_scene import assert_same, environment, finish, lunargr, stages, start, write_inputs
 from small_scene import write_scene
 
+from lunargr_cli.fanout.job import Identity, Work, open_job
+from lunargr_cli.fanout.stages import run_infer
 from lunargr_cli.options import in_parts
-from schemas import PAIRS, SCENE, ArtefactError, ConfigError, InputError, open_artefact
-from schemas.files.outputs import Output
-from stages import ingest, merge, project, sample
+from schemas import PAIRS, SCENE, ArtefactError, ConfigError, InputError, atomic_path, open_artefact
+from schemas.files.outputs import Output, Target
+from stages import infer, ingest, merge, project, sample
 
 
 @pytest.fixture(scope="module")
@@ -213,6 +215,62 @@ def test_parts_of_another_command_are_not_used(inputs, in_one_process, tmp_path)
     code, said = lunargr("project", inputs["crops"], "--resume", "--parts", 6, "-o", output)
     assert code == 0 and "already" not in said
     assert_same(in_one_process("project"), output)
+
+
+def test_a_refused_run_makes_nothing_and_is_refused_again(tmp_path):
+    """The second time, too: a continuation replaces only what its own earlier run recorded."""
+    (tmp_path / "map.tif").write_text("somebody's own")
+    files = [tmp_path / "scene.h5", tmp_path / "checkpoint.h5"]  # a refused run reads neither
+    for path in files:
+        path.write_text("")
+    for _ in range(2):
+        with pytest.raises(ConfigError, match=r"map\.tif: exists already"):
+            run_infer(*files, Output(tmp_path / "map.h5"), infer.Config(), None, Work(parts=2))
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint.h5", "map.tif", "scene.h5"]
+    assert (tmp_path / "map.tif").read_text() == "somebody's own"
+
+
+def write_part(path, fail=False):
+    with atomic_path(path) as partial:
+        partial.write_text("part")
+    if fail:
+        raise InputError("the second part fails")
+
+
+def make_text(output, version=1, fail=False):
+    """A job of two parts, each a file of text."""
+    with open_job(Output(output), [Target(output)], Identity("text", {"version": version}, []), Work()) as job:
+        parts = job.fan("text", write_part, [{}, {"fail": fail}], ".txt")
+        output.write_text("".join(p.read_text() for p in parts))
+
+
+@pytest.mark.parametrize("place", ["note.txt", "photographs/first.tif", "{job}/note.txt"])
+def test_a_folder_of_parts_with_other_files_is_refused_and_stays(tmp_path, place):
+    output, parts = tmp_path / "x.txt", tmp_path / "x.txt.parts"
+    with pytest.raises(InputError):
+        make_text(output, fail=True)
+    [job] = [p.name for p in parts.iterdir() if p.is_dir()]
+    own = parts / place.format(job=job)
+    own.parent.mkdir(exist_ok=True)
+    own.write_text("somebody's own")
+    before = sorted(parts.rglob("*"))
+    for version in (1, 2):  # the same job, and another one, which throws parts away
+        with pytest.raises(ConfigError, match="found a file that no run made"):
+            make_text(output, version)
+    assert sorted(parts.rglob("*")) == before
+    own.unlink()
+    if "photographs" in place:
+        own.parent.rmdir()
+    make_text(output, version=2)
+    assert [p.name for p in tmp_path.iterdir()] == ["x.txt"]
+
+
+def test_a_file_put_among_the_parts_of_a_run_stays(tmp_path):
+    output = tmp_path / "x.txt"
+    with open_job(Output(output), [Target(output)], Identity("text", {}, []), Work()) as job:
+        job.fan("text", write_part, [{}], ".txt")
+        (job.folder / "note.txt").write_text("somebody's own")
+    assert [p.name for p in (tmp_path / "x.txt.parts").rglob("*") if p.is_file()] == ["note.txt"]
 
 
 @pytest.mark.slow

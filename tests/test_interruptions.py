@@ -56,6 +56,19 @@ def test_ctrl_c_is_one_line_wherever_it_falls(program):
     assert (done.returncode, done.stderr) == (130, LINE)
 
 
+@pytest.mark.parametrize(
+    "program",
+    [
+        "import lunargr_cli; os.kill(os.getpid(), signal.SIGTERM)",
+        "from lunargr_cli import main; main.app = lambda: os.kill(os.getpid(), signal.SIGTERM); main.main()",
+    ],
+)
+def test_a_terminated_command_says_so(program):
+    """As by ``kill``, or at the end of a Slurm job's time."""
+    done = python(program)
+    assert (done.returncode, done.stderr) == (143, LINE)
+
+
 def test_a_library_keeps_its_handlers():
     done = python("sys.argv = ['other']; import lunargr_cli; os.kill(os.getpid(), signal.SIGINT)")
     assert "KeyboardInterrupt" in done.stderr

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +11,7 @@ import typer
 from lunargr_cli import options
 from lunargr_cli.console import Console
 from schemas.files.locks import scratch_path
+from schemas.files.outputs import check_outputs, map_targets
 from stages import infer, ingest
 from stages.infer import Config
 
@@ -68,8 +68,7 @@ def command(
     from schemas.reading import is_artefact
 
     console, to = Console(quiet), options.make_map_output(output, overwrite, geotiff, no_geotiff)
-    interrupted = scheduler is not None or resume  # may have got as far as the GeoTIFF: its parts tell
-    infer.check_files([terrain, checkpoint], replace(to, resume=interrupted), config)
+    check_outputs(map_targets(to, config.geotiff), [terrain, checkpoint], overwrite)
     gridding = None
     check_file(terrain, "scene.h5 or a DEM")
     if is_artefact(terrain):

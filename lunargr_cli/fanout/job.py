@@ -17,11 +17,13 @@ from typing import Any
 from lunargr_cli.fanout.engines import Engine, Task, ThisProcess, open_dask
 from schemas.errors import ConfigError, InputError
 from schemas.files.locks import claim
-from schemas.files.outputs import Output, check_output
+from schemas.files.outputs import Output, Target, check_outputs
 from schemas.provenance import file_state, sha256
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 
 PATIENCE = 20  # seconds until a new file must show on a network file system
+DASK = "dask"  # folder of the workers' own files
+RECORD = ".made"  # in the folder of parts: the names, without endings, of all that jobs made there
 
 
 @dataclass
@@ -32,7 +34,11 @@ class Job:
     engine: Engine
     say: Say
     progress: Progress
-    again: bool  # whether an earlier run of the same job was interrupted
+
+    def file(self, name: str) -> Path:
+        """A file beside the parts, which goes with them."""
+        _note(self.folder.parent, [f"{self.folder.name}/{_stem(name)}"])
+        return self.folder / name
 
     def fan(
         self, name: str, function: Callable[..., Any], arguments: Sequence[Mapping[str, Any]], suffix: str = ".h5"
@@ -45,6 +51,7 @@ class Job:
         """
         count = len(arguments)
         paths = [self.folder / f"{name}-{k + 1:05d}-of-{count:05d}{suffix}" for k in range(count)]
+        _note(self.folder.parent, [f"{self.folder.name}/{_stem(path.name)}" for path in paths])
         todo = [Task(function, path, dict(a)) for path, a in zip(paths, arguments, strict=True) if not path.exists()]
         if len(todo) < count:
             self.say(f"{name}: {count - len(todo)} of {count} parts are there already")
@@ -97,31 +104,78 @@ class Identity:
 
 
 @contextlib.contextmanager
-def open_job(output: Output, identity: Identity, work: Work) -> Iterator[Job]:
+def open_job(output: Output, targets: Sequence[Target], identity: Identity, work: Work) -> Iterator[Job]:
     """The parts of an output beside it, gone when all ends well and kept when it does not.
 
-    Parts of another command, by ``identity``, are thrown away.
+    targets : all files that the run writes. Parts of another command, by ``identity``, are thrown away. Raises
+    ConfigError before anything is made, also where the folder of parts holds what no job made.
     """
     path = output.file
-    check_output(path, [*identity.inputs, *identity.sources], output.overwrite)
     with claim(path):
-        digest = identity.digest()
-        root = path.with_name(f"{path.name}.parts")
-        folder = root / digest[:16]
-        for other in root.iterdir() if root.is_dir() else ():
-            if other != folder:
-                shutil.rmtree(other, ignore_errors=True)
-        again = folder.is_dir()
+        check_outputs(targets, [*identity.inputs, *identity.sources], output.overwrite)
+        folder = path.with_name(f"{path.name}.parts") / identity.digest()[:16]
+        _refuse_foreign(folder.parent)
+        _clear(folder.parent, keep=folder.name)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigError(f"{root}: cannot be made a folder ({error.strerror}); choose another --output.") from None
-        for left in folder.glob(".*partial-*"):  # of killed workers
+            raise ConfigError(
+                f"{folder.parent}: cannot be made a folder ({error.strerror}); choose another --output."
+            ) from None
+        _note(folder.parent, [folder.name, f"{folder.name}/{DASK}"])
+        for left in folder.glob(".*"):  # of killed workers
             left.unlink(missing_ok=True)
-        engine: Any = open_dask(work.scheduler, folder) if work.scheduler else contextlib.nullcontext(ThisProcess())
+        engine: Any = (
+            open_dask(work.scheduler, folder / DASK) if work.scheduler else contextlib.nullcontext(ThisProcess())
+        )
         with engine as working:
-            yield Job(folder.resolve(), working, work.say, work.progress, again)
-        shutil.rmtree(root, ignore_errors=True)
+            yield Job(folder.resolve(), working, work.say, work.progress)
+        _clear(folder.parent)
+
+
+def _stem(name: str) -> str:
+    """What the temporary names of a part, and the files that its stage writes beside it, have in common with it."""
+    return name.lstrip(".").partition(".")[0]
+
+
+def _note(root: Path, names: Sequence[str]) -> None:
+    """Record names that are about to be made in the folder of parts."""
+    if new := [name for name in names if name not in _noted(root)]:
+        with open(root / RECORD, "a") as stream:
+            stream.write("".join(f"{name}\n" for name in new))
+
+
+def _noted(root: Path) -> set[str]:
+    record = root / RECORD
+    return set(record.read_text().splitlines()) if record.is_file() else set()
+
+
+def _refuse_foreign(root: Path) -> None:
+    """Refuse a folder of parts that holds what no job recorded. Raises ConfigError."""
+    noted = _noted(root)
+    for path in root.iterdir() if root.is_dir() else ():
+        made = path.name in noted and path.is_dir() and not path.is_symlink()
+        inner = [p for p in path.iterdir() if f"{path.name}/{_stem(p.name)}" not in noted] if made else [path]
+        if inner and path.name != RECORD:
+            raise ConfigError(
+                f"{inner[0]}: expected only the parts of an interrupted run in {root.name}, found a file that no run made; "
+                "move it, or choose another `output`."
+            )
+
+
+def _clear(root: Path, keep: str = "") -> None:
+    """Remove what jobs recorded in the folder of parts, but for the folder ``keep``, and the folder itself if empty."""
+    noted = _noted(root)
+    for folder in (root / name for name in noted if "/" not in name and name != keep):
+        for path in folder.iterdir() if folder.is_dir() else ():
+            if f"{folder.name}/{_stem(path.name)}" in noted:
+                shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+    if not keep:
+        (root / RECORD).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            root.rmdir()
 
 
 def _await(path: Path) -> None:

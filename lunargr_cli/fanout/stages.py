@@ -15,8 +15,7 @@ from typing import Any
 from lunargr_cli.fanout.job import Identity, Job, Work, open_job
 from schemas import ConfigError, atomic_path
 from schemas.files.companions import companions_of
-from schemas.files.outputs import Output, Target, check_output, check_outputs
-from stages.common.progress import Progress
+from schemas.files.outputs import Output, Target, map_targets
 
 # What a part holds where --parts does not say: some minutes of work on real data.
 BANDS_OF_DEM, BANDS_OF_MAP, BANDS_OF_ALBEDO, PAIRS, SAMPLES = 8, 8, 1, 512, 4
@@ -47,7 +46,7 @@ def run_ingest(dem: Path, images: Path | None, output: Output, config: Any, work
             bands = ingest.count_bands(dem, config)
             cut = _cut(config, work.parts or math.ceil(bands / BANDS_OF_DEM), bands)
             pieces = _fan(job, "dem", "ingest", [dem, None], cut)
-            grid = job.folder / "grid.h5"
+            grid = job.file("grid.h5")
             if images is not None:
                 merge.run(pieces, Output(grid, overwrite=True), merge.Config(virtual=True, inputs=(dem,)))
         if images is not None:
@@ -93,49 +92,38 @@ def run_project(crops: Path, output: Output, config: Any, work: Work) -> Any:
 
 def run_infer(terrain: Path, checkpoint: Path, output: Output, config: Any, gridding: Any, work: Work) -> Any:
     """svbrdf.h5 from shards of the map's rows. gridding : ingest.Config for a raster, None for a scene"""
-    from stages import infer, ingest
+    from stages import infer, ingest, merge
 
     terrain, checkpoint = terrain.resolve(), checkpoint.resolve()
-    with _job(output, "infer", config, [terrain, checkpoint], (), work, {"gridding": gridding}) as job:
-        output = replace(output, resume=job.again)
-        infer.check_files([terrain, checkpoint], output, config)
+    more = {"gridding": gridding}
+    with _job(
+        output, "infer", config, [terrain, checkpoint], (), work, map_targets(output, config.geotiff), more
+    ) as job:
         scene = terrain
         if gridding is not None:
-            scene = job.folder / "scene.h5"
+            scene = job.file("scene.h5")
             if not scene.exists():
                 ingest.run(terrain, None, scene, gridding, progress=job.progress)
         bands = infer.count_bands(scene, config)
         cut = _cut(config, work.parts or math.ceil(bands / BANDS_OF_MAP), bands)
         pieces = job.fan("map", map_part, [{"scene": scene, "checkpoint": checkpoint, "config": c} for c in cut])
-        _merge_map(pieces, output, config, [terrain, checkpoint], job.progress)
+        merge.run(pieces, output, merge.Config(inputs=(terrain, checkpoint)), progress=job.progress)
     return infer.summarise(output.file, len(pieces))
-
-
-def _merge_map(pieces: list[Path], output: Output, config: Any, inputs: list[Path], progress: Progress) -> None:
-    """Merge the shards of a map, over the GeoTIFF that an interrupted run may have written already."""
-    from stages import merge
-
-    if config.geotiff and (output.overwrite or output.resume):
-        output.geotiff_path.unlink(missing_ok=True)
-    merge.run(pieces, output, merge.Config(inputs=tuple(inputs)), progress=progress)
 
 
 def run_albedo(svbrdf: Path, scene: Path, output: Output, config: Any, work: Work) -> Any:
     """A map with albedo: the images' calibration in one part, then shards of the map's rows."""
-    from stages import albedo
+    from stages import albedo, merge
 
     svbrdf, scene = svbrdf.resolve(), scene.resolve()
-    sources = albedo.source_files(scene)
-    check_output(output.file, sources, output.overwrite)
-    with _job(output, "albedo", config, [svbrdf, scene], sources, work) as job:
-        output = replace(output, resume=job.again)
-        albedo.check_files([svbrdf, scene, *sources], output, config)
+    sources, targets = albedo.source_files(scene), map_targets(output, config.geotiff)
+    with _job(output, "albedo", config, [svbrdf, scene], sources, work, targets) as job:
         files = {"svbrdf": svbrdf, "scene": scene}
         [calibration] = job.fan("calibration", calibration_part, [files | {"config": config}], ".json")
         bands = albedo.count_bands(svbrdf, scene, config)
         cut = _cut(config, work.parts or math.ceil(bands / BANDS_OF_ALBEDO), bands)
         pieces = job.fan("map", albedo_part, [files | {"config": c, "calibration": calibration} for c in cut])
-        _merge_map(pieces, output, config, [svbrdf, scene], job.progress)
+        merge.run(pieces, output, merge.Config(inputs=(svbrdf, scene)), progress=job.progress)
     return albedo.summarise(output.file, scene)
 
 
@@ -171,8 +159,8 @@ def run_diagnose(pairs: Path, checkpoint: Path | None, output: Output, config: A
     pairs, checkpoint = pairs.resolve(), checkpoint and checkpoint.resolve()
     inputs = [pairs, *([checkpoint] if checkpoint else [])]
     named = ((output.path, "output"), (output.json, "json"), (output.report, "report"))
-    check_outputs([Target(path, option) for path, option in named if path is not None], inputs, output.overwrite)
-    with _job(output, "diagnose", config, inputs, (), work) as job:
+    targets = [Target(path, option) for path, option in named if path is not None]
+    with _job(output, "diagnose", config, inputs, (), work, targets) as job:
         arguments = {"pairs": pairs, "checkpoint": checkpoint, "config": config}
         (piece,) = job.fan("diagnosis", diagnose_part, [arguments])
         for made, wanted in ((".json", output.json), (".html", output.report), (".h5", output.path)):
@@ -207,7 +195,8 @@ def _job(
     inputs: Sequence[Path],
     sources: Sequence[Path],
     work: Work,
+    targets: Sequence[Target] = (),
     more: dict[str, Any] | None = None,
 ) -> contextlib.AbstractContextManager[Job]:
     options = asdict(config) | {"parts": work.parts} | (more or {})
-    return open_job(output, Identity(stage, options, inputs, sources), work)
+    return open_job(output, targets or [Target(output.file)], Identity(stage, options, inputs, sources), work)

@@ -72,6 +72,12 @@ class Output:
         return self.geotiff or self.file.with_suffix(".tif")
 
 
+def map_targets(output: Output, as_geotiff: bool) -> list[Target]:
+    """The files of a map: the artefact, and its GeoTIFF where one is wanted."""
+    picture = Target(output.geotiff_path, "geotiff", f"the GeoTIFF of {output.file.name}")
+    return [Target(output.file), *([picture] if as_geotiff else [])]
+
+
 @contextlib.contextmanager
 def protect(inputs: Iterable[Path]) -> Iterator[None]:
     """Within this block no file is written in the place of one of these, or of a file that one of them names."""

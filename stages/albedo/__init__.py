@@ -11,7 +11,7 @@ from stages.albedo.config import Config, Summary
 
 if TYPE_CHECKING:
     from stages.albedo.calibrate import Calibration
-    from stages.albedo.stage import calibrate_to, check_files, count_bands, run, run_part, source_files, summarise
+    from stages.albedo.stage import calibrate_to, count_bands, run, run_part, source_files, summarise
 
 __getattr__ = imported_later(__name__, "stage", "calibrate")
 __all__ = [
@@ -19,7 +19,6 @@ __all__ = [
     "Config",
     "Summary",
     "calibrate_to",
-    "check_files",
     "count_bands",
     "run",
     "run_part",

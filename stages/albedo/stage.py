@@ -16,9 +16,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import SCENE, SVBRDF, ArtefactError, ArtefactWriter, InputError, atomic_path, check_output, open_artefact
+from schemas import SCENE, SVBRDF, ArtefactError, ArtefactWriter, InputError, atomic_path, open_artefact
 from schemas.files.companions import companions_of
-from schemas.files.outputs import Output
+from schemas.files.outputs import Output, check_outputs, map_targets
 from schemas.reading import read_strings
 from stages.albedo.calibrate import COSINES, Calibration, calibrate, choose_windows, take_samples
 from stages.albedo.config import Config, Summary, used_frames
@@ -106,7 +106,8 @@ def run_part(svbrdf: Path, scene: Path, calibration: Path, output: Path, config:
 def _run(
     svbrdf: Path, scene: Path, calibration: Path | None, output: Output, config: Config, progress: Progress
 ) -> Summary:
-    check_files([svbrdf, scene, *source_files(scene)], output, config)
+    as_geotiff = config.geotiff and config.shard[1] == 1
+    check_outputs(map_targets(output, as_geotiff), [svbrdf, scene], output.overwrite)
     with open_ground(svbrdf, scene, config) as ground:
         found = Calibration.read(calibration) if calibration else _calibrate(svbrdf, scene, ground, config, progress)
         ground.references.take_off(found.fields)
@@ -140,18 +141,11 @@ def _run(
             for block in _blocks(ground, edge, own, progress):
                 maps.put(block, *work_block(ground, found, block))
             maps.close()
-            if config.geotiff and config.shard[1] == 1:
+            if as_geotiff:
                 stack.enter_context(companions_of(output.file))
                 partial = stack.enter_context(atomic_path(output.geotiff_path))
                 write_geotiff(partial, writer.file, read_grid(writer.file, output.file))
             return _summary(writer.file, config, scene)
-
-
-def check_files(inputs: Sequence[Path], output: Output, config: Config) -> None:
-    """Refuse outputs that cannot be written. A run that is resumed may have got as far as the GeoTIFF. Raises ConfigError."""
-    check_output(output.file, inputs, output.overwrite)
-    if config.geotiff:
-        check_output(output.geotiff_path, [*inputs, output.file], output.overwrite or output.resume)
 
 
 def calibrate_to(path: Path, svbrdf: Path, scene: Path, config: Config) -> None:

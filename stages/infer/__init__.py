@@ -11,7 +11,7 @@ from schemas.later import imported_later
 from stages.infer.config import Config
 
 if TYPE_CHECKING:
-    from stages.infer.stage import check_body, check_files, count_bands, run, summarise
+    from stages.infer.stage import check_body, count_bands, run, summarise
 
 __getattr__ = imported_later(__name__, "stage")
-__all__ = ["Config", "check_body", "check_files", "count_bands", "run", "summarise"]
+__all__ = ["Config", "check_body", "count_bands", "run", "summarise"]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from schemas import SCENE, SVBRDF, ArtefactWriter, ConfigError, atomic_path, open_artefact, read_strings
 from schemas.files.companions import companions_of
-from schemas.files.outputs import Output, Target, check_apart, check_outputs
+from schemas.files.outputs import Output, check_outputs, map_targets
 from stages.common.memory import keep_freed_memory, return_freed_memory
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.infer.config import Config
@@ -62,7 +62,7 @@ def run(
     output = Output.at(output)
     window_and_stride(config)
     check_precision(config.precision)
-    check_files([scene, checkpoint], output, config)
+    check_outputs(map_targets(output, config.geotiff and config.shard[1] == 1), [scene, checkpoint], output.overwrite)
     device = choose_device(config.device)
     keep_freed_memory()
     predictor = load_predictor(checkpoint, device)
@@ -118,16 +118,6 @@ def run(
             windows = _predict(file, writer, picture, mapper, config, progress)
             share, ranges = _statistics(writer.file, names)
     return Summary(grid, predictor.model.name, share, windows, ranges)
-
-
-def check_files(inputs: Sequence[Path], output: Output, config: Config) -> None:
-    """Refuse outputs that cannot be written. A run that is resumed may have got as far as the GeoTIFF. Raises ConfigError."""
-    target = Target(output.file)
-    check_outputs([target], inputs, output.overwrite)
-    if config.geotiff:
-        picture = Target(output.geotiff_path, "geotiff", f"the GeoTIFF of {output.file.name}")
-        check_apart([target, picture], inputs)
-        check_outputs([picture], inputs, output.overwrite or output.resume)
 
 
 def count_bands(scene: Path, config: Config) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 from schemas import ArtefactWriter, Schema, atomic_path, read_config
 from schemas.command_line import whole_command
 from schemas.files.companions import companions_of
-from schemas.files.outputs import Output, Target, check_outputs
+from schemas.files.outputs import Output, check_outputs, map_targets
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.merge.config import Config
 from stages.merge.joining import join_paths, join_variable
@@ -34,7 +34,9 @@ def run(
     with open_parts(parts) as opened:
         made_with = read_config(opened.files[0]) | {"shard": [0, 1]}
         as_geotiff = opened.schema.name in MAPS and made_with.get("geotiff", True)
-        _check_output(opened, output, as_geotiff)
+        # Parts in a run's own folder beside its output go with that folder.
+        foreign = [path for path in opened.paths if f"{output.file.name}.parts" not in path.parts]
+        check_outputs(map_targets(output, as_geotiff), foreign, output.overwrite)
         provenance, inputs = _provenance(opened, output.file, config)
         seed = int(opened.files[0].attrs.get("seed", -1))
         with ArtefactWriter(
@@ -58,15 +60,6 @@ def run(
                     write_geotiff(partial, writer.file, read_grid(writer.file, output.file))
             progress(len(opened.names), len(opened.names), "merging")
         return opened.schema
-
-
-def _check_output(parts: Parts, output: Output, as_geotiff: bool) -> None:
-    """Refuse to replace parts, but for those in a run's own folder beside its output, which go with it. Raises ConfigError."""
-    foreign = [path for path in parts.paths if f"{output.file.name}.parts" not in path.parts]
-    targets = [Target(output.file)]
-    if as_geotiff:
-        targets.append(Target(output.geotiff_path, name=f"the GeoTIFF of {output.file.name}"))
-    check_outputs(targets, foreign, output.overwrite)
 
 
 def _provenance(parts: Parts, output: Path, config: Config) -> tuple[dict[str, Any], list[Path]]:
