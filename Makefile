@@ -15,7 +15,7 @@ SHARED := $(or $(LUNARGR_SHARED),$(abspath ../shared))
 # A module is compiled once, when it is first imported: pip leaves it to us (see below).
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help install demo demo-paper demo-albedo figures test test-slow mutants fuzz endurance lint bench campaign campaign-laboratory campaign-real docs wheel vendor-js reproduce-apollo15 reproduce-models clean
+.PHONY: help install demo demo-full demo-paper demo-albedo figures test test-slow mutants fuzz endurance lint bench campaign campaign-laboratory campaign-real docs wheel vendor-js reproduce-apollo15 reproduce-models clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-20s %s\n", $$1, $$2}'
@@ -96,39 +96,56 @@ vendor-js: ## bundle three.js for the page of `lunargr view` again (needs npm; v
 
 # --- the embedded scene --------------------------------------------------------------------------------------------
 
-D := demo
+# Two chains with the same rules: they differ in D, the folder, and in what is set for it here.
+D := demo-full
+SIZE_demo := --size-px 1024 --images 12
+COUNT_demo := 400
+EPOCHS_demo := 6
+RUNS_demo := 0
+PLACES_demo := 12
+NOTE_demo := --note "One training run, fewer crops, a smaller scene. The figures of README come from 'make demo-full'."
+COUNT_demo-full := 1200
+EPOCHS_demo-full := 6
+RUNS_demo-full := 0 1 2
+PLACES_demo-full := 20
+ALSO_demo-full = $(D)/held_out.h5 $(D)/match.json
+FIGURES_demo-full = $(D)/figures/match_daisy_1.png $(D)/figures/match_sift_1.png
+
 # One split of the scene for everything that is sampled from it: a quarter of its ground tiles is for testing, 20 at least.
 DEMO_SPLIT := --split 65/10/25
 # fp32: the README's figures must not hang on whether a processor is made for bf16
 # batches of 8: few pairs need many steps
-DEMO_TRAIN := --epochs 6 --batch 8 --precision fp32
-DEMO_RUNS := $(foreach seed,0 1 2,$(D)/checkpoint_$(seed).h5)
+DEMO_TRAIN = --epochs $(EPOCHS_$(D)) --batch 8 --precision fp32
+DEMO_RUNS = $(foreach seed,$(RUNS_$(D)),$(D)/checkpoint_$(seed).h5)
 
 CORES := $(shell nproc 2>/dev/null || getconf _NPROCESSORS_ONLN)
 # Of four steps beside each other; small crops gain little from a second thread.
 THREADS := $(shell echo $$(($(CORES) < 8 ? 1 : $(CORES) / 4)))
 
-demo: $(STAMP) ## run every stage on the embedded scene and name a report to open
-	+$(MAKE) --no-print-directory $(D)/scene.h5
-	+OMP_NUM_THREADS=$(THREADS) $(MAKE) --no-print-directory -j $(CORES) BESIDE=1 $(D)/report.html
-	@echo; echo "Open $(abspath $(D)/report.html)"; echo "and  $(abspath $(D)/view.html)"
+demo demo-full: $(STAMP)
+	+$(MAKE) --no-print-directory D=$@ $@/scene.h5
+	+OMP_NUM_THREADS=$(THREADS) $(MAKE) --no-print-directory -j $(CORES) BESIDE=1 D=$@ $@/report.html
+	@echo; echo "Open $(abspath $@/report.html)"; echo "and  $(abspath $@/view.html)"
+
+demo: ## the stages in five minutes on a small embedded scene: a report and a map to relight
+demo-full: ## the whole embedded scene, three training runs: the figures of README (a quarter of an hour)
 
 # Of steps beside each other every line says whose it is, and bars, which draw over each other, become lines.
 SAYS = $(if $(BESIDE),2> >(trap "" INT; sed -u "s/^/$(basename $(@F)): /" >&2))
 
 $(D)/scene/images.csv: | $(STAMP)
-	$(LUNARGR) simulate -o $(D)/scene --hidden sun_azimuth:error_deg=5 --overwrite
+	$(LUNARGR) simulate -o $(D)/scene $(SIZE_$(D)) --hidden sun_azimuth:error_deg=5 --overwrite
 
 $(D)/scene.h5: $(D)/scene/images.csv
 	$(LUNARGR) ingest $(D)/scene/dem.tif --images $(D)/scene/images.csv --gsd 5 -o $@ --overwrite
 
 $(D)/crops.h5: $(D)/scene.h5
-	$(LUNARGR) sample $< --count 1200 $(DEMO_SPLIT) -o $@ --overwrite $(SAYS)
+	$(LUNARGR) sample $< --count $(COUNT_$(D)) $(DEMO_SPLIT) -o $@ --overwrite $(SAYS)
 
 $(D)/pairs.h5: $(D)/crops.h5
 	$(LUNARGR) project $< -o $@ --overwrite $(SAYS)
 
-# Training is random: three seeds, so that a gain can be told from luck.
+# Training is random: from several seeds a gain can be told from luck.
 $(DEMO_RUNS): $(D)/checkpoint_%.h5: $(D)/pairs.h5
 	$(LUNARGR) train $< $(DEMO_TRAIN) --seed $* -o $@ --overwrite --resume $(SAYS)
 
@@ -160,19 +177,19 @@ $(D)/match.json: $(D)/pairs.h5 $(D)/checkpoint_0.h5
 
 # Places that every image covers: what the images disagree on there cannot be the ground.
 $(D)/stack.h5: $(D)/scene.h5
-	$(LUNARGR) sample $< --stack --crop 64 --count 20 $(DEMO_SPLIT) -o $(D)/stack_crops.h5 --overwrite $(SAYS)
+	$(LUNARGR) sample $< --stack --crop 64 --count $(PLACES_$(D)) $(DEMO_SPLIT) -o $(D)/stack_crops.h5 --overwrite $(SAYS)
 	$(LUNARGR) project $(D)/stack_crops.h5 -o $@ --overwrite $(SAYS)
 
 $(D)/diagnosis.h5: $(D)/stack.h5
 	$(LUNARGR) diagnose $< --model hapke -o $@ --json $(D)/diagnosis.json --report $(D)/diagnosis.html --overwrite $(SAYS)
 
-# the long ones first: no core is left alone with one of them
-$(D)/report.html: $(DEMO_RUNS) $(D)/diagnosis.h5 $(D)/evaluation.h5 $(D)/held_out.h5 $(D)/match.json $(D)/render.exr $(D)/view.html
+# The long ones first: no core is left alone with one of them. Then what a person can look at while the rest runs.
+$(D)/report.html: $(DEMO_RUNS) $(D)/diagnosis.h5 $(D)/view.html $(D)/render.exr $(D)/evaluation.h5 $(ALSO_$(D))
 	$(LUNARGR) report $(D)/scene.h5 $(D)/crops.h5 $(D)/pairs.h5 $(D)/checkpoint_0.h5 $(D)/svbrdf_albedo.h5 $(D)/evaluation.h5 \
-	    $(D)/held_out.h5 $(D)/match.json $(D)/diagnosis.json $(D)/render.png $(D)/figures/match_daisy_1.png $(D)/figures/match_sift_1.png \
-	    $(D)/view.html -o $@ --title "lunargr demo: the embedded scene" --overwrite $(SAYS)
+	    $(ALSO_$(D)) $(D)/diagnosis.json $(D)/render.png $(FIGURES_$(D)) $(D)/view.html -o $@ $(NOTE_$(D)) \
+	    --title "lunargr demo: the embedded scene" --overwrite $(SAYS)
 
-demo-paper: $(D)/m2.h5 ## the model M2 of the Lunar-G2R paper on the demo's pairs, one run with the paper's network
+demo-paper: $(D)/m2.h5 ## the model M2 of the Lunar-G2R paper on the pairs of demo-full, one run with the paper's network
 
 $(D)/checkpoint_m2.h5: $(D)/pairs.h5
 	$(LUNARGR) train $< --model M2 --positive --widths 16-32-64-128-256 --dropout 0.1-0.1-0.2-0.2-0.3 --brightness 1 \
@@ -181,7 +198,7 @@ $(D)/checkpoint_m2.h5: $(D)/pairs.h5
 $(D)/m2.h5: $(D)/pairs.h5 $(D)/checkpoint_m2.h5
 	$(LUNARGR) evaluate $^ --only learned --only learned_gain_offset -o $@ --overwrite
 
-demo-albedo: $(D)/match_albedo.json ## judge the demo's albedo by all of its images, each left out once, and by matching features
+demo-albedo: $(D)/match_albedo.json ## judge the albedo of demo-full by all of its images, each left out once, and by matching features
 
 $(D)/held_out_all.h5: $(D)/pairs.h5 $(foreach fold,1 2 3 4,$(D)/fold_$(fold).h5)
 	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite
@@ -189,7 +206,7 @@ $(D)/held_out_all.h5: $(D)/pairs.h5 $(foreach fold,1 2 3 4,$(D)/fold_$(fold).h5)
 $(D)/match_albedo.json: $(D)/held_out_all.h5
 	$(LUNARGR) match $< --count 20 --json $@ --overwrite
 
-figures: $(TESTED) ## write every figure of README.md and docs/, and the notebook, from what demo, reproduce-* and bench left
+figures: $(TESTED) ## write every figure of README.md and docs/, and the notebook, from what demo-full, reproduce-* and bench left
 	$(BIN)/python examples/figures.py
 	@# the notebook trains its own network for two passes, and keeps it
 	if [ -f $(D)/pairs.h5 ]; then cd $(D) && ../$(BIN)/python ../examples/notebook_page.py; fi
@@ -254,5 +271,5 @@ reproduce-models: $(MODELS_PAIRS) ## train M1..M6, kernels and Hapke from three 
 	$(LUNARGR) compare $< -o results/models --seeds 3 --epochs 4 --batch 8 --precision fp32 --json results/models.json --resume
 
 clean: ## remove what the targets made, except .venv
-	rm -rf demo results build *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf demo demo-full results build *.egg-info .pytest_cache .ruff_cache .mypy_cache
 	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +

@@ -1,4 +1,4 @@
-"""Make the pictures of README.md again from what `make demo` left. Run: make figures
+"""Make the pictures of README.md again from what `make demo-full` left. Run: make figures
 
 Everything rendered has a gain and an offset fitted to the image. The crop is where the learned reflectance then gains as much over one
 coefficient set as on the median test crop, not where it gains most.
@@ -113,11 +113,11 @@ def shrink(source: Path, output: Path, width: int) -> None:
 
 
 def main(root: Path) -> None:
-    demo, images = root / "demo", root / "docs" / "images"
+    demo, images = root / "demo-full", root / "docs" / "images"
     needed = ("evaluation.h5", "pairs.h5", "render.tif", "render.png", "figures/match_daisy_1.png")
     missing = [name for name in needed if not (demo / name).is_file()]
     if missing:
-        print(f"pictures stay as they are: no demo/{missing[0]}; run make demo", file=sys.stderr)
+        print(f"pictures stay as they are: no demo-full/{missing[0]}; run make demo-full", file=sys.stderr)
         return
     draw_relit(demo, images / "demo_relit.jpg")
     shrink(demo / "render.png", images / "demo_render.jpg", 900)

@@ -1,6 +1,6 @@
 """Write every figure of an evaluation into README.md and docs/, from the files that commands left. Run: make figures
 
-Between `<!-- figures:NAME -->` and `<!-- end -->` stands what the function of that name makes of demo/ and results/.
+Between `<!-- figures:NAME -->` and `<!-- end -->` stands what the function of that name makes of demo-full/ and results/.
 Where a file is absent the block names the command that makes it: no figure is kept from another run.
 """
 
@@ -31,7 +31,7 @@ KNOWS = {
     "gain_offset": "each crop's gain and offset",
 }
 BRIEF = ("learned", "global", "hapke_fitted", "hapke_raw", "hapke_minmax", "learned_gain_offset", "hapke_gain_offset")
-DEMO, APOLLO, PAPER = "make demo", "make reproduce-apollo15", "make reproduce-models"
+DEMO, APOLLO, PAPER = "make demo-full", "make reproduce-apollo15", "make reproduce-models"
 ALBEDO = "make demo-albedo"
 
 
@@ -114,14 +114,14 @@ def brief(result: dict[str, Any]) -> list[str]:
 
 
 def demo(root: Path) -> list[str]:
-    result = read(root, "demo/evaluation.json", DEMO)
+    result = read(root, "demo-full/evaluation.json", DEMO)
     return evaluated(result, brief(result), paper_row(root))
 
 
 def paper_row(root: Path) -> list[list[str]]:
     """The paper's model and network, where they were trained on the same pairs."""
     try:
-        other = read(root, "demo/m2.json", "make demo-paper")
+        other = read(root, "demo-full/m2.json", "make demo-paper")
     except Absent:
         return []
     runs = f"M2 with the paper's network ({conclusions.basis(other)}): "
@@ -129,7 +129,7 @@ def paper_row(root: Path) -> list[list[str]]:
 
 
 def demo_rows(root: Path) -> list[str]:
-    result = read(root, "demo/evaluation.json", DEMO)
+    result = read(root, "demo-full/evaluation.json", DEMO)
     return evaluated(result, result["models"], paper_row(root))
 
 
@@ -190,11 +190,11 @@ def models(root: Path) -> list[str]:
 def commands(_: Path) -> list[str]:
     """What `make demo` runs, as make itself lists it, from within demo/."""
     listed = subprocess.run(
-        ["make", "-nB", "demo/report.html"], cwd=ROOT, capture_output=True, text=True, check=True
+        ["make", "-nB", "D=demo", "demo/report.html"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout
     found = re.findall(r"^\.venv/bin/(lunargr (?:.*\\\n)*.*)$", listed, re.M)
     lines = "\n".join(found).replace(" --overwrite", "").replace(" --resume", "").replace("demo/", "")
-    return [f"    {re.sub(r'^ +', '    ', line)}".rstrip() for line in lines.splitlines()]
+    return [f"    {re.sub(r'(?<=[^ ]) +', ' ', re.sub(r'^ +', '    ', line))}".rstrip() for line in lines.splitlines()]
 
 
 def benchmark(root: Path, name: str) -> list[str]:
@@ -227,11 +227,11 @@ def sizes(root: Path) -> list[str]:
     rows = []
     for name, unit, counted in SIZES:
         try:
-            size = (root / "demo" / name).stat().st_size
+            size = (root / "demo-full" / name).stat().st_size
             per = "-"
             if counted:
                 file, variable = counted.split(":")
-                with h5py.File(root / "demo" / file) as opened:
+                with h5py.File(root / "demo-full" / file) as opened:
                     shape = opened[variable].shape
                 number = shape[0] if len(shape) == 3 else shape[0] * shape[1] / 1e6
                 per = (
@@ -240,7 +240,7 @@ def sizes(root: Path) -> list[str]:
                     else f"{size / number / 1e6:.1f} MB a {unit}"
                 )
         except FileNotFoundError:
-            raise Absent(f"demo/{name}", DEMO) from None
+            raise Absent(f"demo-full/{name}", DEMO) from None
         rows.append([f"`{name}`", f"{size / 1e6:.1f} MB", per])
     return table(["file of the demo", "size", "each"], rows)
 
@@ -294,11 +294,11 @@ BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "demo-commands": commands,
     "demo": demo,
     "demo-rows": demo_rows,
-    "demo-held-out": lambda root: held_out(root, "demo/held_out.json", DEMO),
-    "demo-albedo": lambda root: held_out(root, "demo/held_out_all.json", ALBEDO),
-    "demo-albedo-match": lambda root: matched(root, "demo/match_albedo.json", ALBEDO),
-    "demo-match": lambda root: matched(root, "demo/match.json", DEMO),
-    "demo-diagnosis": lambda root: diagnosed(root, "demo", DEMO),
+    "demo-held-out": lambda root: held_out(root, "demo-full/held_out.json", DEMO),
+    "demo-albedo": lambda root: held_out(root, "demo-full/held_out_all.json", ALBEDO),
+    "demo-albedo-match": lambda root: matched(root, "demo-full/match_albedo.json", ALBEDO),
+    "demo-match": lambda root: matched(root, "demo-full/match.json", DEMO),
+    "demo-diagnosis": lambda root: diagnosed(root, "demo-full", DEMO),
     "apollo15": apollo15,
     "apollo15-held-out": lambda root: held_out(root, "results/apollo15/held_out.json", APOLLO),
     "apollo15-match": lambda root: matched(root, "results/apollo15/match.json", APOLLO),

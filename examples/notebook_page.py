@@ -1,6 +1,6 @@
 """Run examples/relight.py cell by cell and write docs/relight.md, its pictures and docs/relight.ipynb.
 
-Run in the folder of the files: cd demo; python ../examples/notebook_page.py
+Run in the folder of the files: cd demo-full; python ../examples/notebook_page.py
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def filled(name, tmp_path, files):
 
 
 def test_a_block_is_replaced_by_what_the_file_holds(tmp_path):
-    text = filled("demo", tmp_path, {"demo/evaluation.json": EVALUATION})
+    text = filled("demo", tmp_path, {"demo-full/evaluation.json": EVALUATION})
     assert (
         "9.99e-5" not in text and text.startswith("before\n<!-- figures:demo -->\n") and text.endswith("-->\nafter 1\n")
     )
@@ -73,12 +73,12 @@ def test_a_block_is_replaced_by_what_the_file_holds(tmp_path):
 
 def test_the_papers_model_stands_in_the_table_where_it_was_trained(tmp_path):
     other = {**EVALUATION, "model": "M2", "models": {"learned": row(8.7e-5, "none")}, "training_runs": 1}
-    text = filled("demo", tmp_path, {"demo/evaluation.json": EVALUATION, "demo/m2.json": other})
+    text = filled("demo", tmp_path, {"demo-full/evaluation.json": EVALUATION, "demo-full/m2.json": other})
     assert re.search(r"\| M2 .*1 training run\): learned reflectance .* 8\.70e-5", text)
 
 
 def test_unseen_images_are_a_claim_of_their_own(tmp_path):
-    text = filled("demo-held-out", tmp_path, {"demo/held_out.json": HELD_OUT})
+    text = filled("demo-held-out", tmp_path, {"demo-full/held_out.json": HELD_OUT})
     assert (
         "4.40e-6" in text
         and "unseen images" in text
@@ -91,15 +91,15 @@ def test_unseen_images_are_a_claim_of_their_own(tmp_path):
 @pytest.mark.parametrize("name", [n for n in figures["BLOCKS"] if n != "demo-commands"])
 def test_without_a_file_the_block_names_the_command_and_no_figure(name, tmp_path):
     text = figures["rewrite"](PAGE.replace("NAME", name), tmp_path)
-    assert "9.99e-5" not in text and re.search(r"`(make|python) [^`]+` makes `(demo|results|docs)/", text)
+    assert "9.99e-5" not in text and re.search(r"`(make|python) [^`]+` makes `(demo-full|results|docs)/", text)
     assert not NUMBER.search(text)
 
 
 def test_a_file_of_something_else_is_refused(tmp_path):
-    for folder in ("demo", "docs"):
+    for folder in ("demo-full", "docs"):
         (tmp_path / folder).mkdir()
     (tmp_path / "README.md").write_text(PAGE.replace("NAME", "demo"))
-    (tmp_path / "demo" / "evaluation.json").write_text('{"a": 1}')
+    (tmp_path / "demo-full" / "evaluation.json").write_text('{"a": 1}')
     with pytest.raises(SystemExit) as ended:
         figures["main"](tmp_path)
     assert ended.value.code == 3 and "9.99e-5" in (tmp_path / "README.md").read_text()
@@ -147,12 +147,12 @@ def test_a_benchmark_stands_as_it_was_printed(tmp_path):
 
 
 def test_sizes_are_those_of_the_files(tmp_path):
-    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo-full").mkdir()
     for name, _, _ in figures["SIZES"]:
-        (tmp_path / "demo" / name).write_bytes(b"x" * 2000)
+        (tmp_path / "demo-full" / name).write_bytes(b"x" * 2000)
     for name, shape in (("scene", (1000, 2000)), ("svbrdf", (1000, 2000)), ("svbrdf_albedo", (1000, 2000)),
                         ("crops", (4, 8, 8)), ("pairs", (4, 8, 8)), ("evaluation", (4, 8, 8))):  # fmt: skip
-        with h5py.File(tmp_path / "demo" / f"{name}.h5", "w") as file:
+        with h5py.File(tmp_path / "demo-full" / f"{name}.h5", "w") as file:
             file["measured" if name == "evaluation" else "elevation"] = np.zeros(shape, np.float32)
     text = figures["rewrite"](PAGE.replace("NAME", "demo-sizes"), tmp_path)
     assert "| `scene.h5` | 8.0 MB | 4.0 MB a Mpx of the working grid |" in text

@@ -22,7 +22,7 @@ from stages.report import conclusions
 from stages.report.maps import _longest, round_length
 
 WKT = "LOCAL_CS[moon]"
-VOID = {"meta", "img", "br", "link", "hr"}
+VOID = {"meta", "img", "br", "link", "hr", "input"}
 
 
 def _write_maps(folder, rng):
@@ -225,6 +225,52 @@ def test_the_first_screen_concludes_before_anything_else(page):
     assert page[0].index('class="conclusions"') < page[0].index("<nav>")
 
 
+def test_the_first_screen_shows_numbers_and_one_crop_before_and_after(page, folder):
+    """Three numbers with their intervals, signed as changes of an error; the slider's pictures are the renderings of one crop."""
+    first, _ = page[0].split("<nav>")
+    result = json.loads((folder / "evaluation.json").read_text())
+    gain = result["gains"]["learned"][result["strongest_baseline"]["none"]]
+    assert re.findall(r'<dd class="value">(.*?)</dd>', first)[:2] == [f"{-gain['gain_percent']:+.1f} %", "1.25 deg"]
+    assert first.count('<dd class="value">') == 3 and "95 %: 1.05 .. 1.45 deg" in first
+    assert (
+        first.index("headline")
+        < first.index('class="slider"')
+        < first.index("<details")
+        < first.index('class="conclusions"')
+    )
+    right, left = (decoded(code) for code in re.findall(r'base64,([^"]+)"', first[first.index('class="slider"') :])[:2])
+    with h5py.File(folder / "evaluation.h5") as file:
+        names = [name.decode() for name in file["model_name"][...]]
+        shown = [file["rendered"][names.index(name)] for name in (result["strongest_baseline"]["none"], "learned")]
+    agree = [
+        [np.corrcoef(picture.ravel(), crop.ravel())[0, 1] for crop in crops]
+        for picture, crops in zip((left, right), shown, strict=True)
+    ]
+    assert min(map(max, agree)) > 0.99 and np.argmax(agree[0]) == np.argmax(agree[1])
+
+
+def decoded(code: str) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(base64.b64decode(code), np.uint8), cv2.IMREAD_GRAYSCALE)
+
+
+def test_a_note_stands_above_the_results(tmp_path):
+    (tmp_path / "diagnosis.json").write_text(json.dumps(FOUND))
+    report.run([tmp_path / "diagnosis.json"], tmp_path / "page.html", report.Config(note="One <run>."))
+    text = (tmp_path / "page.html").read_text()
+    assert text.index("One &lt;run&gt;.") < text.index('class="headline"')
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "value", "interval", "kind"),
+    [(3.0, 20.0, "-12.0 %", "95 %: -20.0 .. -3.0 %", "good"), (-30.0, -2.0, "+12.0 %", "95 %: +2.0 .. +30.0 %", "bad"),
+     (-1.0, 25.0, "-12.0 %", "95 %: -25.0 .. +1.0 %", ""), (None, None, "-12.0 %", "no interval", "")],
+)  # fmt: skip
+def test_a_number_says_whether_it_is_sure(low, high, value, interval, kind):
+    [number] = conclusions.evaluation_numbers(evaluation_result(low, high))
+    assert number[:2] == (value, interval) and number.kind == kind
+    assert ("not surely different" in number.label) == (not kind)
+
+
 def evaluation_result(low, high):
     gain = {
         "gain_percent": -12.0 if high is not None and high < 0 else 12.0,
@@ -338,7 +384,7 @@ def test_a_page_of_view_is_linked_given_or_beside(folder, tmp_path):
 
 
 def test_the_rendered_map_stands_on_the_first_screen_and_not_once_more(folder, tmp_path):
-    """Behind it the conclusions, and before both the way to the page that relights the map."""
+    """Below it the way to the page that relights the map, then the conclusions."""
     for name in ("render", "errors"):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((40, 40), 90, np.uint8))
     (tmp_path / "view.html").write_text("page")
@@ -346,7 +392,7 @@ def test_the_rendered_map_stands_on_the_first_screen_and_not_once_more(folder, t
     titles = report.run(files, tmp_path / "page.html", report.Config())
     text = (tmp_path / "page.html").read_text()
     first, rest = text.split("<nav>")
-    assert first.index("view.html") < first.index('class="conclusions"') < first.index("The map as")
+    assert first.index("The map as") < first.index("view.html") < first.index('class="conclusions"')
     assert "The map as" not in rest and "Errors of the compared models" in rest and "Pictures" in titles
 
 

@@ -27,10 +27,11 @@ def command(
     ],
     output: OutputFile = Path("report.html"),
     title: Annotated[str, typer.Option("--title", help="Title of the page.")] = Config.title,
+    note: Annotated[str, typer.Option("--note", help="A remark above the results.")] = Config.note,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
 ) -> None:
     """Put maps, tables, curves and pictures of a run on one self-contained HTML page."""
     console = Console(quiet)
-    titles = report.run(files, Output(output, overwrite), Config(title), console.say, console.progress)
+    titles = report.run(files, Output(output, overwrite), Config(title, note), console.say, console.progress)
     console.say(f"{output}: {', '.join(titles)}")

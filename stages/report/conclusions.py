@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from typing import Any
 
 import h5py
 
 from schemas import read_strings
-from stages.common.page.sentences import Sentence, compared, counted, listed
+from stages.common.page.sentences import Number, Sentence, compared, counted, error_change, listed
 from stages.physics.photometry import get_model
 
 # (row, what it may know of the scored crops)
@@ -45,6 +46,24 @@ def learned(file: h5py.File) -> list[Sentence]:
 def evaluation(result: dict[str, Any]) -> list[Sentence]:
     """What learned reflectance gains on ground that training never saw, over the strongest baseline and the paper's."""
     found = []
+    for words, which, title, gain in _gains(result):
+        found.append(compared(words, f"{which}, '{title}'", gain, basis(result)))
+    return found
+
+
+def evaluation_numbers(result: dict[str, Any]) -> list[Number]:
+    """The same gains as changes of the squared error, of models that know nothing of the scored crops."""
+    label = "squared error on unseen ground, against"
+    claim = CLAIMS[0][2]
+    return [
+        error_change(gain, f"{label} {which}, {title}")
+        for words, which, title, gain in _gains(result)
+        if words == claim
+    ]
+
+
+def _gains(result: dict[str, Any]) -> Iterator[tuple[str, str, str, dict[str, Any]]]:
+    """(claim, kind of the other model, its title, gain)"""
     for ours, freedom, words in CLAIMS:
         rivals = [(result.get("strongest_baseline", {}).get(freedom), "the strongest model without a network")]
         if freedom == "none":
@@ -52,10 +71,7 @@ def evaluation(result: dict[str, Any]) -> list[Sentence]:
         for other, which in rivals:
             gain = result["gains"].get(ours, {}).get(other or "")
             if gain and gain["gain_percent"] is not None:
-                title = result.get("titles", {}).get(other, str(other).replace("_", " "))
-                who = f"{which}, '{title}'"
-                found.append(compared(words, who, gain, basis(result)))
-    return found
+                yield words, which, result.get("titles", {}).get(other, str(other).replace("_", " ")), gain
 
 
 def held_out_images(result: dict[str, Any]) -> list[Sentence]:
@@ -69,6 +85,14 @@ def held_out_images(result: dict[str, Any]) -> list[Sentence]:
         unseen += f", their Suns {sun['least']:.0f} to {sun['most']:.0f} deg from the nearest one used"
     what = "Another claim: on seen ground, under unseen images, albedo from the other photographs"
     return [compared(what, "the map from terrain alone", gain, unseen)]
+
+
+def held_out_numbers(result: dict[str, Any]) -> list[Number]:
+    """The same gain as a change of the squared error."""
+    gain = result["gains"].get("albedo", {}).get("terrain")
+    if not gain or gain.get("gain_percent") is None:
+        return []
+    return [error_change(gain, "squared error under unseen images, with albedo against the map from terrain alone")]
 
 
 def albedo(file: h5py.File) -> list[Sentence]:

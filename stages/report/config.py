@@ -1,4 +1,4 @@
-"""What report is asked for."""
+"""The settings of report."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Config:
-    """The page's title."""
+    """note : a remark above the results"""
 
     title: str = "Lunar reflectance learned from terrain"
+    note: str = ""

@@ -79,6 +79,40 @@ def evaluation(result: dict[str, Any], file: h5py.File | None) -> page.Section:
     return section
 
 
+def before_and_after(result: dict[str, Any], file: h5py.File | None) -> list[Markup]:
+    """One test crop: the photograph, and a slider between the strongest model without a network and the learned one.
+
+    It is the crop where the learned one gains what it gains on the median crop.
+    """
+    other = result.get("strongest_baseline", {}).get("none")
+    if file is None or "rendered" not in file or not {"learned", other} <= set(result["models"]):
+        return []
+    names = list(result["models"])
+    pair = [names.index(name) for name in (other, "learned")]
+    before, after = (file["mse"][m] for m in pair)
+    ratio = np.where(before > 0, after / np.where(before > 0, before, 1), np.nan)
+    order = np.argsort(ratio)[: int(np.isfinite(ratio).sum())]
+    if not len(order):
+        return []
+    k = int(order[len(order) // 2])
+    measured = file["measured"][k]
+    low, high = pictures.limits(measured)
+    photograph, left, right = (
+        pictures.photo_uri(pictures.coloured(image, low, high, "gray"))
+        for image in (measured, *(file["rendered"][m, k] for m in pair))
+    )
+    titles = result.get("titles", {})
+    percent = 100 * (1 - ratio[k])
+    caption = (
+        f"The same crop rendered without and with the network (pair {file['pair_index'][k]}): the squared error "
+        f"changes by {-percent:+.0f} %, as on the median test crop."
+    )
+    return [
+        page.picture(photograph, "A photograph of ground that training never saw"),
+        page.slider(left, right, (titles.get(other, words(other)), titles.get("learned", "learned")), caption),
+    ]
+
+
 def _like_for_like(models: dict[str, Any], ours: str, other: str) -> bool:
     """Rows of the same freedom, and the paper's comparison with Hapke matched by range."""
     if other.startswith("learned"):

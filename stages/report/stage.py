@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import quote
 
 import cv2
@@ -18,9 +19,8 @@ from schemas import ConfigError, InputError, atomic_path, check_output, open_art
 from schemas.files.outputs import Output
 from schemas.files.user_files import check_file, read_json
 from stages.common import page
-from stages.common.page import pictures
-from stages.common.page.diagnosis import conclusions as diagnosed
-from stages.common.page.sentences import Sentence
+from stages.common.page import diagnosis, pictures
+from stages.common.page.sentences import Number, Sentence
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.report import conclusions, maps, results, sections
 from stages.report.config import Config
@@ -37,6 +37,7 @@ SENTENCES = {"checkpoint": conclusions.learned, "svbrdf": conclusions.albedo}
 ORDER = ("scene", "pairs", "checkpoint", "svbrdf", "evaluation", "held_out", "match", "compare", "diagnosis")
 # ... and of its first screen: what was learned, what it gains, what is still wrong
 FIRST = ("checkpoint", "evaluation", "svbrdf", "held_out", "diagnosis")
+MOST_NUMBERS = 3  # in large type
 PICTURES = {".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 LARGEST_PICTURE = 12 * 2**20  # bytes
 HEAVY, WIDEST = 300_000, 1400  # bytes, px: larger pictures are scaled down and written as WebP
@@ -50,12 +51,47 @@ CAPTIONS = {
 }
 
 
-class Part(NamedTuple):
-    """What one file gives. kind : one of ORDER; sentences : for the first screen"""
+@dataclass
+class Part:
+    """What one file gives to the page. kind : one of ORDER; sentences, numbers, pictures : for the first screen"""
 
     kind: str
     section: page.Section
     sentences: list[Sentence]
+    numbers: list[Number] = field(default_factory=list)
+    pictures: list[Markup] = field(default_factory=list)
+
+
+@dataclass
+class Found:
+    """What all files give. seen : evaluation.h5 and the evaluation.json beside it are one result"""
+
+    parts: list[Part] = field(default_factory=list)
+    shown: list[Path] = field(default_factory=list)
+    linked: list[Path] = field(default_factory=list)
+    details: list[Markup] = field(default_factory=list)
+    seen: list[Any] = field(default_factory=list)
+
+    def add(self, path: Path) -> None:
+        """Take in one file. Raises ArtefactError, InputError."""
+        kind = path.suffix.lower()
+        if kind in PICTURES:
+            self.shown.append(path)
+            return
+        if kind == ".html":
+            check_file(path, "a page of 'lunargr view'")
+            self.linked.append(path)
+            return
+        load = _json if kind == ".json" else _artefact
+        try:
+            part = load(path, self.details, self.seen)
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise InputError(
+                f"{path}: expected a result as its stage writes it, found other content ({type(error).__name__}: {error}); "
+                "run the stage again."
+            ) from None
+        if part is not None:
+            self.parts.append(part)
 
 
 def run(
@@ -75,44 +111,22 @@ def run(
     if not files:
         raise ConfigError("report: expected at least one file, found none; give the artefacts of a run.")
     check_output(output.file, files, output.overwrite)
-    found: list[Part] = []
-    shown: list[Path] = []
-    linked: list[Path] = []
-    details: list[Markup] = []
-    seen: list[Any] = []  # evaluation.h5 and the evaluation.json beside it are one result
+    found = Found()
     for number, path in enumerate(sorted(files, key=lambda p: p.suffix.lower() == ".json")):
         progress(number, len(files), "report")
-        if path.suffix.lower() in PICTURES:
-            shown.append(path)
-            continue
-        if path.suffix.lower() == ".html":
-            check_file(path, "a page of 'lunargr view'")
-            linked.append(path)
-            continue
-        load = _json if path.suffix.lower() == ".json" else _artefact
-        try:
-            part = load(path, details, seen)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise InputError(
-                f"{path}: expected a result as its stage writes it, found other content ({type(error).__name__}: {error}); "
-                "run the stage again."
-            ) from None
-        if part is not None:
-            found.append(part)
-    found.sort(key=lambda part: ORDER.index(part.kind))
-    chapters = [part.section for part in found]
-    first = next((path for path in shown if path.stem.startswith("render")), None)
-    rest = [path for path in shown if path != first]
+        found.add(path)
+    found.parts.sort(key=lambda part: ORDER.index(part.kind))
+    chapters = [part.section for part in found.parts]
+    lit = next((path for path in found.shown if path.stem.startswith("render")), None)
+    rest = [path for path in found.shown if path != lit]
     if rest:
         chapters.append(_gallery(rest))
-    if details:
-        chapters.append(page.Section("Provenance", details))
-    if not chapters and first is None:
+    if found.details:
+        chapters.append(page.Section("Provenance", found.details))
+    if not chapters and lit is None:
         raise ConfigError("report: expected artefacts or results of lunargr, found nothing that can be shown.")
     progress(len(files), len(files), "report")
-    head = _head(found, linked, output.file)
-    if first is not None:
-        head = [page.beside(head, _figure(first))]
+    head = _first_screen(found, lit, config.note, output.file)
     subtitle = f"made by lunargr {version('lunargr')} from {len(files)} files"
     footer = "Every number and picture on this page is read from the files named under Provenance."
     with atomic_path(output.file) as partial:
@@ -120,17 +134,30 @@ def run(
     return [s.title for s in chapters]
 
 
-def _head(found: Sequence[Part], linked: Sequence[Path], output: Path) -> list[Markup]:
-    """The first screen: a way to the page that relights the map, and conclusions, each once."""
+def _first_screen(found: Found, lit: Path | None, note: str, output: Path) -> list[Markup]:
+    """The note, three numbers, the pictures, the way to the page that relights the map; the findings in words, folded."""
+    head = [page.paragraph(note, "note")] if note else []
+    parts = sorted((p for p in found.parts if p.kind in FIRST), key=lambda p: FIRST.index(p.kind))
+    # the first of each result, then what else there is
+    numbers = [*(p.numbers[0] for p in parts if p.numbers), *(n for p in parts for n in p.numbers[1:])][:MOST_NUMBERS]
+    if numbers:
+        head.append(page.headline(numbers))
+    shown = [picture for part in parts for picture in part.pictures]
+    if lit is not None:
+        shown.append(_figure(lit))
+    if shown:
+        head.append(page.grid(shown))
     beside = output.with_name("view.html")
-    if beside.is_file() and beside.resolve() not in [path.resolve() for path in linked]:
-        linked = [*linked, beside]
-    head = []
-    for path in linked:
+    if beside.is_file() and beside.resolve() not in [path.resolve() for path in found.linked]:
+        found.linked.append(beside)
+    for path in found.linked:
         address = quote(os.path.relpath(path, output.parent).replace(os.sep, "/"))
         head.append(page.link(address, f"Move the Sun and the camera over this map: {path.name}"))
-    sentences = [s for kind in FIRST for part in found if part.kind == kind for s in part.sentences]
-    return [*head, page.conclusions(dict.fromkeys(sentences))] if sentences else head
+    sentences = dict.fromkeys(s for part in parts for s in part.sentences)
+    if sentences:
+        said = page.conclusions(sentences)
+        head.append(page.folded("What this run found, in words", [said]) if numbers else said)
+    return head
 
 
 def _artefact(path: Path, details: list[Markup], seen: list[Any]) -> Part | None:
@@ -168,11 +195,13 @@ def _result(result: dict[str, Any], file: Any) -> Part | None:
     if {"models", "differences"} <= keys:
         return Part("compare", results.comparison(result), [])
     if "verdict" in keys:
-        return Part("diagnosis", results.diagnosis(result), diagnosed(result))
+        return Part("diagnosis", results.diagnosis(result), diagnosis.conclusions(result), diagnosis.numbers(result))
     if {"models", "gains", "claim"} <= keys:
-        return Part("held_out", held_out_images(result), conclusions.held_out_images(result))
+        said = conclusions.held_out_images(result), conclusions.held_out_numbers(result)
+        return Part("held_out", held_out_images(result), *said)
     if {"models", "gains"} <= keys:
-        return Part("evaluation", results.evaluation(result, file), conclusions.evaluation(result))
+        said = conclusions.evaluation(result), conclusions.evaluation_numbers(result)
+        return Part("evaluation", results.evaluation(result, file), *said, results.before_and_after(result, file))
     return None
 
 

@@ -1,4 +1,5 @@
-"""The page that `report` and `diagnose` write: one HTML file without scripts or links to the network, light and dark.
+"""The page that `report` and `diagnose` write: one HTML file without links to the network, light and dark. Its only script
+is the line that moves a slider.
 
 ``parts.html.j2`` holds the parts, ``page.html.j2`` the whole, ``style.css`` the style. Functions here return escaped
 HTML.
@@ -15,6 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from stages.common.page import pictures
+from stages.common.page.sentences import Number
 
 
 @functools.cache
@@ -53,6 +55,21 @@ def heading(text: str) -> Markup:
 def conclusions(items: Iterable[tuple[str, str]]) -> Markup:
     """Sentences on top of the page: (text, '' | 'good' | 'bad')."""
     return _part("conclusions", list(items))
+
+
+def headline(numbers: Iterable[Number]) -> Markup:
+    """Numbers in large type, side by side."""
+    return _part("headline", list(numbers))
+
+
+def slider(left: str, right: str, names: tuple[str, str], caption: str) -> Markup:
+    """Two images (data URIs) of one place on top of each other, and a handle that moves their border."""
+    return _part("slider", Markup(left), Markup(right), names, caption)
+
+
+def folded(summary: str, parts: Iterable[Markup]) -> Markup:
+    """Parts that open on a click."""
+    return _part("folded", summary, list(parts))
 
 
 def table(caption: str, columns: Sequence[str], rows: Sequence[Sequence[str]], best: int | None = None) -> Markup:
@@ -105,11 +122,6 @@ def budget(shares: Iterable[tuple[str, float]]) -> Markup:
 def grid(figures: Iterable[Markup]) -> Markup:
     """Figures side by side, as many as fit."""
     return _part("grid", list(figures))
-
-
-def beside(parts: Iterable[Markup], figure: Markup) -> Markup:
-    """Text with a picture to its right, below it on narrow screens."""
-    return _part("beside", list(parts), figure)
 
 
 def crops(figures: Iterable[Markup]) -> Markup:

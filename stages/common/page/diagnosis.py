@@ -11,7 +11,7 @@ from typing import Any
 from markupsafe import Markup
 
 from stages.common import page
-from stages.common.page.sentences import Sentence, compared, counted, listed, words
+from stages.common.page.sentences import Number, Sentence, compared, counted, error_change, listed, words
 
 BUDGET = {
     "named": "the causes that were named",
@@ -58,9 +58,26 @@ def conclusions(result: dict[str, Any]) -> list[Sentence]:
         on = f"{held_out['pairs']:,} unseen pairs" if held_out.get("pairs") else "unseen pairs"
         if held_out.get("sites"):
             on += f" of {counted(held_out['sites'], 'place')}"
+        on += ", each pixel with an albedo of its own"
         found.append(compared("With what was named, the simulation", "the simulation without it", held_out, on))
     if result.get("blind"):
         found.append((_blind_sentence(result["blind"]), ""))
+    return found
+
+
+def numbers(result: dict[str, Any]) -> list[Number]:
+    """The first cause's value with its 95 % interval, and what all causes together change."""
+    found = []
+    for cause in (result.get("causes") or [])[:1]:
+        for name, v in list(cause.get("parameters", {}).items())[:1]:
+            if v.get("value") is not None and v.get("error") is not None:
+                unit = {"1": "", "degree": " deg"}.get(v.get("unit", "1"), f" {v.get('unit')}")
+                low, high = (v["value"] + side * 1.96 * v["error"] for side in (-1, 1))
+                what = f"{words(cause['effect'])} ({words(name.removesuffix('_deg').removesuffix('_px'))}): found by the diagnosis"
+                found.append(Number(f"{v['value']:.3g}{unit}", f"95 %: {low:.3g} .. {high:.3g}{unit}", what))
+    held_out = result.get("held_out") or {}
+    if result.get("causes") and held_out.get("gain_percent") is not None:
+        found.append(error_change(held_out, "squared error of the simulation with what the diagnosis named"))
     return found
 
 
@@ -94,8 +111,9 @@ def _budget(budget: dict[str, float | None]) -> list[Markup]:
     if not shares:
         return []
     note = (
-        "Shares of the variance of the relative residual under the nominal model. What the images of a place have in common is "
-        "albedo and relief that the model has not; a part of it may be a cause that these data cannot tell from ground."
+        "Shares of the variance of the relative residual under the nominal model. What the images of a place have in common is albedo and "
+        "relief that the model lacks; a part of it may be a cause that these data cannot tell from ground. The squared error on top of the "
+        "page gives each pixel an albedo of its own, so what the images have in common is not in it."
     )
     return [page.budget(shares), page.paragraph(note, "soft")]
 

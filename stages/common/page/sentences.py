@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 Sentence = tuple[str, str]  # text, '' | 'good' | 'bad'
+
+
+class Number(NamedTuple):
+    """A result in large type: '-18.0 %', its interval, what it is; kind : '' | 'good' | 'bad'"""
+
+    value: str
+    interval: str
+    label: str
+    kind: str = ""
 
 
 def verdict(gain: dict[str, Any]) -> str:
@@ -43,6 +52,15 @@ def compared(ours: str, other: str, gain: dict[str, Any], on: str) -> Sentence:
     if word == "better":
         return f"{ours} has a squared error {value:.1f} % lower than {other} ({bounds(gain)}; {on}).", "good"
     return f"{ours} has a squared error {-value:.1f} % higher than {other}; {tail}.", "bad"
+
+
+def error_change(gain: dict[str, Any], label: str) -> Number:
+    """By how many percent a squared error changes: a gain with the opposite sign. label : which error, against which"""
+    value, low, high = (gain.get(f"gain_percent{end}") for end in ("", "_low", "_high"))
+    kind = {"better": "good", "worse": "bad"}.get(verdict(gain), "")
+    interval = "no interval" if low is None or high is None else f"95 %: {-high:+.1f} .. {-low:+.1f} %"
+    sure = "" if kind else "not surely different: "
+    return Number(f"{-float(value or 0):+.1f} %", interval, sure + label, kind)
 
 
 def counted(number: int, noun: str) -> str:

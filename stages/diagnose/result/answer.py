@@ -131,14 +131,12 @@ class Answer:
             return self.note[0].upper() + self.note[1:] + ("" if self.note.endswith(".") else ".")
         if self.verdict == "named":
             parts = [f"{c.effect.title} ({describe(c.to_json()['parameters'])})" for c in self.causes]
-            left = self.budget.get("common_to_images", 0.0)
-            rest = f"; of the residual's variance {100 * self.budget.get('named', 0):.0f} % is that, {100 * left:.0f} % is common to the images of a place"
             more = (
                 f". What is left holds {' and '.join(self.structure)}, which nothing named explains"
                 if self.structure
                 else ""
             )
-            return f"The simulation lacks {' and '.join(parts)}{rest if self.budget else ''}{more}."
+            return f"The simulation lacks {' and '.join(parts)}{more}."
         if self.verdict == "unexplained":
             return f"The residual holds {' and '.join(self.structure) or 'structure'}, which nothing in the catalogue explains."
         if self.verdict == "cannot_tell":

@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from schemas import atomic_path
 from stages.common import page
-from stages.common.page.diagnosis import About, chapters, conclusions
+from stages.common.page.diagnosis import About, chapters, conclusions, numbers
 from stages.diagnose.result.answer import Answer
 from stages.diagnose.result.drawings import draw
 from stages.diagnose.search.state import State
@@ -22,12 +22,14 @@ def write_page(path: Path, answer: Answer, state: State | None, image_ids: Seque
     said = answer.to_json()
     drawn: dict[str, list[Markup]] = draw(state, image_ids) if state is not None and state.sites else {}
     sections = [page.Section(title, parts) for title, parts in chapters(said, _about, drawn)]
+    large = numbers(said)
+    head = [*([page.headline(large)] if large else []), page.conclusions(conclusions(said))]
     nominal = answer.form or answer.config.get("checkpoint") or answer.config.get("model", "")
     subtitle = f"made by lunargr {version('lunargr')} from {answer.pairs} pairs in {answer.images} images; nominal model: {nominal}"
     text = page.page(
         "What the simulation gets wrong",
         subtitle,
-        [page.conclusions(conclusions(said))],
+        head,
         sections,
         f"Verdict: {answer.verdict}. Every number is also in the JSON of this diagnosis.",
     )
