@@ -1,7 +1,8 @@
-"""Lines of an image shifted against each other, as the trembling pointing of a line-scan camera leaves them.
+"""Line jitter: lines of an image shifted against each other by the camera's unsteady pointing.
 
-Every image has waves over its own lines. What one half of the samples of its lines says of them is asked of the other half: ground that is
-displaced for another reason is not displaced alike all along a line.
+The shift is a sum of waves over the lines of the detector. The two halves of the lines' samples measure each wave independently. The product
+of both measurements, averaged over images, is the variance of the shift: errors of relief and brightness average to zero in it. The mean over
+the images of one place is taken out first, since an error of the DEM displaces all of them alike.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stages.common.intervals import student_quantile
 from stages.diagnose.likelihood.jackknife import jackknife_error
 from stages.diagnose.model.chain import Chain
 from stages.diagnose.model.nominal import full_light
@@ -32,22 +34,35 @@ STEADY, TREMBLING = "steady", "trembling"  # names of the squares without and wi
 
 @dataclass
 class Lines:
-    """How far lines are shifted. variance : (K,) px2 of each wave in either direction; rms : px, and its error over ground
+    """Shifts of lines. variance : (K,) px2 of each wave in either direction; square : px2, mean square shift, and its standard error over
+    ``grounds`` places
 
-    known, fields, across : displacement of every site without, by all samples, and as the other half of them has it
+    known, fields, across : displacement of every site without jitter, with it from all samples, and with it from the other half of them
     """
 
     variance: Tensor
-    rms: float
-    error: float
+    square: float
+    square_error: float
+    grounds: int
     known: list[Field]
     fields: list[Field]
     across: list[Field]
 
     @property
+    def rms(self) -> float:
+        """Root of the mean square shift, px."""
+        return math.sqrt(max(self.square, 0.0))
+
+    @property
+    def error(self) -> float:
+        """Standard error of ``rms``, px."""
+        return self.square_error / (2 * self.rms) if self.rms else math.inf
+
+    @property
     def ordinary(self) -> bool:
-        """Whether lines are shifted no more than any camera's."""
-        return self.rms**2 - self.error**2 <= LineJitter.tolerance["rms_px"] ** 2
+        """Whether the 95 % interval of the mean square reaches down to the jitter of an ordinary camera."""
+        half = student_quantile(self.grounds - 1) * self.square_error if self.grounds > 1 else math.inf
+        return not self.square - half > LineJitter.tolerance["rms_px"] ** 2
 
     def over_the_crop(self, sites: Sequence[Site], frames: int) -> Tensor:
         """(frames, coordinates of ``line_jitter``) px: the part that goes with the rows of a crop, the mean of all that show a frame."""
@@ -69,14 +84,15 @@ def lines(chains: Sequence[Chain], known: Sequence[Field], variance: Tensor | No
     waves = per_site(lambda chain: _line_waves(chain.site), chains)
     halves = [_first_half(chain.site) for chain in chains]
     some = torch.full((waves[0].shape[1],), 0.01, dtype=torch.float64)
-    found = Lines(some if variance is None else variance, 0.0, 0.0, list(known), list(known), list(known))
+    found = Lines(some if variance is None else variance, 0.0, 0.0, len(chains), list(known), list(known), list(known))
     for _ in range(TURNS):
         every = list(zip(chains, found.fields, known, waves, halves, strict=True))
         asks = per_site(lambda site: _equations(*site), every)
         unlike = float(np.median(np.concatenate([_differences(*site) for site in asks])))  # pixels per independent one
         asks = [(gram / unlike, score / unlike) for gram, score in asks]
         if variance is None:
-            found.variance, found.rms, found.error = _scatter(asks, found.variance)
+            found.variance = _scatter(asks, found.variance)
+            found.square, found.square_error = _in_both_halves(asks, found.variance)
             if found.ordinary:
                 break
         amounts = [_solve(gram.sum(0), score.sum(0), found.variance)[0] for gram, score in asks]
@@ -88,21 +104,40 @@ def lines(chains: Sequence[Chain], known: Sequence[Field], variance: Tensor | No
     return found
 
 
-def _scatter(asks: Sequence[tuple[Tensor, Tensor]], variance: Tensor) -> tuple[Tensor, float, float]:
-    """Variance of every wave (K,), px2, by expectation-maximisation from a first guess; rms of all waves in both directions, px, and its error over
-    ground. asks : products of every site, as :func:`_equations` has them
+def _scatter(asks: Sequence[tuple[Tensor, Tensor]], variance: Tensor) -> Tensor:
+    """Variance of every wave (K,), px2, by expectation-maximisation from a first guess. asks : products of every site, as
+    :func:`_equations` has them
     """
-
-    def size(of: Tensor) -> float:
-        return math.sqrt(2 * float(of.sum()))
-
-    squares = variance.expand(len(asks), -1)
     for _ in range(ROUNDS):
         solved = [_solve(gram.sum(0), score.sum(0), variance) for gram, score in asks]
         squares = torch.stack([(mean.square() + spread).mean((0, 1)) for mean, spread in solved])
         variance = squares.mean(0).clamp(min=1e-8)
-    without = [size((squares.sum(0) - own) / max(len(asks) - 1, 1)) for own in squares]
-    return variance, size(variance), float(jackknife_error(np.array(without)))
+    return variance
+
+
+def _in_both_halves(asks: Sequence[tuple[Tensor, Tensor]], variance: Tensor) -> tuple[float, float]:
+    """Mean square shift of all waves in both directions, px2, and its standard error over ground.
+
+    variance : (K,) px2 of every wave, for weights. The value may be negative, as an unbiased estimate of nothing is in half of all cases.
+    """
+    sums = []
+    for gram, score in asks:
+        inverse = torch.linalg.inv(gram + CAPTURE**-2 * torch.eye(gram.shape[-1]))
+        halves = torch.einsum("hnab,hnb->hna", inverse, score)[:, :, 2:].unflatten(2, (2, len(variance)))
+        spread = inverse.diagonal(dim1=-2, dim2=-1)[:, :, 2:].unflatten(2, (2, len(variance)))
+        weight = 1 / (variance + spread.prod(0).sqrt()).square()
+        images = halves.shape[1]
+        if images > 1:
+            halves = (halves - halves.mean(1, keepdim=True)) * math.sqrt(images / (images - 1))
+        sums.append(torch.stack([(weight * halves.prod(0)).sum((0, 1)), weight.sum((0, 1))]))
+    every = torch.stack(sums)  # (sites, 2, K)
+
+    def size(of: Tensor) -> float:
+        return 2 * float((of[0] / of[1]).sum())
+
+    total = every.sum(0)
+    without = np.array([size(total - own) for own in every])
+    return size(total), float(jackknife_error(without)) if len(every) > 1 else math.inf
 
 
 def _line_waves(site: Site) -> Tensor:

@@ -19,7 +19,7 @@ from stages.diagnose.registration.registered import Registration, shifted_frames
 from stages.diagnose.registration.squares import OWN
 from stages.diagnose.registration.sunward import sunward
 from stages.diagnose.result.answer import Named
-from stages.diagnose.search.doubts import with_ordinary
+from stages.diagnose.search.doubts import doubt_size, with_ordinary
 from stages.diagnose.search.state import State
 from stages.diagnose.settings import CORRELATED, ROUNDS
 from stages.effects import Effect, Survey, effect_names, get_effect
@@ -122,11 +122,12 @@ def _leaning(state: State, r: Registration, name: str) -> tuple[Named | None, st
     compared = (plain.name, r.form.name)
     if not plain.terms or r.doubt(*compared, OWN):  # beside each image's own shift it was found sure
         compared = OWN
-    return _named(effect, parameters, r, *compared), r.doubt(*compared, OWN)
+    why = doubt_size(abs(r.share) * lean, r.share_error * lean, type(effect)) or r.doubt(*compared, OWN)
+    return _named(effect, parameters, r, *compared), why
 
 
 def _lines(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
-    """Named where other samples surely tell how far a line is shifted, by more than is ordinary."""
+    """Line jitter, where one half of each line predicts the shift of the other half, and why it gets no name, or ''."""
     if not r.lines_tremble:
         return None, ""
     cls = get_effect(name)
@@ -134,7 +135,7 @@ def _lines(state: State, r: Registration, name: str) -> tuple[Named | None, str]
     effect = cls({p.name: amounts[:, k] for k, p in enumerate(cls.fitted())}, state.data)
     compared, size = (STEADY, TREMBLING), r.lines.rms
     made = _named(effect, {"rms_px": (size, with_ordinary(size, r.lines.error, cls), "px")}, r, *compared)
-    return made, r.doubt(*compared, compared)
+    return made, doubt_size(size, r.lines.error, cls) or r.doubt(*compared, compared)
 
 
 def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str]:
@@ -170,16 +171,10 @@ def _shifts(state: State, r: Registration, name: str) -> tuple[Named | None, str
     size = cls.size(effect.values)
     scatter = float(jackknife_error(np.array([cls.size(made(c).values) for c in r.without[form]])))
     error = max(scatter, r.shift_error)
-    if _ordinary(size, error, cls):
-        return None, ""
+    why = doubt_size(size, error, cls) or why
     if not why and sunward(r.mean_shifts(state.sites, r.fitted[form][0]), state.sites):
         why = "albedo that follows the ground's curvature looks the same: shifts along the Sun's azimuth that grow with the tangent of its elevation"
     return _named(effect, {"rms_px": (size, with_ordinary(size, error, cls), "px")}, r, first, form, frames), why
-
-
-def _ordinary(size: float, error: float, cls: type[Effect]) -> bool:
-    """Whether what the scatter of its values leaves of an rms size is ordinary."""
-    return size**2 - error**2 < max(cls.tolerance.values()) ** 2
 
 
 Cut = tuple[Callable[[Survey, State], Named | None], float]  # what makes the cause of it, share of the pixels

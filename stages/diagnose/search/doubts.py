@@ -20,9 +20,7 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
     """Why the fitted values cannot be a cause, or ''."""
     cls = type(cause.effect)
     if cls.scope == "image":
-        size, error = cause.rms, cause.errors.get("rms", math.inf)
-        least = max(cls.tolerance.values(), default=0.0)
-        return as_ordinary("rms", size, least, error) if size - 2 * error < least else ""
+        return doubt_size(cause.rms, cause.errors.get("rms", math.inf), cls)
     values = {k: float(v) for k, v in cause.effect.values.items()}
     if not cls.plausible(values, state.data):
         return impossible(cause.effect)
@@ -52,6 +50,14 @@ def doubt(state: State, cause: Cause, sure: float = SURE) -> str:
         if size - 2 * error < cls.tolerance.get(name, 0.0):
             return f"the law of the ground, which is not known, passes for as much ({name} = {values[name]:.2g} +- {error:.1g})"
     return ""
+
+
+def doubt_size(size: float, error: float, cls: type[Effect]) -> str:
+    """Why an rms size with a standard error is not surely more than nothing, and than what every data set has, or ''."""
+    least = max(cls.tolerance.values(), default=0.0)
+    if size - 2 * error < least:
+        return as_ordinary("rms", size, least, error)
+    return f"its rms is only {size / error:.1f} standard errors from zero" if size < SURE * error else ""
 
 
 def surely_ordinary(cause: Cause) -> bool:
@@ -141,6 +147,7 @@ __all__ = [
     "doubt",
     "doubt_all",
     "doubt_any",
+    "doubt_size",
     "impossible",
     "ordinary",
     "surely_ordinary",
