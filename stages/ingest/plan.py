@@ -17,6 +17,7 @@ from schemas import ConfigError, GeometryError, InputError
 from stages.common.progress import Progress, show_nothing
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, local_metric_crs
+from stages.physics.maps.projections import operation
 
 # A map whose pixels are within this of square and of the working GSD counts as metric: no resampling, only means.
 METRIC_TOLERANCE = 0.01
@@ -92,8 +93,10 @@ def plan_grid(
         )
     crs = local_metric_crs(lon, lat, radius)
     transform, width, height = calculate_default_transform(
-        dataset.crs, crs, dataset.width, dataset.height, *dataset.bounds, resolution=wanted
-    )
+        **operation(whole.crs_wkt, crs.to_wkt(), whole.middle_longitude_deg),
+        width=dataset.width, height=dataset.height, left=dataset.bounds.left, bottom=dataset.bounds.bottom,
+        right=dataset.bounds.right, top=dataset.bounds.top, resolution=wanted,
+    )  # fmt: skip
     # Pixel corners at whole multiples of the GSD: two runs on overlapping DEMs then differ by whole pixels only.
     transform = Affine(
         wanted, 0, wanted * round(transform.c / wanted), 0, -wanted, wanted * round(transform.f / wanted)

@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -32,8 +33,10 @@ from stages.physics.images.orthorectify import (
 )
 from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
-from stages.physics.maps.grid import Grid, check_body, require_crs
+from stages.physics.maps.grid import Grid, check_body, require_crs, unit_vectors
 from stages.physics.maps.window import Box
+
+FARTHEST_EDGE = math.radians(60)  # an image whose edge lies farther from a grid's middle may surround the grid
 
 
 @dataclass(frozen=True)
@@ -97,21 +100,29 @@ class MapSource:
     camera_position: Floats
     notes: tuple[str, ...] = ()
 
+    @cached_property
+    def _placements(self) -> list[tuple[float, Window]]:
+        return rasters.placements(self.dataset, self.grid, margin=0)
+
     def box(self) -> Box | None:
         """See :meth:`Source.box`."""
-        if rasters.source_window(self.dataset, self.grid, margin=0) is None:
+        if not self._placements:
             return None
-        image = self.dataset
-        own = rasters.grid_of(image, self.grid.radius)
+        image, grid = self.dataset, self.grid
+        own = rasters.grid_of(image, grid.radius)
         down, right = np.linspace(-0.5, image.height - 0.5, 33), np.linspace(-0.5, image.width - 0.5, 33)
         top, left = np.full(33, -0.5), np.full(33, -0.5)
         rows = np.concatenate([down, down, top, np.full(33, image.height - 0.5)])
         cols = np.concatenate([left, np.full(33, image.width - 0.5), right, right])
-        row, col = self.grid.rowcol_of_lonlat(*own.lonlat(rows, cols))
+        lon, lat = own.lonlat(rows, cols)
+        up = unit_vectors(*grid.lonlat((grid.height - 1) / 2, (grid.width - 1) / 2))
+        if (unit_vectors(lon, lat) @ up).min() < math.cos(FARTHEST_EDGE):
+            return 0, 0, grid.height, grid.width
+        row, col = grid.rowcol_of_lonlat(lon, lat)
         good = np.isfinite(row) & np.isfinite(col)
         r0, c0 = max(0, math.floor(row[good].min())), max(0, math.floor(col[good].min()))
-        r1 = min(self.grid.height, math.ceil(row[good].max()) + 1)
-        c1 = min(self.grid.width, math.ceil(col[good].max()) + 1)
+        r1 = min(grid.height, math.ceil(row[good].max()) + 1)
+        c1 = min(grid.width, math.ceil(col[good].max()) + 1)
         return r0, c0, max(0, r1 - r0), max(0, c1 - c0)
 
     def read(self, row: int, col: int, height: int, width: int, field: Field | None = None) -> Pixels:
@@ -132,11 +143,15 @@ class MapSource:
         r, c = np.meshgrid(np.arange(height + 1) + row - 0.5, np.arange(width + 1) + col - 0.5, indexing="ij")
         relief = self._relief_at(r, c, field.reference) if field.share else None
         dx, dy = field.at(r, c, relief)
-        x, y = self.grid.xy(r + dy, c + dx)
-        x, y = rasters.transform_points(self.grid, self.dataset, x.ravel(), y.ravel())
-        sample, line = (v.reshape(r.shape) for v in ~self.dataset.transform @ (x, y))
-        lines, samples = sliding_window_view(line, (2, 2)), sliding_window_view(sample, (2, 2))
-        return area_means(self._pixels, self.dataset.shape, lines, samples, np.ones((height, width), bool))
+        lon, lat = self.grid.lonlat(r + dy, c + dx)
+        own = rasters.grid_of(self.dataset, self.grid.radius)
+        values, valid = np.full((height, width), np.nan, np.float32), np.zeros((height, width), bool)
+        for middle, _ in self._placements:
+            sample, line = ~self.dataset.transform @ own.map_xy(lon, lat, middle)
+            lines, samples = sliding_window_view(line, (2, 2)), sliding_window_view(sample, (2, 2))
+            more, more_valid = area_means(self._pixels, self.dataset.shape, lines, samples, ~valid)
+            values[more_valid], valid[more_valid] = more[more_valid], True
+        return values, valid
 
     def _relief_at(self, row: Floats, col: Floats, reference: float) -> tuple[Floats, Floats]:
         """(dx, dy) px of all the relief displacement at places in a window; unknown ground counts as level."""

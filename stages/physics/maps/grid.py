@@ -7,7 +7,6 @@ array[r, c]. GDAL counts corners from 0 (our centre 0 is its 0.5), CSM centres f
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -23,12 +22,22 @@ from rasterio.transform import Affine
 from schemas.errors import ArtefactError, GeometryError, InputError
 from stages.common.arrays import Floats
 from stages.physics.bodies.spheres import RADII, Body, find_body
+from stages.physics.maps.projections import (
+    ELLIPSOID,
+    FARTHEST,
+    continued_crs,
+    degrees_crs,
+    ellipsoid_of,
+    latitude_ratio,
+    near_longitude,
+    parse_crs,
+    scale_tangent,
+)
 
 GDAL_CENTRE = 0.5  # GDAL's coordinate of the centre of the first pixel
 CSM_CENTRE = 0.5
 ISIS_CENTRE = 1.0
 BODY_TOLERANCE = 0.005  # of the radius: mean, equatorial and reference spheres of one body
-_ELLIPSOID = re.compile(r"(?:SPHEROID|ELLIPSOID)\[\"[^\"]*\",\s*([0-9.eE+]+),\s*([0-9.eE+]+)")
 
 
 @dataclass(frozen=True)
@@ -47,19 +56,34 @@ class Grid:
     @cached_property
     def crs(self) -> CRS:
         """Its CRS, parsed."""
-        return _parsed(self.crs_wkt)
+        return parse_crs(self.crs_wkt)
 
     @property
     def latitude_ratio(self) -> float:
-        """:func:`latitude_ratio` of its CRS."""
-        return _latitude_ratio(self.crs_wkt)
+        """Of its CRS, see ``projections.latitude_ratio``."""
+        return latitude_ratio(self.crs_wkt)
 
     @cached_property
-    def _geographic(self) -> CRS:
+    def continued(self) -> bool:
+        """Whether its map goes on beyond 180 degrees from its central meridian: see ``projections``."""
+        return continued_crs(self.crs_wkt) is not None
+
+    @cached_property
+    def _whole(self) -> CRS:
+        """Its CRS, continued where it can be."""
+        return continued_crs(self.crs_wkt) or self.crs
+
+    @cached_property
+    def _degrees(self) -> CRS:
         """Longitude and latitude of the kind that ``crs`` itself counts in."""
-        if self.latitude_ratio == 1.0:
-            return sphere_crs(self.radius)
-        return CRS.from_proj4(f"+proj=longlat {ellipsoid_of(self.crs)} +no_defs")
+        return degrees_crs(f"+R={self.radius!r}" if self.latitude_ratio == 1.0 else ellipsoid_of(self.crs_wkt))
+
+    @cached_property
+    def middle_longitude_deg(self) -> float:
+        """Of the grid's middle, in the turn that its own coordinates count in; 0 where that is off the body."""
+        x, y = self.transform @ (self.width / 2, self.height / 2)
+        lon, _ = rasterio.warp.transform(self._whole, self._degrees, [x], [y])
+        return float(lon[0]) if math.isfinite(lon[0]) else 0.0
 
     @property
     def gsd(self) -> float:
@@ -95,9 +119,9 @@ class Grid:
         x, y : (...,) m, broadcastable; returns (...,) each
         """
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-        lon, lat = rasterio.warp.transform(self.crs, self._geographic, x.ravel(), y.ravel())
-        lat = _scale_tangent(np.asarray(lat), self.latitude_ratio)
-        return np.reshape(lon, x.shape), np.reshape(lat, x.shape)
+        lon, lat = rasterio.warp.transform(self._whole, self._degrees, x.ravel(), y.ravel())
+        lat = scale_tangent(np.asarray(lat), self.latitude_ratio)
+        return np.reshape(near_longitude(lon, 0.0), x.shape), np.reshape(lat, x.shape)
 
     def rowcol_of_lonlat(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
         """(row, col), fractional, of places given in degrees.
@@ -106,15 +130,21 @@ class Grid:
         """
         return self.rowcol(*self.map_xy(longitude_deg, latitude_deg))
 
-    def map_xy(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
+    def map_xy(
+        self, longitude_deg: ArrayLike, latitude_deg: ArrayLike, middle_deg: float | None = None
+    ) -> tuple[Floats, Floats]:
         """Map coordinates of places given in degrees.
 
-        longitude_deg, latitude_deg : (...,), broadcastable; returns x and y, (...,) m each
+        longitude_deg, latitude_deg : (...,), broadcastable; returns x and y, (...,) m each, NaN off the map
+        middle_deg : longitude about which the map is continued by half a turn on either side, the grid's own middle by default
         """
         lon, lat = np.broadcast_arrays(np.asarray(longitude_deg, float), np.asarray(latitude_deg, float))
-        lat_own = _scale_tangent(lat.ravel(), 1 / self.latitude_ratio)
-        x, y = rasterio.warp.transform(self._geographic, self.crs, lon.ravel(), lat_own)
-        return np.reshape(x, lon.shape), np.reshape(y, lon.shape)
+        lon = near_longitude(lon, self.middle_longitude_deg if middle_deg is None else middle_deg)
+        lat_own = scale_tangent(lat.ravel(), 1 / self.latitude_ratio)
+        near = np.abs(lon.ravel()) < FARTHEST
+        x, y = rasterio.warp.transform(self._degrees, self._whole, np.where(near, lon.ravel(), 0.0), lat_own)
+        shown = near & np.isfinite(x)
+        return np.reshape(np.where(shown, x, np.nan), lon.shape), np.reshape(np.where(shown, y, np.nan), lon.shape)
 
     def window(self, row: int, col: int, height: int, width: int) -> Grid:
         """The grid of array[row : row + height, col : col + width]."""
@@ -186,12 +216,6 @@ def lonlat_of_points(points: Floats) -> tuple[Floats, Floats]:
 
 
 @lru_cache(maxsize=256)
-def _parsed(wkt: str) -> CRS:
-    with rasterio.Env():  # keeps GDAL's own messages off the terminal
-        return CRS.from_wkt(wkt)
-
-
-@lru_cache(maxsize=256)
 def sphere_crs(radius: float) -> CRS:
     """Longitude and latitude on the reference sphere."""
     return _named(f"+proj=longlat +R={radius!r} +no_defs", radius)
@@ -218,40 +242,8 @@ def _named(proj: str, radius: float, projection: str = "") -> CRS:
 
 def crs_radius(crs: CRS) -> float | None:
     """Equatorial radius of a CRS's ellipsoid in metres, None where it names none."""
-    match = _ELLIPSOID.search(crs.to_wkt())
+    match = ELLIPSOID.search(crs.to_wkt())
     return float(match.group(1)) if match else None
-
-
-def latitude_ratio(crs: CRS) -> float:
-    """tan(planetocentric latitude) over the tangent of the latitude that a CRS counts in: (b/a)^2 for planetographic ones.
-
-    1 for spheres and where the CRS says 'ocentric'. PROJ does not convert latitudes between an ellipsoid and a sphere, which
-    on Mars would be 20 km in the middle latitudes.
-    """
-    return _latitude_ratio(crs.to_wkt())
-
-
-@lru_cache(maxsize=256)
-def _latitude_ratio(wkt: str) -> float:
-    match = _ELLIPSOID.search(wkt)
-    inverse = float(match.group(2)) if match else 0.0
-    return 1.0 if inverse == 0 or "ocentric" in wkt.lower() else (1 - 1 / inverse) ** 2
-
-
-def ellipsoid_of(crs: CRS) -> str:
-    """A CRS's ellipsoid as PROJ parameters."""
-    match = _ELLIPSOID.search(crs.to_wkt())
-    if match is None:
-        return ""
-    return f"+a={match.group(1)} +rf={match.group(2)}" if float(match.group(2)) else f"+R={match.group(1)}"
-
-
-def _scale_tangent(latitude_deg: Floats, factor: float) -> Floats:
-    """Latitudes, deg, whose tangents are ``factor`` times as large."""
-    if factor == 1.0:
-        return latitude_deg
-    latitude = np.radians(latitude_deg)
-    return np.degrees(np.arctan2(factor * np.sin(latitude), np.cos(latitude)))
 
 
 def check_body(where: str, crs: CRS, body: Body) -> None:
@@ -277,7 +269,7 @@ def read_grid(file: h5py.File, path: object) -> Grid:
     c, a, b, f, d, e = (float(v) for v in str(attributes["GeoTransform"]).split())
     wkt = str(attributes["crs_wkt"])
     try:
-        crs = _parsed(wkt)
+        crs = parse_crs(wkt)
         metres = crs.is_projected and abs(crs.linear_units_factor[1] - 1) < 1e-6
     except CRSError as error:
         raise ArtefactError(

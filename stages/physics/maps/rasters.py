@@ -8,14 +8,12 @@ import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import rasterio
 import rasterio.warp
 from numpy.typing import NDArray
-from rasterio.crs import CRS
 from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
 from rasterio.io import DatasetReader
@@ -27,7 +25,8 @@ from schemas.files.hdf5 import silence_hdf5
 from schemas.files.user_files import check_file
 from stages.common.arrays import Mask
 from stages.common.memory import return_freed_memory
-from stages.physics.maps.grid import GDAL_CENTRE, Grid, ellipsoid_of, latitude_ratio
+from stages.physics.maps.grid import GDAL_CENTRE, Grid
+from stages.physics.maps.projections import TURN, near_longitude, operation
 
 # ISIS special pixels of 32-bit cubes (NULL, LRS, LIS, HIS, HRS) all lie beyond this; so do -3.4028e38 in its spellings.
 SPECIAL = 3.4e38
@@ -147,15 +146,29 @@ def read_window(dataset: DatasetReader, window: Window, band: int = 1) -> NDArra
     return result
 
 
-def source_window(dataset: DatasetReader, grid: Grid, margin: int = 2) -> Window | None:
-    """The window of a raster that covers a grid, None where they do not meet."""
+def placements(dataset: DatasetReader, grid: Grid, margin: int = 2) -> list[tuple[float, Window]]:
+    """The longitudes about which a raster's map is continued where it covers some of a grid, and its window for each.
+
+    More than one where the raster's own ends lie on the grid, as those of a map of the whole body.
+    """
     rows = np.concatenate([np.linspace(-0.5, grid.height - 0.5, 9)] * 4 + [np.full(9, grid.height / 2)])
     cols = np.concatenate(
         [np.full(9, v) for v in np.linspace(-0.5, grid.width - 0.5, 4)] + [np.linspace(-0.5, grid.width - 0.5, 9)]
     )
-    x, y = grid.xy(rows, cols)
-    x, y = transform_points(grid, dataset, x, y)
-    u, v = ~dataset.transform @ (x, y)
+    own = grid_of(dataset, grid.radius)
+    lon, lat = grid.lonlat(rows, cols)
+    nearest = float(near_longitude(grid.middle_longitude_deg, own.middle_longitude_deg))
+    found = []
+    for middle in (nearest, nearest - TURN, nearest + TURN) if own.continued else (nearest,):
+        u, v = ~dataset.transform @ own.map_xy(lon, lat, middle)
+        window = _covering(dataset, u, v, margin)
+        if window is not None:
+            found.append((middle, window))
+    return found
+
+
+def _covering(dataset: DatasetReader, u: NDArray, v: NDArray, margin: int) -> Window | None:
+    """The window of a raster around points at columns u and rows v, px from its corner; None where it has none."""
     good = np.isfinite(u) & np.isfinite(v)
     if not good.any():
         return None
@@ -164,25 +177,6 @@ def source_window(dataset: DatasetReader, grid: Grid, margin: int = 2) -> Window
     r0 = max(0, int(np.floor(v[good].min())) - margin)
     r1 = min(dataset.height, int(np.ceil(v[good].max())) + margin)
     return Window(c0, r0, c1 - c0, r1 - r0) if c1 > c0 and r1 > r0 else None
-
-
-def transform_points(grid: Grid, dataset: DatasetReader, x: NDArray, y: NDArray) -> tuple[NDArray, NDArray]:
-    """Map coordinates of a grid -> those of a raster on the same body.
-
-    A geographic raster may count longitudes 0..360 or -180..180: the points follow the raster's own domain.
-
-    x, y : (n,) in the units of either CRS; returns (n,) each
-    """
-    if grid.latitude_ratio == latitude_ratio(dataset.crs):
-        tx, ty = (np.asarray(v) for v in rasterio.warp.transform(grid.crs, dataset.crs, x, y))
-    else:
-        tx, ty = grid_of(dataset, grid.radius).map_xy(*grid.map_lonlat(x, y))
-    if dataset.crs.is_geographic:
-        left = min(dataset.bounds.left, dataset.bounds.right)
-        tx = (tx - left) % 360.0 + left
-        # what lies just west of the raster must not wrap to its far east
-        tx = np.where(tx - left > 360.0 - 0.05 * 360.0, tx - 360.0, tx)
-    return tx, ty
 
 
 def grid_of(dataset: DatasetReader, radius: float) -> Grid:
@@ -195,25 +189,32 @@ def warp(dataset: DatasetReader, grid: Grid, resampling: Resampling, band: int =
 
     Area-weighted for ``Resampling.average``. Only the window that the grid needs is read, piece by piece where it is large.
     """
-    values = np.full((grid.height, grid.width), np.nan, np.float32)
-    window = source_window(dataset, grid)
-    if window is None:
-        return values, np.zeros(values.shape, bool)
-    if window.width * window.height > LARGEST_WINDOW and values.size > 1:
+    values, valid = np.full((grid.height, grid.width), np.nan, np.float32), np.zeros((grid.height, grid.width), bool)
+    placed = placements(dataset, grid)
+    if any(window.width * window.height > LARGEST_WINDOW for _, window in placed) and values.size > 1:
         return _warp_halves(dataset, grid, resampling, band)
+    for middle, window in placed:
+        more, more_valid = _warp_window(dataset, grid, resampling, band, middle, window)
+        better = (more_valid & ~valid) | np.isnan(values)
+        values[better], valid[better] = more[better], more_valid[better]
+    return values, valid
+
+
+def _warp_window(
+    dataset: DatasetReader, grid: Grid, resampling: Resampling, band: int, middle: float, window: Window
+) -> tuple[NDArray[np.float32], Mask]:
+    """A window of a raster, as :func:`placements` gives it, on a grid."""
+    values = np.full((grid.height, grid.width), np.nan, np.float32)
     source = read_window(dataset, window, band)
-    transform = dataset.window_transform(window)
     invalid = ~np.isfinite(source)
     if invalid.all():
         return values, np.zeros(values.shape, bool)
     base = float(source[~invalid].mean())  # float32 in GDAL's kernels: keep the numbers small
     common = {
-        "src_transform": transform,
-        "src_crs": dataset.crs,
+        "src_transform": dataset.window_transform(window),
         "dst_transform": grid.transform,
-        "dst_crs": grid.crs,
         "tolerance": 0,
-    } | _latitudes(dataset, grid)
+    } | operation(dataset.crs.to_wkt(), grid.crs_wkt, middle)
     rasterio.warp.reproject(
         (source - base).astype(np.float32),
         values,
@@ -243,33 +244,6 @@ def _warp_halves(
         halves = grid.window(0, 0, grid.height, middle), grid.window(0, middle, grid.height, grid.width - middle)
     first, second = (warp(dataset, half, resampling, band) for half in halves)
     return np.concatenate([first[0], second[0]], axis), np.concatenate([first[1], second[1]], axis)
-
-
-def _latitudes(dataset: DatasetReader, grid: Grid) -> dict[str, Any]:
-    """Arguments for GDAL's reprojection where raster and grid count latitudes in different ways: see latitude_ratio."""
-    if latitude_ratio(dataset.crs) == grid.latitude_ratio:
-        return {}
-    steps = []
-    for crs, inverse in ((dataset.crs, True), (grid.crs, False)):
-        figure = ellipsoid_of(crs)
-        geocentric = f"+step {'' if inverse else '+inv '}+proj=geoc {figure}"
-        if crs.is_geographic:
-            units = ("deg", "rad") if inverse else ("rad", "deg")
-            projection = f"+step +proj=unitconvert +xy_in={units[0]} +xy_out={units[1]}"
-        else:
-            projection = f"+step {'+inv ' if inverse else ''}{_plain(crs.to_proj4())}"
-        pair = [projection, geocentric] if latitude_ratio(crs) != 1.0 else [projection]
-        steps += pair if inverse else pair[::-1]
-    # CRSs from PROJ strings count east first, as the pipeline does; those from files may not
-    return {
-        "src_crs": CRS.from_proj4(dataset.crs.to_proj4()),
-        "dst_crs": CRS.from_proj4(grid.crs.to_proj4()),
-        "COORDINATE_OPERATION": " ".join(["+proj=pipeline", *steps]),
-    }
-
-
-def _plain(proj4: str) -> str:
-    return " ".join(word for word in proj4.split() if not word.startswith(("+no_defs", "+type", "+wktext")))
 
 
 def choose_resampling(dataset: DatasetReader, grid: Grid) -> tuple[Resampling, float]:
