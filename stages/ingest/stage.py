@@ -37,7 +37,7 @@ from stages.ingest.validity import check_frames, hash_files, write_validity
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.images.table import Frame, load_frames, read_frames, write_frames
 from stages.physics.maps import rasters
-from stages.physics.maps.grid import Grid, check_body, read_grid, require_crs
+from stages.physics.maps.grid import Grid, read_grid, require_crs
 
 LARGEST_CROP = 8192  # px: what a network can see at once, and more
 
@@ -182,8 +182,7 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, pr
             "then give that scene in place of the DEM, with `images` and `shard`."
         )
     with rasters.open_raster(dem, "a DEM") as dataset:
-        crs = require_crs(str(dem), dataset.crs, dataset.transform)
-        check_body(str(dem), crs, body)
+        require_crs(str(dem), dataset.crs, dataset.transform, body)
         plan = plan_grid(dem, dataset, config.gsd, body.radius, progress)
         attributes = {"gsd_m": plan.grid.gsd, "body_radius_m": body.radius, "elevation_source": dem.name}
         if count > 1:
@@ -197,8 +196,9 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, pr
 def count_bands(dem: Path, config: Config) -> int:
     """Rows of blocks of a raster's grid: more shards than these have nothing to do."""
     with rasters.open_raster(dem, "a DEM") as dataset:
-        require_crs(str(dem), dataset.crs, dataset.transform)
-        plan = plan_grid(dem, dataset, config.gsd, find_body(config.body).radius)
+        body = find_body(config.body)
+        require_crs(str(dem), dataset.crs, dataset.transform, body)
+        plan = plan_grid(dem, dataset, config.gsd, body.radius)
     return math.ceil(plan.grid.height / config.block)
 
 

@@ -11,7 +11,8 @@ from stages.physics.bodies.ephemeris import AU, et_to_utc, place_of, subsolar_po
 from stages.physics.bodies.spheres import Body
 from stages.physics.cameras import Camera, open_camera
 from stages.physics.images.labels import label_time, product_time
-from stages.physics.maps.grid import BODY_TOLERANCE
+from stages.physics.maps.grid import BODY_TOLERANCE, require_crs
+from stages.physics.maps.rasters import open_raster
 
 SUN_COLUMNS = ("subsolar_longitude_deg", "subsolar_latitude_deg", "solar_distance_au")
 SPACECRAFT_COLUMNS = ("spacecraft_longitude_deg", "spacecraft_latitude_deg", "spacecraft_altitude_m")
@@ -63,6 +64,9 @@ def complete_row(
     if camera is not None:
         for key, value in zip(SPACECRAFT_COLUMNS, _spacecraft(camera, body.radius), strict=True):
             full[key] = full.get(key) or repr(value)
+    elif any(not full.get(k) for k in SPACECRAFT_COLUMNS):
+        with open_raster(image, "an image") as dataset:  # a raw image lacks its camera before it lacks these
+            require_crs(str(image), dataset.crs, dataset.transform, body)
     return full
 
 

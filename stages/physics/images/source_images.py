@@ -33,7 +33,7 @@ from stages.physics.images.orthorectify import (
 )
 from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
-from stages.physics.maps.grid import Grid, check_body, require_crs, unit_vectors
+from stages.physics.maps.grid import Grid, require_crs, unit_vectors
 from stages.physics.maps.window import Box
 
 FARTHEST_EDGE = math.radians(60)  # an image whose edge lies farther from a grid's middle may surround the grid
@@ -77,9 +77,8 @@ def open_source(frame: Frame, grid: Grid, elevation: Any, heights: tuple[float, 
     what = f"the image '{frame.image_id}'"
     if frame.camera is None:
         with rasters.open_raster(frame.path, what) as dataset:
-            require_crs(str(frame.path), dataset.crs, dataset.transform)
+            require_crs(str(frame.path), dataset.crs, dataset.transform, find_body(str(grid.radius)))
             rasters.check_single_band(frame.path, dataset, what)
-            check_body(str(frame.path), dataset.crs, find_body(str(grid.radius)))
             yield MapSource(dataset, grid, elevation, frame.camera_position(grid.radius))
         return
     camera = open_camera_for(frame.camera, grid.radius)

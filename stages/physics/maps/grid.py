@@ -250,9 +250,21 @@ def check_body(where: str, crs: CRS, body: Body) -> None:
     """Refuse a CRS of another body. Raises GeometryError."""
     found = crs_radius(crs)
     if found is not None and abs(found - body.radius) > BODY_TOLERANCE * body.radius:
+        earth = abs(found - RADII["earth"]) < BODY_TOLERANCE * RADII["earth"]
+        advice = "" if earth else "name the body with `body`, or "
         raise GeometryError(
-            f"{where}: expected a CRS on a sphere of {body.radius:g} m ({body.name}), found radius {found:g} m; name the body with `body`."
+            f"{where}: expected a CRS on a sphere of {body.radius:g} m ({body.name}), found radius {found:g} m"
+            f"{' (the Earth, which some programs write for any body)' if earth else ''}; {advice}{_assign_crs(body.radius)}."
         )
+
+
+def _assign_crs(radius: float) -> str:
+    """How to give a raster the CRS of a body of that radius, m."""
+    degrees = "IAU_2015:30100" if radius == RADII["moon"] else f"'+proj=longlat +R={radius:.10g}'"
+    return (
+        f"assign the CRS that the map truly has: 'rio edit-info --crs {degrees} FILE' for degrees, "
+        f"'+proj=eqc +R={radius:.10g} +units=m' or the like for metres"
+    )
 
 
 def check_same_body(where: object, radius: float, body: str | None) -> None:
@@ -287,25 +299,29 @@ def read_grid(file: h5py.File, path: object) -> Grid:
     return Grid(wkt, Affine(a, b, c, d, e, f), height, width, float(file.attrs["body_radius_m"]))
 
 
-def require_crs(where: str, crs: CRS | None, transform: Affine) -> CRS:
-    """The CRS of a raster that must be georeferenced. Raises InputError."""
+def require_crs(where: str, crs: CRS | None, transform: Affine, body: Body) -> CRS:
+    """The CRS of a raster that must be a map of the body. Raises InputError, and GeometryError for another body."""
     if crs is None or transform == Affine.identity():
         raise InputError(
-            f"{where}: expected a georeferenced raster, found no CRS; assign one (gdal_edit.py -a_srs) or, for a raw image, give its camera."
+            f"{where}: expected a map-projected raster, found no CRS; give the camera of a raw image, or {_assign_crs(body.radius)}."
         )
     if not all(map(math.isfinite, tuple(transform)[:6])) or transform.determinant == 0:
         raise InputError(
             f"{where}: expected pixels of a finite size, found the transform {tuple(transform)[:6]}; set it with gdal_edit.py -a_ullr."
+        )
+    try:
+        on_body = bool((crs.is_geographic or crs.is_projected) and crs.to_wkt() and crs.to_proj4())
+    except CRSError:
+        on_body = False
+    if not on_body:
+        raise InputError(
+            f"{where}: expected longitude and latitude or a map projection, found another CRS (local, three-dimensional or "
+            f"unknown to PROJ); {_assign_crs(body.radius)}."
         )
     if crs.is_geographic and not -360.0 <= transform.c <= 540.0:
         raise InputError(
             f"{where}: expected longitudes of -360 .. 540 deg, found a raster that begins at {transform.c:g}; take off whole "
             "turns (gdal_edit.py -a_ullr)."
         )
-    try:
-        crs.to_wkt()
-    except CRSError as error:
-        raise InputError(
-            f"{where}: its CRS cannot be understood ({error}); assign one with gdal_edit.py -a_srs."
-        ) from None
+    check_body(where, crs, body)
     return crs

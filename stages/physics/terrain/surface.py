@@ -19,7 +19,7 @@ from schemas.errors import ArtefactError, ConfigError, InputError, RegistryError
 from schemas.reading import open_artefact, read_kind, read_strings
 from stages.common.arrays import Floats32
 from stages.physics.bodies.spheres import Body
-from stages.physics.maps.grid import Grid, check_body, read_grid, require_crs
+from stages.physics.maps.grid import Grid, read_grid, require_crs
 from stages.physics.maps.rasters import check_metres, check_single_band, open_raster, pixel_size_at, read_window
 from stages.physics.photometry import ReflectanceModel, get_model
 from stages.physics.photometry.albedo_factor import AlbedoFactor
@@ -268,10 +268,9 @@ def _uniform(model: ReflectanceModel, parameters: Mapping[str, float]) -> NDArra
 
 def _metric_grid(path: Path, dataset: DatasetReader, body: Body) -> Grid:
     """The grid of a raw DEM that can be rendered as it stands: north up, square metres."""
-    crs = require_crs(str(path), dataset.crs, dataset.transform)
+    crs = require_crs(str(path), dataset.crs, dataset.transform, body)
     check_single_band(path, dataset, "a DEM")
     check_metres(path, dataset)
-    check_body(str(path), crs, body)
     t = dataset.transform
     advice = "bring it to a metric grid with 'lunargr ingest' and render its scene.h5."
     if crs.is_geographic or abs(crs.linear_units_factor[1] - 1.0) > 1e-9:

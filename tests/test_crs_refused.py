@@ -1,0 +1,74 @@
+"""Rasters without a CRS of the body: one line that says how to assign one, and what it says works."""
+
+from __future__ import annotations
+
+import re
+import shlex
+
+import numpy as np
+import pytest
+import rasterio
+import small_scene
+from click.testing import CliRunner
+from evaluation_scene import run_command
+from rasterio.crs import CRS
+from rasterio.rio.main import main_group
+from test_formats import isis_cube
+
+from schemas import GeometryError, InputError
+from stages import ingest
+from stages.physics.bodies.spheres import find_body
+from stages.physics.images.table import read_frames
+
+LOCAL = (
+    'LOCAL_CS["local",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]',
+    'ENGCRS["rover",EDATUM["lander"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],LENGTHUNIT["metre",1]]',
+    "EPSG:4978",
+)
+
+
+def with_crs(source, path, crs):
+    with rasterio.open(source) as raster:
+        return small_scene.write_raster(path, raster.read(1), crs, raster.transform, nodata=raster.nodata)
+
+
+@pytest.mark.parametrize("crs", LOCAL)
+def test_a_local_crs_is_refused_in_one_line(crs, small_files, tmp_path):
+    dem = with_crs(small_files.dem, tmp_path / "dem.tif", CRS.from_user_input(crs))
+    light = ("--model", "M2", "--sun-azimuth", "90", "--sun-elevation", "30")
+    for command in (
+        ("ingest", dem, "-o", tmp_path / "out.h5"),
+        ("render", "--dem", dem, *light, "-o", tmp_path / "out.exr"),
+    ):
+        code, message = run_command(*command)
+        assert code == 3 and "\n" not in message
+        assert re.search(r"dem\.tif: expected .* map projection, found another CRS .*IAU_2015:30100", message)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32631", "EPSG:4326"])
+def test_a_moon_map_tagged_as_the_earth_is_mended_by_the_advice(crs, small_files, tmp_path):
+    """The command in the message, run as it stands, makes the DEM good: its true CRS instead of another body."""
+    if crs == "EPSG:4326":
+        with rasterio.open(small_files.folder / "image0.tif") as raster:
+            z = np.where(raster.read(1) == raster.nodata, np.nan, 100 * raster.read(1))
+            dem = small_scene.write_raster(tmp_path / "dem.tif", z, CRS.from_user_input(crs), raster.transform)
+    else:
+        dem = with_crs(small_files.dem, tmp_path / "dem.tif", CRS.from_user_input(crs))
+    with pytest.raises(GeometryError, match=r"the Earth.*assign the CRS") as caught:
+        ingest.run(dem, None, tmp_path / "scene.h5", ingest.Config())
+    assert "name the body" not in str(caught.value)
+    degrees, metres = re.search(r"'(rio [^']*) FILE' for degrees, '([^']*)'", str(caught.value)).groups()
+    words = shlex.split(degrees) if crs == "EPSG:4326" else ["rio", "edit-info", "--crs", metres]
+    assert words[:3] == ["rio", "edit-info", "--crs"]
+    done = CliRunner().invoke(main_group, [*words[1:], str(dem)])
+    assert done.exit_code == 0, done.output
+    ingest.run(dem, None, tmp_path / "scene.h5", ingest.Config())
+    assert (tmp_path / "scene.h5").is_file()
+
+
+def test_an_unprojected_cube_is_told_that_it_lacks_its_camera(tmp_path):
+    isis_cube(tmp_path / "raw.cub", np.full((8, 8), 0.05, "<f4"), "Real")
+    table = tmp_path / "images.csv"
+    table.write_text("image_id,path,units,start_time\nA,raw.cub,iof,2010-01-01T00:00:00Z\n")
+    with pytest.raises(InputError, match=r"raw\.cub: .*no CRS; give the camera"):
+        read_frames(table, find_body("moon"))
