@@ -490,6 +490,9 @@ def test_broken_isds_are_refused_in_one_line(isd, name, error, message):
 
 
 def test_cubes_without_a_camera_are_told(shared):
-    for name, message in (("ldem_4.cub", "found instrument 'LOLA'"), ("wac_backplanes.reduced.cub", "'WAC-VIS'")):
+    for name, message in (
+        ("ldem_4.cub", "found a map-projected one; leave 'camera' empty"),
+        ("wac_backplanes.reduced.cub", "'WAC-VIS'"),
+    ):
         with pytest.raises(LunargrError, match=message):
             open_camera(shared / "data/formats" / name)

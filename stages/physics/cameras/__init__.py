@@ -10,13 +10,14 @@ from pathlib import Path
 
 from stages.common.registry import import_all
 from stages.physics.cameras.base import Camera, camera_from_document, cameras, read_document, register
-from stages.physics.cameras.isis_cube import cube_document, is_cube
+from stages.physics.cameras.isis_cube import is_cube
+from stages.physics.cameras.isis_instruments import cube_document
 
 import_all(__name__, __path__)
 
 
 def open_camera(path: str | Path) -> Camera:
-    """The camera in a file: our JSON, an ALE/CSM ISD, or an LROC NAC cube with SPICE attached. Raises LunargrError."""
+    """The camera in a file: our JSON, an ALE/CSM ISD, or an ISIS cube with SPICE attached. Raises LunargrError."""
     path = Path(path)
     if path.is_file() and is_cube(path):
         return camera_from_document(cube_document(path), str(path))

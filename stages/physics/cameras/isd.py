@@ -76,7 +76,7 @@ class Detector:
             summing=summing,
             distortion=code,
             coefficients=coefficients,
-            notes=notes,
+            notes=(*notes, *document.get("lunargr_notes", ())),
         )
 
     def directions(self, line: ArrayLike, sample: ArrayLike) -> Floats:

@@ -1,8 +1,9 @@
-"""The camera of an LROC NAC cube that went through ISIS ``spiceinit``: its label and attached tables make an ISD."""
+"""What a camera takes from an ISIS cube that went through ``spiceinit``: its label, NAIF keywords and SPICE tables."""
 
 from __future__ import annotations
 
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import InputError
+from stages.common.arrays import Floats
 from stages.physics.images.labels import Block, find_block, find_value, isis_table, read_label
 from stages.physics.maps.grid import CSM_CENTRE, ISIS_CENTRE
 
@@ -22,117 +24,131 @@ def is_cube(path: Path) -> bool:
         return file.read(32).lstrip().startswith(b"Object = IsisCube")
 
 
-def cube_document(path: Path) -> dict[str, Any]:
-    """The ISD of a NAC cube, cropped or whole. Raises InputError for other instruments and without SPICE tables."""
-    where = str(path)
-    label = read_label(path)
-    if label is None:
-        raise InputError(f"{where}: expected an ISIS label, found none.")
-    instrument = str(find_value(label, "InstrumentId") or "none")
-    if instrument not in ("NACL", "NACR"):
+@dataclass(frozen=True)
+class Extent:
+    """Which part of the image that was taken a cube holds, cropped and reduced as AlphaCube says; pairs are (line, sample).
+
+    lines, samples : of the cube; corner : of its first pixel in the whole image, px, 0 at the outer corner
+    scale : pixels of the whole image to one of the cube; whole : size of the whole image
+    """
+
+    lines: int
+    samples: int
+    corner: tuple[float, float]
+    scale: tuple[float, float]
+    whole: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Cube:
+    """label : the whole label; keywords : its NAIF keywords; spice : the SPICE tables under the keys of an ISD"""
+
+    where: str
+    label: Block
+    keywords: Block
+    spice: dict[str, Any]
+
+    @classmethod
+    def open(cls, path: Path) -> Cube:
+        """The label, keywords and tables of a file. Raises InputError where spiceinit left none."""
+        where = str(path)
+        label = read_label(path)
+        if label is None:
+            raise InputError(f"{where}: expected an ISIS label, found none.")
+        if find_block(label, "Mapping") is not None:
+            raise InputError(
+                f"{where}: expected a cube as its camera took it, found a map-projected one; leave 'camera' empty."
+            )
+        keywords = find_block(label, "NaifKeywords")
+        if keywords is None:
+            raise InputError(
+                f"{where}: expected SPICE data attached to the cube, found none; run spiceinit on it first."
+            )
+        spice = {
+            "instrument_position": _states(path, label, "InstrumentPosition"),
+            "sun_position": _states(path, label, "SunPosition"),
+            "instrument_pointing": _rotations(path, label, "InstrumentPointing"),
+            "body_rotation": _rotations(path, label, "BodyRotation"),
+        }
+        return cls(where, label, keywords, spice)
+
+    @property
+    def code(self) -> int:
+        """NAIF's number of the instrument."""
+        found = find_value(self.label, "NaifIkCode")
+        return int(self.value("NaifFrameCode") if found is None else found)
+
+    def value(self, key: str) -> Any:
+        """A value of the label. Raises InputError where there is none."""
+        return self._required(self.label, key, "the cube's label")
+
+    def kernel(self, name: str, count: int = 1, code: int | None = None) -> Floats:
+        """(count,) numbers of the instrument kernel, spiceinit's copy. code : the cube's own where None. Raises InputError."""
+        key = f"INS{self.code if code is None else code}_{name}"
+        found = np.atleast_1d(np.array(self._required(self.keywords, key, "its NAIF keywords"), float))
+        if found.size < count:
+            raise InputError(
+                f"{self.where}: expected {count} numbers in {key}, found {found.size}; run spiceinit again."
+            )
+        return found[:count]
+
+    def clock_time(self) -> float:
+        """Ephemeris time of the clock count before the exposure, which spiceinit keeps as the bytes of a double."""
+        for key, value in self.keywords.items():
+            if key.startswith("CLOCK_ET_") and key.endswith("_COMPUTED"):
+                digits = f"{value:016d}" if isinstance(value, int) else str(value)  # bytes may happen to be all digits
+                try:
+                    return float(struct.unpack("<d", bytes.fromhex(digits))[0])
+                except (ValueError, struct.error):
+                    break
         raise InputError(
-            f"{where}: expected a cube of the LROC NAC to take the camera from, found instrument '{instrument}'; make an ISD "
-            "with ALE (isd_generate CUBE, see docs/from_pds_to_pairs.md, step 3) and name that."
+            f"{self.where}: expected the clock's computed time among its NAIF keywords, found none; run spiceinit again."
         )
-    keywords = find_block(label, "NaifKeywords")
-    if keywords is None:
-        raise InputError(f"{where}: expected SPICE data attached to the cube, found none; run spiceinit on it first.")
-    number = -85600 if instrument == "NACL" else -85610
-    kernel = {name: _required(keywords, f"INS{number}_{name}", where) for name in _KERNEL}
-    preroll = _preroll(keywords, where)
-    exposure = float(_required(label, "LineExposureDuration", where)) / 1000.0
-    rate = exposure * (1 + kernel["MULTIPLI_LINE_ERROR"]) + kernel["ADDITIVE_LINE_ERROR"] / 1000.0
-    first_time = preroll + kernel["CONSTANT_TIME_OFFSET"] + kernel["ADDITIONAL_PREROLL"] * rate
-    first_line, first_sample, lines, samples = _crop(label, where)
-    summing = float(_required(label, "SpatialSumming", where))
-    start = first_time + first_line * rate
-    centre = start + lines * rate / 2
-    radii = next((v for k, v in keywords.items() if k.startswith("BODY") and k.endswith("_RADII")), None)
-    if radii is None:
-        raise InputError(
-            f"{where}: expected the body's radii among its NAIF keywords, found none; run spiceinit again."
-        )
-    return {
-        "name_model": "USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL",
-        "image_lines": lines,
-        "image_samples": samples,
-        "center_ephemeris_time": centre,
-        "starting_ephemeris_time": start,
-        "line_scan_rate": [[CSM_CENTRE, start - centre, rate]],
-        "detector_line_summing": summing,
-        "detector_sample_summing": summing,
-        "focal_length_model": {"focal_length": kernel["FOCAL_LENGTH"]},
-        "focal2pixel_lines": kernel["ITRANSL"],
-        "focal2pixel_samples": kernel["ITRANSS"],
-        "detector_center": {
-            "line": kernel["BORESIGHT_LINE"],
-            "sample": kernel["BORESIGHT_SAMPLE"] - ISIS_SHIFT,
-        },
-        "starting_detector_line": 0,
-        "starting_detector_sample": float(find_value(label, "SampleFirstPixel") or 0) + first_sample * summing,
-        "optical_distortion": {"lrolrocnac": {"coefficients": [kernel["OD_K"]]}},
-        "radii": {"semimajor": radii[0], "semiminor": radii[2], "unit": "km"},
-        "instrument_position": _states(path, label, "InstrumentPosition"),
-        "sun_position": _states(path, label, "SunPosition"),
-        "instrument_pointing": _rotations(path, label, "InstrumentPointing"),
-        "body_rotation": _rotations(path, label, "BodyRotation"),
-    }
 
+    def extent(self) -> Extent:
+        """The part of the image that the cube holds. Raises InputError."""
+        size = find_block(self.label, "Dimensions")
+        if size is None:
+            raise InputError(f"{self.where}: expected the cube's Dimensions, found none.")
+        lines, samples = int(size["Lines"]), int(size["Samples"])
+        alpha = find_block(self.label, "AlphaCube")
+        if alpha is None:
+            return Extent(lines, samples, (0.0, 0.0), (1.0, 1.0), (lines, samples))
+        try:
+            # ISIS puts the outer corner at 0.5
+            first = [float(alpha[f"AlphaStarting{axis}"]) - ISIS_SHIFT for axis in ("Line", "Sample")]
+            last = [float(alpha[f"AlphaEnding{axis}"]) - ISIS_SHIFT for axis in ("Line", "Sample")]
+            whole = float(alpha["AlphaLines"]), float(alpha["AlphaSamples"])
+        except (KeyError, TypeError, ValueError):
+            raise InputError(
+                f"{self.where}: expected numbers in its AlphaCube group, found others; crop it again."
+            ) from None
+        scale = (last[0] - first[0]) / lines, (last[1] - first[1]) / samples
+        if min(scale) <= 0:
+            raise InputError(
+                f"{self.where}: expected an AlphaCube with starts before ends, found {dict(alpha)!r:.120}."
+            )
+        return Extent(lines, samples, (first[0], first[1]), scale, whole)
 
-_KERNEL = (
-    "FOCAL_LENGTH",
-    "ITRANSL",
-    "ITRANSS",
-    "BORESIGHT_LINE",
-    "BORESIGHT_SAMPLE",
-    "OD_K",
-    "MULTIPLI_LINE_ERROR",
-    "ADDITIVE_LINE_ERROR",
-    "ADDITIONAL_PREROLL",
-    "CONSTANT_TIME_OFFSET",
-)
+    def common(self, extent: Extent) -> dict[str, Any]:
+        """The keys of an ISD that every instrument's cube fills alike."""
+        radii = next((v for k, v in self.keywords.items() if k.startswith("BODY") and k.endswith("_RADII")), None)
+        if radii is None:
+            raise InputError(
+                f"{self.where}: expected the body's radii among its NAIF keywords, found none; run spiceinit again."
+            )
+        return {
+            "image_lines": extent.lines,
+            "image_samples": extent.samples,
+            "radii": {"semimajor": radii[0], "semiminor": radii[2], "unit": "km"},
+            **self.spice,
+        }
 
-
-def _required(block: Block, key: str, where: str) -> Any:
-    value = find_value(block, key)
-    if value is None:
-        raise InputError(f"{where}: expected '{key}' in the cube's label, found none; run spiceinit on it again.")
-    return value
-
-
-def _preroll(keywords: Block, where: str) -> float:
-    """Ephemeris time of the clock count before the exposure, which spiceinit keeps as the bytes of a double."""
-    for key, value in keywords.items():
-        if key.startswith("CLOCK_ET_") and key.endswith("_COMPUTED"):
-            digits = f"{value:016d}" if isinstance(value, int) else str(value)  # bytes may happen to be all digits
-            try:
-                return float(struct.unpack("<d", bytes.fromhex(digits))[0])
-            except (ValueError, struct.error):
-                break
-    raise InputError(
-        f"{where}: expected the clock's computed time among its NAIF keywords, found none; run spiceinit again."
-    )
-
-
-def _crop(label: Block, where: str) -> tuple[float, float, int, int]:
-    """(line, sample) of the cube's corner in the whole image, and its lines and samples."""
-    size = find_block(label, "Dimensions")
-    if size is None:
-        raise InputError(f"{where}: expected the cube's Dimensions, found none.")
-    lines, samples = int(size["Lines"]), int(size["Samples"])
-    alpha = find_block(label, "AlphaCube")
-    if alpha is None:
-        return 0.0, 0.0, lines, samples
-    if (alpha.get("BetaLines"), alpha.get("BetaSamples")) != (
-        alpha["AlphaEndingLine"] - alpha["AlphaStartingLine"],
-        alpha["AlphaEndingSample"] - alpha["AlphaStartingSample"],
-    ):
-        raise InputError(
-            f"{where}: expected a cube at its image's full scale, found one reduced or enlarged; crop only."
-        )
-    # ISIS puts the outer corner at 0.5
-    first_line, first_sample = (float(alpha[f"AlphaStarting{axis}"]) - ISIS_SHIFT for axis in ("Line", "Sample"))
-    return first_line, first_sample, lines, samples
+    def _required(self, block: Block, key: str, what: str) -> Any:
+        value = find_value(block, key)
+        if value is None:
+            raise InputError(f"{self.where}: expected '{key}' in {what}, found none; run spiceinit on it again.")
+        return value
 
 
 def _table(path: Path, label: Block, name: str, fields: tuple[int, int]) -> NDArray[np.float64]:
