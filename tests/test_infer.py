@@ -49,17 +49,10 @@ def reference(small_artefacts, checkpoint, tmp_path_factory):
     return maps(small_artefacts["scene"], checkpoint, tmp_path_factory.mktemp("reference") / "map.h5", window=512)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"window": 128, "stride": 128},
-        {"window": 128, "stride": 64, "offset": 64},
-        {"window": 100, "stride": 77, "offset": 13},
-    ],
-)
-def test_the_grid_of_windows_does_not_matter(small_artefacts, checkpoint, reference, tmp_path, options):
+@pytest.mark.parametrize("window", [128, 77])
+def test_the_size_of_windows_does_not_matter(small_artefacts, checkpoint, reference, tmp_path, window):
     """The bar is 2 % of a coefficient's standard deviation; windows with their whole context reach 0.1 %."""
-    got, valid = maps(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", **options)
+    got, valid = maps(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", window=window)
     np.testing.assert_array_equal(valid, reference[1])
     for k in range(got.shape[0]):
         spread = np.nanstd(reference[0][k])
@@ -72,7 +65,7 @@ def test_no_squares_at_window_borders(small_artefacts, checkpoint, reference, tm
 
     The same pixels, since five borders on this small map cross other terrain than the rest does.
     """
-    got, _ = maps(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", window=64, stride=64)
+    got, _ = maps(small_artefacts["scene"], checkpoint, tmp_path / "map.h5", window=64)
     for layer, seamless in zip(got, reference[0], strict=True):
         for axis in (0, 1):
             borders = np.arange(63, layer.shape[axis] - 1, 64)
@@ -164,9 +157,7 @@ def test_shards_make_the_same_map(small_artefacts, checkpoint, reference, tmp_pa
     parts = []
     for k in range(3):
         parts.append(tmp_path / f"part{k}.h5")
-        infer.run(
-            small_artefacts["scene"], checkpoint, parts[-1], infer.Config(window=100, stride=90, shard=(k, 3), **FULL)
-        )
+        infer.run(small_artefacts["scene"], checkpoint, parts[-1], infer.Config(window=90, shard=(k, 3), **FULL))
         assert not parts[-1].with_suffix(".tif").exists()
     merge.run([parts[1], parts[2], parts[0]], tmp_path / "whole.h5")
     with rasterio.open(tmp_path / "whole.tif") as tiff:
@@ -184,13 +175,13 @@ def test_shards_make_the_same_map(small_artefacts, checkpoint, reference, tmp_pa
         merge.run(parts, tmp_path / "mixed.h5")
 
 
-def test_windows_cover_every_pixel_once_blended():
-    for length, window, stride, offset in [(100, 30, 20, 0), (100, 30, 30, 7), (10, 30, 15, 3), (97, 16, 5, 100)]:
-        total = np.zeros(length)
-        for first, last in windows.axis_windows(length, window, stride, offset):
-            assert 0 <= first < last <= length
-            total[first:last] += windows.blend_weights(first, last, window - stride, length)
-        assert (total > 0).all()
+@pytest.mark.parametrize("window", [None, 16, 77, 4000])
+def test_windows_of_all_shards_cover_every_pixel_once(window):
+    count = np.zeros((3000, 500), int)
+    for k in range(3):
+        for row, col, height, width in windows.list_windows(count.shape, infer.Config(window=window, shard=(k, 3)), 2):
+            count[row : row + height, col : col + width] += 1
+    assert (count == 1).all()
 
 
 def test_wrong_inputs_are_refused(small_files, small_artefacts, checkpoint, tmp_path):
@@ -200,8 +191,8 @@ def test_wrong_inputs_are_refused(small_files, small_artefacts, checkpoint, tmp_
         infer.run(coarse, checkpoint, tmp_path / "m.h5", infer.Config(**FULL))
     with pytest.raises(ArtefactError, match="expected a 'checkpoint'"):
         infer.run(small_artefacts["scene"], small_artefacts["pairs"], tmp_path / "m.h5", infer.Config(**FULL))
-    with pytest.raises(ConfigError, match="`stride`"):
-        infer.run(small_artefacts["scene"], checkpoint, tmp_path / "m.h5", infer.Config(window=64, stride=65, **FULL))
+    with pytest.raises(ConfigError, match="`window`"):
+        infer.run(small_artefacts["scene"], checkpoint, tmp_path / "m.h5", infer.Config(window=15, **FULL))
     assert not (tmp_path / "m.h5").exists()
 
 
@@ -213,14 +204,6 @@ def test_a_dem_with_nothing_at_its_edges(checkpoint, tmp_path):
     small_scene.write_raster(tmp_path / "dem.tif", z, small_scene.local_crs(), Affine(20, 0, -3000, 0, -20, 3000))
     ingest.run(tmp_path / "dem.tif", None, tmp_path / "s.h5", ingest.Config())
     one, valid = maps(tmp_path / "s.h5", checkpoint, tmp_path / "a.h5", window=512)
-    two, _ = maps(tmp_path / "s.h5", checkpoint, tmp_path / "b.h5", window=80, stride=80, offset=31)
+    two, _ = maps(tmp_path / "s.h5", checkpoint, tmp_path / "b.h5", window=80)
     np.testing.assert_array_equal(valid, np.isfinite(z))
     assert np.nanmax(np.abs(one - two)) < 1e-3 * np.nanstd(one[0])
-
-
-def test_weights_of_neighbouring_windows_add_up_to_one():
-    """Both fade over what they share, so that neither ends with a step; at the map's edges none fades."""
-    first, second = windows.blend_weights(0, 40, 10, 100), windows.blend_weights(30, 70, 10, 100)
-    np.testing.assert_allclose(first[30:] + second[:10], 1, rtol=1e-6)
-    np.testing.assert_allclose(second[:10], (np.arange(10) + 0.5) / 10, rtol=1e-5)
-    np.testing.assert_array_equal(first[:30], 1)

@@ -23,7 +23,7 @@ SAMPLE = [
     "DEM complex",
     "infer --body mars on a scene",
     "sample --crop '0'",
-    "infer --stride '0'",
+    "infer --window '0'",
     "render --altitude '0'",
     "no validation pairs",
     "image all nodata",

@@ -30,16 +30,6 @@ def command(
             help="Window size, px; context around it is added (default: what is fast).",
         ),
     ] = None,
-    stride: Annotated[
-        int | None,
-        typer.Option("--stride", min=1, max=options.MOST, help="Step between windows, px (default: a window)."),
-    ] = None,
-    offset: Annotated[
-        int,
-        typer.Option(
-            "--window-offset", min=-options.MOST, max=options.MOST, metavar="PX", help="Shift the grid of windows."
-        ),
-    ] = Config.offset,
     precision: Annotated[
         str,
         typer.Option(

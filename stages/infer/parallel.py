@@ -70,20 +70,3 @@ def run_in_threads(
             if worker.ident is not None:
                 worker.join()
         torch.set_num_threads(threads)
-
-
-def in_order(found: Iterator[tuple[int, Item | None]]) -> Iterator[tuple[int, Item | None]]:
-    """What :func:`run_in_threads` yields, with all items of a job before those of the next."""
-    waiting: dict[int, list[Item | None]] = {}
-    current = 0
-    for number, item in found:
-        waiting.setdefault(number, []).append(item)
-        while waiting.get(current):
-            for early in waiting[current]:
-                yield current, early
-            ended = waiting[current][-1] is None
-            waiting[current].clear()
-            if not ended:
-                break
-            del waiting[current]
-            current += 1

@@ -23,10 +23,10 @@ from schemas.files.outputs import Output, check_outputs, map_targets
 from stages.common.memory import keep_freed_memory, return_freed_memory
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.infer.config import Config
-from stages.infer.parallel import in_order, run_in_threads
+from stages.infer.parallel import run_in_threads
 from stages.infer.terrain import TerrainReader, valid_part
-from stages.infer.windows import Box, axis_windows, cut_swaths, list_windows, shard_rows, window_and_stride
-from stages.infer.writing import Blend, MapWriter
+from stages.infer.windows import Box, check_window, list_windows, shard_rows, window_rows
+from stages.infer.writing import MapWriter
 from stages.network.mapper import Mapper
 from stages.network.precision import check_precision, choose_inference_precision
 from stages.network.predictor import choose_device, load_predictor
@@ -60,7 +60,7 @@ def run(
 ) -> Summary:
     """Write ``svbrdf.h5`` and, if wanted, a cloud-optimised GeoTIFF. Raises ConfigError, ArtefactError."""
     output = Output.at(output)
-    window_and_stride(config)
+    check_window(config)
     check_precision(config.precision)
     check_outputs(map_targets(output, config.geotiff and config.shard[1] == 1), [scene, checkpoint], output.overwrite)
     device = choose_device(config.device)
@@ -122,9 +122,8 @@ def run(
 
 def count_bands(scene: Path, config: Config) -> int:
     """Rows of windows on a scene: more shards than these have nothing to do."""
-    window, stride = window_and_stride(config)
     with open_artefact(scene, SCENE) as file:
-        return len(axis_windows(file["elevation"].shape[0], window, stride, config.offset))
+        return len(window_rows(file["elevation"].shape[0], config))
 
 
 def summarise(svbrdf: Path, windows: int = 0) -> Summary:
@@ -147,11 +146,7 @@ def _predict(
     own = shard_rows(elevation.shape[0], config)
     if config.shard[1] > 1:
         writer.file.attrs["shard_rows"] = np.array(own, np.int64)
-    window, stride = window_and_stride(config)
-    if config.window is None and config.stride is None:
-        boxes = cut_swaths(elevation.shape, config, mapper.together)
-    else:
-        boxes = list_windows(elevation.shape, config)
+    boxes = list_windows(elevation.shape, config, mapper.together)
 
     def work(box: Box) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
         part = valid_part(dem_valid, box)
@@ -161,26 +156,15 @@ def _predict(
         return_freed_memory()  # or what windows of other sizes leave behind would grow with the map
 
     outputs = MapWriter(writer, elevation, dem_valid, own, picture)
-    blend = Blend(outputs, window - stride, own) if window > stride else None
-    found = run_in_threads(boxes, work, mapper.together)
     rows, done = sum(box[2] for box in boxes), 0
-    begun = -1
-    for number, strip in in_order(found) if blend else found:
-        if blend and number > begun:
-            begun = number
-            blend.begin(boxes[number])
+    for _, strip in run_in_threads(boxes, work, mapper.together):
         progress(min(done, rows), rows, "rows of windows")
         if strip is None:
             continue
         row, col, values = strip
         done += values.shape[1]
-        if blend:
-            blend.add(boxes[number], row, col, values)
-        else:
-            outputs.put(row, col, values)
+        outputs.put(row, col, values)
         outputs.copy_elevation()
-    if blend:
-        blend.flush(own[1])
     while outputs.copy_elevation():
         pass
     progress(rows, rows, "rows of windows")
