@@ -17,8 +17,10 @@ from lunargr_cli.main import app  # noqa: E402
 
 HEAD = """# Commands
 
-`python examples/cli_page.py` writes this page. `lunargr COMMAND --help` explains every option in full.
+`python examples/cli_page.py` writes this page. `lunargr COMMAND --help` explains every option in full. Commands that write
+files also take `--overwrite` and `--quiet`.
 """
+EVERYWHERE = ("--overwrite", "--quiet")  # of all commands that write: not repeated
 SHARED_FROM = 3  # commands with the same option: then it is explained once, on top
 
 
@@ -40,7 +42,7 @@ def default_of(option: Any) -> str:
 
 def first_sentence(option: Any) -> str:
     text = STATED.sub("", cell(getattr(option, "help", "") or ""))
-    return re.split(r"(?<=[\w)])\. (?=[A-Z])", text)[0].removesuffix(".")
+    return re.split(r"(?<=[\w)'])\. (?=[A-Z])", text)[0].removesuffix(".")
 
 
 def spelled(option: Any) -> str:
@@ -67,15 +69,12 @@ def section(name: str, command: Any, shared: set[tuple[str, str]]) -> list[str]:
     first, _, rest = text.partition("\n\n")
     lines = [f"## {name}", "", " ".join(first.split()), ""]
     for paragraph in rest.strip("\n").split("\n\n"):
-        shown = paragraph.strip()
-        if shown.startswith("lunargr "):
+        if (shown := paragraph.strip()).startswith("lunargr "):
             lines += ["```", *(line.rstrip() for line in shown.splitlines()), "```", ""]
-        elif shown:
-            lines += [shown, ""]
-    every = options_of(name, command)
+    every = [p for p in options_of(name, command) if p.opts[0] not in EVERYWHERE]
     own = [p for p in every if key_of(p) not in shared]
     if own:
-        lines += ["| option | default | |", "|---|---|---|"]
+        lines += ["|option|default||", "|---|---|---|"]
         lines += [f"|{spelled(p)}|{default_of(p)}|{first_sentence(p)}|" for p in own]
         lines += [""]
     also = [f"`{p.opts[0]}`" + (f" ({default_of(p)})" if default_of(p) else "") for p in every if key_of(p) in shared]
@@ -88,9 +87,9 @@ def page() -> str:
     count = Counter(key_of(p) for options in every.values() for p in options if p.param_type_name == "option")
     shared = {key for key, number in count.items() if number >= SHARED_FROM}
     first = {key_of(p): p for options in reversed(every.values()) for p in options}
-    lines = [HEAD, "| option of every command | |", "|---|---|"]
+    lines = [HEAD, "|option of every command||", "|---|---|"]
     lines += [f"|{spelled(p)}|{first_sentence(p)}|" for p in group.params]
-    lines += ["", "| option of many commands | |", "|---|---|"]
+    lines += ["", "|option of many commands||", "|---|---|"]
     lines += [f"|{spelled(first[key])}|{key[1]}|" for key in count if key in shared]
     lines += [""]
     for name, command in group.commands.items():

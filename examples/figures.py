@@ -6,10 +6,10 @@ Where a file is absent the block names the command that makes it: no figure is k
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import re
-import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -18,21 +18,26 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from stages.common.page.diagnosis import conclusions as diagnosis_sentences  # noqa: E402
-from stages.common.page.sentences import Sentence  # noqa: E402
+from stages.common.page.sentences import counted, listed, words  # noqa: E402
 from stages.report import conclusions  # noqa: E402
 from stages.report.held_out import TITLES as MAPS  # noqa: E402
 
 BLOCK = re.compile(r"(<!-- figures:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.S)
-KNOWS = {
-    "none": "nothing of the scored crops",
-    "minmax": "each crop's range and mean",
-    "gain": "each crop's gain",
-    "gain_offset": "each crop's gain and offset",
+FITTED = {
+    "none": "nothing",
+    "minmax": "range and mean",
+    "gain": "gain",
+    "gain_offset": "gain and offset",
 }
-BRIEF = ("learned", "global", "hapke_fitted", "hapke_raw", "hapke_minmax", "learned_gain_offset", "hapke_gain_offset")
 DEMO, APOLLO, PAPER = "make demo-full", "make reproduce-apollo15", "make reproduce-models"
 ALBEDO = "make demo-albedo"
+# Of two rows that are one model under two names the table keeps one: (model of the network, row left out, row that is kept)
+TWICE = (
+    ("hapke", "global", "hapke_fitted"),
+    ("hapke", "global_gain_offset", "hapke_fitted_gain_offset"),
+    ("kernels", "global", "kernels"),
+    ("kernels", "kernels_gain_offset", "global_gain_offset"),
+)
 
 
 class Absent(Exception):
@@ -48,102 +53,129 @@ def read(root: Path, name: str, command: str) -> dict[str, Any]:
 
 def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
     columns = list(columns)
-    return ["", *(f"| {' | '.join(row)} |" for row in (columns, ["---"] * len(columns), *rows)), ""]
+    return ["", *(f"|{'|'.join(row)}|" for row in (columns, ["---"] * len(columns), *rows)), ""]
 
 
-def with_bounds(value: float, low: float | None, high: float | None, spread: float | None = None) -> str:
-    """'7.95e-5 +- 0.12 (5.78 .. 12.2)': bounds and spread with the exponent of the value."""
-    power = math.floor(math.log10(value)) if value > 0 else 0
-    text = f"{value / 10**power:.2f}" + (f"e{power}" if power else "")
-    text += "" if spread is None else f" +- {spread / 10**power:.2f}"
+def power_of(rows: Iterable[dict[str, Any]]) -> int:
+    """The power of ten that all errors of a table are given in: that of the row in the middle."""
+    errors = sorted(row["mse"] for row in rows if row["mse"] > 0)
+    return math.floor(math.log10(errors[len(errors) // 2])) if errors else 0
+
+
+def number(value: float) -> str:
+    """Three digits, never as a power of ten."""
+    return f"{value:.3g}" if value >= 100 else f"{value:#.3g}".removesuffix(".")
+
+
+def with_bounds(value: float, low: float | None, high: float | None, spread: float | None, power: int) -> str:
+    """'7.95 ± 0.12 (5.78 to 12.2)' in units of ten to the ``power``."""
+    text = number(value / 10**power) + ("" if spread is None else f" ± {spread / 10**power:.2g}")
     if low is None:
         return f"{text} (no interval)"
-    low_text, high_text = ("unbounded" if x is None else f"{x / 10**power:#.3g}".removesuffix(".") for x in (low, high))
-    return f"{text} ({low_text} .. {high_text})"
+    return f"{text} ({number(low / 10**power)} to {'unbounded' if high is None else number(high / 10**power)})"
 
 
-def bullets(sentences: list[Sentence]) -> list[str]:
-    """Sentences as a list in Markdown."""
-    return [f"- {text}" for text, _ in sentences]
+def percent(value: float, low: float, high: float) -> str:
+    return f"{value:.1f} % ({low:.1f} to {high:.1f})"
 
 
-def table_rows(result: dict[str, Any], names: Iterable[str], prefix: str = "") -> list[list[str]]:
-    """Lines of an evaluation's table."""
-    lines = []
-    for name in names:
-        row = result["models"][name]
-        error = with_bounds(row["mse"], row["mse_low"], row["mse_high"], row.get("mse_run_std"))
-        ssim = "-" if row.get("ssim") is None else f"{row['ssim']:.3f}"
-        title = result.get("titles", {}).get(name, name)
-        lines.append([prefix + title, KNOWS.get(row["freedom"], row["freedom"]), error, ssim])
+def ssim(row: dict[str, Any]) -> str:
+    return "-" if row.get("ssim") is None else f"{row['ssim']:.3f}"
+
+
+def unit_of(result: dict[str, Any], power: int) -> str:
+    unit = "I/F squared" if result["image_units"] == "iof" else "of the full DN range squared"
+    return f"MSE, 1e{power} {unit}" if power else f"MSE, {unit}"
+
+
+def evaluated(result: dict[str, Any], more: dict[str, Any] | None = None) -> list[str]:
+    """A table of errors, what it rests on, and the conclusions. more : the paper's model, on the same pairs"""
+    twice = {(model, left) for model, left, kept in TWICE if kept in result["models"]}
+    names = [name for name in result["models"] if (result["model"], name) not in twice]
+    rows = [(result["models"][name], result.get("titles", {}).get(name, name)) for name in names]
+    for name, row in (more or {"models": {}})["models"].items():
+        rows.append(
+            (row, f"M2 with the paper's network, {counted(more['training_runs'], 'run')}: {name.replace('_', ' ')}")
+        )
+    power = power_of(row for row, _ in rows)
+    lines = [
+        f"Model {result['model']}; {conclusions.basis(result)}; training used none of this ground. ± is the standard deviation "
+        "of training runs; brackets hold 95 % intervals. Whatever is fitted to each scored crop stands in the second column."
+    ]
+    order = list(FITTED)
+    cells = [
+        [title, FITTED[row["freedom"]],
+         with_bounds(row["mse"], row["mse_low"], row["mse_high"], row.get("mse_run_std"), power), ssim(row)]
+        for row, title in sorted(rows, key=lambda pair: order.index(pair[0]["freedom"]))
+    ]  # fmt: skip
+    left = [f"- {title(result, kept)} is also the model {model} with one coefficient set for all ground, and stands once."
+            for model, left, kept in TWICE[::2] if model == result["model"] and kept in result["models"] and left in result["models"]]  # fmt: skip
+    notes = [f"- Note: {text}." for text in result.get("warnings", [])]
+    return [
+        *lines,
+        *table(["model", "fitted to each crop", unit_of(result, power), "SSIM"], cells),
+        *won(result),
+        *covered(result),
+        *left,
+        *notes,
+    ]
+
+
+def won(result: dict[str, Any]) -> list[str]:
+    """The learned reflectance against the strongest baseline of its kind, and against the paper's."""
+    best, lines = result["strongest_baseline"], []
+    for ours, theirs, name in (
+        ("learned", best.get("none"), "the strongest model without a network"),
+        ("learned", "hapke_minmax", "the paper's baseline"),
+        ("learned_gain_offset", best.get("gain_offset"), "the strongest model without a network, both with gain and offset"),
+    ):  # fmt: skip
+        gain = result["gains"].get(ours, {}).get(theirs or "")
+        if gain and gain["gain_percent"] is not None:
+            lines.append(f"- Squared error of the learned reflectance: {gained(gain, f'{name} ({theirs})')}.")
     return lines
 
 
-def evaluated(result: dict[str, Any], names: Iterable[str], more: list[list[str]]) -> list[str]:
-    """A table of errors with what it rests on, and what it says."""
-    unit = "I/F squared" if result["image_units"] == "iof" else "shares of the full DN range, squared"
-    lines = [
-        f"Model {result['model']}, {conclusions.basis(result)}, none of it seen in training. MSE in {unit}; +- is the standard deviation of "
-        "training runs, in brackets 95 % intervals."
-    ]
-    rows = sorted(table_rows(result, names), key=lambda row: list(KNOWS.values()).index(row[1]))
-    return (
-        lines
-        + table(["model", "what it may know", "MSE", "SSIM"], [*rows, *more])
-        + bullets(conclusions.evaluation(result))
-        + covered(result)
-    )
+def title(result: dict[str, Any], name: str) -> str:
+    return f"The row '{result.get('titles', {}).get(name, name)}'"
 
 
 def covered(result: dict[str, Any]) -> list[str]:
-    """What the error bars hold."""
+    """The share of pixels inside the error bars."""
     found = result.get("coverage_percent")
     if not found:
         return []
     bands = [band["95"] for band in found.get("by_incidence", []) if band["pixels"]]
-    spread = f"; by incidence those of 95 % hold {min(bands):.1f} to {max(bands):.1f} %" if bands else ""
+    spread = f" ({min(bands):.1f} to {max(bands):.1f} % by incidence)" if bands else ""
     return [
-        f"- Intervals that should hold 68 and 95 % of the pixels hold {found['68']:.1f} and {found['95']:.1f} %{spread}."
+        f"- {found['95']:.1f} % of the pixels lie inside the 95 % intervals{spread}, and {found['68']:.1f} % inside the 68 % intervals."
     ]
-
-
-def brief(result: dict[str, Any]) -> list[str]:
-    """The rows of a short table: the strongest baselines and the paper's among them."""
-    wanted = {*BRIEF, *result.get("strongest_baseline", {}).values()}
-    return [name for name in result["models"] if name in wanted]
-
-
-def demo(root: Path) -> list[str]:
-    result = read(root, "demo-full/evaluation.json", DEMO)
-    return evaluated(result, brief(result), paper_row(root))
-
-
-def paper_row(root: Path) -> list[list[str]]:
-    """The paper's model and network, where they were trained on the same pairs."""
-    try:
-        other = read(root, "demo-full/m2.json", "make demo-paper")
-    except Absent:
-        return []
-    runs = f"M2 with the paper's network ({conclusions.basis(other)}): "
-    return table_rows(other, [name for name in other["models"] if name.startswith("learned")], runs)
 
 
 def demo_rows(root: Path) -> list[str]:
     result = read(root, "demo-full/evaluation.json", DEMO)
-    return evaluated(result, result["models"], paper_row(root))
+    try:
+        paper = read(root, "demo-full/m2.json", "make demo-paper")
+    except Absent:
+        return evaluated(result)
+    learned = {name: row for name, row in paper["models"].items() if name.startswith("learned")}
+    return evaluated(result, {**paper, "models": learned})
 
 
 def held_out(root: Path, name: str, command: str) -> list[str]:
     """Seen ground under unseen images."""
     result = read(root, name, command)
+    power = power_of(result["models"].values())
     rows = [
-        [MAPS.get(name, name), with_bounds(row["mse"], row["mse_low"], row["mse_high"]),
-         "-" if row.get("ssim") is None else f"{row['ssim']:.3f}"]
+        [MAPS.get(name, name), with_bounds(row["mse"], row["mse_low"], row["mse_high"], None, power), ssim(row)]
         for name, row in result["models"].items()
-    ]  # fmt: skip
-    unit = "" if result.get("image_units") == "iof" else " MSE in DN squared."
-    lines = [f"Claim: {result['claim']}; {conclusions.basis(result)}, {len(result['images'])} images.{unit}"]
-    lines += table(["map", "MSE", "SSIM"], rows) + bullets(conclusions.held_out_images(result))
+    ]
+    unit = f"MSE, 1e{power} {'I/F' if result.get('image_units') == 'iof' else 'DN'} squared"
+    lines = [f"Claim: {result['claim']}; {conclusions.basis(result)}, {len(result['images'])} images."]
+    sun = result["nearest_used_sun_deg"]
+    gain = gained(result["gains"]["albedo"]["terrain"], "the map from terrain alone")
+    lines += table(["map", unit, "SSIM"], rows)
+    lines += [f"- Squared error with albedo: {gain}.",
+              f"- Suns of the unseen images stand {sun['least']:.0f} to {sun['most']:.0f} deg from the nearest one used."]  # fmt: skip
     return lines + covered(result)
 
 
@@ -154,47 +186,80 @@ def matched(root: Path, name: str, command: str) -> list[str]:
     for matcher, renderings in result["matchers"].items():
         for name, row in renderings.items():
             share, low, high = (row[f"within_1_px_percent{end}"] for end in ("", "_low", "_high"))
-            text = "-" if share is None else f"{share:.1f} %" + ("" if low is None else f" ({low:.1f} .. {high:.1f})")
+            text = "-" if share is None else f"{share:.1f} %" if low is None else percent(share, low, high)
             rows.append([matcher, name.replace("_", " "), str(row["matches"]), text])
     lines = [f"{result['crops']} crops on {result['tiles']} ground tiles, one training run, 95 % intervals over tiles."]
     return lines + table(["matcher", "rendering", "matches", "within 1 px"], rows)[:-1]
 
 
 def diagnosed(root: Path, folder: str, command: str) -> list[str]:
-    return bullets(diagnosis_sentences(read(root, f"{folder}/diagnosis.json", command)))
+    """The named causes with their values, the gain on unseen pairs, and what the data leave open."""
+    result = read(root, f"{folder}/diagnosis.json", command)
+    data, judged = result["data"], result.get("held_out") or {}
+    rows = []
+    for cause in result.get("causes", []):
+        values = [f"{name} = {v['value']:.3g} ± {v['error']:.1g}{'' if v['unit'] == '1' else ' ' + v['unit']}"
+                  for name, v in cause["parameters"].items()]  # fmt: skip
+        rows.append([words(cause["effect"]), "; ".join(values)])
+    lines = [f"{data['pairs']} pairs of {counted(data['sites'], 'site')}; verdict: {words(result['verdict'])}."]
+    lines += table(["cause", "value"], rows) if rows else []
+    if rows and judged.get("gain_percent") is not None:
+        gain = percent(judged["gain_percent"], judged["gain_percent_low"], judged["gain_percent_high"])
+        lines.append(f"- With these causes the squared error on {judged['pairs']} unseen pairs is lower by {gain}.")
+    if result.get("blind"):
+        lines.append(f"- These data cannot show whether the following are present: {listed(result['blind'])}.")
+    return lines
 
 
 def apollo15(root: Path) -> list[str]:
-    result = read(root, "results/apollo15/evaluation.json", APOLLO)
-    return evaluated(result, brief(result), [])
+    return evaluated(read(root, "results/apollo15/evaluation.json", APOLLO))
+
+
+def gained(gain: dict[str, Any], over: str) -> str:
+    """'25.3 % lower (11.4 to 37.0) than ...', no stronger than the interval allows."""
+    value, low, high = (gain[f"gain_percent{end}"] for end in ("", "_low", "_high"))
+    if low is None or high is None or low <= 0 <= high:
+        interval = "no interval" if low is None or high is None else f"{low:.1f} to {high:.1f}"
+        return f"no sure difference from {over}: gain {value:.1f} % ({interval})"
+    return f"{percent(abs(value), *sorted((abs(low), abs(high))))} {'lower' if value > 0 else 'higher'} than {over}"
+
+
+def three_results(root: Path) -> list[str]:
+    """The short table of README: what was tested, the result, and a caveat."""
+    rows = []
+    for name, command, tested, caveat in (
+        ("demo-full/evaluation.json", DEMO, "Simulated scene, unseen ground",
+         "A Hapke law lights the scene, and a part of its albedo follows the terrain."),
+        ("results/apollo15/evaluation.json", APOLLO, "Apollo 15 photographs, unseen ground",
+         "All frames share one Sun. Frames were aligned with the terrain on test ground, too."),
+    ):  # fmt: skip
+        result = read(root, name, command)
+        best = result["strongest_baseline"]["none"]
+        rows.append([f"{tested} ({counted(result['tiles'], 'tile')})",
+                     gained(result["gains"]["learned"][best], f"the best law with one coefficient set ({best})"), caveat])  # fmt: skip
+    result = read(root, "results/apollo15/held_out.json", APOLLO)
+    rows.append([f"Apollo 15 photographs, unseen frame over seen ground ({len(result['images'])} frames)",
+                 gained(result["gains"]["albedo"]["terrain"], "the map from terrain alone"),
+                 "The frames share one Sun: this shows nothing about another Sun."])  # fmt: skip
+    return table(["test", "squared error of the learned map", "caveat"], rows) + ["Brackets hold 95 % intervals."]
 
 
 def models(root: Path) -> list[str]:
     """The paper's comparison of reflectance models."""
     result = read(root, "results/models.json", PAPER)
-    rows = []
+    power, rows = power_of(result["models"].values()), []
     for name, row in result["models"].items():
-        error = with_bounds(row["mse"], row["mse_low"], row["mse_high"], row["mse_seed_std"])
+        error = with_bounds(row["mse"], row["mse_low"], row["mse_high"], row["mse_seed_std"], power)
         paper = "-" if row.get("paper_mse_crop_sum") is None else f"{row['paper_mse_crop_sum']:.2f}"
         rows.append([name, error, f"{row['mse_crop_sum']:.4f}", paper])
     lines = [
-        f"{result['crops']} validation crops on {result['tiles']} ground tiles, {result['seeds']} training runs each; +- is the standard "
-        "deviation of runs, in brackets 95 % intervals over tiles and runs. The paper's figures are of its own pairs."
+        f"{result['crops']} validation crops on {result['tiles']} ground tiles, {result['seeds']} training runs of each model. ± is the "
+        "standard deviation of runs; brackets hold 95 % intervals over tiles and runs. The paper scores its own pairs."
     ]
-    lines += table(["model", "MSE", "MSE summed over a crop", "the paper's"], rows)
+    lines += table(["model", f"MSE, 1e{power}", "MSE summed over a crop", "in the paper"], rows)
     known = [p for p in result["differences"] if p["larger_than_noise"]]
     text = "; ".join(f"{p['better']} below {p['worse']} by {p['difference_percent']:.1f} %" for p in known)
     return [*lines, f"Differences larger than their noise: {text or 'none'}."]
-
-
-def commands(_: Path) -> list[str]:
-    """What `make demo` runs, as make itself lists it, from within demo/."""
-    listed = subprocess.run(
-        ["make", "-nB", "D=demo", "demo/report.html"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout
-    found = re.findall(r"^\.venv/bin/(lunargr (?:.*\\\n)*.*)$", listed, re.M)
-    lines = "\n".join(found).replace(" --overwrite", "").replace(" --resume", "").replace("demo/", "")
-    return [f"    {re.sub(r'(?<=[^ ]) +', ' ', re.sub(r'^ +', '    ', line))}".rstrip() for line in lines.splitlines()]
 
 
 def benchmark(root: Path, name: str) -> list[str]:
@@ -225,19 +290,19 @@ def sizes(root: Path) -> list[str]:
     import h5py
 
     rows = []
-    for name, unit, counted in SIZES:
+    for name, unit, variable in SIZES:
         try:
             size = (root / "demo-full" / name).stat().st_size
             per = "-"
-            if counted:
-                file, variable = counted.split(":")
+            if variable:
+                file, path = variable.split(":")
                 with h5py.File(root / "demo-full" / file) as opened:
-                    shape = opened[variable].shape
-                number = shape[0] if len(shape) == 3 else shape[0] * shape[1] / 1e6
+                    shape = opened[path].shape
+                amount = shape[0] if len(shape) == 3 else shape[0] * shape[1] / 1e6
                 per = (
-                    f"{size / number / 1e3:,.0f} kB a {unit}"
+                    f"{size / amount / 1e3:,.0f} kB a {unit}"
                     if len(shape) == 3
-                    else f"{size / number / 1e6:.1f} MB a {unit}"
+                    else f"{size / amount / 1e6:.1f} MB a {unit}"
                 )
         except FileNotFoundError:
             raise Absent(f"demo-full/{name}", DEMO) from None
@@ -252,6 +317,7 @@ CAMPAIGNS = (
     ("ingest --images", 667 * 250.0, None),
     ("sample", 83.614, None),
     ("project", 83.614, None),
+    ("train", 66.662, None),
     ("infer", 342.0, 4180.0),
     ("render", 342.0, 4180.0),
     ("evaluate", 8.337, None),
@@ -261,14 +327,14 @@ CAMPAIGNS = (
 def campaigns(root: Path) -> list[str]:
     """Processor time of large work, from the rates that bench_scaling measured and wrote into the page."""
     try:
-        text = (root / "docs" / "scaling.md").read_text()
+        text = (root / "docs" / "resources.md").read_text()
     except FileNotFoundError:
-        raise Absent("docs/scaling.md", "python tests/benchmarks/bench_scaling.py --docs docs/scaling.md") from None
+        raise Absent("docs/resources.md", "python tests/benchmarks/bench_scaling.py --docs docs/resources.md") from None
     rates = {m[1]: (m[2], float(m[3]), m[4]) for m in RATE.finditer(text)}
     rows = []
     for stage, *works in CAMPAIGNS:
         if stage not in rates:
-            raise Absent(f"the rate of {stage}", "python tests/benchmarks/bench_scaling.py --docs docs/scaling.md")
+            raise Absent(f"the rate of {stage}", "python tests/benchmarks/bench_scaling.py --docs docs/resources.md")
         peaks, rate, unit = rates[stage]
         memory = max(float(p.replace(",", "")) for p in peaks.split(", ")) / 1e3
         times = ["" if work is None else duration(rate * work) for work in works]
@@ -283,16 +349,56 @@ def campaigns(root: Path) -> list[str]:
     return table(["stage", "work at Tycho", "Tycho", "global 100 m map", "memory"], rows)
 
 
-RATE = re.compile(r"^\| `([a-z -]+)` \| [^|]*\| ([^|]*?) \|.*\| ([0-9.]+) s per ([^|]*?) \|$", re.M)
+RATE = re.compile(r"^\| ?`([a-z -]+)` ?\|[^|]*\| ?([^|]*?) ?\|.*\| ?([0-9.]+) s per ([^|]*?) ?\|$", re.M)
 
 
 def duration(seconds: float) -> str:
     return f"{seconds / 60:.1f} min" if seconds < 3600 else f"{seconds / 3600:.1f} h"
 
 
+KINDS = (
+    ("real photographs", lambda row: row["data"] == "photographs"),
+    ("simulators by other people, law given", lambda row: row["law"] == "given" and row["data"] != "own scenes"),
+    ("simulators by other people, law unknown", lambda row: row["law"] == "unknown" and row["data"] != "own scenes"),
+    ("own scenes", lambda row: row["data"] == "own scenes"),
+)
+
+
+def diagnose_campaigns(root: Path) -> list[str]:
+    """Sums over the campaigns of diagnose, from the list that docs/diagnose_campaigns.csv keeps."""
+    try:
+        listed_rows = list(csv.DictReader((root / "docs" / "diagnose_campaigns.csv").read_text().splitlines()))
+    except FileNotFoundError:
+        raise Absent("docs/diagnose_campaigns.csv", "make campaign") from None
+    rows = []
+    for version, name in (("current", "this version"), ("earlier", "earlier versions")):
+        for kind, belongs in KINDS:
+            chosen = [row for row in listed_rows if row["version"] == version and belongs(row)]
+            if chosen:
+                found = [share(chosen, *columns) for columns in (
+                    ("false_names", "nulls"), ("named_first", "plants"), ("another_first", "plants"), ("faults_in_words", "faults"))]  # fmt: skip
+                rows.append([f"{kind}, {name}", *found])
+    return table(
+        [
+            "data",
+            "name although nothing was planted",
+            "planted effect named first",
+            "another effect named first",
+            "camera fault described",
+        ],
+        rows,
+    )
+
+
+def share(rows: list[dict[str, str]], part: str, whole: str) -> str:
+    """'34 of 77 (44 %)', over the rows that have both numbers."""
+    both = [(int(row[part]), int(row[whole])) for row in rows if row[part] and row[whole]]
+    some, every = (sum(numbers) for numbers in zip(*both, strict=True)) if both else (0, 0)
+    return f"{some} of {every} ({100 * some / every:.0f} %)" if every else "-"
+
+
 BLOCKS: dict[str, Callable[[Path], list[str]]] = {
-    "demo-commands": commands,
-    "demo": demo,
+    "three-results": three_results,
     "demo-rows": demo_rows,
     "demo-held-out": lambda root: held_out(root, "demo-full/held_out.json", DEMO),
     "demo-albedo": lambda root: held_out(root, "demo-full/held_out_all.json", ALBEDO),
@@ -304,11 +410,9 @@ BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "apollo15-match": lambda root: matched(root, "results/apollo15/match.json", APOLLO),
     "apollo15-diagnosis": lambda root: diagnosed(root, "results/apollo15", APOLLO),
     "models": models,
+    "diagnose-campaigns": diagnose_campaigns,
     "demo-sizes": sizes,
     "campaigns": campaigns,
-    "bench-training": lambda root: benchmark(root, "bench_training"),
-    "bench-layer": lambda root: benchmark(root, "bench_layer"),
-    "bench-inference": lambda root: benchmark(root, "bench_inference"),
     "bench-view": lambda root: benchmark(root, "bench_view"),
 }
 

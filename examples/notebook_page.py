@@ -1,4 +1,4 @@
-"""Run examples/relight.py cell by cell and write docs/relight.md, its pictures and docs/relight.ipynb.
+"""Run examples/relight.py cell by cell and write docs/relight.ipynb.
 
 Run in the folder of the files: cd demo-full; python ../examples/notebook_page.py
 """
@@ -25,7 +25,7 @@ KERNEL = {"kernelspec": {"display_name": "Python 3", "language": "python", "name
 
 @dataclass
 class Cell:
-    """``printed`` and ``pictures`` (JPEG) are what running it left."""
+    """``printed`` and ``pictures`` (JPEG) are the outputs of running it."""
 
     kind: str  # 'markdown' | 'code'
     text: str
@@ -65,25 +65,8 @@ def run(cells: list[Cell]) -> dict[str, Any]:
     return names
 
 
-def page(cells: list[Cell]) -> tuple[str, dict[str, bytes]]:
-    """The page in Markdown, and its pictures by name."""
-    lines, pictures = [], {}
-    for cell in cells:
-        if cell.kind == "markdown":
-            lines += [cell.text, ""]
-            continue
-        lines += ["```python", cell.text, "```", ""]
-        if cell.printed:
-            lines += ["```text", cell.printed, "```", ""]
-        for picture in cell.pictures:
-            name = f"relight_{len(pictures) + 1}.jpg"
-            pictures[name] = picture
-            lines += [f"![What the cell above draws](images/{name})", ""]
-    return "\n".join(lines).rstrip() + "\n", pictures
-
-
 def notebook(cells: list[Cell]) -> str:
-    """The same as a Jupyter notebook, with its outputs."""
+    """The cells as a Jupyter notebook, with their outputs."""
     made = []
     for number, cell in enumerate(cells):
         entry: dict[str, Any] = {"cell_type": cell.kind, "id": f"cell-{number}", "metadata": {}, "source": cell.text}
@@ -103,9 +86,5 @@ def notebook(cells: list[Cell]) -> str:
 if __name__ == "__main__":
     cells = read_cells(SCRIPT)
     run(cells)
-    text, pictures = page(cells)
-    (ROOT / "docs" / "relight.md").write_text(text)
     (ROOT / "docs" / "relight.ipynb").write_text(notebook(cells))
-    for name, content in pictures.items():
-        (ROOT / "docs" / "images" / name).write_bytes(content)
-    print(ROOT / "docs" / "relight.md")
+    print(ROOT / "docs" / "relight.ipynb")

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # From pairs to a relit map
-# What `lunargr project` wrote, `pairs.h5`, opened with xarray; a network trained on it; its map relit with numpy, and held against
-# `lunargr render`. The files are those of `make demo`. This page is `examples/relight.py`, run cell by cell by `examples/notebook_page.py`:
-# open the [notebook](relight.ipynb) in Jupyter, or run the script in the folder of the files. It needs xarray and h5netcdf.
+# This notebook opens `pairs.h5` with xarray, trains a network on it, relights its map with numpy, and compares the result with
+# `lunargr render`. The files are those of `make demo-full`. It is `examples/relight.py`, run cell by cell by `examples/notebook_page.py`.
+# It needs xarray and h5netcdf.
 
 # %%
 import subprocess
@@ -25,7 +25,7 @@ def lunargr(*words):
 
 # %% [markdown]
 # ## What a pair is
-# A crop of terrain, an image laid over it, and where the Sun and the camera stood. Every variable knows its unit.
+# A crop of terrain, an image of it, and the directions of Sun and camera. Every variable has its unit as an attribute.
 
 # %%
 pairs = xr.open_dataset("pairs.h5", engine="h5netcdf")
@@ -52,7 +52,7 @@ print(f"the Sun stands {elevation:.1f} deg high, {azimuth % 360:.1f} deg clockwi
 
 # %% [markdown]
 # ## Learn the reflectance, map it
-# Two passes over the pairs are enough to see something; `make demo` takes six, from three seeds.
+# Two passes over the pairs give a first map; `make demo-full` takes six, from three seeds.
 
 # %%
 if not Path("relight_map.h5").exists():
@@ -64,7 +64,7 @@ print(f"{model.name}: I/F = {model.formula}")
 print("coefficients:", ", ".join(maps.coefficient.values))
 
 # %% [markdown]
-# A coefficient is selected by its name. Those that the network predicts place by place have a standard deviation.
+# A coefficient is selected by its name. Coefficients that the network predicts per pixel have a standard deviation.
 
 # %%
 name = str(maps.map_name.values[0])

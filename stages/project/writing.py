@@ -17,7 +17,7 @@ from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
 from stages.project.summary import Registered, Summary, extremes
 
-# Digits after the point that pairs.h5 keeps; for their effect on a rendering see docs/scaling.md.
+# Digits after the point that pairs.h5 keeps; docs/resources.md lists them.
 IOF_DECIMALS, COUNT_DECIMALS, HORIZON_DECIMALS = 5, 1, 1
 RAY_DECIMALS = {"detector_line": 2, "detector_sample": 2, "emission_deg": 2, "phase_deg": 3}
 ALWAYS = ("valid", "sun_direction_enu", "camera_position_enu", "convergence_deg")

@@ -1,7 +1,7 @@
 """Training on the CPU, interleaved in one run: the best plain recipe, our network, the whole step, the loop and the loader.
 
 The peer is the U-Net of the paper as one writes it in PyTorch (zero padding, torch's own BatchNorm, LeakyReLU, Dropout, nearest
-upsampling), channels last, Adam, with bfloat16 and without: `docs/scaling.md` says what was measured.
+upsampling), channels last, Adam, with bfloat16 and without: `make bench ONLY=training` runs it.
 """
 
 from __future__ import annotations

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeVar
 
 from stages.physics.photometry.base import get_model, model_names
 from stages.physics.photometry.conventions import Convention, conventions
 from stages.physics.photometry.published import ParameterSet, published_sets
+
+Entry = TypeVar("Entry")
 
 
 def parameter_sets(model: str | None = None) -> list[ParameterSet]:
@@ -58,27 +61,29 @@ def as_dict() -> dict[str, Any]:
 
 def markdown() -> str:
     """The reference part of the photometry page: every model, set and convention."""
-    lines = ["## Models", ""]
-    lines += ["| model | I/F = | parameters | reciprocal | source |", "|---|---|---|---|---|"]
+    lines = ["## Models", "", "|model|parameters|reciprocal|source|", "|---|---|---|---|"]
     models = [get_model(name) for name in model_names()]
-    for m in models:
-        names = ", ".join(p.name for p in m.parameters)
-        lines.append(f"| `{m.name}` | {m.formula} | {names} | {'yes' if m.reciprocal else 'no'} | {m.reference} |")
-    lines += ["", "## Parameters", ""]
-    lines += ["| model | parameter | unit | lower | upper | default | what |", "|---|---|---|---|---|---|---|"]
-    for m in models:
-        for p in m.parameters:
-            numbers = " | ".join(f"{v:.6g}" for v in (p.lower, p.upper, p.default))
-            lines.append(f"| `{m.name}` | {p.name} | {p.unit} | {numbers} | {p.description} |")
-    lines += ["", "## Published parameter sets", ""]
-    lines += ["| set | model | values | what | source |", "|---|---|---|---|---|"]
-    for s in published_sets():
-        lines.append(f"| `{s.name}` | `{s.model}` | {values_text(s)} | {s.description} | {s.reference} |")
+    alike = _grouped(
+        (f"`{m.name}`", (", ".join(p.name for p in m.parameters), "yes" if m.reciprocal else "no", m.reference))
+        for m in models
+    )
+    lines += [f"|{', '.join(names)}|{'|'.join(rest)}|" for rest, names in alike.items()]
+    lines += ["", "## Published parameter sets", "", "|sets|model|source|", "|---|---|---|"]
+    sets = _grouped((f"`{s.name}`", (f"`{s.model}`", s.reference)) for s in published_sets())
+    lines += [f"|{', '.join(names)}|{'|'.join(rest)}|" for rest, names in sets.items()]
     lines += ["", "## Conventions of other programs", ""]
-    lines += ["| convention | model here | bands, in the program's order | formula gives | implies | source |"]
+    lines += ["|convention|model here|bands, in the program's order|formula gives|implies|source|"]
     lines += ["|---|---|---|---|---|---|"]
     for c in related_conventions():
         bands = ", ".join(f"{n} [{u}]" if u != "1" else n for n, u in c.quantities)
         implied = ", ".join(f"{n} = {v:g}" for n, v in c.implied.items()) or "-"
-        lines.append(f"| `{c.name}` | `{c.model}` | {bands} | {c.returns} | {implied} | {c.reference} |")
-    return "\n".join(lines).replace("|I/F|", "I/F")
+        lines.append(f"|`{c.name}`|`{c.model}`|{bands}|{c.returns}|{implied}|{c.reference}|")
+    return "\n".join(lines)
+
+
+def _grouped(entries: Iterable[tuple[str, Entry]]) -> dict[Entry, list[str]]:
+    """Names by what they share, in the order of the first name."""
+    found: dict[Entry, list[str]] = {}
+    for name, entry in entries:
+        found.setdefault(entry, []).append(name)
+    return found

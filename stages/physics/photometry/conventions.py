@@ -205,7 +205,7 @@ _add(
     "Sato et al. (2014), LROC WAC_HAPKEPARAMMAP and ISIS lrowacphomap: c = backward minus forward share, -1..1",
     _theta_in_degrees("theta", _rename({name: name for name in ("w", "b", "c", "Bc0", "hc", "Bs0", "hs", "phi")})),
 )
-_G2R = "Lunar-G2R reference implementation, {}.brdf: channels before LeakyReLU(0.01), in the order of the file"
+_G2R = "Lunar-G2R code, {}.brdf: channels before LeakyReLU(0.01)"
 for _name, _model, _channels, _zero in (
     ("polynomial_2p", "M1", {"x": "b", "y": "a"}, ()),
     ("polynomial_3p_cst", "M2", {"x": "b", "y": "a", "z": "c"}, ()),
@@ -229,7 +229,7 @@ _add(
     "x 1, y 1, z 1",
     "hapke_g2r",
     "r = I/F / pi",
-    "Lunar-G2R reference implementation, hapke_diff.brdf: h, sqrt(1 - w), B0; positive values",
+    "Lunar-G2R code, hapke_diff.brdf: h, sqrt(1 - w), B0",
     _rename({"x": "h", "y": "gamma", "z": "B0"}),
 )
 
