@@ -64,7 +64,7 @@ def options_of(name: str, command: Any) -> list[Any]:
 
 
 def section(name: str, command: Any, shared: set[tuple[str, str]]) -> list[str]:
-    """A command: what it does, its examples, its own options, and the names of those that it shares."""
+    """A command: what it does, its examples, its own options, and the default name of its output."""
     text = (command.help or "").replace("\b", "").strip()
     first, _, rest = text.partition("\n\n")
     lines = [f"## {name}", "", " ".join(first.split()), ""]
@@ -77,8 +77,8 @@ def section(name: str, command: Any, shared: set[tuple[str, str]]) -> list[str]:
         lines += ["|option|default||", "|---|---|---|"]
         lines += [f"|{spelled(p)}|{default_of(p)}|{first_sentence(p)}|" for p in own]
         lines += [""]
-    also = [f"`{p.opts[0]}`" + (f" ({default_of(p)})" if default_of(p) else "") for p in every if key_of(p) in shared]
-    return [*lines, *([f"Also: {', '.join(also)}.", ""] if also else [])]
+    output = next((default_of(p) for p in every if p.opts[0] == "--output" and key_of(p) in shared), "")
+    return [*lines, *([f"Writes {output}.", ""] if output.startswith("`") else [])]
 
 
 def page() -> str:
@@ -89,8 +89,10 @@ def page() -> str:
     first = {key_of(p): p for options in reversed(every.values()) for p in options}
     lines = [HEAD, "|option of every command||", "|---|---|"]
     lines += [f"|{spelled(p)}|{first_sentence(p)}|" for p in group.params]
-    lines += ["", "|option of many commands||", "|---|---|"]
-    lines += [f"|{spelled(first[key])}|{key[1]}|" for key in count if key in shared]
+    lines += ["", "|option of many commands||commands|", "|---|---|---|"]
+    for key in (key for key in count if key in shared and key[0] not in EVERYWHERE):
+        users = [name for name, options in every.items() if any(key_of(p) == key for p in options)]
+        lines.append(f"|{spelled(first[key])}|{key[1]}|{', '.join(users) if key[0] != '--output' else 'most'}|")
     lines += [""]
     for name, command in group.commands.items():
         lines += section(name, command, shared)

@@ -262,15 +262,6 @@ def models(root: Path) -> list[str]:
     return [*lines, f"Differences larger than their noise: {text or 'none'}."]
 
 
-def benchmark(root: Path, name: str) -> list[str]:
-    """What a benchmark printed, word for word."""
-    try:
-        printed = (root / f"results/bench/{name}.txt").read_text().rstrip()
-    except FileNotFoundError:
-        raise Absent(f"results/bench/{name}.txt", f"make bench ONLY={name.removeprefix('bench_')}") from None
-    return ["```text", *printed.splitlines(), "```"]
-
-
 SIZES = (
     ("scene.h5", "Mpx of the working grid", "scene.h5:elevation"),
     ("crops.h5", "pair", "crops.h5:elevation"),
@@ -400,7 +391,6 @@ def share(rows: list[dict[str, str]], part: str, whole: str) -> str:
 BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "three-results": three_results,
     "demo-rows": demo_rows,
-    "demo-held-out": lambda root: held_out(root, "demo-full/held_out.json", DEMO),
     "demo-albedo": lambda root: held_out(root, "demo-full/held_out_all.json", ALBEDO),
     "demo-albedo-match": lambda root: matched(root, "demo-full/match_albedo.json", ALBEDO),
     "demo-match": lambda root: matched(root, "demo-full/match.json", DEMO),
@@ -413,7 +403,6 @@ BLOCKS: dict[str, Callable[[Path], list[str]]] = {
     "diagnose-campaigns": diagnose_campaigns,
     "demo-sizes": sizes,
     "campaigns": campaigns,
-    "bench-view": lambda root: benchmark(root, "bench_view"),
 }
 
 

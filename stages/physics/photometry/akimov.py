@@ -3,11 +3,7 @@
     D = cos(g/2) cos[pi/(pi - g) (L - g/2)] cos(B)^(eta g/(pi - g)) / cos(L)
 
 L and B are photometric longitude and latitude: cos(e) = cos(B) cos(L), cos(i) = cos(B) cos(g - L). D is 1 at the
-mirror point L = g/2, B = 0. With d = pi/2 - L and q = g/(pi - g) the two cosines of longitude become
-
-    cos[pi/(pi - g) (L - g/2)] / cos(L) = sin((1 + q) d) / sin(d) = cos(q d) + sin(q d) / tan(d)
-
-which has no 0/0 at the limb (d = 0), and tends to 1 as g goes to 0, where L is not defined.
+mirror point L = g/2, B = 0.
 """
 
 from __future__ import annotations
@@ -57,6 +53,7 @@ float radiance_factor(float p[COUNT], float mu0, float mu, float cos_g) {
         d = torch.atan2(along, across)
         # No direction above the horizon is within 1e-6 of d = 0 but where e = 90 deg; the floor keeps 1/tan finite.
         d = d.clamp(min=1e-6, max=math.pi - (1e-7 if double else 1e-4))
+        # sin((1 + q) d) / sin(d) with q = g/(pi - g) and d = pi/2 - L, written without the 0/0 at the limb
         longitude = torch.cos(share * d) + torch.sin(share * d) / torch.tan(d)
         cos2_latitude = ((across * across + along * along) / (sin_phase * sin_phase)).clamp(min=floor, max=1.0)
         latitude = torch.exp(0.5 * parameters["eta"] * share * cos2_latitude.log())

@@ -7,18 +7,16 @@ With s the direction of the Sun, v that of the camera, n the normal and h = (s +
     phi_h    azimuth of h about n, from the tangent t = the Sun's direction projected on the surface
     phi_d    azimuth of s about h, from the plane of n and h
 
-The frame follows the Sun, so that M6 is an isotropic function of (i, e, g). With D = (n . (s x v))^2, the squared
-volume of the three directions, and P = sin^2(i) + cos(g) - cos(i) cos(e):
+The frame follows the Sun, so M6 is an isotropic function of (i, e, g). With D = (n . (s x v))^2 and
+P = sin^2(i) + cos(g) - cos(i) cos(e):
 
     cos(phi_h) = P / sqrt(P^2 + D)
     cos(phi_d) = q / sqrt(q^2 + D),  q = cos(g/2) (cos e - cos i)
 
-An azimuth is not defined where its angle theta is 0; a term of machine precision under the root makes both cosines go
-smoothly to 0 there, with finite slopes.
+Where theta is 0 its azimuth is not defined; a term of machine precision under the root makes both cosines go smoothly to 0.
 
-Supplement of Grethen et al., Lunar-G2R, section 2; Rusinkiewicz, S. (1998), Eurographics Workshop on Rendering, 11.
-Its authors' code differs: its h is not normalised and its tangent is the camera's direction, so its coefficients do not
-carry over.
+Supplement of Grethen et al., Lunar-G2R, section 2; Rusinkiewicz (1998), Eurographics Workshop on Rendering, 11. The authors' code
+does not normalise h and takes the camera's direction as tangent, so its coefficients do not carry over.
 """
 
 from __future__ import annotations
