@@ -71,7 +71,7 @@ def plant(folder: Path, albedo: np.ndarray, images: list[np.ndarray], units: str
         lon, lat = SUNS[k]
         rows.append(
             {
-                "image_id": f"IMG{k}", "path": f"image{k}.tif", "units": units, "start_time": "2010-01-01T00:00:00Z",
+                "image_id": f"IMG{k}", "path": f"image{k}.tif", "units": units, "start_time": "",
                 "subsolar_longitude_deg": lon, "subsolar_latitude_deg": lat, "solar_distance_au": 1.0,
                 "spacecraft_longitude_deg": LON, "spacecraft_latitude_deg": LAT, "spacecraft_altitude_m": 5e7,
             }

@@ -114,7 +114,7 @@ def write_scene(folder: Path, images: int = 3, gain=None, nodata_hole: bool = Tr
         )
         rows.append(
             {
-                "image_id": f"IMG{k}", "path": f"image{k}.tif", "units": units, "start_time": "2010-01-01T00:00:00Z",
+                "image_id": f"IMG{k}", "path": f"image{k}.tif", "units": units, "start_time": "",
                 "subsolar_longitude_deg": SUN[0], "subsolar_latitude_deg": SUN[1], "solar_distance_au": 1.0,
                 "spacecraft_longitude_deg": LON, "spacecraft_latitude_deg": LAT, "spacecraft_altitude_m": 5e7,
             }

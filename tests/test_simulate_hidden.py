@@ -94,6 +94,7 @@ def test_the_table_is_told_another_sun(plain, tmp_path, effect, axis):
     config = make_config(FEW)
     for true, given in zip(rows(plain), rows(other), strict=True):
         angles = []
+        assert true["start_time"] and not given["start_time"]  # a time would tell where the Sun was
         for row in (true, given):
             sun, _ = directions(config, row)
             angles.append((math.degrees(math.atan2(sun[0], sun[1])), math.degrees(math.asin(sun[2]))))

@@ -38,6 +38,10 @@ def command(
     skip_outside: Annotated[
         bool, typer.Option("--skip-outside", help="Leave out images that do not touch the DEM.")
     ] = Config.skip_outside,
+    trust_table: Annotated[
+        bool,
+        typer.Option("--trust-table", help="Accept Suns that are not those of their times, and unlikely orbits."),
+    ] = Config.trust_table,
     shard: options.Shard = None,
     scheduler: options.Scheduler = None,
     resume: options.ResumeParts = False,

@@ -36,6 +36,7 @@ from stages.ingest.plan import plan_grid
 from stages.ingest.validity import check_frames, hash_files, write_validity
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.images.table import Frame, load_frames, read_frames, write_frames
+from stages.physics.images.table_checks import check_table
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, read_grid, require_crs
 
@@ -76,6 +77,9 @@ def run(
         raise ConfigError(f"`crop`: expected an even number of pixels, 16 .. {LARGEST_CROP}; found {config.crop}.")
     body = find_body(config.body)
     frames = read_frames(images, body) if images else []
+    if images and not config.trust_table:
+        for sentence in check_table(images, frames, body):
+            say(f"warning: {sentence}")
     check_output(output.file, [dem, *([images] if images else []), *_files(frames)], output.overwrite)
     alone = config.shard[1] == 1
     with _open_terrain(dem, images, config, body, progress) as terrain:
@@ -169,7 +173,7 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, pr
                 raise ConfigError(f"{dem}: its body has a radius of {grid.radius:g} m; give the same `body`.")
             if config.gsd is not None and abs(config.gsd - grid.gsd) > 1e-3 * grid.gsd:
                 raise ConfigError(f"{dem}: a grid at {grid.gsd:g} m; leave `gsd` away, or give the DEM itself.")
-            own = ("crop", "skip_outside", "shard", "block")
+            own = ("crop", "skip_outside", "trust_table", "shard", "block")
             stored = read_config(file) | {k: v for k, v in asdict(config).items() if k in own}
             names = ("gsd_m", "body_radius_m", "elevation_source")
             yield Terrain(

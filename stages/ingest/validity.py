@@ -16,6 +16,7 @@ from stages.ingest.config import Config
 from stages.ingest.plan import ANY_RELIEF
 from stages.physics.images.source_images import open_source
 from stages.physics.images.table import Frame
+from stages.physics.images.table_checks import check_emission
 from stages.physics.maps.grid import Grid
 from stages.physics.maps.positions import blocks, valid_positions
 
@@ -85,6 +86,8 @@ def write_validity(
             pixel = grid.local_frames(r + h / 2, c + w / 2).pixel_size[0]
             area += float(eroded.sum()) * float(pixel[0] * pixel[1])
     _check_sun(frame, grid, (r0 + r1) / 2, (c0 + c1) / 2)
+    if not config.trust_table:
+        check_emission(frame, grid, (r0 + r1) / 2, (c0 + c1) / 2)
     return area
 
 

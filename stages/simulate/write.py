@@ -99,7 +99,10 @@ class ImageFile:
 
 
 def table_row(config: Config, shot: Pass, path: str, hidden: Hidden) -> dict[str, Any]:
-    """An image's row of images.csv: the truth, but for a planted error of the Sun's direction."""
+    """An image's row of images.csv: the truth, but for a planted error of the Sun's direction.
+
+    With such an error the row has no time, which would tell where the Sun was.
+    """
     lon, lat = shot.sun.longitude_deg, shot.sun.latitude_deg
     azimuth, elevation = hidden.get("sun_azimuth"), hidden.get("sun_elevation")
     if azimuth or elevation:
@@ -111,7 +114,7 @@ def table_row(config: Config, shot: Pass, path: str, hidden: Hidden) -> dict[str
         "image_id": shot.image_id,
         "path": path,
         "units": config.units,
-        "start_time": shot.start_time,
+        "start_time": "" if azimuth or elevation else shot.start_time,
         "subsolar_longitude_deg": f"{lon:.6f}",
         "subsolar_latitude_deg": f"{lat:.6f}",
         "solar_distance_au": f"{shot.sun.distance_au:.8f}",
