@@ -130,4 +130,6 @@ def _score_held_out_images(
     console.table("by image", *image_lines(result))
     if result["coverage_percent"] is not None:
         console.table("pixels within the intervals, percent", *coverage_lines(result["coverage_percent"]))
+    for warning in result["warnings"]:
+        console.say(f"note: {warning}.")
     console.say(f"written: {output.file}, {output.file.with_suffix('.json')}")

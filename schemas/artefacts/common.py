@@ -31,9 +31,9 @@ def text_column(dim: str, name: str, description: str, required: bool = True) ->
     return Variable(name, (dim,), STRING, "", description, required=required)
 
 
-def angle(dim: str, name: str, limit: float, description: str) -> Variable:
-    """A finite angle within +-``limit`` degrees for every entry of one dimension."""
-    return column(dim, name, "degree", description, minimum=-limit, maximum=limit, finite=True)
+def angle(dim: str, name: str, limit: float, description: str, **checks: Any) -> Variable:
+    """A finite angle within +-``limit`` degrees for every entry of one dimension. checks : as of :func:`column`"""
+    return column(dim, name, "degree", description, minimum=-limit, maximum=limit, finite=True, **checks)
 
 
 def crop_map(name: str, dtype: str, unit: str, description: str, **checks: Any) -> Variable:
@@ -96,6 +96,14 @@ PAIR_PLACE = (
     column("pair", "tile", "1", "ground tile of the geographic split", "i4"),
     column("pair", "split", "1", "which part of the geographic split", "u1", flags=SPLITS),
 )
+
+LEARNED = "distinct crops of training and validation"  # dimension `place`
+LEARNED_GROUND = (
+    angle("place", "ground_longitude_deg", 720.0, "east longitude of the crop's centre", required=False),
+    angle("place", "ground_latitude_deg", 90.0, "planetocentric latitude of the crop's centre", required=False),
+    column("place", "ground_split", "1", "whether for training or validation", "u1", flags=SPLITS[:2], required=False),
+)
+LEARNED_EDGE = Attribute("ground_edge_m", "edge of these crops, m", False, "number", SMALLEST_GSD, 1e9)
 
 IMAGE_NOISE = Attribute(
     "image_noise",

@@ -2,7 +2,18 @@
 
 from __future__ import annotations
 
-from schemas.artefacts.common import GRID, IMAGE_NOISE, PLACE, VALIDITY, column, grid_map, text_column
+from schemas.artefacts.common import (
+    GRID,
+    IMAGE_NOISE,
+    LEARNED,
+    LEARNED_EDGE,
+    LEARNED_GROUND,
+    PLACE,
+    VALIDITY,
+    column,
+    grid_map,
+    text_column,
+)
 from schemas.declaration import Attribute, Schema, Variable, declare
 
 
@@ -58,6 +69,7 @@ SVBRDF = declare(
             "band": "structure sizes, fine to coarse",
             "incidence_bin": "bins of the cosine of incidence",
             "level": "68 and 95 % intervals",
+            "place": LEARNED,
         },
         variables=GRID
         + (
@@ -82,12 +94,14 @@ SVBRDF = declare(
             grid_map("elevation", "f4", "m", "height above the reference sphere"),
             grid_map("valid", "u1", "1", "1 = the map holds coefficients here", flags=VALIDITY, compress=True),
         )
-        + _ALBEDO,
+        + _ALBEDO
+        + LEARNED_GROUND,
         attributes=PLACE
         + (
             Attribute("model", "reflectance model"),
             Attribute("quantity", "what the model gives: I/F"),
             IMAGE_NOISE,
+            LEARNED_EDGE,
             Attribute("image_units", "units of the images that the map was trained on: 'iof' or 'dn'", required=False),
         ),
     )

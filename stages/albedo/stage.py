@@ -112,8 +112,9 @@ def _run(
         found = Calibration.read(calibration) if calibration else _calibrate(svbrdf, scene, ground, config, progress)
         ground.references.take_off(found.fields)
         sizes = {d: ground.map[d].shape[0] for d in ("coefficient", "y", "x")}
-        if "map_name" in ground.map:
-            sizes["map"] = len(ground.map["map_name"])
+        for dim in ("map", "place"):
+            if dim in ground.map:
+                sizes[dim] = len(ground.map[dim])
         sizes |= {
             "frame": len(ground.references.frames),
             "band": LEVELS + 1,

@@ -48,6 +48,7 @@ from stages.diagnose.search.walls import hide_dark
 from stages.diagnose.settings import MIMICKED, MISFIT, STILL
 from stages.diagnose.structure.kinds import PILED, structure
 from stages.effects import effect_names, get_effect
+from stages.pairs.ground import leave_out_learned
 from stages.pairs.reader import PairReader
 
 CROP = 128  # px: so large are the pairs that are counted, and of larger ones fewer are taken, for the memory that they need
@@ -102,6 +103,10 @@ def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, p
         )
     nominal = load_nominal(checkpoint, config.model, reader.units, config.free)
     train, test = split(reader)
+    if checkpoint is not None:
+        test, notes = leave_out_learned(reader, test, checkpoint, "test")
+        for note in notes:
+            say(f"note: {note}")
     sites = _load(reader, train, config)
     hidden = _load(reader, test, dataclasses.replace(config, most_sites=64))
     answer = Answer("cannot_tell", config={**dataclasses.asdict(config), "checkpoint": str(checkpoint or "")})

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from schemas import DIAGNOSIS, ArtefactError, RegistryError, open_artefact, read_strings
-from schemas.provenance import read_record
 from stages.effects.base import Effect, Survey, get_effect
+from stages.pairs.ground import boxes_overlap, splits_of
 
 
 def load_extension(path: Path, image_ids: Sequence[str] | None = None) -> list[Effect]:
@@ -75,7 +75,7 @@ def check_ground(diagnosis: Path, pairs: Path) -> list[str]:
 
     Raises ArtefactError where both descend from samples of the same ground that were split in different ways.
     """
-    learned, tested = _splits(diagnosis), _splits(pairs)
+    learned, tested = splits_of(diagnosis), splits_of(pairs)
     if not learned or not tested:
         missing = diagnosis if not learned else pairs
         return [
@@ -84,24 +84,11 @@ def check_ground(diagnosis: Path, pairs: Path) -> list[str]:
         ]
     for mine in tested:
         for other in learned:
-            if mine["split_id"] != other["split_id"] and _overlap(mine["split_ground_deg"], other["split_ground_deg"]):
+            boxes = mine["split_ground_deg"], other["split_ground_deg"]
+            if mine["split_id"] != other["split_id"] and boxes_overlap(*boxes):
                 raise ArtefactError(
                     f"{diagnosis}: expected a diagnosis that learned from ground split as in {pairs.name} ({mine['split_id']}), "
                     f"found split {other['split_id']}: it may have learned from the test ground; sample both with the same "
                     "`tile_m`, `split` and `seed`."
                 )
     return []
-
-
-def _splits(path: Path) -> list[dict[str, Any]]:
-    """What the samples that an artefact descends from say of their splits."""
-    own, ancestors = read_record(Path(path))
-    records = [*([own] if own else []), *ancestors.values()]
-    return [r["config"] for r in records if r["schema"] == "crops" and "split_id" in r["config"]]
-
-
-def _overlap(first: Sequence[float], second: Sequence[float]) -> bool:
-    """Whether two boxes (west, east, south, north; degrees) share ground."""
-    (w1, e1, s1, n1), (w2, e2, s2, n2) = first, second
-    turned = round((w1 - w2) / 360) * 360
-    return w1 < e2 + turned and w2 + turned < e1 and s1 < n2 and s2 < n1

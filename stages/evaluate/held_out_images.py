@@ -40,6 +40,7 @@ from stages.evaluate.checks import report_files
 from stages.evaluate.coverage import BANDS_DEG, count_within, shares
 from stages.evaluate.metrics import ssim
 from stages.evaluate.table import finite, gain_entry
+from stages.pairs.ground import leave_out_learned
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form, illuminate
 from stages.physics.formation.radiometry import crop_range, match_crops
@@ -106,7 +107,7 @@ def run(
     _check_once(maps)
     with PairReader(pairs) as reader, contextlib.ExitStack() as stack:
         opened = [_open(path, reader, stack) for path in maps]
-        chosen = _choose(reader, opened, config.split)
+        chosen, notes = _choose(reader, opened, config.split)
         sizes = {"model": len(ROWS), "pair": len(chosen), "y": reader.size[0], "x": reader.size[1]}
         settings = asdict(config) | {"held_out_images": True}
         with ArtefactWriter(
@@ -120,7 +121,7 @@ def run(
         ) as writer:
             scores = _score(reader, opened, chosen, writer, progress)
             result = _conclude(reader, opened, chosen, scores, config)
-            result |= {"pairs_file": pairs.name, "maps": [path.name for path in maps]}
+            result |= {"pairs_file": pairs.name, "maps": [path.name for path in maps], "warnings": notes}
             writer.write("model_name", ROWS)
             numbers = [k for k, _ in chosen]
             writer.write("pair_index", numbers)
@@ -172,19 +173,22 @@ def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> Albedo
     return AlbedoMap(path, file, read_strings(file, "albedo_image_id"), suns, error)
 
 
-def _choose(reader: PairReader, maps: Sequence[AlbedoMap], split: str) -> list[tuple[int, int]]:
-    """(pair, map) of what may be scored. Raises ArtefactError where every image made the albedo."""
-    chosen = []
-    for k in reader.indices(split):
+def _choose(reader: PairReader, maps: Sequence[AlbedoMap], split: str) -> tuple[list[tuple[int, int]], list[str]]:
+    """(pair, map) of what may be scored, and notes on what is left out. Raises ArtefactError where nothing may be."""
+    chosen: list[tuple[int, int]] = []
+    wanted = reader.indices(split)
+    fresh = [leave_out_learned(reader, wanted, albedo_map.path, split) for albedo_map in maps]
+    unlearned = [set(pairs.tolist()) for pairs, _ in fresh]
+    for k in wanted.tolist():
         name = reader.image_ids[reader.frame[k]]
-        unseen = [number for number, albedo_map in enumerate(maps) if name not in albedo_map.used]
-        chosen += [(int(k), number) for number in unseen[:1]]
+        unseen = [number for number, m in enumerate(maps) if name not in m.used and k in unlearned[number]]
+        chosen += [(k, number) for number in unseen[:1]]
     if not chosen:
         raise ArtefactError(
             f"{maps[0].path}: expected pairs of split '{split}' whose image did not make the albedo, found none; "
             "run 'lunargr albedo' with `fold` or `leave_out`."
         )
-    return chosen
+    return chosen, list(dict.fromkeys(note for _, notes in fresh for note in notes))
 
 
 def _score(

@@ -18,6 +18,7 @@ from stages.evaluate.parts import Fan, Kept, first_runs, score_in_parts
 from stages.evaluate.rows import Row
 from stages.evaluate.scores import Scores
 from stages.evaluate.task import Task, make_task, score_here, summarise
+from stages.pairs.ground import leave_out_learned
 from stages.pairs.reader import PairReader
 
 RENDERINGS_LIMIT = 512 * 2**20  # bytes of rendered crops that are kept without being asked for
@@ -71,9 +72,13 @@ def _run(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Confi
     _check_outputs(files)
     check(config)
     with PairReader(pairs) as reader:
-        task = make_task(reader, checkpoints, select(reader, config.split), config)
+        wanted, notes = select(reader, config.split), []
+        for checkpoint in checkpoints:
+            wanted, more = leave_out_learned(reader, wanted, checkpoint, config.split)
+            notes += more
+        task = make_task(reader, checkpoints, wanted, config)
         check_runs(checkpoints, task)
-        rows, scores, scale, result = _write(task, files, limitations(checkpoints[0], task), score)
+        rows, scores, scale, result = _write(task, files, limitations(checkpoints[0], task) + notes, score)
         if output.figures is not None:
             from stages.evaluate.figures import write_figures
 

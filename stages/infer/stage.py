@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from schemas import SCENE, SVBRDF, ArtefactWriter, ConfigError, atomic_path, open_artefact, read_strings
+from schemas import CHECKPOINT, SCENE, SVBRDF, ArtefactWriter, ConfigError, atomic_path, open_artefact, read_strings
 from schemas.files.companions import companions_of
 from schemas.files.outputs import Output, check_outputs, map_targets
 from stages.common.memory import keep_freed_memory, return_freed_memory
@@ -30,6 +30,7 @@ from stages.infer.writing import MapWriter
 from stages.network.mapper import Mapper
 from stages.network.precision import check_precision, choose_inference_precision
 from stages.network.predictor import choose_device, load_predictor
+from stages.pairs.ground import Ground
 from stages.pairs.holes import fill_holes
 from stages.physics.maps.geotiff import MapTiff, band_names, map_tags
 from stages.physics.maps.grid import Grid, check_same_body, read_grid
@@ -66,6 +67,8 @@ def run(
     device = choose_device(config.device)
     keep_freed_memory()
     predictor = load_predictor(checkpoint, device)
+    with open_artefact(checkpoint, CHECKPOINT) as trained:
+        ground = Ground.read(trained)
     precision = config.precision
     with open_artefact(scene, SCENE) as file:
         grid = read_grid(file, scene)
@@ -79,6 +82,8 @@ def run(
         names = [p.name for p in predictor.model.parameters]
         maps = list(predictor.maps.maps) if predictor.maps.channels > len(predictor.maps.maps) else []
         sizes = {"coefficient": len(names), "map": len(maps), "y": grid.height, "x": grid.width}
+        if ground is not None:
+            sizes |= ground.sizes
         attributes = {
             "gsd_m": grid.gsd,
             "body_radius_m": grid.radius,
@@ -86,7 +91,9 @@ def run(
             "quantity": QUANTITY,
             "image_units": predictor.image_units,
             "precision": precision,
-        } | ({"image_noise": predictor.image_noise} if math.isfinite(predictor.image_noise) else {})
+        } | ({} if ground is None else ground.attributes)
+        if math.isfinite(predictor.image_noise):
+            attributes["image_noise"] = predictor.image_noise
         with contextlib.ExitStack() as stack:
             writer = stack.enter_context(
                 ArtefactWriter(
@@ -103,6 +110,8 @@ def run(
             writer.write("x", file["x"][...])
             writer.write("y", file["y"][...])
             writer.write("coefficient_name", names)
+            if ground is not None:
+                ground.write(writer)
             if maps:
                 writer.write("map_name", maps)
                 writer.dataset("coefficients_std")

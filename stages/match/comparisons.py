@@ -11,8 +11,11 @@ import torch
 
 from schemas import EVALUATION, SPLITS, ArtefactError, ConfigError, open_artefact, read_kind, read_strings
 from schemas.errors import InputError
+from stages.common.progress import Say
+from stages.match.config import Config
 from stages.match.pictures import read_picture
 from stages.network.predictor import choose_device, load_predictor
+from stages.pairs.ground import leave_out_learned
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form
 from stages.physics.formation.radiometry import match_crops
@@ -41,19 +44,19 @@ def is_artefact(path: Path) -> bool:
     return path.suffix.lower() in (".h5", ".hdf5", ".nc")
 
 
-def comparisons(files: list[Path], split: str, count: int, seed: int, device: str) -> tuple[int, Iterator[Comparison]]:
+def comparisons(files: list[Path], config: Config, note: Say) -> tuple[int, Iterator[Comparison]]:
     """How many comparisons the files hold, and the comparisons; which kind they are follows from the files. Raises LunargrError.
 
-    split, count, seed : which crops of a pairs file or an evaluation; device : of the network
+    note : is told which pairs are left out
     """
     first, *others = files
     if not is_artefact(first):
         return 1, iter([from_images(first, others)])
     if others and is_artefact(others[0]):
-        return from_pairs(first, others[0], split, count, seed, device)
+        return from_pairs(first, others[0], config, note)
     if others:
         raise ConfigError(f"{others[0]}: expected a checkpoint after {first.name}, found an image file.")
-    return from_evaluation(first, count, seed)
+    return from_evaluation(first, config.count, config.seed)
 
 
 def from_images(measured: Path, rendered: list[Path]) -> Comparison:
@@ -120,21 +123,23 @@ def from_evaluation(path: Path, count: int, seed: int) -> tuple[int, Iterator[Co
     return len(chosen), read()
 
 
-def from_pairs(
-    pairs: Path, checkpoint: Path, split: str, count: int, seed: int, device: str
-) -> tuple[int, Iterator[Comparison]]:
+def from_pairs(pairs: Path, checkpoint: Path, config: Config, note: Say) -> tuple[int, Iterator[Comparison]]:
     """Crops of a split, rendered with the learned reflectance and with Hapke matched as in the paper."""
+    split = config.split
     if split not in dict(SPLITS):
         raise ConfigError(f"`split`: expected one of {', '.join(dict(SPLITS))}, found '{split}'.")
-    predictor = load_predictor(checkpoint, choose_device(device))
+    predictor = load_predictor(checkpoint, choose_device(config.device))
     on_device = next(predictor.parameters()).device
     with PairReader(pairs) as reader:
         indices = reader.indices(split)
         if not len(indices):
             raise ArtefactError(f"{pairs}:/split: expected '{split}' pairs to match, found none; sample more crops.")
+        indices, notes = leave_out_learned(reader, indices, checkpoint, split)
+        for sentence in notes:
+            note(sentence)
         known = np.array([float(reader.valid([k]).float().mean()) for k in indices])
         units, tile = reader.units, reader.tile
-    chosen = indices[choose(known, tile[indices], count, seed)]
+    chosen = indices[choose(known, tile[indices], config.count, config.seed)]
     hapke = get_model("hapke")
     defaults = torch.tensor([[p.default for p in hapke.parameters]])[:, :, None, None]
 

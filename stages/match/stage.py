@@ -40,7 +40,10 @@ def run(
     check_outputs(targets, [*files, *networks], output.overwrite)
     models = Models(config.features_model, config.lightglue_model)
     matchers = [get_matcher(name, models) for name in config.matchers]
-    total, source = comparisons(files, config.split, config.count, config.seed, config.device)
+    notes: list[str] = []
+    total, source = comparisons(files, config, notes.append)
+    for note in notes:
+        say(f"note: {note}.")
     collected: dict[str, dict[str, list[Matches]]] = {m.name: {} for m in matchers}
     ground: list[int] = []
     progress(0, total, "match")
@@ -67,6 +70,7 @@ def run(
         "crops": total,
         "tiles": len(set(ground)),
         "files": [f.name for f in files],
+        "warnings": notes,
         "matchers": {
             m.name: {name: summarise(found, ground) for name, found in collected[m.name].items()} for m in matchers
         },

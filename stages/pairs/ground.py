@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from schemas import SPLITS, ArtefactError, ArtefactWriter
+from schemas import SPLITS, ArtefactError, ArtefactWriter, open_artefact, read_kind
 from schemas.provenance import read_record
 from stages.common.arrays import Floats
 from stages.pairs.reader import PairReader
@@ -77,12 +77,12 @@ def leave_out_learned(
     Raises ArtefactError where no pair is left.
     """
     rank = dict(SPLITS)[split]
+    with open_artefact(learner, read_kind(learner)) as file:
+        ground, radius = Ground.read(file), float(file.attrs["body_radius_m"])
     mine, theirs = splits_of(reader.path), splits_of(learner)
     ids = {s["split_id"] for s in mine}, {s["split_id"] for s in theirs}
     if ids[0] == ids[1] and len(ids[0]) == 1 and (reader.split[wanted] == rank).all():
         return wanted, []  # one split of one scene: its parts share no ground
-    with h5py.File(learner, "r") as file:
-        ground, radius = Ground.read(file), float(file.attrs["body_radius_m"])
     if ground is None:
         known = mine and theirs
         boxes = [(m["split_ground_deg"], t["split_ground_deg"]) for m in mine for t in theirs]

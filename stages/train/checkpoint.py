@@ -12,6 +12,7 @@ import numpy as np
 from schemas import CHECKPOINT, ArtefactWriter
 from schemas.files.outputs import Output
 from stages.network.predictor import write_state
+from stages.pairs.ground import Ground
 from stages.train.config import Config
 from stages.train.resume import History
 from stages.train.training import Training
@@ -41,7 +42,8 @@ def write_checkpoint(output: Output, config: Config, training: Training, history
     }
     if math.isfinite(predictor.image_noise):
         attributes["image_noise"] = predictor.image_noise
-    sizes = {"epoch": len(history.train_loss), "frame": len(reader.image_ids)}
+    ground = Ground.of(reader)
+    sizes = {"epoch": len(history.train_loss), "frame": len(reader.image_ids)} | ground.sizes
     with ArtefactWriter(
         output.file,
         CHECKPOINT,
@@ -49,7 +51,7 @@ def write_checkpoint(output: Output, config: Config, training: Training, history
         config=asdict(config),
         inputs=[reader.path],
         seed=config.seed,
-        attributes=attributes,
+        attributes=attributes | ground.attributes,
         overwrite=output.overwrite,
     ) as writer:
         for key in ("train_loss", "validation_loss", "epoch_seconds"):
@@ -58,4 +60,5 @@ def write_checkpoint(output: Output, config: Config, training: Training, history
         # NaN for an image without training pairs, whose gain is not known.
         for key in ("gain", "offset"):
             writer.write(key, np.where(known, getattr(radiometry, key)().detach().cpu().numpy(), np.nan))
+        ground.write(writer)
         write_state(writer.file.create_group("weights", track_order=True), predictor.state_dict())
