@@ -17,7 +17,6 @@ from schemas.errors import GeometryError
 from stages.physics.horizon.hulls import sweep_horizon
 from stages.physics.horizon.occluder import occluder_distance
 from stages.physics.horizon.scene import Overview, horizon_in_scene, make_overview
-from stages.physics.horizon.shadow import sweep_shadow
 from stages.physics.horizon.sweeps import PixelSize
 
 __all__ = ["Overview", "cast_shadow", "horizon", "horizon_in_scene", "make_overview", "occluder_distance"]
@@ -58,7 +57,7 @@ def horizon(
 def cast_shadow(
     elevation: ArrayLike, gsd: PixelSize, azimuth: float, sun_elevation: float, body_radius: float | None = None
 ) -> NDArray[np.bool_]:
-    """Where terrain hides the Sun's centre.
+    """Where terrain hides the Sun's centre: its horizon stands above the Sun.
 
     elevation : (H, W), m; NaN = nothing there; rows run south
     gsd : m per pixel, one number or two as in :func:`horizon`
@@ -69,4 +68,10 @@ def cast_shadow(
     """
     grid = np.ascontiguousarray(elevation, dtype=np.float32)
     _check(grid.shape, gsd, body_radius, azimuth, sun_elevation)
-    return sweep_shadow(grid, gsd, azimuth, sun_elevation, body_radius)
+    sun = np.float32(sun_elevation)
+    if body_radius is not None:
+        south, east = gsd if isinstance(gsd, tuple) else (gsd, gsd)
+        rows, columns = (np.arange(size, dtype=np.float32) - (size - 1) / 2 for size in grid.shape)
+        towards = columns * east * math.sin(azimuth) - rows[:, None] * south * math.cos(azimuth)
+        sun = np.arctan(math.tan(sun_elevation) + towards / body_radius).astype(np.float32)
+    return sweep_horizon(grid, gsd, azimuth, body_radius) > sun

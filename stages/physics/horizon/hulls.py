@@ -2,7 +2,7 @@
 
 A point under the chord of two others can never be the horizon of anything behind it, so that a stack of hull points
 per line, which every row pushes to, holds all that matters, and the horizon is the point where the sight line touches.
-As for the cast shadow, terrain within ``NEAR`` rows is sampled along the pixel's own ray. Beyond, the slopes from the
+Terrain within ``NEAR`` rows is sampled along the pixel's own ray. Beyond, the slopes from the
 pixel's own height to the highest points that the two neighbouring lines see are interpolated.
 """
 
@@ -122,8 +122,9 @@ def _horizon_rows(
     z, z_row, z_step, z_column, out, out_row, out_step, out_column, start, stop, first, count, sweep, taps, sinks,
     hull, depth, samples, visible, chosen, observers, seen_s, seen_h, angle,
 ):  # fmt: skip
-    """Sweep rows start..stop of one strip of lines; arguments as for the cast shadow's ``_shadow_rows``.
+    """Sweep rows start..stop of one strip of ``count`` lines from line ``first`` on.
 
+    z[z_row + z_step * i, j - z_column] is pixel (i, j), and so for out. sinks : curvature, see ``sweeps.sink``
     hull : (rows, lines, 2) row and height of hull points, farthest first; depth : (lines,) points in use
     samples : (RING + 2, lines), the lines' heights over the last rows; the rest is scratch
     """
