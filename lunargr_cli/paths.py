@@ -62,8 +62,9 @@ def guarded(
         return
     for path in (*files.read, *(path for _, path, _ in files.written)):
         _check_name(path)
-    replace = bool(options.get("overwrite") or options.get("resume"))  # what is resumed, stages say
-    with protect(files.read):
+    overwrite = bool(options.get("overwrite"))
+    replace = overwrite or bool(options.get("resume"))  # what is resumed, stages say
+    with protect(files.read, overwrite):
         check_apart([Target(path, name) for name, path, _ in files.written])
         with lock:  # whoever gets it tidies up after a killed run
             check_outputs(

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from schemas import ConfigError, atomic_path
+from schemas import ConfigError, atomic_path, write_json
 from schemas.files.companions import companions_of
 from schemas.files.locks import claim, lock_path, partial_path, record_path, scratch_path, unlocked
+from schemas.files.outputs import Target, check_outputs, protect
 
 NO_FLOCK = """
 import errno, fcntl, warnings
@@ -221,3 +222,19 @@ def test_files_that_belong_to_nothing_stay(tmp_path):
             partial.write_text("an epoch")
         raise KeyboardInterrupt
     assert [p.name for p in tmp_path.iterdir()] == ["epoch.h5"]
+
+
+def test_a_run_that_was_not_told_to_replaces_no_file_at_all(tmp_path):
+    """Also where the stage forgot to name the file among its outputs."""
+    forgotten, told, new = (tmp_path / name for name in ("forgotten.txt", "told.txt", "new.txt"))
+    for path in (forgotten, told):
+        path.write_text("there before")
+    with protect([], overwrite=False):
+        check_outputs([Target(told)], overwrite=True)
+        for path in (told, new, new):  # what the run itself wrote it may write again
+            write_json(path, 1)
+        with pytest.raises(ConfigError, match="exists already"):
+            write_json(forgotten, 1)
+    assert forgotten.read_text() == "there before"
+    with protect([], overwrite=True):
+        write_json(forgotten, 1)

@@ -15,7 +15,7 @@ from PIL import Image, ImageSequence
 from render_scene import LAT, LON, SUN, lunargr_render
 
 from stages.physics.maps.grid import read_grid, unit_vectors
-from stages.render.dataset import to_quaternion
+from stages.render.dataset import export_files, to_quaternion
 from stages.render.pictures import read_exr
 
 TRAJECTORY = f"""view_id,longitude_deg,latitude_deg,altitude_m,look_longitude_deg,look_latitude_deg
@@ -32,6 +32,23 @@ def render_views(path, tmp_path, monkeypatch, capsys, kind):
     code, error = lunargr_render(monkeypatch, capsys, path, *arguments, "-o", tmp_path / "views", "--quiet")
     assert code == 0, error
     return tmp_path / "views" / kind
+
+
+@pytest.mark.parametrize("kind", ["colmap", "nerfstudio"])
+def test_an_export_replaces_no_file_unless_told_to(hilly_map, tmp_path, monkeypatch, capsys, kind):
+    target = render_views(hilly_map[0], tmp_path, monkeypatch, capsys, kind)
+    files = export_files(["one", "two", "three"], target.parent, kind)
+    assert sorted(files) == sorted(p for p in target.rglob("*") if p.is_file())
+    arguments = ("--trajectory", tmp_path / "t.csv", *SUN, "--size", "60,40", "--fov", "8", "--export", kind)
+    common = [monkeypatch, capsys, hilly_map[0], *arguments, "-o", target.parent, "--quiet", "--resume"]
+    for path in files[1:]:
+        path.unlink()
+    files[0].write_text("somebody's own")
+    code, error = lunargr_render(*common)
+    assert code == 3 and "world.json: exists already; add --overwrite" in error
+    assert [p for p in target.rglob("*") if p.is_file()] == files[:1] and files[0].read_text() == "somebody's own"
+    assert lunargr_render(*common, "--overwrite")[0] == 0
+    assert json.loads(files[0].read_text())["unit"] == "m"
 
 
 def to_world(target, lon, lat, height):

@@ -82,3 +82,15 @@ def test_bad_stereo_options_are_one_line(wide_map, tmp_path, monkeypatch, capsys
     ):
         code, error = lunargr_render(monkeypatch, capsys, wide_map, *arguments, "-o", tmp_path / "s")
         assert code == 3 and message in error and error.count("\n") == 1, error
+
+
+def test_stereo_pairs_replace_no_file_unless_told_to(wide_map, tmp_path, monkeypatch, capsys):
+    own = tmp_path / "s" / "pair_00001_matches.exr"
+    own.parent.mkdir()
+    own.write_text("somebody's own")
+    arguments = ("--stereo", "3", "--size", "16,16", "--fov", "10", "-o", tmp_path / "s", "-q")
+    code, error = lunargr_render(monkeypatch, capsys, wide_map, *arguments)
+    assert code == 3 and "pair_00001_matches.exr: exists already" in error
+    assert list(own.parent.iterdir()) == [own] and own.read_text() == "somebody's own"
+    assert lunargr_render(monkeypatch, capsys, wide_map, *arguments, "--overwrite")[0] == 0
+    assert len(list(own.parent.iterdir())) == 3 * 5 + 1

@@ -12,7 +12,7 @@ import stat
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from schemas.files.inputs import Inputs
 from schemas.files.locks import claim, partial_path, record_path
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_protected: ContextVar[Inputs | None] = ContextVar("protected", default=None)
+_guard: ContextVar[_Guard | None] = ContextVar("guard", default=None)
 
 
 @dataclass(frozen=True)
@@ -78,14 +78,34 @@ def map_targets(output: Output, as_geotiff: bool) -> list[Target]:
     return [Target(output.file), *([picture] if as_geotiff else [])]
 
 
+@dataclass
+class _Guard:
+    """What a command may replace. replaceable : the absolute paths of files that it may, or that it wrote itself"""
+
+    inputs: Inputs
+    overwrite: bool
+    replaceable: set[str] = field(default_factory=set)
+
+    def refuse(self, path: Path) -> None:
+        """Refuse to write ``path`` in the place of an input, or of a file that may not be replaced. Raises ConfigError."""
+        refuse_inputs(Target(path), [self.inputs])
+        place = os.path.abspath(path)
+        if not self.overwrite and place not in self.replaceable and os.path.lexists(path):
+            raise _exists(Target(path))
+        self.replaceable.add(place)
+
+
 @contextlib.contextmanager
-def protect(inputs: Iterable[Path]) -> Iterator[None]:
-    """Within this block no file is written in the place of one of these, or of a file that one of them names."""
-    token = _protected.set(Inputs(inputs))
+def protect(inputs: Iterable[Path], overwrite: bool = True) -> Iterator[None]:
+    """Within this block no file is written in the place of one of these, or of a file that one of them names.
+
+    Without ``overwrite`` no file at all is replaced, but for those that :func:`check_outputs` was told may be.
+    """
+    token = _guard.set(_Guard(Inputs(inputs), overwrite))
     try:
         yield
     finally:
-        _protected.reset(token)
+        _guard.reset(token)
 
 
 def check_outputs(targets: Iterable[Target], inputs: Sequence[Path] = (), overwrite: bool = False) -> None:
@@ -97,11 +117,13 @@ def check_outputs(targets: Iterable[Target], inputs: Sequence[Path] = (), overwr
     check_apart(targets, inputs)
     for target in targets:
         _check_place(target, overwrite)
+    if overwrite and (guard := _guard.get()):
+        guard.replaceable.update(os.path.abspath(target.path) for target in targets)
 
 
 def check_apart(targets: Iterable[Target], inputs: Sequence[Path] = ()) -> None:
     """Refuse outputs in the place of an input or of each other; files or folders. Raises ConfigError."""
-    known = [Inputs(inputs), *([given] if (given := _protected.get()) else [])]
+    known = [Inputs(inputs), *([guard.inputs] if (guard := _guard.get()) else [])]
     for target in targets:
         refuse_inputs(target, known)
     earlier = Inputs()
@@ -146,8 +168,14 @@ def _check_place(target: Target, overwrite: bool) -> None:
     if mode and not stat.S_ISREG(mode):
         raise ConfigError(f"{path}: expected a file name, found a device, pipe or socket; {another}.")
     if mode and not overwrite:
-        raise ConfigError(f"{path}: exists already; add `overwrite` to replace it or {another}.")
+        raise _exists(target)
     _check_writable(path.parent, target)
+
+
+def _exists(target: Target) -> ConfigError:
+    return ConfigError(
+        f"{target.path}: exists already; add `overwrite` to replace it or choose another `{target.setting}`."
+    )
 
 
 def _check_writable(folder: Path, target: Target) -> None:
@@ -195,8 +223,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     """
     path = Path(path)
     partial = partial_path(path)
-    _refuse_protected(path)
     with claim(path):
+        _refuse(path)
         try:
             yield partial
             if (output := current_output()) is not None and output != path:
@@ -219,9 +247,9 @@ def write_json(path: Path, content: Any) -> None:
         partial.write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
 
 
-def _refuse_protected(path: Path) -> None:
-    if (known := _protected.get()) is not None:
-        refuse_inputs(Target(path), [known])
+def _refuse(path: Path) -> None:
+    if (guard := _guard.get()) is not None:
+        guard.refuse(path)
 
 
 @contextlib.contextmanager
@@ -237,7 +265,7 @@ def atomic_folder(folder: Path, last: str) -> Iterator[Path]:
             yield staging
             made = [p.relative_to(staging) for p in sorted(staging.rglob("*")) if p.is_file()]
             for name in sorted(made, key=lambda p: p == Path(last)):
-                _refuse_protected(folder / name)
+                _refuse(folder / name)
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(staging / name, folder / name)
         except LunargrError as error:  # names the folder that the user knows

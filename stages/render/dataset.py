@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from schemas.errors import InputError
+from schemas.files.companions import companions_of
+from schemas.files.locks import claim
 from schemas.files.outputs import atomic_path
 from stages.common.arrays import Floats, Floats32, Mask
 from stages.physics.cameras.pinhole import Pinhole
@@ -57,7 +59,17 @@ def make_world(grid: Grid) -> World:
     return World(axes[2] * grid.radius, axes)
 
 
-def export_views(views: Sequence[View], grid: Grid, folder: Path, kind: str) -> list[Path]:
+def export_files(view_ids: Sequence[str], folder: Path, kind: str) -> list[Path]:
+    """The files of the data set ``kind``; the first is written last, and the others belong to it."""
+    images = [f"images/{name}.png" for name in view_ids]
+    if kind == "colmap":
+        rest = [f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")]
+    else:
+        rest = [*(f"depths/{name}.npy" for name in view_ids), "transforms.json"]
+    return [folder / kind / name for name in ("world.json", *images, *rest)]
+
+
+def export_views(views: Sequence[View], grid: Grid, folder: Path, kind: str) -> None:
     """Write the data set of ``views`` into ``folder``/colmap or ``folder``/nerfstudio. Raises InputError."""
     missing = [view.exr.name for view in views if not view.exr.exists()]
     if missing:
@@ -65,13 +77,15 @@ def export_views(views: Sequence[View], grid: Grid, folder: Path, kind: str) -> 
             f"{folder}: expected every view's EXR, found {missing[0]} missing (of {len(missing)}); render all views first, without `png_only`."
         )
     target, world = folder / kind, make_world(grid)
-    (target / "images").mkdir(parents=True, exist_ok=True)
-    written = [_write_world(target / "world.json", world, grid)]
-    limit = _white(views)
-    for view in views:
-        written.append(_write_image(target / "images" / f"{view.view_id}.png", read_exr(view.exr)["image"], limit))
-    write = _write_colmap if kind == "colmap" else _write_nerfstudio
-    return [*written, *write(views, world, target)]
+    told = target / "world.json"
+    with claim(told), companions_of(told):
+        (target / "images").mkdir(exist_ok=True)
+        limit = _white(views)
+        for view in views:
+            _write_image(target / "images" / f"{view.view_id}.png", read_exr(view.exr)["image"], limit)
+        write = _write_colmap if kind == "colmap" else _write_nerfstudio
+        write(views, world, target)
+        _write_world(told, world, grid)
 
 
 def z_depth(camera: Pinhole, distance: NDArray) -> Floats:
@@ -102,23 +116,21 @@ def _white(views: Sequence[View]) -> float:
     return max(float(np.percentile(values, 99.5)), 1e-6) if values.size else 1.0
 
 
-def write_text(path: Path, text: str) -> Path:
+def write_text(path: Path, text: str) -> None:
     """A whole text file, or none."""
     with atomic_path(path) as partial:
         partial.write_text(text)
-    return path
 
 
-def _write_image(path: Path, image: Floats32, white: float) -> Path:
+def _write_image(path: Path, image: Floats32, white: float) -> None:
     """An 8-bit picture with display gamma. image : (H, W) I/F; white : the I/F that is shown white"""
     grey, _ = stretch(image, (0.0, white))
     data = cv2.imencode(".png", cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB))[1].tobytes()
     with atomic_path(path) as partial:
         partial.write_bytes(data)
-    return path
 
 
-def _write_world(path: Path, world: World, grid: Grid) -> Path:
+def _write_world(path: Path, world: World, grid: Grid) -> None:
     row, col = (grid.height - 1) / 2, (grid.width - 1) / 2
     lon, lat = (float(v) for v in grid.lonlat(row, col))
     document = {
@@ -128,14 +140,13 @@ def _write_world(path: Path, world: World, grid: Grid) -> Path:
         "body_radius": grid.radius,
         "unit": "m",
     }
-    return write_text(path, json.dumps(document, indent=1))
+    write_text(path, json.dumps(document, indent=1))
 
 
-def _write_nerfstudio(views: Sequence[View], world: World, target: Path) -> list[Path]:
+def _write_nerfstudio(views: Sequence[View], world: World, target: Path) -> None:
     """transforms.json with depth maps as float32 arrays in mm, which nerfstudio's default scale makes metres."""
     (target / "depths").mkdir(exist_ok=True)
     frames: list[dict[str, Any]] = []
-    written = []
     for view in views:
         rotation, place = world.pose(view.camera)
         matrix = np.eye(4)
@@ -144,7 +155,6 @@ def _write_nerfstudio(views: Sequence[View], world: World, target: Path) -> list
         path = target / "depths" / f"{view.view_id}.npy"
         with atomic_path(path) as partial, partial.open("wb") as file:
             np.save(file, depth, allow_pickle=False)
-        written.append(path)
         frames.append(
             {
                 "file_path": f"images/{view.view_id}.png",
@@ -154,7 +164,7 @@ def _write_nerfstudio(views: Sequence[View], world: World, target: Path) -> list
             }
         )
     document = {"camera_model": "OPENCV", "orientation_override": "none", "frames": frames}
-    return [*written, write_text(target / "transforms.json", json.dumps(document, indent=1))]
+    write_text(target / "transforms.json", json.dumps(document, indent=1))
 
 
 def _intrinsics(camera: Pinhole) -> dict[str, float]:
@@ -168,7 +178,7 @@ def _intrinsics(camera: Pinhole) -> dict[str, float]:
     }
 
 
-def _write_colmap(views: Sequence[View], world: World, target: Path) -> list[Path]:
+def _write_colmap(views: Sequence[View], world: World, target: Path) -> None:
     """sparse/0 with cameras.txt, images.txt and points3D.txt: true ground points with all views that see them."""
     folder = target / "sparse" / "0"
     folder.mkdir(parents=True, exist_ok=True)
@@ -190,8 +200,8 @@ def _write_colmap(views: Sequence[View], world: World, target: Path) -> list[Pat
         pose = (*to_quaternion(rotation.T), *(-rotation.T @ place))
         images.append(f"{k + 1} {' '.join(f'{v:.12g}' for v in pose)} {k + 1} {view.view_id}.png")
         images.append(" ".join(f"{x:.4f} {y:.4f} {point}" for x, y, point in seen[k]))
-    tables = (("cameras", cameras), ("images", images), ("points3D", lines))
-    return [write_text(folder / f"{name}.txt", "\n".join(table) + "\n") for name, table in tables]
+    for name, table in (("cameras", cameras), ("images", images), ("points3D", lines)):
+        write_text(folder / f"{name}.txt", "\n".join(table) + "\n")
 
 
 def _tracks(views: Sequence[View], world: World) -> Iterator[tuple[Floats, list[tuple[int, float, float]]]]:

@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 
 from schemas.errors import ConfigError, GeometryError
-from schemas.files.outputs import Output, check_output
+from schemas.files.companions import companions_of
+from schemas.files.locks import claim
+from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.arrays import Floats, Floats32
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.physics.bodies.spheres import Body, find_body
@@ -51,30 +53,41 @@ def run_stereo(
     folder = output.file
     _check(config, stereo)
     manifest = folder / "manifest.json"
-    check_output(manifest, [source], output.overwrite)
+    names = [f"pair_{number:05d}" for number in range(stereo.count)]
+    files = [path for name in names for path in pair_files(folder, name)]
+    if any(path.exists() for path in files):
+        with claim(manifest):  # tidies up where a killed run left some of them
+            pass
+    check_outputs([Target(path) for path in (manifest, *files)], [source], output.overwrite)
     body = find_body("moon" if config.body is None else config.body)
     view_config = replace(config, view="pinhole", position=(0.0, 0.0, 0.0))
     check(view_config)
     rng = np.random.default_rng(stereo.seed)
     pairs: list[dict[str, Any]] = []
-    with open_source(source, config, body) as surface:
+    with claim(manifest), companions_of(manifest), open_source(source, config, body) as surface:
         relief, world = surface.height_range(), make_world(surface.grid)
         places = _Places(surface, config, stereo, rng)
-        for number in range(stereo.count):
+        for number, name in enumerate(names):
             progress(number, stereo.count, "pairs")
-            pairs.append(_render_pair(f"pair_{number:05d}", surface, places, view_config, body, relief, world, folder))
-    document = {
-        "source": source.name,
-        "pixel_centre": 0.5,
-        "unit": "m",
-        "gsd": places.footprint / config.size_px[0],
-        "tile": places.tile,
-        "seed": stereo.seed,
-        "pairs": pairs,
-    }
-    write_text(manifest, json.dumps(document, indent=1))
+            pairs.append(_render_pair(name, surface, places, view_config, body, relief, world, folder))
+        document = {
+            "source": source.name,
+            "pixel_centre": 0.5,
+            "unit": "m",
+            "gsd": places.footprint / config.size_px[0],
+            "tile": places.tile,
+            "seed": stereo.seed,
+            "pairs": pairs,
+        }
+        write_text(manifest, json.dumps(document, indent=1))
     progress(stereo.count, stereo.count, "pairs")
     return manifest
+
+
+def pair_files(folder: Path, name: str) -> list[Path]:
+    """EXR and PNG of the left view, of the right one, and the correspondences."""
+    views = [path for side in ("left", "right") for path in output_files(folder / f"{name}_{side}.exr", "pinhole")]
+    return [*views, folder / f"{name}_matches.exr"]
 
 
 def _check(config: Config, stereo: StereoConfig) -> None:
@@ -162,7 +175,7 @@ def _render_pair(
         cameras.append(camera)
     depths = exrs[0]["depth"], exrs[1]["depth"]
     matches = correspondences(cameras[0], cameras[1], depths, world)
-    path = folder / f"{name}_matches.exr"
+    path = pair_files(folder, name)[-1]
     with write_exr(path, depths[0].shape[0], depths[0].shape[1], list(matches)) as writer:
         writer.write(matches)
     ground = np.isfinite(depths[0])

@@ -11,6 +11,8 @@ from typing import cast
 import numpy as np
 
 from schemas.errors import ConfigError, GeometryError, LunargrError
+from schemas.files.companions import companions_of
+from schemas.files.locks import claim
 from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.arrays import Floats32
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
@@ -21,7 +23,7 @@ from stages.physics.maps.grid import Grid
 from stages.physics.terrain.shading import BACKPLANES, Light
 from stages.physics.terrain.surface import Surface
 from stages.render.config import SUN, Config, Summary, check, inputs, output_files
-from stages.render.dataset import View, export_views
+from stages.render.dataset import View, export_files, export_views
 from stages.render.perspective import apply_sensor, make_scene, render_view
 from stages.render.pictures import Preview, write_exr, write_png
 from stages.render.setup import camera_place, find_camera, make_light, metadata, open_source
@@ -58,8 +60,15 @@ def run_trajectory(
     suffix = ".png" if config.png_only else ".exr"
     outputs = {view.view_id: output_files(folder / f"{view.view_id}{suffix}", "pinhole") for view in views}
     done = {v.view_id for v in views if output.resume and all(p.exists() for p in outputs[v.view_id])}
-    targets = [Target(path) for view in views if view.view_id not in done for path in outputs[view.view_id]]
-    check_outputs(targets, [table, *inputs(source, config)], output.overwrite or output.resume)
+    new = [outputs[view.view_id] for view in views if view.view_id not in done]
+    if config.export:
+        new.append(export_files([view.view_id for view in views], folder, config.export))
+    targets = [Target(path) for files in new for path in files]
+    for files in new:
+        if any(path.exists() for path in files):
+            with claim(files[0]):  # tidies up where a killed run left some of them
+                pass
+    check_outputs(targets, [table, *inputs(source, config)], output.overwrite)
     results: list[Summary] = []
     with open_source(source, config, body) as surface:
         relief = surface.height_range()
@@ -76,11 +85,11 @@ def run_trajectory(
                     lights = {key: make_light(surface, view_config, body, relief)}
                 camera = find_camera(surface, view_config)
                 light = replace(lights[key], camera_position=camera_place(camera))
-                results.append(
-                    render_camera(
-                        surface, camera, light, relief, outputs[view.view_id], view_config, view.view_id, show_nothing
+                files = outputs[view.view_id]
+                with claim(files[0]), companions_of(files[0]):
+                    results.append(
+                        render_camera(surface, camera, light, relief, files, view_config, view.view_id, show_nothing)
                     )
-                )
             except LunargrError as error:
                 raise type(error)(f"{table.name}, {view.view_id}: {error}") from None
         if config.export is not None:

@@ -16,7 +16,8 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
-from schemas.files.outputs import Output, Target, check_apart, check_outputs
+from schemas.errors import ConfigError
+from schemas.files.outputs import Output, Target, check_outputs
 from schemas.provenance import sha256
 from stages.common.memory import keep_freed_memory
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
@@ -56,7 +57,12 @@ def run(
     sidecar = output.file.with_name(f"{output.file.stem}.resume.h5")
     inputs = [pairs, *([Path(config.extend)] if config.extend else [])]
     check_outputs([Target(output.file)], inputs, output.overwrite)
-    check_apart([Target(output.file), Target(sidecar, name=f"the state of the unfinished {output.file.name}")], inputs)
+    state = Target(sidecar, name=f"the state of the unfinished {output.file.name}")
+    check_outputs([state], [*inputs, output.file], overwrite=True)
+    if sidecar.exists() and not (output.resume or output.overwrite):
+        raise ConfigError(
+            f"{sidecar}: the state of an unfinished run; add `resume` to go on with it, or `overwrite` to start anew."
+        )
     rank, ranks = join_group()
     device = choose_device(config.device)
     if device.type == "cuda" and ranks > 1:
