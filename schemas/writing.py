@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -14,22 +13,22 @@ import h5py
 import numpy as np
 
 from schemas.declaration import STRING, Schema, Variable
-from schemas.errors import ArtefactError, ConfigError, InputError
-from schemas.files.hdf5 import UNKNOWN, release_errors, silence_hdf5
-from schemas.files.outputs import atomic_path, check_output, is_full_disk, terminate_as_exception
+from schemas.errors import ArtefactError
+from schemas.files.hdf5 import UNKNOWN, abandoned, whole_hdf5
+from schemas.files.outputs import check_output
 from schemas.provenance import describe_run
 from schemas.reading import open_artefact
 
 _STANDARD_NAMES = {"x": "projection_x_coordinate", "y": "projection_y_coordinate"}
 # The netCDF-4 format's marker for a dimension without a coordinate variable of its own.
 _BARE_DIMENSION = "This is a netCDF dimension but not a netCDF variable.%10d"
-_abandoned: list[h5py.File] = []
 
 
 class ArtefactWriter:
     """Writes one artefact under a temporary name, and checks it before it gets its own; use as a context manager.
 
-    Raises ArtefactError where what was written is not what its schema declares; then nothing is left. Dimensions are sized on entry; ``None`` is not allowed. Variables are created on first use, from their declaration.
+    Dimensions are sized on entry; ``None`` is not allowed. Variables are created on first use, from their declaration.
+    Raises ArtefactError where what was written is not what its schema declares; then nothing is left.
     """
 
     def __init__(
@@ -53,22 +52,10 @@ class ArtefactWriter:
         self.file: h5py.File
         # A dataset that is released writes what it still holds, and no one hears of a failure: all are kept to the end.
         self._kept: list[h5py.Dataset] = []
-        self._errors_before = len(release_errors)
-        self._failed = True  # until its block has ended well
 
     def __enter__(self) -> ArtefactWriter:
-        silence_hdf5()
-        self._stack.__enter__()
-        try:
-            partial = self._partial = self._stack.enter_context(atomic_path(self.path))
-            self._stack.enter_context(terminate_as_exception())
-            try:
-                self.file = h5py.File(partial, "w", track_order=True, libver=("earliest", "v110"))
-                self._stack.callback(self._close)
-            except OSError as error:
-                if is_full_disk(error):
-                    raise
-                raise ConfigError(f"{self.path}: cannot be written ({error}); choose another `output`.") from None
+        with contextlib.ExitStack() as stack:
+            self.file = stack.enter_context(whole_hdf5(self.path, self._check))
             for key, value in self._root_attributes.items():
                 self.file.attrs[key] = value
             for order, (name, size) in enumerate(self.sizes.items()):
@@ -80,32 +67,28 @@ class ArtefactWriter:
             for name in self.sizes:
                 if name in self.schema:
                     self._create(self.schema[name], scale=True)
-        except BaseException:
-            if self._stack.__exit__(*sys.exc_info()):
-                raise RuntimeError("an artefact's error was swallowed") from None
-            raise
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            missing = [v.name for v in self.schema.variables if v.required and v.name not in self.file]
-            missing += [a.name for a in self.schema.attributes if a.required and a.name not in self.file.attrs]
-            if missing:
-                error = RuntimeError(f"{self.schema.name}: written without {', '.join(missing)}")
-                self._stack.__exit__(type(error), error, None)
-                raise error
-            self._name_coordinates()
-            error = self._flush()
-        self._failed = error is not None
-        if is_full_disk(error):
-            # Give back the room that the partial file took: HDF5 can then flush and close without failing once more.
-            os.truncate(self._partial, 0)
-        self._stack.__exit__(None if error is None else type(error), error, trace)
+        try:
+            with self._stack:
+                if error is not None:
+                    raise error
+                self._finish()
+        except BaseException:
+            abandoned.extend(self._kept)  # after a full disk HDF5 would crash where it releases them
+            raise
         self._kept.clear()
-        if kind is None and error is not None:
-            raise error
+
+    def _finish(self) -> None:
+        missing = [v.name for v in self.schema.variables if v.required and v.name not in self.file]
+        missing += [a.name for a in self.schema.attributes if a.required and a.name not in self.file.attrs]
+        if missing:
+            raise RuntimeError(f"{self.schema.name}: written without {', '.join(missing)}")
+        self._name_coordinates()
 
     def _name_coordinates(self) -> None:
         """A dimension whose entries have names gets them as its coordinate: xarray's ``sel(coefficient="a")`` takes them."""
@@ -114,42 +97,12 @@ class ArtefactWriter:
                 self.file[dim][...] = self.file[f"{dim}_name"][...]
                 self.file[dim].attrs["long_name"] = self.schema[f"{dim}_name"].description
 
-    def _flush(self) -> BaseException | None:
-        """Write everything that HDF5 still holds; returns what went wrong, now or when a dataset was released."""
-        if len(release_errors) > self._errors_before:
-            return release_errors[self._errors_before]
-        try:
-            self.file.flush()
-        except (OSError, RuntimeError) as error:
-            return error if is_full_disk(error) else self._not_whole(error)
-        return None
-
-    def _not_whole(self, error: BaseException) -> InputError:
-        return InputError(
-            f"{self.path}: cannot be written whole ({error}); nothing half-written is left. "
-            "Look after the disk and run the command again."
-        )
-
-    def _close(self) -> None:
-        if len(release_errors) > self._errors_before:
-            # HDF5 would follow a pointer into what it failed to release, and take the process down.
-            _abandoned.append(self.file)
-            return
-        try:
-            self.file.close()
-        except (OSError, RuntimeError) as error:
-            _abandoned.append(self.file)
-            if not self._failed:  # else the first error is the one to report
-                raise self._not_whole(error) from None
-        if not self._failed:
-            self._check()
-
-    def _check(self) -> None:
+    def _check(self, partial: Path) -> None:
         """Refuse what the next stage would refuse, while it has no name yet. Raises ArtefactError."""
         try:
-            open_artefact(self._partial, self.schema).close()
+            open_artefact(partial, self.schema).close()
         except ArtefactError as error:
-            problem = str(error).replace(str(self._partial), str(self.path)).rpartition("; ")[0]
+            problem = str(error).replace(str(partial), str(self.path)).rpartition("; ")[0]
             raise ArtefactError(
                 f"{problem}; nothing was written. Look for such values in the inputs; if there are none, report it."
             ) from None

@@ -135,6 +135,32 @@ def test_a_failure_where_a_dataset_is_let_go_of_is_not_lost(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+STATE = """
+import os, resource, sys, torch
+from pathlib import Path
+from types import SimpleNamespace
+from schemas import InputError
+from stages.train.resume import History, copy_weights, save
+net = torch.nn.Sequential(*[torch.nn.Conv2d(16, 16, 3) for _ in range(4)])
+optimizer = torch.optim.Adam(net.parameters())
+net(torch.zeros(1, 16, 20, 20)).sum().backward()
+optimizer.step()
+training = SimpleNamespace(modules={"net": net}, optimizer=optimizer, precision="fp32")
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, resource.RLIM_INFINITY))
+try:
+    save(Path("x.resume.h5"), "identity", training, History(), copy_weights(training))
+except InputError as error:
+    print(error)
+    os._exit(3)
+"""
+
+
+def test_a_disk_that_fills_under_the_state_of_a_training_is_one_line(tmp_path):
+    done = subprocess.run([sys.executable, "-c", STATE], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 3 and "x.resume.h5: the disk is full" in done.stdout, done
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("size", [100_000, 1_000_000, 5_000_000])  # while tiles are written, and while they are copied
 def test_a_disk_that_fills_under_a_geotiff_leaves_nothing(tmp_path, rng, size):
     values = rng.normal(size=(2, 768, 768)).astype(np.float32)

@@ -1,14 +1,20 @@
-"""Errors of the HDF5 library: kept from the terminal, and collected where no caller can catch them."""
+"""HDF5 files that are whole or absent, whatever the HDF5 library does where a disk is full."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import h5py
 import numpy as np
+
+from schemas.errors import ConfigError, InputError
+from schemas.files.outputs import atomic_path, is_full_disk
 
 # For unknown values where HDF5's scale-offset filter keeps some decimals, which cannot be NaN: netCDF's default fill.
 UNKNOWN = np.float32(9.969209968386869e36)
@@ -27,6 +33,73 @@ def silence_hdf5() -> None:
         sys.excepthook, sys.unraisablehook = _except_h5py_release, _except_h5py_unraisable
 
 
+@contextlib.contextmanager
+def whole_hdf5(path: Path, check: Callable[[Path], None] = lambda partial: None) -> Iterator[h5py.File]:
+    """A new HDF5 file, open for writing; it gets its name when the block ends well, and is gone when it does not.
+
+    check : of the finished file under its temporary name. Raises InputError where the disk is full or fails, ConfigError
+    for a place that cannot be written.
+    """
+    silence_hdf5()
+    before = len(release_errors)
+    with atomic_path(path) as partial:
+        try:
+            file = h5py.File(partial, "w", track_order=True, libver=("earliest", "v110"))
+        except OSError as error:
+            if is_full_disk(error):
+                raise
+            raise ConfigError(f"{path}: cannot be written ({error}); choose another `output`.") from None
+        try:
+            yield file
+            _flush(path, file, before)
+        except BaseException as error:
+            if is_full_disk(
+                error
+            ):  # give back the room that the file took: HDF5 can then close without failing once more
+                os.truncate(partial, 0)
+            _close(file, before)
+            raise
+        if error := _close(file, before):
+            raise _not_whole(path, error)
+        check(partial)
+
+
+def _flush(path: Path, file: h5py.File, before: int) -> None:
+    """Write everything that HDF5 still holds; raises what went wrong, now or when an object was released."""
+    found: BaseException | None = None
+    if len(release_errors) > before:
+        found = release_errors[before]
+    else:
+        try:
+            file.flush()
+        except (OSError, RuntimeError) as error:
+            found = error
+    if found is not None:
+        raise found if is_full_disk(found) else _not_whole(path, found)
+
+
+def _close(file: h5py.File, before: int) -> BaseException | None:
+    """Close the file; returns what went wrong."""
+    if len(release_errors) > before:
+        # HDF5 would follow a pointer into what it failed to release, and take the process down.
+        abandoned.append(file)
+        return release_errors[before]
+    try:
+        file.close()
+    except (OSError, RuntimeError) as error:
+        abandoned.append(file)
+        return error
+    return None
+
+
+def _not_whole(path: Path, error: BaseException) -> InputError:
+    return InputError(
+        f"{path}: cannot be written whole ({error}); nothing half-written is left. "
+        "Look after the disk and run the command again."
+    )
+
+
+abandoned: list[Any] = []  # what HDF5 must never release
 release_errors: list[BaseException] = []  # of HDF5 objects that could not write what they held when they were released
 _hooks: list[tuple[Callable[..., Any], Callable[[Any], Any]]] = []
 

@@ -7,9 +7,7 @@ import errno
 import json
 import os
 import shutil
-import signal
 import stat
-import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -272,23 +270,3 @@ def atomic_folder(folder: Path, last: str) -> Iterator[Path]:
             raise type(error)(str(error).replace(str(staging), str(folder))) from None
         finally:
             shutil.rmtree(staging, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def terminate_as_exception() -> Iterator[None]:
-    """Let SIGTERM (a Slurm time limit, ``kill``) unwind like Ctrl-C, so that the partial file is removed."""
-    if (
-        threading.current_thread() is not threading.main_thread()
-        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
-    ):
-        yield
-        return
-
-    def stop(number: int, frame: Any) -> None:
-        raise SystemExit(128 + number)
-
-    signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)

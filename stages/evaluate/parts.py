@@ -12,8 +12,7 @@ import h5py
 import numpy as np
 
 from schemas import write_json
-from schemas.files.hdf5 import silence_hdf5
-from schemas.files.outputs import atomic_path
+from schemas.files.hdf5 import whole_hdf5
 from stages.evaluate.config import Config
 from stages.evaluate.fitting import fit_rows
 from stages.evaluate.renderers import Constant
@@ -107,8 +106,7 @@ def write_scores(
     renderings: bool,
 ) -> None:
     """Score every row on the crops ``wanted`` (n,) and write the scores and the crops; fitted : from :func:`write_fit`."""
-    silence_hdf5()
-    with PairReader(pairs) as reader, atomic_path(path) as partial, h5py.File(partial, "w") as file:
+    with PairReader(pairs) as reader, whole_hdf5(path) as file:
         rows = make_task(reader, checkpoints, wanted, config).rows()
         scale = read_fit(fitted, rows)
         shape, first = (len(wanted), *reader.size), first_runs(rows)

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from schemas.errors import ArtefactError
-from schemas.files.hdf5 import silence_hdf5
-from schemas.files.outputs import atomic_path
+from schemas.files.hdf5 import silence_hdf5, whole_hdf5
 from stages.network.predictor import read_state, write_state
 from stages.train.training import Training
 
@@ -47,7 +46,7 @@ def load_weights(training: Training, weights: Weights) -> None:
 
 def save(sidecar: Path, identity: str, training: Training, history: History, best: Weights) -> None:
     """Write the state of an unfinished run, whole or not at all. best : weights of the best epoch so far"""
-    with atomic_path(sidecar) as partial, h5py.File(partial, "w", track_order=True) as file:
+    with whole_hdf5(sidecar) as file:
         file.attrs["identity"] = identity
         file.attrs["history"] = json.dumps(asdict(history))
         file.attrs["precision"] = training.precision
