@@ -217,8 +217,46 @@ A_DATA := $(SHARED)/data/apollo15
 A_RUNS := $(foreach seed,0 1 2,$(A)/checkpoint_$(seed).h5)
 A_FOLDS := $(foreach fold,1 2 3 4 5,$(A)/fold_$(fold).h5)
 
-reproduce-apollo15: $(A)/report.html ## the same stages on five real Apollo 15 frames (needs the reference data)
-	@echo; echo "Open $(abspath $(A)/report.html)"
+# Frames with their cameras: 125 m a pixel, orthorectified; what is left of their poses is registered.
+C := results/apollo15_cubes
+C_RUNS := $(foreach seed,0 1 2,$(C)/checkpoint_$(seed).h5)
+C_FOLDS := $(foreach fold,1 2 3,$(C)/fold_$(fold).h5)
+
+# The film frames need the reference folder; the cubes are fetched where it is not there.
+reproduce-apollo15: $(C)/report.html $(if $(wildcard $(A_DATA)/images.csv),$(A)/report.html) ## the same stages on real Apollo 15 frames: three with their cameras, and five registered ones where the reference data are
+	@echo; for report in $^; do echo "Open $(CURDIR)/$$report"; done
+
+$(C)/data/images.csv: | $(STAMP)
+	@test -d $(SHARED)/data/apollo15_cubes || $(PIP) --constraint constraints.txt --editable '.[data]'
+	LUNARGR_SHARED=$(SHARED) $(BIN)/python examples/fetch_apollo15.py $(@D)
+
+$(C)/scene.h5: $(C)/data/images.csv
+	$(LUNARGR) ingest $(C)/data/dem.tif --images $< --gsd 316 --crop 32 -o $@ --overwrite
+
+$(C)/crops.h5: $(C)/scene.h5
+	$(LUNARGR) sample $< --crop 32 --count 900 --tile-m 11000 --split 60/15/25 -o $@ --overwrite
+
+$(C)/pairs.h5: $(C)/crops.h5
+	$(LUNARGR) project $< --register field --shifts $(C)/shifts.csv -o $@ --overwrite
+
+$(C_RUNS): $(C)/checkpoint_%.h5: $(C)/pairs.h5
+	$(LUNARGR) train $< --model kernels --epochs 10 --batch 8 --precision fp32 --seed $* -o $@ --overwrite --resume
+
+$(C)/svbrdf.h5: $(C)/scene.h5 $(C)/checkpoint_0.h5
+	$(LUNARGR) infer $^ -o $@ --overwrite
+
+$(C_FOLDS): $(C)/fold_%.h5: $(C)/svbrdf.h5 $(C)/scene.h5
+	$(LUNARGR) albedo $^ --fold $*/3 --register field --no-geotiff -o $@ --overwrite
+
+$(C)/held_out.h5: $(C)/pairs.h5 $(C_FOLDS)
+	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite
+
+$(C)/evaluation.h5: $(C)/pairs.h5 $(C_RUNS)
+	$(LUNARGR) evaluate $^ -o $@ --figures $(C)/figures --overwrite
+
+$(C)/report.html: $(C)/evaluation.h5 $(C)/held_out.h5
+	$(LUNARGR) report $(C)/scene.h5 $(C)/crops.h5 $(C)/pairs.h5 $(C)/checkpoint_0.h5 $(C)/svbrdf.h5 $^ -o $@ \
+	    --title "Apollo 15 metric camera cubes over GLD100" --overwrite
 
 $(A)/scene.h5: | $(STAMP)
 	@test -f $(A_DATA)/images.csv || { echo "reproduce-apollo15: no data at $(A_DATA); set LUNARGR_SHARED to the folder that holds data/apollo15"; exit 3; }
