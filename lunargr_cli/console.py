@@ -35,6 +35,11 @@ def harmless(text: str) -> str:
     return "".join(c if c in "\n\t" or unicodedata.category(c) not in _STEERING else _spelled(c) for c in text)
 
 
+def without_steering(text: str) -> str:
+    """The text without what steers a terminal or ends a line."""
+    return "".join(c for c in text if unicodedata.category(c) not in _STEERING)
+
+
 def _spelled(character: str) -> str:
     return character.encode("unicode_escape", "surrogatepass").decode()
 

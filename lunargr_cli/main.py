@@ -22,7 +22,7 @@ from lunargr_cli.console import flush_out, say_error, say_resources, set_up_stre
 from lunargr_cli.options import check_numbers
 from lunargr_cli.paths import guarded
 from lunargr_cli.spelling import running, spell
-from schemas.command_line import recording
+from schemas.command_line import count_processes, recording
 from schemas.errors import EXIT_CODE, InputError, LunargrError
 from schemas.files.locks import claim
 
@@ -35,7 +35,7 @@ VERBOSE = ("--verbose", "-v")
 def _command_line() -> str:
     """What made this process, as one would type it again."""
     words = ["lunargr", *sys.argv[1:]]
-    processes, here = (int(os.environ.get(name, 1)) for name in ("WORLD_SIZE", "LOCAL_WORLD_SIZE"))
+    processes, here = count_processes()
     if processes > 1:
         nodes = ["--nnodes", str(processes // here)] if processes > here else []
         words = ["torchrun", *nodes, "--nproc-per-node", str(here), "-m", "lunargr_cli.main", *sys.argv[1:]]

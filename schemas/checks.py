@@ -1,4 +1,4 @@
-"""Checks of an artefact's numbers, text and links against its declaration, made whenever one is opened."""
+"""Checks of an artefact's numbers and text against its declaration, made whenever one is opened."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from schemas.errors import ArtefactError
 UNIT_TOLERANCE = 1e-3  # of a unit vector's length: writers in float32, and in few decimals
 GSD_TOLERANCE = 1e-3  # relative: what writing numbers as text may cost
 LARGEST_TABLE = 100_000_000  # values of a table; a larger size is an error of the file's writer
+DEEPEST_JSON = 64  # levels: whatever follows them by recursion can
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
@@ -29,58 +30,49 @@ def parse_json(text: str, where: str, error: type[Exception] = ArtefactError, ad
     """The content of JSON text. Raises ``error`` for other text, for deep nesting and for what is no Unicode."""
     try:
         found = json.loads(text)
+        deep = _is_deep(found)
+    except RecursionError:
+        deep = True
+    except ValueError as problem:
+        raise error(f"{where}: expected JSON, found something else ({str(problem)[:120]}); {advice}.") from None
+    if deep:
+        raise error(f"{where}: expected JSON of at most {DEEPEST_JSON} levels, found more; {advice}.")
+    try:
         json.dumps(found, ensure_ascii=False).encode()
     except UnicodeEncodeError:
         raise error(
             f"{where}: expected text in Unicode, found half of a surrogate pair (\\ud800 ..); {advice}."
         ) from None
-    except RecursionError:
-        raise error(
-            f"{where}: expected JSON of a few levels, found it nested beyond what can be read; {advice}."
-        ) from None
-    except ValueError as problem:
-        raise error(f"{where}: expected JSON, found something else ({str(problem)[:120]}); {advice}.") from None
     return found
 
 
-def check_links(path: Path, file: h5py.File) -> None:
-    """Refuse data outside the file, and links that lead nowhere or in a circle. Raises ArtefactError."""
-    seen: set[int] = set()
+def _is_deep(content: Any) -> bool:
+    """Whether lists and objects lie within each other beyond DEEPEST_JSON levels."""
+    level = [content]
+    for _ in range(DEEPEST_JSON + 1):
+        level = [node for node in level if isinstance(node, dict | list)]
+        if not level:
+            return False
+        level = [v for node in level for v in (node.values() if isinstance(node, dict) else node)]
+    return True
 
-    def visit(group: h5py.Group) -> None:
-        for name in group:
-            where = f"{path}:{group.name.rstrip('/')}/{name}"
-            link = group.get(name, getlink=True)
-            if isinstance(link, h5py.ExternalLink):
-                raise ArtefactError(
-                    f"{where}: expected data in this file, found a link into '{link.filename}'; copy them in with h5copy."
-                )
-            try:
-                node = group[name]
-            except (KeyError, OSError, RuntimeError):
-                raise ArtefactError(
-                    f"{where}: expected data, found a link to nothing or to itself; write it again."
-                ) from None
-            if isinstance(node, h5py.Dataset):
-                if node.external:
-                    raise ArtefactError(
-                        f"{where}: expected data in this file, found them kept in '{node.external[0][0]}'; repack it (h5repack)."
-                    )
-            elif isinstance(node, h5py.Group):
-                address = h5py.h5o.get_info(node.id).addr
-                if address not in seen:
-                    seen.add(address)
-                    visit(node)
 
-    seen.add(h5py.h5o.get_info(file.id).addr)
-    visit(file)
+def is_foreign(file: h5py.File) -> bool:
+    """Whether another program wrote a file: what it says of its making is then its own matter."""
+    return not {"lunargr_schema", "lunargr_version"} <= set(file.attrs)
+
+
+def remedy(file: h5py.File, schema: Schema) -> str:
+    """What to do about a file that is not as its schema says."""
+    stage = f"write it again with 'lunargr {schema.stage}'"
+    return f"mend the program that wrote it, or {stage}" if is_foreign(file) else stage
 
 
 def check_attributes(path: Path, file: h5py.File, schema: Schema) -> None:
     """Check kinds, ranges and choices of the root attributes. Raises ArtefactError."""
-    for attribute in (*ROOT_ATTRIBUTES, *schema.attributes):
+    for attribute in (*(() if is_foreign(file) else ROOT_ATTRIBUTES), *schema.attributes):
         if attribute.name in file.attrs:
-            _check_attribute(path, file, attribute, f"write it again with 'lunargr {schema.stage}'")
+            _check_attribute(path, file, attribute, remedy(file, schema))
 
 
 def _check_attribute(path: Path, file: h5py.File, attribute: Attribute, advice: str) -> None:
@@ -114,7 +106,7 @@ def check_georeference(path: Path, file: h5py.File, schema: Schema) -> None:
     """Refuse a map whose georeference is absent, not north up, or not of pixels of ``gsd_m``. Raises ArtefactError."""
     if not any(v.georeferenced for v in schema.variables):
         return
-    where, advice = f"{path}:/crs", f"write it again with 'lunargr {schema.stage}'"
+    where, advice = f"{path}:/crs", remedy(file, schema)
     found = file["crs"].attrs if "crs" in file else {}
     if as_text(found.get("crs_wkt")) is None or as_text(found.get("GeoTransform")) is None:
         raise ArtefactError(f"{where}: expected a georeference (crs_wkt, GeoTransform), found none; {advice}.")
@@ -132,7 +124,9 @@ def check_georeference(path: Path, file: h5py.File, schema: Schema) -> None:
 
 
 def as_text(value: Any) -> str | None:
-    """An attribute's text, None where it is something else."""
+    """An attribute's text, None where it is something else. Some programs write lists of one text."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
     if isinstance(value, bytes):
         try:
             return value.decode()
@@ -143,13 +137,22 @@ def as_text(value: Any) -> str | None:
     return None
 
 
+def any_text(value: Any) -> str:
+    """An attribute as text to show or compare, whatever it is: bytes that are no UTF-8 are spelled out."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    if isinstance(value, bytes):
+        return value.decode(errors="backslashreplace")
+    return str(value).encode("utf-8", "backslashreplace").decode()
+
+
 def check_values(path: Path, file: h5py.File, schema: Schema) -> None:
     """Check ranges, flags, indices, directions and text of all variables that are tables. Raises ArtefactError."""
     for variable in schema.variables:
         if variable.is_table and variable.name in file:
             data = file[variable.name]
             where = f"{path}:/{variable.name}"
-            advice = f"write it again with 'lunargr {schema.stage}'"
+            advice = remedy(file, schema)
             if data.size > LARGEST_TABLE:
                 raise ArtefactError(
                     f"{where}: expected at most {LARGEST_TABLE:,} values, found {data.size:,}; {advice}."

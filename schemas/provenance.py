@@ -18,14 +18,16 @@ from typing import Any
 import h5py
 import numpy as np
 
-from schemas.checks import parse_json
+from schemas.checks import any_text, is_foreign, parse_json
 from schemas.command_line import running_command
 from schemas.declaration import Schema
 from schemas.errors import ArtefactError
+from schemas.files.hdf5 import open_hdf5
 from schemas.rasters import raster_kind, read_raster
 
 CONVENTIONS = "CF-1.11"
 SIDECAR = "record.json"  # beside files that cannot carry a record themselves: rasters and tables
+Record = dict[str, Any]
 # A shard names the same large inputs as the check before it: (path, size, time of change) -> SHA-256.
 known_digests: dict[tuple[str, int, int], str] = {}
 
@@ -94,20 +96,19 @@ def _describe(stage: str, config: Mapping[str, Any], inputs: Sequence[Path], see
 
 def read_record(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str, Any]]]:
     """An artefact's own record (None for other files) and, by SHA-256, those of all that it descends from."""
-    h5py._errors.silence_errors()
     digests: list[tuple[str, str]] = []
     try:
-        if not h5py.is_hdf5(path):
+        if not (path.is_file() and h5py.is_hdf5(path)):
             return _read_raster(path)
-        with h5py.File(path, "r") as file:
-            root = {k: (v.decode() if isinstance(v, bytes) else v) for k, v in file.attrs.items()}
-            if root.get("lunargr_schema") == "scene" and "sha256" in file and "camera_sha256" in file:
-                images, cameras = ([d.decode() for d in file[k][...]] for k in ("sha256", "camera_sha256"))
+        with open_hdf5(path) as file:
+            if is_foreign(file):
+                return None, {}
+            root = dict(file.attrs.items())
+            if any_text(root["lunargr_schema"]) == "scene" and "sha256" in file and "camera_sha256" in file:
+                images, cameras = ([any_text(d) for d in file[k][...]] for k in ("sha256", "camera_sha256"))
                 digests = list(zip(images, cameras, strict=True))
-    except (OSError, RuntimeError):
-        return None, {}
-    if "lunargr_schema" not in root:
-        return None, {}
+    except (OSError, RuntimeError, TypeError, ValueError, ArtefactError):
+        return None, {}  # whoever opens it says what is wrong
     record, ancestors = _unpack(root, path)
     if digests:
         record["images"] = {"count": len(digests), "sha256": combine_digests(d for pair in digests for d in pair if d)}
@@ -130,12 +131,12 @@ def _read_raster(path: Path) -> tuple[dict[str, Any] | None, dict[str, dict[str,
 def _unpack(root: Mapping[str, Any], path: object) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
     """The record in an artefact's root attributes, and those of its ancestors by SHA-256. Raises ArtefactError."""
     record = {
-        "schema": str(root["lunargr_schema"]),
-        "history": str(root.get("history", "")),
-        "command": str(root.get("command", "")),
-        "folder": str(root.get("folder", "")),
-        "version": str(root.get("lunargr_version", "")),
-        "seed": int(root.get("seed", -1)),
+        "schema": any_text(root["lunargr_schema"]),
+        "history": any_text(root.get("history", "")),
+        "command": any_text(root.get("command", "")),
+        "folder": any_text(root.get("folder", "")),
+        "version": any_text(root.get("lunargr_version", "")),
+        "seed": _whole(root.get("seed", -1)),
         "config": _parse(path, root, "config", "{}"),
         "inputs": _parse(path, root, "inputs", "[]"),
     }
@@ -153,14 +154,26 @@ def _checked(path: object, record: Any, ancestors: Any) -> tuple[dict[str, Any],
 
 
 def _parse(path: object, root: Mapping[str, Any], name: str, absent: str) -> Any:
-    return parse_json(str(root.get(name, absent)), f"{path}: root attribute '{name}'")
+    return parse_json(any_text(root.get(name, absent)), f"{path}: root attribute '{name}'")
+
+
+def record_of(file: h5py.File) -> Record:
+    """The record of an open artefact. Raises ArtefactError."""
+    return _unpack(dict(file.attrs), file.filename)[0]
+
+
+def _whole(value: Any) -> int | None:
+    try:
+        return int(value)
+    except (OverflowError, TypeError, ValueError):
+        return None
 
 
 def _is_record(record: Any) -> bool:
     """Whether :func:`chain` and ``lunargr replay`` can follow it."""
     if not isinstance(record, dict):
         return False
-    inputs, images = record.get("inputs"), record.get("images")
+    inputs, images, made = record.get("inputs"), record.get("images"), record.get("made_images", "")
     keys = ("schema", "history", "command", "folder", "version")
     return (
         all(isinstance(record.get(k), str) for k in keys)
@@ -170,8 +183,13 @@ def _is_record(record: Any) -> bool:
         and all(
             isinstance(i, dict) and isinstance(i.get("name"), str) and isinstance(i.get("sha256"), str) for i in inputs
         )
-        and (images is None or (isinstance(images, dict) and {"count", "sha256"} <= set(images)))
+        and (images is None or _is_images(images))
+        and isinstance(made, str)
     )
+
+
+def _is_images(images: Any) -> bool:
+    return isinstance(images, dict) and isinstance(images.get("count"), int) and isinstance(images.get("sha256"), str)
 
 
 def combine_digests(digests: Iterable[str]) -> str:
@@ -213,26 +231,28 @@ def chain(path: Path) -> list[Step]:
     Its own SHA-256 is left empty: nobody needs it, and the file may be large.
     """
     own, ancestors = read_record(path)
+    makers = {r["made_images"]: r for r in ancestors.values() if "made_images" in r}
     steps: list[Step] = []
     seen: set[str] = set()
-
-    def visit(source: Mapping[str, str]) -> None:
-        if source["sha256"] in seen:
-            return
-        seen.add(source["sha256"])
-        record = ancestors.get(source["sha256"])
-        visit_sources(record)
-        steps.append(Step(source["name"], source["sha256"], record))
-
-    def visit_sources(record: Mapping[str, Any] | None) -> None:
-        for earlier in record["inputs"] if record else ():
-            visit(earlier)
-        images = record.get("images") if record else None
-        if images and images["sha256"] not in seen:
-            seen.add(images["sha256"])
-            name = f"{images['count']} image{'s' if images['count'] > 1 else ''}"
-            steps.append(Step(name, images["sha256"], makers.get(images["sha256"])))
-
-    makers = {r["made_images"]: r for r in ancestors.values() if "made_images" in r}
-    visit_sources(own)
+    # Steps to visit, the next one last; one that was visited already follows what it was made from.
+    waiting = [(step, False) for step in reversed(_sources(own, makers, ancestors))]
+    while waiting:
+        step, visited = waiting.pop()
+        if visited:
+            steps.append(step)
+        elif step.sha256 not in seen:
+            seen.add(step.sha256)
+            waiting.append((step, True))
+            waiting += [(source, False) for source in reversed(_sources(step.record, makers, ancestors))]
     return [*steps, Step(path.name, "", own)]
+
+
+def _sources(record: Record | None, makers: Mapping[Any, Record], ancestors: Mapping[str, Record]) -> list[Step]:
+    """What a record says that its file was made from. makers : of images, by their digest; ancestors : by SHA-256"""
+    if record is None:
+        return []
+    found = [Step(i["name"], i["sha256"], ancestors.get(i["sha256"])) for i in record["inputs"]]
+    if images := record.get("images"):
+        name = f"{images['count']} image{'s' if images['count'] != 1 else ''}"
+        found.append(Step(name, images["sha256"], makers.get(images["sha256"])))
+    return found

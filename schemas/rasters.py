@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from schemas.errors import ArtefactError
+from schemas.files.references import open_raster_file
 
 TIFF_TAG = "LUNARGR_RECORD"
 EXR_ATTRIBUTE = "lunargr:record"
@@ -25,7 +26,7 @@ class Raster:
 
 
 def raster_kind(path: Path) -> str:
-    """'GeoTIFF', 'EXR' or '' by a file's first bytes."""
+    """'GeoTIFF', 'EXR' or '' by a file's first bytes; '' for devices and pipes, which might never answer."""
     try:
         if not path.is_file():  # opening a pipe waits for who writes into it
             return ""
@@ -42,23 +43,18 @@ def read_raster(path: Path) -> Raster:
 
 
 def _read_tiff(path: Path) -> Raster:
-    import warnings
-
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.errors import RasterioError
 
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path, driver="GTiff") as file:
-                tags = {str(k): str(v) for k, v in file.tags().items()}
-                bands = [
-                    (name or f"band {k + 1}", unit or "", kind)
-                    for k, (name, unit, kind) in enumerate(zip(file.descriptions, file.units, file.dtypes, strict=True))
-                ]
-                if file.crs:
-                    tags["crs"] = str(file.crs.to_wkt()).split('"')[1]
-                shape = (file.height, file.width)
+        with open_raster_file(path) as file:
+            tags = {str(k): str(v) for k, v in file.tags().items()}
+            bands = [
+                (name or f"band {k + 1}", unit or "", kind)
+                for k, (name, unit, kind) in enumerate(zip(file.descriptions, file.units, file.dtypes, strict=True))
+            ]
+            if file.crs:
+                tags["crs"] = str(file.crs.to_wkt()).split('"')[1]
+            shape = (file.height, file.width)
     except RasterioError as error:
         raise ArtefactError(
             f"{path}: expected a whole GeoTIFF, found a damaged one ({error}); write it again."

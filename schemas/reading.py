@@ -8,36 +8,44 @@ from typing import Any
 import h5py
 import numpy as np
 
-from schemas.checks import as_text, check_attributes, check_georeference, check_links, check_values, parse_json
+from schemas.checks import (
+    any_text,
+    as_text,
+    check_attributes,
+    check_georeference,
+    check_values,
+    is_foreign,
+    parse_json,
+    remedy,
+)
 from schemas.declaration import SCHEMAS, STRING, Schema, Variable
 from schemas.errors import ArtefactError
-from schemas.files.hdf5 import silence_hdf5
+from schemas.files.hdf5 import open_hdf5, silence_hdf5
+from schemas.units import unit_name
 
 
 def open_artefact(path: Path, schema: Schema) -> h5py.File:
     """Open an artefact for reading, after checking that it is what it should be. Raises ArtefactError."""
     path = Path(path)
-    file = _open_hdf5(path)
+    file = open_hdf5(path)
     try:
-        check_links(path, file)
         _check_kind(path, file, schema)
         for variable in schema.variables:
             if variable.name in file:
-                _check_variable(path, file, variable)
+                _check_variable(path, file, variable, remedy(file, schema))
             elif variable.required:
                 raise ArtefactError(
                     f"{path}:/{variable.name}: expected a variable ({variable.description}), found none; "
-                    f"write it again with 'lunargr {schema.stage}'."
+                    f"{remedy(file, schema)}."
                 )
         for attribute in schema.attributes:
             if attribute.required and attribute.name not in file.attrs:
                 raise ArtefactError(
                     f"{path}: expected the root attribute '{attribute.name}' ({attribute.description}), found none; "
-                    f"write it again with 'lunargr {schema.stage}'."
+                    f"{remedy(file, schema)}."
                 )
         check_attributes(path, file, schema)
         _check_sizes(path, file, schema)
-        _check_views(path, file)
         check_georeference(path, file, schema)
         check_values(path, file, schema)
     except BaseException:
@@ -48,7 +56,7 @@ def open_artefact(path: Path, schema: Schema) -> h5py.File:
 
 def read_kind(path: Path) -> Schema:
     """The schema that an artefact names as its own. Raises ArtefactError."""
-    with _open_hdf5(Path(path)) as file:
+    with open_hdf5(Path(path)) as file:
         name = _attribute(path, file, "lunargr_schema")
     if name not in SCHEMAS:
         raise ArtefactError(
@@ -70,25 +78,6 @@ def is_artefact(path: Path) -> bool:
         return path.suffix.lower() in (".h5", ".hdf5")
 
 
-def _open_hdf5(path: Path) -> h5py.File:
-    silence_hdf5()
-    if not path.exists():
-        raise ArtefactError(f"{path}: no such file; check the path or run the stage that writes it.")
-    if path.is_dir():
-        raise ArtefactError(f"{path}: expected an HDF5 file, found a folder; name the file in it.")
-    if not path.is_file():
-        raise ArtefactError(f"{path}: expected an HDF5 file, found a device or a pipe; name a file.")
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        kind = (
-            "a damaged or truncated HDF5 file"
-            if h5py.is_hdf5(path) or "truncated" in str(error)
-            else "another kind of file"
-        )
-        raise ArtefactError(f"{path}: expected an HDF5 artefact, found {kind}; write it again.") from None
-
-
 def _check_kind(path: Path, file: h5py.File, schema: Schema) -> None:
     found = _attribute(path, file, "lunargr_schema")
     if not found and schema.foreign_writers:
@@ -98,10 +87,14 @@ def _check_kind(path: Path, file: h5py.File, schema: Schema) -> None:
         raise ArtefactError(
             f"{path}: expected a '{schema.name}' artefact (from 'lunargr {schema.stage}'), found {kind}; check the order of the files."
         )
-    version = file.attrs.get("schema_version", schema.version)
-    if np.shape(version) not in ((), (1,)) or np.ravel(version)[0] != schema.version:
+    version = any_text(np.ravel(file.attrs.get("schema_version", schema.version))[0])
+    try:
+        same = float(version) == schema.version
+    except ValueError:
+        same = False
+    if not same:
         raise ArtefactError(
-            f"{path}: expected version {schema.version} of '{schema.name}', found {version}; write it again with 'lunargr {schema.stage}'."
+            f"{path}: expected version {schema.version} of '{schema.name}', found '{version}'; {remedy(file, schema)}."
         )
 
 
@@ -118,7 +111,7 @@ def _attribute(path: Path, file: h5py.File, name: str) -> str:
     return text
 
 
-def _check_variable(path: Path, file: h5py.File, variable: Variable) -> None:
+def _check_variable(path: Path, file: h5py.File, variable: Variable, advice: str) -> None:
     where = f"{path}:/{variable.name}"
     data = file[variable.name]
     if not isinstance(data, h5py.Dataset) or data.ndim != len(variable.dims):
@@ -132,13 +125,11 @@ def _check_variable(path: Path, file: h5py.File, variable: Variable) -> None:
         return
     if data.dtype.kind not in "iufb":
         raise ArtefactError(f"{where}: expected numbers ({variable.dtype}), found {data.dtype}; write it again.")
-    unit = _text(data.attrs.get("units", ""))
+    unit = read_unit(data)
     allowed = (variable.unit, *variable.unit_choices)
     if unit and unit not in allowed:
         expected = " or ".join(f"'{u}'" for u in dict.fromkeys(allowed))
-        ours = SCHEMAS.get(_text(file.attrs.get("lunargr_schema", "")))
-        advice = f"write it again with 'lunargr {ours.stage}'." if ours else "mend the writer of the file."
-        raise ArtefactError(f"{where}: expected units {expected}, found '{unit}'; {advice}")
+        raise ArtefactError(f"{where}: expected units {expected}, found '{unit}'; {advice}.")
 
 
 def _check_sizes(path: Path, file: h5py.File, schema: Schema) -> None:
@@ -158,20 +149,9 @@ def _check_sizes(path: Path, file: h5py.File, schema: Schema) -> None:
                 )
 
 
-def _check_views(path: Path, file: h5py.File) -> None:
-    """Refuse views of files that are gone, where HDF5 would silently read fill values. Raises ArtefactError."""
-    for data in file.values():
-        if isinstance(data, h5py.Dataset) and data.is_virtual:
-            for source in {part.file_name for part in data.virtual_sources()}:
-                if not (path if source == "." else path.resolve().parent / source).is_file():
-                    raise ArtefactError(
-                        f"{path}:{data.name}: expected the file '{source}' that it is a view of, found none; "
-                        "bring it back, or merge the parts again without `virtual`."
-                    )
-
-
-def _text(value: Any) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)
+def read_unit(data: h5py.Dataset) -> str:
+    """The unit of a variable in the spelling that declarations have, '' where it names none."""
+    return unit_name(any_text(data.attrs.get("units", "")))
 
 
 def unpack(data: h5py.Dataset, values: Any) -> np.ndarray:
@@ -197,9 +177,11 @@ def unpack(data: h5py.Dataset, values: Any) -> np.ndarray:
 
 def read_strings(file: h5py.File, name: str) -> list[str]:
     """A string variable as a list of ``str``."""
-    return [_text(v) for v in file[name][...]]
+    return [any_text(v) for v in file[name][...]]
 
 
 def read_config(file: h5py.File) -> dict[str, Any]:
-    """The configuration that an artefact was made with. Raises ArtefactError."""
-    return parse_json(_text(file.attrs.get("config", "{}")), f"{file.filename}: root attribute 'config'")
+    """The configuration that an artefact was made with; {} in files of other programs. Raises ArtefactError."""
+    if is_foreign(file):
+        return {}
+    return parse_json(any_text(file.attrs.get("config", "{}")), f"{file.filename}: root attribute 'config'")

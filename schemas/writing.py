@@ -13,9 +13,10 @@ import h5py
 import numpy as np
 
 from schemas.declaration import STRING, Schema, Variable
-from schemas.errors import ArtefactError
+from schemas.errors import ArtefactError, ConfigError
 from schemas.files.hdf5 import UNKNOWN, abandoned, whole_hdf5
 from schemas.files.outputs import check_output
+from schemas.files.references import is_inside
 from schemas.provenance import describe_run
 from schemas.reading import open_artefact
 
@@ -186,7 +187,12 @@ class ArtefactWriter:
         dtype = np.dtype(variable.dtype)
         layout = h5py.VirtualLayout(shape, dtype)
         for target, source, part in sources:
-            file = os.path.relpath(os.path.realpath(source.file.filename), os.path.realpath(self.path.parent))
+            file = os.path.relpath(os.path.abspath(source.file.filename), os.path.abspath(self.path.parent))
+            if not is_inside(file):
+                raise ConfigError(
+                    f"{self.path}: expected the parts in its own folder or below it, found '{file}'; "
+                    "choose an `output` beside them, or merge without `virtual`."
+                )
             view = h5py.VirtualSource(file, source.name, source.shape, source.dtype)
             layout[target] = view[part]
         fill = sources[0][1].fillvalue if sources and sources[0][1].scaleoffset is not None else np.nan

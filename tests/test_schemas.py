@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -13,7 +14,9 @@ import numpy as np
 import pytest
 
 from schemas import PAIRS, SCHEMAS, ArtefactError, ArtefactWriter, ConfigError, check_output, open_artefact, read_kind
-from schemas.reading import unpack
+from schemas.checks import parse_json
+from schemas.provenance import chain
+from schemas.reading import read_config, unpack
 
 PLACE = {"gsd_m": 5.0, "body_radius_m": 1737400.0}
 
@@ -196,6 +199,86 @@ def test_pairs_of_other_programs_need_no_lunargr_attributes(tmp_path):
             del file.attrs[name]
     with open_artefact(path, PAIRS) as file:
         assert "lunargr_schema" not in file.attrs and file["image"].shape[0] > 0
+
+
+def write_foreign(path, **root):
+    """pairs.h5 as another program may write it. root : its attributes, beside those that lunargr needs"""
+    with h5py.File(write_pairs(path), "r+") as file:
+        for name in set(file.attrs) - {"gsd_m", "body_radius_m"}:
+            del file.attrs[name]
+        for name, value in root.items():
+            file.attrs[name] = value
+    return path
+
+
+@pytest.mark.parametrize(
+    ("variable", "unit"),
+    [
+        ("longitude_deg", "degrees_east"),
+        ("latitude_deg", "degree_north"),
+        ("sun_horizon_deg", "degrees"),
+        ("solar_distance_au", "AU"),
+        ("elevation", "meters"),
+        ("image", b"DN"),
+        ("image", np.array(["1"], "S1")),
+    ],
+)
+def test_units_that_cf_calls_equal_are_equal(tmp_path, variable, unit):
+    path = write_foreign(tmp_path / "pairs.h5")
+    with h5py.File(path, "r+") as file:
+        if variable not in file:
+            file[variable] = np.ones(1)
+        file[variable].attrs["units"] = unit
+    open_artefact(path, PAIRS).close()
+
+
+@pytest.mark.parametrize("unit", ["degrees_west", "radian", b"\xff\xfe", 5])
+def test_other_units_are_not(tmp_path, unit):
+    path = write_foreign(tmp_path / "pairs.h5")
+    with h5py.File(path, "r+") as file:
+        file["longitude_deg"].attrs["units"] = unit
+    with pytest.raises(ArtefactError, match=r"/longitude_deg: expected units 'degree', found .*; mend the program"):
+        open_artefact(path, PAIRS)
+
+
+@pytest.mark.parametrize(
+    "root",
+    [
+        {"schema_version": "1", "lunargr_schema": "pairs"},
+        {"schema_version": np.float64(1)},
+        {"inputs": "{}", "provenance": "[]", "config": "no JSON", "seed": "none", "history": b"\xff"},
+    ],
+)
+def test_what_another_program_says_of_its_making_is_its_own_matter(tmp_path, root):
+    path = write_foreign(tmp_path / "pairs.h5", **root)
+    with open_artefact(path, PAIRS) as file:
+        assert read_config(file) == {}
+    assert chain(path)[-1].record is None
+
+
+def test_another_programs_version_is_refused_in_words(tmp_path):
+    path = write_foreign(tmp_path / "pairs.h5", lunargr_schema="pairs", schema_version="two")
+    with pytest.raises(ArtefactError, match="expected version 1 of 'pairs', found 'two'; mend the program"):
+        open_artefact(path, PAIRS)
+
+
+@pytest.mark.parametrize("name", ["command", "history", "folder", "lunargr_version", "title", "Conventions"])
+def test_text_that_is_no_utf_8_is_read(tmp_path, name):
+    path = write_pairs(tmp_path / "pairs.h5")
+    with h5py.File(path, "r+") as file:
+        file.attrs[name] = b"made in K\xf6ln"
+    open_artefact(path, PAIRS).close()
+    record = chain(path)[-1].record
+    assert record is not None
+    assert "made in K" in str({"title": "made in K", "Conventions": "made in K"} | record)
+    json.dumps(record, ensure_ascii=False).encode()
+
+
+@pytest.mark.parametrize("deep", ["[" * 65 + "]" * 65, '{"a":' * 500 + "1" + "}" * 500, "[" * 100_000])
+def test_json_is_of_few_levels(deep):
+    with pytest.raises(ArtefactError, match="expected JSON of at most 64 levels"):
+        parse_json(deep, "a.json")
+    assert parse_json("[" * 64 + "]" * 64, "a.json")
 
 
 def test_directions_have_length_1(tmp_path):

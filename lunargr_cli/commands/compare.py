@@ -141,6 +141,7 @@ def _was_scored_on(evaluation: Path, inputs: list[Path]) -> bool:
 def _read_origin(path: Path, schema: Schema) -> tuple[dict[str, Any], list[str]]:
     """The options that an artefact was made with, and the SHA-256 of its inputs."""
     from schemas import open_artefact, read_config
+    from schemas.provenance import record_of
 
     with open_artefact(path, schema) as file:
-        return read_config(file), [entry["sha256"] for entry in json.loads(str(file.attrs["inputs"]))]
+        return read_config(file), [entry["sha256"] for entry in record_of(file)["inputs"]]

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import json
+import os
+import pkgutil
+import re
 import shlex
 from collections.abc import Iterator, Sequence
+from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lunargr_cli.console import write_out
+from lunargr_cli import commands
+from lunargr_cli.console import without_steering, write_out
+from schemas.command_line import output_of
 from schemas.errors import ArtefactError
 
 if TYPE_CHECKING:
     from schemas.provenance import Step
 
 NAME, ORDER = "replay", 91
+_PROGRAM = re.compile(r"lunargr|torchrun (--nnodes \d+ )?--nproc-per-node \d+ -m lunargr_cli\.main")
 
 
 def command(file: Annotated[Path, typer.Argument(help="Any artefact of lunargr: HDF5, GeoTIFF or EXR.")]) -> None:
@@ -36,23 +44,62 @@ def command(file: Annotated[Path, typer.Argument(help="Any artefact of lunargr: 
 
 
 def script(steps: Sequence[Step]) -> Iterator[str]:
-    """A shell script: inputs first, each with its hash; what no command is known for is said in comments."""
+    """A shell script: inputs first, each with its hash; steps without a known command are comments.
+
+    The records come from a file that anybody may have written. Raises ArtefactError for commands of other programs.
+    """
+    folders = [step.record["folder"] for step in steps if step.record and step.record["command"]]
     yield "set -eu"
-    folder, done = "", set()
+    if folders:
+        yield "# Give a folder to work in another one. Files that are there already are kept."
+        yield f"[ $# -gt 0 ] || set -- {shlex.quote(without_steering(folders[0]))}"
+        yield 'cd -- "$1" && here=$PWD'
+    folder, done = folders[0] if folders else "", set()
     for step in steps:
         record = step.record
         mark = f"  # sha256 {step.sha256}" if step.sha256 else ""
         if record is None:
-            yield f"# needs {step.name}{mark}"
+            yield _comment(f"needs {step.name}{mark}")
             continue
         seed = "" if record["seed"] < 0 else f", seed {record['seed']}"
-        yield f"# {step.name}: {record['schema']}, lunargr {record['version']}{seed}{mark.replace('  #', ',')}"
+        yield _comment(f"{step.name}: {record['schema']}, lunargr {record['version']}{seed}{mark.replace('  #', ',')}")
         if not record["command"]:
-            yield f"# made from Python, by the stage's run(), with {json.dumps(record['config'], sort_keys=True)}"
+            config = json.dumps(record["config"], sort_keys=True)
+            yield _comment(f"made from Python, by the stage's run(), with {config}")
             continue
+        words, output = _read_command(record["command"], step.name)
         if record["folder"] != folder:
             folder = record["folder"]
-            yield f"cd {shlex.quote(folder)}"
-        if record["command"] not in done:  # one command may leave several files
-            yield record["command"]
-        done.add(record["command"])
+            beside = without_steering(os.path.relpath(folder or ".", folders[0] or "."))
+            yield 'cd "$here"' + ("" if beside == "." else f"/{shlex.quote(beside)}")
+        if (folder, *words) not in done:  # one command may leave several files
+            yield f"[ -e {shlex.quote(output)} ] || {shlex.join(words)}"
+        done.add((folder, *words))
+
+
+def _read_command(command: str, made: str) -> tuple[list[str], str]:
+    """The words of a recorded command and the output that it names or leaves to its default. Raises ArtefactError.
+
+    made : a file that the command made. The output is not replaced: the words lose --overwrite.
+    """
+    try:
+        words = [without_steering(word) for word in shlex.split(command) if word != "--overwrite"]
+    except ValueError:
+        words = []
+    first = next((k + 2 for k, word in enumerate(words) if word == "-m"), 0) if words[:1] == ["torchrun"] else 1
+    name = words[first] if len(words) > first else ""
+    if not _PROGRAM.fullmatch(" ".join(words[:first])) or name not in _command_names():
+        raise ArtefactError(
+            f"{made}: expected a command of lunargr in its record, found '{command[:80]}'; do not run it."
+        )
+    default = signature(import_module(f"lunargr_cli.commands.{name}").command).parameters.get("output")
+    output = output_of(words) or (str(default.default) if default and isinstance(default.default, Path) else made)
+    return words, output
+
+
+def _command_names() -> set[str]:
+    return {module.name for module in pkgutil.iter_modules(commands.__path__)}
+
+
+def _comment(text: str) -> str:
+    return f"# {without_steering(text)}"

@@ -1,4 +1,4 @@
-"""HDF5 files that are whole or absent, whatever the HDF5 library does where a disk is full."""
+"""Opening HDF5 files, and writing them whole or not at all, whatever the HDF5 library does where a disk is full."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from schemas.errors import ConfigError, InputError
+from schemas.errors import ArtefactError, ConfigError, InputError
 from schemas.files.outputs import atomic_path, is_full_disk
+from schemas.files.references import check_hdf5
 
 # For unknown values where HDF5's scale-offset filter keeps some decimals, which cannot be NaN: netCDF's default fill.
 UNKNOWN = np.float32(9.969209968386869e36)
@@ -31,6 +32,29 @@ def silence_hdf5() -> None:
     if sys.excepthook is not _except_h5py_release:
         _hooks.append((sys.excepthook, sys.unraisablehook))
         sys.excepthook, sys.unraisablehook = _except_h5py_release, _except_h5py_unraisable
+
+
+def open_hdf5(path: Path) -> h5py.File:
+    """An HDF5 file for reading, which refers to nothing that it may not. Raises ArtefactError."""
+    silence_hdf5()
+    if not path.exists():
+        raise ArtefactError(f"{path}: no such file; check the path or run the stage that writes it.")
+    if path.is_dir():
+        raise ArtefactError(f"{path}: expected an HDF5 file, found a folder; name the file in it.")
+    if not path.is_file():
+        raise ArtefactError(f"{path}: expected an HDF5 file, found a device or a pipe; name a file.")
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        damaged = h5py.is_hdf5(path) or "truncated" in str(error)
+        kind = "a damaged or truncated HDF5 file" if damaged else "another kind of file"
+        raise ArtefactError(f"{path}: expected an HDF5 artefact, found {kind}; write it again.") from None
+    try:
+        check_hdf5(path, file)
+    except BaseException:
+        file.close()
+        raise
+    return file
 
 
 @contextlib.contextmanager
@@ -100,6 +124,7 @@ def _not_whole(path: Path, error: BaseException) -> InputError:
 
 
 abandoned: list[Any] = []  # what HDF5 must never release
+
 release_errors: list[BaseException] = []  # of HDF5 objects that could not write what they held when they were released
 _hooks: list[tuple[Callable[..., Any], Callable[[Any], Any]]] = []
 

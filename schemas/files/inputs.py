@@ -8,22 +8,20 @@ of an image.
 from __future__ import annotations
 
 import contextlib
-import csv
 import errno
 import functools
-import json
 import os
 import stat
-import warnings
 from collections.abc import Hashable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import InputError
+from schemas.errors import InputError, LunargrError
 from schemas.files.locks import is_beside
 
 TABLES = (".csv", ".json")
 FILE_COLUMNS = ("path", "camera")
+_UNREADABLE = (LunargrError, OSError, RuntimeError, ValueError, KeyError, TypeError)  # said when the file is opened
 
 
 class Inputs:
@@ -106,10 +104,13 @@ def _read_names(path: Path, size: int, modified: int) -> tuple[Path, ...]:
 
 
 def _in_table(path: Path) -> Iterator[Path]:
+    from schemas.files.user_files import parse_csv, read_json, read_text
+
+    what = "an image table"
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        rows: Any = json.loads(text) if path.suffix.lower() == ".json" else list(csv.DictReader(text.splitlines()))
-    except (OSError, ValueError, csv.Error, RecursionError):
+        is_json = path.suffix.lower() == ".json"
+        rows: Any = read_json(path, what) if is_json else parse_csv(path, read_text(path, what), what)[1]
+    except LunargrError:
         return
     rows = rows.get("images") if isinstance(rows, Mapping) else rows
     for row in rows if isinstance(rows, list) else ():
@@ -131,16 +132,16 @@ def _is_hdf5(path: Path) -> bool:
 def _in_artefact(path: Path) -> Iterator[Path]:
     import h5py
 
-    from schemas.files.hdf5 import silence_hdf5
+    from schemas.checks import any_text
+    from schemas.files.hdf5 import open_hdf5
 
-    silence_hdf5()
     named: list[str] = []
-    with contextlib.suppress(OSError, RuntimeError, ValueError, KeyError, TypeError), h5py.File(path, "r") as file:
-        named += [_text(file.attrs["scene"])] if "scene" in file.attrs else []
+    with contextlib.suppress(*_UNREADABLE), open_hdf5(path) as file:
+        named += [any_text(file.attrs["scene"])] if "scene" in file.attrs else []
         for column in FILE_COLUMNS:
             data = file.get(column)
             if isinstance(data, h5py.Dataset) and data.ndim == 1:
-                named += map(_text, data[...])
+                named += map(any_text, data[...])
         for data in file.values():
             if isinstance(data, h5py.Dataset) and data.is_virtual:
                 named += {part.file_name for part in data.virtual_sources()}
@@ -151,15 +152,10 @@ def _in_artefact(path: Path) -> Iterator[Path]:
 
 
 def _in_raster(path: Path) -> Iterator[Path]:
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    from rasterio.errors import RasterioError
 
-    with warnings.catch_warnings(), contextlib.suppress(RasterioError, OSError, ValueError):
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(path) as data:
-            for name in data.files:
-                yield Path(name)
+    from schemas.files.references import open_raster_file
 
-
-def _text(value: Any) -> str:
-    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+    with contextlib.suppress(RasterioError, *_UNREADABLE), open_raster_file(path) as data:
+        for name in data.files:
+            yield Path(name)

@@ -1,7 +1,9 @@
-"""Reading the user's own text and JSON files, and refusing expected is no regular file."""
+"""Reading the user's own text, JSON and CSV files; devices and pipes are refused."""
 
 from __future__ import annotations
 
+import csv
+import io
 from pathlib import Path
 from typing import Any
 
@@ -44,3 +46,15 @@ def read_text(path: Path, expected: str, encoding: str = "utf-8-sig") -> str:
 def read_json(path: Path, expected: str) -> Any:
     """The content of a JSON file. expected : what it should hold, for error lines. Raises InputError."""
     return parse_json(read_text(path, expected), f"{path}: expected {expected}", InputError, "mend the file")
+
+
+def parse_csv(path: Path, text: str, expected: str) -> tuple[list[str], list[dict[str | None, Any]]]:
+    """Column names and rows of the text of a CSV file. expected : what it should hold, for error lines. Raises InputError."""
+    reader = csv.DictReader(io.StringIO(text, newline=""))
+    try:
+        reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
+        return list(reader.fieldnames), list(reader)
+    except csv.Error as error:
+        raise InputError(
+            f"{path}: expected {expected}, found no CSV that can be read ({error}); mend the file."
+        ) from None

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from schemas import DIAGNOSIS, ArtefactError, RegistryError, open_artefact, read_strings
+from schemas.checks import any_text
 from stages.effects.base import Effect, Survey, get_effect
 from stages.pairs.ground import boxes_overlap, splits_of
 
@@ -25,7 +26,7 @@ def load_extension(path: Path, image_ids: Sequence[str] | None = None) -> list[E
     Raises ArtefactError, RegistryError.
     """
     with open_artefact(Path(path), DIAGNOSIS) as file:
-        entries = json.loads(file.attrs["extension"])
+        entries = json.loads(any_text(file.attrs["extension"]))
         known = {name: k for k, name in enumerate(read_strings(file, "image_id"))}
         try:
             names = _tables(entries, file)

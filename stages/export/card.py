@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.provenance import Record
 from stages.network.predictor import Predictor
 
 
@@ -15,20 +15,19 @@ def model_card(
     name: str,
     checkpoint: str,
     predictor: Predictor,
-    attributes: Mapping[str, str],
+    record: Record,
     losses: Mapping[str, NDArray],
     best: int,
 ) -> str:
     """The card in Markdown.
 
-    attributes : of the checkpoint; losses : train_loss and validation_loss, (epochs,) each; best : epoch of the
+    record : of the checkpoint; losses : train_loss and validation_loss, (epochs,) each; best : epoch of the
     weights, from 1
     """
     model, stride = predictor.model, predictor.net.stride
     rows = "\n".join(f"| {k} | `{p.name}` | {p.unit} | {p.description} |" for k, p in enumerate(model.parameters))
-    files = json.loads(attributes.get("inputs", "[]"))
-    inputs = ", ".join(f"`{i['name']}` (SHA-256 `{i['sha256'][:16]}...`)" for i in files)
-    history = attributes.get("history", "").strip().splitlines() or ["?"]
+    inputs = ", ".join(f"`{i['name']}` (SHA-256 `{i['sha256'][:16]}...`)" for i in record["inputs"])
+    history = record["history"].strip().splitlines() or ["?"]
     found = float(losses["validation_loss"][best - 1]) if 0 < best <= len(losses["validation_loss"]) else float("nan")
     error = f"{found:.4g}" if np.isfinite(found) else "not recorded"
     return f"""# {name}
@@ -54,7 +53,7 @@ those pixels as context, on windows that begin at multiples of {stride}. Holes m
 ## Where it comes from
 
 - Exported from `{checkpoint}`, epoch {best} of {len(losses["train_loss"])}; mean squared error on validation pixels {error} (I/F squared).
-- Trained on {inputs or "inputs that were not recorded"} with lunargr {attributes.get("lunargr_version", "?")}: `{history[-1]}`
+- Trained on {inputs or "inputs that were not recorded"} with lunargr {record["version"] or "?"}: `{history[-1]}`
 - Images in {"I/F" if predictor.image_units == "iof" else "DN, with a gain and an offset per image"}.
 
 ## Limits

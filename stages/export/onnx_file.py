@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 
 from schemas import CHECKPOINT, ConfigError, atomic_path, check_output, open_artefact
+from schemas.checks import any_text
 from schemas.files.companions import companions_of
 from schemas.files.outputs import Output
+from schemas.provenance import record_of
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.export.card import model_card
 from stages.export.config import Config
@@ -66,8 +68,9 @@ def run(
         check_output(made, [checkpoint], output.overwrite)
     predictor = load_predictor(checkpoint)
     with open_artefact(checkpoint, CHECKPOINT) as file:
+        record = record_of(file)
         attributes = {
-            k: str(file.attrs[k]) for k in ("history", "lunargr_version", "config", "inputs") if k in file.attrs
+            k: any_text(file.attrs[k]) for k in ("history", "lunargr_version", "config", "inputs") if k in file.attrs
         }
         losses = {k: file[k][...] for k in ("train_loss", "validation_loss")}
         best = int(file.attrs["best_epoch"])
@@ -75,7 +78,7 @@ def run(
     names = tuple(p.name for p in predictor.model.parameters)
     with companions_of(path), atomic_path(path) as partial, atomic_path(card) as text:
         partial.write_bytes(data)
-        text.write_text(model_card(path.name, checkpoint.name, predictor, attributes, losses, best), encoding="utf-8")
+        text.write_text(model_card(path.name, checkpoint.name, predictor, record, losses, best), encoding="utf-8")
     return Summary(predictor.model.name, names, predictor.net.stride, len(data), card)
 
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import warnings
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import OpenImageIO as oiio
-import rasterio
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.errors import RasterioError
 
 from schemas.errors import InputError
+from schemas.files.references import open_raster_file
 from stages.match.base import Matches
 
 WIDTH, HEIGHT = 512, 384  # the size at which the Lunar-G2R paper reports errors
@@ -25,10 +24,8 @@ def read_picture(path: Path) -> np.ndarray:
     if not path.is_file():
         raise InputError(f"{path}: no such file; give an image file.")
     if path.suffix.lower() != ".exr":
-        with contextlib.suppress(RasterioError), warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path) as source:
-                return source.read(1, masked=True).astype(np.float32).filled(np.nan)
+        with contextlib.suppress(RasterioError), open_raster_file(path) as source:
+            return source.read(1, masked=True).astype(np.float32).filled(np.nan)
     image = oiio.ImageBuf(str(path))
     pixels = image.get_pixels(oiio.FLOAT) if image.initialized and not image.has_error else None
     if pixels is None or pixels.size == 0:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import h5py
 
 from schemas import ArtefactError, InputError, Schema, open_artefact, read_config, read_kind
-from schemas.checks import parse_json
+from schemas.checks import any_text, parse_json
 from stages.physics.images.table import relative_path
 
 # The dimension along which the shards of a stage are laid end to end; maps are joined by rows instead, and so are scenes
@@ -127,11 +126,11 @@ def _check_alike(parts: Parts) -> None:
     first, name = parts.files[0], parts.paths[0]
     for path, file in zip(parts.paths[1:], parts.files[1:], strict=True):
         for key, value in first.attrs.items():
-            if key not in {*_OWN, *_JOINED, ROWS} and str(file.attrs.get(key)) != str(value):
+            if key not in {*_OWN, *_JOINED, ROWS} and any_text(file.attrs.get(key)) != any_text(value):
                 raise ArtefactError(
                     f"{path}: expected {key} = {value} as in {name}, found {file.attrs.get(key)}; these are not parts of one whole."
                 )
-        mine, other = (json.loads(str(f.attrs["config"])) for f in (first, file))
+        mine, other = read_config(first), read_config(file)
         if any(mine.get(k) != other.get(k) for k in {*mine, *other} - {"shard", "device"}):
             raise ArtefactError(
                 f"{path}: expected the options that {name} was made with, found others; run the shard again."
@@ -144,7 +143,7 @@ def _check_alike(parts: Parts) -> None:
 
 def _hashes(file: h5py.File, path: Path) -> list[str]:
     """SHA-256 of what a part was made from."""
-    inputs = parse_json(str(file.attrs.get("inputs", "[]")), f"{path}: root attribute 'inputs'")
+    inputs = parse_json(any_text(file.attrs.get("inputs", "[]")), f"{path}: root attribute 'inputs'")
     if not isinstance(inputs, list) or not all(isinstance(i, dict) for i in inputs):
         raise ArtefactError(
             f"{path}: expected a list of files in the root attribute 'inputs', found {inputs!r:.40}; run the shard again."

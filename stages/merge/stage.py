@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas import ArtefactWriter, Schema, atomic_path, read_config
+from schemas.checks import is_foreign
 from schemas.command_line import whole_command
 from schemas.files.companions import companions_of
 from schemas.files.outputs import Output, check_outputs, map_targets
@@ -38,7 +39,7 @@ def run(
         foreign = [path for path in opened.paths if f"{output.file.name}.parts" not in path.parts]
         check_outputs(map_targets(output, as_geotiff), foreign, output.overwrite)
         provenance, inputs = _provenance(opened, output.file, config)
-        seed = int(opened.files[0].attrs.get("seed", -1))
+        seed = -1 if is_foreign(opened.files[0]) else int(opened.files[0].attrs.get("seed", -1))
         with ArtefactWriter(
             output.file,
             opened.schema,

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from schemas.artefacts import PAIRS, SPLITS
 from schemas.errors import ArtefactError
-from schemas.reading import open_artefact, read_strings, unpack
+from schemas.reading import open_artefact, read_strings, read_unit, unpack
 from stages.common.memory import keep_freed_memory
 from stages.pairs.holes import fill_holes
 from stages.pairs.records import Mapping, Records
@@ -73,8 +73,7 @@ class PairReader:
             raise ArtefactError(f"{path}: expected pairs, found none; sample more crops.")
         self.gsd = float(f.attrs["gsd_m"])
         self.body_radius = float(f.attrs["body_radius_m"])
-        unit = f["image"].attrs.get("units", "1")
-        self.units = "dn" if (unit.decode() if isinstance(unit, bytes) else str(unit)) == "dn" else "iof"
+        self.units = "dn" if read_unit(f["image"]) == "dn" else "iof"
         self.split = f["split"][...].astype(np.int64)
         self.frame = f["image_index"][...].astype(np.int64)
         self.site = f["site"][...].astype(np.int64)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from schemas.errors import InputError
-from schemas.files.user_files import read_text
+from schemas.files.user_files import parse_csv, read_text
 from stages.render.config import SUN
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
@@ -50,9 +50,9 @@ class ViewRow:
 
 def read_trajectory(path: Path) -> list[ViewRow]:
     """Read and check a trajectory table. Raises InputError naming the row and column."""
-    text = read_text(path, "a trajectory (CSV, one row per view)")
-    reader = csv.DictReader(line for line in text.splitlines() if not line.lstrip().startswith("#"))
-    names = [name.strip() for name in reader.fieldnames or []]
+    what = "a trajectory (CSV, one row per view)"
+    lines = [line for line in read_text(path, what).splitlines() if not line.lstrip().startswith("#")]
+    names, records = parse_csv(path, "\n".join(lines), what)
     for name in ("longitude_deg", "latitude_deg", "altitude_m"):
         if name not in names:
             raise InputError(f"{path}: expected a column '{name}', found {', '.join(names) or 'nothing'}; add it.")
@@ -62,8 +62,7 @@ def read_trajectory(path: Path) -> list[ViewRow]:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(f"{path}: expected each column once, found '{twice[0]}' twice; remove one.")
-    reader.fieldnames = names
-    rows = [_row(path, number, record) for number, record in enumerate(reader, start=1)]
+    rows = [_row(path, number, record) for number, record in enumerate(records, start=1)]
     if not rows:
         raise InputError(f"{path}: expected at least one view, found none; write one row per view.")
     seen: set[str] = set()
@@ -76,7 +75,7 @@ def read_trajectory(path: Path) -> list[ViewRow]:
     return rows
 
 
-def _row(path: Path, number: int, record: dict[str, str | None]) -> ViewRow:
+def _row(path: Path, number: int, record: dict[str | None, Any]) -> ViewRow:
     where = f"{path}: view {number}"
     if None in record:
         raise InputError(f"{where}: expected as many cells as columns, found more; correct the row.")

@@ -18,6 +18,7 @@ from markupsafe import Markup
 from schemas import ConfigError, InputError, atomic_path, check_output, open_artefact, read_kind
 from schemas.files.outputs import Output
 from schemas.files.user_files import check_file, read_json
+from schemas.provenance import read_record
 from stages.common import page
 from stages.common.page import diagnosis, pictures
 from stages.common.page.sentences import Number, Sentence
@@ -164,7 +165,7 @@ def _artefact(path: Path, details: list[Markup], seen: list[Any]) -> Part | None
     """The section of one HDF5 artefact; its origin is appended to ``details``, its result to ``seen``."""
     schema = read_kind(path)
     with open_artefact(path, schema) as file:
-        details.append(_origin(path, file))
+        details.append(_origin(path, schema.title))
         if schema.name in ("evaluation", "diagnosis"):
             result = json.loads(str(file.attrs["metrics" if schema.name == "evaluation" else "report"]))
             seen.append(result)
@@ -245,13 +246,12 @@ def _caption(path: Path) -> str:
     return name if caption is None else f"{caption} ({name})"
 
 
-def _origin(path: Path, file: Any) -> Markup:
+def _origin(path: Path, title: str) -> Markup:
     """Who made a file, from what and with which options."""
-    attributes = file.attrs
-    if "history" not in attributes:
+    record, _ = read_record(path)
+    if record is None:
         return page.disclosure(f"{path.name}: written by another program", "no provenance in the file")
-    inputs = json.loads(str(attributes.get("inputs", "[]")))
-    lines = [f"{attributes['history']}, version {attributes.get('lunargr_version', '?')}"]
-    lines += [f"from {source['name']}  sha256 {source['sha256']}" for source in inputs]
-    lines.append(json.dumps(json.loads(str(attributes.get("config", "{}"))), indent=1))
-    return page.disclosure(f"{path.name}: {attributes.get('title', '')}", "\n".join(lines))
+    lines = [f"{record['history']}, version {record['version'] or '?'}"]
+    lines += [f"from {source['name']}  sha256 {source['sha256']}" for source in record["inputs"]]
+    lines.append(json.dumps(record["config"], indent=1))
+    return page.disclosure(f"{path.name}: {title}", "\n".join(lines))

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from schemas.command_line import count_processes
+from schemas.errors import ConfigError
+
 
 def join_group() -> tuple[int, int]:
     """(rank, number of processes); starts the process group under torchrun."""
-    ranks = int(os.environ.get("WORLD_SIZE", 1))
+    ranks, _ = count_processes()
     if ranks == 1:
         return 0, 1
     if not dist.is_initialized():
-        dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+        try:
+            dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+        except (ValueError, RuntimeError) as error:
+            reason = " ".join(str(error).split())[:160]
+            raise ConfigError(
+                f"WORLD_SIZE: expected {ranks} processes that torchrun started, could not join them ({reason}); "
+                "use torchrun or unset it."
+            ) from None
     return dist.get_rank(), ranks
 
 

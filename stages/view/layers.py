@@ -6,13 +6,13 @@ import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 from rasterio.transform import Affine
 
 from schemas import SVBRDF, ArtefactError, InputError, RegistryError, open_artefact, read_strings
+from schemas.reading import read_unit
 from stages.common.arrays import Floats32
 from stages.physics.maps.grid import Grid, read_grid
 from stages.physics.photometry import ReflectanceModel, get_model, model_names
@@ -118,12 +118,7 @@ def _others(file: h5py.File, grid: Grid, names: list[str], factor: int) -> list[
 def _layer(variable: h5py.Dataset, name: str, title: str, lead: tuple[int, ...], factor: int) -> Layer:
     long_name = variable.attrs.get("long_name")
     text = title.replace("_", " ") + (f": {long_name}" if long_name is not None else "")
-    return Layer(name, text, _unit(variable), _shrunk(variable, lead, factor))
-
-
-def _unit(variable: h5py.Dataset) -> str:
-    unit: Any = variable.attrs.get("units", "1")
-    return unit.decode() if isinstance(unit, bytes) else str(unit)
+    return Layer(name, text, read_unit(variable) or "1", _shrunk(variable, lead, factor))
 
 
 def _shrunk(variable: h5py.Dataset, lead: tuple[int, ...], factor: int) -> Floats32:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ import numpy as np
 
 from schemas.checks import has_control_characters
 from schemas.errors import InputError
-from schemas.files.user_files import check_file, read_json, read_text
+from schemas.files.user_files import check_file, parse_csv, read_json, read_text
 from schemas.reading import read_strings
 from schemas.writing import ArtefactWriter
 from stages.physics.bodies.ephemeris import AU, parse_utc
@@ -86,10 +85,7 @@ def read_frames(table: Path, body: Body | None = None) -> list[Frame]:
                 "mend the file."
             )
     else:
-        try:
-            rows = list(csv.DictReader(read_text(table, what).splitlines()))
-        except csv.Error as error:
-            raise InputError(f"{table}: expected a CSV table, found something else ({error}); mend the file.") from None
+        rows = parse_csv(table, read_text(table, what), what)[1]
     if not rows:
         raise InputError(f"{table}: expected at least one image, found none; mend the table.")
     return _frames(table, rows, body)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,14 +14,16 @@ import rasterio
 import rasterio.warp
 from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
-from rasterio.errors import NotGeoreferencedWarning, RasterioError, RasterioIOError
+from rasterio.errors import RasterioError, RasterioIOError
 from rasterio.io import DatasetReader
 from rasterio.warp import Resampling
 from rasterio.windows import Window
 
 from schemas.errors import InputError
-from schemas.files.hdf5 import silence_hdf5
+from schemas.files.hdf5 import open_hdf5, silence_hdf5
+from schemas.files.references import open_raster_file
 from schemas.files.user_files import check_file
+from schemas.units import unit_name
 from stages.common.arrays import Mask
 from stages.common.memory import return_freed_memory
 from stages.physics.maps.grid import GDAL_CENTRE, Grid
@@ -44,14 +45,9 @@ def open_raster(path: Path, what: str = "a raster") -> Iterator[DatasetReader]:
     check_file(Path(path), what)
     silence_hdf5()
     if h5py.is_hdf5(path):  # of a damaged one GDAL's HDF5 library would print its whole error stack
-        try:
-            h5py.File(path, "r").close()
-        except OSError:
-            raise InputError(f"{path}: expected {what}, found a damaged HDF5 file; fetch it again.") from None
+        open_hdf5(Path(path)).close()
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            dataset = rasterio.open(path)
+        dataset = open_raster_file(Path(path))
     except RasterioIOError as error:
         raise InputError(
             f"{path}: expected {what} that GDAL reads, found something else ({_one_line(error)}); is it the right file?"
@@ -94,10 +90,9 @@ def check_single_band(path: Path, dataset: DatasetReader, what: str) -> None:
         )
 
 
-# m
-_UNITS = dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0)
-_UNITS |= dict.fromkeys(("km", "kilometre", "kilometer", "kilometers", "kilometres"), 1000.0)
-_UNITS |= dict.fromkeys(("ft", "foot", "feet"), 0.3048) | dict.fromkeys(("us survey foot", "us-ft"), 12 / 39.37)
+# m; for advice
+_LENGTHS = dict.fromkeys(("km", "kilometre", "kilometer", "kilometers", "kilometres"), 1000.0)
+_LENGTHS |= dict.fromkeys(("ft", "foot", "feet"), 0.3048) | dict.fromkeys(("us survey foot", "us-ft"), 12 / 39.37)
 _VERTICAL = re.compile(
     r'(?:VERT_?CRS|VERT_CS|VERTICALCRS)\[.*?(?:LENGTHUNIT|UNIT)\["([^"]*)",\s*([0-9.eE+-]+)', re.DOTALL
 )
@@ -109,9 +104,9 @@ def check_metres(path: Path, dataset: DatasetReader) -> None:
     factor = 1.0
     if not unit and dataset.crs is not None and (vertical := _VERTICAL.search(dataset.crs.to_wkt())):
         unit, factor = vertical.group(1).lower(), float(vertical.group(2))
-    if _UNITS.get(unit) == 1.0 or (factor != 1.0 and abs(factor - 1) < 1e-9):
+    if unit_name(unit) in ("", "m") or (factor != 1.0 and abs(factor - 1) < 1e-9):
         return
-    metres = factor if factor != 1.0 else _UNITS.get(unit)
+    metres = factor if factor != 1.0 else _LENGTHS.get(unit)
     advice = f"convert them (gdal_calc.py, 'A*{metres:g}')" if metres else "convert them, or set the unit that is true"
     raise InputError(
         f"{path}: expected elevations in metres, found the unit '{unit}'; {advice} and say so (gdal_edit.py -units m)."
