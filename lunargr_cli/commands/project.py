@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,9 +21,10 @@ from stages import project
 from stages.project import Config
 
 if TYPE_CHECKING:
-    from stages.project import Registered
+    from stages.project import Registered, Resemblance
 
 NAME, ORDER = "project", 40
+BRIGHTEST = 1.0  # I/F of a white Lambert surface that faces the Sun
 
 
 class RegisterTakesNoValue(typer.core.TyperCommand):
@@ -100,8 +102,38 @@ def command(
     )
     if summary.registered:
         _say_registered(console, summary.registered)
+    _say_resemblances(console, summary.resemblances, summary.units)
     if blocks_csv is not None:
         _write_blocks(blocks_csv, summary.registered)
+
+
+def _say_resemblances(console: Console, resemblances: Sequence[Resemblance], units: str) -> None:
+    """A line per image: how much it resembles its rendering; a warning where that is what chance gives."""
+    rows = [
+        (
+            r.image_id,
+            *("-" if math.isnan(v) else f"{v:.2f}" for v in (r.correlation, r.chance, r.contrast)),
+            f"{r.mean:.4g}",
+        )
+        for r in resemblances
+        if not math.isnan(r.mean)
+    ]
+    if rows:
+        mean = "mean I/F" if units == "iof" else "mean DN"
+        console.table("images beside their renderings", ["image", "correlation", "chance", "contrast", mean], rows)
+    for r in resemblances:
+        if r.is_chance:
+            opposite = (
+                "; it shows its negative: heights or the Sun may be reversed" if -r.correlation > r.chance else ""
+            )
+            console.say(
+                f"warning: image '{r.image_id}' resembles the rendering of its ground no more than chance gives "
+                f"({r.correlation:.2f}, chance {r.chance:.2f}){opposite}; check its place, its Sun and the DEM, or try --register"
+            )
+        if units == "iof" and r.mean > BRIGHTEST:
+            console.say(
+                f"warning: image '{r.image_id}' has a mean I/F of {r.mean:.4g}, more than a white surface has; its units may be dn"
+            )
 
 
 def _say_registered(console: Console, registered: Sequence[Registered]) -> None:

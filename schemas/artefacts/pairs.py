@@ -89,6 +89,17 @@ _REGISTRATION = (
     _optional("frame", "relief_share_error", "1", "its standard error; NaN = none"),
 )
 
+_RESEMBLANCE = (
+    _optional(
+        "frame", "rendering_correlation", "1", "correlation of the image and its rendering, small structure only"
+    ),
+    _optional("frame", "rendering_chance", "1", "largest correlation with renderings of other ground, or turned"),
+    _optional(
+        "frame", "rendering_contrast", "1", "small structure of the image over the rendering's, relative to means"
+    ),
+    _optional("frame", "image_mean", "1", "mean of the image where it was compared, in its own units"),
+)
+
 PAIRS = declare(
     Schema(
         name="pairs",
@@ -104,7 +115,7 @@ PAIRS = declare(
         },
         sizes=(("enu", 3),),
         foreign_writers=True,
-        variables=_MAPS + _DIRECTIONS + _CROP_PLACE + FRAMES + _REGISTRATION,
+        variables=_MAPS + _DIRECTIONS + _CROP_PLACE + FRAMES + _REGISTRATION + _RESEMBLANCE,
         attributes=PLACE,
     )
 )

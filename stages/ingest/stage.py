@@ -36,7 +36,7 @@ from stages.ingest.plan import plan_grid
 from stages.ingest.validity import check_frames, hash_files, write_validity
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.images.table import Frame, load_frames, read_frames, write_frames
-from stages.physics.images.table_checks import check_table
+from stages.physics.images.table_checks import check_distinct, check_table
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, read_grid, require_crs
 
@@ -120,7 +120,9 @@ def run(
             if frames and alone and not any(areas):
                 raise _no_positions(images, config, terrain.grid.gsd)
             writer.write("valid_area_m2", np.array(areas))
-            write_frames(writer, [hash_files(frame) for frame in mine])
+            hashed = [hash_files(frame) for frame in mine]
+            check_distinct(hashed)
+            write_frames(writer, hashed)
     return summarise(output.file, tuple(skipped))
 
 

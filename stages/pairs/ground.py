@@ -49,7 +49,8 @@ class Ground:
         """From an open checkpoint or map; None where it holds no such record."""
         if EDGE not in file.attrs or any(name not in file for name in COLUMNS):
             return None
-        return cls(*(file[name][...] for name in COLUMNS), float(file.attrs[EDGE]))
+        lon, lat, split = (file[name][...] for name in COLUMNS)
+        return cls(lon, lat, split, float(file.attrs[EDGE]))
 
     @property
     def sizes(self) -> dict[str, int]:

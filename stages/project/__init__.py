@@ -10,7 +10,7 @@ from stages.project.config import Config
 if TYPE_CHECKING:
     from stages.project.inputs import count_pairs, scene_of, source_files
     from stages.project.stage import run
-    from stages.project.summary import Registered, summarise
+    from stages.project.summary import Registered, Resemblance, summarise
 
 __getattr__ = imported_later(__name__, "stage", "inputs", "summary")
-__all__ = ["Config", "Registered", "count_pairs", "run", "scene_of", "source_files", "summarise"]
+__all__ = ["Config", "Registered", "Resemblance", "count_pairs", "run", "scene_of", "source_files", "summarise"]

@@ -1,4 +1,4 @@
-"""Registration of the images of pairs, and what pairs.h5 records of it."""
+"""Registration of the images of pairs, their likeness to renderings, and what pairs.h5 records of both."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stages.physics.images.source_images import Source
 from stages.physics.images.table import Frame
 from stages.project.config import Config
 from stages.project.inputs import Scene
-from stages.project.summary import Registered
+from stages.project.summary import RESEMBLANCE, Registered, Resemblance
 
 
 def register(frame: Frame, index: int, source: Source, crops: h5py.File, scene: Scene, config: Config) -> Registered:
@@ -58,6 +58,27 @@ def combined_share(registered: Sequence[Registered]) -> tuple[float, float, int]
     mean = float((weight * share).sum() / weight.sum())
     excess = float((weight * (share - mean) ** 2).sum()) / max(1, len(share) - 1)
     return mean, math.sqrt(max(1.0, excess) / float(weight.sum())), len(share)
+
+
+def resemble(
+    frame: Frame, index: int, source: Source, crops: h5py.File, scene: Scene, field: Field | None
+) -> Resemblance:
+    """Compare one image with its rendering at some blocks about all of its crops: all shards find the same."""
+    from stages.physics.images.register_frame import choose_blocks
+    from stages.project.resemblance import BLOCKS, compare_with_rendering
+
+    mine = crops["image_index"][...] == index
+    rows, cols = (crops[name][...][mine] for name in ("row", "col"))
+    blocks = choose_blocks(rows, cols, crops["elevation"].shape[1], scene.grid, BLOCKS)
+    return compare_with_rendering(frame, source, scene.elevation, scene.overview, scene.grid, blocks, field)
+
+
+def write_resemblances(writer: ArtefactWriter, frames: Sequence[Frame], found: Sequence[Resemblance]) -> None:
+    """One value per image and variable, NaN for images without crops here."""
+    known = {entry.image_id: entry for entry in found}
+    for name, attribute in zip(RESEMBLANCE, ("correlation", "chance", "contrast", "mean"), strict=True):
+        column = [getattr(known[f.image_id], attribute) if f.image_id in known else math.nan for f in frames]
+        writer.write(name, np.array(column, float))
 
 
 FRAME_VARIABLES: dict[str, Callable[[Field], float]] = {

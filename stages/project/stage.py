@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -18,13 +18,14 @@ from stages.physics.horizon.scene import horizon_in_scene
 from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import Frame, load_frames
+from stages.physics.images.table_checks import check_distinct
 from stages.physics.maps.grid import LocalFrames
 from stages.physics.maps.window import Window
 from stages.project.config import Config
 from stages.project.geometry import Geometry, check_directions, crop_geometry
 from stages.project.inputs import Scene, check_places, check_sources, open_scene, scene_of
-from stages.project.register import displacement_at, register, write_registration
-from stages.project.summary import Registered, Summary
+from stages.project.register import displacement_at, register, resemble, write_registration, write_resemblances
+from stages.project.summary import Registered, Resemblance, Summary
 from stages.project.writing import Pair, PairDatasets, Tally, kept_decimals
 
 CROP_COLUMNS = ("longitude_deg", "latitude_deg", "row", "col", "image_index", "site", "tile", "split")
@@ -39,6 +40,7 @@ def run(
     check_output(output.file, [crops, scene_of(crops, config)], output.overwrite)
     with open_artefact(crops, CROPS) as file, open_scene(crops, file, config) as scene:
         frames = load_frames(file, crops)
+        check_distinct(frames)
         total, size = file["elevation"].shape[:2]
         part = slice(*shard_range(total, config.shard))
         check_sources(crops, [frames[k] for k in sorted({int(k) for k in file["image_index"][part]})])
@@ -114,7 +116,7 @@ def _project(
     # by the whole table, not this shard's images: all parts of one whole hold the same variables
     rays = any(f.camera for f in frames)
     datasets = PairDatasets(writer, "1" if units == "iof" else "dn", decimals, rays, config.register is not None)
-    tally, registered = Tally(), list[Registered]()
+    tally, registered, resemblances = Tally(), list[Registered](), list[Resemblance]()
     image_index, rows, cols = (crops.column(name) for name in ("image_index", "row", "col"))
     total = len(image_index)
     for index in np.unique(image_index).tolist():
@@ -131,6 +133,7 @@ def _project(
                 progress(tally.pairs, total, f"registration ({frame.image_id})")
                 registered.append(register(frame, index, source, crops.file, scene, config))
                 field = registered[-1].field
+            resemblances.append(resemble(frame, index, source, crops.file, scene, field))
             view = View(source, field, rows[mine], cols[mine], mean, local, geometry)
             for place, k in enumerate(mine.tolist()):
                 if tally.pairs % 20 == 0:
@@ -145,7 +148,9 @@ def _project(
     writer.write("solar_distance_au", np.array([f.solar_distance_au for f in frames]))
     if config.register:
         write_registration(writer, frames, registered)
-    return tally.summary(crops.size, tuple(registered))
+    write_resemblances(writer, frames, resemblances)
+    summary = tally.summary(crops.size, units)
+    return replace(summary, registered=tuple(registered), resemblances=tuple(resemblances))
 
 
 def _pair(view: View, place: int, heights: NDArray[np.float32], scene: Scene) -> Pair:

@@ -7,12 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 
 from schemas import PAIRS, open_artefact
-from schemas.reading import unpack
+from schemas.reading import read_strings, unpack
 from stages.physics.images.displacement import Field
 from stages.physics.images.registration import Shift
+
+# frame variables of pairs.h5, in the order of Resemblance's fields
+RESEMBLANCE = ("rendering_correlation", "rendering_chance", "rendering_contrast", "image_mean")
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,27 @@ class Registered:
 
 
 @dataclass(frozen=True)
+class Resemblance:
+    """Of one image and its renderings, over some blocks; NaN where nothing is known.
+
+    correlation : of small structure, mean over the blocks; chance : the largest with renderings turned, mirrored or
+    exchanged; contrast : structure of the image over that of the rendering, both relative to their means
+    mean : of the image, in its own units
+    """
+
+    image_id: str
+    correlation: float
+    chance: float
+    contrast: float
+    mean: float
+
+    @property
+    def is_chance(self) -> bool:
+        """Whether the image resembles its ground no more than other ground. Not where nothing was compared."""
+        return not math.isnan(self.mean) and not self.correlation > self.chance
+
+
+@dataclass(frozen=True)
 class Summary:
     """What project wrote, for the line at the end."""
 
@@ -34,7 +59,9 @@ class Summary:
     incidence_deg: tuple[float, float]
     emission_deg: tuple[float, float]
     shadowed_share: float
+    units: str
     registered: tuple[Registered, ...] = ()
+    resemblances: tuple[Resemblance, ...] = ()
 
 
 def summarise(pairs: Path) -> Summary:
@@ -47,9 +74,20 @@ def summarise(pairs: Path) -> Summary:
             angle = unpack(file["sun_horizon_deg"], file["sun_horizon_deg"][k]).astype(np.float64)
             above = np.radians(angle) > math.asin(sun[k, 2])
             seen, shadowed, total = seen + int(valid.sum()), shadowed + int((valid & above).sum()), total + valid.size
+        compared = read_resemblances(file)
+        units = "dn" if str(file["image"].attrs["units"]) == "dn" else "iof"
     incidence = np.degrees(np.arccos(sun[:, 2])).tolist()
     emission = np.degrees(np.arccos(camera[:, 2] / np.linalg.norm(camera, axis=1))).tolist()
-    return Summary(len(sun), seen / max(1, total), extremes(incidence), extremes(emission), shadowed / max(1, seen))
+    shares = seen / max(1, total), shadowed / max(1, seen)
+    return Summary(len(sun), shares[0], extremes(incidence), extremes(emission), shares[1], units, (), compared)
+
+
+def read_resemblances(file: h5py.File) -> tuple[Resemblance, ...]:
+    """What an open pairs.h5 says of its images and their renderings; nothing where it does not."""
+    if any(name not in file for name in RESEMBLANCE):
+        return ()
+    columns = [file[name][...].tolist() for name in RESEMBLANCE]
+    return tuple(map(Resemblance, read_strings(file, "image_id"), *columns))
 
 
 def extremes(angles: Sequence[float]) -> tuple[float, float]:

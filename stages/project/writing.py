@@ -15,7 +15,7 @@ from schemas import ArtefactWriter, InputError
 from stages.physics.images.orthorectify import Ortho
 from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
-from stages.project.summary import Registered, Summary, extremes
+from stages.project.summary import Summary, extremes
 
 # Digits after the point that pairs.h5 keeps; docs/resources.md lists them.
 IOF_DECIMALS, COUNT_DECIMALS, HORIZON_DECIMALS = 5, 1, 1
@@ -98,15 +98,15 @@ class Tally:
         self.incidence.append(math.degrees(math.acos(up)))
         self.emission.append(math.degrees(math.acos(pair.camera[2] / np.linalg.norm(pair.camera))))
 
-    def summary(self, size: int, registered: tuple[Registered, ...]) -> Summary:
-        """Of all that was counted. size : px, of a crop's side"""
+    def summary(self, size: int, units: str) -> Summary:
+        """Of all that was counted. size : px, of a crop's side; units : of the images, 'iof' or 'dn'"""
         return Summary(
             self.pairs,
             self.valid / max(1, self.pairs * size * size),
             extremes(self.incidence),
             extremes(self.emission),
             self.shadowed / max(1, self.valid),
-            registered,
+            units,
         )
 
 

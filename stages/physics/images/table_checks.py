@@ -52,6 +52,18 @@ def check_table(table: Path, frames: Sequence[Frame], body: Body) -> list[str]:
     return unusual
 
 
+def check_distinct(frames: Sequence[Frame]) -> None:
+    """Refuse two images that are one file by its SHA-256: their pairs would count twice. Raises InputError."""
+    seen: dict[str, Frame] = {}
+    for frame in frames:
+        first = seen.setdefault(frame.sha256, frame)
+        if frame.sha256 and first is not frame:
+            raise InputError(
+                f"{frame.path}: image '{frame.image_id}' is the photograph of '{first.image_id}' again (same SHA-256); "
+                "keep one of them in the table."
+            )
+
+
 def check_emission(frame: Frame, grid: Grid, row: float, col: float) -> None:
     """Refuse a map-projected image that its spacecraft saw at a grazing angle at (row, col). Raises GeometryError."""
     emission = _emission_deg(grid, row, col, frame.camera_position(grid.radius))
