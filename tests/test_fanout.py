@@ -20,6 +20,7 @@ from lunargr_cli.fanout.job import Identity, Work, open_job
 from lunargr_cli.fanout.stages import run_infer
 from lunargr_cli.options import in_parts
 from schemas import PAIRS, SCENE, ArtefactError, ConfigError, InputError, atomic_path, open_artefact
+from schemas.files.inputs import Inputs
 from schemas.files.outputs import Output, Target
 from stages import infer, ingest, merge, project, sample
 
@@ -357,6 +358,18 @@ def test_more_parts_than_pairs(tmp_path):
         (tmp_path / "merged.h5").rename(tmp_path / f"merged_{name}.h5")
     with open_artefact(tmp_path / "merged_pairs.h5", PAIRS) as file:
         assert len(file["image"]) == 1 and file["image"].attrs["units"] == "dn"
+
+
+def test_a_scene_names_its_dem_from_wherever_it_lies(small_files, tmp_path):
+    """Its shards may lie in folders of their own, and the whole in another."""
+    config = ingest.Config(gsd=20, crop=32, block=100)
+    parts = [tmp_path / f"{k}" / "rows.h5" for k in range(2)]
+    for k, part in enumerate(parts):
+        ingest.run(small_files.dem, None, part, replace(config, shard=(k, 2)))
+    merge.run(parts, tmp_path / "grid.h5")
+    ingest.run(tmp_path / "grid.h5", small_files.images, tmp_path / "more" / "scene.h5", replace(config, gsd=None))
+    for scene in (*parts, tmp_path / "grid.h5", tmp_path / "more" / "scene.h5"):
+        assert Inputs([scene]).find(small_files.dem) is not None, scene
 
 
 def test_a_view_says_so_when_a_part_is_gone(small_artefacts, tmp_path):

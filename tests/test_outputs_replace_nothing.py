@@ -24,8 +24,8 @@ SUN = ["--sun-azimuth", "100", "--sun-elevation", "35"]
 READS = {
     "simulate": (["recipe.json"], ["--recipe", "recipe.json"]),
     "ingest": (["dem.tif", "images.csv", "image1.tif"], ["dem.tif", "--images", "images.csv"]),
-    "sample": (["scene.h5", "image1.tif"], ["scene.h5"]),
-    "project": (["crops.h5", "scene.h5", "image1.tif"], ["crops.h5", "--register"]),
+    "sample": (["scene.h5", "image1.tif", "dem.tif"], ["scene.h5"]),
+    "project": (["crops.h5", "scene.h5", "image1.tif", "dem.tif"], ["crops.h5", "--register"]),
     "train": (["pairs.h5", "diagnosis.h5"], ["pairs.h5", "--extend", "diagnosis.h5"]),
     "infer": (["dem.tif", "checkpoint.h5"], ["dem.tif", "checkpoint.h5"]),
     "render": (["svbrdf.h5", "camera.json"], ["svbrdf.h5", "--camera", "camera.json", *SUN]),
@@ -38,7 +38,7 @@ READS = {
     "merge": (["pairs.h5", "more.h5"], ["pairs.h5", "more.h5"]),
     "inspect": (["scene.h5", "image1.tif"], ["scene.h5"]),
     "models": ([], []),
-    "albedo": (["svbrdf.h5", "scene.h5", "image1.tif"], ["svbrdf.h5", "scene.h5"]),
+    "albedo": (["svbrdf.h5", "scene.h5", "image1.tif", "dem.tif"], ["svbrdf.h5", "scene.h5"]),
     "view": (["svbrdf.h5", "pairs.h5"], ["svbrdf.h5", "--pairs", "pairs.h5"]),
     "export": (["checkpoint.h5"], ["checkpoint.h5"]),
 }

@@ -65,7 +65,7 @@ SCENE = declare(
         attributes=PLACE
         + (
             Attribute("crop_px", "crop size that valid_position was eroded for", True, "integer", 2, LARGEST_COUNT),
-            Attribute("elevation_source", "name of the DEM file"),
+            Attribute("elevation_source", "the DEM file, relative to this file"),
             Attribute("elevation_low_m", "least elevation, m", False, "number", *HEIGHTS),
             Attribute("elevation_high_m", "largest elevation, m", False, "number", *HEIGHTS),
             Attribute("dem_valid_px", "valid pixels of the DEM", False, "integer", 0),

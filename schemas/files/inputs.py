@@ -1,7 +1,7 @@
 """The files that a run reads, under every name that they have: no output may replace one of them.
 
 These are the files that the user names, and the files that those name in turn: the images and camera models of an image
-table, of a scene or of crops, the scene of crops, the parts behind a virtual artefact, the sources of a VRT, the label
+table, of a scene or of crops, the DEM of a scene, the scene of crops, the parts behind a virtual artefact, the sources of a VRT, the label
 of an image.
 """
 
@@ -21,6 +21,7 @@ from schemas.files.locks import is_beside
 
 TABLES = (".csv", ".json")
 FILE_COLUMNS = ("path", "camera")
+FILE_ATTRIBUTES = ("scene", "elevation_source")
 _UNREADABLE = (LunargrError, OSError, RuntimeError, ValueError, KeyError, TypeError)  # said when the file is opened
 
 
@@ -137,7 +138,7 @@ def _in_artefact(path: Path) -> Iterator[Path]:
 
     named: list[str] = []
     with contextlib.suppress(*_UNREADABLE), open_hdf5(path) as file:
-        named += [any_text(file.attrs["scene"])] if "scene" in file.attrs else []
+        named += [any_text(file.attrs[name]) for name in FILE_ATTRIBUTES if name in file.attrs]
         for column in FILE_COLUMNS:
             data = file.get(column)
             if isinstance(data, h5py.Dataset) and data.ndim == 1:

@@ -35,7 +35,7 @@ from stages.ingest.elevation import reuse_elevation, write_elevation
 from stages.ingest.plan import plan_grid
 from stages.ingest.validity import check_frames, hash_files, write_validity
 from stages.physics.bodies.spheres import Body, find_body
-from stages.physics.images.table import Frame, load_frames, read_frames, write_frames
+from stages.physics.images.table import Frame, load_frames, read_frames, relative_path, write_frames
 from stages.physics.images.table_checks import check_distinct, check_table
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, read_grid, require_crs
@@ -99,7 +99,11 @@ def run(
             sizes,
             config=terrain.config,
             inputs=[dem] + ([images] if images else []),
-            attributes=terrain.attributes | {"crop_px": np.int32(config.crop)},
+            attributes=terrain.attributes
+            | {
+                "crop_px": np.int32(config.crop),
+                "elevation_source": relative_path(terrain.source, output.file.resolve().parent),
+            },
             overwrite=output.overwrite,
         ) as writer:
             _write_grid(writer, terrain.grid)
@@ -153,9 +157,10 @@ def summarise(scene: Path, skipped: tuple[str, ...] = ()) -> Summary:
 class Terrain:
     """The source of the scene's elevations.
 
-    write : writes them; returns the number of valid pixels, the least and the largest elevation, m
+    source : the DEM file; write : writes them; returns the number of valid pixels, the least and the largest elevation, m
     """
 
+    source: Path
     grid: Grid
     config: dict[str, Any]
     attributes: dict[str, Any]
@@ -177,10 +182,9 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, pr
                 raise ConfigError(f"{dem}: a grid at {grid.gsd:g} m; leave `gsd` away, or give the DEM itself.")
             own = ("crop", "skip_outside", "trust_table", "shard", "block")
             stored = read_config(file) | {k: v for k, v in asdict(config).items() if k in own}
-            names = ("gsd_m", "body_radius_m", "elevation_source")
-            yield Terrain(
-                grid, stored, {k: file.attrs[k] for k in names}, partial(reuse_elevation, dem, file, count > 1), file
-            )
+            attributes = {k: file.attrs[k] for k in ("gsd_m", "body_radius_m")}
+            source = dem.resolve().parent / str(file.attrs.get("elevation_source", ""))
+            yield Terrain(source, grid, stored, attributes, partial(reuse_elevation, dem, file, count > 1), file)
         return
     if images is not None and count > 1:
         raise ConfigError(
@@ -190,13 +194,13 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, pr
     with rasters.open_raster(dem, "a DEM") as dataset:
         require_crs(str(dem), dataset.crs, dataset.transform, body)
         plan = plan_grid(dem, dataset, config.gsd, body.radius, progress)
-        attributes = {"gsd_m": plan.grid.gsd, "body_radius_m": body.radius, "elevation_source": dem.name}
+        attributes = {"gsd_m": plan.grid.gsd, "body_radius_m": body.radius}
         if count > 1:
             bands = math.ceil(plan.grid.height / config.block)
             rows = [min(plan.grid.height, config.block * band) for band in shard_range(bands, config.shard)]
             attributes["shard_rows"] = np.array(rows, np.int64)
         stored = asdict(config) | {"resampled": plan.factor is None}
-        yield Terrain(plan.grid, stored, attributes, partial(write_elevation, dem, dataset, plan, config))
+        yield Terrain(dem, plan.grid, stored, attributes, partial(write_elevation, dem, dataset, plan, config))
 
 
 def count_bands(dem: Path, config: Config) -> int:

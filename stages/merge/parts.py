@@ -12,6 +12,7 @@ import h5py
 
 from schemas import ArtefactError, InputError, Schema, open_artefact, read_config, read_kind
 from schemas.checks import any_text, parse_json
+from schemas.files.inputs import FILE_ATTRIBUTES
 from stages.physics.images.table import relative_path
 
 # The dimension along which the shards of a stage are laid end to end; maps are joined by rows instead, and so are scenes
@@ -76,8 +77,9 @@ class Parts:
             common |= {name: _JOINED[name](values) for name, values in found.items() if values}
         if common.get("dem_valid_px") == 0:
             raise InputError(f"{self.paths[0]}: expected elevations in one of the parts, found only nodata in all.")
-        if "scene" in common:
-            common["scene"] = moved(str(common["scene"]), self.paths[0], output)
+        for name in FILE_ATTRIBUTES:
+            if name in common:
+                common[name] = moved(str(common[name]), self.paths[0], output)
         return common
 
 
@@ -126,9 +128,12 @@ def _check_alike(parts: Parts) -> None:
     first, name = parts.files[0], parts.paths[0]
     for path, file in zip(parts.paths[1:], parts.files[1:], strict=True):
         for key, value in first.attrs.items():
-            if key not in {*_OWN, *_JOINED, ROWS} and any_text(file.attrs.get(key)) != any_text(value):
+            theirs = file.attrs.get(key)
+            if key in FILE_ATTRIBUTES:
+                value, theirs = (moved(any_text(v), p, name) for v, p in ((value, name), (theirs, path)))
+            if key not in {*_OWN, *_JOINED, ROWS} and any_text(theirs) != any_text(value):
                 raise ArtefactError(
-                    f"{path}: expected {key} = {value} as in {name}, found {file.attrs.get(key)}; these are not parts of one whole."
+                    f"{path}: expected {key} = {value} as in {name}, found {theirs}; these are not parts of one whole."
                 )
         mine, other = read_config(first), read_config(file)
         if any(mine.get(k) != other.get(k) for k in {*mine, *other} - {"shard", "device"}):
