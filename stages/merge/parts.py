@@ -79,7 +79,7 @@ class Parts:
             raise InputError(f"{self.paths[0]}: expected elevations in one of the parts, found only nodata in all.")
         for name in FILE_ATTRIBUTES:
             if name in common:
-                common[name] = moved(str(common[name]), self.paths[0], output)
+                common[name] = moved(any_text(common[name]), self.paths[0], output)
         return common
 
 
