@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import h5py
@@ -366,12 +367,20 @@ def test_what_registration_finds_is_taken_off_by_all_shards(rng, tmp_path, monke
     moved, stayed = (np.log(made(scene, c)[0] / truth)[inner] for c in (config, QUIET))
     assert rms(moved - moved.mean()) < 0.25 * rms(stayed - stayed.mean())
     path, again, part = (tmp_path / name for name in ("calibration.json", "again.json", "part.h5"))
-    albedo.calibrate_to(path, scene.map, scene.scene, config)
-    Calibration.read(path).write(again)
+    albedo.calibrate_to(Output(path), scene.map, scene.scene, config)
+    made_from = json.loads(path.read_text())["made_from"]
+    Calibration.read(path, made_from).write(again, made_from)
     assert again.read_bytes() == path.read_bytes()
     whole = made(scene, config)[0]
-    running.run_part(scene.map, scene.scene, path, part, config)
+    monkeypatch.setattr(running, "_calibrate", None)  # shards have no need of it
+    albedo.run(scene.map, scene.scene, part, config, calibration=path)
     np.testing.assert_array_equal(read(part, "albedo")[0], whole)
+    with pytest.raises(ArtefactError, match=r"calibration\.json: .* found another \(register\)"):
+        albedo.run(scene.map, scene.scene, tmp_path / "other.h5", QUIET, calibration=path)
+    for text in ("no JSON", "[]", '{"made_from": 1}'):
+        path.write_text(text)
+        with pytest.raises(ArtefactError, match=r"calibration\.json: expected "):
+            albedo.run(scene.map, scene.scene, tmp_path / "other.h5", config, calibration=path)
 
 
 def test_an_unknown_form_of_registration_is_refused(planted, tmp_path):

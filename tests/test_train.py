@@ -194,9 +194,10 @@ def test_uncalibrated_images_get_their_gains(tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_learn_like_one(small_artefacts, trained, tmp_path):
-    """torchrun with two processes: BatchNorm sees whole batches, dropout and loss too, so the losses agree to rounding.
+    """torchrun with two processes: BatchNorm, dropout and loss see whole batches.
 
-    Measured: 1e-6 to 6e-5 apart; without shared statistics, a factor of two in the first epoch.
+    Sums come in another order, and training lets their rounding grow. Measured: losses 7e-7 apart after the first epoch,
+    1e-3 after four; without shared statistics, a factor of two in the first epoch.
     """
     out = tmp_path / "checkpoint.h5"
     command = [
@@ -208,7 +209,8 @@ def test_two_processes_learn_like_one(small_artefacts, trained, tmp_path):
     subprocess.run(command, check=True, capture_output=True, timeout=240)
     with h5py.File(out) as two, h5py.File(tmp_path / "one.h5") as one:
         for name in ("train_loss", "validation_loss"):
-            np.testing.assert_allclose(two[name][...], one[name][...], rtol=1e-3, err_msg=name)
+            np.testing.assert_allclose(two[name][0], one[name][0], rtol=1e-5, err_msg=name)
+            np.testing.assert_allclose(two[name][...], one[name][...], rtol=5e-3, err_msg=name)
 
 
 def test_bad_requests_are_refused_and_leave_nothing(small_artefacts, tmp_path):

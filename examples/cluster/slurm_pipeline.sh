@@ -3,56 +3,50 @@
 #
 #   examples/cluster/slurm_pipeline.sh DEM IMAGES_CSV FOLDER
 #
-# Settings (environment): LUNARGR=lunargr  SHARDS=32  IMAGE_SHARDS=SHARDS  NODES=2  GPUS=4  GSD=5  CROP=128  COUNT=80000
-# MODEL=M2  EPOCHS=20  SEED=0, and those of slurm_array.sh. What exists is not made again: after a failure, mend its cause
-# and run the same line once more. DRY_RUN=1 prints what would be submitted.
+# Settings (environment): SHARDS=32  IMAGE_SHARDS=SHARDS  GSD=5  CROP=128  COUNT=80000  MODEL=hapke  EPOCHS=20  SEED=0
+#   REGISTER=  constant, affine or field: take off how far images lie from their renderings; nothing without
+#   NODES=2  GPUS=4  of each node, for training; GPUS=0 trains on CPUs
+#   TRAIN_OPTIONS="--cpus-per-task=8 --mem=32G --time=12:00:00 -p gpu"  in place of what slurm_train.sh asks for
+# and those of slurm_array.sh, which hold for all other jobs. Every job is shown to Slurm before the first is submitted;
+# a second chain beside one in the queue is refused. What exists is not made again: after a failure, mend its cause and
+# run the same line again. DRY_RUN=1 prints what would be submitted.
 set -euo pipefail
 
 if [ $# -lt 3 ]; then
-    sed -n '2,9s/^# \{0,1\}//p' "$0" >&2
+    sed -n '2,12s/^# \{0,1\}//p' "$0" >&2
     exit 2
 fi
 dem=$1 images=$2 folder=$3
-: "${LUNARGR:=lunargr}" "${SHARDS:=32}" "${NODES:=2}" "${GPUS:=4}" "${GSD:=5}" "${CROP:=128}" "${COUNT:=80000}"
-: "${IMAGE_SHARDS:=$SHARDS}" "${MODEL:=M2}" "${EPOCHS:=20}" "${SEED:=0}" "${SBATCH_OPTIONS:=}"
-export LUNARGR
+: "${SHARDS:=32}" "${NODES:=2}" "${GPUS:=4}" "${GSD:=5}" "${CROP:=128}" "${COUNT:=80000}" "${IMAGE_SHARDS:=$SHARDS}"
+: "${MODEL:=hapke}" "${EPOCHS:=20}" "${SEED:=0}" "${REGISTER:=}" "${TRAIN_OPTIONS:=}"
 here=$(cd "$(dirname "$0")" && pwd)
+# shellcheck source-path=SCRIPTDIR source=slurm_jobs.bash
+. "$here/slurm_jobs.bash"
+export LUNARGR
 mkdir -p "$folder"
-last=${AFTER:-} # the job that the next one has to wait for
 
-# wide OUTPUT SHARDS STAGE ARGUMENTS...
-wide() {
-    [ -e "$1" ] && return
-    last=$(AFTER=$last "$here/slurm_array.sh" "$2" "$1" "${@:3}")
+scene=$folder/scene.h5 pairs=$folder/pairs.h5 checkpoint=$folder/checkpoint.h5 map=$folder/svbrdf.h5
+register=() training=(--nodes="$NODES")
+[ -z "$REGISTER" ] || register=(--register "$REGISTER")
+[ "$GPUS" = 0 ] || training+=(--gpus-per-node="$GPUS")
+read -r -a options <<<"$TRAIN_OPTIONS"
+training+=(${options[@]+"${options[@]}"})
+
+pipeline() {
+    # The DEM's rows first, then each image on the grid that they give.
+    wide "$folder/grid.h5" "$SHARDS" ingest "$dem" --gsd "$GSD" --crop "$CROP"
+    wide "$scene" "$IMAGE_SHARDS" ingest "$folder/grid.h5" --images "$images" --crop "$CROP"
+    wide "$folder/crops.h5" 4 sample "$scene" --count "$COUNT" --seed "$SEED"
+    wide "$pairs" "$SHARDS" project "$folder/crops.h5" ${register[@]+"${register[@]}"}
+    [ -e "$checkpoint" ] || submit "$checkpoint" "${training[@]}" "$here/slurm_train.sh" \
+        "$pairs" "$checkpoint" --model "$MODEL" --epochs "$EPOCHS" --seed "$SEED"
+    local trained=$last
+    one "$folder/evaluation.h5" evaluate "$pairs" "$checkpoint" --resume
+    last=$trained
+    wide "$map" "$SHARDS" infer "$scene" "$checkpoint"
+    # The images are calibrated once, for all shards.
+    one "$folder/calibration.json" albedo "$map" "$scene" ${register[@]+"${register[@]}"}
+    wide "$folder/svbrdf_albedo.h5" "$SHARDS" albedo "$map" "$scene" ${register[@]+"${register[@]}"} \
+        --calibration "$folder/calibration.json"
 }
-
-# one OUTPUT SBATCH_WORDS...: a single job
-one() {
-    local output=$1
-    shift
-    [ -e "$output" ] && return
-    local words=(sbatch --parsable)
-    [ -z "$SBATCH_OPTIONS" ] || { read -r -a extra <<<"$SBATCH_OPTIONS" && words+=("${extra[@]}"); }
-    [ -z "$last" ] || words+=(--dependency="afterok:$last")
-    words+=("$@")
-    if [ -n "${DRY_RUN:-}" ]; then
-        printf '%q ' "${words[@]}" >&2
-        echo >&2
-        last=12345
-    else
-        last=$("${words[@]}")
-    fi
-}
-
-# The DEM's rows first, then each image on the grid that they give.
-wide "$folder/grid.h5" "$SHARDS" ingest "$dem" --gsd "$GSD" --crop "$CROP"
-wide "$folder/scene.h5" "$IMAGE_SHARDS" ingest "$folder/grid.h5" --images "$images" --crop "$CROP"
-wide "$folder/crops.h5" 4 sample "$folder/scene.h5" --count "$COUNT" --seed "$SEED"
-wide "$folder/pairs.h5" "$SHARDS" project "$folder/crops.h5"
-one "$folder/checkpoint.h5" --nodes="$NODES" --gpus-per-node="$GPUS" "$here/slurm_train.sh" \
-    "$folder/pairs.h5" "$folder/checkpoint.h5" --model "$MODEL" --epochs "$EPOCHS" --seed "$SEED"
-trained=$last
-wide "$folder/svbrdf.h5" "$SHARDS" infer "$folder/scene.h5" "$folder/checkpoint.h5"
-last=$trained
-one "$folder/evaluation.h5" --job-name=lunargr-evaluate --cpus-per-task=4 --mem=8G --time=04:00:00 --wrap \
-    "$LUNARGR evaluate $(printf '%q ' "$folder/pairs.h5" "$folder/checkpoint.h5")--resume --output $(printf %q "$folder/evaluation.h5")"
+submit_all "$folder" pipeline

@@ -35,6 +35,10 @@ def command(
             help="Align each image with its rendering: constant, affine or field, as in 'lunargr project'.",
         ),
     ] = Config.register,
+    calibration: Annotated[
+        Path | None,
+        typer.Option("--calibration", metavar="JSON", help="Calibration of the images to use, from '-o NAME.json'."),
+    ] = None,
     geotiff: options.GeoTiff = None,
     no_geotiff: options.NoGeoTiff = False,
     shard: options.Shard = None,
@@ -49,6 +53,8 @@ def command(
 
     The albedo multiplies the I/F of the map. It differs from 1 where the photographs agree on a difference, and is 1
     elsewhere. Rendering, evaluation and the GeoTIFF use it.
+
+    An output NAME.json gets the gains, offsets and errors of the images alone. Shards read them with --calibration.
     """
     converted = {
         "leave_out": options.read_names("--leave-out", leave_out),
@@ -57,13 +63,24 @@ def command(
     }
     config = options.configure(Config, locals(), **converted, shard=options.parse_shard(shard))
     console, to = Console(quiet), options.make_map_output(output, overwrite, geotiff, no_geotiff)
-    if options.in_parts(scheduler, resume, parts, shard):
+    in_parts = options.in_parts(scheduler, resume, parts, shard)
+    if output.suffix == ".json":
+        if in_parts or shard or calibration:
+            raise ConfigError(
+                f"{output}: expected an output NAME.h5 with --shard, --scheduler, --resume and --calibration, found a calibration."
+            )
+        fitted = albedo.calibrate_to(to, svbrdf, scene, config, console.progress)
+        console.say(f"{output}: calibration of {len(fitted.gain)} images")
+        return
+    if in_parts and calibration:
+        raise ConfigError("--calibration: --scheduler and --resume make their own; give it to --shard alone.")
+    if in_parts:
         from lunargr_cli.fanout.job import Work
         from lunargr_cli.fanout.stages import run_albedo
 
         summary = run_albedo(svbrdf, scene, to, config, Work(scheduler, parts, console.say, console.progress))
     else:
-        summary = albedo.run(svbrdf, scene, to, config, console.say, console.progress)
+        summary = albedo.run(svbrdf, scene, to, config, console.say, console.progress, calibration)
     mean, std, low, high = summary.albedo
     console.say(
         f"{output}: albedo from {len(summary.images)} images over {summary.covered_share:.1%} of the map, "

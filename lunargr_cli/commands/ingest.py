@@ -60,10 +60,11 @@ def command(
     else:
         summary = ingest.run(dem, images, to, config, console.say, console.progress)
     grid, (low, high) = summary.grid, summary.elevation_range
+    heights = f"{low:.1f} to {high:.1f} m" if summary.dem_valid_share else "no elevations"
     method = "reprojected to a local metric grid" if summary.resampled else "area means of the DEM's own grid"
     console.say(
         f"{output}: {grid.height} x {grid.width} px at {grid.gsd:g} m, {method}; "
-        f"{summary.dem_valid_share:.1%} valid, {low:.1f} to {high:.1f} m"
+        f"{summary.dem_valid_share:.1%} valid, {heights}"
     )
     for name in summary.skipped:
         console.say(f"left out: image '{name}' does not touch the DEM")

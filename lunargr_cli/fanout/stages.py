@@ -131,14 +131,14 @@ def calibration_part(path: Path, svbrdf: Path, scene: Path, config: Any) -> None
     """Fit the images' gains and offsets, which all shards share."""
     from stages import albedo
 
-    albedo.calibrate_to(path, svbrdf, scene, config)
+    albedo.calibrate_to(Output(path, overwrite=True), svbrdf, scene, config)
 
 
 def albedo_part(path: Path, svbrdf: Path, scene: Path, config: Any, calibration: Path) -> None:
     """Write one shard of a map with albedo."""
     from stages import albedo
 
-    albedo.run_part(svbrdf, scene, calibration, path, config)
+    albedo.run(svbrdf, scene, Output(path, overwrite=True), config, calibration=calibration)
     path.with_suffix(".tif").unlink(missing_ok=True)  # where one part is the whole
 
 

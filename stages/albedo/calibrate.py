@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from scipy.special import stdtrit
 
+from schemas.checks import parse_json
+from schemas.errors import ArtefactError
 from stages.albedo.intervals import GAUSSIAN, Stack, unseen_intervals
 from stages.albedo.posterior import Spread, settle
 from stages.albedo.pyramid import LEVELS, bands
@@ -64,8 +66,8 @@ class Calibration:
         confidence = 1.0 / np.interp(look.cos_incidence, _middles(), self.error)
         return ratio, np.where(known, confidence, 0).astype(np.float32)
 
-    def write(self, path: Path) -> None:
-        """Write it as JSON."""
+    def write(self, path: Path, made_from: dict[str, Any]) -> None:
+        """Write it as JSON. made_from : the inputs and options that it holds for"""
         values = {"gain": self.gain, "offset": self.offset, "error": self.error}
         values |= {"interval": self.interval, "shadow": self.shadow}
         values |= {
@@ -75,13 +77,25 @@ class Calibration:
             "own_px": self.spread.own_px,
         }
         text: dict[str, Any] = {k: v.tolist() for k, v in values.items()} | {"shared_px": self.spread.shared_px}
-        text["fields"] = as_text(self.fields)
+        text |= {"fields": as_text(self.fields), "made_from": made_from}
         path.write_text(json.dumps(text))
 
     @staticmethod
-    def read(path: Path) -> Calibration:
-        """Read what :meth:`write` wrote."""
-        text = json.loads(path.read_text())
+    def read(path: Path, made_from: dict[str, Any]) -> Calibration:
+        """Read what :meth:`write` wrote for the same inputs and options. Raises ArtefactError for anything else."""
+        advice = "make it with 'lunargr albedo ... -o calibration.json'"
+        try:
+            text = parse_json(path.read_text(), str(path), advice=advice)
+        except (OSError, UnicodeDecodeError) as error:
+            raise ArtefactError(f"{path}: expected a calibration as JSON, found none ({error}); {advice}.") from None
+        found = text.pop("made_from", None) if isinstance(text, dict) else None
+        if found != made_from:
+            changed = (
+                [k for k, v in made_from.items() if found.get(k) != v] if isinstance(found, dict) else ["made_from"]
+            )
+            raise ArtefactError(
+                f"{path}: expected the calibration of these files and options, found another ({', '.join(changed)}); {advice}."
+            )
         shared_px, fields = float(text.pop("shared_px")), tuple(from_text(text.pop("fields")))
         v = {k: np.array(values, float) for k, values in text.items()}
         spread = Spread(v["shared"], v["own"], shared_px, v["own_px"], v["prior"])

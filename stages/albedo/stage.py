@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 
 from schemas import SCENE, SVBRDF, ArtefactError, ArtefactWriter, InputError, atomic_path, open_artefact
 from schemas.files.companions import companions_of
-from schemas.files.outputs import Output, check_outputs, map_targets
+from schemas.files.outputs import Output, check_output, check_outputs, map_targets
+from schemas.provenance import sha256
 from schemas.reading import read_strings
 from stages.albedo.calibrate import COSINES, Calibration, calibrate, choose_windows, take_samples
 from stages.albedo.config import Config, Summary, used_frames
@@ -93,23 +95,18 @@ def run(
     config: Config,
     say: Say = say_nothing,
     progress: Progress = show_nothing,
+    calibration: Path | None = None,
 ) -> Summary:
-    """Write the map with albedo. Raises LunargrError."""
-    return _run(svbrdf, scene, None, Output.at(output), config, progress)
-
-
-def run_part(svbrdf: Path, scene: Path, calibration: Path, output: Path, config: Config) -> Summary:
-    """:func:`run` for one shard, with the calibration of :func:`calibrate_to` that all shards share."""
-    return _run(svbrdf, scene, calibration, Output(output, overwrite=True), config, show_nothing)
-
-
-def _run(
-    svbrdf: Path, scene: Path, calibration: Path | None, output: Output, config: Config, progress: Progress
-) -> Summary:
+    """Write the map with albedo. calibration : from :func:`calibrate_to`, for shards, which share it. Raises LunargrError."""
+    output = Output.at(output)
     as_geotiff = config.geotiff and config.shard[1] == 1
-    check_outputs(map_targets(output, as_geotiff), [svbrdf, scene], output.overwrite)
+    named = [svbrdf, scene, *([calibration] if calibration else [])]
+    check_outputs(map_targets(output, as_geotiff), named, output.overwrite)
     with open_ground(svbrdf, scene, config) as ground:
-        found = Calibration.read(calibration) if calibration else _calibrate(svbrdf, scene, ground, config, progress)
+        if calibration:
+            found = Calibration.read(calibration, _identity(svbrdf, scene, config))
+        else:
+            found = _calibrate(svbrdf, scene, ground, config, progress)
         ground.references.take_off(found.fields)
         sizes = {d: ground.map[d].shape[0] for d in ("coefficient", "y", "x")}
         for dim in ("map", "place"):
@@ -149,10 +146,22 @@ def _run(
             return _summary(writer.file, config, scene)
 
 
-def calibrate_to(path: Path, svbrdf: Path, scene: Path, config: Config) -> None:
-    """Write the calibration that all parts of one map share, as JSON."""
-    with open_ground(svbrdf, scene, config) as ground, atomic_path(path) as partial:
-        _calibrate(svbrdf, scene, ground, config, show_nothing).write(partial)
+def calibrate_to(
+    output: Output, svbrdf: Path, scene: Path, config: Config, progress: Progress = show_nothing
+) -> Calibration:
+    """Write the calibration of the images, which all parts of one map share, as JSON. Raises LunargrError."""
+    check_output(output.file, [svbrdf, scene], output.overwrite)
+    with open_ground(svbrdf, scene, config) as ground, atomic_path(output.file) as partial:
+        found = _calibrate(svbrdf, scene, ground, config, progress)
+        found.write(partial, _identity(svbrdf, scene, config))
+    return found
+
+
+def _identity(svbrdf: Path, scene: Path, config: Config) -> dict[str, Any]:
+    """The files and options that a calibration hangs on."""
+    fold = list(config.fold) if config.fold else None
+    options = {"leave_out": list(config.leave_out), "fold": fold, "register": config.register}
+    return {"svbrdf": sha256(svbrdf), "scene": sha256(scene)} | options
 
 
 def _calibrate(svbrdf: Path, scene: Path, ground: Ground, config: Config, progress: Progress) -> Calibration:

@@ -171,6 +171,16 @@ class Bench:
     def map(self, edge: int) -> Path:
         return self.file(f"map-{edge}.h5", lambda p: make.write_map(self.ground(edge), p))
 
+    def strips(self, edge: int) -> Path:
+        """The scene of a map under tilted strips."""
+
+        def write(path: Path) -> None:
+            table = make.write_table(path.with_suffix(".csv"), make.write_strips(self.folder, edge, MAP_GSD))
+            options = ["--skip-outside", "--crop", CROP, "--quiet"]
+            make.lunargr("ingest", self.ground(edge), "--images", table, *options, "-o", path)
+
+        return self.file(f"strips-{edge}.h5", write)
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -221,6 +231,10 @@ STAGES = {
     "infer": Stage(
         "map at 5 m, edge in px", "Mpx", (2000, 4000, 6000), (6000, 12000, 18000),
         lambda b, n: ["infer", b.ground(n), b.checkpoint(), "--device", "cpu"], mpx,
+    ),
+    "albedo": Stage(
+        f"map at 5 m under {make.LOOKS} images, edge in px", "Mpx", (768, 1536, 3072), (1536, 3072, 6144),
+        lambda b, n: ["albedo", b.map(n), b.strips(n)], mpx,
     ),
     "render": Stage(
         "map at 5 m, edge in px", "Mpx", (2000, 4000, 6000), (6000, 12000, 18000),

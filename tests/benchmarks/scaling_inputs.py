@@ -68,6 +68,30 @@ def write_raster(path: Path, tile: np.ndarray, height: int, width: int, gsd: flo
     return path
 
 
+STRIP_PX, TILT, LOOKS = 640, 0.2, 6  # width of a strip, columns a row, images over each pixel
+
+
+def write_strips(folder: Path, edge: int, gsd: float) -> list[Path]:
+    """Tilted strips across a square map, nodata on both sides of each, so many that LOOKS show every pixel."""
+    tile = brightness(relief(gsd), gsd)
+    width = STRIP_PX + math.ceil(TILT * edge)
+    paths = []
+    for k, left in enumerate(range(-width, edge, STRIP_PX // LOOKS)):
+        first, last = max(0, left), min(edge, left + width)
+        if last <= first:
+            continue
+        rows, cols = np.arange(edge)[:, None], np.arange(first, last)[None, :]
+        image = tile[rows % PERIOD, cols % PERIOD]
+        image[np.abs(cols - left - TILT * rows - STRIP_PX / 2) > STRIP_PX / 2] = np.nan
+        path = folder / f"strip-{edge}-{k}.tif"
+        transform = Affine(gsd, 0, gsd * (first - edge / 2), 0, -gsd, gsd * edge / 2)
+        size = {"height": edge, "width": last - first, "count": 1, "dtype": "float32", "nodata": math.nan}
+        with rasterio.open(path, "w", driver="GTiff", crs=crs(), transform=transform, **size) as out:
+            out.write(image, 1)
+        paths.append(path)
+    return paths
+
+
 def write_table(path: Path, images: list[Path]) -> Path:
     """An image table for one Sun, and a camera straight above."""
     azimuth, distance = SUN_AZIMUTH, math.pi / 2 - SUN_ELEVATION
