@@ -387,3 +387,35 @@ def test_an_unknown_form_of_registration_is_refused(planted, tmp_path):
     with pytest.raises(ConfigError, match=r"register`: expected one of constant, affine, field, found 'rubber'"):
         made(planted, replace(QUIET, register="rubber"), "no.h5")
     assert not (planted.folder / "no.h5").exists()
+
+
+def test_of_a_tilted_strip_only_the_windows_that_it_crosses_are_read():
+    from stages.albedo.footprints import CELL_PX, MARGIN_PX, read_footprint
+
+    rows, cols = np.arange(1500)[:, None], np.arange(1400)[None, :]
+    valid = np.abs(cols - 100 - 0.8 * rows) < 60
+    valid[700:] = False
+    box = (0, int(np.argmax(valid.any(axis=0))), 700, int(valid.any(axis=0).sum()))
+    footprint = read_footprint(valid[None], 0, box)
+    reach = CELL_PX + MARGIN_PX
+    for row in range(0, 1500, 100):
+        for col in range(0, 1400, 100):
+            found = footprint.within((row, col, 100, 100))
+            seen = np.argwhere(valid[row : row + 100, col : col + 100]) + (row, col)
+            near = valid[max(0, row - reach) : row + 100 + reach, max(0, col - reach) : col + 100 + reach]
+            assert (found is not None) >= bool(len(seen)) and (found is None or near.any())
+            if found is not None and len(seen):
+                top, left, height, width = found
+                assert (seen.min(axis=0) >= (top, left)).all() and (
+                    seen.max(axis=0) < (top + height, left + width)
+                ).all()
+                assert row <= top and col <= left and top + height <= row + 100 and left + width <= col + 100
+    whole = footprint.within((0, 0, 1500, 1400))
+    assert whole is not None and all(abs(a - b) <= 2 * reach for a, b in zip(whole, box, strict=True))
+
+
+def test_images_beside_each_other_give_what_images_of_the_whole_map_give(planted, found, tmp_path, monkeypatch):
+    """A window that an image fills in part holds the same as if the image had been read over all of it."""
+    monkeypatch.setattr("stages.albedo.footprints.CELL_PX", 16)
+    for mine, whole in zip(made(planted, name="cells.h5"), found, strict=True):
+        np.testing.assert_allclose(mine, whole, rtol=2e-3, atol=2e-3)

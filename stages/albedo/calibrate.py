@@ -23,7 +23,7 @@ from schemas.errors import ArtefactError
 from stages.albedo.intervals import GAUSSIAN, Stack, unseen_intervals
 from stages.albedo.posterior import Spread, settle
 from stages.albedo.pyramid import LEVELS, bands
-from stages.albedo.references import Box, Look, References, overlap
+from stages.albedo.references import Box, Look, References
 from stages.albedo.registered import as_text, from_text
 from stages.common.arrays import Floats, Floats32
 from stages.common.progress import Progress, show_nothing
@@ -111,19 +111,22 @@ class Sample:
     looks: list[Look] = field(default_factory=list)
 
 
-def choose_windows(shape: tuple[int, int], boxes: Sequence[Box]) -> list[Box]:
-    """Windows spread over the map such that every image has WINDOWS_PER_IMAGE, as far as LOOKS allow."""
+def choose_windows(shape: tuple[int, int], count: int, overlapping: Callable[[Box], list[int]]) -> list[Box]:
+    """Windows spread over the map such that every one of ``count`` images has WINDOWS_PER_IMAGE, as far as LOOKS allow.
+
+    overlapping : the images that show something of a window
+    """
     rows, cols = (-(-n // WINDOW_PX) for n in shape)
     total = rows * cols
     step = max(1, round(total * 0.6180339887))  # the golden section leaves no large gap at any time
     while np.gcd(step, total) != 1:
         step += 1
-    seen, looks = np.zeros(len(boxes), int), 0
+    seen, looks = np.zeros(count, int), 0
     chosen: list[Box] = []
     for number in range(total):
         row, col = (WINDOW_PX * k for k in divmod(number * step % total, cols))
         box = row, col, min(WINDOW_PX, shape[0] - row), min(WINDOW_PX, shape[1] - col)
-        images = [k for k, other in enumerate(boxes) if overlap(box, other)]
+        images = overlapping(box)
         if not images or (seen[images] >= WINDOWS_PER_IMAGE).all():
             continue
         if looks + len(images) > LOOKS and chosen:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.albedo.footprints import Footprint
 from stages.common.arrays import Floats32
 from stages.physics.bodies.ephemeris import AU
 from stages.physics.horizon.scene import Overview, horizon_in_scene
@@ -44,6 +45,20 @@ class Look:
     shadow: NDArray[np.bool_]
     sun_sine: float
 
+    def padded(self, own: Box, box: Box) -> Look:
+        """The same on a larger window, of which the photograph shows nothing beside its own."""
+        part = np.s_[own[0] - box[0] : own[0] - box[0] + own[2], own[1] - box[1] : own[1] - box[1] + own[3]]
+
+        def pad(values: NDArray, around: float) -> NDArray:
+            whole = np.full(box[2:], around, values.dtype)
+            whole[part] = values
+            return whole
+
+        return Look(
+            pad(self.measured, np.nan), pad(self.predicted, np.nan), pad(self.cos_incidence, np.nan),
+            pad(self.usable, False), pad(self.shadow, False), self.sun_sine,
+        )  # fmt: skip
+
 
 class SceneHorizon:
     """The terrain horizon towards one Sun for any window, from an overview of the scene that all Suns share."""
@@ -68,7 +83,7 @@ class SceneHorizon:
 
 
 class References(contextlib.AbstractContextManager):
-    """The images of a scene. boxes : (row, col, height, width) of what each shows; use as a context manager."""
+    """The images of a scene. footprints : where each shows something; use as a context manager."""
 
     def __init__(
         self,
@@ -77,10 +92,10 @@ class References(contextlib.AbstractContextManager):
         overview: Overview,
         heights: tuple[float, float],
         frames: Sequence[Frame],
-        boxes: Sequence[Box],
+        footprints: Sequence[Footprint],
     ) -> None:
         self.surface, self.elevation, self.overview, self.heights = surface, elevation, overview, heights
-        self.frames, self.boxes = frames, boxes
+        self.frames, self.footprints = frames, footprints
         self._fields: Sequence[Field | None] = [None] * len(frames)
         self._open: OrderedDict[int, tuple[Source, contextlib.ExitStack]] = OrderedDict()
 
@@ -95,10 +110,15 @@ class References(contextlib.AbstractContextManager):
 
     def overlapping(self, box: Box) -> list[int]:
         """Images that may show something of a window."""
-        return [k for k, other in enumerate(self.boxes) if overlap(box, other)]
+        return [k for k, footprint in enumerate(self.footprints) if footprint.within(box)]
 
     def look(self, k: int, box: Box) -> Look | None:
         """Image ``k`` on a window, None where it shows nothing that counts."""
+        inner = self.footprints[k].within(box)
+        found = self._look(k, inner) if inner else None
+        return found if inner == box or not found or not inner else found.padded(inner, box)
+
+    def _look(self, k: int, box: Box) -> Look | None:
         row, col, height, width = box
         pixels = self.source(k).read(row, col, height, width, self._fields[k])
         if not pixels.valid.any():
@@ -136,8 +156,3 @@ class References(contextlib.AbstractContextManager):
             source = stack.enter_context(opened)
             self._open[k] = source, stack.pop_all()
         return source
-
-
-def overlap(a: Box, b: Box) -> bool:
-    """Whether two boxes share a pixel."""
-    return a[0] < b[0] + b[2] and b[0] < a[0] + a[2] and a[1] < b[1] + b[3] and b[1] < a[1] + a[3]

@@ -21,8 +21,9 @@ def register(references: References, form: str, progress: Progress) -> list[Fiel
     """By how much each image lies away from its rendering, from blocks all over it; None where it shows nothing."""
     found: list[Field | None] = []
     grid = references.surface.grid
-    for k, (frame, (row, col, height, width)) in enumerate(zip(references.frames, references.boxes, strict=True)):
+    for k, (frame, footprint) in enumerate(zip(references.frames, references.footprints, strict=True)):
         progress(k, len(references.frames), "registration")
+        row, col, height, width = footprint.box
         if not (height and width):
             found.append(None)
             continue

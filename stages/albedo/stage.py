@@ -24,6 +24,7 @@ from schemas.provenance import sha256
 from schemas.reading import read_strings
 from stages.albedo.calibrate import COSINES, Calibration, calibrate, choose_windows, take_samples
 from stages.albedo.config import Config, Summary, used_frames
+from stages.albedo.footprints import read_footprint
 from stages.albedo.posterior import estimate, settle
 from stages.albedo.prior import terrain_variance
 from stages.albedo.pyramid import HALO_PX, LEVELS
@@ -41,7 +42,7 @@ from stages.physics.maps.grid import read_grid
 from stages.physics.terrain.surface import Surface, open_surface
 
 BLOCK_PX = 768
-STACK_PX = 64 << 20  # pixels of all images of a block, with what lies around it: 1.3 GB with all that is made of them
+STACK_PX = 24 << 20  # pixels of all images of a block, with what lies around it: 0.2 GB
 OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
 
 
@@ -70,10 +71,9 @@ def open_ground(svbrdf: Path, scene: Path, config: Config) -> Iterator[Ground]:
         frames = load_frames(terrain, scene)
         used = used_frames(frames, config) if frames else []
         chosen = [frame for frame, use in zip(frames, used, strict=True) if use]
-        boxes: list[Box] = [
-            tuple(box) for box, use in zip(terrain["frame_window"][...].tolist(), used, strict=True) if use
-        ]
-        if not any(box[2] and box[3] for box in boxes):
+        boxes = terrain["frame_window"][...].tolist()
+        footprints = [read_footprint(terrain["valid"], k, tuple(boxes[k])) for k in np.flatnonzero(used).tolist()]
+        if not any(f.cells.any() for f in footprints):
             raise InputError(f"{scene}: expected images that overlap the map {svbrdf}, found none.")
         units = _units(svbrdf, file, scene, chosen)
         surface = stack.enter_context(open_surface(svbrdf, None, {}, find_body(str(file.attrs["body_radius_m"]))))
@@ -83,7 +83,7 @@ def open_ground(svbrdf: Path, scene: Path, config: Config) -> Iterator[Ground]:
         heights = (float(cells.min()) if cells.size else 0.0), overview.highest
         heights = heights[0] - 0.5 * max(0.0, heights[1] - heights[0]), heights[1]
         references = stack.enter_context(
-            References(replace(surface, deviations=None), elevation, overview, heights, chosen, boxes)
+            References(replace(surface, deviations=None), elevation, overview, heights, chosen, footprints)
         )
         yield Ground(file, references, units, surface)
 
@@ -168,7 +168,7 @@ def _calibrate(svbrdf: Path, scene: Path, ground: Ground, config: Config, progre
     references = ground.references
     fields = tuple(register(references, config.register, progress)) if config.register else ()
     references.take_off(fields)
-    windows = choose_windows(ground.map["valid"].shape, references.boxes)
+    windows = choose_windows(ground.map["valid"].shape, len(references.frames), references.overlapping)
     samples = take_samples(references, windows, progress, lambda box: terrain_variance(ground.surface, box))
     if not samples:
         raise InputError(
@@ -184,18 +184,15 @@ def work_block(ground: Ground, calibration: Calibration, block: Box) -> tuple[Fl
     top, left = max(0, row - HALO_PX), max(0, col - HALO_PX)
     bottom, right = min(rows, row + height + HALO_PX), min(cols, col + width + HALO_PX)
     box = top, left, bottom - top, right - left
-    references = ground.references
-    images, ratios, confidences = [], [], []
+    references, images = ground.references, list[int]()
+    ratio, confidence = np.zeros((2, len(references.overlapping(box)), *box[2:]), np.float32)
     for k in references.overlapping(box):
         look = references.look(k, box)
         if look is not None:
-            ratio, confidence = calibration.ratio(k, look)
+            ratio[len(images)], confidence[len(images)] = calibration.ratio(k, look)
             images.append(k)
-            ratios.append(ratio)
-            confidences.append(confidence)
+    ratio, confidence = ratio[: len(images)], confidence[: len(images)]
     inner = np.s_[row - top : row - top + height, col - left : col - left + width]
-    ratio = np.stack(ratios) if images else np.zeros((0, box[2], box[3]), np.float32)
-    confidence = np.stack(confidences) if images else ratio.copy()
     count = (confidence[:, *inner] > 0).sum(axis=0).astype(np.uint16)
     spread = calibration.spread.of(images)
     settle(ratio, confidence, spread)
