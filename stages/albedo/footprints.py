@@ -27,8 +27,8 @@ class Footprint:
         part = self.cells[rows, cols]
         if not part.any():
             return None
-        top, bottom = _reach(part.any(axis=1), self.box[0] + CELL_PX * rows.start, box[0], box[2])
-        left, right = _reach(part.any(axis=0), self.box[1] + CELL_PX * cols.start, box[1], box[3])
+        top, bottom = _reach(np.asarray(part.any(axis=1)), self.box[0] + CELL_PX * rows.start, box[0], box[2])
+        left, right = _reach(np.asarray(part.any(axis=0)), self.box[1] + CELL_PX * cols.start, box[1], box[3])
         return (top, left, bottom - top, right - left) if bottom > top and right > left else None
 
 
