@@ -39,8 +39,11 @@ $(TESTED): $(STAMP)
 	$(PIP) --constraint constraints.txt --editable '.[test,lint,spice]'
 	@touch $@
 
+# How sources and pages are written: lint looks at it, test does not.
+STYLE := tests/test_docstrings.py tests/test_figures.py tests/test_layers.py tests/test_package.py
+
 test: $(TESTED) ## the tests that every change must pass (under 10 minutes on two cores)
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" $(STYLE:%=--ignore=%)
 
 test-slow: $(TESTED) ## the longer checks
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
@@ -54,10 +57,11 @@ fuzz: $(TESTED) ## three thousand malformed inputs through the real commands: on
 endurance: $(TESTED) ## interrupt every stage TIMES times (20) at random moments, run it again, compare every byte
 	$(BIN)/python tests/endurance.py --times $(or $(TIMES),20)
 
-lint: $(TESTED) ## ruff, formatting and mypy
+lint: $(TESTED) ## ruff, formatting, mypy, and how sources and pages are written
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python -m pytest -q $(STYLE)
 
 bench: $(TESTED) ## speed and memory, each beside a named peer in the same run; on a quiet machine, then make figures; ONLY=word for some
 	mkdir -p results/bench

@@ -18,7 +18,8 @@ from typing import Annotated, Any
 import typer
 
 from lunargr_cli import INTERRUPTED, commands, quiet_interruptions, signals, stop
-from lunargr_cli.console import flush_out, say_error, say_resources, set_up_streams, write_out
+from lunargr_cli.console import Console, flush_out, say_error, say_resources, set_up_streams, write_out
+from lunargr_cli.next_step import next_step
 from lunargr_cli.options import check_numbers
 from lunargr_cli.paths import guarded
 from lunargr_cli.spelling import running, spell
@@ -55,8 +56,8 @@ def _plain(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode()
 
 
-def _with_safeguards(command: Callable[..., None], shared: bool) -> Callable[..., None]:
-    """The command with what every one of them needs around it.
+def _with_safeguards(name: str, command: Callable[..., None], shared: bool) -> Callable[..., None]:
+    """The command with what every one of them needs around it; its last line says what usually follows.
 
     No number reaches it that is not finite, its inputs are safe from its outputs, it holds the lock of its output from its
     first step on, its command line is known to what it writes, and its errors name its options.
@@ -71,6 +72,8 @@ def _with_safeguards(command: Callable[..., None], shared: bool) -> Callable[...
             made_by = _plain(_command_line()), _plain(_folder())
             with recording(made_by), guarded(command, options, _lock(options.get("output"))):
                 command(**options)
+            if (step := next_step(name, options)) and os.environ.get("RANK", "0") == "0":
+                Console(options.get("quiet", False)).say(f"next: {step}")
         except LunargrError as error:
             raise type(error)(spell(str(error))) from None
         finally:
@@ -124,7 +127,7 @@ for _module in sorted(
     (importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)),
     key=lambda module: module.ORDER,
 ):
-    _command = _with_safeguards(_module.command, getattr(_module, "SHARED_OUTPUT", False))
+    _command = _with_safeguards(_module.NAME, _module.command, getattr(_module, "SHARED_OUTPUT", False))
     # Named, the first sentence is wrapped in the list of commands; left to click, it is cut off.
     _summary = " ".join((_module.command.__doc__ or "").split()).split(". ")[0].rstrip(".")
     app.command(name=_module.NAME, cls=getattr(_module, "CLASS", None), short_help=_summary)(_command)

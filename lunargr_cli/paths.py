@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from schemas.errors import ConfigError
+from schemas.errors import ConfigError, InputError
 from schemas.files.outputs import Target, check_apart, check_folder, check_outputs, protect
 
 
@@ -73,7 +73,24 @@ def guarded(
             for name, path, kind in files.written:
                 if kind is Writes.FOLDER:
                     check_folder(Target(path, name))
+            for path in files.read:
+                _check_there(path)
             yield
+
+
+def _check_there(path: Path) -> None:
+    """Refuse a missing input before a stage is imported, which takes seconds. Raises InputError."""
+    address = os.fspath(path)
+    if ":" in address or address.startswith(
+        "/vsi"
+    ):  # GDAL also reads NETCDF:file.h5:variable and /vsizip/maps.zip/map.tif
+        return
+    try:
+        os.stat(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the path or run the stage that writes it.") from None
+    except (OSError, ValueError):  # of which the stage says more
+        return
 
 
 def _check_name(path: Path) -> None:

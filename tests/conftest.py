@@ -71,6 +71,17 @@ def small_artefacts(small_files, tmp_path_factory):
     return paths
 
 
+@pytest.fixture(scope="session")
+def small_checkpoint(small_artefacts, tmp_path_factory):
+    """A network trained for a moment on the small scene, for tests to which what it learned does not matter."""
+    from stages import train
+
+    path = tmp_path_factory.mktemp("trained") / "checkpoint.h5"
+    config = train.Config(model="hapke_g2r", epochs=1, batch=16, widths=(4, 8, 8), device="cpu", precision="fp32")
+    train.run(small_artefacts["pairs"], path, config)
+    return path
+
+
 @pytest.fixture
 def hilly_map(rng, tmp_path):
     """svbrdf.h5 of a hilly map, alone in the test's folder, with its grid, elevation and coefficients."""

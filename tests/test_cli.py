@@ -7,13 +7,7 @@ import subprocess
 import sys
 
 import pytest
-
-
-def lunargr(*arguments, cwd=None):
-    return subprocess.run(
-        [sys.executable, "-m", "lunargr_cli.main", *map(str, arguments)], capture_output=True, text=True, cwd=cwd
-    )
-
+from command import lunargr
 
 STAGES = [
     "simulate",
@@ -88,7 +82,7 @@ def refused(result, folder, before):
         (["merge", "crops.h5", "pairs.h5", "-o", "x.h5"], "expected a 'crops'"),
         (["inspect", "text.h5"], "another kind of file"),
         (["schema", "nothing"], "choose one of"),
-        (["ingest", "../nowhere/dem.tif", "--body", "pluto2", "-o", "x.h5"], "expected a radius"),
+        (["ingest", "text.h5", "--body", "pluto2", "-o", "x.h5"], "expected a radius"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_3(small_artefacts, tmp_path, arguments, words):
@@ -141,3 +135,22 @@ def test_registries_are_listed(command, names, monkeypatch):
 def test_match_without_files_says_what_to_give():
     result = lunargr("match")
     assert result.returncode == 3 and "give pairs.h5 and checkpoint.h5, or --list" in result.stderr
+
+
+REFUSED_AT_ONCE = """import os, sys
+from lunargr_cli.main import main
+os._exit = sys.exit
+for words in (["train", "absent.h5"], ["render", "--dem", sys.executable, "--model", "hapke", "-o", "x.exr"]):
+    sys.argv = ["lunargr", *words]
+    try:
+        main()
+    except SystemExit as stop:
+        print(stop.code, {"torch", "numba", "rasterio"} & set(sys.modules))
+"""
+
+
+def test_a_missing_file_or_sun_is_refused_before_a_stage_is_imported(tmp_path):
+    """Whose import takes seconds."""
+    done = subprocess.run([sys.executable, "-c", REFUSED_AT_ONCE], capture_output=True, text=True, cwd=tmp_path)
+    assert done.stdout.splitlines() == 2 * ["3 set()"], done.stderr
+    assert "absent.h5: no such file" in done.stderr and "--sun-azimuth" in done.stderr

@@ -100,6 +100,7 @@ def test_an_echo_may_lag_by_what_was_not_tried(scene, tmp_path):
     assert 0 < error < 0.5 and abs(abs(lag) - 7) < 3 * error and unit == "px"
 
 
+@pytest.mark.slow
 def test_large_gains_of_images_are_one_cause(scene, tmp_path):
     """What a first estimate leaves of them is no second cause, nor a curve of the detector."""
     answer = diagnose.run(_pairs(scene, tmp_path, {"image_gain": {"rms": 0.2}})).answer
@@ -262,6 +263,7 @@ def test_of_many_crops_those_that_are_diagnosed_lie_all_over_the_scene():
     assert all(a is b for a, b in zip(all_over(crops[:100], 384, 128), crops[:100], strict=True))
 
 
+@pytest.mark.slow
 def test_what_is_displaced_is_no_cause_where_the_test_pairs_lose_by_it(scene, tmp_path, monkeypatch):
     """Albedo that follows relief looks like a shift: the simulation of other ground is worse with it."""
 
@@ -438,6 +440,7 @@ def test_too_few_pixels_cannot_tell(scene, tmp_path):
     assert answer.verdict == "cannot_tell" and not answer.causes and "too few" in answer.sentence().lower()
 
 
+@pytest.mark.slow
 def test_a_model_that_does_not_fit_names_nothing(scene, tmp_path):
     path = _pairs(scene, tmp_path, {})
     with h5py.File(path, "a") as file:

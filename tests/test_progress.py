@@ -115,8 +115,8 @@ def test_a_log_gets_a_line_now_and_then(monkeypatch):
     )
 
 
-def test_training_counts_the_batches_of_all_epochs_and_of_validation(tmp_path):
-    """And the file says the same number of the best epoch as the terminal."""
+def test_training_counts_the_batches_of_all_epochs_and_what_follows_them(tmp_path):
+    """Validation and standard deviations. And the file says the same number of the best epoch as the terminal."""
     scene = make_scene(np.random.default_rng(11), pairs=32, size=16, frames=2)
     scene.split = np.repeat([0, 1, 2], [16, 8, 8]).astype(np.uint8)
     pairs = write_pairs(tmp_path / "pairs.h5", scene)
@@ -125,7 +125,13 @@ def test_training_counts_the_batches_of_all_epochs_and_of_validation(tmp_path):
     train.run(pairs, tmp_path / "c.h5", config, say=said.append, progress=lambda *report: reports.append(report))
     counts = [done for done, _, _ in reports]
     assert counts == sorted(set(counts)) and {total for _, total, _ in reports} == {counts[-1]}
-    assert {what for _, _, what in reports} == {"epoch 1/3", "epoch 2/3", "epoch 3/3", "validation"}
+    assert {what for _, _, what in reports} == {
+        "epoch 1/3",
+        "epoch 2/3",
+        "epoch 3/3",
+        "validation",
+        "standard deviations",
+    }
     starred = [line for line in said if line.startswith("epoch ") and "*" in line][-1]
     with h5py.File(tmp_path / "c.h5") as file:
         assert f"epoch {file.attrs['best_epoch']:3d}/3" in starred

@@ -10,7 +10,8 @@ import subprocess
 
 import h5py
 import pytest
-from cluster_scene import LUNARGR, assert_same, environment, lunargr
+from cluster_scene import LUNARGR, assert_same, environment
+from command import outcome as lunargr
 from test_schemas import write_pairs
 
 from lunargr_cli.commands import replay

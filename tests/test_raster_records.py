@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 import rasterio
-from cluster_scene import lunargr
+from command import outcome as lunargr
 
 from schemas.provenance import chain, sha256
 from stages import convert, render

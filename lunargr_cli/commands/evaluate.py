@@ -98,7 +98,7 @@ def command(
         result = evaluate.run(pairs, checkpoints, to, config, console.say, console.progress)
     columns, cells = result_lines(result)
     unit = "I/F" if result["image_units"] == "iof" else f"shares of {result['dn_full_range']:.0f} DN"
-    console.table(f"split '{split}': {basis(result)}; errors in {unit}", columns, cells)
+    console.table(f"split '{split}': {basis(result)}; RMSE in {unit}, MSE in its square", columns, cells)
     columns, cells = gain_lines(result)
     if cells:
         console.table(f"what the learned reflectance gains, paired over ground: {basis(result)}", columns, cells)

@@ -26,6 +26,7 @@ from schemas.errors import ConfigError
 from schemas.files.outputs import Output, write_json
 from stages import render
 from stages.render import Config, StereoConfig, Summary
+from stages.render.config import check
 
 NAME, ORDER = "render", 60
 CONVERGENCE = ",".join(f"{edge:g}" for edge in StereoConfig.convergence_deg)
@@ -227,6 +228,8 @@ def command(
         "shard": parse_shard(shard),
     }
     config = configure(Config, locals(), **converted)
+    if stereo is None:
+        check(config, trajectory is not None)
     console, to = Console(quiet), Output(output, overwrite, resume, json=json_file)
     if stereo is None and altitude is not None:
         raise ConfigError("--altitude: expected together with --stereo; a single view has its height in --position.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -71,7 +72,8 @@ def command(
     console = Console(quiet)
     summary = train.run(pairs, Output(output, overwrite, resume), config, console.say, console.progress)
     best = summary.history.best_epoch
+    error = math.sqrt(summary.history.validation_loss[best])
     console.say(
-        f"{output}: best epoch {best + 1}, validation MSE {summary.history.validation_loss[best]:.4e}; "
+        f"{output}: best epoch {best + 1}, validation RMSE {error:.5f} in {summary.error_unit}; "
         f"{summary.pairs_per_second:.1f} pairs/s in {summary.precision}"
     )

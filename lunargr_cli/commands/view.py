@@ -54,5 +54,5 @@ def command(
     smaller = f", means of {made.factor} x {made.factor} px" if made.factor > 1 else ""
     console.say(
         f"{output}: {made.height} x {made.width} px{smaller}, {made.model}, {made.layers} maps, "
-        f"{made.photographs} photographs, {made.size / 1e6:.1f} MB; open it in a browser"
+        f"{made.photographs} photographs, {made.size / 1e6:.1f} MB"
     )

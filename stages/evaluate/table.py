@@ -153,7 +153,7 @@ def result_lines(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
                 _bounds_text(row),
                 "-" if row["mse_run_std"] is None else f"{row['mse_run_std']:.1e}",
                 f"{row['mse_crop_sum']:.3f}",
-                f"{row['rmse']:.4f}",
+                f"{row['rmse']:.5f}",
                 *(
                     "-" if row[key] is None else f"{row[key]:.{digits}f}"
                     for key, digits in (("psnr", 2), ("psnr_crop_range", 2), ("ssim", 3), ("lpips", 3))

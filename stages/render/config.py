@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from schemas.errors import ConfigError
+from stages.common.sun_given import sun_given
 
 VIEWS = ("ortho", "pinhole")
 EXPORTS = ("colmap", "nerfstudio")
@@ -147,6 +148,8 @@ def check(config: Config, trajectory: bool = False) -> None:
         raise ConfigError("the Earth: expected `earthshine` with both `earth_azimuth_deg` and `earth_elevation_deg`.")
     if config.export is not None and not trajectory:
         raise ConfigError("`export`: expected together with `trajectory`; a single view makes no data set.")
+    if not (trajectory or config.camera):  # rows and camera models may know their Sun
+        sun_given(*(getattr(config, name) for name in SUN if name != "solar_distance_au"))
     if config.export not in (None, *EXPORTS):
         raise ConfigError(f"`export`: expected one of {', '.join(EXPORTS)}; found '{config.export}'.")
     if config.view == "ortho" or config.camera or trajectory:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from schemas.errors import InputError
 from schemas.files.companions import companions_of
@@ -27,6 +26,7 @@ from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
 from stages.render.pictures import read_exr, stretch
 
+EXPORT_PASSES = 3  # over all views: for a common white, for the pictures, for the data set's own tables
 POINTS_PER_SIDE = 24  # of each view, on which the sparse points are picked
 SAME_PLACE = 2e-3  # of the distance: a point that another view sees this near is the same
 GL_AXES = np.diag([1.0, -1.0, -1.0])  # nerfstudio's cameras look along -z, with y up
@@ -69,8 +69,13 @@ def export_files(view_ids: Sequence[str], folder: Path, kind: str) -> list[Path]
     return [folder / kind / name for name in ("world.json", *images, *rest)]
 
 
-def export_views(views: Sequence[View], grid: Grid, folder: Path, kind: str) -> None:
-    """Write the data set of ``views`` into ``folder``/colmap or ``folder``/nerfstudio. Raises InputError."""
+def export_views(
+    views: Sequence[View], grid: Grid, folder: Path, kind: str, report: Callable[[int], None] = lambda done: None
+) -> None:
+    """Write the data set of ``views`` into ``folder``/colmap or ``folder``/nerfstudio. Raises InputError.
+
+    report : called with the number of views done, each counted EXPORT_PASSES times in the end
+    """
     missing = [view.exr.name for view in views if not view.exr.exists()]
     if missing:
         raise InputError(
@@ -80,12 +85,18 @@ def export_views(views: Sequence[View], grid: Grid, folder: Path, kind: str) -> 
     told = target / "world.json"
     with claim(told), companions_of(told):
         (target / "images").mkdir(exist_ok=True)
-        limit = _white(views)
-        for view in views:
+        limit = _white(_counted(views, report, 0))
+        for view in _counted(views, report, len(views)):
             _write_image(target / "images" / f"{view.view_id}.png", read_exr(view.exr)["image"], limit)
         write = _write_colmap if kind == "colmap" else _write_nerfstudio
-        write(views, world, target)
+        write(views, world, target, lambda done: report(2 * len(views) + done))
         _write_world(told, world, grid)
+
+
+def _counted(views: Sequence[View], report: Callable[[int], None], before: int) -> Iterator[View]:
+    for number, view in enumerate(views):
+        report(before + number)
+        yield view
 
 
 def z_depth(camera: Pinhole, distance: NDArray) -> Floats:
@@ -109,7 +120,7 @@ def _ray_slopes(camera: Pinhole) -> tuple[Floats, Floats]:
     return x, y
 
 
-def _white(views: Sequence[View]) -> float:
+def _white(views: Iterable[View]) -> float:
     """One white for all views, so that the same ground is as bright in each."""
     sample = [image[np.isfinite(image)][::97] for image in (read_exr(v.exr)["image"] for v in views)]
     values = np.concatenate(sample)
@@ -143,11 +154,11 @@ def _write_world(path: Path, world: World, grid: Grid) -> None:
     write_text(path, json.dumps(document, indent=1))
 
 
-def _write_nerfstudio(views: Sequence[View], world: World, target: Path) -> None:
+def _write_nerfstudio(views: Sequence[View], world: World, target: Path, report: Callable[[int], None]) -> None:
     """transforms.json with depth maps as float32 arrays in mm, which nerfstudio's default scale makes metres."""
     (target / "depths").mkdir(exist_ok=True)
     frames: list[dict[str, Any]] = []
-    for view in views:
+    for view in _counted(views, report, 0):
         rotation, place = world.pose(view.camera)
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = rotation @ GL_AXES, place
@@ -178,11 +189,11 @@ def _intrinsics(camera: Pinhole) -> dict[str, float]:
     }
 
 
-def _write_colmap(views: Sequence[View], world: World, target: Path) -> None:
+def _write_colmap(views: Sequence[View], world: World, target: Path, report: Callable[[int], None]) -> None:
     """sparse/0 with cameras.txt, images.txt and points3D.txt: true ground points with all views that see them."""
     folder = target / "sparse" / "0"
     folder.mkdir(parents=True, exist_ok=True)
-    points = list(_tracks(views, world))
+    points = list(_tracks(views, world, report))
     seen: list[list[tuple[float, float, int]]] = [[] for _ in views]
     lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
     for number, (place, track) in enumerate(points, start=1):
@@ -204,10 +215,12 @@ def _write_colmap(views: Sequence[View], world: World, target: Path) -> None:
         write_text(folder / f"{name}.txt", "\n".join(table) + "\n")
 
 
-def _tracks(views: Sequence[View], world: World) -> Iterator[tuple[Floats, list[tuple[int, float, float]]]]:
+def _tracks(
+    views: Sequence[View], world: World, report: Callable[[int], None]
+) -> Iterator[tuple[Floats, list[tuple[int, float, float]]]]:
     """Ground points of every view, (3,) in the world's axes, m, with (view, sample, line) of all views that see them."""
     depths = [read_exr(view.exr)["depth"] for view in views]
-    for k, view in enumerate(views):
+    for k, view in enumerate(_counted(views, report, 0)):
         points, sample, line = _grid_points(view.camera, depths[k], world)
         tracks = [[(k, s, ln)] for s, ln in zip(sample, line, strict=True)]
         for other, other_view in enumerate(views):
@@ -249,5 +262,7 @@ def project(camera: Pinhole, world: World, points: Floats) -> tuple[Mask, Floats
 
 def to_quaternion(rotation: Floats) -> tuple[float, float, float, float]:
     """(3, 3) rotation -> w, x, y, z with w >= 0."""
+    from scipy.spatial.transform import Rotation  # slow to import, and of no use to a view without a data set
+
     x, y, z, w = (float(v) for v in Rotation.from_matrix(rotation).as_quat(canonical=True))
     return w, x, y, z

@@ -23,12 +23,14 @@ from stages.physics.maps.grid import Grid
 from stages.physics.terrain.shading import BACKPLANES, Light
 from stages.physics.terrain.surface import Surface
 from stages.render.config import SUN, Config, Summary, check, inputs, output_files
-from stages.render.dataset import View, export_files, export_views
+from stages.render.dataset import EXPORT_PASSES, View, export_files, export_views
 from stages.render.perspective import apply_sensor, make_scene, render_view
 from stages.render.pictures import Preview, write_exr, write_png
 from stages.render.setup import camera_place, find_camera, make_light, metadata, open_source
 from stages.render.tally import Tally
 from stages.render.trajectory import ViewRow, read_trajectory
+
+EACH = 3  # work of rendering a view, in passes of its export
 
 
 def run_trajectory(
@@ -70,11 +72,12 @@ def run_trajectory(
                 pass
     check_outputs(targets, [table, *inputs(source, config)], output.overwrite)
     results: list[Summary] = []
+    total = EACH * len(views) + (0 if config.export is None else EXPORT_PASSES * len(views))
     with open_source(source, config, body) as surface:
         relief = surface.height_range()
         lights: dict[str, Light] = {}  # a Sun that stays serves many views with one horizon
         for number, view in enumerate(views):
-            progress(number, len(views), "views")
+            progress(EACH * number, total, "views")
             if view.view_id in done:
                 results.append(Summary(view.view_id, tuple(outputs[view.view_id]), config.size_px, skipped=True))
                 continue
@@ -95,8 +98,11 @@ def run_trajectory(
         if config.export is not None:
             cameras = [cast(Pinhole, find_camera(surface, _with_row(config, view))) for view in views]
             rendered = [View(v.view_id, c, outputs[v.view_id][0]) for v, c in zip(views, cameras, strict=True)]
-            export_views(rendered, surface.grid, folder, config.export)
-    progress(len(views), len(views), "views")
+            before = EACH * len(views)
+            export_views(
+                rendered, surface.grid, folder, config.export, lambda done: progress(before + done, total, "export")
+            )
+    progress(total, total, "views")
     return results
 
 

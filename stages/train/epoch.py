@@ -114,10 +114,15 @@ def evaluate_loss(
 
 
 def overall(progress: Progress, epoch: int, epochs: int, work: tuple[int, int], before: int = 0) -> Progress:
-    """What a part of an epoch reports its progress to, as a share of the whole training.
+    """What a part of an epoch reports its progress to, as a share of the whole training and of what follows it.
 
     work : of training and of validation in an epoch; before : done in this epoch already
     """
-    first, total = epoch * sum(work) + before, epochs * sum(work)
+    first, total = epoch * sum(work) + before, whole(epochs, work)
     each = 1 if before else BACKWARD
     return lambda done, _, what: progress(first + each * done, total, what)
+
+
+def whole(epochs: int, work: tuple[int, int]) -> int:
+    """All work: the epochs, then the standard deviations, which look once more at the training pairs."""
+    return epochs * sum(work) + work[0] // BACKWARD

@@ -29,10 +29,10 @@ from stages.train.checkpoint import write_checkpoint
 from stages.train.checks import check, check_pairs
 from stages.train.config import Config
 from stages.train.deviations import fit_deviations
-from stages.train.epoch import BACKWARD, evaluate_loss, learn_epoch, overall
+from stages.train.epoch import BACKWARD, evaluate_loss, learn_epoch, overall, whole
 from stages.train.processes import join_group
 from stages.train.resume import History, Weights, copy_weights, load_weights, restore, save
-from stages.train.training import describe, set_up
+from stages.train.training import describe, error_unit, set_up
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ class Summary:
     pairs_per_second: float
     precision: str
     start: dict[str, float]
+    error_unit: str
 
 
 def run(
@@ -87,7 +88,7 @@ def run(
             say(f"resumed after epoch {len(history.train_loss)}/{config.epochs}")
         if rank == 0:
             say(describe(training))
-        speed = math.nan
+        speed, unit = math.nan, error_unit(training)
         train, validation = reader.indices("train"), reader.indices("validation")
         work = BACKWARD * math.ceil(len(train) / config.batch), math.ceil(len(validation[rank::ranks]) / config.batch)
         for epoch in range(len(history.train_loss), config.epochs):
@@ -107,20 +108,20 @@ def run(
             if rank == 0:
                 save(sidecar, identity, training, history, best)
                 speed = len(train) / training_seconds
-                left = (config.epochs - epoch - 1) * history.epoch_seconds[-1]
                 say(
-                    f"epoch {epoch + 1:3d}/{config.epochs}  train {train_loss:.4e}  validation {validation_loss:.4e}"
-                    f"{' *' if history.best_epoch == epoch else '  '} {speed:6.1f} pairs/s  {left / 60:5.1f} min left"
+                    f"epoch {epoch + 1:3d}/{config.epochs}  RMSE in {unit}: training {math.sqrt(train_loss):.5f}, "
+                    f"validation {math.sqrt(validation_loss):.5f}{' *' if history.best_epoch == epoch else '  '} {speed:6.1f} pairs/s"
                 )
         if rank == 0:
             load_weights(training, best)
             fit_deviations(training, train, validation)
+            progress(whole(config.epochs, work), whole(config.epochs, work), "standard deviations")
             write_checkpoint(output, config, training, history)
             sidecar.unlink(missing_ok=True)
     if ranks > 1:
         dist.barrier()
         dist.destroy_process_group()
-    return Summary(history, speed, training.precision, training.start)
+    return Summary(history, speed, training.precision, training.start, unit)
 
 
 def _load_extensions(path: str | None, pairs: Path, say: Say) -> list[Extension]:

@@ -74,6 +74,11 @@ def set_up(
     return Training(reader, predictor, radiometry, optimizer, extensions, device, precision, named, rank, ranks)
 
 
+def error_unit(training: Training) -> str:
+    """What root mean squared errors are in: of uncalibrated images gains are fitted, so that errors read like I/F."""
+    return "I/F" if training.radiometry.calibrated else "I/F at the images' mean gain"
+
+
 def describe(training: Training) -> str:
     """A line on what is about to be learned, on which machine."""
     predictor, reader = training.predictor, training.reader

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
 from schemas.errors import InputError
 from stages.common.arrays import Floats
@@ -42,6 +41,9 @@ class States:
             return np.broadcast_to(self.positions[0], times.shape + (3,)).copy()
         velocities = self.velocities
         if velocities is None:
+            # Half of the time of importing this package, for tables without velocities alone.
+            from scipy.interpolate import CubicSpline
+
             velocities = CubicSpline(self.times, self.positions, bc_type="natural")(self.times, 1)
         i = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, n - 2)
         h = (self.times[i + 1] - self.times[i])[:, None]

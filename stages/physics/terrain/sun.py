@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
-from schemas.errors import ConfigError, GeometryError
+from schemas.errors import GeometryError
 from stages.common.arrays import Floats
+from stages.common.sun_given import sun_given
 from stages.physics.bodies.ephemeris import AU, subsolar_point
 from stages.physics.bodies.spheres import Body
 from stages.physics.light.sun_disc import SUN_RADIUS
@@ -77,25 +79,15 @@ def find_sun(
     distance_au: float | None = None,
 ) -> Sun:
     """The Sun from exactly one of its three descriptions. Raises ConfigError or GeometryError."""
-    angles = azimuth_deg is not None or elevation_deg is not None
-    subsolar = subsolar_longitude_deg is not None or subsolar_latitude_deg is not None
-    if angles + subsolar + (time is not None) != 1:
-        raise ConfigError(
-            "the Sun: expected one of `sun_azimuth_deg` with `sun_elevation_deg`, `subsolar_longitude_deg` with `subsolar_latitude_deg`, "
-            f"or `time`; found {'none' if not (angles or subsolar or time) else 'more than one'}."
-        )
+    given = sun_given(azimuth_deg, elevation_deg, subsolar_longitude_deg, subsolar_latitude_deg, time)
     if time is not None:
         point = subsolar_point(time, body)
         return sun_from_subsolar(point.longitude_deg, point.latitude_deg, point.distance_au)
-    if subsolar:
-        if subsolar_longitude_deg is None or subsolar_latitude_deg is None:
-            raise ConfigError(
-                "the Sun: expected both `subsolar_longitude_deg` and `subsolar_latitude_deg`, found one; give both."
-            )
-        return sun_from_subsolar(subsolar_longitude_deg, subsolar_latitude_deg, distance_au or 1.0)
-    if azimuth_deg is None or elevation_deg is None:
-        raise ConfigError("the Sun: expected both `sun_azimuth_deg` and `sun_elevation_deg`, found one; give both.")
-    return sun_from_angles(azimuth_deg, elevation_deg, grid, distance_au or 1.0)
+    if given == "subsolar":
+        return sun_from_subsolar(
+            cast(float, subsolar_longitude_deg), cast(float, subsolar_latitude_deg), distance_au or 1.0
+        )
+    return sun_from_angles(cast(float, azimuth_deg), cast(float, elevation_deg), grid, distance_au or 1.0)
 
 
 def check_sun_is_up(sun: Sun, grid: Grid, relief: float, name: str = "Sun") -> None:
