@@ -35,6 +35,16 @@ def check_scheduler(text: str | None) -> str | None:
     return text
 
 
+def complete_model(incomplete: str) -> list[str]:
+    """Names of reflectance models for the shell's completion ('lunargr --install-completion')."""
+    from schemas.later import import_when_used
+
+    import_when_used("torch")
+    from stages.physics.photometry import model_names
+
+    return [name for name in model_names() if name.startswith(incomplete)]
+
+
 Config = TypeVar("Config")
 
 

@@ -154,3 +154,12 @@ def test_a_missing_file_or_sun_is_refused_before_a_stage_is_imported(tmp_path):
     done = subprocess.run([sys.executable, "-c", REFUSED_AT_ONCE], capture_output=True, text=True, cwd=tmp_path)
     assert done.stdout.splitlines() == 2 * ["3 set()"], done.stderr
     assert "absent.h5: no such file" in done.stderr and "--sun-azimuth" in done.stderr
+
+
+@pytest.mark.parametrize("words", ["train pairs.h5", "diagnose pairs.h5", "render --dem dem.tif"])
+def test_the_shell_completes_models(words, monkeypatch):
+    line = f"lunargr {words} --model hapke_l"
+    monkeypatch.setenv("_LUNARGR_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", line)
+    monkeypatch.setenv("COMP_CWORD", str(len(line.split()) - 1))
+    assert lunargr().stdout.split() == ["hapke_legendre", "hapke_legendre_h1981"]

@@ -8,6 +8,7 @@ import os
 import shlex
 import subprocess
 
+import command
 import h5py
 import pytest
 from cluster_scene import LUNARGR, assert_same, environment
@@ -27,9 +28,7 @@ def made(small_files, tmp_path_factory):
     folder = tmp_path_factory.mktemp("made")
 
     def run(*arguments):
-        done = subprocess.run(
-            [*LUNARGR, *map(str, arguments)], cwd=folder, env=environment(), capture_output=True, text=True
-        )
+        done = command.lunargr(*arguments, cwd=folder)
         assert done.returncode == 0, done.stderr
 
     run("ingest", small_files.dem, "--images", small_files.images, "--gsd", 20, "--crop", 32, "-o", "scene.h5")

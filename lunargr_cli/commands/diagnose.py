@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.console import Console, write_out
-from lunargr_cli.options import MOST, Json, Overwrite, Quiet, Scheduler, Seed, configure, read_names
+from lunargr_cli.options import MOST, Json, Overwrite, Quiet, Scheduler, Seed, complete_model, configure, read_names
 from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
 from schemas.files.outputs import Output
@@ -28,6 +28,7 @@ def command(
         str,
         typer.Option(
             "--model",
+            autocompletion=complete_model,
             help="Reflectance model to fit without a checkpoint; measured lunar laws replace it where they fit clearly better.",
         ),
     ] = Config.model,

@@ -18,6 +18,7 @@ from lunargr_cli.options import (
     Seed,
     Shard,
     check_once,
+    complete_model,
     configure,
     parse_shard,
 )
@@ -55,7 +56,12 @@ def command(
         ),
     ] = None,
     model: Annotated[
-        str | None, typer.Option("--model", help="Reflectance model for --dem; 'lunargr models' lists them.")
+        str | None,
+        typer.Option(
+            "--model",
+            autocompletion=complete_model,
+            help="Reflectance model for --dem; 'lunargr models' lists them.",
+        ),
     ] = None,
     parameters: Annotated[
         list[str] | None,

@@ -20,7 +20,12 @@ NAME, ORDER = "train", 50
 def command(
     pairs: Annotated[Path, typer.Argument(help="pairs.h5 from 'lunargr project'.")],
     model: Annotated[
-        str, typer.Option("--model", help="Reflectance model to predict; 'lunargr models' lists them.")
+        str,
+        typer.Option(
+            "--model",
+            autocompletion=options.complete_model,
+            help="Reflectance model to predict; 'lunargr models' lists them.",
+        ),
     ] = Config.model,
     maps: Annotated[
         str | None,
