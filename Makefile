@@ -164,7 +164,7 @@ $(D)/fold_%.h5: $(D)/svbrdf.h5 $(D)/scene.h5
 	$(LUNARGR) albedo $^ --fold $*/4 --no-geotiff -o $@ --overwrite $(SAYS)
 
 $(D)/render.exr: $(D)/svbrdf_albedo.h5
-	$(LUNARGR) render $< --sun-azimuth 270 --sun-elevation 25 -o $@ --overwrite $(SAYS)
+	$(LUNARGR) render $< --sun-azimuth 270 --sun-elevation 15 -o $@ --overwrite $(SAYS)
 
 $(D)/view.html: $(D)/svbrdf_albedo.h5 $(D)/pairs.h5
 	$(LUNARGR) view $< --pairs $(D)/pairs.h5 -o $@ --title "lunargr demo: the embedded scene" --overwrite $(SAYS)

@@ -53,11 +53,10 @@ def evaluation(result: dict[str, Any]) -> list[Sentence]:
 
 def evaluation_numbers(result: dict[str, Any]) -> list[Number]:
     """The same gains as changes of the squared error, of models that know nothing of the scored crops."""
-    label = "squared error on unseen ground, against"
     claim = CLAIMS[0][2]
     return [
-        error_change(gain, f"{label} {which}, {title}")
-        for words, which, title, gain in _gains(result)
+        error_change(gain, f"squared error on unseen ground, against {which}")
+        for words, which, _, gain in _gains(result)
         if words == claim
     ]
 
