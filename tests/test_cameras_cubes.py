@@ -16,6 +16,7 @@ from stages.physics.bodies.ephemeris import utc_to_et
 from stages.physics.cameras import camera_from_document, open_camera
 from stages.physics.cameras.isis_cube import Cube
 from stages.physics.cameras.isis_instruments import document_of
+from stages.physics.images.camera_image import open_camera_image
 from stages.physics.images.labels import find_block, find_value, parse_pvl, read_label
 
 SPICE = ("instrument_position", "sun_position", "instrument_pointing", "body_rotation")
@@ -202,3 +203,54 @@ def test_what_a_cube_lacks_is_named(shared):
         with pytest.raises(InputError, match=message) as caught:
             document_of(cube_of(shared, "dawnfc", **change)[0])
         assert "\n" not in str(caught.value)
+
+
+# --- the camera of another image ------------------------------------------------------------------------------------
+
+NAC, APOLLO = "formats/M143947267L.cal.echo.crop.cub", "apollo15_cubes/AS15-M-0297_crop.cub"
+
+
+def moved_in_time(document, seconds):
+    tables = {key: dict(document[key]) for key in SPICE}
+    for table in tables.values():
+        table["ephemeris_times"] = np.asarray(table["ephemeris_times"]) + seconds
+    return document | tables | {"center_ephemeris_time": document["center_ephemeris_time"] + seconds}
+
+
+def whole(document, cube):
+    """What ALE made of cropped cubes: the crop's size with the first line, sample and time of the whole image."""
+    if "line_scan_rate" in document:
+        return moved_in_time(document, -cube.extent().corner[0] * document["line_scan_rate"][0][2])
+    return document | {"starting_detector_line": 0, "starting_detector_sample": 0}
+
+
+def unreduced(document, cube):
+    return document | {key: 0.5 * document[key] for key in ("detector_line_summing", "detector_sample_summing")}
+
+
+def later(document, cube):
+    return moved_in_time(document, 25.2)
+
+
+@pytest.mark.parametrize("cube", [NAC, APOLLO])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (None, ""),
+        (whole, r"expected the camera of this part of the image \(AlphaCube\), found one of the whole image"),
+        (unreduced, r"expected a camera that sums \S+ detector pixels to one \w+ of the cube"),
+        (later, r"expected a camera of the image that began at \S+, found one \+(24|31)\.\d s from it"),
+    ],
+)
+def test_the_camera_of_another_image_is_refused(shared, cube, change, message):
+    path = shared / "data" / cube
+    opened = Cube.open(path)
+    document = document_of(opened)
+    camera = camera_from_document(change(document, opened) if change else document, "camera.json")
+    if change is None:
+        with open_camera_image(path, camera, "an image") as image:
+            assert (image.lines, image.samples) == (camera.lines, camera.samples)
+        return
+    with pytest.raises(InputError, match=message) as caught, open_camera_image(path, camera, "an image"):
+        pass
+    assert "\n" not in str(caught.value)

@@ -39,6 +39,28 @@ class Extent:
     whole: tuple[float, float]
 
 
+def image_extent(label: Block, where: str) -> Extent:
+    """The part of its image that a cube holds. Raises InputError."""
+    size = find_block(label, "Dimensions")
+    if size is None:
+        raise InputError(f"{where}: expected the cube's Dimensions, found none.")
+    lines, samples = int(size["Lines"]), int(size["Samples"])
+    alpha = find_block(label, "AlphaCube")
+    if alpha is None:
+        return Extent(lines, samples, (0.0, 0.0), (1.0, 1.0), (lines, samples))
+    try:
+        # ISIS puts the outer corner at 0.5
+        first = [float(alpha[f"AlphaStarting{axis}"]) - ISIS_SHIFT for axis in ("Line", "Sample")]
+        last = [float(alpha[f"AlphaEnding{axis}"]) - ISIS_SHIFT for axis in ("Line", "Sample")]
+        whole = float(alpha["AlphaLines"]), float(alpha["AlphaSamples"])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{where}: expected numbers in its AlphaCube group, found others; crop it again.") from None
+    scale = (last[0] - first[0]) / lines, (last[1] - first[1]) / samples
+    if min(scale) <= 0:
+        raise InputError(f"{where}: expected an AlphaCube with starts before ends, found {dict(alpha)!r:.120}.")
+    return Extent(lines, samples, (first[0], first[1]), scale, whole)
+
+
 @dataclass(frozen=True)
 class Cube:
     """label : the whole label; keywords : its NAIF keywords; spice : the SPICE tables under the keys of an ISD"""
@@ -107,28 +129,7 @@ class Cube:
 
     def extent(self) -> Extent:
         """The part of the image that the cube holds. Raises InputError."""
-        size = find_block(self.label, "Dimensions")
-        if size is None:
-            raise InputError(f"{self.where}: expected the cube's Dimensions, found none.")
-        lines, samples = int(size["Lines"]), int(size["Samples"])
-        alpha = find_block(self.label, "AlphaCube")
-        if alpha is None:
-            return Extent(lines, samples, (0.0, 0.0), (1.0, 1.0), (lines, samples))
-        try:
-            # ISIS puts the outer corner at 0.5
-            first = [float(alpha[f"AlphaStarting{axis}"]) - ISIS_SHIFT for axis in ("Line", "Sample")]
-            last = [float(alpha[f"AlphaEnding{axis}"]) - ISIS_SHIFT for axis in ("Line", "Sample")]
-            whole = float(alpha["AlphaLines"]), float(alpha["AlphaSamples"])
-        except (KeyError, TypeError, ValueError):
-            raise InputError(
-                f"{self.where}: expected numbers in its AlphaCube group, found others; crop it again."
-            ) from None
-        scale = (last[0] - first[0]) / lines, (last[1] - first[1]) / samples
-        if min(scale) <= 0:
-            raise InputError(
-                f"{self.where}: expected an AlphaCube with starts before ends, found {dict(alpha)!r:.120}."
-            )
-        return Extent(lines, samples, (first[0], first[1]), scale, whole)
+        return image_extent(self.label, self.where)
 
     def common(self, extent: Extent) -> dict[str, Any]:
         """The keys of an ISD that every instrument's cube fills alike."""

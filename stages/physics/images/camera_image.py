@@ -14,9 +14,17 @@ from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
 from schemas.errors import InputError
+from stages.physics.bodies.ephemeris import parse_utc, utc_to_et
 from stages.physics.cameras import Camera
+from stages.physics.cameras.frame import Frame
+from stages.physics.cameras.isis_cube import Extent, image_extent
+from stages.physics.cameras.linescan import LineScan
+from stages.physics.cameras.pushframe import PushFrame
+from stages.physics.images.labels import Block, find_block, find_value, read_label
 from stages.physics.maps import rasters
 
+LABELLED = (".cub",)
+TIME_TOLERANCE = 5.0  # s: clocks, prerolls and whole seconds of labels
 PICTURES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff")
 
 
@@ -65,14 +73,14 @@ def open_camera_image(path: Path, camera: Camera, what: str) -> Iterator[CameraI
                 raise InputError(
                     f"{path}: expected {what} of one band, found {bands}; take the one that is meant (gdal_translate -b N)."
                 )
-            _check_size(path, camera, spec.height, spec.width)
+            _check_belongs(path, camera, spec.height, spec.width)
             yield CameraImage(path, spec.height, spec.width, None, picture)
         finally:
             picture.close()
         return
     with rasters.open_raster(path, what) as dataset:
         rasters.check_single_band(path, dataset, what)
-        _check_size(path, camera, dataset.height, dataset.width)
+        _check_belongs(path, camera, dataset.height, dataset.width)
         yield CameraImage(path, dataset.height, dataset.width, dataset, None)
 
 
@@ -96,9 +104,64 @@ def _open_picture(path: Path) -> Any | None:
     return picture
 
 
-def _check_size(path: Path, camera: Camera, lines: int, samples: int) -> None:
+def _check_belongs(path: Path, camera: Camera, lines: int, samples: int) -> None:
+    """Refuse the camera of another image, or of the whole or unbinned image. Raises InputError."""
     if (lines, samples) != (camera.lines, camera.samples):
         raise InputError(
             f"{path}: expected {camera.lines} lines x {camera.samples} samples as its camera model has, found {lines} x {samples}; "
             "is it cropped, summed or map-projected? Make the camera model for this very file."
         )
+    label = read_label(path) if path.suffix.lower() in LABELLED else None
+    if label is None or find_block(label, "Mapping") is not None:
+        return
+    extent = image_extent(label, str(path))
+    _check_time(path, label, camera, extent)
+    if isinstance(camera, (Frame, LineScan, PushFrame)):
+        _check_window(path, label, camera, extent)
+
+
+def _check_time(path: Path, label: Block, camera: Camera, extent: Extent) -> None:
+    """Against StartTime, of the whole image: the camera's first line is that of the cube, not of the whole image."""
+    started = find_value(label, "StartTime")
+    times = camera.ephemeris_time(np.array([0.0, 1.0]))
+    if started is None or times is None:
+        return
+    after = float(times[0]) - utc_to_et(parse_utc(str(started), f"{path}: StartTime"))
+    expected = extent.corner[0] * float(times[1] - times[0]) / extent.scale[0]
+    if abs(after - expected) > TIME_TOLERANCE and abs(after) > TIME_TOLERANCE:
+        raise InputError(
+            f"{path}: expected a camera of the image that began at {started}, found one {after:+.1f} s from it; make the "
+            "camera model for this very file."
+        )
+    if abs(after) < abs(after - expected):
+        raise _of_the_whole(path, f"its first line {after:.3f} s after the image's start", f"{expected:.3f} s")
+
+
+def _check_window(path: Path, label: Block, camera: Frame | LineScan | PushFrame, extent: Extent) -> None:
+    """The camera's summing and first detector pixel against the cube's crop, scale and summing."""
+    detector, framing = camera.detector, isinstance(camera, Frame)
+    summing = find_value(label, "SpatialSumming")
+    for axis, name in ((0, "line"), (1, "sample")):
+        if axis == 0 and not framing:
+            continue  # lines of these are times
+        binning = detector.summing[axis] / extent.scale[axis]
+        least = float(summing or 1.0)  # a camera of the unreduced image sums less than that
+        if binning < 0.999 * least or (summing is not None and binning > 1.001 * least):
+            raise InputError(
+                f"{path}: expected a camera that sums {least * extent.scale[axis]:g} detector pixels to one {name} of "
+                f"the cube, as SpatialSumming and AlphaCube say, found {detector.summing[axis]:g}; make the camera model for "
+                "this very file."
+            )
+        first = float(find_value(label, "SampleFirstPixel") or 0.0) if axis == 1 else 0.0
+        corner = extent.corner[axis] * binning
+        # of the two, the whole image's first pixel or the cube's: instruments begin some pixels into their detectors
+        if abs(detector.start[axis] - first) < abs(detector.start[axis] - first - corner):
+            found = f"its first {name} at detector pixel {detector.start[axis]:g}"
+            raise _of_the_whole(path, found, f"{first + corner:g}")
+
+
+def _of_the_whole(path: Path, found: str, expected: str) -> InputError:
+    return InputError(
+        f"{path}: expected the camera of this part of the image (AlphaCube), found one of the whole image, {found} instead of "
+        f"{expected}; make the camera model for this very file."
+    )
