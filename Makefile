@@ -114,7 +114,7 @@ PLACES_demo-full := 20
 ALSO_demo-full = $(D)/held_out.h5 $(D)/match.json
 FIGURES_demo-full = $(D)/figures/match_daisy_1.png $(D)/figures/match_sift_1.png
 
-# One split of the scene for everything that is sampled from it: a quarter of its ground tiles is for testing, 20 at least.
+# One split of the scene for everything that is sampled from it: a quarter of its ground tiles is for testing (20 of demo-full).
 DEMO_SPLIT := --split 65/10/25
 # fp32: the README's figures must not hang on whether a processor is made for bf16
 # batches of 8: few pairs need many steps

@@ -145,7 +145,7 @@ for words in (["train", "absent.h5"], ["render", "--dem", sys.executable, "--mod
     try:
         main()
     except SystemExit as stop:
-        print(stop.code, {"torch", "numba", "rasterio"} & set(sys.modules))
+        print(stop.code, {"torch", "numba"} & set(sys.modules))
 """
 
 

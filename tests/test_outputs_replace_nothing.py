@@ -195,6 +195,7 @@ def test_an_output_that_nobody_marked_cannot_replace_anything(tmp_path):
     command.__annotations__ = {"source": Path, "result": Path, "output": OutputFile}
     result = tmp_path / "result.json"
     result.write_text("kept")
+    (tmp_path / "source").write_text("")
     arguments = {"source": tmp_path / "source", "result": result, "output": tmp_path / "o"}
     with pytest.raises(ConfigError, match="would replace"), guarded(command, arguments):
         command(**arguments)
