@@ -100,7 +100,7 @@ def evaluated(result: dict[str, Any], more: dict[str, Any] | None = None) -> lis
     power = power_of(row for row, _ in rows)
     lines = [
         f"Model {result['model']}; {conclusions.basis(result)}; training used none of this ground. ± is the standard deviation "
-        "of training runs; brackets hold 95 % intervals. Whatever is fitted to each scored crop stands in the second column."
+        "of training runs; brackets hold 95 % intervals. The second column lists what is fitted to each scored crop."
     ]
     order = list(FITTED)
     cells = [
@@ -108,7 +108,7 @@ def evaluated(result: dict[str, Any], more: dict[str, Any] | None = None) -> lis
          with_bounds(row["mse"], row["mse_low"], row["mse_high"], row.get("mse_run_std"), power), ssim(row)]
         for row, title in sorted(rows, key=lambda pair: order.index(pair[0]["freedom"]))
     ]  # fmt: skip
-    left = [f"- {title(result, kept)} is also the model {model} with one coefficient set for all ground, and stands once."
+    left = [f"- {title(result, kept)} is also the model {model} with one coefficient set for all ground, and appears once."
             for model, left, kept in TWICE[::2] if model == result["model"] and kept in result["models"] and left in result["models"]]  # fmt: skip
     notes = [f"- Note: {text}." for text in result.get("warnings", [])]
     return [
@@ -175,7 +175,7 @@ def held_out(root: Path, name: str, command: str) -> list[str]:
     gain = gained(result["gains"]["albedo"]["terrain"], "the map from terrain alone")
     lines += table(["map", unit, "SSIM"], rows)
     lines += [f"- Squared error with albedo: {gain}.",
-              f"- Suns of the unseen images stand {sun['least']:.0f} to {sun['most']:.0f} deg from the nearest one used."]  # fmt: skip
+              f"- The Sun of each unseen image is {sun['least']:.0f} to {sun['most']:.0f} deg from the nearest Sun used."]  # fmt: skip
     return lines + covered(result)
 
 
