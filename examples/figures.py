@@ -69,7 +69,9 @@ def number(value: float) -> str:
 
 def with_bounds(value: float, low: float | None, high: float | None, spread: float | None, power: int) -> str:
     """'7.95 ± 0.12 (5.78 to 12.2)' in units of ten to the ``power``."""
-    text = number(value / 10**power) + ("" if spread is None else f" ± {spread / 10**power:.2g}")
+    text = number(value / 10**power)
+    if spread is not None:
+        text += f" ± {spread / 10**power:.{len(text.partition('.')[2])}f}"
     if low is None:
         return f"{text} (no interval)"
     return f"{text} ({number(low / 10**power)} to {'unbounded' if high is None else number(high / 10**power)})"

@@ -60,7 +60,7 @@ def test_a_block_is_replaced_by_what_the_file_holds(tmp_path):
     assert "9.99e-5" not in text and text.startswith("before\n<!-- figures:demo-rows -->\n")
     assert text.endswith("-->\nafter 1\n")
     assert "|model|fitted to each crop|MSE, 1e-5 I/F squared|SSIM|" in text
-    assert "|learned reflectance|nothing|3.10 ± 0.062 (1.55 to 6.20)|0.800|" in text
+    assert "|learned reflectance|nothing|3.10 ± 0.06 (1.55 to 6.20)|0.800|" in text
     assert (
         "no sure difference from the strongest model without a network (hapke_fitted): gain 26.2 % (-3.0 to 41.0)"
         in text
