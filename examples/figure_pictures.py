@@ -135,7 +135,7 @@ def draw_apollo15(folder: Path, output: Path) -> None:
             (
                 residual,
                 {"cmap": "RdBu_r", "vmin": -span / 3, "vmax": span / 3},
-                f"photograph minus rendering: rms {share:.0f} % of its range",
+                f"residual: rms {share:.0f} % of the range",
             )
         )
     for axis, (picture, style, title) in zip(axes.flat, shown, strict=True):
