@@ -15,7 +15,10 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from schemas.errors import ConfigError, InputError
+from schemas.files.locks import LONGEST_NAME
 from schemas.files.outputs import Target, check_apart, check_folder, check_outputs, protect
+
+LONGEST_PATH = 4096  # bytes, as Linux has it
 
 
 class Writes(enum.Enum):
@@ -57,11 +60,11 @@ def guarded(
     options : the command's parameters by name; lock : of the output, held within the block. Raises ConfigError, InputError.
     """
     files = files_of(command, options)
+    for path in (*files.read, *(path for _, path, _ in files.written)):
+        _check_name(path)
     if not files.written:
         yield
         return
-    for path in (*files.read, *(path for _, path, _ in files.written)):
-        _check_name(path)
     overwrite = bool(options.get("overwrite"))
     replace = overwrite or bool(options.get("resume"))  # what is resumed, stages say
     with protect(files.read, overwrite):
@@ -94,11 +97,13 @@ def _check_there(path: Path) -> None:
 
 
 def _check_name(path: Path) -> None:
-    """GDAL, HDF5 and JSON keep names as UTF-8. Raises ConfigError."""
+    """Refuse names that no file has; GDAL, HDF5 and JSON keep names as UTF-8. Raises ConfigError."""
     name = os.fspath(path)
     if "\0" in name or not name:
         raise ConfigError(f"'{name}': expected the name of a file; check the options.")
     try:
-        name.encode()
+        longest = max(len(part.encode()) for part in name.split(os.sep))
     except UnicodeEncodeError:
         raise ConfigError(f"{name}: expected a name in UTF-8, found other bytes; rename the file.") from None
+    if longest > LONGEST_NAME or len(name.encode()) >= LONGEST_PATH:
+        raise ConfigError(f"{name}: expected a name of at most {LONGEST_NAME} bytes, found a longer one; shorten it.")

@@ -32,7 +32,7 @@ def raster_kind(path: Path) -> str:
             return ""
         with open(path, "rb") as file:
             start = file.read(4)
-    except OSError:
+    except (OSError, ValueError):
         return ""
     return "GeoTIFF" if start in _TIFF else "EXR" if start in _EXR else ""
 

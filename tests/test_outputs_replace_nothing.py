@@ -200,3 +200,53 @@ def test_an_output_that_nobody_marked_cannot_replace_anything(tmp_path):
     with pytest.raises(ConfigError, match="would replace"), guarded(command, arguments):
         command(**arguments)
     assert result.read_text() == "kept"
+
+
+LONG = "n" * 300
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["inspect", LONG],
+        ["replay", LONG],
+        ["sample", LONG],
+        ["sample", "d/" * 2100 + "scene.h5"],
+        ["ingest", "dem.tif", "--images", LONG],
+        ["sample", "scene.h5", "-o", LONG],
+        ["sample", "scene.h5", "-o", "n" * 240],  # itself short enough, but not under its temporary name
+        ["models", "--json", LONG],
+        ["ingest", "dem.tif", "--images", "images.csv"],
+        ["ingest", "dem.tif", "--images", "cameras.csv"],
+    ],
+    ids=lambda words: " ".join(words)[:40],
+)
+def test_a_name_that_no_file_can_have_is_one_line(monkeypatch, capsys, inputs, tmp_path, words):
+    monkeypatch.chdir(tmp_path)
+    for name in ("dem.tif", "scene.h5"):
+        shutil.copy(inputs / name, tmp_path)
+    header, first, *_ = (inputs / "images.csv").read_text().splitlines()
+    row = dict(zip(header.split(","), first.split(","), strict=True))
+    for name, change in (("images.csv", {"path": LONG}), ("cameras.csv", {"camera": LONG})):
+        changed = row | change
+        (tmp_path / name).write_text(",".join(changed) + "\n" + ",".join(changed.values()) + "\n")
+    before = sorted(tmp_path.rglob("*"))
+    code, lines = run(monkeypatch, capsys, *words)
+    assert code == 3 and len(lines) == 1, lines
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_pipe_is_no_raster_and_nobody_waits_for_it(tmp_path):
+    """Opening it would wait for who writes into it: `inspect` and `replay` did, for ever."""
+    import signal
+
+    from schemas.rasters import raster_kind
+
+    os.mkfifo(tmp_path / "pipe")
+    before = signal.signal(signal.SIGALRM, lambda *_: pytest.fail("waits"))
+    signal.alarm(20)
+    try:
+        assert raster_kind(tmp_path / "pipe") == ""
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)

@@ -16,6 +16,7 @@ import numpy as np
 from schemas.errors import ArtefactError, ConfigError, InputError
 from schemas.files.outputs import atomic_path, is_full_disk
 from schemas.files.references import check_hdf5
+from schemas.files.user_files import check_file
 
 # For unknown values where HDF5's scale-offset filter keeps some decimals, which cannot be NaN: netCDF's default fill.
 UNKNOWN = np.float32(9.969209968386869e36)
@@ -37,12 +38,7 @@ def silence_hdf5() -> None:
 def open_hdf5(path: Path) -> h5py.File:
     """An HDF5 file for reading, which refers to nothing that it may not. Raises ArtefactError."""
     silence_hdf5()
-    if not path.exists():
-        raise ArtefactError(f"{path}: no such file; check the path or run the stage that writes it.")
-    if path.is_dir():
-        raise ArtefactError(f"{path}: expected an HDF5 file, found a folder; name the file in it.")
-    if not path.is_file():
-        raise ArtefactError(f"{path}: expected an HDF5 file, found a device or a pipe; name a file.")
+    check_file(path, "an HDF5 file", ArtefactError)
     try:
         file = h5py.File(path, "r")
     except OSError as error:

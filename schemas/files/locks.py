@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from filelock import BaseFileLock
 
 PATIENCE = 0.2  # seconds: another run may be letting go in this moment
+LONGEST_NAME = 255  # bytes, of a file on every system
 SHOWN = 120  # characters of who holds a lock
 
 _guard = threading.Lock()

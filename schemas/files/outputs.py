@@ -17,7 +17,7 @@ from typing import Any
 from schemas.errors import ConfigError, InputError, LunargrError
 from schemas.files.companions import current_output, note_companion
 from schemas.files.inputs import Inputs
-from schemas.files.locks import claim, partial_path, record_path
+from schemas.files.locks import LONGEST_NAME, claim, partial_path, record_path
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _guard: ContextVar[_Guard | None] = ContextVar("guard", default=None)
@@ -155,6 +155,11 @@ def check_folder(target: Target) -> None:
 
 def _check_place(target: Target, overwrite: bool) -> None:
     path, another = target.path, f"choose another `{target.setting}`"
+    if (over := len(os.fsencode(partial_path(path).name)) - LONGEST_NAME) > 0:
+        longest = len(os.fsencode(path.name)) - over
+        raise ConfigError(
+            f"{path}: expected a name of at most {longest} bytes, which leaves room for a lock's; {another}."
+        )
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:

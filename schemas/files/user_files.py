@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import csv
 import io
+import os
+import stat
 from pathlib import Path
 from typing import Any
 
 from schemas.checks import parse_json
-from schemas.errors import InputError
+from schemas.errors import InputError, LunargrError
 
 LARGEST_TEXT = 1 << 30  # bytes: PDS indices have hundreds of megabytes
 
 
-def check_file(path: Path, expected: str) -> None:
-    """Refuse what is no regular file, before it is read. expected : what it should be, in words. Raises InputError."""
-    path = Path(path)
-    if path.is_dir():
-        raise InputError(f"{path}: expected {expected}, found a folder; name the file in it.")
-    if not path.exists():
-        raise InputError(f"{path}: no such file; expected {expected}. Check the path.")
-    if not path.is_file():
-        raise InputError(f"{path}: expected {expected}, found a device or a pipe; write it to a file and name that.")
+def check_file(path: Path, expected: str, error: type[LunargrError] = InputError) -> None:
+    """Refuse what is no regular file, before it is read. expected : what it should be, in words. Raises ``error``."""
+    try:
+        mode = os.stat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        raise error(f"{path}: no such file; expected {expected}. Check the path.") from None
+    except (OSError, ValueError) as problem:
+        why = getattr(problem, "strerror", None) or problem
+        raise error(f"{path}: expected {expected}, cannot be read ({why}); check its name and permissions.") from None
+    if stat.S_ISDIR(mode):
+        raise error(f"{path}: expected {expected}, found a folder; name the file in it.")
+    if not stat.S_ISREG(mode):
+        raise error(f"{path}: expected {expected}, found a device or a pipe; write it to a file and name that.")
 
 
 def read_text(path: Path, expected: str, encoding: str = "utf-8-sig") -> str:
