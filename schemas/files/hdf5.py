@@ -79,8 +79,8 @@ def whole_hdf5(path: Path, check: Callable[[Path], None] = lambda partial: None)
                 os.truncate(partial, 0)
             _close(file, before)
             raise
-        if error := _close(file, before):
-            raise _not_whole(path, error)
+        if late := _close(file, before):
+            raise _not_whole(path, late)
         check(partial)
 
 
