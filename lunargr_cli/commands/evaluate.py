@@ -80,8 +80,9 @@ def command(
     config = options.configure(
         Config, locals(), only=options.check_once("--only", only or ()), extend=str(extend) if extend else None
     )
+    from stages.common.page.sentences import basis
     from stages.evaluate.coverage import coverage_lines
-    from stages.evaluate.table import basis, gain_lines, result_lines
+    from stages.evaluate.table import gain_lines, result_lines
 
     console = Console(quiet)
     to = Output(output, overwrite, json=json_file, figures=figures)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from stages.common.intervals import ERROR, Interval, gain_interval, ratio_interval
-from stages.common.page.sentences import verdict
+from stages.common.page.sentences import basis, compared, verdict
 from stages.evaluate.metrics import psnr
 from stages.evaluate.rows import TITLES, freedom
 from stages.evaluate.scores import Scores
@@ -99,36 +99,9 @@ def conclude(result: dict[str, Any]) -> list[str]:
             if gain["gain_percent"] is None:
                 continue
             name = "the learned reflectance" + (" with the diagnosed effects" if "extended" in ours else "")
-            sentences.append(
-                f"{words}, {name} {_claim(gain)} the strongest baseline, {rival} ({TITLES[rival]}); {_evidence(result, gain)}."
-            )
+            other = f"the strongest baseline, {rival} ({TITLES[rival]})"
+            sentences.append(compared(f"{words}, {name}", other, gain, basis(result))[0])
     return sentences
-
-
-def _claim(gain: dict[str, float | None]) -> str:
-    word = verdict(gain)
-    size = abs(gain["gain_percent"] or 0.0)
-    if word == "better":
-        return f"has a squared error {size:.1f} % lower than"
-    if word == "worse":
-        return f"has a squared error {size:.1f} % higher than"
-    return "cannot be told apart from"
-
-
-def _evidence(result: dict[str, Any], gain: dict[str, float | None]) -> str:
-    """What a gain rests on: its interval, pairs, tiles or sites, training runs."""
-    low, high = gain["gain_percent_low"], gain["gain_percent_high"]
-    bounds = "no interval" if low is None or high is None else f"95 %: {low:+.1f} .. {high:+.1f} %"
-    return f"gain {gain['gain_percent']:+.1f} % ({bounds}; {basis(result)})"
-
-
-def basis(result: dict[str, Any]) -> str:
-    """'120 pairs, 7 ground tiles, 1 training run'."""
-    runs, tiles = result["training_runs"], result["tiles"]
-    ground = f"{tiles} ground tile{'s' * (tiles != 1)}"
-    if result["interval_unit"] == "site":
-        ground = f"{result['sites']} site{'s' * (result['sites'] != 1)} of one ground tile"
-    return f"{result['pairs']} pairs, {ground}, {runs} training run{'s' * (runs != 1)}"
 
 
 def _mean(values: np.ndarray) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 
 from schemas import read_strings
-from stages.common.page.sentences import Number, Sentence, compared, counted, error_change, listed
+from stages.common.page.sentences import Number, Sentence, basis, compared, counted, error_change, listed
 from stages.physics.photometry import get_model
 
 # (row, what it may know of the scored crops)
@@ -17,15 +17,6 @@ CLAIMS = (
     ("learned", "none", "On unseen ground the learned reflectance"),
     ("learned_gain_offset", "gain_offset", "On unseen ground, with a gain and an offset fitted to each scored crop, the learned reflectance"),
 )  # fmt: skip
-
-
-def basis(result: dict[str, Any]) -> str:
-    """What a gain rests on: pairs, ground, training runs."""
-    ground = counted(result["tiles"], "ground tile")
-    if result.get("interval_unit") == "site" and "sites" in result:
-        ground = f"{counted(result['sites'], 'site')} of one ground tile"
-    pairs = f"{result['pairs']:,} pairs on {ground}"
-    return f"{pairs}, {counted(result['training_runs'], 'training run')}" if "training_runs" in result else pairs
 
 
 def learned(file: h5py.File) -> list[Sentence]:

@@ -8,8 +8,7 @@ from markupsafe import Markup
 
 from stages.common import page
 from stages.common.page.diagnosis import formatted as cell
-from stages.common.page.sentences import bounds, verdict
-from stages.report.conclusions import basis
+from stages.common.page.sentences import basis, bounds, verdict
 
 TITLES = {
     "terrain": "map from terrain",

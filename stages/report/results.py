@@ -13,8 +13,7 @@ from stages.common import page
 from stages.common.page import pictures
 from stages.common.page.diagnosis import chapters, conclusions, words
 from stages.common.page.diagnosis import formatted as cell
-from stages.common.page.sentences import bounds, verdict
-from stages.report.conclusions import basis
+from stages.common.page.sentences import basis, bounds, verdict
 
 COLOURS = {
     "learned": "#3b8ecb",

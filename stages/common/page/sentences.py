@@ -66,3 +66,12 @@ def error_change(gain: dict[str, Any], label: str) -> Number:
 def counted(number: int, noun: str) -> str:
     """'1 place', '1,200 places'"""
     return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
+def basis(result: dict[str, Any]) -> str:
+    """What a gain rests on: pairs, ground, training runs."""
+    ground = counted(result["tiles"], "ground tile")
+    if result.get("interval_unit") == "site" and "sites" in result:
+        ground = f"{counted(result['sites'], 'site')} of one ground tile"
+    pairs = f"{result['pairs']:,} pairs on {ground}"
+    return f"{pairs}, {counted(result['training_runs'], 'training run')}" if "training_runs" in result else pairs
