@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from cluster_scene import assert_same, environment, finish, lunargr, stages, sta
 from small_scene import write_scene
 
 from lunargr_cli.fanout.job import Identity, Work, open_job
-from lunargr_cli.fanout.stages import run_infer
+from lunargr_cli.fanout.stages import run_infer, run_ingest
 from lunargr_cli.options import in_parts
 from schemas import PAIRS, SCENE, ArtefactError, ConfigError, InputError, atomic_path, open_artefact
 from schemas.files.inputs import Inputs
@@ -332,7 +333,9 @@ def test_rows_on_nodata_are_a_part_like_any_other(tmp_path):
     found = [ingest.run(files.dem, None, part, replace(config, shard=(k, 8))) for k, part in enumerate(parts)]
     assert [f.dem_valid_share > 0 for f in found] == [False] * 5 + [True] * 3
     merge.run(parts, tmp_path / "merged.h5")
-    assert_same(tmp_path / "whole.h5", tmp_path / "merged.h5")
+    run_ingest(files.dem, None, Output(tmp_path / "fanned.h5"), config, Work(parts=6))
+    for name in ("merged", "fanned"):
+        assert_same(tmp_path / "whole.h5", tmp_path / f"{name}.h5")
     assert ingest.summarise(tmp_path / "merged.h5") == ingest.summarise(tmp_path / "whole.h5")
     _blank(files.dem, np.s_[::2], np.s_[:, ::2])  # a quarter of each pixel of 40 m is known: too little for a mean
     for k in range(2):
@@ -387,6 +390,20 @@ def test_a_view_says_so_when_a_part_is_gone(small_artefacts, tmp_path):
     parts[1].unlink()
     with pytest.raises(ArtefactError, match=r"parts/1\.h5"):
         open_artefact(tmp_path / "pairs.h5", PAIRS)
+
+
+def test_a_view_of_a_map_leaves_the_geotiff_to_a_copy(hilly_map, tmp_path):
+    parts = [tmp_path / f"{k}.h5" for k in range(2)]
+    for k, part in enumerate(parts):
+        shutil.copy(hilly_map[0], part)
+        with h5py.File(part, "r+") as file:
+            file.attrs["shard_rows"] = [80 * k, 80 * k + 80]  # of 160
+            file.attrs["config"] = json.dumps({"shard": [k, 2]})
+    merge.run(parts, tmp_path / "view.h5", merge.Config(virtual=True))
+    assert_same(hilly_map[0], tmp_path / "view.h5")
+    assert not (tmp_path / "view.tif").exists()
+    merge.run(parts, tmp_path / "copy.h5")
+    assert (tmp_path / "copy.tif").exists()
 
 
 def test_merging_keeps_masks_sparse(small_files, tmp_path):

@@ -23,7 +23,10 @@ def command(
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="File to write."), Writes.FILE],
     virtual: Annotated[
-        bool, typer.Option("--virtual", help="Write links to the parts instead of copies; the parts must stay.")
+        bool,
+        typer.Option(
+            "--virtual", help="Write links to the parts instead of copies, and no GeoTIFF; the parts must stay."
+        ),
     ] = Config.virtual,
     overwrite: Overwrite = False,
     quiet: Quiet = False,

@@ -31,7 +31,7 @@ from stages.physics.images.displacement import Field
 
 WINDOW_PX = 128
 WINDOWS_PER_IMAGE = 16
-LOOKS = 4096  # windows of images held at a time: 0.8 GB at most
+LOOKS = 2048  # windows of images held at a time: 0.8 GB at most, with their ratios
 ROUNDS = 6
 SETTLED = 0.05  # relative change of all variances below which no further round is made
 COSINES = np.linspace(0.0, 1.0, 17)  # bins of cos(incidence) over which the error may differ

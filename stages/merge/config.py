@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Config:
-    """virtual : leave large variables in the parts, which the output then needs; inputs : recorded as what the whole
+    """virtual : leave large variables in the parts, which the output then needs, and write no GeoTIFF; inputs : recorded as what the whole
     was made from, in place of its parts
     """
 

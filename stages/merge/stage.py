@@ -29,12 +29,13 @@ def run(
 ) -> Schema:
     """Join ``parts``, in the order of their shards. Raises ArtefactError where they are not parts of one whole.
 
-    The GeoTIFF of a map is written too, if its parts want one.
+    The GeoTIFF of a map is written too, if its parts want one and it is no view of them.
     """
     output = Output.at(output)
     with open_parts(parts) as opened:
         made_with = read_config(opened.files[0]) | {"shard": [0, 1]}
-        as_geotiff = opened.schema.name in MAPS and made_with.get("geotiff", True)
+        # HDF5 cannot read a view of files that this process holds open, and a view is there to save a copy.
+        as_geotiff = opened.schema.name in MAPS and made_with.get("geotiff", True) and not config.virtual
         # Parts in a run's own folder beside its output go with that folder.
         foreign = [path for path in opened.paths if f"{output.file.name}.parts" not in path.parts]
         check_outputs(map_targets(output, as_geotiff), foreign, output.overwrite)
