@@ -130,6 +130,19 @@ def _check_variable(path: Path, file: h5py.File, variable: Variable, advice: str
     if unit and unit not in allowed:
         expected = " or ".join(f"'{u}'" for u in dict.fromkeys(allowed))
         raise ArtefactError(f"{where}: expected units {expected}, found '{unit}'; {advice}.")
+    _check_packing(where, data, advice)
+
+
+def _check_packing(where: str, data: h5py.Dataset, advice: str) -> None:
+    """Refuse attributes by which :func:`unpack` could not decode a variable. Raises ArtefactError."""
+    for name in ("scale_factor", "add_offset", "_FillValue", "missing_value"):
+        value = data.attrs.get(name, 1.0)
+        numbers = np.ravel(value) if isinstance(value, np.ndarray | np.generic | float) else np.array(["?"])
+        good = numbers.dtype.kind in "iuf" and numbers.size > 0
+        if good and name in ("scale_factor", "add_offset"):
+            good = numbers.size == 1 and bool(np.isfinite(numbers[0])) and (numbers[0] != 0 or name == "add_offset")
+        if not good:
+            raise ArtefactError(f"{where}: expected a number in '{name}', found '{any_text(value)[:40]}'; {advice}.")
 
 
 def _check_sizes(path: Path, file: h5py.File, schema: Schema) -> None:
@@ -151,7 +164,8 @@ def _check_sizes(path: Path, file: h5py.File, schema: Schema) -> None:
 
 def read_unit(data: h5py.Dataset) -> str:
     """The unit of a variable in the spelling that declarations have, '' where it names none."""
-    return unit_name(any_text(data.attrs.get("units", "")))
+    unit = data.attrs.get("units", "")
+    return "" if isinstance(unit, h5py.Empty) else unit_name(any_text(unit))
 
 
 def unpack(data: h5py.Dataset, values: Any) -> np.ndarray:
@@ -168,10 +182,10 @@ def unpack(data: h5py.Dataset, values: Any) -> np.ndarray:
     if packed:
         scale, offset = (float(np.ravel(data.attrs.get(k, v))[0]) for k, v in (("scale_factor", 1), ("add_offset", 0)))
         result = (values * scale + offset).astype(np.float32)
-    for fill in fills:
-        known = values == np.asarray(np.ravel(fill)[0], values.dtype)
-        if known.any():
-            result[known] = np.nan
+    for fill in np.concatenate([np.ravel(f) for f in fills]) if fills else ():
+        unknown = values == np.asarray(fill, values.dtype)
+        if unknown.any():
+            result[unknown] = np.nan
     return result
 
 

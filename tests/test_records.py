@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -87,14 +88,24 @@ def packed_integers(file, name, values):
 
 
 def a_view(file, name, values):
-    with h5py.File(f"{file.filename}.{name}", "w") as other:
+    source = Path(f"{file.filename}.{name}")
+    with h5py.File(source, "w") as other:
         other[name] = values
     layout = h5py.VirtualLayout(values.shape, values.dtype)
-    layout[...] = h5py.VirtualSource(f"{file.filename}.{name}", name, values.shape)
+    layout[...] = h5py.VirtualSource(source.name, name, values.shape)
     file.create_virtual_dataset(name, layout)
 
 
-LAYOUTS = [contiguous, chunked, zipped, big_endian, scale_offset, packed_integers, a_view]
+def missing_values(file, name, values):
+    """Unknown values in two spellings, neither of them the fill value."""
+    stored = np.where(np.isfinite(values), values, np.float32(-9999))
+    stored[:5][~np.isfinite(values[:5])] = -8888
+    data = file.create_dataset(name, data=stored, chunks=(1, SIZE, SIZE))
+    if name != "valid":
+        data.attrs["missing_value"] = np.array([-9999, -8888], np.float32)
+
+
+LAYOUTS = [missing_values, contiguous, chunked, zipped, big_endian, scale_offset, packed_integers, a_view]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda f: f.__name__)

@@ -221,6 +221,7 @@ def write_foreign(path, **root):
         ("elevation", "meters"),
         ("image", b"DN"),
         ("image", np.array(["1"], "S1")),
+        ("image", h5py.Empty("S1")),
     ],
 )
 def test_units_that_cf_calls_equal_are_equal(tmp_path, variable, unit):
@@ -295,6 +296,31 @@ def test_packed_numbers_are_scaled_and_moved(tmp_path):
         data = file.create_dataset("height", data=np.array([0, 10, -32768], np.int16))
         data.attrs["scale_factor"], data.attrs["add_offset"], data.attrs["_FillValue"] = 0.5, 100.0, np.int16(-32768)
         np.testing.assert_array_equal(unpack(data, data[...]), [100.0, 105.0, np.nan])
+
+
+def test_each_of_several_missing_values_is_unknown(tmp_path):
+    with h5py.File(tmp_path / "packed.h5", "w") as file:
+        data = file.create_dataset("height", data=np.array([1, -1, 5, -2], np.float32))
+        data.attrs["missing_value"] = np.array([-1, -2], np.float32)
+        np.testing.assert_array_equal(unpack(data, data[...]), [1, np.nan, 5, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("scale_factor", "x"),
+        ("scale_factor", 0.0),
+        ("add_offset", np.nan),
+        ("missing_value", "none"),
+        ("_FillValue", h5py.Empty("f4")),
+    ],
+)
+def test_maps_that_cannot_be_unpacked_are_refused(tmp_path, name, value):
+    path = write_pairs(tmp_path / "pairs.h5")
+    with h5py.File(path, "r+") as file:
+        file["image"].attrs[name] = value
+    with pytest.raises(ArtefactError, match=f"/image: expected a number in '{name}', found"):
+        open_artefact(path, PAIRS)
 
 
 def test_an_output_that_is_a_hard_link_to_an_input_is_refused(tmp_path):

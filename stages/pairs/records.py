@@ -82,9 +82,8 @@ class Records:
 
     def _find_kind(self) -> str:
         data = self.data
-        simple = data.dtype in (np.dtype("<f4"), np.dtype("u1")) and not {"scale_factor", "add_offset"} & set(
-            data.attrs
-        )
+        decoded = {"scale_factor", "add_offset", "missing_value"} & set(data.attrs)
+        simple = data.dtype in (np.dtype("<f4"), np.dtype("u1")) and not decoded
         if not simple or data.is_virtual or data.external or data.file.userblock_size or 0 in data.shape:
             return "hdf5"
         creation = data.id.get_create_plist()
