@@ -100,6 +100,12 @@ def command(
         f"{output}: {summary.pairs} pairs, {summary.valid_share:.1%} of pixels valid, {summary.shadowed_share:.1%} of these in cast shadow; "
         f"incidence {i0:.1f}-{i1:.1f} deg, emission {e0:.1f}-{e1:.1f} deg"
     )
+    if summary.negative:
+        shares = ", ".join(f"{name} {share:.1%}" for name, share in list(summary.negative.items())[:5])
+        console.say(
+            f"I/F below 0 in {len(summary.negative)} images: {shares}{' ...' if len(summary.negative) > 5 else ''} of their valid "
+            "pixels; check the dark level that calibration took off"
+        )
     if summary.registered:
         _say_registered(console, summary.registered)
     _say_resemblances(console, summary.resemblances, summary.units)

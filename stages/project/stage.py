@@ -140,7 +140,7 @@ def _project(
                     progress(tally.pairs, total, f"pairs ({frame.image_id})")
                 pair = _pair(view, place, crops.elevation(k), scene)
                 datasets.put(k, pair)
-                tally.add(pair)
+                tally.add(pair, frame)
     progress(total, total, "pairs")
     for name in CROP_COLUMNS:
         writer.write(name, crops.column(name))

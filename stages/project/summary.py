@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import h5py
@@ -17,6 +17,7 @@ from stages.physics.images.registration import Shift
 
 # frame variables of pairs.h5, in the order of Resemblance's fields
 RESEMBLANCE = ("rendering_correlation", "rendering_chance", "rendering_contrast", "image_mean")
+FEW_NEGATIVE = 0.001  # of an image's pixels: noise in shadows
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,10 @@ class Resemblance:
 
 @dataclass(frozen=True)
 class Summary:
-    """What project wrote, for the line at the end."""
+    """What project wrote, for the line at the end.
+
+    negative : image_id -> share of its valid pixels whose I/F is below 0, of images with more than FEW_NEGATIVE of them
+    """
 
     pairs: int
     valid_share: float
@@ -62,24 +66,33 @@ class Summary:
     units: str
     registered: tuple[Registered, ...] = ()
     resemblances: tuple[Resemblance, ...] = ()
+    negative: Mapping[str, float] = field(default_factory=dict)
 
 
 def summarise(pairs: Path) -> Summary:
     """The summary of a file that was merged from parts."""
     with open_artefact(pairs, PAIRS) as file:
         sun, camera = file["sun_direction_enu"][...], file["camera_position_enu"][...]
+        names, index = read_strings(file, "image_id"), file["image_index"][...]
+        units = "dn" if str(file["image"].attrs["units"]) == "dn" else "iof"
         seen = shadowed = total = 0
+        below, valid_px = np.zeros(len(names), np.int64), np.zeros(len(names), np.int64)
         for k in range(file["valid"].shape[0]):
             valid = file["valid"][k].astype(bool)
             angle = unpack(file["sun_horizon_deg"], file["sun_horizon_deg"][k]).astype(np.float64)
             above = np.radians(angle) > math.asin(sun[k, 2])
             seen, shadowed, total = seen + int(valid.sum()), shadowed + int((valid & above).sum()), total + valid.size
+            valid_px[index[k]] += valid.sum()
+            if units == "iof":
+                below[index[k]] += (unpack(file["image"], file["image"][k])[valid] < 0).sum()
         compared = read_resemblances(file)
-        units = "dn" if str(file["image"].attrs["units"]) == "dn" else "iof"
     incidence = np.degrees(np.arccos(sun[:, 2])).tolist()
     emission = np.degrees(np.arccos(camera[:, 2] / np.linalg.norm(camera, axis=1))).tolist()
     shares = seen / max(1, total), shadowed / max(1, seen)
-    return Summary(len(sun), shares[0], extremes(incidence), extremes(emission), shares[1], units, (), compared)
+    negative = often_negative(dict(zip(names, zip(below.tolist(), valid_px.tolist(), strict=True), strict=True)))
+    return Summary(
+        len(sun), shares[0], extremes(incidence), extremes(emission), shares[1], units, (), compared, negative
+    )
 
 
 def read_resemblances(file: h5py.File) -> tuple[Resemblance, ...]:
@@ -88,6 +101,11 @@ def read_resemblances(file: h5py.File) -> tuple[Resemblance, ...]:
         return ()
     columns = [file[name][...].tolist() for name in RESEMBLANCE]
     return tuple(map(Resemblance, read_strings(file, "image_id"), *columns))
+
+
+def often_negative(counts: Mapping[str, tuple[int, int]]) -> dict[str, float]:
+    """Shares of negative pixels that are more than FEW_NEGATIVE. counts : image_id -> negative and valid pixels"""
+    return {name: below / valid for name, (below, valid) in counts.items() if below > FEW_NEGATIVE * valid}
 
 
 def extremes(angles: Sequence[float]) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from schemas import ArtefactWriter, InputError
 from stages.physics.images.orthorectify import Ortho
 from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
-from stages.project.summary import Summary, extremes
+from stages.project.summary import Summary, extremes, often_negative
 
 # Digits after the point that pairs.h5 keeps; docs/resources.md lists them.
 IOF_DECIMALS, COUNT_DECIMALS, HORIZON_DECIMALS = 5, 1, 1
@@ -88,9 +88,14 @@ class Tally:
     shadowed: int = 0
     incidence: list[float] = field(default_factory=list)
     emission: list[float] = field(default_factory=list)
+    negative: dict[str, tuple[int, int]] = field(default_factory=dict)
 
-    def add(self, pair: Pair) -> None:
-        """Count one pair."""
+    def add(self, pair: Pair, frame: Frame) -> None:
+        """Count one pair of an image."""
+        below, valid = self.negative.get(frame.image_id, (0, 0))
+        if frame.units == "iof":
+            below += int((pair.image[pair.valid] < 0).sum())
+        self.negative[frame.image_id] = below, valid + int(pair.valid.sum())
         up = pair.sun[2]
         self.pairs += 1
         self.valid += int(pair.valid.sum())
@@ -107,6 +112,7 @@ class Tally:
             extremes(self.emission),
             self.shadowed / max(1, self.valid),
             units,
+            negative=often_negative(self.negative),
         )
 
 
