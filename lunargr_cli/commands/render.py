@@ -26,6 +26,7 @@ from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
 from schemas.files.outputs import Output, write_json
 from stages import render
+from stages.common.brightness import NAMES
 from stages.render import Config, StereoConfig, Summary
 from stages.render.config import check
 
@@ -263,16 +264,17 @@ def _show(results: list[Summary], to: Output, console: Console) -> None:
     """The table of what was rendered, and the JSON."""
     if to.json is not None:
         _write_json(to.json, results)
+    brightness = NAMES[results[0].image_units] if results else NAMES["iof"]
     console.table(
         "rendered",
-        ("view", "pixels", "known", "mean I/F", "shadow", "incidence", "rays/px", "files"),
+        ("view", "pixels", "known", f"mean {brightness}", "shadow", "incidence", "rays/px", "files"),
         map(_row, results),
     )
     for r in results:
         if r.clipped:
             share = r.clipped / (r.known_share * r.size_px[0] * r.size_px[1])
             console.say(
-                f"{r.view_id}: the model gives I/F below 0 in {r.clipped} pixels ({share:.2%}); they are drawn as 0."
+                f"{r.view_id}: the model gives {brightness} below 0 in {r.clipped} pixels ({share:.2%}); they are drawn as 0."
             )
 
 
@@ -310,6 +312,7 @@ def _write_json(path: Path, results: list[Summary]) -> None:
             "samples": r.samples,
             "skipped": r.skipped,
             "clipped_px": r.clipped,
+            "image_units": r.image_units,
         }
         for r in results
     ]

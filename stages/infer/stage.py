@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from schemas import CHECKPOINT, SCENE, SVBRDF, ArtefactWriter, ConfigError, atomic_path, open_artefact, read_strings
 from schemas.files.companions import companions_of
 from schemas.files.outputs import Output, check_outputs, map_targets
+from stages.common.brightness import QUANTITIES
 from stages.common.memory import keep_freed_memory, return_freed_memory
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.infer.config import Config
@@ -36,7 +37,6 @@ from stages.physics.maps.geotiff import MapTiff, band_names, map_tags
 from stages.physics.maps.grid import Grid, check_same_body, read_grid
 
 SAMPLE = 256  # px, edge of the terrain by which the precision is chosen
-QUANTITY = "radiance factor I/F = pi r, including cos(incidence)"
 GSD_TOLERANCE = 0.05  # relative; beyond it terrain has another scale than the network was trained at
 
 
@@ -88,7 +88,7 @@ def run(
             "gsd_m": grid.gsd,
             "body_radius_m": grid.radius,
             "model": predictor.model.name,
-            "quantity": QUANTITY,
+            "quantity": QUANTITIES[predictor.image_units],
             "image_units": predictor.image_units,
             "precision": precision,
         } | ({} if ground is None else ground.attributes)

@@ -96,6 +96,7 @@ class Summary:
     size_px : samples, lines; known_share, shadow_share : of the pixels, 0..1; mean : I/F; samples : rays per pixel and axis
     skipped : the view was there already, and was not looked at
     clipped : pixels where the model's I/F was below 0 and is drawn as 0
+    image_units : of the images that the map was learned from, 'iof' or 'dn'
     """
 
     view_id: str
@@ -108,6 +109,7 @@ class Summary:
     samples: int = 0
     skipped: bool = False
     clipped: int = 0
+    image_units: str = "iof"
 
 
 def inputs(source: Path, config: Config) -> list[Path]:

@@ -42,7 +42,7 @@ def render_map(
     named = {path.suffix.lower(): path for path in files}
     wanted = channels if ".exr" in named else list(dict.fromkeys([*bands, "shadow", "incidence_deg"]))
     wanted = [*wanted, "clipped"]
-    preview, tally = Preview(grid.height, grid.width), Tally()
+    preview, tally = Preview(grid.height, grid.width), Tally(surface.image_units)
     facts = metadata(surface, config, light)
     with contextlib.ExitStack() as stack:
         exr = tif = None

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
 from schemas.provenance import raster_record
+from stages.common.brightness import QUANTITIES
 from stages.physics.bodies.ephemeris import AU
 from stages.physics.bodies.spheres import Body
 from stages.physics.cameras import Camera
@@ -169,7 +170,7 @@ def metadata(surface: Surface, config: Config, light: Light) -> dict[str, object
     return {
         "source": surface.path.name,
         "model": surface.model.name,
-        "quantity": "radiance factor I/F = pi r, including cos(incidence)",
+        "quantity": QUANTITIES[surface.image_units],
         "sun_position_mcmf": " ".join(f"{v:.6e}" for v in light.sun.position),
         "config": " ".join(f"{k}={v}" for k, v in sorted(facts.items())),
         "record": raster_record("render", facts, inputs(surface.path, config)),

@@ -15,7 +15,8 @@ from stages.render.config import Summary
 class Tally:
     """Shares and means of an image, gathered from its bands of rows."""
 
-    def __init__(self) -> None:
+    def __init__(self, image_units: str) -> None:
+        self.image_units = image_units
         self.pixels = self.known = self.clipped = 0
         self.total = self.dark = 0.0
         self.low, self.high = math.inf, -math.inf
@@ -45,4 +46,5 @@ class Tally:
             (self.low, self.high),
             samples,
             clipped=self.clipped,
+            image_units=self.image_units,
         )

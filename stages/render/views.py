@@ -140,7 +140,7 @@ def render_camera(
     bands: Iterable[dict[str, Floats32]] = render_view(surface, camera, light, scene)
     if any(effect.slot == "sensor" for effect in light.extensions):  # these need the whole image
         bands = [_whole(bands, light, scene.grid)]
-    preview, tally, done, ground = Preview(camera.lines, camera.samples, 8192), Tally(), 0, False
+    preview, tally, done, ground = Preview(camera.lines, camera.samples, 8192), Tally(surface.image_units), 0, False
     with contextlib.ExitStack() as stack:
         exr = None
         if ".exr" in named:

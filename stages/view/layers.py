@@ -14,6 +14,7 @@ from rasterio.transform import Affine
 from schemas import SVBRDF, ArtefactError, InputError, RegistryError, open_artefact, read_strings
 from schemas.reading import read_unit
 from stages.common.arrays import Floats32
+from stages.common.brightness import NAMES
 from stages.physics.maps.grid import Grid, read_grid
 from stages.physics.photometry import ReflectanceModel, get_model, model_names
 from stages.physics.photometry.albedo_factor import FACTOR, AlbedoFactor
@@ -37,7 +38,7 @@ class Content:
     """The map of one page.
 
     elevation : (H, W) float32, m above the sphere, NaN where unknown; coefficients in the model's order, then the rest
-    factor : pixels of the file along each side of one pixel here
+    factor : pixels of the file along each side of one pixel here; brightness : name of the image's unit
     """
 
     grid: Grid
@@ -46,6 +47,7 @@ class Content:
     coefficients: list[Layer]
     others: list[Layer]
     factor: int
+    brightness: str
 
 
 def read_content(path: Path, max_px: int) -> Content:
@@ -57,6 +59,7 @@ def read_content(path: Path, max_px: int) -> Content:
             raise RegistryError(
                 f"{path}: its model {model.name} has no formula for a page (glsl in its file); models that have one: {', '.join(able)}."
             )
+        units = str(file.attrs.get("image_units", "iof"))
         names, expected = read_strings(file, "coefficient_name"), [p.name for p in model.parameters]
         if names != expected:
             raise ArtefactError(
@@ -80,7 +83,8 @@ def read_content(path: Path, max_px: int) -> Content:
         known &= np.isfinite(layer.values)
     if not known.any():
         raise InputError(f"{path}: expected valid coefficients and elevations, found none; nothing to show.")
-    return Content(coarse_grid(full, factor, elevation.shape), model, elevation, coefficients, others, factor)
+    grid = coarse_grid(full, factor, elevation.shape)
+    return Content(grid, model, elevation, coefficients, others, factor, NAMES[units])
 
 
 def coarse_grid(full: Grid, factor: int, shape: tuple[int, ...]) -> Grid:

@@ -76,6 +76,7 @@ def describe(content: Content, frames: Frames, photographs: Sequence[Photograph]
         "gsd": grid.gsd,
         "radius": grid.radius,
         "factor": content.factor,
+        "brightness": content.brightness,
         "model": {"name": content.model.name, "title": content.model.title, "formula": content.model.formula},
         "count": len(content.coefficients),
         "elevation": blob.add_map(pack_map(content.elevation, known, HEIGHT_STEP * grid.gsd)),

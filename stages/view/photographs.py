@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from schemas import PAIRS, SPLITS, InputError, open_artefact, read_strings
 from stages.common.arrays import Floats32
 from stages.physics.maps.grid import Grid
+from stages.physics.maps.projections import near_longitude
 from stages.view.frames import Frames
 from stages.view.layers import block_mean
 
@@ -69,6 +70,7 @@ def _choose(file: h5py.File, candidates: NDArray[np.int_], count: int) -> list[i
     image = file["image_index"][...][candidates]
     test = file["split"][...][candidates] == dict(SPLITS)["test"] if "split" in file else np.zeros(len(image), bool)
     lon, lat = file["longitude_deg"][...][candidates], file["latitude_deg"][...][candidates]
+    lon = near_longitude(lon, float(lon[0]))
     away = np.hypot((lon - lon.mean()) * math.cos(math.radians(lat.mean())), lat - lat.mean())
     order = np.lexsort((away, ~test, image))
     first = [order[np.flatnonzero(image[order] == i)[0]] for i in np.unique(image)]

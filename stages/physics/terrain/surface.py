@@ -102,6 +102,7 @@ class Surface:
     deviations : (M, H, W) dataset, standard deviations of the coefficients ``mapped``, or None where unknown
     image_noise : I/F, standard deviation of photographs about renderings that the coefficients do not explain
     albedo_error : None where the map holds none
+    image_units : 'dn' where the map was learned from images in DN: its brightness is relative
     """
 
     path: Path
@@ -115,6 +116,7 @@ class Surface:
     mapped: tuple[str, ...] = ()
     image_noise: float = 0.0
     albedo_error: AlbedoError | None = None
+    image_units: str = "iof"
 
     @property
     def knows_errors(self) -> bool:
@@ -217,6 +219,7 @@ def _mapped_surface(path: Path, file: h5py.File, grid: Grid, elevation: Elevatio
         reflectance = AlbedoFactor(reflectance)
     surface = Surface(path, grid, elevation, reflectance, file["coefficients"], np.empty(0, np.float32), albedo)
     surface.albedo_error = AlbedoError.read(file)
+    surface.image_units = str(file.attrs.get("image_units", "iof"))
     if "coefficients_std" in file:
         surface.deviations = file["coefficients_std"]
         surface.mapped = tuple(read_strings(file, "map_name"))

@@ -19,7 +19,7 @@ class Panel {
       byId(id).onchange = () => act.change({ auto: false, limits: [Number(byId("black").value), Number(byId("white").value)] });
     }
     const means = head.factor > 1 ? `, each the mean of ${head.factor} × ${head.factor} of the file's` : "";
-    byId("about").textContent = `${head.width} × ${head.height} pixels of ${short(head.gsd)} m${means}. Radiance factor I/F, with cos(incidence) in it; negative values are shown as 0. Made by ${document.querySelector("meta[name=generator]").content}.`;
+    byId("about").textContent = `${head.width} × ${head.height} pixels of ${short(head.gsd)} m${means}. Radiance factor (${head.brightness}), with cos(incidence) in it; negative values are shown as 0. Made by ${document.querySelector("meta[name=generator]").content}.`;
     window.addEventListener("keydown", (event) => this.key(event));
   }
 
@@ -160,7 +160,7 @@ function pixelRows(head, page, relighter, row, col) {
   return [
     ...place,
     ["Height", `${page.elevation[k].toFixed(1)} m`],
-    ["I/F", image < 0 ? "unknown" : image.toFixed(5)],
+    [head.brightness, image < 0 ? "unknown" : image.toFixed(5)],
     ["i, e, g", [incidence, emission, phase].map(degrees).join(", ")],
     ["Slope", degrees(slope)],
     ["Sunlight", `${(100 * sunlight).toFixed(0)} %`],

@@ -28,9 +28,9 @@ class Photographs {
     const measured = p.values.map((v) => v * gain), white = percentiles(measured, [0.995])[0] * 1.05 || 1;
     drawGrey(byId("measured"), measured, p, white);
     drawGrey(byId("rendered"), rendered, p, white);
-    const unit = p.unit === "dn" ? `DN, times ${gain.toPrecision(3)} here` : "I/F";
+    const unit = p.unit === "dn" ? `DN, times ${gain.toPrecision(3)} here` : "I/F", own = this.relighter.head.brightness;
     byId("photograph-text").textContent =
-      `Means ${found.means.map((v) => v.toPrecision(3)).join(" (measured, " + unit + ") and ")} (page); correlation ${found.correlation.toFixed(3)}, RMS difference ${found.rms.toPrecision(3)} I/F. ` +
+      `Means ${found.means.map((v) => v.toPrecision(3)).join(" (measured, " + unit + ") and ")} (page); correlation ${found.correlation.toFixed(3)}, RMS difference ${found.rms.toPrecision(3)} ${own}. ` +
       "Both have the same black and white; the page has the photograph's Sun and camera.";
   }
 }

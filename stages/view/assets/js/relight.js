@@ -1,7 +1,7 @@
 // The map under one Sun: from heights and coefficients to I/F and angles, on the map's own pixels.
 
 const QUANTITIES = [
-  { name: "image", title: "Image", unit: "I/F" },
+  { name: "image", title: "Image" },  // in the map's own brightness
   { name: "sunlight", title: "Sunlight", unit: "share of the Sun that is seen" },
   { name: "incidence", title: "Incidence", unit: "deg", colours: "cividis" },
   { name: "emission", title: "Emission", unit: "deg", colours: "cividis" },
@@ -49,7 +49,7 @@ class Relighter {
     const [low, high] = range(page.elevation);
     this.base = (low + high) / 2;
     this.relief = high - low;
-    this.layers = [...QUANTITIES, ...page.fields.map((f, k) => ({ ...f, colours: k < head.count ? "viridis" : "magma" }))];
+    this.layers = [{ ...QUANTITIES[0], unit: head.brightness }, ...QUANTITIES.slice(1), ...page.fields.map((f, k) => ({ ...f, colours: k < head.count ? "viridis" : "magma" }))];
     const heights = Float32Array.from(page.elevation, (z) => (Number.isFinite(z) ? z - this.base : NOTHING));
     const fields = this.fieldTexture();
     const shared = {
