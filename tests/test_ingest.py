@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import h5py
 import numpy as np
 import pytest
@@ -233,3 +235,29 @@ def test_crop_larger_than_any_valid_region(small_files, tmp_path):
         ingest.run(small_files.dem, small_files.images, tmp_path / "scene.h5", ingest.Config(crop=384))
     with pytest.raises(ConfigError, match="even"):
         ingest.run(small_files.dem, small_files.images, tmp_path / "scene.h5", ingest.Config(crop=33))
+
+
+def test_a_dem_too_coarse_for_an_image_is_told_how_fine_it_must_be(small_files, tmp_path):
+    """A strip 240 m wide holds crops of 32 px on grids of 7.5 m and finer, none of the 20 m here and none of 16 px either."""
+    with rasterio.open(small_files.folder / "image0.tif") as image:
+        values, t = image.read(1), image.transform
+        middle = values.shape[1] // 2
+        values[:, : middle - 10] = values[:, middle + 10 :] = -1e4  # 20 pixels of 12 m
+        small_scene.write_raster(tmp_path / "strip.tif", values, image.crs, t, nodata=-1e4)
+    table = edit_table(small_files, tmp_path, path="strip.tif")
+    with pytest.raises(GeometryError, match=r"larger than any valid region of any image, where (\d+) m") as caught:
+        ingest.run(small_files.dem, table, tmp_path / "scene.h5", ingest.Config(crop=32))
+    assert "choose a `crop`" not in str(caught.value)
+    assert 5 < float(re.search(r"a grid of (\S+) m or finer", str(caught.value))[1]) <= 7.5
+
+
+def test_heights_above_another_sphere_are_noted(small_files, tmp_path):
+    other = rasterio.CRS.from_proj4("+proj=stere +lat_0=10 +lon_0=20 +R=1738000 +units=m +no_defs")
+    with rasterio.open(small_files.dem) as dem:
+        path = small_scene.write_raster(tmp_path / "dem.tif", dem.read(1), other, dem.transform, nodata=dem.nodata)
+    said: list[str] = []
+    ingest.run(path, None, tmp_path / "a.h5", ingest.Config(), said.append)
+    assert len(said) == 1 and "sphere of 1738000 m, its heights are taken as above 1737400 m" in said[0]
+    ingest.run(path, None, tmp_path / "b.h5", ingest.Config(body="1738000"), said.append)
+    ingest.run(small_files.dem, None, tmp_path / "c.h5", ingest.Config(), said.append)
+    assert len(said) == 1

@@ -1,4 +1,4 @@
-"""`lunargr inspect FILE`: what an artefact is, who made it, from what."""
+"""`lunargr inspect FILE`: what an artefact is, who made it, from what; what a raster, image or camera of others is."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import typer
 
 from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json, Overwrite
-from schemas.errors import ArtefactError
 from schemas.files.outputs import write_json
 
 if TYPE_CHECKING:
@@ -22,20 +21,26 @@ SHOWN = 16  # digits of a SHA-256 on the terminal; --json has all
 
 
 def command(
-    file: Annotated[Path, typer.Argument(help="Any artefact of lunargr: HDF5, GeoTIFF or EXR.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="An artefact of lunargr (HDF5, GeoTIFF, EXR), or any DEM, image, ISIS cube or camera model."
+        ),
+    ],
     json_file: Json = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Show what a file holds and which commands and inputs made it; check it against its schema."""
+    """Show what a file holds: of an artefact its variables, and the commands and inputs that made it; of a DEM, an image or a
+    camera its size, ground, time and Sun, and how fine a DEM it needs.
+    """
     from schemas.provenance import chain
     from schemas.rasters import raster_kind
 
+    if not _is_ours(file):
+        _describe_foreign(file, json_file)
+        return
     content = _describe_raster(file) if raster_kind(file) else _describe_artefact(file)
     steps = chain(file)
-    if raster_kind(file) and steps[-1].record is None:
-        raise ArtefactError(
-            f"{file}: expected a raster that a lunargr command wrote, found no record of one; gdalinfo and oiiotool read others."
-        )
     if json_file is not None:
         result = {
             "file": file.name,
@@ -51,6 +56,26 @@ def command(
     shown = {k: v for k, v in content.attributes.items() if k != "provenance"}
     console.table("attributes", ("name", "value"), shown.items())
     console.table("made by, in this order", ("file", "command", "version", "seed", "sha256"), [_row(s) for s in steps])
+
+
+def _is_ours(file: Path) -> bool:
+    """Whether a lunargr command wrote a file; HDF5 and missing files count too: the artefacts' reader says what is wrong."""
+    from schemas.provenance import chain
+    from schemas.rasters import raster_kind
+
+    if raster_kind(file):
+        return chain(file)[-1].record is not None
+    return not file.is_file() or file.suffix.lower() in (".h5", ".hdf5", ".nc")
+
+
+def _describe_foreign(file: Path, json_file: Path | None) -> None:
+    from stages.physics.images.describe import describe
+
+    title, facts = describe(file)
+    if json_file is not None:
+        write_json(json_file, {"file": file.name, "title": title, "facts": facts})
+    write_out(f"{file}: {title}\n")
+    Console().table("facts", ("name", "value"), facts.items())
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import h5py
 import numpy as np
 
@@ -38,8 +39,9 @@ from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.images.table import Frame, load_frames, read_frames, relative_path, write_frames
 from stages.physics.images.table_checks import check_distinct, check_table
 from stages.physics.maps import rasters
-from stages.physics.maps.grid import Grid, read_grid, require_crs
+from stages.physics.maps.grid import Grid, crs_radius, read_grid, require_crs
 
+SMALLEST_CROP = 16  # px
 LARGEST_CROP = 8192  # px: what a network can see at once, and more
 
 
@@ -73,8 +75,10 @@ def run(
     without images, its rows; of a scene with images, the images.
     """
     output = Output.at(output)
-    if config.crop < 16 or config.crop % 2 or config.crop > LARGEST_CROP:
-        raise ConfigError(f"`crop`: expected an even number of pixels, 16 .. {LARGEST_CROP}; found {config.crop}.")
+    if config.crop < SMALLEST_CROP or config.crop % 2 or config.crop > LARGEST_CROP:
+        raise ConfigError(
+            f"`crop`: expected an even number of pixels, {SMALLEST_CROP} .. {LARGEST_CROP}; found {config.crop}."
+        )
     body = find_body(config.body)
     frames = read_frames(images, body) if images else []
     if images and not config.trust_table:
@@ -82,9 +86,9 @@ def run(
             say(f"warning: {sentence}")
     check_output(output.file, [dem, *([images] if images else []), *_files(frames)], output.overwrite)
     alone = config.shard[1] == 1
-    with _open_terrain(dem, images, config, body, progress) as terrain:
+    with _open_terrain(dem, images, config, body, progress, say) as terrain:
         if frames and config.crop > min(terrain.grid.height, terrain.grid.width):
-            raise _no_positions(images, config, terrain.grid.gsd)
+            raise _no_positions(dem, config, terrain.grid.gsd, min(terrain.grid.height, terrain.grid.width), "the DEM")
         mine, skipped = check_frames(
             frames[slice(*shard_range(len(frames), config.shard))], terrain.grid, config.skip_outside, say
         )
@@ -122,7 +126,8 @@ def run(
             ]
             progress(len(mine), len(mine), "image masks")
             if frames and alone and not any(areas):
-                raise _no_positions(images, config, terrain.grid.gsd)
+                side = _largest_square(writer.file, config.crop)
+                raise _no_positions(images, config, terrain.grid.gsd, side, "any valid region of any image")
             writer.write("valid_area_m2", np.array(areas))
             hashed = [hash_files(frame) for frame in mine]
             check_distinct(hashed)
@@ -169,7 +174,9 @@ class Terrain:
 
 
 @contextlib.contextmanager
-def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, progress: Progress) -> Iterator[Terrain]:
+def _open_terrain(
+    dem: Path, images: Path | None, config: Config, body: Body, progress: Progress, say: Say
+) -> Iterator[Terrain]:
     count = config.shard[1]
     if is_artefact(dem):
         if images is None:
@@ -192,8 +199,14 @@ def _open_terrain(dem: Path, images: Path | None, config: Config, body: Body, pr
             "then give that scene in place of the DEM, with `images` and `shard`."
         )
     with rasters.open_raster(dem, "a DEM") as dataset:
-        require_crs(str(dem), dataset.crs, dataset.transform, body)
+        crs = require_crs(str(dem), dataset.crs, dataset.transform, body)
         plan = plan_grid(dem, dataset, config.gsd, body.radius, progress)
+        sphere = crs_radius(crs)
+        if sphere is not None and abs(sphere - body.radius) > 1 and not plan.holds_radii:
+            say(
+                f"note: {dem}: its CRS is on a sphere of {sphere:.10g} m, its heights are taken as above {body.radius:.10g} m; "
+                f"where they count from its own sphere, name {sphere:.10g} as `body`"
+            )
         attributes = {"gsd_m": plan.grid.gsd, "body_radius_m": body.radius}
         if count > 1:
             bands = math.ceil(plan.grid.height / config.block)
@@ -228,19 +241,33 @@ def _files(frames: Sequence[Frame]) -> list[Path]:
 
 def check_positions(parts: Sequence[Path], images: Path, config: Config) -> None:
     """Refuse shards of a scene in which no crop fits anywhere, as one run does at its end. Raises GeometryError."""
-    gsd = math.nan
+    gsd, side = math.nan, 0
     for part in parts:
         with open_artefact(part, SCENE) as file:
             if file["valid_area_m2"][...].any():
                 return
-            gsd = float(file.attrs["gsd_m"])
-    raise _no_positions(images, config, gsd)
+            gsd, side = float(file.attrs["gsd_m"]), max(side, _largest_square(file, config.crop))
+    raise _no_positions(images, config, gsd, side, "any valid region of any image")
 
 
-def _no_positions(images: Path | None, config: Config, gsd: float) -> GeometryError:
+def _largest_square(file: h5py.File, crop: int) -> int:
+    """px, side of the largest square of valid ground that an image shows, where that is smaller than a crop."""
+    largest = 0
+    for k, (row, col, height, width) in enumerate(file["frame_window"][...].tolist()):
+        for top in range(row, row + height, 4 * crop):
+            strip = file["valid"][k, top : min(top + 5 * crop, row + height), col : col + width]
+            reach = cv2.distanceTransform(np.pad(strip, 1), cv2.DIST_C, 3).max(initial=0)
+            largest = max(largest, 2 * int(reach) - 1)
+    return largest
+
+
+def _no_positions(where: Path | None, config: Config, gsd: float, side: int, what: str) -> GeometryError:
+    """No crop fits. side : px, of the largest square that would"""
+    smaller = f"choose a `crop` of at most {side // 2 * 2} px, or " if side >= SMALLEST_CROP else ""
     return GeometryError(
-        f"{images}: a crop of {config.crop} px ({config.crop * gsd:g} m) is larger than any valid region of any image; "
-        "choose a smaller `crop` or a finer `gsd`."
+        f"{where}: a crop of {config.crop} px ({config.crop * gsd:g} m) is larger than {what}, where {max(side, 0) * gsd:g} m "
+        f"({max(side, 0)} px) fit; {smaller}take a grid of {max(side, 1) * gsd / config.crop:.3g} m or finer (`gsd`), from a DEM "
+        "that is as fine."
     )
 
 

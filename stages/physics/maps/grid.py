@@ -12,8 +12,6 @@ from functools import cached_property, lru_cache
 
 import h5py
 import numpy as np
-import rasterio
-import rasterio.warp
 from numpy.typing import ArrayLike
 from rasterio.crs import CRS
 from rasterio.errors import CRSError
@@ -24,7 +22,6 @@ from stages.common.arrays import Floats
 from stages.physics.bodies.spheres import RADII, Body, find_body
 from stages.physics.maps.projections import (
     ELLIPSOID,
-    FARTHEST,
     continued_crs,
     degrees_crs,
     ellipsoid_of,
@@ -32,6 +29,7 @@ from stages.physics.maps.projections import (
     near_longitude,
     parse_crs,
     scale_tangent,
+    transform,
 )
 
 GDAL_CENTRE = 0.5  # GDAL's coordinate of the centre of the first pixel
@@ -74,16 +72,16 @@ class Grid:
         return continued_crs(self.crs_wkt) or self.crs
 
     @cached_property
-    def _degrees(self) -> CRS:
-        """Longitude and latitude of the kind that ``crs`` itself counts in."""
-        return degrees_crs(f"+R={self.radius!r}" if self.latitude_ratio == 1.0 else ellipsoid_of(self.crs_wkt))
+    def _degrees(self) -> tuple[CRS, CRS]:
+        """Longitude and latitude of the kind that ``crs`` itself counts in; longitudes of -180..180, and of any turn."""
+        figure = f"+R={self.radius!r}" if self.latitude_ratio == 1.0 else ellipsoid_of(self.crs_wkt)
+        return degrees_crs(figure), degrees_crs(figure, any_turn=True)
 
     @cached_property
     def middle_longitude_deg(self) -> float:
         """Of the grid's middle, in the turn that its own coordinates count in; 0 where that is off the body."""
-        x, y = self.transform @ (self.width / 2, self.height / 2)
-        lon, _ = rasterio.warp.transform(self._whole, self._degrees, [x], [y])
-        return float(lon[0]) if math.isfinite(lon[0]) else 0.0
+        lon = float(self.counted_longitude(*self.transform @ (self.width / 2, self.height / 2)))
+        return lon if math.isfinite(lon) else 0.0
 
     @property
     def gsd(self) -> float:
@@ -119,9 +117,20 @@ class Grid:
         x, y : (...,) m, broadcastable; returns (...,) each
         """
         x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-        lon, lat = rasterio.warp.transform(self._whole, self._degrees, x.ravel(), y.ravel())
-        lat = scale_tangent(np.asarray(lat), self.latitude_ratio)
-        return np.reshape(near_longitude(lon, 0.0), x.shape), np.reshape(lat, x.shape)
+        if self.crs.is_geographic:
+            return near_longitude(x, 0.0), scale_tangent(y, self.latitude_ratio)
+        lon, lat = transform(self.crs, self._degrees[0], x, y)
+        return lon, scale_tangent(lat, self.latitude_ratio)
+
+    def counted_longitude(self, x: ArrayLike, y: ArrayLike) -> Floats:
+        """East longitude, degrees, of map coordinates, in the turn that a continued map itself counts in; NaN off the body.
+
+        x, y : (...,) m, broadcastable; returns (...,)
+        """
+        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        if self.crs.is_geographic:
+            return np.where(np.abs(y) <= 90.0, x, np.nan)
+        return transform(self._whole, self._degrees[1], x, y)[0]
 
     def rowcol_of_lonlat(self, longitude_deg: ArrayLike, latitude_deg: ArrayLike) -> tuple[Floats, Floats]:
         """(row, col), fractional, of places given in degrees.
@@ -140,11 +149,11 @@ class Grid:
         """
         lon, lat = np.broadcast_arrays(np.asarray(longitude_deg, float), np.asarray(latitude_deg, float))
         lon = near_longitude(lon, self.middle_longitude_deg if middle_deg is None else middle_deg)
-        lat_own = scale_tangent(lat.ravel(), 1 / self.latitude_ratio)
-        near = np.abs(lon.ravel()) < FARTHEST
-        x, y = rasterio.warp.transform(self._degrees, self._whole, np.where(near, lon.ravel(), 0.0), lat_own)
-        shown = near & np.isfinite(x)
-        return np.reshape(np.where(shown, x, np.nan), lon.shape), np.reshape(np.where(shown, y, np.nan), lon.shape)
+        lat = scale_tangent(lat, 1 / self.latitude_ratio)
+        if self.crs.is_geographic:
+            return lon, lat
+        x, y = transform(self._degrees[1], self._whole, lon, lat)
+        return x, y
 
     def window(self, row: int, col: int, height: int, width: int) -> Grid:
         """The grid of array[row : row + height, col : col + width]."""
@@ -262,7 +271,7 @@ def _assign_crs(radius: float) -> str:
     """How to give a raster the CRS of a body of that radius, m."""
     degrees = "IAU_2015:30100" if radius == RADII["moon"] else f"'+proj=longlat +R={radius:.10g}'"
     return (
-        f"assign the CRS that the map truly has: 'rio edit-info --crs {degrees} FILE' for degrees, "
+        f"assign the CRS that the map truly has: gdal_edit.py -a_srs {degrees} for degrees, "
         f"'+proj=eqc +R={radius:.10g} +units=m' or the like for metres"
     )
 

@@ -16,12 +16,12 @@ import numpy as np
 import rasterio
 import rasterio.warp
 from numpy.typing import ArrayLike
+from rasterio._err import CPLE_BaseError  # what rasterio.warp lets through
 from rasterio.crs import CRS
 
 from stages.common.arrays import Floats
 
 TURN = 360.0  # degrees
-FARTHEST = math.degrees(10) - 1  # degrees: PROJ refuses longitudes beyond 10 rad
 ELLIPSOID = re.compile(r"(?:SPHEROID|ELLIPSOID)\[\"[^\"]*\",\s*([0-9.eE+]+),\s*([0-9.eE+]+)")
 
 
@@ -40,18 +40,39 @@ def continued_crs(wkt: str) -> CRS | None:
         return None
     with rasterio.Env():
         crs = CRS.from_proj4(f"{proj4} +over")
-        (x0, x1), (y0, y1) = rasterio.warp.transform(degrees_crs(ellipsoid_of(wkt)), crs, [0.0, TURN], [10.0, 10.0])
+        (x0, x1), (y0, y1) = rasterio.warp.transform(
+            degrees_crs(ellipsoid_of(wkt), True), crs, [0.0, TURN], [10.0, 10.0]
+        )
     return crs if math.isclose(y0, y1, abs_tol=1e-6 * abs(x1 - x0)) and abs(x1 - x0) > 1e-3 else None
 
 
 @lru_cache(maxsize=256)
-def degrees_crs(figure: str) -> CRS:
-    """Longitude and latitude, with longitudes of any turn. figure : the ellipsoid as PROJ parameters"""
-    return CRS.from_proj4(f"+proj=longlat {figure} +no_defs +over")
+def degrees_crs(figure: str, any_turn: bool = False) -> CRS:
+    """Longitude and latitude, longitudes of any turn if asked for. figure : the ellipsoid as PROJ parameters"""
+    return CRS.from_proj4(f"+proj=longlat {figure} +no_defs{' +over' if any_turn else ''}")
+
+
+def transform(source: CRS, target: CRS, x: Floats, y: Floats) -> Floats:
+    """Coordinates in another CRS, NaN where it has none: PROJ refuses all points for a single one that it cannot project.
+
+    x, y : (...,); returns (2, ...)
+    """
+    try:
+        found = np.asarray(rasterio.warp.transform(source, target, x.ravel(), y.ravel())).reshape(2, *x.shape)
+        return np.where(np.isfinite(found), found, np.nan)
+    except CPLE_BaseError:
+        if x.size == 1:
+            return np.full((2, *x.shape), np.nan)
+        middle = x.size // 2
+        parts = [transform(source, target, x.ravel()[part], y.ravel()[part]) for part in np.s_[:middle, middle:]]
+        return np.concatenate(parts, axis=1).reshape(2, *x.shape)
 
 
 def near_longitude(longitude_deg: ArrayLike, middle_deg: float) -> Floats:
-    """The same longitudes, by whole turns within 180 degrees of ``middle_deg``."""
+    """The same longitudes, by whole turns within 180 degrees of ``middle_deg``.
+
+    longitude_deg : (...,); returns the same shape
+    """
     longitude = np.asarray(longitude_deg, float)
     with np.errstate(invalid="ignore"):
         return longitude - TURN * np.round((longitude - middle_deg) / TURN)
@@ -110,7 +131,7 @@ def ellipsoid_of(wkt: str) -> str:
 
 
 def scale_tangent(latitude_deg: Floats, factor: float) -> Floats:
-    """Latitudes, deg, whose tangents are ``factor`` times as large."""
+    """Latitudes whose tangents are ``factor`` times as large. latitude_deg : (...,); returns the same shape"""
     if factor == 1.0:
         return latitude_deg
     latitude = np.radians(latitude_deg)
