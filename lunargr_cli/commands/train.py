@@ -82,5 +82,3 @@ def command(
         f"{output}: best epoch {best + 1}, validation RMSE {error:.5f} in {summary.error_unit}; "
         f"{summary.pairs_per_second:.1f} pairs/s in {summary.precision}"
     )
-    if summary.image_units == "dn":
-        console.say("the images are in DN, of unknown gain: maps and renderings are relative I/F")

@@ -44,7 +44,6 @@ class Summary:
     precision: str
     start: dict[str, float]
     error_unit: str
-    image_units: str
 
 
 def run(
@@ -122,7 +121,7 @@ def run(
     if ranks > 1:
         dist.barrier()
         dist.destroy_process_group()
-    return Summary(history, speed, training.precision, training.start, unit, training.reader.units)
+    return Summary(history, speed, training.precision, training.start, unit)
 
 
 def _load_extensions(path: str | None, pairs: Path, say: Say) -> list[Extension]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from stages.common.brightness import NAMES
 from stages.network.coefficient_maps import CoefficientMaps
 from stages.network.losses import Radiometry
 from stages.network.precision import choose_precision
@@ -76,7 +77,7 @@ def set_up(
 
 def error_unit(training: Training) -> str:
     """What root mean squared errors are in: of uncalibrated images gains are fitted, so that errors read like I/F."""
-    return "I/F" if training.radiometry.calibrated else "I/F at the images' mean gain"
+    return NAMES["iof"] if training.radiometry.calibrated else f"{NAMES['dn']} (at the images' mean gain)"
 
 
 def describe(training: Training) -> str:
