@@ -263,7 +263,8 @@ def test_a_note_stands_above_the_results(tmp_path):
 @pytest.mark.parametrize(
     ("low", "high", "value", "interval", "kind"),
     [(3.0, 20.0, "-12.0 %", "95 %: -20.0 .. -3.0 %", "good"), (-30.0, -2.0, "+12.0 %", "95 %: +2.0 .. +30.0 %", "bad"),
-     (-1.0, 25.0, "-12.0 %", "95 %: -25.0 .. +1.0 %", ""), (None, None, "-12.0 %", "no interval", "")],
+     (-1.0, 25.0, "-12.0 %", "95 %: -25.0 .. +1.0 %", ""), (None, None, "-12.0 %", "no interval", ""),
+     (30.0, 115.0, "-12.0 %", "95 %: -100.0 .. -30.0 %", "good")],
 )  # fmt: skip
 def test_a_number_says_whether_it_is_sure(low, high, value, interval, kind):
     [number] = conclusions.evaluation_numbers(evaluation_result(low, high))

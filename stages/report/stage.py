@@ -139,8 +139,9 @@ def _first_screen(found: Found, lit: Path | None, note: str, output: Path) -> li
     """The note, three numbers, the pictures, the way to the page that relights the map; the findings in words, folded."""
     head = [page.paragraph(note, "note")] if note else []
     parts = sorted((p for p in found.parts if p.kind in FIRST), key=lambda p: FIRST.index(p.kind))
-    # the first of each result, then what else there is
-    numbers = [*(p.numbers[0] for p in parts if p.numbers), *(n for p in parts for n in p.numbers[1:])][:MOST_NUMBERS]
+    # the first of each result, then what else there is, of the last result first
+    rest = [number for part in reversed(parts) for number in part.numbers[1:]]
+    numbers = [*(part.numbers[0] for part in parts if part.numbers), *rest][:MOST_NUMBERS]
     if numbers:
         head.append(page.headline(numbers))
     shown = [picture for part in parts for picture in part.pictures]

@@ -73,7 +73,7 @@ def numbers(result: dict[str, Any]) -> list[Number]:
             if v.get("value") is not None and v.get("error") is not None:
                 unit = {"1": "", "degree": " deg"}.get(v.get("unit", "1"), f" {v.get('unit')}")
                 low, high = (v["value"] + side * 1.96 * v["error"] for side in (-1, 1))
-                what = f"{words(cause['effect'])} ({words(name.removesuffix('_deg').removesuffix('_px'))}): found by the diagnosis"
+                what = f"{words(cause['effect'])} ({words(name.removesuffix('_deg').removesuffix('_px'))}), named by the diagnosis"
                 found.append(Number(f"{v['value']:.3g}{unit}", f"95 %: {low:.3g} .. {high:.3g}{unit}", what))
     held_out = result.get("held_out") or {}
     if result.get("causes") and held_out.get("gain_percent") is not None:

@@ -25,9 +25,9 @@ def verdict(gain: dict[str, Any]) -> str:
 
 
 def bounds(gain: dict[str, Any]) -> str:
-    """The interval of a gain, in percent."""
+    """The interval of a gain, in percent; no error falls by more than all of it."""
     low, high = gain.get("gain_percent_low"), gain.get("gain_percent_high")
-    return "no interval" if low is None or high is None else f"95 %: {low:+.1f} .. {high:+.1f}"
+    return "no interval" if low is None or high is None else f"95 %: {low:+.1f} .. {min(high, 100.0):+.1f}"
 
 
 def listed(names: list[str]) -> str:
@@ -58,7 +58,7 @@ def error_change(gain: dict[str, Any], label: str) -> Number:
     """By how many percent a squared error changes: a gain with the opposite sign. label : which error, against which"""
     value, low, high = (gain.get(f"gain_percent{end}") for end in ("", "_low", "_high"))
     kind = {"better": "good", "worse": "bad"}.get(verdict(gain), "")
-    interval = "no interval" if low is None or high is None else f"95 %: {-high:+.1f} .. {-low:+.1f} %"
+    interval = "no interval" if low is None or high is None else f"95 %: {-min(high, 100.0):+.1f} .. {-low:+.1f} %"
     sure = "" if kind else "not surely different: "
     return Number(f"{-float(value or 0):+.1f} %", interval, sure + label, kind)
 
