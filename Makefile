@@ -103,7 +103,7 @@ vendor-js: ## bundle three.js for the page of `lunargr view` again (needs npm; v
 D := demo-full
 SIZE_demo := --size-px 1024 --images 12
 COUNT_demo := 400
-EPOCHS_demo := 5
+EPOCHS_demo := 4
 RUNS_demo := 0
 PLACES_demo := 12
 NOTE_demo := --note "One training run, fewer crops, a smaller scene. The figures of README come from 'make demo-full'."
