@@ -50,11 +50,7 @@ def printed_commands():
 
 
 def test_the_commands_that_the_pages_print_have_such_options():
-    from typer.main import get_command
-
-    from lunargr_cli.main import app
-
-    known = get_command(app).commands
+    known = known_commands()
     found = list(printed_commands())
     assert len(found) > 60
     for page, (name, *options) in found:
@@ -62,15 +58,6 @@ def test_the_commands_that_the_pages_print_have_such_options():
             known[name].make_context(name, list(options))
         except Exception as error:  # typer has its own copy of click's
             pytest.fail(f"{page}: lunargr {shlex.join([name, *options])}: {error}")
-
-
-def mentioned_options():
-    """(page, option) of every `--option` in the prose and tables of README and docs."""
-    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
-        for code in re.findall(r"`([^`\n]+)`", page.read_text()):
-            if re.match(r"--\w|lunargr ", code) or re.match(rf"({'|'.join(sorted(known_commands()))}) --", code):
-                for option in re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", code):
-                    yield page.name, option
 
 
 def known_commands():
@@ -81,10 +68,20 @@ def known_commands():
     return get_command(app).commands
 
 
+def mentioned_options(commands):
+    """(page, option) of every `--option` in the prose and tables of README and docs."""
+    begins = re.compile(rf"--\w|lunargr |({'|'.join(commands)}) --")
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        for code in filter(begins.match, re.findall(r"`([^`\n]+)`", page.read_text())):
+            for option in re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", code):
+                yield page.name, option
+
+
 def test_every_option_that_the_pages_mention_exists():
-    exist = {o for command in known_commands().values() for p in command.params for o in [*p.opts, *p.secondary_opts]}
+    commands = known_commands()
+    exist = {o for command in commands.values() for p in command.params for o in [*p.opts, *p.secondary_opts]}
     exist |= {"--version", "--verbose", "--install-completion", "--show-completion", "--help"}
-    found = list(mentioned_options())
+    found = list(mentioned_options(commands))
     assert len(found) > 100
     assert [(page, option) for page, option in found if option not in exist] == []
 
