@@ -137,6 +137,20 @@ def test_a_failed_task_ends_the_chain_and_the_same_line_makes_what_is_missing(st
     assert any(" --model hapke " in line for line in stages)
 
 
+@pytest.mark.parametrize("how", ["one_machine.sh", "Makefile.pipeline"])
+def test_one_machine_makes_what_is_missing(stand_in, tmp_path, how):
+    for name in FILES[:2]:
+        (tmp_path / name).touch()
+    words = ["bash", ROOT / "examples" / "cluster" / how, *FILES, "3"]
+    if how == "Makefile.pipeline":
+        words = ["make", "-f", ROOT / "examples" / how, "DEM=dem.tif", "IMAGES=images.csv", "OUT=run", "N=3"]
+    broken = subprocess.run(words, env=stand_in | {"BROKEN": "pairs.2-of-3.h5"}, cwd=tmp_path, capture_output=True)
+    assert broken.returncode != 0 and not (tmp_path / "run" / "pairs.h5").exists()
+    done = subprocess.run(words, env=stand_in, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert {"calibration.json", "evaluation.h5", "svbrdf_albedo.h5"} <= {p.name for p in (tmp_path / "run").iterdir()}
+
+
 def test_what_slurm_refuses_is_told_before_the_first_job(stand_in, tmp_path):
     done = run("slurm_pipeline.sh", FILES, stand_in | {"GPUS": "4"}, tmp_path)
     assert done.returncode == 1 and "nothing was submitted" in done.stderr and "--gpus-per-node=4" in done.stderr

@@ -5,7 +5,7 @@
 #
 # The same seed gives the same artefacts as a run in one piece, whatever SHARDS is. What exists is not made again:
 # after a failure, run the same line once more. Settings, all optional (environment):
-#   LUNARGR=lunargr  JOBS=2  GSD=5  CROP=128  COUNT=4000  MODEL=M2  EPOCHS=20  SEED=0
+#   LUNARGR=lunargr  JOBS=2  GSD=5  CROP=128  COUNT=4000  MODEL=hapke  EPOCHS=20  SEED=0
 set -euo pipefail
 
 if [ $# -lt 3 ]; then
@@ -13,7 +13,7 @@ if [ $# -lt 3 ]; then
     exit 2
 fi
 dem=$1 images=$2 folder=$3 shards=${4:-4}
-: "${LUNARGR:=lunargr}" "${JOBS:=2}" "${GSD:=5}" "${CROP:=128}" "${COUNT:=4000}" "${MODEL:=M2}" "${EPOCHS:=20}" "${SEED:=0}"
+: "${LUNARGR:=lunargr}" "${JOBS:=2}" "${GSD:=5}" "${CROP:=128}" "${COUNT:=4000}" "${MODEL:=hapke}" "${EPOCHS:=20}" "${SEED:=0}"
 mkdir -p "$folder"
 
 # Jobs run side by side: their threads together should not ask for more cores than there are.
@@ -51,6 +51,9 @@ fan_out pairs project "$folder/crops.h5"
 [ -e "$folder/svbrdf.h5" ] ||
     "$LUNARGR" train "$folder/pairs.h5" --model "$MODEL" --epochs "$EPOCHS" --seed "$SEED" \
         --output "$folder/checkpoint.h5" --overwrite --resume
+map=$folder/svbrdf.h5 calibration=$folder/calibration.json
 fan_out svbrdf infer "$folder/scene.h5" "$folder/checkpoint.h5"
+[ -e "$calibration" ] || "$LUNARGR" albedo "$map" "$folder/scene.h5" --output "$calibration" # once, for all shards
+fan_out svbrdf_albedo albedo "$map" "$folder/scene.h5" --calibration "$calibration"
 [ -e "$folder/evaluation.h5" ] ||
     "$LUNARGR" evaluate "$folder/pairs.h5" "$folder/checkpoint.h5" --output "$folder/evaluation.h5"

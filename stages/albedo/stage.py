@@ -108,10 +108,8 @@ def run(
         else:
             found = _calibrate(svbrdf, scene, ground, config, progress)
         ground.references.take_off(found.fields)
-        sizes = {d: ground.map[d].shape[0] for d in ("coefficient", "y", "x")}
-        for dim in ("map", "place"):
-            if dim in ground.map:
-                sizes[dim] = len(ground.map[dim])
+        there = [v for v in SVBRDF.variables if v.name in ground.map]
+        sizes = {dim: n for v in there for dim, n in zip(v.dims, ground.map[v.name].shape, strict=True)}
         sizes |= {
             "frame": len(ground.references.frames),
             "band": LEVELS + 1,

@@ -102,7 +102,7 @@ def write_table(path: Path, images: list[Path]) -> Path:
     )
     rows = [
         {
-            "image_id": f"IMG{k}", "path": image.name, "units": "iof", "start_time": "2010-01-01T00:00:00Z",
+            "image_id": f"IMG{k}", "path": image.name, "units": "iof", "start_time": "",
             "subsolar_longitude_deg": LON + math.degrees(lon), "subsolar_latitude_deg": math.degrees(lat),
             "solar_distance_au": 1.0, "spacecraft_longitude_deg": LON, "spacecraft_latitude_deg": LAT,
             "spacecraft_altitude_m": 1e5,
