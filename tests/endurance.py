@@ -77,7 +77,13 @@ def endure(name: str, command: list[object], reference: Path, seconds: float, rn
     """One trial; what was done to it."""
     with tempfile.TemporaryDirectory() as folder:
         output = output_of(Path(folder), name)
-        full = [*with_resume(name, command, resume), "-o", output]
+        # without --resume, only --overwrite gives the state of an unfinished training up
+        full = [
+            *with_resume(name, command, resume),
+            "-o",
+            output,
+            *([] if resume or name != "train" else ["--overwrite"]),
+        ]
         blows = []
         for _ in range(rng.choice((1, 1, 2))):
             how = rng.choice((signal.SIGINT, signal.SIGKILL))

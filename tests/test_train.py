@@ -169,6 +169,15 @@ def test_a_cosine_is_not_resumed_with_another_number_of_epochs(
             train.run(*again)
 
 
+def test_the_state_of_an_unfinished_run_is_not_lost_by_a_forgotten_option(tmp_path):
+    """Hours of work: before any pair is read."""
+    side = tmp_path / "checkpoint.resume.h5"
+    side.write_text("state")
+    with pytest.raises(ConfigError, match=r"checkpoint\.resume\.h5: the state of an unfinished run; add `resume`"):
+        train.run(tmp_path / "pairs.h5", tmp_path / "checkpoint.h5", config(epochs=1))
+    assert side.read_text() == "state"
+
+
 def test_resume_refuses_another_run(small_artefacts, tmp_path):
     out = tmp_path / "checkpoint.h5"
     train.run(small_artefacts["pairs"], out, config(epochs=1))
