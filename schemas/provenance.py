@@ -21,8 +21,9 @@ import numpy as np
 from schemas.checks import any_text, is_foreign, parse_json
 from schemas.command_line import running_command
 from schemas.declaration import Schema
-from schemas.errors import ArtefactError
+from schemas.errors import ArtefactError, LunargrError
 from schemas.files.hdf5 import open_hdf5
+from schemas.files.user_files import read_json
 from schemas.rasters import raster_kind, read_raster
 
 CONVENTIONS = "CF-1.11"
@@ -209,10 +210,10 @@ def folder_record(
 
 def _read_sidecar(path: Path) -> dict[str, Any] | None:
     try:
-        found = json.loads((path.parent / SIDECAR).read_text())
+        found = read_json(path.parent / SIDECAR, "the record of this folder's files")
         good = found["files"].get(path.name) == sha256(path) and _is_record(found["record"])
         return found["record"] if good else None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (LunargrError, OSError, KeyError, TypeError, AttributeError):
         return None
 
 

@@ -147,6 +147,13 @@ def test_replay_keeps_what_is_there_and_works_in_another_folder(tmp_path):
     ]
 
 
+def test_a_record_beside_a_file_is_a_file(tmp_path):
+    """A pipe might never answer, and a device never end."""
+    os.mkfifo(tmp_path / "record.json")
+    (tmp_path / "dem.tif").write_bytes(b"a DEM")
+    assert chain(tmp_path / "dem.tif") == [Step("dem.tif", "", None)]
+
+
 def test_a_chain_may_be_of_any_length(tmp_path):
     """Each step made from the one before, and from one that all share."""
     count = 3000
