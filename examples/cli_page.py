@@ -64,13 +64,9 @@ def options_of(name: str, command: Any) -> list[Any]:
 
 
 def section(name: str, command: Any, shared: set[tuple[str, str]]) -> list[str]:
-    """A command: what it does, its examples, its own options, and the default name of its output."""
-    text = (command.help or "").replace("\b", "").strip()
-    first, _, rest = text.partition("\n\n")
+    """A command: what it does, its own options, and the default name of its output."""
+    first = (command.help or "").replace("\b", "").strip().partition("\n\n")[0]
     lines = [f"## {name}", "", " ".join(first.split()), ""]
-    for paragraph in rest.strip("\n").split("\n\n"):
-        if (shown := paragraph.strip()).startswith("lunargr "):
-            lines += ["```", *(line.rstrip() for line in shown.splitlines()), "```", ""]
     every = [p for p in options_of(name, command) if p.opts[0] not in EVERYWHERE]
     own = [p for p in every if key_of(p) not in shared]
     if own:
@@ -88,7 +84,7 @@ def page() -> str:
     shared = {key for key, number in count.items() if number >= SHARED_FROM}
     first = {key_of(p): p for options in reversed(every.values()) for p in options}
     lines = [HEAD, "|option of every command||", "|---|---|"]
-    lines += [f"|{spelled(p)}|{first_sentence(p)}|" for p in group.params]
+    lines += [f"|{spelled(p)}|{first_sentence(p)}|" for p in group.params if "completion" not in p.opts[0]]
     lines += ["", "|option of many commands||commands|", "|---|---|---|"]
     for key in (key for key in count if key in shared and key[0] not in EVERYWHERE):
         users = [name for name, options in every.items() if any(key_of(p) == key for p in options)]

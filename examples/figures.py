@@ -18,8 +18,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from stages.common.page.sentences import counted, listed, words  # noqa: E402
-from stages.report import conclusions  # noqa: E402
+from stages.common.page.sentences import basis, counted, listed, words  # noqa: E402
 from stages.report.held_out import TITLES as MAPS  # noqa: E402
 
 BLOCK = re.compile(r"(<!-- figures:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.S)
@@ -101,7 +100,7 @@ def evaluated(result: dict[str, Any], more: dict[str, Any] | None = None) -> lis
         )
     power = power_of(row for row, _ in rows)
     lines = [
-        f"Model {result['model']}; {conclusions.basis(result)}; training used none of this ground. ± is the standard deviation "
+        f"Model {result['model']}; {basis(result)}; training used none of this ground. ± is the standard deviation "
         "of training runs; brackets hold 95 % intervals. The second column lists what is fitted to each scored crop."
     ]
     order = list(FITTED)
@@ -172,7 +171,7 @@ def held_out(root: Path, name: str, command: str) -> list[str]:
         for name, row in result["models"].items()
     ]
     unit = f"MSE, 1e{power} {'I/F' if result.get('image_units') == 'iof' else 'DN'} squared"
-    lines = [f"Claim: {result['claim']}; {conclusions.basis(result)}, {len(result['images'])} images."]
+    lines = [f"Claim: {result['claim']}; {basis(result)}, {len(result['images'])} images."]
     sun = result["nearest_used_sun_deg"]
     gain = gained(result["gains"]["albedo"]["terrain"], "the map from terrain alone")
     lines += table(["map", unit, "SSIM"], rows)
