@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.server
+import os
 import shutil
 import threading
 
@@ -92,6 +93,13 @@ def test_no_raster_asks_the_network(server, tmp_path):
     with pytest.raises(InputError, match=r"map.xml"), rasters.open_raster(tmp_path / "map.xml"):
         pass
     assert not asked
+
+
+def test_gdal_is_kept_from_a_pipe_beside_a_raster(raster):
+    """It would wait for ever for statistics in it."""
+    os.mkfifo(raster.with_name("dem.tif.aux.xml"))
+    with pytest.raises(InputError, match=r"found the device or pipe 'dem\.tif\.aux\.xml'"), rasters.open_raster(raster):
+        pass
 
 
 def test_a_vrt_has_no_raw_bands(tmp_path):

@@ -180,6 +180,7 @@ def _check_raster(path: Path, size: int, modified: int) -> None:
     waiting, seen = [path], {os.path.realpath(path)}
     while waiting:
         file = waiting.pop()
+        _check_beside(file)
         with open(file, "rb") as stream:
             is_vrt = b"<VRTDataset" in stream.read(_VRT_HEAD)
         if is_vrt:
@@ -192,6 +193,22 @@ def _check_raster(path: Path, size: int, modified: int) -> None:
                 check_hdf5(file, data)
         else:
             _check_further(file, listed=file != path)
+
+
+def _check_beside(path: Path) -> None:
+    """Refuse pipes and devices beside a raster under its name, where GDAL looks for statistics, masks and labels."""
+    folder = path.absolute().parent
+    for name in _endless_in(folder, folder.stat().st_mtime_ns):
+        if name.startswith(path.stem) and name != path.name:
+            raise InputError(f"{path}: expected files beside it, found the device or pipe '{name}'; remove it.")
+
+
+@functools.lru_cache(maxsize=256)
+def _endless_in(folder: Path, modified: int) -> tuple[str, ...]:
+    """The pipes and devices in a folder, listed once while it stays as it is."""
+    with os.scandir(folder) as entries:
+        odd = [Path(entry.path) for entry in entries if not (entry.is_file() or entry.is_dir())]
+    return tuple(path.name for path in odd if path.is_fifo() or path.is_char_device())
 
 
 def _check_further(path: Path, listed: bool) -> None:
