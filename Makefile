@@ -170,7 +170,7 @@ $(D)/view.html: $(D)/svbrdf_albedo.h5 $(D)/pairs.h5
 	$(LUNARGR) view $< --pairs $(D)/pairs.h5 -o $@ --title "lunargr demo: the embedded scene" --overwrite $(SAYS)
 
 $(D)/evaluation.h5: $(D)/pairs.h5 $(DEMO_RUNS)
-	$(LUNARGR) evaluate $^ -o $@ --figures $(D)/figures --overwrite $(SAYS)
+	$(LUNARGR) evaluate $^ -o $@ $(if $(FIGURES_$(D)),--figures $(D)/figures) --overwrite $(SAYS)
 
 $(D)/held_out.h5: $(D)/pairs.h5 $(D)/fold_1.h5
 	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite $(SAYS)
