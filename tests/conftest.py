@@ -18,13 +18,15 @@ SHARED = Path(os.environ.get("LUNARGR_SHARED", ROOT.parent / "shared"))
 
 # Two workers take one file after the other: with the longest ones first, none of them waits for the other at the end.
 LONGEST = (
-    "test_albedo",
     "test_fanout",
-    "test_diagnose_leaks",
+    "test_albedo",
+    "test_interruptions",
+    "test_diagnose_shadows",
     "test_diagnose",
-    "test_view_browser",
     "test_provenance",
     "test_train",
+    "test_diagnose_leaks",
+    "test_view_browser",
 )
 
 
