@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 
+import cv2
 import numpy as np
 import pytest
 from camera_rays import image_to_terrain, looking_at
@@ -98,9 +99,43 @@ def test_other_bodies_by_name_or_radius():
     assert camera_from_document(document | {"body": 255000}, "c").semi_axes == (255000.0, 255000.0)
 
 
+BROWN = {"k1": -0.21, "k2": 0.06, "p1": 1.2e-3, "p2": -8e-4, "k3": -0.01}
+RATIONAL = BROWN | {"k4": 0.02, "k5": -0.01, "k6": 0.003}
+
+
+@pytest.mark.parametrize(
+    "given", [BROWN, RATIONAL, {"model": "fisheye", "k1": -0.04, "k2": 0.01, "k3": -0.004, "k4": 1e-3}]
+)
+def test_distortion_is_opencvs_both_ways(given, rng):
+    document = pinhole().to_document() | {"distortion": given, "focal_px": [500.0, 510.0]}
+    camera = camera_from_document(document, "camera.json")
+    again = camera_from_document(camera.to_document(), "again")
+    points = np.stack([*rng.uniform([[-0.6], [-0.45]], [[0.6], [0.45]], (2, 400)), np.ones(400)], axis=-1)
+    matrix = np.array([[500.0, 0, 319.5], [0, 510, 239.5], [0, 0, 1]])  # OpenCV counts from the first pixel's centre
+    names = [n for n in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6") if n in given]
+    numbers = np.array([given[n] for n in names])
+    if given.get("model") == "fisheye":
+        numbers = np.array([given[n] for n in ("k1", "k2", "k3", "k4")])
+        seen, _ = cv2.fisheye.projectPoints(points[None], np.zeros(3), np.zeros(3), matrix, numbers)
+    else:
+        seen, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, numbers)
+    sample, line = np.moveaxis(seen.reshape(-1, 2), -1, 0) + 0.5
+    for model in (camera, again):
+        ground = model.centre + 1e5 * points @ model.rotation.T
+        np.testing.assert_allclose(model.ground_to_image(ground), [line, sample], atol=1e-6)
+        _, direction = model.rays(line, sample)
+        inside = points / np.linalg.norm(points, axis=-1, keepdims=True)
+        np.testing.assert_allclose(direction @ model.rotation, inside, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
+        ({"focal_lenght": 3}, InputError, "unknown key 'focal_lenght'; the keys are: type, "),
+        ({"focal_xp": 3}, InputError, "unknown key 'focal_xp', did you mean 'focal_px'"),
+        ({"distortion": {"k1": -0.3, "k7": 1}}, InputError, "'distortion': unknown key 'k7'"),
+        ({"distortion": [0.1]}, InputError, "expected an object of OpenCV's coefficients"),
+        ({"distortion": {"model": "brwon"}}, InputError, "expected the model 'brown' or 'fisheye'"),
         ({"focal_px": None}, InputError, "expected finite numbers in 'focal_px'"),
         ({"focal_px": -3}, GeometryError, "focal lengths above 0"),
         ({"size_px": [640.5, 480]}, InputError, "whole number of pixels"),

@@ -29,9 +29,16 @@ BAD = [
     ((*SUN, "--view", "pinhole", "--position", f"{LON},{LAT},5000", "--fov", "200"), "--fov"),
     ((*SUN, "--size", "0,10", "--view", "pinhole", "--position", f"{LON},{LAT},5000"), "--size"),
     ((*SUN, "--view", "fisheye"), "ortho, pinhole"),
-    ((*SUN, "--quaternion", "0,0,0,0"), "--quaternion.* --view ortho"),
-    ((*SUN, "--look-at", f"{LON},{LAT}"), "--look-at.* --view ortho"),
-    ((*SUN, "--quaternion", "1,0,0,0", "--trajectory", "some.csv", "-o", "views"), "--quaternion.* a trajectory"),
+    ((*SUN, "--quaternion", "0,0,0,0"), "--position"),  # a camera's options imply its view
+    ((*SUN, "--look-at", f"{LON},{LAT}"), "--position"),
+    ((*SUN, "--view", "ortho", "--fov", "30"), "--fov.* --view ortho"),
+    ((*SUN, "--samples", "3"), "--samples.* --view ortho"),
+    ((*SUN, "--view", "ortho", "--camera", "svbrdf.h5"), "--camera: expected without --view ortho"),
+    ((*SUN, "--camera", "svbrdf.h5", "--size", "8,8"), "--size.* --camera"),
+    ((*SUN, "--position", f"{LON},{LAT},5000", "--fov", "30", "--backplanes"), "--backplanes.* --view pinhole"),
+    ((*SUN, "--png-only"), "--png-only.* --view ortho"),
+    ((*SUN, "--convergence", "5,9"), "--convergence.* --stereo"),
+    ((*SUN, "--quaternion", "1,0,0,0", "--trajectory", "svbrdf.h5", "-o", "views"), "--quaternion.* a trajectory"),
     ((*SUN, "--model", "hapke"), "--dem"),
     ((*SUN, "-o", "out.jpg"), ".exr, .tif or .png"),
     ((*SUN, "--camera", "missing.json"), "no such file"),
@@ -50,6 +57,15 @@ def test_bad_input_is_one_clear_line(hilly_map, tmp_path, monkeypatch, capsys, a
     assert code == 3
     assert error.count("\n") == 1 and re.search(message, error), error
     assert sorted(p.name for p in tmp_path.iterdir() if p.is_file()) == ["svbrdf.h5"]
+
+
+def test_options_of_a_camera_imply_its_view(hilly_map, tmp_path, monkeypatch, capsys):
+    path, *_ = hilly_map
+    monkeypatch.chdir(tmp_path)
+    asked = (*SUN, "--position", f"{LON},{LAT},5000", "--fov", "30", "--size", "16,12", "--quiet")
+    for name, view in (("implied", ()), ("named", ("--view", "pinhole"))):
+        assert lunargr_render(monkeypatch, capsys, path, *asked, *view, "-o", f"{name}.png")[0] == 0
+    assert (tmp_path / "implied.png").read_bytes() == (tmp_path / "named.png").read_bytes()
 
 
 def test_files_that_cannot_be_rendered(rng, hilly_map, tmp_path, monkeypatch, capsys):

@@ -6,7 +6,7 @@ import pytest
 
 from schemas.command_line import count_processes
 from schemas.errors import ConfigError, InputError
-from schemas.files.user_files import parse_csv
+from schemas.files.user_files import check_columns, check_keys, parse_csv
 from stages.physics.images.table import read_frames
 from stages.render.trajectory import read_trajectory
 from stages.train.processes import join_group
@@ -39,3 +39,11 @@ def test_processes_that_torchrun_did_not_start_are_one_line(monkeypatch):
     monkeypatch.delenv("RANK", raising=False)
     with pytest.raises(ConfigError, match="WORLD_SIZE: expected 2 processes that torchrun started"):
         join_group()
+
+
+def test_misspelt_keys_and_columns_are_refused():
+    with pytest.raises(InputError, match=r"c\.json: unknown key 'focal_lenght', did you mean 'focal_length'"):
+        check_keys(["focal_lenght"], ("focal_length", "size"), "c.json")
+    check_columns(["image_id", "notes", None], ("image_id", "subsolar_longitude_deg"), "t.csv")
+    with pytest.raises(InputError, match="unknown column 'subsolar_longitude', did you mean 'subsolar_longitude_deg'"):
+        check_columns(["image_id", "subsolar_longitude"], ("image_id", "subsolar_longitude_deg"), "t.csv")

@@ -73,8 +73,13 @@ def command(
         ),
     ] = None,
     view: Annotated[
-        str, typer.Option("--view", metavar="ortho|pinhole", help="ortho: the map's own grid; pinhole: a camera.")
-    ] = Config.view,
+        str | None,
+        typer.Option(
+            "--view",
+            metavar="ortho|pinhole",
+            help="ortho: the map's own grid (default); pinhole: a camera, as options of a camera imply.",
+        ),
+    ] = None,
     sun_azimuth_deg: Annotated[
         float | None,
         typer.Option(
@@ -126,14 +131,20 @@ def command(
         ),
     ] = None,
     roll_deg: Annotated[
-        float, typer.Option("--roll", metavar="DEG", help="Turn the camera clockwise about its line of sight.")
-    ] = Config.roll_deg,
+        float | None, typer.Option("--roll", metavar="DEG", help="Turn the camera clockwise about its line of sight.")
+    ] = None,
     fov_deg: Annotated[
-        float, typer.Option("--fov", metavar="DEG", help="Field of view across the image's width.")
-    ] = Config.fov_deg,
-    size_px: Annotated[str, typer.Option("--size", metavar="W,H", help="Image size in pixels.")] = ",".join(
-        map(str, Config.size_px)
-    ),
+        float | None,
+        typer.Option(
+            "--fov", metavar="DEG", help=f"Field of view across the image's width (default: {Config.fov_deg:g})."
+        ),
+    ] = None,
+    size_px: Annotated[
+        str | None,
+        typer.Option(
+            "--size", metavar="W,H", help=f"Image size in pixels (default: {','.join(map(str, Config.size_px))})."
+        ),
+    ] = None,
     camera: Annotated[
         Path | None,
         typer.Option(
@@ -222,12 +233,19 @@ def command(
         raise ConfigError("render: expected a reflectance map (svbrdf.h5) or --dem DEM, one of the two.")
     if parameters and dem is None:
         raise ConfigError("--parameters: expected together with --dem; an svbrdf.h5 holds its own coefficients.")
+    attitude = (look_at, quaternion, roll_deg, fov_deg, size_px)
+    modes = [name for name, given in (("--camera", camera), ("--trajectory", trajectory)) if given]
+    if view == "ortho" and modes:
+        raise ConfigError(f"{modes[0]}: expected without --view ortho; leave one of them out.")
+    seen_by_camera = modes or stereo is not None or any(option is not None for option in attitude)
     converted = {
-        "view": "pinhole" if camera or trajectory else view,
+        "view": view or ("pinhole" if seen_by_camera else Config.view),
+        "roll_deg": Config.roll_deg if roll_deg is None else roll_deg,
+        "fov_deg": Config.fov_deg if fov_deg is None else fov_deg,
         "position": _numbers(position, "--position", (3,)),
         "look_at": _numbers(look_at, "--look-at", (2, 3)),
         "quaternion": _numbers(quaternion, "--quaternion", (4,)),
-        "size_px": _size(size_px),
+        "size_px": Config.size_px if size_px is None else _size(size_px),
         "camera": str(camera) if camera else None,
         "parameters": _parameters(parameters or []),
         "terrain_only": dem is not None,
@@ -240,10 +258,13 @@ def command(
     console, to = Console(quiet), Output(output, overwrite, resume, json=json_file)
     if stereo is None and altitude is not None:
         raise ConfigError("--altitude: expected together with --stereo; a single view has its height in --position.")
+    if stereo is None and convergence != CONVERGENCE:
+        raise ConfigError("--convergence: expected together with --stereo; a single view has no second camera.")
     if stereo is not None:
-        if trajectory is not None or camera or position or shard or resume:
+        own = (trajectory, camera, position, look_at, quaternion, roll_deg, shard, resume or None)
+        if any(option is not None for option in own):
             raise ConfigError(
-                "--stereo: expected without a camera, --trajectory, --shard and --resume; it draws its own."
+                "--stereo: expected without a camera's place and attitude, --trajectory, --shard and --resume; it draws its own."
             )
         low, high = _numbers(convergence, "--convergence", (2,)) or StereoConfig.convergence_deg
         drawn = StereoConfig(stereo, altitude, (low, high), seed=seed)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import difflib
 import io
 import os
 import stat
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -64,3 +66,25 @@ def parse_csv(path: Path, text: str, expected: str) -> tuple[list[str], list[dic
         raise InputError(
             f"{path}: expected {expected}, found no CSV that can be read ({error}); mend the file."
         ) from None
+
+
+def check_keys(found: Iterable[object], known: Collection[str], where: str) -> None:
+    """Refuse keys of a JSON object that are not known: a misspelt one would be ignored. Raises InputError."""
+    unknown = [str(key) for key in found if key not in known]
+    if unknown:
+        raise InputError(
+            f"{where}: unknown key '{unknown[0]:.60}'{_meant(unknown[0], known)}; the keys are: {', '.join(known)}."
+        )
+
+
+def check_columns(found: Iterable[object], known: Collection[str], where: str) -> None:
+    """Refuse columns that look like misspelt ones; others may be there for people. Raises InputError."""
+    for name in found:
+        if isinstance(name, str) and name not in known and (meant := _meant(name, known)):
+            raise InputError(f"{where}: unknown column '{name:.60}'{meant}; rename or remove it.")
+
+
+def _meant(name: str, known: Collection[str]) -> str:
+    """', did you mean ...' where a known name is close."""
+    close = difflib.get_close_matches(name.strip().lower(), [k.lower() for k in known], 1, cutoff=0.8)
+    return f", did you mean '{close[0]}'?" if close else ""

@@ -21,6 +21,16 @@ SUN = (
     "time",
 )
 
+# What each kind of view does not look at: set all the same, it would be ignored.
+_ATTITUDE = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px")
+IGNORED = {
+    "`view` ortho": (*_ATTITUDE, "samples", "png_only"),
+    "`camera`": (*_ATTITUDE, "position", "backplanes_in_tif", "png_only"),
+    "a trajectory": ("position", "quaternion", "roll_deg", "backplanes_in_tif"),
+    "`view` pinhole": ("backplanes_in_tif", "png_only"),
+    "`quaternion`": ("look_at", "roll_deg"),
+}
+
 LARGEST_VIEW = 1 << 30  # pixels; an EXR of them has 4 GB a channel
 
 
@@ -154,13 +164,19 @@ def check(config: Config, trajectory: bool = False) -> None:
         sun_given(*(getattr(config, name) for name in SUN if name != "solar_distance_au"))
     if config.export not in (None, *EXPORTS):
         raise ConfigError(f"`export`: expected one of {', '.join(EXPORTS)}; found '{config.export}'.")
-    if config.view == "ortho" or config.camera or trajectory:
-        if config.quaternion is not None or (config.look_at is not None and not trajectory):
-            name = "quaternion" if config.quaternion is not None else "look_at"
-            other = "a trajectory" if trajectory else "`camera`" if config.camera else "`view` ortho"
-            raise ConfigError(f"`{name}`: expected with `view` pinhole, found with {other}; leave one of them out.")
+    kind = "a trajectory" if trajectory else "`camera`" if config.camera else f"`view` {config.view}"
+    refuse_ignored(config, kind)
+    if kind != "`view` pinhole":
         return
     if config.position is None:
         raise ConfigError("`view` pinhole: expected `position` LON,LAT,ALT or `camera` FILE; found neither.")
-    if config.look_at is not None and config.quaternion is not None:
-        raise ConfigError("`view` pinhole: expected `look_at` or `quaternion`, found both.")
+    if config.quaternion is not None:
+        refuse_ignored(config, "`quaternion`")
+
+
+def refuse_ignored(config: Config, kind: str) -> None:
+    """Refuse what is set but has no meaning with a kind of view of IGNORED. Raises ConfigError."""
+    default = Config()
+    for name in IGNORED[kind]:
+        if getattr(config, name) != getattr(default, name):
+            raise ConfigError(f"`{name}`: expected without {kind}, which does not use it; leave one of them out.")

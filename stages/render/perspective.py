@@ -15,6 +15,7 @@ from rasterio.transform import Affine
 from schemas.errors import GeometryError
 from stages.common.arrays import Floats, Floats32
 from stages.physics.cameras.base import Camera
+from stages.physics.cameras.distortion import NONE
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.formation.chain import Observation, State
 from stages.physics.formation.geometry import Angles
@@ -279,7 +280,9 @@ def _trace(camera: Camera, scene: Scene, first: int, count: int, samples: int) -
 
 def _rays(camera: Camera, line: Floats, sample: Floats) -> tuple[Floats, Floats]:
     """Like ``camera.rays``, with one origin where all rays leave one point."""
-    if isinstance(camera, Pinhole):  # by far the most common, and drawing rays should not take longer than casting them
+    if (
+        isinstance(camera, Pinhole) and camera.distortion[0] == NONE
+    ):  # by far the most common, and drawing rays should not take longer than casting them
         directions = np.empty((len(line), 3))
         _pinhole_rays(camera.focal_px, camera.principal_point_px, camera.rotation, line, sample, directions)
         return camera.centre[None], directions

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from schemas.errors import GeometryError, InputError
+from schemas.files.user_files import check_keys
 from stages.common.arrays import Floats
 from stages.physics.bodies.spheres import find_body
 
@@ -127,11 +128,15 @@ def quaternion_matrix(quaternions: Floats) -> Floats:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def frame_camera(document: Mapping[str, Any], where: str) -> dict[str, Any]:
+FRAME_KEYS = ("type", "principal_point_px", "size_px", "position_mcmf", "rotation_camera_to_mcmf", "body")
+
+
+def frame_camera(document: Mapping[str, Any], where: str, own: tuple[str, ...]) -> dict[str, Any]:
     """Arguments common to our own frame cameras: size, principal point, position, rotation and body.
 
-    Raises InputError or GeometryError.
+    own : the other keys of this camera. Raises InputError, also for keys that are none of them, or GeometryError.
     """
+    check_keys(document, (*FRAME_KEYS, *own), where)
     point = array(document, "principal_point_px", where, (2,))
     samples, lines = array(document, "size_px", where, (2,))
     extent = {"samples": samples, "lines": lines}

@@ -39,7 +39,7 @@ class Orthographic(Camera):
     @classmethod
     def from_document(cls, document: Mapping[str, Any], where: str) -> Orthographic:
         pixel = read.one_or_two(document, "pixel_size", where, "pixel sizes above 0 m")
-        return cls(pixel_size=pixel, **read.frame_camera(document, where))
+        return cls(pixel_size=pixel, **read.frame_camera(document, where, ("pixel_size",)))
 
     def rays(self, line: ArrayLike, sample: ArrayLike) -> tuple[Floats, Floats]:
         line, sample = np.broadcast_arrays(np.asarray(line, float), np.asarray(sample, float))

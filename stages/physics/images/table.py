@@ -14,7 +14,7 @@ import numpy as np
 
 from schemas.checks import has_control_characters
 from schemas.errors import InputError
-from schemas.files.user_files import check_file, parse_csv, read_json, read_text
+from schemas.files.user_files import check_columns, check_file, check_keys, parse_csv, read_json, read_text
 from schemas.reading import read_strings
 from schemas.writing import ArtefactWriter
 from stages.physics.bodies.ephemeris import AU, parse_utc
@@ -31,6 +31,7 @@ _NUMBERS = {
     "spacecraft_latitude_deg": (-90.0, 90.0),
     "spacecraft_altitude_m": (1.0, 1e10),
 }
+COLUMNS = ("image_id", "path", "units", "camera", "band", "angles", "start_time", *_NUMBERS)
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,11 @@ def read_frames(table: Path, body: Body | None = None) -> list[Frame]:
                 f"{table}: expected a JSON list of objects, one per image with the keys of images.csv, found another structure; "
                 "mend the file."
             )
+        for number, row in enumerate(rows, start=1):
+            check_keys(row, COLUMNS, f"{table}: image {number}")
     else:
-        rows = parse_csv(table, read_text(table, what), what)[1]
+        names, rows = parse_csv(table, read_text(table, what), what)
+        check_columns(names, COLUMNS, str(table))
     if not rows:
         raise InputError(f"{table}: expected at least one image, found none; mend the table.")
     return _frames(table, rows, body)
