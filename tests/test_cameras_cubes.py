@@ -8,6 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rasterio
+from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -203,6 +205,55 @@ def test_what_a_cube_lacks_is_named(shared):
         with pytest.raises(InputError, match=message) as caught:
             document_of(cube_of(shared, "dawnfc", **change)[0])
         assert "\n" not in str(caught.value)
+
+
+def shaded_gld100(shared, camera):
+    """(brightness, body-fixed points) of the GLD100 below a camera: Lambert's law on its own slopes, 474 m a pixel."""
+    with rasterio.open(shared / "data/apollo15/gld100_64ppd.tif") as dataset:
+        longitude, latitude = lonlat(camera.image_to_ground(camera.lines / 2, camera.samples / 2))
+        row, col = (int(v) for v in dataset.index(longitude, latitude))
+        window = rasterio.windows.Window(col - 100, row - 100, 200, 200)
+        height, place = dataset.read(1, window=window).astype(float), dataset.window_transform(window)
+    longitude = np.radians(place.c + (np.arange(200) + 0.5) * place.a)[None, :]
+    latitude = np.radians(place.f + (np.arange(200) + 0.5) * place.e)[:, None]
+    up = np.stack(
+        np.broadcast_arrays(
+            np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)
+        ),
+        -1,
+    )
+    points = (1737400.0 + height)[..., None] * up
+    normal = np.cross(np.gradient(points, axis=1), -np.gradient(points, axis=0))
+    to_sun = camera.sun / np.linalg.norm(camera.sun)
+    return normal @ to_sun / np.linalg.norm(normal, axis=-1), points
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_an_apollo_cube_shows_the_ground_that_its_camera_sees(shared):
+    """North up and not turned; 3.1 px east and 3.3 north of 474 m: its pose, and 1.2 px of the GLD100 file against LOLA."""
+    path = shared / "data/apollo15_cubes/AS15-M-0297_crop.cub"
+    camera = open_camera(path)
+    with rasterio.open(path) as dataset:
+        image = gaussian_filter(dataset.read(1).astype(float), 1.5)
+    shade, points = shaded_gld100(shared, camera)
+    line, sample = camera.ground_to_image(points)
+
+    def fine(values):
+        return values - gaussian_filter(values, 12)
+
+    def best(picture):
+        seen = map_coordinates(picture, [line - 0.5, sample - 0.5], order=1, mode="nearest")
+        inner, whole = np.s_[60:140, 60:140], fine(seen)
+        found = {
+            (dy, dx): np.corrcoef(whole[inner].ravel(), np.roll(fine(shade), (dy, dx), (0, 1))[inner].ravel())[0, 1]
+            for dy in range(-8, 9)
+            for dx in range(-8, 9)
+        }
+        return max(found.items(), key=lambda item: item[1])
+
+    (dy, dx), correlation = best(image)
+    assert correlation > 0.75 and abs(dy) <= 4 and abs(dx) <= 4
+    assert best(image[::-1, ::-1])[1] < 0.3
 
 
 # --- the camera of another image ------------------------------------------------------------------------------------
