@@ -173,10 +173,12 @@ def held_out(root: Path, name: str, command: str) -> list[str]:
     unit = f"MSE, 1e{power} {'I/F' if result.get('image_units') == 'iof' else 'DN'} squared"
     lines = [f"Claim: {result['claim']}; {basis(result)}, {len(result['images'])} images."]
     sun = result["nearest_used_sun_deg"]
+    low, high = round(sun["least"]), round(sun["most"])
+    apart = f"{low} to {high} deg from" if high > 0 else "less than 1 deg from"
     gain = gained(result["gains"]["albedo"]["terrain"], "the map from terrain alone")
     lines += table(["map", unit, "SSIM"], rows)
     lines += [f"- Squared error with albedo: {gain}.",
-              f"- The Sun of each unseen image is {sun['least']:.0f} to {sun['most']:.0f} deg from the nearest Sun used."]  # fmt: skip
+              f"- The Sun of each unseen image is {apart} the nearest Sun used.",
     return lines + covered(result)
 
 
