@@ -178,7 +178,7 @@ def held_out(root: Path, name: str, command: str) -> list[str]:
     gain = gained(result["gains"]["albedo"]["terrain"], "the map from terrain alone")
     lines += table(["map", unit, "SSIM"], rows)
     lines += [f"- Squared error with albedo: {gain}.",
-              f"- The Sun of each unseen image is {apart} the nearest Sun used.",
+              f"- The Sun of each unseen image is {apart} the nearest Sun used."]  # fmt: skip
     return lines + covered(result)
 
 
