@@ -230,7 +230,8 @@ def test_units_that_cf_calls_equal_are_equal(tmp_path, variable, unit):
         if variable not in file:
             file[variable] = np.ones(1)
         file[variable].attrs["units"] = unit
-    open_artefact(path, PAIRS).close()
+    with open_artefact(path, PAIRS) as file:
+        assert variable in file
 
 
 @pytest.mark.parametrize("unit", ["degrees_west", "radian", b"\xff\xfe", 5])

@@ -45,7 +45,7 @@ def shell(line: str, cwd: Path) -> subprocess.CompletedProcess:
         ("touch f && lunargr models --json f/x.json", 3, "cannot be written (Not a directory)"),
         ("touch f && lunargr models --json f", 3, "f: exists already; add --overwrite"),
         ("lunargr sample $'a\\xff.h5' -o x.h5", 3, "a\\udcff.h5: expected a name in UTF-8"),
-        ("lunargr inspect $'a\\xff.h5'", 3, "no such file"),
+        ("lunargr inspect $'a\\xff.h5'", 3, "a\\udcff.h5: expected a name in UTF-8"),
     ],
 )
 def test_odd_streams_names_and_folders_are_one_line(tmp_path, line, code, words):
