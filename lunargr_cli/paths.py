@@ -16,7 +16,7 @@ from typing import Any, get_type_hints
 
 from schemas.errors import ConfigError, InputError
 from schemas.files.locks import LONGEST_NAME
-from schemas.files.outputs import Target, check_apart, check_folder, check_outputs, protect
+from schemas.files.outputs import Target, check_apart, check_folder, check_name, check_outputs, protect
 
 LONGEST_PATH = 4096  # bytes, as Linux has it
 
@@ -67,6 +67,10 @@ def guarded(
         return
     overwrite = bool(options.get("overwrite"))
     replace = overwrite or bool(options.get("resume"))  # what is resumed, stages say
+    for name, path, kind in files.written:
+        if kind is Writes.FILE and not path.name:
+            raise ConfigError(f"{path}: expected a file name, found a folder; name the file in `{name}`.")
+        check_name(Target(path, name))
     with protect(files.read, overwrite):
         check_apart([Target(path, name) for name, path, _ in files.written])
         with lock:  # whoever gets it tidies up after a killed run

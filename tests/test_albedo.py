@@ -373,14 +373,14 @@ def test_what_registration_finds_is_taken_off_by_all_shards(rng, tmp_path, monke
     assert again.read_bytes() == path.read_bytes()
     whole = made(scene, config)[0]
     monkeypatch.setattr(running, "_calibrate", None)  # shards have no need of it
-    albedo.run(scene.map, scene.scene, part, config, calibration=path)
+    albedo.run_calibrated(scene.map, scene.scene, path, part, config)
     np.testing.assert_array_equal(read(part, "albedo")[0], whole)
     with pytest.raises(ArtefactError, match=r"calibration\.json: .* found another \(register\)"):
-        albedo.run(scene.map, scene.scene, tmp_path / "other.h5", QUIET, calibration=path)
+        albedo.run_calibrated(scene.map, scene.scene, path, tmp_path / "other.h5", QUIET)
     for text in ("no JSON", "[]", '{"made_from": 1}'):
         path.write_text(text)
         with pytest.raises(ArtefactError, match=r"calibration\.json: expected "):
-            albedo.run(scene.map, scene.scene, tmp_path / "other.h5", config, calibration=path)
+            albedo.run_calibrated(scene.map, scene.scene, path, tmp_path / "other.h5", config)
 
 
 def test_an_unknown_form_of_registration_is_refused(planted, tmp_path):

@@ -215,6 +215,10 @@ LONG = "n" * 300
         ["ingest", "dem.tif", "--images", LONG],
         ["sample", "scene.h5", "-o", LONG],
         ["sample", "scene.h5", "-o", "n" * 240],  # itself short enough, but not under its temporary name
+        ["sample", "scene.h5", "-o", "n" * 252 + ".h5"],
+        ["sample", "scene.h5", "-o", "."],
+        ["sample", "scene.h5", "-o", "/"],
+        ["sample", "scene.h5", "-o", ""],
         ["models", "--json", LONG],
         ["ingest", "dem.tif", "--images", "images.csv"],
         ["ingest", "dem.tif", "--images", "cameras.csv"],

@@ -6,7 +6,7 @@ import pytest
 
 from schemas.command_line import count_processes
 from schemas.errors import ConfigError, InputError
-from schemas.files.user_files import check_columns, check_keys, parse_csv
+from schemas.files.user_files import check_columns, check_keys, parse_csv, parse_number
 from stages.physics.images.table import read_frames
 from stages.render.trajectory import read_trajectory
 from stages.train.processes import join_group
@@ -24,6 +24,13 @@ def test_a_cell_in_quotes_may_hold_lines(tmp_path):
     names, rows = parse_csv(tmp_path, ' a ,b\r\n"x\r\ny",2\r\n', "a table")
     assert (names, rows) == (["a", "b"], [{"a": "x\r\ny", "b": "2"}])
     assert parse_csv(tmp_path, "", "a table") == ([], [])
+
+
+@pytest.mark.parametrize("text", ["1_0", "\u0661\u0662", ""])
+def test_a_table_s_number_is_one_in_any_language(text):
+    with pytest.raises(ValueError):
+        parse_number(text)
+    assert parse_number("-1.5e3") == -1500
 
 
 @pytest.mark.parametrize("text", ["abc", "", "0", "-1", "1.5", "9" * 40])

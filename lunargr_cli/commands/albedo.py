@@ -79,8 +79,10 @@ def command(
         from lunargr_cli.fanout.stages import run_albedo
 
         summary = run_albedo(svbrdf, scene, to, config, Work(scheduler, parts, console.say, console.progress))
+    elif calibration:
+        summary = albedo.run_calibrated(svbrdf, scene, calibration, to, config, console.progress)
     else:
-        summary = albedo.run(svbrdf, scene, to, config, console.say, console.progress, calibration)
+        summary = albedo.run(svbrdf, scene, to, config, console.say, console.progress)
     mean, std, low, high = summary.albedo
     console.say(
         f"{output}: albedo from {len(summary.images)} images over {summary.covered_share:.1%} of the map, "

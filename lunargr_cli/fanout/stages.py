@@ -138,7 +138,7 @@ def albedo_part(path: Path, svbrdf: Path, scene: Path, config: Any, calibration:
     """Write one shard of a map with albedo."""
     from stages import albedo
 
-    albedo.run(svbrdf, scene, Output(path, overwrite=True), config, calibration=calibration)
+    albedo.run_calibrated(svbrdf, scene, calibration, Output(path, overwrite=True), config)
     path.with_suffix(".tif").unlink(missing_ok=True)  # where one part is the whole
 
 

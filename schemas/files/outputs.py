@@ -153,13 +153,22 @@ def check_folder(target: Target) -> None:
     _check_writable(target.path, target)
 
 
-def _check_place(target: Target, overwrite: bool) -> None:
-    path, another = target.path, f"choose another `{target.setting}`"
+def check_name(target: Target) -> None:
+    """Refuse a name beside which no temporary file can stand. Raises ConfigError."""
+    path = Path(os.path.abspath(target.path))
+    if not path.name:
+        raise ConfigError(f"{target.path}: expected a name, found the root folder; choose another `{target.setting}`.")
     if (over := len(os.fsencode(partial_path(path).name)) - LONGEST_NAME) > 0:
         longest = len(os.fsencode(path.name)) - over
         raise ConfigError(
-            f"{path}: expected a name of at most {longest} bytes, which leaves room for a lock's; {another}."
+            f"{target.path}: expected a name of at most {longest} bytes, which leaves room for a temporary file's; "
+            f"choose another `{target.setting}`."
         )
+
+
+def _check_place(target: Target, overwrite: bool) -> None:
+    path, another = target.path, f"choose another `{target.setting}`"
+    check_name(target)
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:

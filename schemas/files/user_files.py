@@ -51,6 +51,13 @@ def read_text(path: Path, expected: str, encoding: str = "utf-8-sig") -> str:
         ) from None
 
 
+def parse_number(text: str) -> float:
+    """A number of a table. Raises ValueError, also for what only Python takes for one: '1_0', digits of other scripts."""
+    if "_" in text or not text.isascii():
+        raise ValueError(f"expected a number, found '{text}'")
+    return float(text)
+
+
 def read_json(path: Path, expected: str) -> Any:
     """The content of a JSON file. expected : what it should hold, for error lines. Raises InputError."""
     return parse_json(read_text(path, expected), f"{path}: expected {expected}", InputError, "mend the file")

@@ -11,7 +11,7 @@ from stages.albedo.config import Config, Summary
 
 if TYPE_CHECKING:
     from stages.albedo.calibrate import Calibration
-    from stages.albedo.stage import calibrate_to, count_bands, run, source_files, summarise
+    from stages.albedo.stage import calibrate_to, count_bands, run, run_calibrated, source_files, summarise
 
 __getattr__ = imported_later(__name__, "stage", "calibrate")
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "calibrate_to",
     "count_bands",
     "run",
+    "run_calibrated",
     "source_files",
     "summarise",
 ]

@@ -95,10 +95,26 @@ def run(
     config: Config,
     say: Say = say_nothing,
     progress: Progress = show_nothing,
-    calibration: Path | None = None,
 ) -> Summary:
-    """Write the map with albedo. calibration : from :func:`calibrate_to`, for shards, which share it. Raises LunargrError."""
-    output = Output.at(output)
+    """Write the map with albedo. Raises LunargrError."""
+    return _run(svbrdf, scene, None, Output.at(output), config, progress)
+
+
+def run_calibrated(
+    svbrdf: Path,
+    scene: Path,
+    calibration: Path,
+    output: Output | Path,
+    config: Config,
+    progress: Progress = show_nothing,
+) -> Summary:
+    """:func:`run` with the calibration of :func:`calibrate_to`, which all shards share. Raises LunargrError."""
+    return _run(svbrdf, scene, calibration, Output.at(output), config, progress)
+
+
+def _run(
+    svbrdf: Path, scene: Path, calibration: Path | None, output: Output, config: Config, progress: Progress
+) -> Summary:
     as_geotiff = config.geotiff and config.shard[1] == 1
     named = [svbrdf, scene, *([calibration] if calibration else [])]
     check_outputs(map_targets(output, as_geotiff), named, output.overwrite)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import InputError
-from schemas.files.user_files import parse_csv, read_text
+from schemas.files.user_files import parse_csv, parse_number, read_text
 from stages.render.config import SUN
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
@@ -85,7 +85,7 @@ def _row(path: Path, number: int, record: dict[str | None, Any]) -> ViewRow:
         if not text.get(name):
             continue
         try:
-            value[name] = float(text[name])
+            value[name] = parse_number(text[name])
         except ValueError:
             value[name] = math.nan
         if not math.isfinite(value[name]):

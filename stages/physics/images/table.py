@@ -14,7 +14,15 @@ import numpy as np
 
 from schemas.checks import has_control_characters
 from schemas.errors import InputError
-from schemas.files.user_files import check_columns, check_file, check_keys, parse_csv, read_json, read_text
+from schemas.files.user_files import (
+    check_columns,
+    check_file,
+    check_keys,
+    parse_csv,
+    parse_number,
+    read_json,
+    read_text,
+)
 from schemas.reading import read_strings
 from schemas.writing import ArtefactWriter
 from stages.physics.bodies.ephemeris import AU, parse_utc
@@ -129,7 +137,7 @@ def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Fram
     numbers: dict[str, Any] = {}
     for key, (low, high) in _NUMBERS.items():
         try:
-            value = float(text.get(key, ""))
+            value = parse_number(text.get(key, ""))
         except ValueError:
             raise InputError(
                 f"{where}: expected a number in column '{key}', found '{text.get(key, '') or 'nothing'}'; mend the table."
