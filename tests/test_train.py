@@ -229,7 +229,7 @@ def test_bad_requests_are_refused_and_leave_nothing(small_artefacts, tmp_path):
         ({"model": "M9"}, RegistryError, "choose one of"),
         ({"lr": -1.0}, ConfigError, "`lr`"),
         ({"epochs": 0}, ConfigError, "`epochs`"),
-        ({"widths": (4, 4, 4, 4, 4, 4, 4)}, ConfigError, "multiple of 64"),
+        ({"widths": (4,) * 7, "dropout": (0.0,)}, ConfigError, "multiple of 64"),
         ({"schedule": "steps"}, ConfigError, "`schedule`"),
         ({"device": "abacus"}, ConfigError, "`device`"),
     ]:
