@@ -143,8 +143,8 @@ def output_files(output: Path, view: str) -> list[Path]:
     raise ConfigError(f"{output}: expected a name that ends in .exr, .tif or .png; choose another `output`.")
 
 
-def check(config: Config, trajectory: bool = False) -> None:
-    """Refuse options that cannot go together. Raises ConfigError."""
+def check(config: Config, trajectory: bool = False, drawn_sun: bool = False) -> None:
+    """Refuse options that cannot go together. drawn_sun : the Sun is none of them. Raises ConfigError."""
     if config.view not in VIEWS:
         raise ConfigError(f"`view`: expected one of {', '.join(VIEWS)}; found '{config.view}'.")
     if config.samples is not None and not 1 <= config.samples <= 32:
@@ -160,7 +160,7 @@ def check(config: Config, trajectory: bool = False) -> None:
         raise ConfigError("the Earth: expected `earthshine` with both `earth_azimuth_deg` and `earth_elevation_deg`.")
     if config.export is not None and not trajectory:
         raise ConfigError("`export`: expected together with `trajectory`; a single view makes no data set.")
-    if not (trajectory or config.camera):  # rows and camera models may know their Sun
+    if not (trajectory or config.camera or drawn_sun):  # rows and camera models may know their Sun
         sun_given(*(getattr(config, name) for name in SUN if name != "solar_distance_au"))
     if config.export not in (None, *EXPORTS):
         raise ConfigError(f"`export`: expected one of {', '.join(EXPORTS)}; found '{config.export}'.")

@@ -61,7 +61,7 @@ def run_stereo(
     check_outputs([Target(path) for path in (manifest, *files)], [source], output.overwrite)
     body = find_body("moon" if config.body is None else config.body)
     view_config = replace(config, view="pinhole", position=(0.0, 0.0, 0.0))
-    check(view_config)
+    check(view_config, drawn_sun=True)
     rng = np.random.default_rng(stereo.seed)
     pairs: list[dict[str, Any]] = []
     with claim(manifest), companions_of(manifest), open_source(source, config, body) as surface:
