@@ -93,6 +93,7 @@ def test_files_that_cannot_be_rendered(rng, hilly_map, tmp_path, monkeypatch, ca
         (("--dem", path, "--model", "nonsense"), "choose one of"),
         (("--dem", path, "--parameters", "albedo"), "NAME=VALUE"),
         (("--dem", path, "--model", "lambert", "--parameters", "colour=1"), "unknown parameter"),
+        (("--dem", path, "--model", "hapke", "--parameters", "theta=20"), "0..1.0472 rad, found 20"),
     ):
         code, error = lunargr_render(monkeypatch, capsys, *arguments, *SUN, *out)
         assert code == 3 and message in error and error.count("\n") == 1, error

@@ -17,9 +17,11 @@ from render_scene import LAT, LON, SUN, lunargr_render, make_grid, write_dem, wr
 
 from schemas import DIAGNOSIS, ArtefactWriter
 from stages import render
+from stages.physics.bodies.spheres import find_body
 from stages.physics.maps.grid import Grid, unit_vectors
 from stages.physics.photometry import evaluate
 from stages.physics.terrain import sun_visibility as light
+from stages.physics.terrain.surface import open_surface
 from stages.render import ortho
 from stages.render.pictures import read_exr, stretch
 
@@ -138,6 +140,16 @@ def test_a_dem_with_one_model_everywhere(rng, tmp_path, monkeypatch, capsys):
     assert np.isfinite(exr["image"]).sum() == 64 * 64 - 16
     told = json.loads((tmp_path / "o.json").read_text())["views"][0]
     assert told["mean_iof"] == pytest.approx(float(np.nanmean(exr["image"])), rel=1e-5)
+
+
+def test_an_angle_of_a_model_may_be_given_in_degrees(rng, tmp_path):
+    path = write_dem(tmp_path / "dem.tif", make_grid(30, 30, 10.0), hills(rng, 30, 10.0))
+    body = find_body("moon")
+    found = []
+    for parameters in ({"theta_deg": 20.0}, {"theta": math.radians(20.0)}):
+        with open_surface(path, "hapke", parameters, body) as surface:
+            found.append(surface.uniform)
+    np.testing.assert_array_equal(*found)
 
 
 def test_extensions_reach_both_kinds_of_view(hilly_map, tmp_path):

@@ -69,7 +69,7 @@ def command(
         typer.Option(
             "--parameters",
             metavar="NAME=VALUE,...",
-            help="Model parameters for --dem; the others take their defaults.",
+            help="Model parameters for --dem, such as w=0.3,theta_deg=20; the others take their defaults.",
         ),
     ] = None,
     view: Annotated[

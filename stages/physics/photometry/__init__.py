@@ -44,7 +44,7 @@ def evaluate(model: str, parameters: Mapping[str, Any], incidence: Any, emission
     Raises RegistryError for an unknown model or parameter.
     """
     reflectance = get_model(model)
-    full = {**reflectance.defaults(), **_in_radians(reflectance, parameters)}
+    full = {**reflectance.defaults(), **in_radians(reflectance, parameters)}
     given = {"incidence": incidence, "emission": emission, "phase": phase, **full}
     as_tensor = any(isinstance(v, torch.Tensor) for v in given.values())
     tensors = {k: v if isinstance(v, torch.Tensor) else torch.from_numpy(np.array(v)) for k, v in given.items()}
@@ -57,7 +57,7 @@ def evaluate(model: str, parameters: Mapping[str, Any], incidence: Any, emission
     return result if as_tensor else result.numpy()[()]
 
 
-def _in_radians(model: ReflectanceModel, parameters: Mapping[str, Any]) -> dict[str, Any]:
+def in_radians(model: ReflectanceModel, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters under their own names, with NAME_deg turned into NAME; RegistryError for a name not known."""
     degrees = {f"{p.name}_deg": p.name for p in model.parameters if p.unit == "rad"}
     names = [p.name for p in model.parameters]
@@ -80,6 +80,7 @@ __all__ = [
     "get_model",
     "get_set",
     "horizon_cosine",
+    "in_radians",
     "lambert_albedo",
     "masked_radiance_factor",
     "model_names",

@@ -21,7 +21,7 @@ from stages.common.arrays import Floats32
 from stages.physics.bodies.spheres import Body
 from stages.physics.maps.grid import Grid, read_grid, require_crs
 from stages.physics.maps.rasters import check_metres, check_single_band, open_raster, pixel_size_at, read_window
-from stages.physics.photometry import ReflectanceModel, get_model
+from stages.physics.photometry import ReflectanceModel, get_model, in_radians
 from stages.physics.photometry.albedo_factor import AlbedoFactor
 
 _HDF5_SUFFIXES = (".h5", ".hdf5", ".nc")
@@ -256,17 +256,18 @@ def _named_model(path: Path, model: str | None) -> ReflectanceModel:
 
 
 def _uniform(model: ReflectanceModel, parameters: Mapping[str, float]) -> NDArray[np.float32]:
-    """(C,) in the model's order; what is not given takes its default. Raises RegistryError or ConfigError."""
-    names = [p.name for p in model.parameters]
-    for name, value in parameters.items():
-        if name not in names:
-            raise RegistryError.unknown(f"parameter of {model.name}", name, names)
-        bounds = next(p for p in model.parameters if p.name == name)
-        if not bounds.lower <= value <= bounds.upper:
+    """(C,) in the model's order; missing ones take their defaults. Raises RegistryError or ConfigError.
+
+    parameters : name -> value; angles in radians, or in degrees under their name with ``_deg``
+    """
+    found = model.defaults() | in_radians(model, parameters)
+    for p in model.parameters:
+        if not p.lower <= found[p.name] <= p.upper:
             raise ConfigError(
-                f"`parameters`: expected {name} of {model.name} in {bounds.lower:g}..{bounds.upper:g}, found {value:g}."
+                f"`parameters`: expected {p.name} of {model.name} in {p.lower:g}..{p.upper:g}{f' {p.unit}' if p.unit == 'rad' else ''}, "
+                f"found {found[p.name]:g}."
             )
-    return np.array([parameters.get(p.name, p.default) for p in model.parameters], np.float32)
+    return np.array([found[p.name] for p in model.parameters], np.float32)
 
 
 def _metric_grid(path: Path, dataset: DatasetReader, body: Body) -> Grid:
