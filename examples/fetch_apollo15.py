@@ -95,10 +95,11 @@ def make_ready(folder: Path, shared: Path | None, source: str = SOURCE) -> Path:
         fetch_elevations(source, cache, dem)
     table = folder / "images.csv"
     with table.open("w", newline="") as stream:
-        rows = [(name.split("_")[0], *[os.path.relpath(path, folder)] * 2) for name, path in sorted(cubes.items())]
         writer = csv.writer(stream)
-        writer.writerow(["image_id", "path", "camera", "units"])
-        writer.writerows([*row, "dn"] for row in rows)
+        writer.writerow(["image_id", "path", "units"])
+        writer.writerows(
+            (name.split("_")[0], os.path.relpath(path, folder), "dn") for name, path in sorted(cubes.items())
+        )
     return table
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import h5py
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from stages import ingest
 from stages.physics.bodies.ephemeris import subsolar_point, utc_to_et
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras import open_camera
-from stages.physics.images.frame_geometry import complete_row
 from stages.physics.images.labels import label_time, product_time
 from stages.physics.images.table import read_frames
 from stages.physics.maps.grid import unit_vectors
@@ -96,17 +93,19 @@ def test_product_ids_count_the_clock(product, start):
     assert product_time("AS15-M-0295") is None
 
 
-def test_isd_and_cube_give_everything(shared):
-    cube = shared / "data/formats/M143947267L.cal.echo.crop.cub"
-    rows = [{"image_id": "NAC", "path": str(cube), "camera": str(cube), "units": "iof"}]
-    row = complete_row(rows[0], cube, cube, find_body("moon"), "table")
+@pytest.mark.parametrize("name", ["formats/M143947267L.cal.echo.crop.cub", "apollo15_cubes/AS15-M-0297_crop.cub"])
+def test_a_cube_is_its_own_camera(shared, tmp_path, name):
+    """Line scanner and framing camera: time, Sun and spacecraft, without a column for the camera."""
+    cube, table = shared / "data" / name, tmp_path / "images.csv"
+    table.write_text(f"image_id,path,units\nA,{cube},dn\n")
+    (frame,) = read_frames(table)
+    assert frame.camera == frame.path == cube
     view = open_camera(cube)
-    sun = subsolar_point(row["start_time"])
-    assert float(row["subsolar_longitude_deg"]) == pytest.approx(sun.longitude_deg, abs=0.01)
-    assert float(row["spacecraft_altitude_m"]) == pytest.approx(
-        np.linalg.norm(view.position(200.0)) - 1737400, abs=1e-3
-    )
-    assert os.path.exists(row["path"])
+    time, sun = float(view.ephemeris_time(0.0)), view.sun_position(view.lines / 2)
+    assert utc_to_et(frame.start_time) == pytest.approx(time, abs=1e-3)
+    np.testing.assert_allclose(frame.sun_position(), sun, rtol=1e-9)
+    assert frame.subsolar_longitude_deg == pytest.approx(subsolar_point(frame.start_time).longitude_deg, abs=0.01)
+    np.testing.assert_allclose(frame.camera_position(RADIUS), view.position(view.lines / 2), atol=1e-3)
 
 
 def test_the_body_must_be_the_cameras(raw, tmp_path):

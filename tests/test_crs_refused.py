@@ -67,3 +67,13 @@ def test_an_unprojected_cube_is_told_that_it_lacks_its_camera(tmp_path):
     table.write_text("image_id,path,units,start_time\nA,raw.cub,iof,2010-01-01T00:00:00Z\n")
     with pytest.raises(InputError, match=r"raw\.cub: .*no CRS; give the camera"):
         read_frames(table, find_body("moon"))
+    instrument = "Group = Instrument\n InstrumentId = METRIC\n End_Group\n"
+    isis_cube(tmp_path / "raw.cub", np.full((8, 8), 0.05, "<f4"), "Real", instrument)
+    with pytest.raises(InputError, match=r"raw\.cub: .*found none; run spiceinit on it first"):
+        read_frames(table, find_body("moon"))
+    mapped = instrument + "Group = Mapping\n ProjectionName = Sinusoidal\n End_Group\n"
+    isis_cube(tmp_path / "raw.cub", np.full((8, 8), 0.05, "<f4"), "Real", mapped)
+    columns = "subsolar_longitude_deg,subsolar_latitude_deg,solar_distance_au,spacecraft_longitude_deg"
+    columns += ",spacecraft_latitude_deg,spacecraft_altitude_m"
+    table.write_text(f"image_id,path,units,start_time,{columns}\nA,raw.cub,iof,2010-01-01,0,0,1,0,0,1e5\n")
+    assert read_frames(table, find_body("moon"))[0].camera is None

@@ -72,8 +72,8 @@ def test_real_dem_has_the_moons_grid(shared):
 # --- special pixels -------------------------------------------------------------------------------------------------
 
 
-def isis_cube(path, array, pixel_type):
-    """A minimal band-sequential cube, by hand."""
+def isis_cube(path, array, pixel_type, groups=""):
+    """A minimal band-sequential cube, by hand; ``groups`` add to its label."""
     label = f"""Object = IsisCube
   Object = Core
     StartByte = 1025
@@ -90,6 +90,7 @@ def isis_cube(path, array, pixel_type):
       Multiplier = 1.0
     End_Group
   End_Object
+  {groups}
 End_Object
 Object = Label
   Bytes = 1024

@@ -24,6 +24,12 @@ def is_cube(path: Path) -> bool:
         return file.read(32).lstrip().startswith(b"Object = IsisCube")
 
 
+def is_own_camera(path: Path) -> bool:
+    """Whether a file is an ISIS cube as an instrument took it: not a map, and not a raster of other origin."""
+    label = (read_label(path) if path.is_file() and is_cube(path) else None) or {}
+    return find_block(label, "Instrument") is not None and find_block(label, "Mapping") is None
+
+
 @dataclass(frozen=True)
 class Extent:
     """Which part of the image that was taken a cube holds, cropped and reduced as AlphaCube says; pairs are (line, sample).

@@ -36,7 +36,7 @@ def document_of(cube: Cube) -> dict[str, Any]:
         known = ", ".join(sorted(n.upper() for n in (*NAC_CODES, *FRAMING)))
         raise InputError(
             f"{cube.where}: expected a cube of {known} to take the camera from, found instrument '{instrument}'; make an ISD "
-            "with ALE (isd_generate CUBE, see docs/from_pds_to_pairs.md, step 3) and name that."
+            "with ALE (isd_generate CUBE, see docs/from_pds_to_pairs.md, step 3) and name it as the camera."
         )
     return _framing(cube, FRAMING[name])
 

@@ -27,6 +27,7 @@ from schemas.reading import read_strings
 from schemas.writing import ArtefactWriter
 from stages.physics.bodies.ephemeris import AU, parse_utc
 from stages.physics.bodies.spheres import Body, find_body
+from stages.physics.cameras.isis_cube import is_own_camera
 from stages.physics.images.frame_geometry import complete_row
 from stages.physics.images.pds_index import index_images
 from stages.physics.maps.grid import unit_vectors
@@ -46,7 +47,7 @@ COLUMNS = ("image_id", "path", "units", "camera", "band", "angles", "start_time"
 class Frame:
     """One source image.
 
-    units : 'iof' or 'dn'; camera : its camera model, None for map-projected images
+    units : 'iof' or 'dn'; camera : its camera model, ``path`` again for an ISIS cube, None for map-projected images
     sha256, camera_sha256 : digests of both files, empty before they are read
     """
 
@@ -131,6 +132,8 @@ def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Fram
         raise InputError(f"{where}: expected units 'iof' or 'dn', found '{units or 'nothing'}'; mend the table.")
     image = table.parent / text["path"]
     camera = table.parent / text["camera"] if text.get("camera") else None
+    if camera is None and is_own_camera(image):
+        camera = image
     text = complete_row(text, image, camera, body, where)
     if text.get("start_time"):
         parse_utc(text["start_time"], f"{where}: column 'start_time'")
