@@ -79,6 +79,7 @@ def test_a_camera_that_is_off_is_found_out_and_put_right(rough, tmp_path, kind, 
         assert put["shift_row_px"][0] == pytest.approx(0.0, abs=0.1)
         assert put["shift_sigma_px"][0] < 0.25
         assert json.loads(put.attrs["config"])["register"] == kind
+        assert put["relief_share"][0] == 0  # a known camera leaves no relief displacement
         # both footprints were sampled apart: ground that crops of both show must look alike again
         truth, wrong, mended = (mosaic(file) for file in (r, o, put))
         before, after = np.nanstd(wrong - truth), np.nanstd(mended - truth)

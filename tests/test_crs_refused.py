@@ -77,3 +77,5 @@ def test_an_unprojected_cube_is_told_that_it_lacks_its_camera(tmp_path):
     columns += ",spacecraft_latitude_deg,spacecraft_altitude_m"
     table.write_text(f"image_id,path,units,start_time,{columns}\nA,raw.cub,iof,2010-01-01,0,0,1,0,0,1e5\n")
     assert read_frames(table, find_body("moon"))[0].camera is None
+    table.write_text(table.read_text().replace("raw.cub", "a" * 300))  # a name that no file can have: ingest says so
+    assert read_frames(table, find_body("moon"))[0].camera is None

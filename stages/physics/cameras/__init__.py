@@ -19,7 +19,7 @@ import_all(__name__, __path__)
 def open_camera(path: str | Path) -> Camera:
     """The camera in a file: our JSON, an ALE/CSM ISD, or an ISIS cube with SPICE attached. Raises LunargrError."""
     path = Path(path)
-    if path.is_file() and is_cube(path):
+    if is_cube(path):
         return camera_from_document(cube_document(path), str(path))
     return camera_from_document(read_document(path), str(path))
 

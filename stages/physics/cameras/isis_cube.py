@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,14 +20,19 @@ ISIS_SHIFT = ISIS_CENTRE - CSM_CENTRE
 
 
 def is_cube(path: Path) -> bool:
-    """Whether a file is an ISIS cube."""
-    with path.open("rb") as file:
-        return file.read(32).lstrip().startswith(b"Object = IsisCube")
+    """Whether a path is an ISIS cube that can be read."""
+    if not os.path.isfile(path):  # Path.is_file raises for names that are too long
+        return False
+    try:
+        with path.open("rb") as file:
+            return file.read(32).lstrip().startswith(b"Object = IsisCube")
+    except OSError:
+        return False
 
 
 def is_own_camera(path: Path) -> bool:
     """Whether a file is an ISIS cube as an instrument took it: not a map, and not a raster of other origin."""
-    label = (read_label(path) if path.is_file() and is_cube(path) else None) or {}
+    label = (read_label(path) if is_cube(path) else None) or {}
     return find_block(label, "Instrument") is not None and find_block(label, "Mapping") is None
 
 

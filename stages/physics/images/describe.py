@@ -66,7 +66,7 @@ def describe(path: Path) -> tuple[str, dict[str, str]]:
         facts = _values(dataset)
         if dataset.crs is not None:
             return "a map (a DEM, or a map-projected image)", facts | _map_facts(path, dataset)
-    if path.is_file() and is_cube(path) and find_block(read_label(path) or {}, "NaifKeywords") is not None:
+    if is_cube(path) and find_block(read_label(path) or {}, "NaifKeywords") is not None:
         return "an image as its camera took it, with its camera", facts | _camera_facts(open_camera(path))
     time = _time(path)
     return "an image without map projection", facts | ({"time": time} if time else {}) | {
