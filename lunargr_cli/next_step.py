@@ -26,12 +26,17 @@ def next_step(command: str, options: Options) -> str | None:
 
 def _run(*words: object, to: str = "", beside: Path | None = None) -> str:
     """A command line; its output gets the name ``to`` in the folder of ``beside``."""
-    target = ["-o", str(beside.with_name(to))] if beside is not None else []
-    return shlex.join(["lunargr", *map(str, words), *target])
+    target = ["-o", beside.with_name(to)] if beside is not None else []
+    return shlex.join(["lunargr", *map(_word, (*words, *target))])
+
+
+def _word(word: object) -> str:
+    """One word of a command line; a file whose name begins with a dash must not be read as an option."""
+    return f"./{word}" if isinstance(word, Path) and str(word).startswith("-") else str(word)
 
 
 def _open(path: Path) -> str:
-    return f"open {shlex.quote(str(path))}"
+    return f"open {shlex.quote(_word(path))}"
 
 
 def _after(command: str, to: str) -> Callable[[Options], str]:

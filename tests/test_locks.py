@@ -11,7 +11,9 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
+from unittest import mock
 
+import filelock
 import pytest
 
 from schemas import ConfigError, atomic_path, write_json
@@ -174,6 +176,7 @@ def test_one_of_many_gets_what_a_killed_run_held(tmp_path):
 KILLED = """
 import os, signal, sys
 from pathlib import Path
+from unittest import mock
 from schemas import atomic_path
 from schemas.files.companions import companions_of
 from schemas.files.locks import claim
@@ -238,3 +241,13 @@ def test_a_run_that_was_not_told_to_replaces_no_file_at_all(tmp_path):
     assert forgotten.read_text() == "there before"
     with protect([], overwrite=True):
         write_json(forgotten, 1)
+
+
+def test_a_folder_that_takes_no_files_is_not_taken_for_another_run(tmp_path):
+    output = tmp_path / "x.h5"
+    with (
+        mock.patch("filelock.FileLock.acquire", side_effect=filelock.Timeout("x")),
+        pytest.raises(ConfigError, match="no file can be made in this folder"),
+        claim(output),
+    ):
+        pass

@@ -38,6 +38,15 @@ def test_what_follows_a_command_is_a_command_that_there_is(name):
         assert "runs/a b/" in " ".join(arguments)
 
 
+@pytest.mark.parametrize("name", WRITING)
+def test_a_file_name_with_a_dash_in_front_is_no_option(name):
+    step = next_step(
+        name,
+        options_of(name, [*READS[name][1], "-o", "-o.h5"] if name not in ("match", "diagnose") else READS[name][1]),
+    )
+    assert " -o." not in step
+
+
 def test_a_part_is_merged_next_and_a_list_is_followed_by_nothing():
     assert next_step("sample", options_of("sample", ["scene.h5", "--shard", "1/4", "-o", "part1.h5"])).startswith(
         "lunargr merge"

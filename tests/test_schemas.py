@@ -331,3 +331,11 @@ def test_an_output_that_is_a_hard_link_to_an_input_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="would replace the input"):
         check_output(tmp_path / "other.h5", [tmp_path / "input.h5"], overwrite=True)
     check_output(tmp_path / "equal.h5", [tmp_path / "input.h5"], overwrite=True)  # another file, if of the same bytes
+
+
+def test_names_that_are_no_utf_8_are_refused(tmp_path):
+    path = write_pairs(tmp_path / "pairs.h5")
+    with h5py.File(path, "r+") as file:
+        file.create_group("inner").create_group(b"\xff")
+    with pytest.raises(ArtefactError, match="expected names in UTF-8, found other bytes"):
+        open_artefact(path, PAIRS)

@@ -156,6 +156,8 @@ def _acquire(output: Path, path: Path, lock: BaseFileLock) -> None:
     try:
         lock.acquire()
     except Timeout:
+        if not path.exists():  # filelock takes a folder without files, such as /proc, for a file that others remove
+            raise ConfigError(f"{output}: no file can be made in this folder; choose another `output`.") from None
         who = _read(record_path(output)).partition("\n")[0]
         who = f" ({who[:SHOWN]})" if who else ""
         raise ConfigError(

@@ -55,7 +55,10 @@ def is_inside(name: str) -> bool:
 
 def check_hdf5(path: Path, file: h5py.File) -> None:
     """Refuse data outside the file, and links and views that lead nowhere or in a circle. Raises ArtefactError."""
-    graph = _scan(path, file)
+    try:
+        graph = _scan(path, file)
+    except UnicodeError:
+        raise ArtefactError(f"{path}: expected names in UTF-8, found other bytes; write it again.") from None
     waiting, done = _files_behind(graph), {os.path.realpath(path)}
     while waiting:
         if (source := waiting.pop()) in done:
