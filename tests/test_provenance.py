@@ -102,24 +102,30 @@ def test_what_a_record_says_cannot_leave_its_words(tmp_path):
     names = tmp_path / "names"
     names.mkdir()
     hostile = "x\ntouch X\r\u2028\x1b[2J"
-    line = f"lunargr ingest dem.tif ; touch Y $(touch Z) `touch V` --overwrite -o {shlex.quote('o' + hostile)}"
+    line = "lunargr ingest dem.tif ; touch Y $(touch Z) `touch V` --overwrite -o o"
     steps = [
         Step(f"dem.tif{hostile}", hostile, None),
         step(f"a{hostile}", line, str(names), version=hostile, schema=hostile),
         step("b.h5", folder=hostile, config={"a": hostile}),
-        step("c.h5", "lunargr sample -o c.h5", f"{names}/{hostile}"),
     ]
     (tmp_path / "lunargr").write_text("#!/bin/sh\nprintf '%s|' \"$@\" >> ../words\n")
     (tmp_path / "lunargr").chmod(0o755)
-    (names / "xtouch X[2J").mkdir()
     path = f"{tmp_path}{os.pathsep}{os.environ['PATH']}"
     script = "\n".join(replay.script(steps))
     done = subprocess.run(["sh"], input=script, env={"PATH": path}, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
-    words = ["ingest", "dem.tif", ";", "touch", "Y", "$(touch", "Z)", "`touch", "V`", "-o", "oxtouch X[2J", ""]
+    words = ["ingest", "dem.tif", ";", "touch", "Y", "$(touch", "Z)", "`touch", "V`", "-o", "o", ""]
     assert (tmp_path / "words").read_text() == "|".join(words)
-    found = ["lunargr", "names", "words", "words", "xtouch X[2J"]
-    assert sorted(p.name for p in tmp_path.rglob("*")) == found
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["lunargr", "names", "words"]
+
+
+@pytest.mark.parametrize(
+    "names", [("a\nb.h5", "runs"), ("a\u200db.h5", "runs"), ("ab.h5", "runs\n2"), ("ab.h5", "\x1b[2J")]
+)
+def test_replay_names_no_other_file_than_the_record(names):
+    made, folder = names
+    with pytest.raises(ArtefactError, match="expected names without control characters in its record"):
+        list(replay.script([step("a.h5", f"lunargr sample {shlex.quote(made)} -o a.h5", folder)]))
 
 
 def test_replay_keeps_what_is_there_and_works_in_another_folder(tmp_path):

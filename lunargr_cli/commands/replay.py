@@ -46,13 +46,14 @@ def command(file: Annotated[Path, typer.Argument(help="Any artefact of lunargr: 
 def script(steps: Sequence[Step]) -> Iterator[str]:
     """A shell script: inputs first, each with its hash; steps without a known command are comments.
 
-    The records come from a file that anybody may have written. Raises ArtefactError for commands of other programs.
+    The records come from a file that anybody may have written. Raises ArtefactError for commands of other programs and
+    for names that a terminal would obey.
     """
     folders = [step.record["folder"] for step in steps if step.record and step.record["command"]]
     yield "set -eu"
     if folders:
         yield "# Give a folder to work in another one. Files that are there already are kept."
-        yield f"[ $# -gt 0 ] || set -- {shlex.quote(without_steering(folders[0]))}"
+        yield f"[ $# -gt 0 ] || set -- {shlex.quote(_plain(folders[0], steps[-1].name))}"
         yield 'cd -- "$1" && here=$PWD'
     folder, done = folders[0] if folders else "", set()
     for step in steps:
@@ -70,7 +71,7 @@ def script(steps: Sequence[Step]) -> Iterator[str]:
         words, output = _read_command(record["command"], step.name)
         if record["folder"] != folder:
             folder = record["folder"]
-            beside = without_steering(os.path.relpath(folder or ".", folders[0] or "."))
+            beside = _plain(os.path.relpath(folder or ".", folders[0] or "."), step.name)
             yield 'cd "$here"' + ("" if beside == "." else f"/{shlex.quote(beside)}")
         if (folder, *words) not in done:  # one command may leave several files
             yield f"[ -e {shlex.quote(output)} ] || {shlex.join(words)}"
@@ -83,7 +84,7 @@ def _read_command(command: str, made: str) -> tuple[list[str], str]:
     made : a file that the command made. The output is not replaced: the words lose --overwrite.
     """
     try:
-        words = [without_steering(word) for word in shlex.split(command) if word != "--overwrite"]
+        words = [word for word in shlex.split(command) if word != "--overwrite"]
     except ValueError:
         words = []
     first = next((k + 2 for k, word in enumerate(words) if word == "-m"), 0) if words[:1] == ["torchrun"] else 1
@@ -92,9 +93,20 @@ def _read_command(command: str, made: str) -> tuple[list[str], str]:
         raise ArtefactError(
             f"{made}: expected a command of lunargr in its record, found '{command[:80]}'; do not run it."
         )
+    words = [_plain(word, made) for word in words]
     default = signature(import_module(f"lunargr_cli.commands.{name}").command).parameters.get("output")
     output = output_of(words) or (str(default.default) if default and isinstance(default.default, Path) else made)
     return words, output
+
+
+def _plain(text: str, made: str) -> str:
+    """A word or folder of a record as it stands; without some characters it names another. Raises ArtefactError."""
+    if without_steering(text) != text:
+        raise ArtefactError(
+            f"{made}: expected names without control characters in its record, found {text[:80]!r}; "
+            "rename that file or folder, and make the file again."
+        )
+    return text
 
 
 def _command_names() -> set[str]:
