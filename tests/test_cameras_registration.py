@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import small_scene
 from rasterio.transform import Affine
-from raw_frames import overhead_camera, photograph, run_all, write_frame
+from raw_frames import overhead_camera, photograph, run_all, write_frame, write_image
 from scipy.ndimage import map_coordinates
 from small_scene import write_raster
 from typer.testing import CliRunner
@@ -139,8 +139,9 @@ def test_shards_join_into_what_one_run_gives(rough, tmp_path):
     dem, image = rough
     table = write_frame(tmp_path, overhead_camera(), image)
     (tmp_path / "b.json").write_text(json.dumps(overhead_camera(50.0).to_document()))
+    write_image(tmp_path / "raw2.tif", image * np.float32(1.001))  # one file under two names is refused
     with table.open("a", newline="") as stream:
-        csv.writer(stream).writerow(["RAW2", "raw.tif", "iof", "b.json", *small_scene.SUN, 1.0])
+        csv.writer(stream).writerow(["RAW2", "raw2.tif", "iof", "b.json", *small_scene.SUN, 1.0])
     _, whole = run_all(dem, table, tmp_path, register="constant")
     parts = []
     for k in (0, 1):
