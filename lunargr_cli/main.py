@@ -181,11 +181,15 @@ def main() -> None:
 
 
 def _in_one_line(error: Exception) -> str | None:
-    """What to say of an error, also of a library's where an input was lost while it was read; None where it is a bug."""
+    """What to say of an error, also of a library's where a disk is full or an input was lost; None where it is a bug."""
+    from schemas.files.outputs import is_full_disk
     from schemas.provenance import changed_inputs
 
     if isinstance(error, LunargrError):
         return str(error)
+    if is_full_disk(error):  # where numba keeps its compiled loops, for one
+        where = getattr(error, "filename", None) or "a file"
+        return f"{where}: the disk is full or over quota; free some space and run the command again."
     if not (lost := changed_inputs()):
         return None
     return (

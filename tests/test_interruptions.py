@@ -193,6 +193,15 @@ def test_a_disk_that_fills_at_any_moment_is_one_line_and_leaves_nothing(small_ar
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.fixture(scope="module")
+def _compiled(tmp_path_factory):
+    """Loops of ``simulate`` in numba's cache, which would not fit on the full disk either."""
+    folder = tmp_path_factory.mktemp("compiled") / "scene"
+    code, said = finish(start(["simulate", "--size-px", 64, "--images", 2, "--quiet", "-o", folder]))
+    assert code == 0, said
+
+
+@pytest.mark.usefixtures("_compiled")
 @pytest.mark.parametrize("before", [False, True])
 def test_a_disk_that_fills_under_a_simulated_scene_leaves_nothing_and_replaces_nothing(tmp_path, before):
     """truth.h5 is written after DEM and images: without it they are of no use."""

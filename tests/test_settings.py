@@ -33,11 +33,14 @@ WRITTEN = {
     "size_px": lambda size: ",".join(map(str, size)), "parameters": lambda values: values or None,
 }  # fmt: skip
 # Of the same name, but not the setting: where the GeoTIFF goes, not whether; left away for the stage's own choice.
-OTHERS = {("infer", "geotiff"), ("albedo", "geotiff"), ("match", "matchers")}
+OTHERS = {
+    ("infer", "geotiff"), ("albedo", "geotiff"), ("match", "matchers"),
+    *(("render", name) for name in ("view", "roll_deg", "fov_deg", "size_px")),
+}  # fmt: skip
 # What commands have beside settings.
 BESIDE = {
     "output", "overwrite", "resume", "quiet", "json_file", "figures", "report", "scheduler", "parts", "no_geotiff", "models",
-    "seeds", "held_out_images", "list_effects", "list_matchers", "files", "blocks_csv", "dem", "trajectory", "stereo", "altitude", "convergence", "pairs",
+    "seeds", "held_out_images", "list_effects", "list_matchers", "files", "blocks_csv", "calibration", "dem", "trajectory", "stereo", "altitude", "convergence", "pairs",
     "images", "seed", "checkpoint", "source", "split", "body",
 }  # fmt: skip
 
@@ -87,11 +90,11 @@ def test_simulate_shows_the_defaults_of_its_recipe():
 
 
 def test_settings_are_spelled_as_the_options_of_the_command_that_runs():
-    before = spelling.running.set(MODULES["infer"].command)
+    before = spelling.running.set(MODULES["render"].command)
     try:
         assert (
-            spelling.spell("`offset`: too far; lower `any_gsd`, see `a b`")
-            == "--window-offset: too far; lower --any-gsd, see `a b`"
+            spelling.spell("`fov_deg`: too wide; lower `size_px`, see `a b`")
+            == "--fov: too wide; lower --size, see `a b`"
         )
         assert spelling.spell("run 'lunargr albedo' with `leave_out`") == "run 'lunargr albedo' with --leave-out"
     finally:
