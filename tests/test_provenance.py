@@ -87,7 +87,7 @@ def step(name, command="", folder="/work", **other):
         "torchrun X.py",
         "torchrun --no-python touch -m lunargr_cli.main",
         "torchrun --nproc-per-node 2 -m X train p.h5",
-        "/tmp/lunargr ingest",
+        "/opt/lunargr ingest",
         "lunargr touch X",
         "lunar\x00gr\n touch X",
     ],
