@@ -279,7 +279,10 @@ def _by_hand(kind: str) -> Iterator[tuple[str, Change]]:
     if kind == "crops":
         yield "a scene that is not there", attribute("scene", "nowhere.h5")
         yield "the hash of another scene", attribute("scene_sha256", "0" * 64)
-        yield "the hash of another image", replace("sha256", lambda a: np.array([b"0" * 64] * len(a), "S64"))
+        yield (
+            "the hash of another image",
+            replace("sha256", lambda a: np.array([b"%064d" % k for k in range(len(a))], "S64")),
+        )
         yield "an image that is not there", replace("path", lambda a: np.array([b"nowhere.tif"] * len(a), "S11"))
         yield "crops off the scene", replace("row", lambda a: a + 100_000)
         yield "crops that are not square", replace("elevation", lambda a: a[:, :, : a.shape[2] // 2])
