@@ -1,7 +1,7 @@
 """Write every figure of an evaluation into README.md and docs/, from the files that commands left. Run: make figures
 
 Between `<!-- figures:NAME -->` and `<!-- end -->` stands what the function of that name makes of demo-full/ and results/.
-Where a file is absent the block names the command that makes it: no figure is kept from another run.
+Where a file is absent the block stays as it is, and the command that makes the file is printed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ sys.path.insert(0, str(ROOT))
 from stages.common.page.sentences import basis, counted, listed, words  # noqa: E402
 from stages.report.held_out import TITLES as MAPS  # noqa: E402
 
-BLOCK = re.compile(r"(<!-- figures:([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.S)
+BLOCK = re.compile(r"(<!-- figures:([a-z0-9-]+) -->\n)(.*?)(<!-- end -->)", re.S)
 FITTED = {
     "none": "nothing",
     "minmax": "range and mean",
@@ -409,19 +409,22 @@ BLOCKS: dict[str, Callable[[Path], list[str]]] = {
 }
 
 
-def block(name: str, root: Path) -> str:
-    """What stands between the markers. Raises KeyError for a block that nobody writes."""
+def block(name: str, root: Path, before: str) -> str:
+    """The text between the markers; ``before`` where its file is absent. Raises KeyError for an unknown name."""
     try:
         lines = BLOCKS[name](root)
     except Absent as absent:
         file, command = absent.args
+        if before.strip():
+            print(f"{name}: kept as it is; `{command}` makes {file}", file=sys.stderr)
+            return before
         lines = [f"*No figures yet: `{command}` makes `{file}`, then `make figures` writes them here.*"]
     return "\n" + "\n".join(lines).strip("\n") + "\n\n"
 
 
 def rewrite(text: str, root: Path) -> str:
     """A page with all its blocks as the files of ``root`` have them."""
-    return BLOCK.sub(lambda found: found[1] + block(found[2], root) + found[3], text)
+    return BLOCK.sub(lambda found: found[1] + block(found[2], root, found[3]) + found[4], text)
 
 
 def main(root: Path) -> None:

@@ -127,10 +127,14 @@ def test_unseen_images_are_a_claim_of_their_own(tmp_path):
 
 
 @pytest.mark.parametrize("name", [*figures["BLOCKS"]])
-def test_without_a_file_the_block_names_the_command_and_no_figure(name, tmp_path):
-    text = figures["rewrite"](PAGE.replace("NAME", name), tmp_path)
-    assert "9.99e-5" not in text and re.search(r"`(make|python) [^`]+` makes `(demo-full|results|docs)/", text)
-    assert not NUMBER.search(text)
+def test_without_a_file_the_block_stays_and_the_command_is_named(name, tmp_path, capsys):
+    page = PAGE.replace("NAME", name)
+    assert figures["rewrite"](page, tmp_path) == page
+    assert re.search(
+        rf"{name}: kept as it is; `(make|python) [^`]+` makes (demo-full|results|docs)/", capsys.readouterr().err
+    )
+    text = figures["rewrite"](page.replace("old 9.99e-5\n", ""), tmp_path)
+    assert re.search(r"`(make|python) [^`]+` makes `(demo-full|results|docs)/", text) and not NUMBER.search(text)
 
 
 def test_a_file_of_something_else_is_refused(tmp_path):
@@ -168,7 +172,10 @@ def test_campaigns_follow_from_the_rates_of_the_scaling_table(tmp_path):
     assert "|`infer`|342 Mpx|2.9 min|34.8 min|1.4 GB|" in text
     assert "|`project`|83.6 thousand pairs|0.7 min||1.4 GB|" in text
     (tmp_path / "docs" / "resources.md").write_text("\n".join(rows[:-1]))
-    assert "No figures yet" in figures["rewrite"](PAGE.replace("NAME", "campaigns"), tmp_path)
+    assert figures["rewrite"](text, tmp_path) == text
+    assert "No figures yet" in figures["rewrite"](
+        PAGE.replace("NAME", "campaigns").replace("old 9.99e-5\n", ""), tmp_path
+    )
 
 
 def test_sizes_are_those_of_the_files(tmp_path):
