@@ -74,7 +74,7 @@ def is_artefact(path: Path) -> bool:
     try:
         with h5py.File(path, "r") as file:
             return "lunargr_schema" in file.attrs
-    except OSError:
+    except (OSError, RuntimeError):  # damaged
         return path.suffix.lower() in (".h5", ".hdf5")
 
 

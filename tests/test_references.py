@@ -174,6 +174,18 @@ def test_a_view_shows_files_beside_it(tmp_path):
         open_artefact(whole, PAIRS)
 
 
+def test_a_damaged_byte_is_one_line(tmp_path):
+    raw = write_pairs(tmp_path / "pairs.h5").read_bytes()
+    refused = 0
+    for place in range(0, len(raw), 389):
+        (tmp_path / "damaged.h5").write_bytes(raw[:place] + bytes([raw[place] ^ 0x5A]) + raw[place + 1 :])
+        try:
+            open_artefact(tmp_path / "damaged.h5", PAIRS).close()
+        except ArtefactError:
+            refused += 1
+    assert refused > 5
+
+
 def test_names_that_lead_out_of_a_folder():
     assert all(map(is_inside, ("a.h5", "a/b.h5", "a/../b.h5", ".", "..a/b")))
     assert not any(map(is_inside, ("/a.h5", "../a.h5", "a/../../b.h5", "..")))

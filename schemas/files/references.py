@@ -52,6 +52,8 @@ def is_inside(name: str) -> bool:
 
 # --- HDF5 -----------------------------------------------------------------------------------------------------------
 
+_DAMAGED = (KeyError, OSError, RuntimeError)  # raised by h5py for bytes that are no HDF5
+
 
 def check_hdf5(path: Path, file: h5py.File) -> None:
     """Refuse data outside the file, and links and views that lead nowhere or in a circle. Raises ArtefactError."""
@@ -59,6 +61,8 @@ def check_hdf5(path: Path, file: h5py.File) -> None:
         graph = _scan(path, file)
     except UnicodeError:
         raise ArtefactError(f"{path}: expected names in UTF-8, found other bytes; write it again.") from None
+    except _DAMAGED:
+        raise ArtefactError(f"{path}: expected a whole HDF5 file, found a damaged one; write it again.") from None
     waiting, done = _files_behind(graph), {os.path.realpath(path)}
     while waiting:
         if (source := waiting.pop()) in done:
@@ -67,7 +71,7 @@ def check_hdf5(path: Path, file: h5py.File) -> None:
         try:
             with h5py.File(source, "r") as other:
                 found = _scan(Path(source), other)
-        except OSError:
+        except _DAMAGED:
             raise ArtefactError(
                 f"{source}: expected an HDF5 file behind {path}, found something else; write it again."
             ) from None
@@ -99,6 +103,7 @@ def _scan(path: Path, file: h5py.File) -> dict[DataSet, set[DataSet]]:
     found: dict[DataSet, set[DataSet]] = {}
     while groups:
         group = groups.pop()
+        list(group.attrs)  # HDF5 compares their checksum
         for name in group:
             within = f"{group.name.rstrip('/')}/{name}"
             where = f"{path}:{within}"
@@ -109,7 +114,8 @@ def _scan(path: Path, file: h5py.File) -> dict[DataSet, set[DataSet]]:
                 )
             try:
                 node = group[name]
-            except (KeyError, OSError, RuntimeError):
+                list(node.attrs)
+            except _DAMAGED:
                 raise ArtefactError(
                     f"{where}: expected data, found a link to nothing or to itself; write it again."
                 ) from None
