@@ -50,7 +50,7 @@ def spelled(option: Any) -> str:
     if option.param_type_name == "argument":
         return f"`{(option.metavar or option.name or '').upper()}`"
     names = ", ".join(f"`{o}`" for o in [*option.opts, *option.secondary_opts])
-    choices = (option.metavar or "").strip("[]").split("|")
+    choices = re.sub(r"^\[(.*)\]$", r"\1", option.metavar or "").split("|")
     return f"{names} {'/'.join(choices)}" if option.metavar else names
 
 

@@ -109,15 +109,12 @@ def evaluated(result: dict[str, Any], more: dict[str, Any] | None = None) -> lis
          with_bounds(row["mse"], row["mse_low"], row["mse_high"], row.get("mse_run_std"), power), ssim(row)]
         for row, title in sorted(rows, key=lambda pair: order.index(pair[0]["freedom"]))
     ]  # fmt: skip
-    left = [f"- {title(result, kept)} is also the model {model} with one coefficient set for all ground, and appears once."
-            for model, left, kept in TWICE[::2] if model == result["model"] and kept in result["models"] and left in result["models"]]  # fmt: skip
     notes = [f"- Note: {text}." for text in result.get("warnings", [])]
     return [
         *lines,
         *table(["model", "fitted to each crop", unit_of(result, power), "SSIM"], cells),
         *won(result),
         *covered(result),
-        *left,
         *notes,
     ]
 
@@ -134,10 +131,6 @@ def won(result: dict[str, Any]) -> list[str]:
         if gain and gain["gain_percent"] is not None:
             lines.append(f"- Squared error of the learned reflectance: {gained(gain, f'{name} ({theirs})')}.")
     return lines
-
-
-def title(result: dict[str, Any], name: str) -> str:
-    return f"The row '{result.get('titles', {}).get(name, name)}'"
 
 
 def covered(result: dict[str, Any]) -> list[str]:

@@ -5,7 +5,7 @@
 #
 # Settings (environment): SHARDS=32  IMAGE_SHARDS=SHARDS  GSD=5  CROP=128  COUNT=80000  MODEL=hapke  EPOCHS=20  SEED=0
 #   REGISTER=  constant, affine or field: take off how far images lie from their renderings; nothing without
-#   NODES=2  GPUS=4  of each node, for training; GPUS=0 trains on CPUs
+#   NODES=1  GPUS=1  of each node, for training; GPUS=0 trains on CPUs
 #   TRAIN_OPTIONS="--cpus-per-task=8 --mem=32G --time=12:00:00 -p gpu"  in place of what slurm_train.sh asks for
 # and those of slurm_array.sh, which hold for all other jobs. Every job is shown to Slurm before the first is submitted;
 # a second chain beside one in the queue is refused. What exists is not made again: after a failure, mend its cause and
@@ -17,7 +17,7 @@ if [ $# -lt 3 ]; then
     exit 2
 fi
 dem=$1 images=$2 folder=$3
-: "${SHARDS:=32}" "${NODES:=2}" "${GPUS:=4}" "${GSD:=5}" "${CROP:=128}" "${COUNT:=80000}" "${IMAGE_SHARDS:=$SHARDS}"
+: "${SHARDS:=32}" "${NODES:=1}" "${GPUS:=1}" "${GSD:=5}" "${CROP:=128}" "${COUNT:=80000}" "${IMAGE_SHARDS:=$SHARDS}"
 : "${MODEL:=hapke}" "${EPOCHS:=20}" "${SEED:=0}" "${REGISTER:=}" "${TRAIN_OPTIONS:=}"
 here=$(cd "$(dirname "$0")" && pwd)
 # shellcheck source-path=SCRIPTDIR source=slurm_jobs.bash

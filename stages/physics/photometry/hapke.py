@@ -20,7 +20,7 @@ Porosity (Hapke 2008), with phi the filling factor; K = 1 at phi = 0:
 
     K = -ln(1 - 1.209 phi^(2/3)) / (1.209 phi^(2/3))
 
-Effective cosines mu0e, mue and shadowing S: macroscopic roughness of mean slope theta, see `roughness.py`.
+Effective cosines mu0e, mue and shadowing S: macroscopic roughness of mean slope theta, see below.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     p(g) = 1 + b cos(g) + c (3/2 cos^2(g) - 1/2)
 
-and all else as in `hapke.py`.
+and all else as in `hapke`.
 """
 
 from __future__ import annotations

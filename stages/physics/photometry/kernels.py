@@ -7,7 +7,7 @@
              R cos^3 g/(mu + 0.3), R s(0.06), g mu, cos g, 1
 
 The kernels are factors of lunar laws: Lambert, Lommel-Seeliger, Hapke's roughness (1984) and shadow hiding (1986), and
-the polynomial M2. They were selected one by one, by how much each improves the fit to the laws in `tests/hidden/laws.py`.
+the polynomial M2. They were selected one by one, by how much each improves the fit to lunar laws that the tests hide in simulated images.
 """
 
 from __future__ import annotations
