@@ -49,13 +49,13 @@ test-slow: $(TESTED) ## the longer checks
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 mutants: $(TESTED) ## plant bugs one at a time and see whether the tests notice, before a release; ONLY=word for some
-	OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py --only "$(ONLY)"
+	OMP_NUM_THREADS=1 $(BIN)/python tests/validation/mutants.py --only "$(ONLY)"
 
 fuzz: $(TESTED) ## three thousand malformed inputs through the real commands: one line each, no traceback, nothing left
-	OMP_NUM_THREADS=1 $(BIN)/python tests/malformed.py
+	OMP_NUM_THREADS=1 $(BIN)/python tests/validation/malformed.py
 
 endurance: $(TESTED) ## interrupt every stage TIMES times (20) at random moments, run it again, compare every byte
-	$(BIN)/python tests/endurance.py --times $(or $(TIMES),20)
+	$(BIN)/python tests/validation/endurance.py --times $(or $(TIMES),20)
 
 lint: $(TESTED) ## ruff, formatting, mypy, and how sources and pages are written
 	$(BIN)/ruff check .
@@ -65,19 +65,19 @@ lint: $(TESTED) ## ruff, formatting, mypy, and how sources and pages are written
 
 bench: $(TESTED) ## speed and memory, each beside a named peer in the same run; on a quiet machine, then make figures; ONLY=word for some
 	mkdir -p results/bench
-	for script in tests/benchmarks/bench_*$(ONLY)*.py; do echo "== $$script"; \
+	for script in tests/validation/benchmarks/bench_*$(ONLY)*.py; do echo "== $$script"; \
 	  $(BIN)/python $$script | tee results/bench/$$(basename $$script .py).txt; done
 
 campaign: $(TESTED) ## what diagnose names on fresh hidden scenes (hours); SEED=N is drawn once, after the code is frozen
-	$(BIN)/python tests/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign
+	$(BIN)/python tests/validation/campaign.py --seed $(or $(SEED),$(error make campaign SEED=N)) --scenes 10 --nulls 40 --jobs $(or $(JOBS),2) --output results/campaign
 
 LABORATORY = laboratory
 campaign-laboratory: $(TESTED) ## what diagnose names in files of another laboratory's simulator; SEED=N, LABORATORY=second_laboratory for another one
-	$(BIN)/python tests/laboratory_campaign.py --laboratory $(LABORATORY) --seed $(or $(SEED),$(error make campaign-laboratory SEED=N)) --cases 44 --jobs $(or $(JOBS),2) --output results/$(LABORATORY)
+	$(BIN)/python tests/validation/laboratory_campaign.py --laboratory $(LABORATORY) --seed $(or $(SEED),$(error make campaign-laboratory SEED=N)) --cases 44 --jobs $(or $(JOBS),2) --output results/$(LABORATORY)
 
 # Pairs of real photographs; REGISTERED=pairs.h5 adds a registered set.
 campaign-real: $(TESTED) results/apollo15/diagnosis.h5 ## plant effects into real photographs and see what diagnose names (needs the reference data)
-	OMP_NUM_THREADS=1 $(BIN)/python tests/planted.py --raw $(A)/stack.h5 $(if $(REGISTERED),--registered $(REGISTERED)) --seed $(or $(SEED),5) --resamples $(or $(RESAMPLES),40) --jobs $(or $(JOBS),2) --output results/planted
+	OMP_NUM_THREADS=1 $(BIN)/python tests/validation/planted.py --raw $(A)/stack.h5 $(if $(REGISTERED),--registered $(REGISTERED)) --seed $(or $(SEED),5) --resamples $(or $(RESAMPLES),40) --jobs $(or $(JOBS),2) --output results/planted
 
 docs: $(TESTED) ## write the generated parts of docs/ again, and build the site in build/site
 	$(BIN)/python examples/cli_page.py

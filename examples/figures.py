@@ -316,12 +316,16 @@ def campaigns(root: Path) -> list[str]:
     try:
         text = (root / "docs" / "resources.md").read_text()
     except FileNotFoundError:
-        raise Absent("docs/resources.md", "python tests/benchmarks/bench_scaling.py --docs docs/resources.md") from None
+        raise Absent(
+            "docs/resources.md", "python tests/validation/benchmarks/bench_scaling.py --docs docs/resources.md"
+        ) from None
     rates = {m[1]: (m[2], float(m[3]), m[4]) for m in RATE.finditer(text)}
     rows = []
     for stage, *works in CAMPAIGNS:
         if stage not in rates:
-            raise Absent(f"the rate of {stage}", "python tests/benchmarks/bench_scaling.py --docs docs/resources.md")
+            raise Absent(
+                f"the rate of {stage}", "python tests/validation/benchmarks/bench_scaling.py --docs docs/resources.md"
+            )
         peaks, rate, unit = rates[stage]
         memory = max(float(p.replace(",", "")) for p in peaks.split(", ")) / 1e3
         times = ["" if work is None else duration(rate * work) for work in works]

@@ -34,7 +34,7 @@ SIMULATORS = ("hidden", "laboratory", "second_laboratory")
 @pytest.mark.parametrize("simulator", SIMULATORS)
 def test_hidden_data_import_nothing_of_the_program(simulator):
     others = {*SIMULATORS} - {simulator}
-    paths = sorted((ROOT / "tests" / simulator).glob("*.py"))
+    paths = sorted((ROOT / "tests/validation" / simulator).glob("*.py"))
     assert len(paths) > 5
     for path in paths:
         for node in ast.walk(ast.parse(path.read_text())):

@@ -43,7 +43,7 @@ def python(program: str) -> subprocess.CompletedProcess:
         "import lunargr_cli.main as m\ndef app():\n try: os.kill(os.getpid(), signal.SIGINT)\n"
         " except KeyboardInterrupt: raise ImportError('numpy')\nm.app = app\nm.main()",
         # within an import, where compiled libraries print what breaks theirs
-        f"import lunargr_cli.main as m, time; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        f"import lunargr_cli.main as m, time; sys.path.insert(0, {str(Path(__file__).parent / 'support')!r})\n"
         "def app():\n import interrupted_import\n time.sleep(60)\nm.app = app\nm.main()",
         # where Python swallows it, and would print a traceback
         "import lunargr_cli.main as m, weakref\nclass Kept: pass\ndef app():\n kept = Kept()\n"

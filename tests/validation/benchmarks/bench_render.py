@@ -1,6 +1,6 @@
 """A 1024 x 1024 perspective view of a 4096 x 4096 DEM beside Mitsuba, and an ortho map streamed in blocks.
 
-    python tests/benchmarks/bench_render.py [--dem 4096] [--view 1024] [--map 4096]
+    python tests/validation/benchmarks/bench_render.py [--dem 4096] [--view 1024] [--map 4096]
 
 Both draw the same scene with 2 x 2 rays a pixel, Lambert's law and cast shadows. Mitsuba's build (mesh and Embree-like
 kd-tree or BVH) is timed apart from its rendering, because a trajectory over one DEM pays it once.
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from rasterio.transform import Affine
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "support"))
 
 from relief import body_point, hills
 

@@ -1,6 +1,6 @@
 """Peak memory and time of every stage against the size of its input: memory should stay flat, and time grow in proportion.
 
-    python tests/benchmarks/bench_scaling.py [--stages ingest,infer] [--largest] [--sizes infer=4000,8000,16000]
+    python tests/validation/benchmarks/bench_scaling.py [--stages ingest,infer] [--largest] [--sizes infer=4000,8000,16000]
                                              [--folder SCRATCH] [--json FILE] [--docs docs/resources.md]
 
 Every figure is of the actual `lunargr` command in a process of its own: its peak resident memory as the kernel counts

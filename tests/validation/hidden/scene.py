@@ -22,7 +22,7 @@ from hidden.sensor import Detector, Pose, shoot
 from hidden.terrain import make_terrain, measured_relief, patches, red_noise, units
 
 RADIUS = 1737400.0
-SHARED = Path(os.environ.get("LUNARGR_SHARED", Path(__file__).parents[3] / "shared"))
+SHARED = Path(os.environ.get("LUNARGR_SHARED", Path(__file__).parents[4] / "shared"))
 DISTANCE = 400.0  # crop sizes: the traced camera is at infinity
 
 

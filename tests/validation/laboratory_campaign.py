@@ -1,8 +1,8 @@
 """Judge `lunargr diagnose` by another laboratory's simulator: files of which it knows nothing, against what was hidden in them.
 
-    python tests/laboratory_campaign.py --seed N --cases 44 --jobs 2 --output results/laboratory [--laboratory second_laboratory]
+    python tests/validation/laboratory_campaign.py --seed N --cases 44 --jobs 2 --output results/laboratory [--laboratory second_laboratory]
 
-Makes each case in OUTPUT/ (see tests/laboratory and tests/second_laboratory: two authors, nothing in common), runs the command line on it, and writes OUTPUT.json (every case, as it comes)
+Makes each case in OUTPUT/ (see tests/validation/laboratory and tests/validation/second_laboratory: two authors, nothing in common), runs the command line on it, and writes OUTPUT.json (every case, as it comes)
 and OUTPUT.md (tables); cases that OUTPUT.json holds already are not done again. A seed is drawn once, after the code is frozen.
 """
 
@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from sure_names import doubtful
 
 LABORATORIES = ("laboratory", "second_laboratory")
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 BINS = ((0.0, 0.08), (0.08, 0.15), (0.15, 0.4), (0.4, math.inf))  # of fid
 RIGHT, ANOTHER, BLIND, DENIED = "right", "another first", "no name, in `blind`", "no name, not in `blind`"
 HONEST, BARE, NOTHING = "unexplained, or named with structure left", "named without structure", "nothing said"
@@ -80,7 +80,7 @@ def summarise(cases: list[dict]) -> str:
     seeds = ", ".join(sorted({str(case["seed"]) for case in cases}))
     lines = ["# `lunargr diagnose` judged by another laboratory's simulator", ""]
     lines += [
-        f"Written by `tests/laboratory_campaign.py`, seed {seeds}; every share is a count.",
+        f"Written by `tests/validation/laboratory_campaign.py`, seed {seeds}; every share is a count.",
         "",
         "| | |",
         "|---|---|",

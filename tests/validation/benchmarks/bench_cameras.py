@@ -1,6 +1,6 @@
 """Speed of the cameras: line-scan ground_to_image against a numpy Newton search in the same run, and orthorectification.
 
-    python tests/benchmarks/bench_cameras.py [ISD.json ...]
+    python tests/validation/benchmarks/bench_cameras.py [ISD.json ...]
 
 Without an ISD the cameras of the reference data are taken (LUNARGR_SHARED, or ../shared).
 """
@@ -21,7 +21,7 @@ from stages.physics.cameras.linescan import LineScan, _into
 from stages.physics.images.orthorectify import Terrain, orthorectify
 from stages.physics.maps.grid import Grid, local_metric_crs
 
-SHARED = Path(os.environ.get("LUNARGR_SHARED", Path(__file__).resolve().parents[3] / "shared"))
+SHARED = Path(os.environ.get("LUNARGR_SHARED", Path(__file__).resolve().parents[4] / "shared"))
 POINTS = 1_000_000
 
 

@@ -1,6 +1,6 @@
 """Cast shadow and horizon: megapixels per second beside Embree (through Mitsuba), and memory on a 20,000 x 20,000 map.
 
-python tests/benchmarks/bench_light.py                speed and disagreement
+python tests/validation/benchmarks/bench_light.py                speed and disagreement
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[3]))
 
 GSD = 5.0
 AZIMUTHS_DEG = (0, 17, 45, 80, 90, 133, 200, 260, 315)

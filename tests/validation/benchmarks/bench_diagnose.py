@@ -1,6 +1,6 @@
 """Time of `lunargr diagnose` from open file to answer, against the time NumPy needs to read and sum the same pixels.
 
-python tests/benchmarks/bench_diagnose.py [--size 128]
+python tests/validation/benchmarks/bench_diagnose.py [--size 128]
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The page of `lunargr view` in headless Chromium: its weight, its I/F against `lunargr render`, its frames per second.
 
-    python tests/benchmarks/bench_view.py                     # a rough map of 2048 x 2048 px, M2
-    python tests/benchmarks/bench_view.py --map demo-full/svbrdf_albedo.h5 --pairs demo-full/pairs.h5
+    python tests/validation/benchmarks/bench_view.py                     # a rough map of 2048 x 2048 px, M2
+    python tests/validation/benchmarks/bench_view.py --map demo-full/svbrdf_albedo.h5 --pairs demo-full/pairs.h5
 
 Chromium draws in software (SwiftShader): no graphics card takes part, the processor draws on as many cores as there are. A frame ends
 when a pixel of it has been read back. "Another Sun": shadows and light are worked out for every pixel of the map; "camera": the
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "support"))
 
 from browser import run_in_page
 from relief import hills

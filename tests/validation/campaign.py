@@ -1,6 +1,6 @@
 """`make campaign`: plant every effect in hidden scenes, name it blindly, and write what came out into docs.
 
-    python tests/campaign.py --seed 7 --scenes 10 --nulls 40 --jobs 2 --output results/campaign
+    python tests/validation/campaign.py --seed 7 --scenes 10 --nulls 40 --jobs 2 --output results/campaign
 
 Writes OUTPUT.json (every case, as it comes), OUTPUT.md (tables) and OUTPUT.png (planted against named); cases that OUTPUT.json
 holds already are not done again. Seeds of a final campaign are drawn once, after the code is frozen; development uses others.
@@ -121,7 +121,12 @@ def case(scene: Scene, effect: dict, seed: int, folder: Path, law: str = "linear
 
 def summarise(cases: list[dict]) -> str:
     """Markdown tables, every share with its counts."""
-    lines = ["# Campaign of `lunargr diagnose`", "", "Written by `tests/campaign.py`; every share is a count.", ""]
+    lines = [
+        "# Campaign of `lunargr diagnose`",
+        "",
+        "Written by `tests/validation/campaign.py`; every share is a count.",
+        "",
+    ]
     nulls = [c for c in cases if not c["planted"]]
     named = [c for c in nulls if c["answer"]["causes"]]
     lines += ["| | |", "|---|---|", f"| any cause named when nothing is hidden | {_share(len(named), len(nulls))} |"]

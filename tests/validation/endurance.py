@@ -1,6 +1,6 @@
 """Interrupt every stage at random moments, run it again, and compare every dataset with an uninterrupted run's.
 
-    python tests/endurance.py [--times 20] [--stages ingest,train,...] [--seed 0]
+    python tests/validation/endurance.py [--times 20] [--stages ingest,train,...] [--seed 0]
 
 Each time: the command is started, ended by SIGINT or SIGKILL at a random moment of its run, and (sometimes after a
 second interruption) run again with the same words. What is at the output's name while it was interrupted must be
@@ -19,8 +19,7 @@ import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
 import OpenImageIO as oiio
 from cluster_scene import assert_same, finish, lunargr, stages, start, write_inputs
 

@@ -246,5 +246,6 @@ def main() -> int:
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "support"))
     sys.modules["malformed"] = sys.modules["__main__"]  # the cases import from here
     sys.exit(main())

@@ -13,7 +13,7 @@ from scipy import ndimage
 from .fields import Array, block_mean, fractal_crop, rms_slope
 from .layout import Needs
 
-DATA = Path(os.environ.get("LUNARGR_SHARED", Path(__file__).parents[3] / "shared")) / "data"
+DATA = Path(os.environ.get("LUNARGR_SHARED", Path(__file__).parents[4] / "shared")) / "data"
 REAL = {  # file below DATA, metres per pixel, largest grid that it is used for
     "kepler": ("dem/kepler_lola.tif", 47.68, 804),
     "gld": ("apollo15/gld100_64ppd.tif", 474.0, 1024),

@@ -1,6 +1,6 @@
 """`make campaign-real`: effects planted into real photographs, or into what is known of them, and what `diagnose` makes of it.
 
-    python tests/planted.py --output results/planted --raw stack.h5 --registered registered.h5 --seed 5
+    python tests/validation/planted.py --output results/planted --raw stack.h5 --registered registered.h5 --seed 5
 
 A plant changes the images themselves (a shift, a blur, gamma, columns, an echo, clipping), the table (the Sun) or the DEM (smoothed, stretched), in a
 copy of pairs that `lunargr project` wrote. Without photographs, :func:`semi_real` makes a scene: measured or fractal relief, rendered four times finer than

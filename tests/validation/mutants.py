@@ -1,6 +1,6 @@
 """`make mutants`: plant bugs in the program, one at a time, and see whether the tests notice.
 
-    python tests/mutants.py [--only WORD] [--list]
+    python tests/validation/mutants.py [--only WORD] [--list]
 
 Each bug replaces one piece of text in one file and names the tests that should fail then. The tree is copied to a
 temporary folder for them. Ends with exit code 1 where fewer than 90 % are caught, or where a bug's text is not found any
@@ -23,7 +23,7 @@ from pathlib import Path
 from mutant import Mutant
 from mutant_list import MUTANTS
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 ENOUGH = 0.9
 TIMEOUT = 600  # seconds: a bug that hangs is a bug that is noticed
 

@@ -1,6 +1,6 @@
 """The rendering layer in training: its share of the network's step, and Mitsuba's time for the forward half alone.
 
-    python tests/benchmarks/bench_layer.py
+    python tests/validation/benchmarks/bench_layer.py
 
 Layer: `formation.form` and the loss on valid pixels: slopes, angles, penumbra and reflectance from scratch, forward and
 backward to the coefficients, which come channels last as the network gives them. Layer and network take turns, and the

@@ -1,6 +1,6 @@
 """Reflectance of a training batch, forward and backward to the coefficients: every model beside Dr.Jit and a copy.
 
-    python tests/benchmarks/bench_photometry.py
+    python tests/validation/benchmarks/bench_photometry.py
 
 64 crops of 128 x 128 in float32, geometry given. The peer is the same M2 written for Dr.Jit, Mitsuba's compiler, which
 fuses it into one kernel forward and one backward; "copy" moves the three coefficient maps once. Wall time is the least
