@@ -1,4 +1,4 @@
-"""Which coefficients are maps and which are global, what stays the same on any number of threads, and the pieces of both."""
+"""Which coefficients are maps and which are global, and their deviations."""
 
 from __future__ import annotations
 
@@ -10,14 +10,11 @@ import pytest
 import rasterio
 import torch
 from evaluation_scene import run_command
-from torch.nn import functional
 
 from schemas import ConfigError, RegistryError, read_strings
 from schemas.files.outputs import Output
 from stages import infer, train
-from stages.common.threads import one_thread_each, share_out
 from stages.network.coefficient_maps import CoefficientMaps
-from stages.network.crop_sums import PIECE, convolution, sum_over_crops
 from stages.network.losses import crop_errors, squared_error
 from stages.network.pixels import Pixels, fit_pixels
 from stages.network.predictor import load_predictor
@@ -41,13 +38,6 @@ def trained(small_artefacts, tmp_path_factory):
 def weights(path):
     with h5py.File(path) as file:
         return {name: data[...] for name, data in file["weights"].items()}
-
-
-@pytest.fixture
-def threads():
-    before = torch.get_num_threads()
-    yield torch.set_num_threads
-    torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("name", model_names())
@@ -112,61 +102,6 @@ def _stop_after_one(learn):
         return learn(training, indices, config, epoch, progress)
 
     return learn_or_stop
-
-
-@pytest.mark.parametrize("model", ["hapke", "kernels", "M2"])
-def test_the_same_checkpoint_on_any_number_of_threads(model, small_artefacts, tmp_path, threads):
-    found = []
-    for count in (1, 2, 3):
-        threads(count)
-        train.run(
-            small_artefacts["pairs"], tmp_path / f"{count}.h5", train.Config(model=model, **(SMALL | {"epochs": 1}))
-        )
-        found.append(weights(tmp_path / f"{count}.h5"))
-    for other in found[1:]:
-        for name, value in found[0].items():
-            np.testing.assert_array_equal(value, other[name], err_msg=name)
-
-
-def test_convolution_in_pieces_is_convolution(threads):
-    threads(2)
-    torch.manual_seed(0)
-    x, weight, bias = torch.randn(2 * PIECE + 1, 3, 9, 8), torch.randn(5, 3, 3, 3), torch.randn(5)
-    found = []
-    for whole in (True, False):
-        given = [t.clone().requires_grad_() for t in (x, weight, bias)]
-        if whole:
-            y = functional.conv2d(*given)
-        else:
-            with one_thread_each():
-                y = convolution(*given)
-        found.append([y, *torch.autograd.grad((y * y).sum(), given)])
-    for a, b in zip(*found, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)
-
-
-def test_sums_over_crops_and_their_gradients(threads):
-    """With one value per crop and one field, and with work inside that is shared out again."""
-    threads(2)
-    field, factor = torch.randn(3 * PIECE - 1, 4, 4), torch.randn(3 * PIECE - 1, 1, 1)
-
-    def objective(first, last, field, factor):
-        share_out(lambda a, b: None, 8)
-        error = (field * factor).square().sum()
-        return error, error.detach()
-
-    found = []
-    for pieces in (False, True):
-        given = [t.clone().requires_grad_() for t in (field, factor)]
-        if pieces:
-            with one_thread_each():
-                value, told = sum_over_crops(objective, *given)
-        else:
-            value, told = sum_over_crops(objective, *given)
-        assert not told.requires_grad and told.item() == pytest.approx(value.item())
-        found.append([value, *torch.autograd.grad(value, given)])
-    for a, b in zip(*found, strict=True):
-        torch.testing.assert_close(a, b)
 
 
 def test_a_crop_that_is_bright_as_a_whole_costs_little(rng):

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stages.common.threads import one_thread_each
 from stages.network.pixels import Pixels, fit_pixels
 from stages.physics.formation.geometry import Angles
 from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
@@ -129,5 +128,4 @@ def fit_nonlinear(
 ) -> np.ndarray:
     """One parameter set for all pixels, within the model's bounds, (C,): see :func:`fit_pixels`."""
     pixels = Pixels(sample.angles, sample.visibility.double(), sample.image.double())
-    with one_thread_each():  # thousands of small operations, whose sums must not hang on the number of threads
-        return fit_pixels(model, pixels, free, None if calibrated else sample.frame, ROUNDS).double().numpy()
+    return fit_pixels(model, pixels, free, None if calibrated else sample.frame, ROUNDS).double().numpy()

@@ -49,7 +49,7 @@ class _Exported(torch.nn.Module):
 
     def forward(self, elevation: Tensor) -> Tensor:
         keys = elevation.new_empty(0, dtype=torch.int64)
-        features = self.net.plain_features(scale_elevation(elevation, self.elevation_scale), keys)
+        features = self.net.features(scale_elevation(elevation, self.elevation_scale), keys)
         return self.maps.stack(self.maps.unbounded(self.net.read_out(features)), dim=1)
 
 

@@ -10,6 +10,8 @@ from typing import TypeVar
 
 import torch
 
+from stages.common.threads import one_thread
+
 Job = TypeVar("Job")
 Item = TypeVar("Item")
 
@@ -23,8 +25,7 @@ def run_in_threads(
     PyTorch may use, and each of PyTorch's operators runs on one. At most two items a thread wait for the caller. An
     error in one thread ends all, and so does leaving the loop, once the items that are being made are done.
     """
-    threads = torch.get_num_threads()
-    together = max(1, min(together, threads, len(jobs)))
+    together = max(1, min(together, torch.get_num_threads(), len(jobs)))
     made: queue.Queue[tuple[int, Item | None] | BaseException] = queue.Queue(2 * together)
     stop = threading.Event()
     left = deque(enumerate(jobs))
@@ -52,21 +53,20 @@ def run_in_threads(
         except BaseException as error:
             hand_over(error)
 
-    torch.set_num_threads(1)  # a convolution shared out among threads adds up in another order, which bf16 shows
     workers = [threading.Thread(target=take_jobs, name=f"strips {k}", daemon=True) for k in range(together)]
-    try:
-        for worker in workers:
-            worker.start()
-        finished = 0
-        while finished < len(jobs):
-            result = made.get()
-            if isinstance(result, BaseException):
-                raise result
-            finished += result[1] is None
-            yield result
-    finally:
-        stop.set()
-        for worker in workers:
-            if worker.ident is not None:
-                worker.join()
-        torch.set_num_threads(threads)
+    with one_thread():
+        try:
+            for worker in workers:
+                worker.start()
+            finished = 0
+            while finished < len(jobs):
+                result = made.get()
+                if isinstance(result, BaseException):
+                    raise result
+                finished += result[1] is None
+                yield result
+        finally:
+            stop.set()
+            for worker in workers:
+                if worker.ident is not None:
+                    worker.join()

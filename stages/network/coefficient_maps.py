@@ -54,7 +54,7 @@ class CoefficientMaps(nn.Module):
     def _bounded(self, raw: Tensor, dim: int, names: Sequence[str]) -> Tensor:
         return leaky_relu(raw, SLOPE) if self.positive else self.model.constrain(raw, dim, names)
 
-    def everywhere(self) -> dict[str, Tensor]:
+    def global_values(self) -> dict[str, Tensor]:
         """The parameters that are the same everywhere, by name, each ()."""
         values = self._bounded(self.rest_start + self.rest_shift * self.output_scale, 0, self.rest)
         return dict(zip(self.rest, values.unbind(0), strict=True))
@@ -63,15 +63,12 @@ class CoefficientMaps(nn.Module):
         """The network's output (B, channels, H, W), scaled and shifted to the start: maps before their bounds."""
         return output.float() * self.output_scale + self.start[:, None, None]
 
-    def combine(self, unbounded: Tensor, everywhere: Sequence[Tensor]) -> Tensor | dict[str, Tensor]:
-        """The coefficients as ``formation.chain.form`` takes them.
-
-        unbounded : (B, channels, H, W); everywhere : the values of the other parameters, each broadcasting to (B, H, W)
-        """
+    def combine(self, unbounded: Tensor) -> Tensor | dict[str, Tensor]:
+        """The coefficients as ``formation.chain.form`` takes them. unbounded : (B, channels, H, W)"""
         bounded = self._bounded(unbounded.narrow(1, 0, len(self.maps)), 1, self.maps)
         if not self.rest:
             return bounded
-        return dict(zip((*self.maps, *self.rest), (*bounded.unbind(1), *everywhere), strict=True))
+        return dict(zip(self.maps, bounded.unbind(1), strict=True)) | self.global_values()
 
     def stack(self, unbounded: Tensor, dim: int) -> Tensor:
         """All parameters along ``dim``, in the model's order.
@@ -83,7 +80,7 @@ class CoefficientMaps(nn.Module):
             return bounded
         maps = dict(zip(self.maps, bounded.unbind(dim), strict=True))
         like = next(iter(maps.values()))
-        found = maps | {name: value.to(like.dtype).expand_as(like) for name, value in self.everywhere().items()}
+        found = maps | {name: value.to(like.dtype).expand_as(like) for name, value in self.global_values().items()}
         return torch.stack([found[name] for name in self.names], dim=dim)
 
     def deviations(self, unbounded: Tensor, dim: int) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stages.common.threads import one_thread
 from stages.network.predictor import Predictor
 from stages.network.strips import Rows, StripUNet
 
@@ -76,12 +77,8 @@ class Mapper:
     @torch.inference_mode()
     def _next(found: Iterator[Tensor]) -> Tensor:
         """On one thread: shared out among several a convolution adds up in another order, and bf16 shows it."""
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        with one_thread():
             return next(found)
-        finally:
-            torch.set_num_threads(threads)
 
     @torch.inference_mode()
     def _complete(self, raw: Tensor) -> NDArray[np.float32]:

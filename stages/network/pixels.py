@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from stages.common.threads import one_thread
 from stages.network.losses import Radiometry
 from stages.pairs.reader import Batch, PairReader
 from stages.physics.formation import facets
@@ -79,6 +80,7 @@ def sample_pixels(
     return Pixels(Angles(mu0, mu, phase), light, image, tuple(rest), pair.long())
 
 
+@one_thread()  # thousands of small operations, whose sums must not depend on the number of threads
 def fit_pixels(
     model: ReflectanceModel,
     pixels: Pixels,

@@ -8,8 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from stages.network.cpu.fused_layers import join, norm_act, pool, quarter_weights
-from stages.network.crop_sums import convolution
 from stages.network.layers import SLOPE, BatchNorm, Dropout, draw_keys
 
 WIDTHS = (16, 32, 64, 128, 256)
@@ -28,21 +26,13 @@ class HeightConv(nn.Conv2d):
         with torch.no_grad():  # neighbours differ far less than heights do: start where BatchNorm's eps is small
             self.weight *= 16
 
-    def differences(self, x: Tensor) -> Tensor:
-        """The convolution without its bias.
-
-        x : (B, 1, H, W); returns (B, C, H, W)
-        """
-        # In float32 whatever the rest is in: bfloat16 keeps three digits of a height, too few for a slope.
-        with torch.autocast(x.device.type, enabled=False):
-            weight = self.weight - self.weight.mean(dim=(2, 3), keepdim=True)
-            return convolution(functional.pad(x.float(), (1, 1, 1, 1), mode="replicate"), weight)
-
     def forward(self, x: Tensor) -> Tensor:
         """x : (B, 1, H, W), scaled heights; returns (B, C, H, W)."""
-        assert self.bias is not None
-        y = self.differences(x) + self.bias[:, None, None]
         kind = x.device.type
+        # In float32 whatever the rest is in: bfloat16 keeps three digits of a height, too few for a slope.
+        with torch.autocast(kind, enabled=False):
+            weight = self.weight - self.weight.mean(dim=(2, 3), keepdim=True)
+            y = functional.conv2d(functional.pad(x.float(), (1, 1, 1, 1), mode="replicate"), weight, self.bias)
         return y.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else y
 
 
@@ -70,20 +60,6 @@ class Block(nn.Sequential):
         for step in self:
             x = step(x, keys) if isinstance(step, Dropout) else step(x)
         return x
-
-    def fused(self, x: Tensor, keys: Tensor, pad: int) -> Tensor:
-        """The same in fewer passes on the CPU. x has its edges continued by a pixel already (heights do not).
-
-        x : (B, C, H + 2, W + 2), or (B, 1, H, W) of heights; keys : (B,); returns (B, D, H + 2 pad, W + 2 pad)
-        """
-        entry, first, _, drop, second, last, _ = self
-        assert isinstance(entry, nn.Conv2d) and isinstance(first, BatchNorm) and isinstance(drop, Dropout)
-        assert isinstance(second, nn.Conv2d) and isinstance(last, BatchNorm) and entry.bias is not None
-        assert second.bias is not None
-        y = entry.differences(x) if isinstance(entry, HeightConv) else convolution(x, entry.weight)
-        y = norm_act(y, entry.bias, first, 1, drop, keys)
-        y = convolution(y, second.weight)
-        return norm_act(y, second.bias, last, pad)
 
 
 class UNet(nn.Module):
@@ -130,22 +106,12 @@ class UNet(nn.Module):
 
     def read_out(self, features: Tensor) -> Tensor:
         """(B, F, H, W) -> (B, C, H, W), the last layer."""
-        return convolution(features, self.head.weight, self.head.bias)
+        return self.head(features)
 
     def features(self, x: Tensor, keys: Tensor | None = None) -> Tensor:
         """The input of the last layer, (B, F, H, W) with F the first of the widths."""
         if keys is None:
             keys = draw_keys(len(x), x.device) if self.training else x.new_empty(0, dtype=torch.int64)
-        # The fused form has no gradient in evaluation mode.
-        if x.device.type == "cpu" and (self.training or not torch.is_grad_enabled()):
-            return self._fused(x, keys)
-        return self.plain_features(x, keys)
-
-    def plain_features(self, x: Tensor, keys: Tensor) -> Tensor:
-        """The features by plain PyTorch operations: what GPUs run and the fused form is tested against.
-
-        x : (B, 1, H, W), scaled heights; keys : (B,); returns (B, F, H, W)
-        """
         kept = []
         for block in self.down[:-1]:
             x = block(x, keys)
@@ -155,20 +121,4 @@ class UNet(nn.Module):
         for rise, block in zip(self.rise, self.up, strict=True):
             x = rise(functional.interpolate(x, scale_factor=2.0, mode="nearest"))
             x = block(torch.cat([x, kept.pop()], dim=1), keys)
-        return x
-
-    def _fused(self, x: Tensor, keys: Tensor) -> Tensor:
-        """The same to rounding, in fewer passes: see ``fused``."""
-        kept = []
-        for block in self.down[:-1]:
-            assert isinstance(block, Block)
-            kept.append(block.fused(x, keys, 0))
-            x = pool(kept[-1])
-        bottom = self.down[-1]
-        assert isinstance(bottom, Block)
-        x = bottom.fused(x, keys, 1)
-        for rise, block in zip(self.rise, self.up, strict=True):
-            assert isinstance(rise, nn.Conv2d) and rise.bias is not None and isinstance(block, Block)
-            quarters = convolution(x, quarter_weights(rise.weight), rise.bias.repeat(4))
-            x = block.fused(join(quarters, kept.pop()), keys, 0 if block is self.up[-1] else 1)
         return x

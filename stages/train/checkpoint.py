@@ -28,7 +28,7 @@ def write_checkpoint(output: Output, config: Config, training: Training, history
         "model": predictor.model.name,
         "coefficients": json.dumps(maps.names),
         "maps": json.dumps(maps.maps),
-        "globals": json.dumps({name: value.item() for name, value in maps.everywhere().items()}),
+        "globals": json.dumps({name: value.item() for name, value in maps.global_values().items()}),
         "positive": np.int32(maps.positive),
         "deviations": np.int32(maps.channels > len(maps.maps)),
         "elevation_scale_m": predictor.elevation_scale,

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from schemas import InputError
 from stages.common.progress import Progress, show_nothing
-from stages.network.crop_sums import sum_over_crops
 from stages.network.losses import crop_errors
 from stages.pairs.reader import Batch
 from stages.physics.formation.chain import form
@@ -72,18 +71,13 @@ def _errors(training: Training, batch: Batch, brightness: float, keys: Tensor | 
     short = training.precision == "bf16" and keys is not None
     with torch.autocast(training.device.type, torch.bfloat16, enabled=short):
         unbounded = predictor.unbounded(batch.observation.elevation, keys)
-    everywhere = [value.expand(len(unbounded), 1, 1) for value in maps.everywhere().values()]
-    frame = batch.observation.frame
-    assert frame is not None
-
-    def objective(first: int, last: int, unbounded: Tensor, gain: Tensor, offset: Tensor, *everywhere: Tensor):
-        coefficients = maps.combine(unbounded, everywhere)
-        rendered = form(batch.observation.part(first, last), maps.model, coefficients, training.extensions)
-        measured = batch.image[first:last] / radiometry.scale
-        predicted = rendered if radiometry.calibrated else gain * rendered + offset
-        return crop_errors(predicted, measured, batch.valid[first:last], brightness)
-
-    return sum_over_crops(objective, unbounded, *radiometry.crop_gains(frame), *everywhere)
+    observation = batch.observation
+    assert observation.frame is not None
+    rendered = form(observation, maps.model, maps.combine(unbounded), training.extensions)
+    if not radiometry.calibrated:
+        gain, offset = radiometry.crop_gains(observation.frame)
+        rendered = gain * rendered + offset
+    return crop_errors(rendered, batch.image / radiometry.scale, batch.valid, brightness)
 
 
 @torch.no_grad()

@@ -21,7 +21,6 @@ from schemas.files.outputs import Output, Target, check_outputs
 from schemas.provenance import sha256
 from stages.common.memory import keep_freed_memory
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.common.threads import one_thread_each
 from stages.network.predictor import choose_device
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import Extension
@@ -74,7 +73,7 @@ def run(
         # an effect may depend on a direction on the ground, which is lost when crops are turned
         say("crops are not turned or mirrored: the extended model may hold effects bound to an azimuth")
         config = replace(config, augment=False)
-    with one_thread_each(), PairReader(pairs, detector=bool(extensions)) as reader:
+    with PairReader(pairs, detector=bool(extensions)) as reader:
         check_pairs(reader, config, say)
         training = set_up(reader, config, extensions, device, rank, ranks)
         history, best = History(), Weights()

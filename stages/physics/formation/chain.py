@@ -7,8 +7,8 @@ Extensions (``stages/effects``) act at the slot that they name; the order of the
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -45,13 +45,6 @@ class Observation:
     detector_line: Tensor | None = None
     frame: Tensor | None = None
     site: Tensor | None = None
-
-    def part(self, first: int, last: int) -> Observation:
-        """Crops ``first`` .. ``last`` of the batch."""
-        if first == 0 and last == len(self.elevation):
-            return self
-        cut: dict[str, Any] = {k: v[first:last] for k, v in vars(self).items() if isinstance(v, Tensor)}
-        return replace(self, **cut)
 
 
 @dataclass
