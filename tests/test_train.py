@@ -275,7 +275,6 @@ def test_the_losses_are_means_over_valid_pixels(small_artefacts):
 def test_an_epoch_shows_every_training_pair_once(batch, ranks):
     pairs, shown = np.arange(100, 150), []
     for rank in range(ranks):
-        steps, keys = order_steps(pairs, batch, True, np.random.default_rng(3), rank, ranks)
-        assert [len(k) for k in keys] == [len(indices) for indices, _ in steps]
+        steps = order_steps(pairs, batch, True, np.random.default_rng(3), rank, ranks)
         shown += [k for indices, _ in steps for k in indices.tolist()]
     assert sorted(shown) == pairs.tolist() and shown != pairs.tolist()

@@ -48,9 +48,8 @@ class _Exported(torch.nn.Module):
         self.elevation_scale = predictor.elevation_scale
 
     def forward(self, elevation: Tensor) -> Tensor:
-        keys = elevation.new_empty(0, dtype=torch.int64)
-        features = self.net.features(scale_elevation(elevation, self.elevation_scale), keys)
-        return self.maps.stack(self.maps.unbounded(self.net.read_out(features)), dim=1)
+        output = self.net(scale_elevation(elevation, self.elevation_scale))
+        return self.maps.stack(self.maps.unbounded(output), dim=1)
 
 
 def run(

@@ -38,16 +38,16 @@ class Predictor(torch.nn.Module):
         self.gsd = float("nan")
         self.image_noise = float("nan")  # I/F, of the images, beside errors of the maps
 
-    def forward(self, elevation: Tensor, keys: Tensor | None = None) -> Tensor:
-        """(B, H, W) m -> (B, C, H, W) coefficients; ``keys`` as in :class:`UNet`."""
-        return self.maps.stack(self.unbounded(elevation, keys), dim=1)
+    def forward(self, elevation: Tensor) -> Tensor:
+        """(B, H, W) m -> (B, C, H, W) coefficients."""
+        return self.maps.stack(self.unbounded(elevation), dim=1)
 
-    def unbounded(self, elevation: Tensor, keys: Tensor | None = None) -> Tensor:
+    def unbounded(self, elevation: Tensor) -> Tensor:
         """(B, H, W) m -> (B, channels, H, W), the maps before their bounds: see :class:`CoefficientMaps`."""
         x = scale_elevation(elevation, self.elevation_scale)
         if elevation.device.type == "cpu":
             x = x.to(memory_format=torch.channels_last)
-        return self.maps.unbounded(self.net(x, keys))
+        return self.maps.unbounded(self.net(x))
 
     def _whole_strides(self, elevation: Tensor) -> Tensor:
         stride = self.net.stride

@@ -15,8 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from stages.network.layers import SLOPE
-from stages.network.unet import UNet
+from stages.network.unet import SLOPE, UNet
 
 Piece = tuple[Tensor, bool]  # rows (1, C, n, W), n > 0, and whether they are the last
 Rows = Iterator[Piece]  # from north to south

@@ -8,10 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from stages.network.layers import SLOPE, BatchNorm, Dropout, draw_keys
-
 WIDTHS = (16, 32, 64, 128, 256)
 DROPOUT = (0.1, 0.1, 0.2, 0.2, 0.3)
+SLOPE = 0.01  # of LeakyReLU below zero
 
 
 class HeightConv(nn.Conv2d):
@@ -42,24 +41,18 @@ def _conv(inputs: int, outputs: int) -> nn.Conv2d:
 
 
 class Block(nn.Sequential):
-    """Two 3x3 convolutions with BatchNorm and LeakyReLU, dropout between them. ``layer`` numbers the dropout."""
+    """Two 3x3 convolutions with BatchNorm and LeakyReLU, dropout between them. entry : the first convolution"""
 
-    def __init__(self, inputs: int, outputs: int, dropout: float, layer: int) -> None:
+    def __init__(self, entry: nn.Conv2d, outputs: int, dropout: float) -> None:
         super().__init__(
-            HeightConv(inputs, outputs) if layer == 0 else _conv(inputs, outputs),
-            BatchNorm(outputs),
+            entry,
+            nn.BatchNorm2d(outputs),
             nn.LeakyReLU(SLOPE, inplace=True),
-            Dropout(dropout, layer),
+            nn.Dropout(dropout),
             _conv(outputs, outputs),
-            BatchNorm(outputs),
+            nn.BatchNorm2d(outputs),
             nn.LeakyReLU(SLOPE, inplace=True),
         )
-
-    def forward(self, x: Tensor, keys: Tensor) -> Tensor:  # type: ignore[override]
-        """x : (B, C, H, W); keys : (B,); returns (B, D, H, W)."""
-        for step in self:
-            x = step(x, keys) if isinstance(step, Dropout) else step(x)
-        return x
 
 
 class UNet(nn.Module):
@@ -72,14 +65,13 @@ class UNet(nn.Module):
         super().__init__()
         if len(dropout) != len(widths):
             dropout = [dropout[min(k, len(dropout) - 1)] for k in range(len(widths))]
+        levels = range(len(widths) - 1)
         self.down = nn.ModuleList(
-            Block(1 if k == 0 else widths[k - 1], width, dropout[k], k) for k, width in enumerate(widths)
+            Block(_conv(widths[k - 1], width) if k else HeightConv(1, width), width, dropout[k])
+            for k, width in enumerate(widths)
         )
-        self.rise = nn.ModuleList(_conv(widths[k + 1], widths[k]) for k in reversed(range(len(widths) - 1)))
-        self.up = nn.ModuleList(
-            Block(2 * widths[k], widths[k], dropout[k], 2 * len(widths) - 2 - k)
-            for k in reversed(range(len(widths) - 1))
-        )
+        self.rise = nn.ModuleList(_conv(widths[k + 1], widths[k]) for k in reversed(levels))
+        self.up = nn.ModuleList(Block(_conv(2 * widths[k], widths[k]), widths[k], dropout[k]) for k in reversed(levels))
         self.head = nn.Conv2d(widths[0], outputs, 1)
         nn.init.zeros_(self.head.weight)  # training starts from the uniform surface, not from noise around it
         self.head.bias = nn.Parameter(torch.zeros(outputs))
@@ -100,25 +92,19 @@ class UNet(nn.Module):
         up = sum(2 * 2**k + 2**k for k in range(levels))
         return down + up + self.stride
 
-    def forward(self, x: Tensor, keys: Tensor | None = None) -> Tensor:
-        """x : (B, 1, H, W), scaled heights; keys : (B,) int64, of each crop's dropout, drawn where None."""
-        return self.read_out(self.features(x, keys))
+    def forward(self, x: Tensor) -> Tensor:
+        """x : (B, 1, H, W), scaled heights; returns (B, C, H, W)."""
+        return self.head(self.features(x))
 
-    def read_out(self, features: Tensor) -> Tensor:
-        """(B, F, H, W) -> (B, C, H, W), the last layer."""
-        return self.head(features)
-
-    def features(self, x: Tensor, keys: Tensor | None = None) -> Tensor:
-        """The input of the last layer, (B, F, H, W) with F the first of the widths."""
-        if keys is None:
-            keys = draw_keys(len(x), x.device) if self.training else x.new_empty(0, dtype=torch.int64)
+    def features(self, x: Tensor) -> Tensor:
+        """The input of ``head``, the last layer: (B, F, H, W) with F the first of the widths. x : (B, 1, H, W)"""
         kept = []
         for block in self.down[:-1]:
-            x = block(x, keys)
+            x = block(x)
             kept.append(x)
             x = functional.max_pool2d(x, 2)
-        x = self.down[-1](x, keys)
+        x = self.down[-1](x)
         for rise, block in zip(self.rise, self.up, strict=True):
             x = rise(functional.interpolate(x, scale_factor=2.0, mode="nearest"))
-            x = block(torch.cat([x, kept.pop()], dim=1), keys)
+            x = block(torch.cat([x, kept.pop()], dim=1))
         return x

@@ -70,7 +70,7 @@ def _residuals(training: Training, indices: NDArray[np.int64]) -> tuple[Tensor, 
     def predict(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         x = scale_elevation(batch.observation.elevation.to(device), predictor.elevation_scale)
         features = predictor.net.features(x)
-        coefficients = maps.stack(maps.unbounded(predictor.net.read_out(features)), dim=1).cpu()
+        coefficients = maps.stack(maps.unbounded(predictor.net.head(features)), dim=1).cpu()
         return features.float().cpu(), coefficients, form(batch.observation, model, coefficients, training.extensions)
 
     pixels = sample_pixels(training.reader, indices, training.radiometry, predict)

@@ -7,15 +7,11 @@ import math
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from schemas import InputError
 from stages.common.progress import Progress, show_nothing
-from stages.network.losses import crop_errors
-from stages.pairs.reader import Batch
-from stages.physics.formation.chain import form
 from stages.train.config import Config
-from stages.train.processes import mean_over_ranks, sum_gradients, sum_over_ranks
+from stages.train.processes import mean_over_ranks, share_buffers, sum_over_ranks
 from stages.train.steps import learning_rate, order_steps, prefetch
 from stages.train.training import Training
 
@@ -33,26 +29,25 @@ def learn_epoch(
     rank, ranks, device = training.rank, training.ranks, training.device
     # All randomness of an epoch depends on (seed, epoch): a resumed run draws what an uninterrupted one would.
     rng = np.random.default_rng([config.seed, epoch])
-    torch.manual_seed(hash((config.seed, epoch)) % 2**31)
+    torch.manual_seed(hash((config.seed, epoch, rank)) % 2**31)
     training.predictor.train()
     sums = torch.zeros(2, dtype=torch.float64, device=device)  # squared errors and pixels of this process
-    steps, keys = order_steps(train, config.batch, config.augment, rng, rank, ranks)
+    steps = order_steps(train, config.batch, config.augment, rng, rank, ranks)
     for number, batch in enumerate(prefetch(training.reader, steps, device)):
         for group in training.optimizer.param_groups:
             group["lr"] = learning_rate(
                 config.lr, config.schedule, epoch * len(steps) + number, config.epochs * len(steps)
             )
-        objective, error = _errors(training, batch, config.brightness, keys[number].to(device))
+        objective, error = training.errors(batch, config.brightness, training.precision == "bf16")
         pixels = batch.valid.sum().double()
         sums += torch.stack([error.detach().double(), pixels])
         if number % CHECK_EVERY == 0 and not torch.isfinite(sums[0]):
             break
-        # The mean over the valid pixels of the whole batch; this process has its share of the sum.
-        loss = objective / sum_over_ranks(pixels, ranks).clamp(min=1).float()
+        # The mean over the valid pixels of the whole batch. This process has its share of the sum, and DDP takes the
+        # mean of the processes' gradients.
+        loss = objective * ranks / sum_over_ranks(pixels, ranks).clamp(min=1).float()
         training.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        if ranks > 1:
-            sum_gradients(training.learned)
         training.optimizer.step()
         if rank == 0:
             progress(number + 1, len(steps), f"epoch {epoch + 1}/{config.epochs}")
@@ -62,22 +57,6 @@ def learn_epoch(
             f"{training.reader.path}: the loss is not finite in epoch {epoch + 1}; lower `lr` or check the images' units."
         )
     return mean_over_ranks(error_sum, pixel_sum, ranks, device)
-
-
-def _errors(training: Training, batch: Batch, brightness: float, keys: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Sums over a batch, () each: what is minimised, and squared errors. keys : (B,), for dropout, in training only"""
-    predictor, radiometry = training.predictor, training.radiometry
-    maps = predictor.maps
-    short = training.precision == "bf16" and keys is not None
-    with torch.autocast(training.device.type, torch.bfloat16, enabled=short):
-        unbounded = predictor.unbounded(batch.observation.elevation, keys)
-    observation = batch.observation
-    assert observation.frame is not None
-    rendered = form(observation, maps.model, maps.combine(unbounded), training.extensions)
-    if not radiometry.calibrated:
-        gain, offset = radiometry.crop_gains(observation.frame)
-        rendered = gain * rendered + offset
-    return crop_errors(rendered, batch.image / radiometry.scale, batch.valid, brightness)
 
 
 @torch.no_grad()
@@ -92,12 +71,13 @@ def evaluate_loss(
 
     indices : (n,), of pairs; returns NaN where there are none
     """
+    share_buffers(training.predictor, training.ranks)
     training.predictor.eval()
     totals, pixels = [0.0, 0.0], 0.0
     mine = indices[training.rank :: training.ranks]
     steps = [(mine[k : k + batch_size], None) for k in range(0, len(mine), batch_size)]
     for number, batch in enumerate(prefetch(training.reader, steps, training.device)):
-        objective, error = _errors(training, batch, brightness)
+        objective, error = training.errors(batch, brightness)
         totals[0] += float(error)
         totals[1] += float(objective)
         pixels += float(batch.valid.sum())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 import torch.distributed as dist
@@ -30,17 +29,10 @@ def join_group() -> tuple[int, int]:
     return dist.get_rank(), ranks
 
 
-def sum_gradients(parameters: Sequence[Tensor]) -> None:
-    """Each process has the gradient of its share of the loss: add them up.
-
-    parameters : tensors of any shape
-    """
-    flat = torch.cat([(p.grad if p.grad is not None else torch.zeros_like(p)).reshape(-1) for p in parameters])
-    dist.all_reduce(flat)
-    offset = 0
-    for p in parameters:
-        p.grad = torch.empty_like(p).copy_(flat[offset : offset + p.numel()].view_as(p))
-        offset += p.numel()
+def share_buffers(module: torch.nn.Module, ranks: int) -> None:
+    """Give all processes the first one's running statistics, by which evaluation normalises."""
+    for buffer in module.buffers() if ranks > 1 else ():
+        dist.broadcast(buffer, 0)
 
 
 def sum_over_ranks(values: Tensor, ranks: int) -> Tensor:

@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from stages.pairs import symmetries
 from stages.pairs.reader import Batch, PairReader
@@ -27,10 +26,10 @@ def learning_rate(highest: float, schedule: str, step: int, steps: int) -> float
 
 def order_steps(
     train: NDArray[np.int64], batch: int, augment: bool, rng: np.random.Generator, rank: int, ranks: int
-) -> tuple[list[tuple[NDArray, NDArray | None]], list[Tensor]]:
-    """The batches of one epoch for this process: (pair indices, symmetries), and the crops' keys for dropout.
+) -> list[tuple[NDArray, NDArray | None]]:
+    """The batches of one epoch for this process: (pair indices, symmetries).
 
-    Every process gets the same number of batches; a crop's symmetry and dropout do not depend on its process.
+    Every process gets the same number of batches; a crop's symmetry does not depend on its process.
 
     train : (n,), indices of pairs
     """
@@ -38,13 +37,11 @@ def order_steps(
     turns = rng.integers(0, symmetries.COUNT, len(order)) if augment else None
     count = math.ceil(len(order) / batch)
     bounds = [len(order) * k // count for k in range(count + 1)]  # equal batches: BatchNorm dislikes a rest of one
-    drawn = torch.from_numpy(rng.integers(0, 2**62, len(order)))
-    steps, keys = [], []
+    steps = []
     for first, last in itertools.pairwise(bounds):
         mine = np.arange(first, last)[rank::ranks] if last - first >= ranks else np.arange(first, last)
         steps.append((order[mine], None if turns is None else turns[mine]))
-        keys.append(drawn[mine])
-    return steps, keys
+    return steps
 
 
 def prefetch(

@@ -125,12 +125,11 @@ def our_steps(reader: PairReader, bf16: bool) -> dict[str, Callable[[], None]]:
     predictor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.Adam(predictor.parameters(), 1e-4, fused=True)
     batch = reader.batch(np.arange(BATCH))
-    keys = torch.arange(BATCH)
     coefficients = torch.full((BATCH, 3, SIZE, SIZE), 0.05, requires_grad=True)
 
     def network() -> None:
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            out = predictor.net(batch.observation.elevation[:, None], keys)
+            out = predictor.net(batch.observation.elevation[:, None])
         optimizer.zero_grad(set_to_none=True)
         out.float().square().mean().backward()
         optimizer.step()
@@ -140,7 +139,7 @@ def our_steps(reader: PairReader, bf16: bool) -> dict[str, Callable[[], None]]:
 
     def whole() -> None:
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            out = predictor(batch.observation.elevation, keys)
+            out = predictor(batch.observation.elevation)
         error = squared_error(form(batch.observation, model, out.float()), batch.image, batch.valid)
         optimizer.zero_grad(set_to_none=True)
         (error / batch.valid.sum()).backward()
