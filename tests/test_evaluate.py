@@ -13,7 +13,7 @@ from evaluation_scene import A, B, C, KnowsTheTruth, make_scene
 from stages.common.intervals import ERROR, LOG, ratio_interval
 from stages.evaluate import least_squares
 from stages.evaluate.config import Config
-from stages.evaluate.fitting import choose_fit_pairs, sample_pixels
+from stages.evaluate.fitting import as_pixels, choose_fit_pairs, draw_pixels
 from stages.evaluate.metrics import ssim
 from stages.evaluate.renderers import Constant, Renderer, read_batch, unit_images
 from stages.evaluate.rows import HAPKE_FREE
@@ -105,7 +105,7 @@ def test_a_model_that_is_not_linear_reaches_the_same_optimum(scene):
     batch = read_batch(scene, train, 1.0)
     gram.add(unit_images(model, batch), batch.image, batch.usable, batch.frame)
     exact = least_squares.solve_coefficients(gram.gram)
-    sample = sample_pixels(batch, 10**6, np.random.default_rng(0))
+    sample = as_pixels(draw_pixels(batch, 10**6, np.random.default_rng(0)), 10**9)
     assert least_squares.fit_nonlinear(model, sample, calibrated=True) == pytest.approx(exact, abs=1e-6)
 
 
@@ -115,7 +115,7 @@ def test_nonlinear_fit_finds_planted_hapke_parameters(scene):
     planted[0] = 0.8 * planted[0]
     batch = read_batch(scene, np.flatnonzero(scene.split == 0), 1.0)
     batch.image = Renderer("planted", model, Constant(planted)).radiance_factor(batch)
-    sample = sample_pixels(batch, 100, np.random.default_rng(0))
+    sample = as_pixels(draw_pixels(batch, 100, np.random.default_rng(0)), 10**9)
     found = least_squares.fit_nonlinear(model, sample, calibrated=True)
     batch.memo.clear()
     refit = Renderer("refit", model, Constant(found)).radiance_factor(batch)
@@ -129,11 +129,11 @@ def test_a_nonlinear_fit_is_the_same_to_the_last_bit_wherever_its_pixels_lie(sce
     monkeypatch.setattr(least_squares, "ROUNDS", 30)
     model = get_model("hapke")
     batch = read_batch(scene, np.flatnonzero(scene.split == 0), 1.0)
-    sample = sample_pixels(batch, 200, np.random.default_rng(0))
-    found = least_squares.fit_nonlinear(model, sample, calibrated, HAPKE_FREE)
+    sample = draw_pixels(batch, 200, np.random.default_rng(0))
+    found = least_squares.fit_nonlinear(model, as_pixels(sample), calibrated, HAPKE_FREE)
     for places in (1, 3):
-        moved = {name: torch.cat([value[:places], value])[places:] for name, value in vars(sample).items()}
-        again = least_squares.fit_nonlinear(model, least_squares.PixelSample(**moved), calibrated, HAPKE_FREE)
+        moved = torch.cat([sample[:, :places], sample], dim=1)[:, places:]
+        again = least_squares.fit_nonlinear(model, as_pixels(moved), calibrated, HAPKE_FREE)
         np.testing.assert_array_equal(again, found)
     default = np.array([p.default for p in model.parameters])
     assert (np.abs(found - default) > 1e-3).sum() >= 2

@@ -10,7 +10,6 @@ import torch
 
 from stages.evaluate.least_squares import (
     FrameGram,
-    PixelSample,
     fit_nonlinear,
     sample_gram,
     solve_coefficients,
@@ -19,7 +18,9 @@ from stages.evaluate.least_squares import (
 )
 from stages.evaluate.renderers import Batch, Constant, Renderer, batches, read_batch, unit_images
 from stages.evaluate.rows import HAPKE_FREE, Row
+from stages.network.pixels import Pixels
 from stages.pairs.reader import PairReader
+from stages.physics.formation.geometry import Angles
 from stages.physics.formation.radiometry import full_scale
 
 SAMPLE_PIXELS = 100_000  # for sets that are fitted to a random sample
@@ -105,7 +106,7 @@ def _fit_sets(data: Fitting, renderers: Sequence[Renderer], tick: Callable[[int]
     albedo = by_name.get("lunar_lambert") if calibrated else None  # of uncalibrated images the gains carry it
     gram = FrameGram(len(shared[0].model.parameters), frames) if exact else None
     albedo_gram = FrameGram(1, frames)
-    samples: list[PixelSample] = []
+    samples: list[torch.Tensor] = []
     rng = np.random.default_rng(data.seed)
     per_crop = max(1, SAMPLE_PIXELS // max(1, len(data.train)))
     for chosen in batches(data.train, data.size) if exact or sampled or albedo else ():
@@ -115,23 +116,22 @@ def _fit_sets(data: Fitting, renderers: Sequence[Renderer], tick: Callable[[int]
         if albedo is not None:
             albedo_gram.add(albedo.radiance_factor(batch)[:, None], batch.image, batch.usable, batch.frame)
         if sampled:
-            samples.append(sample_pixels(batch, per_crop, rng))
+            samples.append(draw_pixels(batch, per_crop, rng))
         tick(len(chosen))
     if albedo is not None:
         albedo.scale = float(solve_coefficients(albedo_gram.gram)[0])
-    sample = _join(samples) if samples else None
+    sample = torch.cat(samples, dim=1) if samples else None
     if gram is not None:
         found = Constant(_solve_linear(gram.gram, shared[0], calibrated))
     elif shared and sample is not None:
-        thin = sample.thin(LEVENBERG_PIXELS)
-        found = Constant(fit_nonlinear(shared[0].model, thin, calibrated))
+        found = Constant(fit_nonlinear(shared[0].model, as_pixels(sample, LEVENBERG_PIXELS), calibrated))
     for renderer in shared:
         renderer.coefficients = found
     if "kernels" in by_name and sample is not None:
-        grams = sample_gram(by_name["kernels"].model, sample, frames)
+        grams = sample_gram(by_name["kernels"].model, as_pixels(sample), frames)
         by_name["kernels"].coefficients = Constant(_solve_linear(grams, by_name["kernels"], calibrated))
     if "hapke_fitted" in by_name and sample is not None:
-        hapke, thin = by_name["hapke_fitted"], sample.thin(LEVENBERG_PIXELS)
+        hapke, thin = by_name["hapke_fitted"], as_pixels(sample, LEVENBERG_PIXELS)
         hapke.coefficients = Constant(fit_nonlinear(hapke.model, thin, calibrated, HAPKE_FREE))
 
 
@@ -151,8 +151,8 @@ def dn_scale(reader: PairReader, indices: np.ndarray, size: int) -> float:
     return full_scale(largest)
 
 
-def sample_pixels(batch: Batch, per_crop: int, rng: np.random.Generator) -> PixelSample:
-    """Up to ``per_crop`` usable pixels of every crop."""
+def draw_pixels(batch: Batch, per_crop: int, rng: np.random.Generator) -> torch.Tensor:
+    """Up to ``per_crop`` usable pixels of every crop: the fields of :func:`as_pixels`, (6, N) float64."""
     state = batch.state
     visibility = torch.ones_like(batch.image) if state.sun_visibility is None else state.sun_visibility
     width = batch.image[0].numel()
@@ -162,23 +162,12 @@ def sample_pixels(batch: Batch, per_crop: int, rng: np.random.Generator) -> Pixe
         picked = rng.choice(places, size=min(per_crop, len(places)), replace=False)
         chosen.append(b * width + np.sort(picked))
     index = torch.from_numpy(np.concatenate(chosen).astype(np.int64))
-    shape = batch.image.shape
-
-    def take(field: torch.Tensor) -> torch.Tensor:
-        return field.expand(shape).reshape(-1)[index]
-
-    angles = state.angles
-    frame = torch.as_tensor(batch.frame.astype(np.int64))[:, None, None]
-    return PixelSample(
-        take(angles.cos_incidence),
-        take(angles.cos_emission),
-        take(angles.cos_phase),
-        take(visibility),
-        take(batch.image),
-        take(frame),
-    )
+    angles, frame = state.angles, torch.as_tensor(batch.frame)[:, None, None]
+    fields = angles.cos_incidence, angles.cos_emission, angles.cos_phase, visibility, batch.image, frame
+    return torch.stack([field.expand(batch.image.shape).reshape(-1)[index].double() for field in fields])
 
 
-def _join(samples: list[PixelSample]) -> PixelSample:
-    names = PixelSample.__dataclass_fields__
-    return PixelSample(**{n: torch.cat([getattr(s, n) for s in samples]) for n in names})
+def as_pixels(fields: torch.Tensor, most: int = SAMPLE_PIXELS) -> Pixels:
+    """At most ``most`` of drawn pixels (6, N), evenly taken."""
+    *angles, light, image, frame = fields[:, :: max(1, -(-fields.shape[1] // most))]
+    return Pixels(Angles(*angles), light, image, frame=frame.long())

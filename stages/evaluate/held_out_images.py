@@ -38,6 +38,7 @@ from stages.common.intervals import ERROR, choose_units, gain_interval, ratio_in
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.evaluate.checks import report_files
 from stages.evaluate.coverage import BANDS_DEG, count_within, shares
+from stages.evaluate.least_squares import FrameGram, solve_gain_offset
 from stages.evaluate.metrics import ssim
 from stages.evaluate.table import finite, gain_entry
 from stages.pairs.ground import leave_out_learned
@@ -260,19 +261,14 @@ def _image_scales(reader: PairReader, albedo_map: AlbedoMap, frame: int) -> list
     train = np.intersect1d(mine, reader.indices("train"))
     fitted = train if len(train) else mine
     fitted = fitted[:: max(1, len(fitted) // FIT_PAIRS)]
-    columns: list[list[Floats]] = [[], [], []]
+    gram = FrameGram(1, 2)
     for k in fitted:
-        pictures = albedo_map.render(reader, int(k))
-        valid = reader.valid([k]) & torch.isfinite(pictures[0]) & torch.isfinite(pictures[1])
-        for column, picture in zip(columns, [*pictures, reader.image([k]).double()], strict=True):
-            column.append(picture[valid].numpy())
-    terrain, albedo, measured = (np.concatenate(c) for c in columns)
-    scales = []
-    for rendered in (terrain, albedo):
-        design = np.stack([rendered, np.ones_like(rendered)], axis=1)
-        gain, offset = np.linalg.lstsq(design, measured, rcond=None)[0]
-        scales.append((float(gain), float(offset)))
-    return scales
+        pictures = torch.stack(albedo_map.render(reader, int(k)))  # (2, 1, h, w)
+        valid = reader.valid([k]) & torch.isfinite(pictures).all(dim=0)
+        measured = reader.image([k]).double()
+        gram.add(pictures, measured.expand(2, -1, -1), valid.expand(2, -1, -1), np.arange(2))
+    gain, offset = solve_gain_offset(gram.gram, np.ones(1))
+    return list(zip(gain.tolist(), offset.tolist(), strict=True))
 
 
 def _nearest_sun(reader: PairReader, suns: Floats, k: int) -> float:

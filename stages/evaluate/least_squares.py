@@ -8,15 +8,14 @@ one small Gram matrix per frame, so that the fit streams and is exact.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from stages.network.pixels import Pixels, fit_pixels
-from stages.physics.formation.geometry import Angles
-from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
+from stages.network.pixels import Pixels, design_columns, fit_pixels
+from stages.physics.formation.radiometry import line_of_sums
+from stages.physics.photometry import ReflectanceModel
 
 ROUNDS = 100  # of a fit that is not linear: a baseline is to be as good as its law allows
 
@@ -51,18 +50,11 @@ def solve_gain_offset(gram: np.ndarray, coefficients: np.ndarray) -> tuple[np.nd
 
     Frames without pixels keep gain 1 and offset 0; a constant rendering leaves the mean in the offset.
     """
-    frames = len(gram)
-    gain, offset = np.ones(frames), np.zeros(frames)
-    for f in range(frames):
-        n = gram[f, -2, -2]
-        if n == 0:
-            continue
-        mean_r, mean_y = coefficients @ gram[f, :-2, -2] / n, gram[f, -2, -1] / n
-        variance = coefficients @ gram[f, :-2, :-2] @ coefficients / n - mean_r**2
-        covariance = coefficients @ gram[f, :-2, -1] / n - mean_r * mean_y
-        gain[f] = covariance / variance if variance > 1e-12 * max(mean_r**2, 1e-300) else 0.0
-        offset[f] = mean_y - gain[f] * mean_r
-    return gain, offset
+    n, of_y = gram[:, -2, -2], gram[:, -2, -1]
+    of_r, of_ry = gram[:, :-2, -2] @ coefficients, gram[:, :-2, -1] @ coefficients
+    of_rr = np.einsum("fkl,k,l->f", gram[:, :-2, :-2], coefficients, coefficients)
+    gain, offset = line_of_sums(n, of_r, of_y, of_rr, of_ry)
+    return np.where(n > 0, gain, 1.0), offset
 
 
 def solve_uncalibrated(gram: np.ndarray, start: np.ndarray, rounds: int = 500) -> np.ndarray:
@@ -87,45 +79,18 @@ def solve_uncalibrated(gram: np.ndarray, start: np.ndarray, rounds: int = 500) -
     return coefficients
 
 
-@dataclass
-class PixelSample:
-    """A random sample of train pixels, for models that are not linear in their parameters. All (N,)."""
-
-    cos_incidence: Tensor
-    cos_emission: Tensor
-    cos_phase: Tensor
-    visibility: Tensor
-    image: Tensor
-    frame: Tensor
-
-    @property
-    def angles(self) -> Angles:
-        """(N,) float64."""
-        return Angles(*(c.double() for c in (self.cos_incidence, self.cos_emission, self.cos_phase)))
-
-    def thin(self, most: int) -> PixelSample:
-        """At most ``most`` pixels, evenly taken."""
-        step = max(1, -(-len(self.image) // most))
-        return PixelSample(**{name: getattr(self, name)[::step] for name in self.__dataclass_fields__})
-
-
-def sample_gram(model: ReflectanceModel, sample: PixelSample, frames: int) -> np.ndarray:
+def sample_gram(model: ReflectanceModel, pixels: Pixels, frames: int) -> np.ndarray:
     """The Gram matrices of a linear model over sampled pixels, (F, K + 2, K + 2)."""
-    angles, count = sample.angles, len(model.parameters)
-    units = torch.eye(count, dtype=torch.float64)
-    images = [masked_radiance_factor(model, model.unpack(unit, 0), angles) for unit in units]
-    gram = FrameGram(count, frames)
-    for f in torch.unique(sample.frame).tolist():
-        mine = sample.frame == f
-        features = torch.stack([(image * sample.visibility)[mine] for image in images])[None, :, None]
-        image = sample.image[mine][None, None].double()
-        gram.add(features, image, torch.ones_like(image, dtype=torch.bool), np.array([f]))
+    assert pixels.frame is not None
+    columns = design_columns(model, pixels)
+    gram = FrameGram(len(columns), frames)
+    for f in torch.unique(pixels.frame).tolist():
+        mine = pixels.frame == f
+        image = pixels.image[mine][None, None]
+        gram.add(columns[None, :, None, mine], image, torch.ones_like(image, dtype=torch.bool), np.array([f]))
     return gram.gram
 
 
-def fit_nonlinear(
-    model: ReflectanceModel, sample: PixelSample, calibrated: bool, free: Sequence[str] = ()
-) -> np.ndarray:
+def fit_nonlinear(model: ReflectanceModel, pixels: Pixels, calibrated: bool, free: Sequence[str] = ()) -> np.ndarray:
     """One parameter set for all pixels, within the model's bounds, (C,): see :func:`fit_pixels`."""
-    pixels = Pixels(sample.angles, sample.visibility.double(), sample.image.double())
-    return fit_pixels(model, pixels, free, None if calibrated else sample.frame, ROUNDS).double().numpy()
+    return fit_pixels(model, pixels, free, calibrated, ROUNDS).double().numpy()

@@ -36,15 +36,15 @@ class CoefficientMaps(nn.Module):
         self.model, self.positive, self.output_scale = model, positive, output_scale
         self.names = [p.name for p in model.parameters]
         self.maps = model.choose_maps(maps)
-        self.rest = tuple(name for name in self.names if name not in self.maps)
+        self.global_names = tuple(name for name in self.names if name not in self.maps)
         raw = dict(zip(self.names, self._unbound(start), strict=True))
         self.start: Tensor
-        self.rest_start: Tensor
+        self.rest_start: Tensor  # of the global parameters; files have the name
         shifts = [float(raw[n]) for n in self.maps]
         self.channels = len(shifts) * (2 if deviations else 1)
         self.register_buffer("start", torch.tensor(shifts + [0.0] * (self.channels - len(shifts))))
-        self.register_buffer("rest_start", torch.tensor([float(raw[n]) for n in self.rest]))
-        self.rest_shift = nn.Parameter(torch.zeros(len(self.rest)), requires_grad=bool(self.rest))
+        self.register_buffer("rest_start", torch.tensor([float(raw[n]) for n in self.global_names]))
+        self.rest_shift = nn.Parameter(torch.zeros(len(self.global_names)), requires_grad=bool(self.global_names))
 
     def _unbound(self, start: Tensor) -> Tensor:
         if self.positive:
@@ -56,8 +56,8 @@ class CoefficientMaps(nn.Module):
 
     def global_values(self) -> dict[str, Tensor]:
         """The parameters that are the same everywhere, by name, each ()."""
-        values = self._bounded(self.rest_start + self.rest_shift * self.output_scale, 0, self.rest)
-        return dict(zip(self.rest, values.unbind(0), strict=True))
+        values = self._bounded(self.rest_start + self.rest_shift * self.output_scale, 0, self.global_names)
+        return dict(zip(self.global_names, values.unbind(0), strict=True))
 
     def unbounded(self, output: Tensor) -> Tensor:
         """The network's output (B, channels, H, W), scaled and shifted to the start: maps before their bounds."""
@@ -66,7 +66,7 @@ class CoefficientMaps(nn.Module):
     def combine(self, unbounded: Tensor) -> Tensor | dict[str, Tensor]:
         """The coefficients as ``formation.chain.form`` takes them. unbounded : (B, channels, H, W)"""
         bounded = self._bounded(unbounded.narrow(1, 0, len(self.maps)), 1, self.maps)
-        if not self.rest:
+        if not self.global_names:
             return bounded
         return dict(zip(self.maps, bounded.unbind(1), strict=True)) | self.global_values()
 
@@ -76,7 +76,7 @@ class CoefficientMaps(nn.Module):
         unbounded : (B, channels, H, W) with dim 1, or alike; returns (B, C, H, W)
         """
         bounded = self._bounded(unbounded.narrow(dim, 0, len(self.maps)), dim, self.maps)
-        if not self.rest:
+        if not self.global_names:
             return bounded
         maps = dict(zip(self.maps, bounded.unbind(dim), strict=True))
         like = next(iter(maps.values()))

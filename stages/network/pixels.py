@@ -16,6 +16,7 @@ from stages.network.losses import Radiometry
 from stages.pairs.reader import Batch, PairReader
 from stages.physics.formation import facets
 from stages.physics.formation.geometry import Angles
+from stages.physics.formation.radiometry import line_of_sums
 from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
 
 MAXIMUM_PAIRS = 512  # enough for a handful of numbers
@@ -39,7 +40,7 @@ def sample_batches(reader: PairReader, indices: NDArray[np.int64]) -> Iterator[t
 class Pixels:
     """Valid pixels of many images, (N,) float64 each: cosines, the share of the Sun that lights them, and I/F.
 
-    extra : (N, ...) float64, further fields of the caller's; pair : (N,) int64, the pairs that the pixels are of
+    extra : (N, ...) float64, further fields of the caller's; pair, frame : (N,) int64, of which pair and image
     """
 
     angles: Angles
@@ -47,6 +48,7 @@ class Pixels:
     image: Tensor
     extra: tuple[Tensor, ...] = ()
     pair: Tensor | None = None
+    frame: Tensor | None = None
 
 
 def sample_pixels(
@@ -85,7 +87,7 @@ def fit_pixels(
     model: ReflectanceModel,
     pixels: Pixels,
     free: Sequence[str] = (),
-    frame: Tensor | None = None,
+    calibrated: bool = True,
     rounds: int = 40,
 ) -> Tensor:
     """One set of parameters (C,) within the model's bounds, by Levenberg-Marquardt from its defaults.
@@ -95,9 +97,10 @@ def fit_pixels(
     choose the place.
 
     free : the parameters that may leave their defaults; all where empty
-    frame : (N,) int64, the image of each pixel, where images have unknown gains and offsets: the best are taken in
+    calibrated : False where images have unknown gains and offsets: the best of each of ``pixels.frame`` are taken in
         every round
     """
+    frame = None if calibrated else pixels.frame
     names = [p.name for p in model.parameters]
     free = free or names
     default = {p.name: torch.tensor(p.default, dtype=torch.float64) for p in model.parameters}
@@ -134,21 +137,21 @@ def fit_pixels(
     return torch.stack([values(raw)[name] for name in names]).float()
 
 
+def design_columns(model: ReflectanceModel, pixels: Pixels) -> Tensor:
+    """(C, N) float64: what each coefficient of a linear model gives where it is 1 and the others 0."""
+    units = torch.eye(len(model.parameters), dtype=torch.float64)
+    return torch.stack(
+        [masked_radiance_factor(model, model.unpack(unit, 0), pixels.angles) * pixels.light for unit in units]
+    )
+
+
 def _residual(rendered: Tensor, image: Tensor, frame: Tensor | None) -> tuple[Tensor, Tensor]:
     """(the gain of each pixel's image, or 1; what is left), with the best gain and offset of each image where unknown."""
     if frame is None:
         return torch.ones(()), image - rendered
-    count = torch.bincount(frame).clamp(min=1)
-
-    def centred(values: Tensor) -> tuple[Tensor, Tensor]:
-        mean = torch.bincount(frame, values) / count
-        return mean, values - mean[frame]
-
-    (mean, x), (_, y) = centred(rendered), centred(image)
-    variance, covariance = (torch.bincount(frame, x * other) / count for other in (x, y))
-    known = variance > 1e-12 * mean.square()  # a constant rendering does not determine a gain
-    gain = torch.where(known, covariance / torch.where(known, variance, 1), 0)[frame]
-    return gain, y - gain * x
+    sums = (torch.bincount(frame, of) for of in (rendered, image, rendered * rendered, rendered * image))
+    gain, offset = (of_frame[frame] for of_frame in line_of_sums(torch.bincount(frame).double(), *sums))
+    return gain, image - gain * rendered - offset
 
 
 def _slopes(render: Callable[[Tensor], Tensor], raw: Tensor) -> Tensor:

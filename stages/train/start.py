@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 from torch import Tensor
 
 from stages.network.losses import Radiometry
-from stages.network.pixels import Pixels, fit_pixels, sample_batches, sample_pixels
+from stages.network.pixels import design_columns, fit_pixels, sample_batches, sample_pixels
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form
-from stages.physics.photometry import ReflectanceModel, get_model, masked_radiance_factor
+from stages.physics.formation.radiometry import line_of_sums
+from stages.physics.photometry import ReflectanceModel, get_model
 
 REFERENCE = "lunar_lambert"  # the published surface against which unknown gains and offsets are first fitted
 
@@ -60,14 +62,12 @@ def fit_radiometry(
         terms = torch.stack([batch.valid.double(), x, y, x * x, x * y], dim=1).sum(dim=(2, 3))
         assert batch.observation.frame is not None
         moments.index_add_(0, batch.observation.frame, terms)
-    n, sx, sy, sxx, sxy = moments.unbind(1)
-    mean_x, mean_y = sx / n.clamp(min=1), sy / n.clamp(min=1)
-    variance = sxx / n.clamp(min=1) - mean_x**2
-    gain = (sxy / n.clamp(min=1) - mean_x * mean_y) / variance.clamp(min=1e-12)
+    n, sx, sy = moments[:, :3].unbind(1)
+    gain, _ = line_of_sums(*moments.unbind(1))
     # A gain below a fifth of brightness over I/F: the image shows texture more than shading, and the ratio is taken.
-    ratio = mean_y / mean_x.clamp(min=1e-6)
+    ratio = sy / sx.clamp(min=1e-6)
     gain = torch.where(gain > 0.2 * ratio, gain, ratio)
-    offset = mean_y - gain * mean_x
+    offset = (sy - gain * sx) / n.clamp(min=1)
     seen = n > 0
     if not seen.any():
         return Radiometry(torch.ones(frames), torch.zeros(frames), calibrated=False)
@@ -87,37 +87,17 @@ def fit_uniform(
     pixels = sample_pixels(reader, indices, radiometry)
     if not model.linear:
         return fit_pixels(model, pixels)
-    gram, right = _normal_equations(model, pixels)
-    return _solve_positive(gram, right) if positive else _solve(gram, right).float()
-
-
-def _normal_equations(model: ReflectanceModel, pixels: Pixels) -> tuple[Tensor, Tensor]:
-    """(C, C) and (C,) float64 of a linear model."""
-    names = [p.name for p in model.parameters]
-    units = [dict(zip(names, unit, strict=True)) for unit in torch.eye(len(names), dtype=torch.float64)]
-    columns = torch.stack([masked_radiance_factor(model, unit, pixels.angles) * pixels.light for unit in units])
+    columns = design_columns(model, pixels)
     # products and sums instead of BLAS, whose sums depend on where arrays lie in memory
     gram = torch.stack([(columns * column).sum(dim=1) for column in columns])
-    return gram, (columns * pixels.image).sum(dim=1)
-
-
-def _solve(gram: Tensor, right: Tensor) -> Tensor:
-    ridge = 1e-6 * gram.diagonal().mean() * torch.eye(len(gram), dtype=torch.float64)
-    return torch.linalg.solve(gram + ridge, right)
-
-
-def _solve_positive(gram: Tensor, right: Tensor) -> Tensor:
-    """Coefficients that come out negative are dropped to a small positive value and the rest solved again."""
-    keep = list(range(len(right)))
-    solution = torch.zeros(len(right), dtype=torch.float64)
-    while keep:
-        part = _solve(gram[keep][:, keep], right[keep])
-        if (part > 0).all():
-            solution[keep] = part
-            break
-        keep.pop(int(part.argmin()))
-    floor = 0.05 * solution.abs().max().clamp(min=1e-3)
-    return torch.maximum(solution, floor).float()
+    gram += 1e-6 * gram.diagonal().mean() * torch.eye(len(gram))
+    right = (columns * pixels.image).sum(dim=1)
+    if not positive:
+        return torch.linalg.solve(gram, right).float()
+    root = torch.linalg.cholesky(gram)
+    within = torch.linalg.solve_triangular(root, right[:, None], upper=False)[:, 0]
+    solution, _ = nnls(root.T.numpy(), within.numpy())
+    return torch.from_numpy(np.maximum(solution, 0.05 * max(solution.max(), 1e-3))).float()
 
 
 def elevation_scale(reader: PairReader, indices: NDArray[np.int64]) -> float:

@@ -111,7 +111,9 @@ def describe(training: Training) -> str:
     """A line on what is about to be learned, on which machine."""
     predictor, reader = training.predictor, training.reader
     maps = predictor.maps
-    where = f"maps of {', '.join(maps.maps)}" + (f", global {', '.join(maps.rest)}" if maps.rest else "")
+    where = f"maps of {', '.join(maps.maps)}" + (
+        f", global {', '.join(maps.global_names)}" if maps.global_names else ""
+    )
     weights = sum(p.numel() for p in predictor.net.parameters())
     train, validation = (len(reader.indices(part)) for part in ("train", "validation"))
     processes = f", {training.ranks} processes" if training.ranks > 1 else ""

@@ -5,6 +5,8 @@ Every stage that compares rendered with measured images uses these.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -19,22 +21,33 @@ def match_crops(rendered: Tensor, measured: Tensor, valid: Tensor, how: str) -> 
           'gain': the least-squares gain; 'gain_offset': the least-squares gain and offset
     A crop whose rendering is constant gets gain 0 under 'minmax' and 'gain_offset', that is the measured mean.
     """
-    n = valid.sum(dim=(-2, -1)).clamp(min=1).to(torch.float64)
     r = torch.where(valid, rendered, 0).to(torch.float64)
     m = torch.where(valid, measured, 0).to(torch.float64)
+    n, of_r, of_m, of_rr, of_rm = (t.sum(dim=(-2, -1)) for t in (valid.to(torch.float64), r, m, r * r, r * m))
     if how == "gain":
-        gain, offset = _ratio((r * m).sum(dim=(-2, -1)), (r * r).sum(dim=(-2, -1))), torch.zeros_like(n)
+        gain, offset = _ratio(of_rm, of_rr), torch.zeros_like(n)
+    elif how == "gain_offset":
+        gain, offset = line_of_sums(n, of_r, of_m, of_rr, of_rm)
+    elif how == "minmax":
+        gain = _ratio(crop_range(measured, valid), crop_range(rendered, valid))
+        offset = (of_m - gain * of_r) / n.clamp(min=1)
     else:
-        mean_r, mean_m = r.sum(dim=(-2, -1)) / n, m.sum(dim=(-2, -1)) / n
-        if how == "minmax":
-            gain = _ratio(crop_range(measured, valid), crop_range(rendered, valid))
-        elif how == "gain_offset":
-            dr = torch.where(valid, r - mean_r[:, None, None], 0)
-            gain = _ratio((dr * m).sum(dim=(-2, -1)), (dr * dr).sum(dim=(-2, -1)))
-        else:
-            raise ValueError(f"matching must be one of {MATCHINGS}, not {how!r}")
-        offset = mean_m - gain * mean_r
+        raise ValueError(f"matching must be one of {MATCHINGS}, not {how!r}")
     return (rendered.to(torch.float64) * gain[:, None, None] + offset[:, None, None]).to(rendered.dtype)
+
+
+def line_of_sums(count: Any, x: Any, y: Any, xx: Any, xy: Any) -> tuple[Any, Any]:
+    """Least-squares gain and offset of y = gain x + offset, from sums over pixels.
+
+    count, x, y, xx, xy : sums of 1, x, y, x^2 and x y, weighted or not; float64 arrays, tensors or numbers of one shape
+    returns (gain, offset) of that shape; where x is constant the gain is 0 and the offset the mean of y
+    """
+    count = count + (count == 0)
+    mean_x, mean_y = x / count, y / count
+    variance, covariance = xx / count - mean_x * mean_x, xy / count - mean_x * mean_y
+    varies = variance > 1e-12 * mean_x * mean_x
+    gain = varies * covariance / (variance + (variance == 0))
+    return gain, mean_y - gain * mean_x
 
 
 def crop_range(image: Tensor, valid: Tensor) -> Tensor:
