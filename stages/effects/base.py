@@ -70,6 +70,7 @@ class Effect(ABC):
     parameters      what the report gives; ``default`` is the null value
     coordinates     what is fitted, where that is not the parameters themselves
     strong          coordinate -> a size that anybody would want to be told about: data that cannot show it are blind to the effect
+    tried           coordinate -> the size at which the default trial stands; ``strong`` where it is not named
     tolerance       coordinate -> a size that every data set has: smaller effects are no cause
     displaces       whether it moves images against the ground: what is known of it is taken out of the measurement
     relative        whether its values per image are known beside those of the other images only: what all share is the ground's
@@ -109,6 +110,7 @@ class Effect(ABC):
     parameters: ClassVar[tuple[Parameter, ...]]
     coordinates: ClassVar[tuple[Parameter, ...]] = ()
     strong: ClassVar[Mapping[str, float]] = {}
+    tried: ClassVar[Mapping[str, float]] = {}
     tolerance: ClassVar[Mapping[str, float]] = {}
     displaces: ClassVar[bool] = False
     relative: ClassVar[bool] = False
@@ -154,8 +156,9 @@ class Effect(ABC):
 
     @classmethod
     def trials(cls, survey: Survey) -> Sequence[Trial]:
-        """Alternative templates; the default is one joint trial with a column per coordinate at ``strong``."""
-        return [Trial(tuple({p.name: cls.strong[p.name]} for p in cls.fitted()))]
+        """Alternative templates; the default is one joint trial with a column per coordinate at its size ``tried``."""
+        sizes = {**cls.strong, **cls.tried}
+        return [Trial(tuple({p.name: sizes[p.name]} for p in cls.fitted()))]
 
     @classmethod
     def shadow_trials(cls, survey: Survey) -> Sequence[Trial]:

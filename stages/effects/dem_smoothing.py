@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from stages.effects.base import Effect, Survey, Trial, register
+from stages.effects.base import Effect, register
 from stages.effects.filters import gaussian, plane, seams
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
@@ -26,13 +26,10 @@ class DemSmoothing(Effect):
         Parameter("sigma2_px2", "px2", -2.0, 4.0, 0.0, "variance by which the DEM is smoother than the truth"),
     )
     strong: ClassVar = {"sigma2_px2": 1.0}
+    tried: ClassVar = {"sigma2_px2": 0.5}
     # pixels that are means, and resampled, are smoother by a quarter; windows over which stereo is matched add as much and more
     tolerance: ClassVar = {"sigma2_px2": 0.7}
     in_simulation: ClassVar = {"sigma2_px2": 0.25}
-
-    @classmethod
-    def trials(cls, survey: Survey) -> list[Trial]:
-        return [Trial(({"sigma2_px2": 0.5},))]
 
     def apply(self, state: State) -> None:
         z = state.elevation

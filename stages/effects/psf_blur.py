@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from stages.effects.base import Effect, Survey, Trial, register
+from stages.effects.base import Effect, register
 from stages.effects.filters import gaussian
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
@@ -25,12 +25,9 @@ class PsfBlur(Effect):
     separate = "an image with cast shadows, whose edges the DEM's resolution does not soften"
     parameters = (Parameter("sigma2_px2", "px2", -0.1, 6.0, 0.0, "variance added to the point-spread function"),)
     strong: ClassVar = {"sigma2_px2": 1.0}
+    tried: ClassVar = {"sigma2_px2": 0.5}
     tolerance: ClassVar = {"sigma2_px2": 0.6}
     in_simulation: ClassVar = {"sigma2_px2": -0.25}
-
-    @classmethod
-    def trials(cls, survey: Survey) -> list[Trial]:
-        return [Trial(({"sigma2_px2": 0.5},))]
 
     def apply(self, state: State) -> None:
         state.image = gaussian(state.image, self.value("sigma2_px2", state))

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import torch
 
-from stages.effects.base import Effect, Survey, Trial, register
+from stages.effects.base import Effect, register
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
 
@@ -27,12 +27,9 @@ class SunAzimuth(Effect):
     separate = "an image of the same ground with the Sun on another side"
     parameters = (Parameter("error_deg", "degree", -45.0, 45.0, 0.0, "truth minus given, the same for all images"),)
     strong: ClassVar = {"error_deg": 0.5}
+    tried: ClassVar = {"error_deg": 0.2}
     # a DEM that is tilted by a quarter of a degree, as long waves of its errors do, seems to turn a Sun 30 deg high by so much
     tolerance: ClassVar = {"error_deg": 0.5}
-
-    @classmethod
-    def trials(cls, survey: Survey) -> list[Trial]:
-        return [Trial(({"error_deg": 0.2},))]
 
     def apply(self, state: State) -> None:
         east, north, up = state.sun_direction.to(state.elevation.dtype).unbind(-1)

@@ -33,10 +33,7 @@ class SunElevation(Effect):
     separate = "an image of the same ground with the Sun at least 20 deg higher or lower"
     parameters = (Parameter("error_deg", "degree", -10.0, 10.0, 0.0, "truth minus given, the same for all images"),)
     strong: ClassVar = {"error_deg": 0.5}
-
-    @classmethod
-    def trials(cls, survey: Survey) -> list[Trial]:
-        return [Trial(({"error_deg": 0.2},))]
+    tried: ClassVar = {"error_deg": 0.2}
 
     @classmethod
     def shadow_trials(cls, survey: Survey) -> list[Trial]:

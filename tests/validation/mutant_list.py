@@ -96,7 +96,7 @@ KNOWN = (
         "crops count as independent, not tiles",
     ),
     Mutant(
-        "stages/effects/curvature_albedo.py",
+        "stages/effects/terrain_albedo.py",
         "(1 + self.value(",
         "(1 - self.value(",
         ("tests/test_effects.py::test_albedo_that_follows_curvature_is_high_in_hollows_where_its_strength_is_above_0",),
