@@ -143,13 +143,13 @@ def test_scale_offset_is_decoded_bit_for_bit_as_hdf5_does(decimals, fill, rng, t
         records.prepare(N)
         out = records.empty(N)
         records.read_into(out, np.arange(N))
-        assert records.kind == "packed"
+        assert records.packed
         np.testing.assert_array_equal(out.view(np.uint32), file["a"][...].view(np.uint32))
 
 
 def test_a_truncated_file_says_so(data, tmp_path):
     path = tmp_path / "p.h5"
-    write(path, data, chunked)
+    write(path, data, scale_offset)
     with PairReader(path) as reader:
         reader.batch(np.arange(N))
         with open(path, "r+b") as file:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -129,7 +128,7 @@ class PairReader:
             else:
                 for done in [self._pool.submit(r.read_into, target, which) for r, target, which in jobs]:
                     done.result()
-        except (OSError, zlib.error) as error:
+        except OSError as error:
             raise ArtefactError(
                 f"{self.path}: cannot be read to the end ({error}); the file is damaged or truncated, write it again."
             ) from None
