@@ -10,75 +10,13 @@ import h5py
 import numpy as np
 import pytest
 import small_scene
+from push_frame import FOCAL_PX, STEP, isd
 from raw_frames import photograph, residual, run_all, write_image
 
 from schemas.errors import GeometryError, InputError
 from stages.physics.bodies.ephemeris import AU
 from stages.physics.cameras import camera_from_document, cameras
 from stages.physics.maps.grid import unit_vectors
-
-STEP = 0.1  # s between framelets
-FOCAL_PX = 500.0
-
-
-def turn_y(angle):
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-
-
-def isd(
-    radius=1e6, orbit=1.05e6, rate=0.012, framelets=30, height=16, overlap=2, samples=16, body=None, sun=None, **changes
-):
-    """A camera that looks straight down from a circular orbit in the plane y = 0, from +x towards -z; rate in rad/s.
-
-    body : (w, x, y, z) of the rotation from the orbit's axes to the body's; changes : of the ISD's keys
-    """
-    times = 1000.0 + (np.arange(framelets) - framelets / 2) * STEP
-    angles = rate * (times - times[0])
-    half = (angles + math.pi / 2) / 2
-    document = {
-        "name_model": "USGS_ASTRO_PUSH_FRAME_SENSOR_MODEL",
-        "center_ephemeris_time": 1000.0,
-        "starting_ephemeris_time": times[0] - 0.025,
-        "exposure_duration": 0.05,
-        "interframe_delay": STEP,
-        "framelet_height": height,
-        "num_lines_overlap": overlap,
-        "framelets_flipped": False,
-        "framelet_order_reversed": False,
-        "detector_sample_summing": 1,
-        "detector_line_summing": 1,
-        "focal2pixel_lines": [0.0, 10.0, 0.0],  # the camera's z axis points up: it looks along (x, y, -f)
-        "focal2pixel_samples": [0.0, 0.0, -10.0],
-        "focal_length_model": {"focal_length": FOCAL_PX / 10},
-        "image_lines": framelets * height,
-        "image_samples": samples,
-        "detector_center": {"line": height / 2, "sample": samples / 2},
-        "starting_detector_line": 0,
-        "starting_detector_sample": 0,
-        "optical_distortion": {"radial": {"coefficients": [0.0, 0.0, 0.0]}},
-        "radii": {"semimajor": radius / 1e3, "semiminor": radius / 1e3, "unit": "km"},
-        "instrument_position": {
-            "unit": "m",
-            "positions": np.stack([orbit * np.cos(angles), 0 * angles, -orbit * np.sin(angles)], axis=1).tolist(),
-            "velocities": (
-                orbit * rate * np.stack([-np.sin(angles), 0 * angles, -np.cos(angles)], axis=1)
-            ).tolist(),
-            "ephemeris_times": times.tolist(),
-        },
-        "instrument_pointing": {
-            "quaternions": np.stack([np.cos(half), 0 * half, -np.sin(half), 0 * half], axis=1).tolist(),
-            "ephemeris_times": times.tolist(),
-        },
-        "body_rotation": {"quaternions": [body or [1.0, 0.0, 0.0, 0.0]], "ephemeris_times": [1000.0]},
-        "sun_position": {
-            "unit": "km",
-            "positions": [[1e5] * 3, [1.5e5] * 3, [2e5] * 3, [2.5e5] * 3] if sun is None else [sun],
-            "velocities": [[125000.0] * 3] * 4 if sun is None else [[0.0] * 3],
-            "ephemeris_times": [999.2, 999.6, 1000.0, 1000.4] if sun is None else [1000.0],
-        },
-    }  # fmt: skip
-    return document | changes
 
 
 def places(points, radius=1e6, orbit=1.05e6, rate=0.012, framelets=30, height=16, overlap=2, samples=16):
@@ -267,12 +205,7 @@ def over_the_scene(**changes):
 
 @pytest.mark.parametrize(
     ("flipped", "reversed_"),
-    [
-        (True, False),
-        (False, True),
-        pytest.param(False, False, marks=pytest.mark.slow),
-        pytest.param(True, True, marks=pytest.mark.slow),
-    ],
+    [(True, False), *(pytest.param(*p, marks=pytest.mark.slow) for p in ((False, True), (False, False), (True, True)))],
 )
 def test_a_raw_push_frame_image_reaches_the_ground_it_shows(small_files, tmp_path, flipped, reversed_):
     document = over_the_scene(framelets_flipped=flipped, framelet_order_reversed=reversed_)

@@ -16,79 +16,49 @@ Change = Callable[[h5py.File], None]
 
 # The commands that read each artefact, with OTHER for the mutated file; every mutation takes the next one.
 READERS: dict[str, list[list[str]]] = {
-    "scene": [
-        ["sample", "scene.h5", "--count", "20", "-o", "out.h5"],
-        ["infer", "scene.h5", "checkpoint.h5", "-o", "out.h5"],
-        [
-            "render",
-            "--dem",
-            "scene.h5",
-            "--model",
-            "M2",
-            "--sun-azimuth",
-            "90",
-            "--sun-elevation",
-            "30",
-            "-o",
-            "out.exr",
+    kind: [line.split() for line in lines]
+    for kind, lines in {
+        "scene": [
+            "sample scene.h5 --count 20 -o out.h5",
+            "infer scene.h5 checkpoint.h5 -o out.h5",
+            "render --dem scene.h5 --model M2 --sun-azimuth 90 --sun-elevation 30 -o out.exr",
+            "ingest scene.h5 --images images.csv --crop 32 -o out.h5",
+            "albedo svbrdf.h5 scene.h5 -o out.h5",
+            "report scene.h5 -o out.html",
         ],
-        ["ingest", "scene.h5", "--images", "images.csv", "--crop", "32", "-o", "out.h5"],
-        ["albedo", "svbrdf.h5", "scene.h5", "-o", "out.h5"],
-        ["report", "scene.h5", "-o", "out.html"],
-    ],
-    "crops": [["project", "crops.h5", "-o", "out.h5"], ["inspect", "crops.h5"]],
-    "pairs": [
-        [
-            "train",
-            "pairs.h5",
-            "--epochs",
-            "1",
-            "--widths",
-            "4-8",
-            "--device",
-            "cpu",
-            "--precision",
-            "fp32",
-            "-o",
-            "out.h5",
+        "crops": [
+            "project crops.h5 -o out.h5",
+            "inspect crops.h5",
         ],
-        ["evaluate", "pairs.h5", "checkpoint.h5", "--device", "cpu", "-o", "out.h5"],
-        ["match", "pairs.h5", "checkpoint.h5", "--count", "1", "--device", "cpu", "--json", "out.json"],
-        ["diagnose", "pairs.h5", "-o", "out.h5"],
-        ["report", "pairs.h5", "-o", "out.html"],
-    ],
-    "checkpoint": [
-        ["infer", "scene.h5", "checkpoint.h5", "--device", "cpu", "-o", "out.h5"],
-        ["evaluate", "pairs.h5", "checkpoint.h5", "--device", "cpu", "-o", "out.h5"],
-        ["match", "pairs.h5", "checkpoint.h5", "--count", "1", "--device", "cpu", "--json", "out.json"],
-        ["export", "checkpoint.h5", "-o", "out.onnx"],
-    ],
-    "svbrdf": [
-        ["render", "svbrdf.h5", "--sun-azimuth", "90", "--sun-elevation", "30", "-o", "out.exr"],
-        ["albedo", "svbrdf.h5", "scene.h5", "-o", "out.h5"],
-        ["view", "svbrdf.h5", "-o", "out.html"],
-        ["report", "svbrdf.h5", "-o", "out.html"],
-    ],
-    "evaluation": [
-        ["match", "evaluation.h5", "--count", "1", "--json", "out.json"],
-        ["report", "evaluation.h5", "-o", "out.html"],
-    ],
-    "diagnosis": [
-        [
-            "render",
-            "svbrdf.h5",
-            "--extend",
-            "diagnosis.h5",
-            "--sun-azimuth",
-            "90",
-            "--sun-elevation",
-            "30",
-            "-o",
-            "out.exr",
+        "pairs": [
+            "train pairs.h5 --epochs 1 --widths 4-8 --device cpu --precision fp32 -o out.h5",
+            "evaluate pairs.h5 checkpoint.h5 --device cpu -o out.h5",
+            "match pairs.h5 checkpoint.h5 --count 1 --device cpu --json out.json",
+            "diagnose pairs.h5 -o out.h5",
+            "report pairs.h5 -o out.html",
         ],
-        ["inspect", "diagnosis.h5"],
-        ["report", "diagnosis.h5", "-o", "out.html"],
-    ],
+        "checkpoint": [
+            "infer scene.h5 checkpoint.h5 --device cpu -o out.h5",
+            "evaluate pairs.h5 checkpoint.h5 --device cpu -o out.h5",
+            "match pairs.h5 checkpoint.h5 --count 1 --device cpu --json out.json",
+            "export checkpoint.h5 -o out.onnx",
+        ],
+        "svbrdf": [
+            "render svbrdf.h5 --sun-azimuth 90 --sun-elevation 30 -o out.exr",
+            "albedo svbrdf.h5 scene.h5 -o out.h5",
+            "view svbrdf.h5 -o out.html",
+            "report svbrdf.h5 -o out.html",
+        ],
+        "evaluation": [
+            "match evaluation.h5 --count 1 --json out.json",
+            "report evaluation.h5 -o out.html",
+        ],
+        "diagnosis": [
+            "render svbrdf.h5 --extend diagnosis.h5 --sun-azimuth 90 --sun-elevation 30 -o out.exr",
+            "inspect diagnosis.h5",
+            "report diagnosis.h5 -o out.html",
+        ],
+    }.items()
 }
 
 

@@ -24,43 +24,25 @@ RENDER = ["render", "svbrdf.h5", "--sun-azimuth", "90", "--sun-elevation", "30",
 SIMULATE = ["simulate", "--print-recipe"]
 # What an option's command needs beside it, to come as far as the option's own value; also run with good files.
 BASE: dict[str, list[str]] = {
-    "simulate": SIMULATE,
-    "ingest": ["ingest", "dem.tif", "--images", "images.csv", "--gsd", "20", "--crop", "32", "-o", "out.h5"],
-    "sample": ["sample", "scene.h5", "-o", "out.h5"],
-    "project": ["project", "crops.h5", "-o", "out.h5"],
-    "train": [
-        "train",
-        "pairs.h5",
-        "--epochs",
-        "1",
-        "--widths",
-        "4-8",
-        "--device",
-        "cpu",
-        "--precision",
-        "fp32",
-        "-o",
-        "out.h5",
-    ],
-    "infer": ["infer", "scene.h5", "checkpoint.h5", "--device", "cpu", "-o", "out.h5"],
-    "render": RENDER,
-    "evaluate": ["evaluate", "pairs.h5", "checkpoint.h5", "--device", "cpu", "-o", "out.h5"],
-    "match": ["match", "pairs.h5", "checkpoint.h5", "--device", "cpu", "--json", "out.json"],
-    "compare": [
-        "compare",
-        "pairs.h5",
-        "-o",
-        "out",
-        "--epochs",
-        "1",
-        "--seeds",
-        "1",
-        "--widths",
-        "4-8",
-        "--device",
-        "cpu",
-    ],
-    "diagnose": ["diagnose", "pairs.h5", "-o", "out.h5"],
+    words[0]: words
+    for words in (
+        SIMULATE,
+        RENDER,
+        *map(
+            str.split,
+            (
+                "ingest dem.tif --images images.csv --gsd 20 --crop 32 -o out.h5",
+                "sample scene.h5 -o out.h5",
+                "project crops.h5 -o out.h5",
+                "train pairs.h5 --epochs 1 --widths 4-8 --device cpu --precision fp32 -o out.h5",
+                "infer scene.h5 checkpoint.h5 --device cpu -o out.h5",
+                "evaluate pairs.h5 checkpoint.h5 --device cpu -o out.h5",
+                "match pairs.h5 checkpoint.h5 --device cpu --json out.json",
+                "compare pairs.h5 -o out --epochs 1 --seeds 1 --widths 4-8 --device cpu",
+                "diagnose pairs.h5 -o out.h5",
+            ),
+        ),
+    )
 }
 CONTROLS = [v for k, v in BASE.items() if k not in ("compare", "diagnose")] + [
     [*RENDER[:6], "--camera", "camera.json", "-o", "out.exr"],

@@ -12,6 +12,7 @@ import h5py
 import small_scene
 from malformed import Case
 from malformed_inputs import INGEST, _column, _cut, raster, text
+from push_frame import isd
 
 TRAJECTORY = [
     "render", "svbrdf.h5", "--trajectory", "views.csv", "--size", "8,8", "--sun-azimuth", "90", "--sun-elevation", "30",
@@ -33,8 +34,6 @@ def view_cases() -> Iterator[Case]:
 
 def write_views(folder: Path) -> None:
     """What the cases make bad: a trajectory, an ISD, two shards of the pairs, a map in another program's convention."""
-    from test_cameras_pushframe import isd
-
     from stages import project
     from stages.physics.photometry import get_model
 
@@ -106,8 +105,6 @@ def _leaves(document: dict[str, Any], above: tuple[str, ...] = ()) -> Iterator[t
 
 
 def _isds() -> Iterator[Case]:
-    from test_cameras_pushframe import isd
-
     arguments = [*INGEST, "images.csv"]
     good = isd()
     beside = {

@@ -243,13 +243,6 @@ STAGES = (
         "strips have too little context: seams",
     ),
     Mutant(
-        "stages/infer/windows.py",
-        "weight = np.minimum(weight, (last - position) / overlap)",
-        "weight = np.minimum(weight, 1.0)",
-        ("tests/test_infer.py::test_weights_of_neighbouring_windows_add_up_to_one",),
-        "windows are blended on one side only: seams",
-    ),
-    Mutant(
         "stages/pairs/holes.py",
         "    return np.where(valid, elevation, (filled * FILL_STEP).astype(np.float32))",
         "    return np.where(valid, elevation, np.float32(0))",
