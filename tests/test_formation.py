@@ -1,16 +1,13 @@
-"""The formation chain: its gradients against finite differences, and the one pass that takes its place in training."""
+"""The formation chain: its gradients against finite differences, and its angles against products of vectors."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import pytest
+import numpy as np
 import torch
 
-from stages.physics.formation.chain import Observation, facets, form
-from stages.physics.formation.cosine_sums import cosine_sum
-from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
-from stages.physics.photometry import get_model, model_names
+from stages.physics.formation.chain import Observation, form, illuminate
+from stages.physics.light.sun_disc import SUN_RADIUS
+from stages.physics.photometry import get_model
 
 
 def test_gradients_in_elevation_sun_and_camera():
@@ -44,57 +41,27 @@ def crops(seed: int = 5, count: int = 3, height: int = 24, width: int = 40) -> O
     return Observation(z, sun[:count], camera[:count], 5.0, 1737400.0, sun_horizon=horizon[:count])
 
 
-def by_the_chain(observation: Observation, model, coefficients: torch.Tensor) -> torch.Tensor:
-    """As ``form`` goes about it where the ground has gradients."""
-    return form(replace(observation, elevation=observation.elevation.clone().requires_grad_()), model, coefficients)
-
-
-@pytest.mark.parametrize("name", model_names())
-@pytest.mark.parametrize("shadows", [True, False])
-def test_one_pass_gives_what_the_chain_gives(name, shadows):
-    """Images to rounding, and gradients, whichever way the coefficients lie in memory."""
-    model, observation = get_model(name), crops()
-    if not shadows:
-        observation = replace(observation, sun_horizon=None)
-    defaults = torch.tensor(list(model.defaults().values())).view(1, -1, 1, 1)
-    generator = torch.Generator().manual_seed(2)
-    maps = defaults * (1 + 0.1 * torch.rand(3, len(model.parameters), 24, 40, generator=generator))
-    weight = torch.rand(3, 24, 40, generator=generator)
-    tolerance = 1e-3 if name == "M6" else 3e-5  # its azimuths turn fast where the half vector meets the normal
-    for given in (maps, maps.contiguous(memory_format=torch.channels_last), defaults):
-        given = given.clone().requires_grad_()
-        expected, found = by_the_chain(observation, model, given), form(observation, model, given)
-        torch.testing.assert_close(found, expected, rtol=tolerance, atol=2e-6)
-        assert (found == 0).float().mean() > 0.05
-        gradients = [torch.autograd.grad(image, given, weight)[0] for image in (expected, found)]
-        scale = gradients[0].abs().max()
-        torch.testing.assert_close(gradients[1] / scale, gradients[0] / scale, rtol=tolerance, atol=1e-5)
-
-
-def test_one_pass_is_exact_in_the_half_shadow():
-    observation = crops()
-    _, light = facets.angles_and_light(
-        observation.elevation, observation.sun_direction, observation.camera_position, observation.sun_horizon, 5.0, 1737400.0
-    )  # fmt: skip
-    expected = sun_visibility(torch.asin(observation.sun_direction[:, 2])[:, None, None], observation.sun_horizon)
-    seen = light > 0
-    assert ((expected > 0.01) & (expected < 0.99) & seen).float().mean() > 0.1
-    torch.testing.assert_close(light[seen], expected[seen], rtol=2e-5, atol=2e-6)
-
-
-def test_the_chain_is_taken_where_one_pass_will_not_do():
-    observation, model = crops(), get_model("M2")
-    coefficients = torch.full((1, 3, 1, 1), 0.1)
-    many = form(replace(observation, elevation=observation.elevation.double()), model, coefficients.double())
-    assert many.dtype == torch.float64
-    one = Observation(
-        observation.elevation[:1], observation.sun_direction[:1], observation.camera_position[:1], 5.0, 1e6
+def test_the_angles_of_a_plane_on_a_sphere():
+    """By products of unit vectors: the plane falls away from the crop's middle with the sphere under it."""
+    east_slope, north_slope, gsd, radius = 0.3, -0.2, 5.0, 2000.0
+    x = (np.arange(30) - 14.5)[None] * gsd
+    y = (9.5 - np.arange(20))[:, None] * gsd
+    z = east_slope * x + north_slope * y
+    sun, camera = np.array([0.6, 0.3, 0.74]), np.array([300.0, -200.0, 900.0])
+    sun /= np.linalg.norm(sun)
+    observation = Observation(
+        torch.from_numpy(z)[None], torch.from_numpy(sun)[None], torch.from_numpy(camera)[None], gsd, radius
     )
-    assert form(one, model, coefficients.expand(4, -1, -1, -1)).shape == (4, 24, 40)
-    for name in ("elevation", "sun_direction", "camera_position", "sun_horizon"):
-        wanted = getattr(observation, name).clone().requires_grad_()
-        image = form(replace(observation, **{name: wanted}), model, coefficients)
-        assert torch.autograd.grad(image.sum(), wanted)[0].abs().max() > 0
+    normal = np.stack([x / radius - east_slope + 0 * y, y / radius - north_slope + 0 * x, np.ones_like(z)])
+    view = camera[:, None, None] - np.stack([x + 0 * y, y + 0 * x, z])
+    normal, view = (v / np.linalg.norm(v, axis=0) for v in (normal, view))
+    angles = illuminate(observation).angles
+    for found, expected in (
+        (angles.cos_incidence, np.tensordot(sun, normal, 1)),
+        (angles.cos_emission, (normal * view).sum(axis=0)),
+        (angles.cos_phase, np.tensordot(sun, view, 1)),
+    ):
+        np.testing.assert_allclose(found[0].numpy(), expected, rtol=1e-6)
 
 
 def test_unknown_horizons_are_not_taken_for_sunlight():
@@ -103,20 +70,3 @@ def test_unknown_horizons_are_not_taken_for_sunlight():
     image = form(observation, get_model("M2"), torch.full((1, 3, 1, 1), 0.1))
     assert torch.isnan(image).sum() <= 1
     assert not image[0, 3, 4] > 0
-
-
-@pytest.mark.parametrize("powers", [((1, 0), (0, 1), (0, 0)), ((2, 0), (1, 1), (0, 2))])
-def test_cosine_sums_have_the_gradient_of_their_value(powers):
-    generator = torch.Generator().manual_seed(1)
-    mu0, phase, light = torch.rand(3, 2, 4, 5, generator=generator, dtype=torch.float64)
-    coefficients = torch.rand(2, 3, 4, 5, generator=generator, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda c: cosine_sum(c, mu0, phase, light, powers), coefficients)
-    plain = sum(c * mu0**p * phase**q for c, (p, q) in zip(coefficients.unbind(1), powers, strict=True))
-    torch.testing.assert_close(cosine_sum(coefficients, mu0, phase, light, powers), plain * light)
-
-
-def test_the_gradient_of_cosine_sums_lies_in_memory_as_the_coefficients_do():
-    light = torch.rand(2, 4, 5)
-    coefficients = torch.rand(2, 3, 4, 5).contiguous(memory_format=torch.channels_last).requires_grad_()
-    image = cosine_sum(coefficients, light, light, light, ((1, 0), (0, 1), (0, 0)))
-    assert torch.autograd.grad(image.sum(), coefficients)[0].stride() == coefficients.stride()

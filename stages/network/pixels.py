@@ -14,7 +14,7 @@ from torch import Tensor
 from stages.common.threads import one_thread
 from stages.network.losses import Radiometry
 from stages.pairs.reader import Batch, PairReader
-from stages.physics.formation import facets
+from stages.physics.formation.chain import illuminate
 from stages.physics.formation.geometry import Angles
 from stages.physics.formation.radiometry import line_of_sums
 from stages.physics.photometry import ReflectanceModel, masked_radiance_factor
@@ -67,13 +67,10 @@ def sample_pixels(
     gain, offset = (value().detach().cpu() for value in (radiometry.gain, radiometry.offset))
     found: list[list[Tensor]] = []
     for pairs, batch in sample_batches(reader, indices):
-        o = batch.observation
-        seen = facets.angles_and_light(
-            o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius
-        )
-        assert seen is not None and o.frame is not None  # on the CPU, without gradients
-        angles, light = seen
-        image = (batch.image - offset[o.frame, None, None]) / gain[o.frame, None, None]
+        frame, state = batch.observation.frame, illuminate(batch.observation)
+        assert frame is not None
+        angles, image = state.angles, (batch.image - offset[frame, None, None]) / gain[frame, None, None]
+        light = torch.ones_like(image) if state.sun_visibility is None else state.sun_visibility
         pair = torch.from_numpy(pairs)[:, None, None].expand(image.shape)
         fields = (pair, angles.cos_incidence, angles.cos_emission, angles.cos_phase, light, image, *extra(batch))
         valid = batch.valid[part]

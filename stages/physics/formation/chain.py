@@ -13,7 +13,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from stages.physics.formation import facets, geometry
+from stages.physics.formation import geometry
 from stages.physics.formation.geometry import Angles
 from stages.physics.formation.resampling import displace
 from stages.physics.light.sun_disc import SUN_RADIUS, sun_visibility
@@ -107,13 +107,6 @@ def form(
         broadcasting to (B, H, W)
     returns (B, H, W)
     """
-    if not extensions:
-        o = observation
-        fast = facets.angles_and_light(
-            o.elevation, o.sun_direction, o.camera_position, o.sun_horizon, o.gsd, o.body_radius
-        )
-        if fast is not None:
-            return model.lit(coefficients, *fast)
     state = illuminate(observation, extensions)
     parameters = model.unpack(coefficients, dim=1)
     state.reflectance = masked_radiance_factor(model, parameters, state.angles)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import torch
-from numba.extending import register_jitable
 from torch import Tensor
 
 SUN_RADIUS = math.radians(0.2666)  # mean angular radius of the Sun at 1 au
@@ -16,10 +15,15 @@ DARKENED = DARKENING * 2 / 3 / (1 - DARKENING / 3)  # flux of the mu-term over t
 def sun_visibility(sun_elevation: Tensor, horizon: Tensor, radius: float | Tensor = SUN_RADIUS) -> Tensor:
     """Share of the Sun's light above a straight horizon, 0..1.
 
+    For a disc of uniform brightness the share is 1/2 - (t sqrt(1 - t^2) + asin(t)) / pi, with the horizon t radii above
+    the centre. Linear limb darkening turns its slices from 2 sqrt(1 - t^2) into 2 (1 - u) sqrt(1 - t^2) + u pi/2 (1 - t^2).
+
     sun_elevation, horizon : rad, broadcastable
     """
     t = ((horizon - sun_elevation) / radius).clamp(-1 + 1e-6, 1 - 1e-6)
-    return disc_share(t, torch.sqrt(1 - t * t), torch.asin(t))
+    uniform = 0.5 - (t * torch.sqrt(1 - t * t) + torch.asin(t)) / math.pi
+    darkened = 0.5 - 0.75 * (t - t**3 / 3)  # the share for slices of weight (1 - t^2), by the same integral
+    return (1 - DARKENED) * uniform + DARKENED * darkened
 
 
 def visibility_slope(t: Tensor) -> Tensor:
@@ -29,15 +33,3 @@ def visibility_slope(t: Tensor) -> Tensor:
     """
     inside = (1 - t * t).clamp(min=0)
     return -(1 - DARKENED) * 2 / math.pi * inside.sqrt() - DARKENED * 0.75 * inside
-
-
-@register_jitable
-def disc_share(t, root, angle):
-    """Share of a limb-darkened disc above a straight line ``t`` radii above its centre; tensors, or numbers in kernels.
-
-    root, angle : sqrt(1 - t^2), asin(t). For a disc of uniform brightness the share is 1/2 - (t root + angle) / pi; linear
-    limb darkening turns its slices from 2 sqrt(1 - t^2) into 2 (1 - u) sqrt(1 - t^2) + u pi/2 (1 - t^2).
-    """
-    uniform = 0.5 - (t * root + angle) / math.pi
-    darkened = 0.5 - 0.75 * (t - t**3 / 3)  # the share for slices of weight (1 - t^2), by the same integral
-    return (1 - DARKENED) * uniform + DARKENED * darkened

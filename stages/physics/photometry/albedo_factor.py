@@ -34,11 +34,3 @@ class AlbedoFactor(ReflectanceModel):
 
     def radiance_factor(self, parameters: Mapping[str, torch.Tensor], angles: Angles) -> torch.Tensor:
         return self.model.radiance_factor(parameters, angles) * parameters[FACTOR.name]
-
-    def lit(
-        self, coefficients: torch.Tensor | Mapping[str, torch.Tensor], angles: Angles, light: torch.Tensor
-    ) -> torch.Tensor:
-        if isinstance(coefficients, torch.Tensor):
-            return self.model.lit(coefficients[:, :-1], angles, light) * coefficients[:, -1]
-        rest = {name: value for name, value in coefficients.items() if name != FACTOR.name}
-        return self.model.lit(rest, angles, light) * coefficients[FACTOR.name]

@@ -105,16 +105,6 @@ class ReflectanceModel(ABC):
         # unbind and not select: its backward is one stack, where select writes a full stack of zeros per parameter
         return dict(zip((p.name for p in self.parameters), coefficients.unbind(dim), strict=True))
 
-    def lit(
-        self, coefficients: torch.Tensor | Mapping[str, torch.Tensor], angles: Angles, light: torch.Tensor
-    ) -> torch.Tensor:
-        """I/F of facets that receive the share ``light`` of the Sun, 0 where Sun or camera are behind them.
-
-        coefficients : (B, C, H, W) or what broadcasts to it, in the order of ``parameters``, or by name, each broadcasting
-            to (B, H, W); light : (B, H, W), 0..1
-        """
-        return masked_radiance_factor(self, self.unpack(coefficients, dim=1), angles) * light
-
     def defaults(self) -> dict[str, float]:
         return {p.name: p.default for p in self.parameters}
 

@@ -53,17 +53,6 @@ class IncidencePhasePolynomial(CosinePolynomial):
             terms.append(functools.reduce(operator.mul, factors))
         return functools.reduce(operator.add, terms)
 
-    def lit(
-        self, coefficients: torch.Tensor | Mapping[str, torch.Tensor], angles: Angles, light: torch.Tensor
-    ) -> torch.Tensor:
-        # numba takes a quarter of a second to load, which `lunargr models` has no use for
-        from stages.physics.formation.cosine_sums import cosine_sum, fits
-
-        geometry = angles.cos_incidence, angles.cos_phase, light
-        if not (isinstance(coefficients, torch.Tensor) and fits(coefficients, *geometry)):
-            return super().lit(coefficients, angles, light)
-        return cosine_sum(coefficients, *geometry, self.powers)
-
 
 @register
 class M1(IncidencePhasePolynomial):
