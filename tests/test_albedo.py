@@ -212,7 +212,7 @@ def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
     from lunargr_cli.fanout.stages import run_albedo
 
     # blocks so small that the map has a row of them for each part
-    monkeypatch.setattr("stages.albedo.stage.BLOCK_PX", 96)
+    monkeypatch.setattr("stages.physics.images.windows.BLOCK_PX", 96)
     config = replace(QUIET, geotiff=True)
     names = ("albedo", "albedo_std", "albedo_images", "coefficients", "elevation", "albedo_gain", "albedo_image_std")
     whole = tmp_path / "whole.h5"
@@ -243,7 +243,7 @@ def interrupt(*arguments, **options):
 
 
 def test_blocks_leave_no_seams(planted, found, monkeypatch):
-    monkeypatch.setattr("stages.albedo.stage.BLOCK_PX", 64)
+    monkeypatch.setattr("stages.physics.images.windows.BLOCK_PX", 64)
     blocks = made(planted, name="blocks.h5")[0]
     assert np.nanmax(np.abs(np.log(blocks / found[0]))) < 0.1 * np.nanmedian(found[1])
 
@@ -390,7 +390,7 @@ def test_an_unknown_form_of_registration_is_refused(planted, tmp_path):
 
 
 def test_of_a_tilted_strip_only_the_windows_that_it_crosses_are_read():
-    from stages.albedo.footprints import CELL_PX, MARGIN_PX, read_footprint
+    from stages.physics.images.footprints import CELL_PX, MARGIN_PX, read_footprint
 
     rows, cols = np.arange(1500)[:, None], np.arange(1400)[None, :]
     valid = np.abs(cols - 100 - 0.8 * rows) < 60
@@ -416,6 +416,6 @@ def test_of_a_tilted_strip_only_the_windows_that_it_crosses_are_read():
 
 def test_images_beside_each_other_give_what_images_of_the_whole_map_give(planted, found, tmp_path, monkeypatch):
     """A window that an image fills in part holds the same as if the image had been read over all of it."""
-    monkeypatch.setattr("stages.albedo.footprints.CELL_PX", 16)
+    monkeypatch.setattr("stages.physics.images.footprints.CELL_PX", 16)
     for mine, whole in zip(made(planted, name="cells.h5"), found, strict=True):
         np.testing.assert_allclose(mine, whole, rtol=2e-3, atol=2e-3)

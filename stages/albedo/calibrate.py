@@ -23,15 +23,14 @@ from schemas.errors import ArtefactError
 from stages.albedo.intervals import GAUSSIAN, Stack, unseen_intervals
 from stages.albedo.posterior import Spread, settle
 from stages.albedo.pyramid import LEVELS, bands
-from stages.albedo.references import Box, Look, References
-from stages.albedo.registered import as_text, from_text
 from stages.common.arrays import Floats, Floats32
 from stages.common.progress import Progress, show_nothing
+from stages.physics.formation.radiometry import fit_line
 from stages.physics.images.displacement import Field
+from stages.physics.images.references import Look, References
+from stages.physics.images.registered import as_text, from_text
+from stages.physics.maps.window import Box
 
-WINDOW_PX = 128
-WINDOWS_PER_IMAGE = 16
-LOOKS = 2048  # windows of images held at a time: 0.8 GB at most, with their ratios
 ROUNDS = 6
 SETTLED = 0.05  # relative change of all variances below which no further round is made
 COSINES = np.linspace(0.0, 1.0, 17)  # bins of cos(incidence) over which the error may differ
@@ -109,32 +108,6 @@ class Sample:
     prior: Floats32 | None = None
     images: list[int] = field(default_factory=list)
     looks: list[Look] = field(default_factory=list)
-
-
-def choose_windows(shape: tuple[int, int], count: int, overlapping: Callable[[Box], list[int]]) -> list[Box]:
-    """Windows spread over the map such that every one of ``count`` images has WINDOWS_PER_IMAGE, as far as LOOKS allow.
-
-    overlapping : the images that show something of a window
-    """
-    rows, cols = (-(-n // WINDOW_PX) for n in shape)
-    total = rows * cols
-    step = max(1, round(total * 0.6180339887))  # the golden section leaves no large gap at any time
-    while np.gcd(step, total) != 1:
-        step += 1
-    seen, looks = np.zeros(count, int), 0
-    chosen: list[Box] = []
-    for number in range(total):
-        row, col = (WINDOW_PX * k for k in divmod(number * step % total, cols))
-        box = row, col, min(WINDOW_PX, shape[0] - row), min(WINDOW_PX, shape[1] - col)
-        images = overlapping(box)
-        if not images or (seen[images] >= WINDOWS_PER_IMAGE).all():
-            continue
-        if looks + len(images) > LOOKS and chosen:
-            break
-        seen[images] += 1
-        looks += len(images)
-        chosen.append(box)
-    return chosen
 
 
 def take_samples(
@@ -232,30 +205,11 @@ def _scales(samples: Sequence[Sample], albedo: Sequence[Any], count: int, units:
     fitted = [k for k in range(count) if sum(len(p[0]) for p in pairs[k]) > 0]
     for k in fitted:
         expected, measured = (np.concatenate([p[i] for p in pairs[k]]) for i in (0, 1))
-        gain[k], offset[k] = _line(expected, measured, units == "dn")
+        gain[k], offset[k] = fit_line(expected, measured, units == "dn")
     if units == "iof" and fitted:
         gain /= np.exp(np.log(gain[fitted]).mean())
         gain[[k for k in range(count) if k not in fitted]] = 1.0
     return _rounded(gain), _rounded(offset)
-
-
-def _line(expected: Floats, measured: Floats, with_offset: bool) -> tuple[float, float]:
-    """measured = gain x expected + offset by Huber's weights (1.345 robust standard deviations)."""
-    weights = np.ones(len(expected))
-    gain = offset = 0.0
-    for _ in range(10):
-        total = weights.sum()
-        x0, y0 = ((weights * v).sum() / total if with_offset else 0.0 for v in (expected, measured))
-        x, y = expected - x0, measured - y0
-        square = (weights * x * x).sum()
-        gain = (weights * x * y).sum() / square if square > 0 else 0.0
-        offset = y0 - gain * x0
-        if not gain > 0:  # the map says nothing of this image: its level alone
-            gain, offset = max(float(np.median(measured) / np.median(expected)), 1e-12), 0.0
-        residual = np.abs(measured - gain * expected - offset)
-        scale = 1.4826 * float(np.median(residual))
-        weights = np.minimum(1.0, 1.345 * max(scale, 1e-300) / np.maximum(residual, 1e-300))
-    return gain, offset
 
 
 def _variances(samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], count: int) -> Spread:

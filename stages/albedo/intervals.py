@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.albedo.posterior import Spread, estimate, settle
-from stages.albedo.references import Look
 from stages.common.arrays import Floats, Floats32
+from stages.physics.images.references import Look
 
 SHARES = (0.6827, 0.95)
 GAUSSIAN = (1.0, 1.96)  # where nothing can be left out

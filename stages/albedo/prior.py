@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from stages.albedo.references import Box
 from stages.physics.formation.geometry import Angles
+from stages.physics.maps.window import Box
 from stages.physics.photometry import masked_radiance_factor
 from stages.physics.photometry.deviation import radiance_deviation
 from stages.physics.terrain.surface import Surface

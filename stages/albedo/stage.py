@@ -22,28 +22,23 @@ from schemas.files.companions import companions_of
 from schemas.files.outputs import Output, check_output, check_outputs, map_targets
 from schemas.provenance import sha256
 from schemas.reading import read_strings
-from stages.albedo.calibrate import COSINES, Calibration, calibrate, choose_windows, take_samples
+from stages.albedo.calibrate import COSINES, Calibration, calibrate, take_samples
 from stages.albedo.config import Config, Summary, used_frames
-from stages.albedo.footprints import read_footprint
 from stages.albedo.posterior import estimate, settle
 from stages.albedo.prior import terrain_variance
 from stages.albedo.pyramid import HALO_PX, LEVELS
-from stages.albedo.references import Box, References
-from stages.albedo.registered import register
 from stages.albedo.writing import Maps, copy_map, kept_attributes
 from stages.common.arrays import Floats32
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.common.shards import shard_range
 from stages.physics.bodies.spheres import find_body
-from stages.physics.horizon.scene import make_overview
+from stages.physics.images.references import References, open_references
+from stages.physics.images.registered import register
 from stages.physics.images.table import Frame, load_frames
+from stages.physics.images.windows import Blocks, choose_blocks, choose_windows
 from stages.physics.maps.geotiff import write_geotiff
-from stages.physics.maps.grid import read_grid
+from stages.physics.maps.grid import check_same_grid, read_grid
+from stages.physics.maps.window import Box
 from stages.physics.terrain.surface import Surface, open_surface
-
-BLOCK_PX = 768
-STACK_PX = 24 << 20  # pixels of all images of a block, with what lies around it: 0.2 GB
-OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
 
 
 @dataclass(frozen=True)
@@ -67,25 +62,13 @@ def open_ground(svbrdf: Path, scene: Path, config: Config) -> Iterator[Ground]:
                 "start from the output of 'lunargr infer'."
             )
         terrain = stack.enter_context(open_artefact(scene, SCENE))
-        _check_same_grid(svbrdf, file, scene, terrain)
+        check_same_grid(svbrdf, file, scene, terrain)
         frames = load_frames(terrain, scene)
         used = used_frames(frames, config) if frames else []
-        chosen = [frame for frame, use in zip(frames, used, strict=True) if use]
-        boxes = terrain["frame_window"][...].tolist()
-        footprints = [read_footprint(terrain["valid"], k, tuple(boxes[k])) for k in np.flatnonzero(used).tolist()]
-        if not any(f.cells.any() for f in footprints):
-            raise InputError(f"{scene}: expected images that overlap the map {svbrdf}, found none.")
-        units = _units(svbrdf, file, scene, chosen)
         surface = stack.enter_context(open_surface(svbrdf, None, {}, find_body(str(file.attrs["body_radius_m"]))))
-        elevation = terrain["elevation"]
-        overview = make_overview(elevation, max(1, math.ceil(max(elevation.shape) / OVERVIEW_PX)))
-        cells = overview.cells[np.isfinite(overview.cells)]
-        heights = (float(cells.min()) if cells.size else 0.0), overview.highest
-        heights = heights[0] - 0.5 * max(0.0, heights[1] - heights[0]), heights[1]
-        references = stack.enter_context(
-            References(replace(surface, deviations=None), elevation, overview, heights, chosen, footprints)
-        )
-        yield Ground(file, references, units, surface)
+        shown = replace(surface, deviations=None)
+        references = stack.enter_context(open_references(scene, terrain, shown, used))
+        yield Ground(file, references, _units(svbrdf, file, scene, references.frames), surface)
 
 
 def run(
@@ -144,13 +127,13 @@ def _run(
                     overwrite=output.overwrite,
                 )
             )
-            edge = _edge(ground)
-            own = _own_rows(ground, edge, config)
+            blocks = _blocks(ground)
+            own = blocks.own_rows(config.shard)
             if config.shard[1] > 1:
                 writer.file.attrs["shard_rows"] = np.array(own, np.int64)
             copy_map(ground.map, writer, own)
             maps = Maps(writer, ground.references.frames, found)
-            for block in _blocks(ground, edge, own, progress):
+            for block in blocks.within(own, progress):
                 maps.put(block, *work_block(ground, found, block))
             maps.close()
             if as_geotiff:
@@ -228,7 +211,11 @@ def source_files(scene: Path) -> list[Path]:
 def count_bands(svbrdf: Path, scene: Path, config: Config) -> int:
     """Rows of blocks on a map: more shards than these have nothing to do."""
     with open_ground(svbrdf, scene, config) as ground:
-        return -(-ground.map["valid"].shape[0] // _edge(ground))
+        return _blocks(ground).bands
+
+
+def _blocks(ground: Ground) -> Blocks:
+    return choose_blocks(ground.map["valid"].shape, ground.references.overlapping, HALO_PX)
 
 
 def summarise(output: Path, scene: Path) -> Summary:
@@ -240,50 +227,6 @@ def summarise(output: Path, scene: Path) -> Summary:
         fold = told.get("fold")
         config = Config(tuple(told.get("leave_out", ())), tuple(fold) if fold else None)
         return _summary(file, config, scene)
-
-
-def _edge(ground: Ground) -> int:
-    """Edge of a block, px: smaller where so many images overlap that memory would grow with them."""
-    edge, references = BLOCK_PX, ground.references
-    rows, cols = ground.map["valid"].shape
-    while edge > 2 * HALO_PX:
-        side = edge + 2 * HALO_PX
-        starts = [(r, c) for r in range(0, rows, edge) for c in range(0, cols, edge)]
-        most = max(len(references.overlapping((r - HALO_PX, c - HALO_PX, side, side))) for r, c in starts)
-        if most * side * side <= STACK_PX:
-            break
-        edge //= 2
-    return edge
-
-
-def _own_rows(ground: Ground, edge: int, config: Config) -> tuple[int, int]:
-    rows = ground.map["valid"].shape[0]
-    first, last = (min(rows, edge * band) for band in shard_range(-(-rows // edge), config.shard))
-    return first, last
-
-
-def _blocks(ground: Ground, edge: int, own: tuple[int, int], progress: Progress) -> Iterator[Box]:
-    cols = ground.map["valid"].shape[1]
-    for row in range(own[0], own[1], edge):
-        progress(row - own[0], own[1] - own[0], "rows")
-        for col in range(0, cols, edge):
-            yield row, col, min(edge, own[1] - row), min(edge, cols - col)
-    progress(own[1] - own[0], own[1] - own[0], "rows")
-
-
-def _check_same_grid(svbrdf: Path, file: h5py.File, scene: Path, terrain: h5py.File) -> None:
-    mine, other = read_grid(file, svbrdf), read_grid(terrain, scene)
-    if abs(mine.radius - other.radius) > 1e-6 * other.radius:
-        raise ArtefactError(
-            f"{svbrdf}: expected a map of a body of {other.radius:g} m as {scene}, found one of {mine.radius:g} m; "
-            "infer the map from this scene."
-        )
-    same = np.allclose(mine.transform, other.transform, rtol=0, atol=1e-6 * other.gsd) and mine.crs == other.crs
-    if not same or (mine.height, mine.width) != (other.height, other.width):
-        raise ArtefactError(
-            f"{svbrdf}: expected the grid of {scene} ({other.height} x {other.width} px at {other.gsd:g} m), found another "
-            f"({mine.height} x {mine.width} px at {mine.gsd:g} m); infer the map from this scene."
-        )
 
 
 def _units(svbrdf: Path, file: h5py.File, scene: Path, frames: Sequence[Frame]) -> str:

@@ -13,8 +13,8 @@ from schemas import SVBRDF, ArtefactWriter
 from schemas.reading import read_strings
 from stages.albedo.calibrate import COSINES, Calibration
 from stages.albedo.pyramid import LEVELS
-from stages.albedo.references import Box
 from stages.physics.images.table import Frame
+from stages.physics.maps.window import Box
 
 ROWS = 256  # rows that are copied at a time
 

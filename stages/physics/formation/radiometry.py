@@ -7,8 +7,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from stages.common.arrays import Floats
 
 MATCHINGS = ("minmax", "gain", "gain_offset")
 
@@ -48,6 +51,28 @@ def line_of_sums(count: Any, x: Any, y: Any, xx: Any, xy: Any) -> tuple[Any, Any
     varies = variance > 1e-12 * mean_x * mean_x
     gain = varies * covariance / (variance + (variance == 0))
     return gain, mean_y - gain * mean_x
+
+
+def fit_line(expected: Floats, measured: Floats, with_offset: bool) -> tuple[float, float]:
+    """Gain and offset of measured = gain x expected + offset, by Huber's weights (1.345 robust standard deviations).
+
+    expected, measured : (n,); a gain that is not above 0 becomes the ratio of both medians, with the offset 0
+    """
+    weights = np.ones(len(expected))
+    gain = offset = 0.0
+    for _ in range(10):
+        total = weights.sum()
+        x0, y0 = ((weights * v).sum() / total if with_offset else 0.0 for v in (expected, measured))
+        x, y = expected - x0, measured - y0
+        square = (weights * x * x).sum()
+        gain = (weights * x * y).sum() / square if square > 0 else 0.0
+        offset = y0 - gain * x0
+        if not gain > 0:
+            gain, offset = max(float(np.median(measured) / np.median(expected)), 1e-12), 0.0
+        residual = np.abs(measured - gain * expected - offset)
+        scale = 1.4826 * float(np.median(residual))
+        weights = np.minimum(1.0, 1.345 * max(scale, 1e-300) / np.maximum(residual, 1e-300))
+    return gain, offset
 
 
 def crop_range(image: Tensor, valid: Tensor) -> Tensor:

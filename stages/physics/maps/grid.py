@@ -304,8 +304,24 @@ def read_grid(file: h5py.File, path: object) -> Grid:
             f"{path}: expected body_radius_m near its CRS's radius of {radius:g} m, found {file.attrs['body_radius_m']:g}; "
             "write it again."
         )
-    height, width = file["elevation"].shape[-2:]
+    height, width = file["y"].size, file["x"].size
     return Grid(wkt, Affine(a, b, c, d, e, f), height, width, float(file.attrs["body_radius_m"]))
+
+
+def check_same_grid(svbrdf: object, file: h5py.File, scene: object, terrain: h5py.File) -> None:
+    """Whether a map lies on the grid of a scene. svbrdf, scene : their paths. Raises ArtefactError."""
+    mine, other = read_grid(file, svbrdf), read_grid(terrain, scene)
+    if abs(mine.radius - other.radius) > 1e-6 * other.radius:
+        raise ArtefactError(
+            f"{svbrdf}: expected a map of a body of {other.radius:g} m as {scene}, found one of {mine.radius:g} m; "
+            "infer the map from this scene."
+        )
+    same = np.allclose(mine.transform, other.transform, rtol=0, atol=1e-6 * other.gsd) and mine.crs == other.crs
+    if not same or (mine.height, mine.width) != (other.height, other.width):
+        raise ArtefactError(
+            f"{svbrdf}: expected the grid of {scene} ({other.height} x {other.width} px at {other.gsd:g} m), found another "
+            f"({mine.height} x {mine.width} px at {mine.gsd:g} m); infer the map from this scene."
+        )
 
 
 def require_crs(where: str, crs: CRS | None, transform: Affine, body: Body) -> CRS:

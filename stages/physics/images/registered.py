@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from stages.albedo.references import References
 from stages.common.progress import Progress
 from stages.physics.images.displacement import Basis, Field
+from stages.physics.images.references import References
 from stages.physics.images.register_frame import choose_blocks, register_frame
 from stages.physics.images.registration import BLOCK_PX
 

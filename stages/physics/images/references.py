@@ -5,21 +5,24 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.albedo.footprints import Footprint
-from stages.common.arrays import Floats32
+from schemas.errors import InputError
+from stages.common.arrays import Floats, Floats32
 from stages.physics.bodies.ephemeris import AU
-from stages.physics.horizon.scene import Overview, horizon_in_scene
+from stages.physics.horizon.scene import Overview, horizon_in_scene, make_overview
 from stages.physics.images.displacement import Field
+from stages.physics.images.footprints import Footprint, read_footprint
 from stages.physics.images.source_images import Source, open_source
-from stages.physics.images.table import Frame
+from stages.physics.images.table import Frame, load_frames
 from stages.physics.light.sun_disc import SUN_RADIUS
 from stages.physics.maps.grid import Grid
 from stages.physics.maps.window import Box, Window
@@ -27,9 +30,24 @@ from stages.physics.terrain.shading import Light, shade_block
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.surface import SHADOWED, Surface
 
+OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
 OPEN_IMAGES = 64  # files that stay open between windows
 SHADOW_MARGIN_PX = 2  # a shadow's edge lies so well where the DEM and the registration say
 TURN = 30e3  # m over which the Sun's azimuth turns by 1 deg on the Moon
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One photograph beside its rendering on the part ``box`` of a window, (h, w) each.
+
+    measured : as in the file, NaN where it shows no known ground; usable : bool, lit and away from shadows
+    planes : the rendering and its backplanes, see ``shade_block``
+    """
+
+    box: Box
+    measured: Floats32
+    usable: NDArray[np.bool_]
+    planes: dict[str, Floats32]
 
 
 @dataclass(frozen=True)
@@ -60,6 +78,10 @@ class Look:
         )  # fmt: skip
 
 
+def _sun_at(position: Floats) -> Sun:
+    return Sun(position, SUN_RADIUS * AU / float(np.linalg.norm(position)))
+
+
 class SceneHorizon:
     """The terrain horizon towards one Sun for any window, from an overview of the scene that all Suns share."""
 
@@ -80,6 +102,24 @@ class SceneHorizon:
                     sun_elevation=elevation, body_radius=grid.radius,
                 )  # fmt: skip
         return result
+
+
+@contextlib.contextmanager
+def open_references(scene: Path, terrain: h5py.File, surface: Surface, used: Sequence[bool]) -> Iterator[References]:
+    """Those images of a scene that are ``used``, beside a surface on the same grid. Raises InputError where none overlaps."""
+    frames, boxes = load_frames(terrain, scene), terrain["frame_window"][...].tolist()
+    chosen = [k for k, use in enumerate(used) if use]
+    footprints = [read_footprint(terrain["valid"], k, tuple(boxes[k])) for k in chosen]
+    if not any(f.cells.any() for f in footprints):
+        raise InputError(f"{scene}: expected images that overlap the map {surface.path}, found none.")
+    elevation = terrain["elevation"]
+    overview = make_overview(elevation, max(1, math.ceil(max(elevation.shape) / OVERVIEW_PX)))
+    cells = overview.cells[np.isfinite(overview.cells)]
+    lowest = float(cells.min()) if cells.size else 0.0
+    lowest -= 0.5 * max(0.0, overview.highest - lowest)  # cells are means: single pixels lie lower
+    heights = lowest, overview.highest
+    with References(surface, elevation, overview, heights, [frames[k] for k in chosen], footprints) as references:
+        yield references
 
 
 class References(contextlib.AbstractContextManager):
@@ -114,35 +154,42 @@ class References(contextlib.AbstractContextManager):
 
     def look(self, k: int, box: Box) -> Look | None:
         """Image ``k`` on a window, None where it shows nothing that counts."""
-        inner = self.footprints[k].within(box)
-        found = self._look(k, inner) if inner else None
-        return found if inner == box or not found or not inner else found.padded(inner, box)
+        seen = self.see(k, box)
+        if seen is None:
+            return None
+        (row, col, height, width), planes = seen.box, seen.planes
+        cosine = np.cos(np.radians(planes["incidence_deg"]))
+        position = self.frames[k].sun_position()
+        _, elevation = _sun_at(position).over(self.surface.grid, row + (height - 1) / 2, col + (width - 1) / 2)
+        look = Look(
+            seen.measured, planes["image"], cosine, seen.usable, planes["shadow"] > SHADOWED,
+            math.sin(max(0.0, elevation)),
+        )  # fmt: skip
+        return look if seen.box == box else look.padded(seen.box, box)
 
-    def _look(self, k: int, box: Box) -> Look | None:
-        row, col, height, width = box
-        pixels = self.source(k).read(row, col, height, width, self._fields[k])
+    def see(self, k: int, box: Box) -> Seen | None:
+        """Image ``k`` beside its rendering on what it shows of a window, None where nothing of that is lit."""
+        inner = self.footprints[k].within(box)
+        if inner is None:
+            return None
+        pixels = self.source(k).read(*inner, self._fields[k])
         if not pixels.valid.any():
             return None
         frame, surface = self.frames[k], self.surface
-        position = frame.sun_position()
-        sun = Sun(position, SUN_RADIUS * AU / float(np.linalg.norm(position)))
+        sun = _sun_at(frame.sun_position())
         camera = frame.camera_position(surface.grid.radius)
         if pixels.ortho is not None:
             camera = pixels.ortho.camera_position
         horizon: Any = SceneHorizon(self.elevation, self.overview, surface.grid, sun)
-        block = shade_block(surface, Light(sun, horizon, camera), row, col, height, width)
-        lit = (block["shadow"] == 0).astype(np.uint8)
+        planes = shade_block(surface, Light(sun, horizon, camera), *inner)
+        lit = (planes["shadow"] == 0).astype(np.uint8)
         side = 2 * SHADOW_MARGIN_PX + 1
         far = cv2.erode(lit, np.ones((side, side), np.uint8), borderValue=1).astype(bool)
-        known = pixels.valid & np.isfinite(pixels.values) & np.isfinite(block["image"])
-        usable = far & known & (block["image"] > 0)
+        known = pixels.valid & np.isfinite(pixels.values) & np.isfinite(planes["image"])
+        usable = far & known & (planes["image"] > 0)
         if not usable.any():
             return None
-        cosine = np.cos(np.radians(block["incidence_deg"]))
-        measured = np.where(known, pixels.values, np.nan).astype(np.float32)
-        _, elevation = sun.over(surface.grid, row + (height - 1) / 2, col + (width - 1) / 2)
-        shadow = block["shadow"] > SHADOWED
-        return Look(measured, block["image"], cosine, usable, shadow, math.sin(max(0.0, elevation)))
+        return Seen(inner, np.where(known, pixels.values, np.nan).astype(np.float32), usable, planes)
 
     def source(self, k: int) -> Source:
         """The open image ``k``."""
