@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -111,6 +111,14 @@ GeoTiff = Annotated[
 NoGeoTiff = Annotated[
     bool, typer.Option("--no-geotiff", help="Write only the HDF5 map; saves a seventh of the time on large maps.")
 ]
+Register = Annotated[
+    str | None,
+    typer.Option(
+        "--register",
+        metavar="FORM",
+        help="Align each image with its rendering: constant, affine or field, as in 'lunargr project'.",
+    ),
+]
 # Of `train` and `compare`
 Epochs = Annotated[int, typer.Option("--epochs", min=1, max=100_000, help="Passes over the training pairs.")]
 Batch = Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Pairs per step, over all processes.")]
@@ -193,3 +201,30 @@ def in_parts(scheduler: str | None, resume: bool, parts: int | None, shard: str 
     if parts is not None and not wanted:
         raise ConfigError("--parts: expected --scheduler or --resume beside it.")
     return wanted
+
+
+def read_list(option: str, text: str | None, counts: Sequence[int] = ()) -> tuple[float, ...] | None:
+    """'3.6,25.8' -> (3.6, 25.8), as many numbers as one of ``counts``, or any; None -> None. Raises ConfigError."""
+    if text is None:
+        return None
+    try:
+        values = tuple(float(v) for v in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) not in (counts or range(1, 1000)) or not all(math.isfinite(v) for v in values):
+        wanted = f"{' or '.join(map(str, counts))} numbers" if counts else "numbers"
+        raise ConfigError(f"{option}: expected {wanted} separated by commas, found '{text}'.")
+    return values
+
+
+def read_parameters(items: Iterable[str] | None) -> dict[str, float]:
+    """['w=0.25,b=0.3'] -> {'w': 0.25, 'b': 0.3}. Raises ConfigError."""
+    names, values = [], []
+    for item in (part for text in items or () for part in text.split(",")):
+        name, _, value = item.partition("=")
+        try:
+            values.append(float(value))
+        except ValueError:
+            raise ConfigError(f"--parameters: expected NAME=VALUE with a number, found '{item}'.") from None
+        names.append(name.strip())
+    return dict(zip(check_once("--parameters", names), values, strict=True))

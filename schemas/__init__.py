@@ -4,7 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from schemas.artefacts import CHECKPOINT, CROPS, DIAGNOSIS, EVALUATION, PAIRS, SCENE, SPLITS, SVBRDF, TRUTH, UNITS
+from schemas.artefacts import (
+    CHECKPOINT,
+    CROPS,
+    DIAGNOSIS,
+    EVALUATION,
+    NORMALIZED,
+    PAIRS,
+    SCENE,
+    SPLITS,
+    SVBRDF,
+    TRUTH,
+    UNITS,
+)
 from schemas.declaration import SCHEMAS, Attribute, Schema, Variable, get_schema
 from schemas.errors import EXIT_CODE, ArtefactError, ConfigError, GeometryError, InputError, LunargrError, RegistryError
 from schemas.later import imported_later
@@ -23,6 +35,7 @@ __all__ = [
     "DIAGNOSIS",
     "EVALUATION",
     "EXIT_CODE",
+    "NORMALIZED",
     "PAIRS",
     "SCENE",
     "SCHEMAS",

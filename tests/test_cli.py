@@ -17,6 +17,7 @@ STAGES = [
     "train",
     "infer",
     "albedo",
+    "normalize",
     "render",
     "evaluate",
     "match",

@@ -133,7 +133,7 @@ def test_functions_are_short_and_take_few_parameters():
 
 
 STAGES_RUN = (
-    "simulate", "ingest", "sample", "project", "train", "infer", "albedo", "render", "view", "export", "evaluate", "match",
+    "simulate", "ingest", "sample", "project", "train", "infer", "albedo", "normalize", "render", "view", "export", "evaluate", "match",
     "diagnose", "compare", "report", "merge", "convert",
 )  # fmt: skip
 

@@ -27,14 +27,7 @@ def command(
         str | None,
         typer.Option("--fold", metavar="K/N", help="Leave out every N-th image, starting with the K-th."),
     ] = None,
-    register: Annotated[
-        str | None,
-        typer.Option(
-            "--register",
-            metavar="FORM",
-            help="Align each image with its rendering: constant, affine or field, as in 'lunargr project'.",
-        ),
-    ] = Config.register,
+    register: options.Register = Config.register,
     calibration: Annotated[
         Path | None,
         typer.Option("--calibration", metavar="JSON", help="Calibration of the images to use, from '-o NAME.json'."),

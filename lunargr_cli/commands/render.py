@@ -17,10 +17,11 @@ from lunargr_cli.options import (
     Resume,
     Seed,
     Shard,
-    check_once,
     complete_model,
     configure,
     parse_shard,
+    read_list,
+    read_parameters,
 )
 from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
@@ -242,12 +243,12 @@ def command(
         "view": view or ("pinhole" if seen_by_camera else Config.view),
         "roll_deg": Config.roll_deg if roll_deg is None else roll_deg,
         "fov_deg": Config.fov_deg if fov_deg is None else fov_deg,
-        "position": _numbers(position, "--position", (3,)),
-        "look_at": _numbers(look_at, "--look-at", (2, 3)),
-        "quaternion": _numbers(quaternion, "--quaternion", (4,)),
+        "position": read_list("--position", position, (3,)),
+        "look_at": read_list("--look-at", look_at, (2, 3)),
+        "quaternion": read_list("--quaternion", quaternion, (4,)),
         "size_px": Config.size_px if size_px is None else _size(size_px),
         "camera": str(camera) if camera else None,
-        "parameters": _parameters(parameters or []),
+        "parameters": read_parameters(parameters),
         "terrain_only": dem is not None,
         "extend": str(extend) if extend else None,
         "shard": parse_shard(shard),
@@ -266,7 +267,7 @@ def command(
             raise ConfigError(
                 "--stereo: expected without a camera's place and attitude, --trajectory, --shard and --resume; it draws its own."
             )
-        low, high = _numbers(convergence, "--convergence", (2,)) or StereoConfig.convergence_deg
+        low, high = read_list("--convergence", convergence, (2,)) or StereoConfig.convergence_deg
         drawn = StereoConfig(stereo, altitude, (low, high), seed=seed)
         manifest = render.run_stereo(path, to, config, drawn, console.say, console.progress)
         console.say(f"{manifest}: {stereo} stereo pairs")
@@ -340,37 +341,9 @@ def _write_json(path: Path, results: list[Summary]) -> None:
     write_json(path, {"views": views})
 
 
-def _numbers(text: str | None, option: str, counts: tuple[int, ...]) -> tuple[float, ...] | None:
-    """'3.6,25.8' -> (3.6, 25.8), as many numbers as one of ``counts``; None -> None. Raises ConfigError."""
-    if text is None:
-        return None
-    try:
-        values = tuple(float(v) for v in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) not in counts or not all(math.isfinite(v) for v in values):
-        raise ConfigError(
-            f"{option}: expected {' or '.join(map(str, counts))} numbers separated by commas, found '{text}'."
-        )
-    return values
-
-
 def _size(text: str) -> tuple[int, int]:
     """'640,480' or '640x480' -> (640, 480). Raises ConfigError."""
     width, _, height = text.replace("x", ",").partition(",")
     if not all(edge.strip().isdecimal() and len(edge.strip()) <= 10 and int(edge) > 0 for edge in (width, height)):
         raise ConfigError(f"--size: expected W,H in pixels, found '{text}'.")
     return int(width), int(height)
-
-
-def _parameters(items: list[str]) -> dict[str, float]:
-    """['w=0.25,b=0.3'] -> {'w': 0.25, 'b': 0.3}. Raises ConfigError."""
-    names, values = [], []
-    for item in (part for text in items for part in text.split(",")):
-        name, _, value = item.partition("=")
-        try:
-            values.append(float(value))
-        except ValueError:
-            raise ConfigError(f"--parameters: expected NAME=VALUE with a number, found '{item}'.") from None
-        names.append(name.strip())
-    return dict(zip(check_once("--parameters", names), values, strict=True))

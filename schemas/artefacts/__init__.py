@@ -9,7 +9,20 @@ from schemas.artefacts.scene import CROPS, SCENE
 from schemas.artefacts.pairs import PAIRS
 from schemas.artefacts.checkpoint import CHECKPOINT
 from schemas.artefacts.svbrdf import SVBRDF
+from schemas.artefacts.normalized import NORMALIZED
 from schemas.artefacts.results import DIAGNOSIS, EVALUATION
 from schemas.artefacts.truth import TRUTH
 
-__all__ = ["CHECKPOINT", "CROPS", "DIAGNOSIS", "EVALUATION", "PAIRS", "SCENE", "SPLITS", "SVBRDF", "TRUTH", "UNITS"]
+__all__ = [
+    "CHECKPOINT",
+    "CROPS",
+    "DIAGNOSIS",
+    "EVALUATION",
+    "NORMALIZED",
+    "PAIRS",
+    "SCENE",
+    "SPLITS",
+    "SVBRDF",
+    "TRUTH",
+    "UNITS",
+]

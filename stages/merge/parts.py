@@ -18,7 +18,7 @@ from stages.physics.images.table import relative_path
 # The dimension along which the shards of a stage are laid end to end; maps are joined by rows instead, and so are scenes
 # without images, which are shards of a DEM.
 RECORD = {"scene": "frame", "crops": "pair", "pairs": "pair"}
-MAPS = ("svbrdf",)
+MAPS = ("svbrdf", "normalized")
 ROWS = "shard_rows"  # root attribute: first and last row that a part of a map holds
 STANDARD = {
     "Conventions", "title", "lunargr_schema", "schema_version", "lunargr_version", "history", "config", "inputs", "seed",

@@ -28,6 +28,7 @@ from stages.physics.maps.grid import Grid
 
 TAGS = ("model", "quantity", "gsd_m", "body_radius_m")
 ALBEDO_BANDS = ("albedo", "albedo_std")
+MOSAIC_BANDS = ("mosaic", "mosaic_std", "mosaic_scatter", "mosaic_images")
 BLOCK, STRIP, COLUMNS = 256, 512, 4096  # px
 
 
@@ -108,22 +109,35 @@ def _as_full_disk() -> Iterator[None]:
 
 
 def write_geotiff(path: Path, file: h5py.File, grid: Grid) -> None:
-    """The map that an open artefact holds, as a cloud-optimised GeoTIFF; with standard deviations and albedo as further bands."""
+    """The map that an open artefact holds, as a cloud-optimised GeoTIFF: coefficients of an svbrdf.h5, or mosaics."""
+    names, fields, tags = (_mosaics if "mosaic" in file else _coefficients)(file)
+    with MapTiff(path, grid, names, tags, ["1"] * len(names)) as tiff:
+        tiff.put_all(*fields)
+
+
+def _coefficients(file: h5py.File) -> tuple[list[str], list[h5py.Dataset], dict[str, str]]:
+    """Bands, variables and tags of an svbrdf.h5; standard deviations and albedo are further bands."""
     fields = [file[name] for name in ("coefficients", "coefficients_std") if name in file]
     maps = read_strings(file, "map_name") if len(fields) > 1 else []
     further = [name for name in ALBEDO_BANDS if name in file]
     names = [*band_names(read_strings(file, "coefficient_name"), maps), *further]
-    with MapTiff(path, grid, names, map_tags(names, file.attrs), ["1"] * len(names)) as tiff:
-        tiff.put_all(*fields, *(file[name] for name in further))
+    return names, [*fields, *(file[name] for name in further)], map_tags(names, file.attrs)
+
+
+def _mosaics(file: h5py.File) -> tuple[list[str], list[h5py.Dataset], dict[str, str]]:
+    """Bands, variables and tags of a normalized.h5: its mosaics, layer by layer."""
+    layers = [f"_{name}" if name else "" for name in read_strings(file, "layer_name")]
+    names = [f"{name}{layer}" for name in MOSAIC_BANDS for layer in layers]
+    return names, [file[name] for name in MOSAIC_BANDS], _root_tags(file.attrs)
 
 
 def map_tags(names: Sequence[str], root: Mapping[str, Any]) -> dict[str, str]:
     """Tags of a map's GeoTIFF. names : of its bands; root : root attributes of its artefact"""
-    return {
-        **{key: str(root[key]) for key in TAGS},
-        "coefficients": json.dumps([n for n in names if not n.endswith("_std")]),
-        TIFF_TAG: pack_record(root),
-    }
+    return _root_tags(root) | {"coefficients": json.dumps([n for n in names if not n.endswith("_std")])}
+
+
+def _root_tags(root: Mapping[str, Any]) -> dict[str, str]:
+    return {key: str(root[key]) for key in TAGS} | {TIFF_TAG: pack_record(root)}
 
 
 def band_names(coefficients: Sequence[str], maps: Sequence[str]) -> list[str]:

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 from schemas.errors import RegistryError
+from stages.physics.photometry.base import ReflectanceModel, get_model, model_names
 
 
 @dataclass(frozen=True)
@@ -134,3 +135,18 @@ def get_set(name: str) -> ParameterSet:
         return _SETS[name]
     except KeyError:
         raise RegistryError.unknown("parameter set", name, _SETS) from None
+
+
+def find_reflectance(name: str) -> tuple[ReflectanceModel, dict[str, float]]:
+    """A model and its default values by its name, or a published set's by the name of the set.
+
+    Raises RegistryError with the choices.
+    """
+    if name.lower() in _SETS:
+        chosen = _SETS[name.lower()]
+        model = get_model(chosen.model)
+        return model, model.defaults() | chosen.values
+    if name.lower() not in (known.lower() for known in model_names()):
+        raise RegistryError.unknown("reflectance model or parameter set", name, [*model_names(), *_SETS])
+    model = get_model(name)
+    return model, model.defaults()

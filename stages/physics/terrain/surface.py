@@ -23,6 +23,7 @@ from stages.physics.maps.grid import Grid, read_grid, require_crs
 from stages.physics.maps.rasters import check_metres, check_single_band, open_raster, pixel_size_at, read_window
 from stages.physics.photometry import ReflectanceModel, get_model, in_radians
 from stages.physics.photometry.albedo_factor import AlbedoFactor
+from stages.physics.photometry.published import find_reflectance
 
 _HDF5_SUFFIXES = (".h5", ".hdf5", ".nc")
 SHADOWED = 0.5  # of the Sun's disc: from there on a pixel counts as shadow
@@ -231,8 +232,8 @@ def _uniform_surface(
     path: Path, grid: Grid, elevation: Elevation, model: str | None, parameters: Mapping[str, float]
 ) -> Surface:
     """A terrain with one model and one set of parameters everywhere."""
-    reflectance = _named_model(path, model)
-    return Surface(path, grid, elevation, reflectance, None, _uniform(reflectance, parameters))
+    reflectance, values = _named_model(path, model)
+    return Surface(path, grid, elevation, reflectance, None, _uniform(reflectance, values, parameters))
 
 
 def _raw_elevation(dataset: DatasetReader, body: Body) -> Elevation:
@@ -245,22 +246,25 @@ def _raw_elevation(dataset: DatasetReader, body: Body) -> Elevation:
     return Elevation(dataset, body.radius if holds_radii else 0.0)
 
 
-def _named_model(path: Path, model: str | None) -> ReflectanceModel:
-    """The registered model, since a terrain has no reflectance of its own. Raises ConfigError where none is named."""
+def _named_model(path: Path, model: str | None) -> tuple[ReflectanceModel, dict[str, float]]:
+    """A model with its values, since a terrain has no reflectance of its own. Raises ConfigError where none is named."""
     if model is None:
         raise ConfigError(
             f"{path}: holds a terrain and no reflectance; name one with `dem` {path} `model` NAME ('lunargr models' lists them), "
             "or render the svbrdf.h5 of 'lunargr infer'."
         )
-    return get_model(model)
+    return find_reflectance(model)
 
 
-def _uniform(model: ReflectanceModel, parameters: Mapping[str, float]) -> NDArray[np.float32]:
-    """(C,) in the model's order; missing ones take their defaults. Raises RegistryError or ConfigError.
+def _uniform(
+    model: ReflectanceModel, values: Mapping[str, float], parameters: Mapping[str, float]
+) -> NDArray[np.float32]:
+    """(C,) in the model's order. Raises RegistryError or ConfigError.
 
+    values : of all parameters, for those that ``parameters`` lacks
     parameters : name -> value; angles in radians, or in degrees under their name with ``_deg``
     """
-    found = model.defaults() | in_radians(model, parameters)
+    found = dict(values) | in_radians(model, parameters)
     for p in model.parameters:
         if not p.lower <= found[p.name] <= p.upper:
             raise ConfigError(

@@ -1,0 +1,168 @@
+"""normalize: the images of a scene at a standard geometry with the terrain's angles, and mosaics of them: normalized.h5.
+
+Blocks of the map are worked one after the other, each with all its images; what lies around a block and is read with it is
+as wide as weights fade, so that blocks leave no edges.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas import NORMALIZED, SCENE, SVBRDF, ArtefactWriter, ConfigError, InputError, open_artefact
+from schemas.files.companions import companions_of
+from schemas.files.outputs import Output, atomic_path, check_outputs, map_targets
+from stages.common.arrays import Floats32
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.normalize.config import Config, Summary, check, phase_layers
+from stages.normalize.factor import GOOD, UNSEEN, Normaliser, placed
+from stages.normalize.levels import Levels, find_levels, take_samples
+from stages.normalize.mosaic import FADE_PX, Mosaic, combine, fading_weight
+from stages.normalize.writing import Maps, attributes_of
+from stages.physics.bodies.spheres import find_body
+from stages.physics.images.references import References, open_references
+from stages.physics.images.registered import register
+from stages.physics.images.table import Frame, load_frames
+from stages.physics.images.windows import Blocks, choose_blocks
+from stages.physics.maps.geotiff import write_geotiff
+from stages.physics.maps.grid import check_same_grid
+from stages.physics.maps.window import Box, Window
+from stages.physics.terrain.surface import open_surface
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The images of a scene, how they are normalised, and whether they are in I/F or DN."""
+
+    references: References
+    normaliser: Normaliser
+    units: str
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the map."""
+        grid = self.references.surface.grid
+        return grid.height, grid.width
+
+    @property
+    def blocks(self) -> Blocks:
+        """The blocks of the map."""
+        return choose_blocks(self.shape, self.references.overlapping, FADE_PX)
+
+
+@dataclass(frozen=True)
+class Block:
+    """What a block shows. normal, std, mask : (n, h, w) of the images ``images``; mosaics : one of each layer"""
+
+    images: list[int]
+    normal: Floats32
+    std: Floats32
+    mask: NDArray[np.uint8]
+    mosaics: list[Mosaic]
+
+
+def run(
+    scene: Path,
+    svbrdf: Path | None,
+    output: Output | Path,
+    config: Config,
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
+) -> Summary:
+    """Write the images at the standard geometry and their mosaics. svbrdf : None for the model of ``config``. Raises LunargrError."""
+    output = Output.at(output)
+    inputs = [scene, *([svbrdf] if svbrdf else [])]
+    as_geotiff = config.geotiff and config.shard[1] == 1
+    check(config, svbrdf is not None)
+    check_outputs(map_targets(output, as_geotiff), inputs, output.overwrite)
+    with contextlib.ExitStack() as stack:
+        ground = stack.enter_context(open_ground(scene, svbrdf, config))
+        references = ground.references
+        if config.register:
+            references.take_off(register(references, config.register, progress))
+        samples = take_samples(references, ground.shape, ground.normaliser, progress)
+        if not samples:
+            raise InputError(
+                f"{scene}: expected images with sunlit pixels within the limits of incidence and emission, found none."
+            )
+        levels = find_levels(samples, [0] * len(references.frames), ground.units, config.level)
+        blocks = ground.blocks
+        own = blocks.own_rows(config.shard)
+        writer = stack.enter_context(
+            ArtefactWriter(
+                output.file,
+                NORMALIZED,
+                Maps.sizes(ground.references, len(phase_layers(config.phase_bins_deg))),
+                config=asdict(config),
+                inputs=inputs,
+                attributes=attributes_of(references.surface, config, ground.units),
+                overwrite=output.overwrite,
+            )
+        )
+        maps = Maps(writer, own if config.shard[1] > 1 else None)
+        for box in blocks.within(own, progress):
+            maps.put(box, work_block(ground, levels, box))
+        maps.close(references, levels, phase_layers(config.phase_bins_deg))
+        if as_geotiff:
+            stack.enter_context(companions_of(output.file))
+            partial = stack.enter_context(atomic_path(output.geotiff_path))
+            write_geotiff(partial, writer.file, references.surface.grid)
+        return maps.summarise(references.frames, levels, ground.units)
+
+
+@contextlib.contextmanager
+def open_ground(scene: Path, svbrdf: Path | None, config: Config) -> Iterator[Ground]:
+    """The images of a scene that may enter. Raises LunargrError."""
+    with contextlib.ExitStack() as stack:
+        terrain = stack.enter_context(open_artefact(scene, SCENE))
+        if svbrdf is not None:
+            check_same_grid(svbrdf, stack.enter_context(open_artefact(svbrdf, SVBRDF)), scene, terrain)
+        frames = load_frames(terrain, scene)
+        body = find_body(str(terrain.attrs["body_radius_m"]))
+        surface = stack.enter_context(open_surface(svbrdf or scene, config.model, config.parameters, body))
+        references = stack.enter_context(open_references(scene, terrain, surface, _used(scene, frames, config)))
+        units = {frame.units for frame in references.frames}
+        if len(units) > 1:
+            raise InputError(f"{scene}: expected one kind of units, found both 'iof' and 'dn'; ingest them apart.")
+        yield Ground(references, Normaliser(surface, config), units.pop())
+
+
+def _used(scene: Path, frames: Sequence[Frame], config: Config) -> list[bool]:
+    names = [frame.image_id for frame in frames]
+    for name in config.leave_out:
+        if name not in names:
+            raise ConfigError(f"`leave_out`: expected an image of the scene ({', '.join(names)}), found '{name}'.")
+    return [name not in config.leave_out for name in names]
+
+
+def work_block(ground: Ground, levels: Levels, block: Box) -> Block:
+    """The images of a block at the standard geometry, and their mosaics."""
+    references, normaliser = ground.references, ground.normaliser
+    around = Window(*block).padded(FADE_PX, ground.shape)
+    inner = Window(*block).within(around).part
+    planes: list[NDArray] = []
+    images, masks = list[int](), list[NDArray[np.uint8]]()
+    for k in references.overlapping(around):
+        seen = references.see(k, around)
+        if seen is None:
+            continue
+        mask = normaliser.mask(seen)
+        factor, spread = normaliser.factor(seen, mask == GOOD)
+        normal = (seen.measured - np.float32(levels.offset[k])) / np.float32(levels.gain[k]) * factor
+        own_error = levels.deviation(k, np.cos(np.radians(seen.planes["incidence_deg"])))
+        std = np.abs(normal) * np.hypot(own_error, spread)
+        whole = placed(np.stack([normal, std, seen.planes["phase_deg"]]), seen.box, around)
+        fade = fading_weight(np.isfinite(whole[0]))
+        images.append(k)
+        masks.append(placed(mask, seen.box, around, UNSEEN)[inner])
+        planes.append(np.stack([*whole, fade])[(slice(None), *inner)].astype(np.float32))
+    size = (4, len(images), *block[2:])
+    normal, std, phase, fade = np.stack(planes, axis=1) if images else np.full(size, np.nan, np.float32)
+    layers = phase_layers(normaliser.config.phase_bins_deg)
+    mosaics = [combine(np.where((phase >= low) & (phase < high), normal, np.nan), std, fade) for low, high in layers]
+    return Block(images, normal, std, np.stack(masks) if masks else np.zeros(size[1:], np.uint8), mosaics)
