@@ -16,16 +16,21 @@ ROOT = Path(__file__).resolve().parent.parent
 SHARED = Path(os.environ.get("LUNARGR_SHARED", ROOT.parent / "shared"))
 
 
-# Two workers take one file after the other: with the longest ones first, none of them waits for the other at the end.
-LONGEST = (
+# Two workers take one file after the other: the longest ones first, or one of them waits at the end. The second begins with
+# files that compile nothing: two workers that compile the same loops at the same time would do so twice.
+FIRST = (
     "test_fanout",
+    "test_evaluate",
+    "test_evaluate_command",
     "test_albedo",
-    "test_interruptions",
-    "test_diagnose_shadows",
-    "test_diagnose",
     "test_provenance",
-    "test_train",
     "test_diagnose_leaks",
+    "test_train",
+    "test_interruptions",
+    "test_infer",
+    "test_diagnose_shadows",
+    "test_malformed",
+    "test_simulate_scene",
     "test_view_browser",
 )
 
@@ -35,7 +40,7 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if "shared" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.shared)
-    places = {name: place for place, name in enumerate(LONGEST)}
+    places = {name: place for place, name in enumerate(FIRST)}
     items.sort(key=lambda item: places.get(item.path.stem, len(places)))
 
 

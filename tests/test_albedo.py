@@ -81,14 +81,12 @@ def test_where_no_photograph_looks_the_map_stays_and_the_error_bar_says_so(plant
     assert std[images == len(SUNS)].mean() < 0.3 * std[far].mean()
 
 
-def test_a_shadow_or_a_cosmic_ray_in_one_image_leaves_no_mark(rng, tmp_path):
-    truth = np.exp(texture(rng))
-    images = photographs(rng, truth)
-    clean, _, _ = made(plant(tmp_path / "clean", truth, images))
-    images[2][100:130, 90:130] *= 0.1
-    images[4][rng.integers(0, SIZE, 60), rng.integers(0, SIZE, 60)] = 1.0
-    marked, _, _ = made(plant(tmp_path / "marked", truth, images))
-    assert rms(np.log(marked / clean)[100:130, 90:130]) < 0.02
+def test_a_shadow_or_a_cosmic_ray_in_one_image_leaves_no_mark(planted, found, rng, tmp_path):
+    clean, truth, images = found[0], planted.albedo, [image.copy() for image in planted.images]
+    images[2][100:130, 110:150] *= 0.1
+    images[4][rng.integers(0, SIZE, 60), rng.integers(110, SIZE, 60)] = 1.0
+    marked, _, _ = made(plant(tmp_path, truth, images))
+    assert rms(np.log(marked / clean)[100:130, 110:150]) < 0.02
     assert rms(np.log(marked / truth)) < 1.5 * rms(np.log(clean / truth)) + 0.002
     assert np.nanmax(np.abs(np.log(marked / clean))) < 0.1
 
@@ -160,10 +158,16 @@ def deviated(planted, tmp_path_factory):
     return path
 
 
-def test_where_no_photograph_looks_the_error_bar_is_the_networks(planted, deviated, tmp_path):
-    out = tmp_path / "albedo.h5"
+@pytest.fixture(scope="module")
+def corrected(planted, deviated, tmp_path_factory):
+    """Albedo of the map with deviations."""
+    out = tmp_path_factory.mktemp("corrected") / "albedo.h5"
     albedo.run(deviated, planted.scene, out, QUIET)
-    factor, std, images, kept = read(out, "albedo", "albedo_std", "albedo_images", "coefficients_std")
+    return out
+
+
+def test_where_no_photograph_looks_the_error_bar_is_the_networks(deviated, corrected):
+    factor, std, images, kept = read(corrected, "albedo", "albedo_std", "albedo_images", "coefficients_std")
     np.testing.assert_array_equal(kept, read(deviated, "coefficients_std")[0])
     far = np.s_[-16:, :16]
     assert (images[far] == 0).all()
@@ -172,12 +176,11 @@ def test_where_no_photograph_looks_the_error_bar_is_the_networks(planted, deviat
     assert std[seen].mean() < 0.03  # photographs know better than the network
 
 
-def test_renderings_take_their_error_bar_from_the_albedo_alone(planted, found, deviated, tmp_path):
+@pytest.mark.usefixtures("found")
+def test_renderings_take_their_error_bar_from_the_albedo_alone(planted, deviated, corrected):
     """The network's deviations, which the photographs have corrected, are not counted once more."""
-    out = tmp_path / "albedo.h5"
-    albedo.run(deviated, planted.scene, out, QUIET)
-    before, after = (rendering(path) for path in (deviated, out))
-    seen = read(out, "albedo_images")[0][20:120, 90:170] == len(SUNS)
+    before, after = (rendering(path) for path in (deviated, corrected))
+    seen = read(corrected, "albedo_images")[0][20:120, 90:170] == len(SUNS)
     assert seen.any()
     relative = (after["image_std"] / after["image"])[seen]
     assert (relative > 0).all() and np.median(relative) < 0.05
@@ -243,7 +246,7 @@ def interrupt(*arguments, **options):
 
 
 def test_blocks_leave_no_seams(planted, found, monkeypatch):
-    monkeypatch.setattr("stages.physics.images.windows.BLOCK_PX", 64)
+    monkeypatch.setattr("stages.physics.images.windows.BLOCK_PX", 128)
     blocks = made(planted, name="blocks.h5")[0]
     assert np.nanmax(np.abs(np.log(blocks / found[0]))) < 0.1 * np.nanmedian(found[1])
 
@@ -253,9 +256,8 @@ def test_rendering_multiplies_by_the_albedo(planted, found):
     np.testing.assert_allclose(images[1], images[0] * found[0][20:120, 90:170], rtol=1e-5)
 
 
+@pytest.mark.usefixtures("found")
 def test_held_out_images_are_never_those_that_made_the_albedo(planted, tmp_path):
-    import json
-
     from stages import project, sample
 
     crops, pairs = tmp_path / "crops.h5", tmp_path / "pairs.h5"
@@ -279,7 +281,6 @@ def test_held_out_images_are_never_those_that_made_the_albedo(planted, tmp_path)
     assert {row["image_id"] for row in scored} == {f"IMG{k}" for k in (0, 2, 4)}
     assert read(folds[0], "albedo_image_id")[0].astype(str).tolist() == used
     everything = planted.folder / "albedo.h5"
-    albedo.run(planted.map, planted.scene, Output(everything, overwrite=True), QUIET)
     code, said = run_command("evaluate", pairs, everything, "--held-out-images", "-o", tmp_path / "no.h5")
     assert code == 3 and "--fold" in said and not (tmp_path / "no.h5").exists()
 
@@ -364,14 +365,15 @@ def test_what_registration_finds_is_taken_off_by_all_shards(rng, tmp_path, monke
     monkeypatch.setattr(running, "register", lambda references, form, progress: [aside] * len(references.frames))
     config = replace(QUIET, register="constant")
     inner = np.s_[8:-8, 8:-8]
-    moved, stayed = (np.log(made(scene, c)[0] / truth)[inner] for c in (config, QUIET))
-    assert rms(moved - moved.mean()) < 0.25 * rms(stayed - stayed.mean())
+    whole = made(scene, config)[0]
+    away = np.log(whole / truth)[inner]
+    # three pixels aside, an image differs from the ground by more than the ground's own contrast
+    assert rms(away - away.mean()) < 0.25 * np.log(truth).std()
     path, again, part = (tmp_path / name for name in ("calibration.json", "again.json", "part.h5"))
     albedo.calibrate_to(Output(path), scene.map, scene.scene, config)
     made_from = json.loads(path.read_text())["made_from"]
     Calibration.read(path, made_from).write(again, made_from)
     assert again.read_bytes() == path.read_bytes()
-    whole = made(scene, config)[0]
     monkeypatch.setattr(running, "_calibrate", None)  # shards have no need of it
     albedo.run_calibrated(scene.map, scene.scene, path, part, config)
     np.testing.assert_array_equal(read(part, "albedo")[0], whole)

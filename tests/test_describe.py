@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 import small_scene
-from cluster_scene import lunargr
+from command import outcome as lunargr
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 

@@ -56,6 +56,7 @@ def test_clipping_shows_after_bicubic_resampling():
     assert saturation.read_off(laid(images)) is None
 
 
+@pytest.mark.slow
 def test_clipping_of_noisy_images_shows_after_resampling(tmp_path):
     """Another laboratory's images: noise that was cut off rings, and of the pile seven per cent lie more than a per cent above the level."""
     path, seed = tmp_path / "pairs.h5", 1752317183

@@ -12,7 +12,8 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from test_diagnose import _pairs, scene  # noqa: F401
+from hidden.scene import Layout, Scene
+from test_diagnose import _pairs
 
 from schemas.files.outputs import Output
 from stages import diagnose
@@ -25,15 +26,15 @@ from stages.diagnose.result import score
 from stages.diagnose.result.score import unconfirmed
 from stages.diagnose.search.refine import _left, errors_over_images
 from stages.diagnose.search.state import Cause
-from stages.effects import get_effect
+from stages.effects import get_effect, load_extension
 
 TEST = 2
 
 
 @pytest.fixture(scope="module")
-def planted(scene, tmp_path_factory):  # noqa: F811
+def planted(tmp_path_factory):
     """Pairs with a wrong Sun, in a folder of their own."""
-    return _pairs(scene, tmp_path_factory.mktemp("leaks"), {"sun_azimuth": {"error_deg": 4.0}})
+    return _pairs(Scene(Layout(images=8)), tmp_path_factory.mktemp("leaks"), {"sun_azimuth": {"error_deg": 4.0}})
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,8 @@ def answer(planted):
 
 def _diagnosed(pairs):
     said = pairs.with_suffix(".json")
-    result = diagnose.run(pairs, None, Output(pairs.with_name(f"{pairs.stem}_d.h5"), json=said))
+    output = Output(pairs.with_name(f"{pairs.stem}_d.h5"), json=said)
+    result = diagnose.run(pairs, None, output, diagnose.Config(most_causes=1))
     return json.loads(said.read_text()), result.state
 
 
@@ -69,6 +71,18 @@ def test_a_planted_sun_is_named_with_its_size(answer):
     assert first["effect"] == "sun_azimuth" and "sun_azimuth" in first["group"]
     found = first["parameters"]["error_deg"]
     assert found["value"] == pytest.approx(4.0, rel=0.1) and found["unit"] == "degree"
+
+
+def test_an_answer_is_written_whole_and_its_budget_adds_up(answer, planted):
+    said = answer[0]
+    assert {"verdict", "causes", "unexplained_fraction", "blind", "held_out", "data", "config"} <= set(said)
+    assert said["held_out"]["gain_percent"] > 0  # one place is kept away: no interval
+    keys = {"effect", "parameters", "p_family_wise", "gain_nats", "gain_error", "group", "to_separate"}
+    assert all(keys <= set(cause) and cause["held_out_low"] > 0 for cause in said["causes"])
+    assert sum(said["budget"].values()) == pytest.approx(1.0) and min(said["budget"].values()) >= 0
+    assert said["causes"][0]["residual_rms_after"] < said["causes"][0]["residual_rms_before"]
+    extension = load_extension(planted.with_name(f"{planted.stem}_d.h5"))
+    assert [effect.name for effect in extension] == [cause["effect"] for cause in said["causes"]]
 
 
 @pytest.mark.slow

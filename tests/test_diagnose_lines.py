@@ -28,9 +28,12 @@ def registered(tmp_path_factory):
     dem_smooth : px, sigma of the Gaussian that the given DEM was smoothed with
     """
 
+    folder = tmp_path_factory.mktemp("lines")
+
     def register(shift, dem_smooth=0.0):
-        pairs = tmp_path_factory.mktemp("lines") / "pairs.h5"
-        semi_real(pairs, 4713, images=4, size=SIZE, truth={"dem_smooth_px": dem_smooth})
+        pairs = folder / f"{dem_smooth}.h5"
+        if not pairs.exists():
+            semi_real(pairs, 4713, images=4, size=SIZE, truth={"dem_smooth_px": dem_smooth})
         with PairReader(pairs) as reader:
             sites = [load_site(reader, np.flatnonzero(reader.site == k)) for k in np.unique(reader.site)[:4]]
             frames = len(reader.image_ids)
@@ -64,6 +67,7 @@ def test_lines_that_tremble_differently_in_every_crop_are_found_with_their_size(
     assert float(common.square().sum(1).mean().sqrt()) < 0.7 * RMS
 
 
+@pytest.mark.slow
 def test_jitter_that_all_crops_of_a_frame_share_becomes_values_of_the_frame(registered):
     rows = 2 * RMS * np.cos(math.pi * (np.arange(SIZE) + 0.5) / SIZE)[:, None]
     side = itertools.cycle([1, -1])  # of the four frames of a place in turn: cameras do not shake alike twice
@@ -73,7 +77,9 @@ def test_jitter_that_all_crops_of_a_frame_share_becomes_values_of_the_frame(regi
     assert common[:, 0].abs().numpy() == pytest.approx(np.full(frames, math.sqrt(2) * RMS), rel=0.2)
 
 
-@pytest.mark.parametrize("name", ["nothing", "columns", "a bend of the whole crop"])
+@pytest.mark.parametrize(
+    "name", ["nothing", *(pytest.param(n, marks=pytest.mark.slow) for n in ("columns", "a bend of the whole crop"))]
+)
 def test_what_is_not_alike_along_a_line_is_no_trembling(registered, name):
     shifts = {
         "nothing": lambda rng, rows, columns: 0 * rows,
@@ -84,6 +90,7 @@ def test_what_is_not_alike_along_a_line_is_no_trembling(registered, name):
     assert not found.lines_tremble
 
 
+@pytest.mark.slow
 def test_relief_that_a_smooth_dem_lacks_is_no_jitter(registered):
     # the DEM's errors displace what is seen by 0.2 to 0.3 px in either half of a line, each half by an amount of its own
     found, _, _ = registered(lambda rng, rows, columns: 0 * rows, dem_smooth=2.0)

@@ -24,8 +24,10 @@ IMAGES = 4
 def registered(tmp_path_factory):
     """Registration of six places, each shown by images of its own, which lie anywhere by so many px rms; and where they do."""
 
+    pairs = semi_real(tmp_path_factory.mktemp("once") / "pairs.h5", 4714, 6, IMAGES)
+
     def register(rms, once=True):
-        with PairReader(semi_real(tmp_path_factory.mktemp("once") / "pairs.h5", 4714, 6, IMAGES)) as reader:
+        with PairReader(pairs) as reader:
             sites = [load_site(reader, np.flatnonzero(reader.site == k)) for k in np.unique(reader.site)[:6]]
         rng = np.random.default_rng(2)
         planted = rng.normal(0, rms / 2**0.5, (6 * IMAGES, 2))
@@ -61,6 +63,7 @@ def test_shifts_that_all_images_have_are_left_to_what_explains_them(registered):
     assert ORDINARY > 0.15
 
 
+@pytest.mark.slow
 def test_images_that_show_several_places_are_judged_on_other_places(registered):
     found, planted = registered(0.8, once=False)
     assert len(found.squares["none"]) == 6

@@ -8,13 +8,15 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import rasterio
-from cluster_scene import assert_same, environment, finish, lunargr, stages, start, write_inputs
+from cluster_scene import assert_same, environment, finish, lunargr, stages, start
+from command import outcome
 from small_scene import write_scene
 
 from lunargr_cli.fanout.job import Identity, Work, open_job
@@ -27,8 +29,9 @@ from stages import infer, ingest, merge, project, sample
 
 
 @pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
-    return write_inputs(tmp_path_factory.mktemp("inputs"))
+def inputs(small_files, small_artefacts, small_checkpoint):
+    """What the stages are run on: files, scene, crops, pairs, checkpoint."""
+    return small_artefacts | {"dem": small_files.dem, "images": small_files.images, "checkpoint": small_checkpoint}
 
 
 MADE_FIRST = {"ingest": "scene", "sample": "crops", "project": "pairs"}  # with the options that the commands are given
@@ -106,10 +109,8 @@ def with_parts(name, inputs):
     return [*stages(inputs)[name], *(["--parts", PARTS[name]] if name in PARTS else [])]
 
 
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("ingest", "sample", "infer", "evaluate")]
-
-
-@pytest.mark.parametrize("name", ["project", *SLOW])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ingest", "sample", "project", "infer", "evaluate"])
 def test_a_worker_dies_and_nothing_is_lost(name, inputs, in_one_process, cluster, tmp_path):
     whole = in_one_process(name)
     cluster.fill()
@@ -135,6 +136,7 @@ def test_workers_of_this_machine(inputs, in_one_process, tmp_path):
     assert_same(in_one_process("project"), output)
 
 
+@pytest.mark.slow
 def test_a_worker_s_error_is_one_line(inputs, cluster, tmp_path):
     """The error that one process would give, and no part that looks whole."""
     cluster.fill()
@@ -204,7 +206,7 @@ def test_an_interrupted_run_goes_on_with_what_is_missing(inputs, in_one_process,
     assert code == {signal.SIGINT: 130, signal.SIGKILL: -9, signal.SIGTERM: 143}[how]
     assert "Traceback" not in said
     assert not output.exists()
-    code, said = lunargr(*command)
+    code, said = outcome(*command)
     assert code == 0 and "of 6 parts are there already" in said, said
     assert_same(in_one_process("project"), output)
     assert [p.name for p in tmp_path.iterdir()] == ["pairs.h5"]
@@ -295,24 +297,44 @@ def test_a_plain_run_after_a_kill_starts_anew_and_ends_the_same(inputs, in_one_p
 # --- by hand: shards and merge --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("virtual", [False, True])
-def test_a_scene_by_hand_is_a_dem_in_rows_and_then_its_images(small_files, tmp_path, virtual):
-    config = {"gsd": 20, "crop": 32, "block": 100}
-    ingest.run(small_files.dem, small_files.images, tmp_path / "whole.h5", ingest.Config(**config))
-    rows = [tmp_path / f"rows{k}.h5" for k in range(3)]
+@dataclass
+class ByHand:
+    """A scene in one piece, and its parts: rows of the DEM, the grid that they make, and shares of the images."""
+
+    whole: Path
+    rows: list[Path]
+    grid: Path
+    images: list[Path]
+
+
+@pytest.fixture(scope="module")
+def by_hand(small_files, tmp_path_factory):
+    folder, config = tmp_path_factory.mktemp("by_hand"), ingest.Config(gsd=20, crop=32, block=64)
+    rows, images = [folder / f"{k}" / "rows.h5" for k in range(3)], [folder / f"images{k}.h5" for k in range(2)]
+    made = ByHand(folder / "whole.h5", rows, folder / "grid.h5", images)
+    ingest.run(small_files.dem, small_files.images, made.whole, config)
     for k, part in enumerate(rows):
-        ingest.run(small_files.dem, None, part, ingest.Config(**config, shard=(k, 3)))
-    merge.run(rows, tmp_path / "grid.h5", merge.Config(virtual))
-    images = [tmp_path / f"images{k}.h5" for k in range(2)]
+        ingest.run(small_files.dem, None, part, replace(config, shard=(k, 3)))
+    merge.run(rows, made.grid, merge.Config(virtual=True))
     for k, part in enumerate(images):
-        ingest.run(tmp_path / "grid.h5", small_files.images, part, ingest.Config(crop=32, block=100, shard=(k, 2)))
-        assert part.stat().st_size < 0.7 * (tmp_path / "whole.h5").stat().st_size  # no elevations of its own
-    merge.run(images, tmp_path / "scene.h5", merge.Config(virtual))
-    assert_same(tmp_path / "whole.h5", tmp_path / "scene.h5")
-    found, whole = ingest.summarise(tmp_path / "scene.h5"), ingest.summarise(tmp_path / "whole.h5")
+        ingest.run(made.grid, small_files.images, part, ingest.Config(crop=32, block=64, shard=(k, 2)))
+    return made
+
+
+@pytest.mark.parametrize("virtual", [False, True])
+def test_a_scene_by_hand_is_a_dem_in_rows_and_then_its_images(by_hand, virtual):
+    for part in by_hand.images:
+        assert part.stat().st_size < 0.7 * by_hand.whole.stat().st_size  # no elevations of its own
+    scene = by_hand.whole.with_name(f"scene_{virtual}.h5")  # a virtual file lies beside its parts
+    merge.run(by_hand.images, scene, merge.Config(virtual))
+    assert_same(by_hand.whole, scene)
+    found, whole = ingest.summarise(scene), ingest.summarise(by_hand.whole)
     assert (found.elevation_range, found.dem_valid_share) == (whole.elevation_range, whole.dem_valid_share)
+
+
+def test_images_cannot_be_shared_out_before_the_dem(small_files, tmp_path):
     with pytest.raises(ConfigError, match="the DEM comes first"):
-        ingest.run(small_files.dem, small_files.images, tmp_path / "x.h5", ingest.Config(**config, shard=(0, 2)))
+        ingest.run(small_files.dem, small_files.images, tmp_path / "x.h5", ingest.Config(gsd=20, shard=(0, 2)))
 
 
 def _blank(dem, *where):
@@ -363,15 +385,9 @@ def test_more_parts_than_pairs(tmp_path):
         assert len(file["image"]) == 1 and file["image"].attrs["units"] == "dn"
 
 
-def test_a_scene_names_its_dem_from_wherever_it_lies(small_files, tmp_path):
+def test_a_scene_names_its_dem_from_wherever_it_lies(by_hand, small_files):
     """Its shards may lie in folders of their own, and the whole in another."""
-    config = ingest.Config(gsd=20, crop=32, block=100)
-    parts = [tmp_path / f"{k}" / "rows.h5" for k in range(2)]
-    for k, part in enumerate(parts):
-        ingest.run(small_files.dem, None, part, replace(config, shard=(k, 2)))
-    merge.run(parts, tmp_path / "grid.h5")
-    ingest.run(tmp_path / "grid.h5", small_files.images, tmp_path / "more" / "scene.h5", replace(config, gsd=None))
-    for scene in (*parts, tmp_path / "grid.h5", tmp_path / "more" / "scene.h5"):
+    for scene in (*by_hand.rows, by_hand.grid, *by_hand.images):
         assert Inputs([scene]).find(small_files.dem) is not None, scene
 
 
@@ -380,7 +396,7 @@ def test_a_view_says_so_when_a_part_is_gone(small_artefacts, tmp_path):
     parts = [tmp_path / "parts" / f"{k}.h5" for k in range(3)]
     for k, part in enumerate(parts):
         project.run(small_artefacts["crops"], part, project.Config(shard=(k, 3)))
-    code, said = lunargr("merge", *parts, "--virtual", "-o", tmp_path / "pairs.h5")
+    code, said = outcome("merge", *parts, "--virtual", "-o", tmp_path / "pairs.h5")
     assert code == 0, said
     assert_same(small_artefacts["pairs"], tmp_path / "pairs.h5")
     with h5py.File(tmp_path / "pairs.h5") as file:
@@ -406,16 +422,10 @@ def test_a_view_of_a_map_leaves_the_geotiff_to_a_copy(hilly_map, tmp_path):
     assert (tmp_path / "copy.tif").exists()
 
 
-def test_merging_keeps_masks_sparse(small_files, tmp_path):
-    """A merged scene is no larger than one that was made in one piece: chunks that nobody wrote stay unwritten."""
-    config = {"gsd": 20, "crop": 32, "block": 64}
-    ingest.run(small_files.dem, small_files.images, tmp_path / "whole.h5", ingest.Config(**config))
-    ingest.run(small_files.dem, None, tmp_path / "grid.h5", ingest.Config(**config))
-    parts = [tmp_path / f"{k}.h5" for k in range(3)]
-    for k, part in enumerate(parts):
-        ingest.run(tmp_path / "grid.h5", small_files.images, part, ingest.Config(crop=32, block=64, shard=(k, 3)))
-    merge.run(parts, tmp_path / "scene.h5")
-    with open_artefact(tmp_path / "scene.h5", SCENE) as a, open_artefact(tmp_path / "whole.h5", SCENE) as b:
+def test_merging_keeps_masks_sparse(by_hand, tmp_path):
+    """A merged scene is no larger than one that was made in one piece: chunks without a value stay unwritten."""
+    merge.run(by_hand.images, tmp_path / "scene.h5")
+    with open_artefact(tmp_path / "scene.h5", SCENE) as a, open_artefact(by_hand.whole, SCENE) as b:
         for name in ("valid", "valid_position"):
             assert a[name].id.get_num_chunks() == b[name].id.get_num_chunks()
 
@@ -423,5 +433,5 @@ def test_merging_keeps_masks_sparse(small_files, tmp_path):
 def test_shards_and_parts_do_not_mix(inputs, tmp_path):
     with pytest.raises(ConfigError, match="one part by hand"):
         in_parts(None, True, None, "1/2")
-    code, said = lunargr("project", inputs["crops"], "--parts", "3", "-o", tmp_path / "x.h5")
+    code, said = outcome("project", inputs["crops"], "--parts", "3", "-o", tmp_path / "x.h5")
     assert code == 3 and len(said.splitlines()) == 1 and "--parts" in said

@@ -6,15 +6,17 @@ import contextlib
 import gc
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import command
 import h5py
 import numpy as np
 import pytest
-from cluster_scene import assert_same, environment, finish, lunargr, start
+from cluster_scene import assert_same, environment, finish, start
 from rasterio.crs import CRS
 from rasterio.transform import Affine
 
@@ -56,16 +58,9 @@ def test_ctrl_c_is_one_line_wherever_it_falls(program):
     assert (done.returncode, done.stderr) == (130, LINE)
 
 
-@pytest.mark.parametrize(
-    "program",
-    [
-        "import lunargr_cli; os.kill(os.getpid(), signal.SIGTERM)",
-        "from lunargr_cli import main; main.app = lambda: os.kill(os.getpid(), signal.SIGTERM); main.main()",
-    ],
-)
-def test_a_terminated_command_says_so(program):
+def test_a_terminated_command_says_so():
     """As by ``kill``, or at the end of a Slurm job's time."""
-    done = python(program)
+    done = python("from lunargr_cli import main; main.app = lambda: os.kill(os.getpid(), signal.SIGTERM); main.main()")
     assert (done.returncode, done.stderr) == (143, LINE)
 
 
@@ -178,9 +173,9 @@ def test_a_disk_that_fills_under_a_geotiff_leaves_nothing(tmp_path, rng, size):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "share", [0.0, 0.5, 0.999]
-)  # the lock, the middle, and what HDF5 writes when it closes the file
+@pytest.mark.parametrize(  # the lock, the middle, and the end that HDF5 writes when it closes the file
+    "share", [*(pytest.param(share, marks=pytest.mark.slow) for share in (0.0, 0.5)), 0.999]
+)
 def test_a_disk_that_fills_at_any_moment_is_one_line_and_leaves_nothing(small_artefacts, tmp_path, share):
     size = int(small_artefacts["crops"].stat().st_size * share)
     words = ["sample", small_artefacts["scene"], "--count", 90, "--tile-m", 1280, "--seed", 3, "--quiet"]
@@ -193,24 +188,17 @@ def test_a_disk_that_fills_at_any_moment_is_one_line_and_leaves_nothing(small_ar
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture(scope="module")
-def _compiled(tmp_path_factory):
-    """Loops of ``simulate`` in numba's cache, which would not fit on the full disk either."""
-    folder = tmp_path_factory.mktemp("compiled") / "scene"
-    code, said = finish(start(["simulate", "--size-px", 64, "--images", 2, "--quiet", "-o", folder]))
-    assert code == 0, said
-
-
-@pytest.mark.usefixtures("_compiled")
-@pytest.mark.parametrize("before", [False, True])
-def test_a_disk_that_fills_under_a_simulated_scene_leaves_nothing_and_replaces_nothing(tmp_path, before):
+def test_a_disk_that_fills_under_a_simulated_scene_leaves_nothing_and_replaces_nothing(tmp_path):
     """truth.h5 is written after DEM and images: without it they are of no use."""
+    # fills numba's cache: compiled loops would not fit on the full disk either
+    done = command.lunargr("simulate", "--size-px", 64, "--images", 2, "--quiet", "-o", tmp_path / "compiled")
+    assert done.returncode == 0, done.stderr
+    shutil.rmtree(tmp_path / "compiled")
     folder, earlier = tmp_path / "scene", {}
-    if before:
-        (folder / "images").mkdir(parents=True)
-        for name in ("dem.tif", "truth.h5", "images/S0001O.tif"):
-            earlier[folder / name] = name
-            (folder / name).write_text(name)
+    (folder / "images").mkdir(parents=True)
+    for name in ("dem.tif", "truth.h5", "images/S0001O.tif"):
+        earlier[folder / name] = name
+        (folder / name).write_text(name)
     process = start(
         ["simulate", "--size-px", 64, "--images", 2, "--overwrite", "--quiet", "-o", folder],
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (80_000, 80_000)),
@@ -241,13 +229,13 @@ def test_an_exr_or_png_without_its_end_is_no_image(tmp_path, rng):
 def test_a_full_disk_keeps_the_parts(small_artefacts, tmp_path):
     """Each part fits, the whole does not: one line, and the same command goes on when there is room."""
     output = tmp_path / "pairs.h5"
-    command = ["project", small_artefacts["crops"], "--resume", "--parts", 2, "-o", output]
+    words = ["project", small_artefacts["crops"], "--resume", "--parts", 2, "-o", output]
     size = small_artefacts["pairs"].stat().st_size * 2 // 3
-    process = start([*command, "--quiet"], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)))
+    process = start([*words, "--quiet"], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)))
     code, said = finish(process)
     assert code == 3 and len(said.splitlines()) == 1 and "disk is full" in said
     assert not output.exists()
-    code, said = lunargr(*command)
+    code, said = command.outcome(*words)
     assert code == 0 and "2 of 2 parts are there already" in said
     assert_same(small_artefacts["pairs"], output)
 

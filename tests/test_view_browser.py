@@ -59,7 +59,7 @@ def test_the_page_shows_what_render_gives(tmp_path, model):
     assert np.nanmin(expected) < 0.9 * np.nanmax(expected)
 
 
-@pytest.mark.parametrize("model", ["hapke", "kernels"])
+@pytest.mark.parametrize("model", ["hapke", pytest.param("kernels", marks=pytest.mark.slow)])
 def test_albedo_from_photographs_is_in_the_picture(tmp_path, model):
     """As `lunargr render` has it: a factor on the I/F of the coefficients, place by place."""
     path, page = make_map(tmp_path, model), tmp_path / "v.html"

@@ -23,12 +23,13 @@ NOISE = 4e-4  # I/F
 
 @dataclass
 class Planted:
-    """A scene and a map of its terrain; albedo : (H, W), what the photographs show beyond the map."""
+    """A scene and a map of its terrain; albedo : (H, W), what the photographs show beyond the map; images : (H, W) each."""
 
     folder: Path
     scene: Path
     map: Path
     albedo: np.ndarray
+    images: list[np.ndarray]
 
 
 def texture(rng, contrast: float = 0.08) -> np.ndarray:
@@ -93,4 +94,4 @@ def plant(folder: Path, albedo: np.ndarray, images: list[np.ndarray], units: str
     coefficients[:, ~np.isfinite(elevation)] = np.nan
     svbrdf = write_svbrdf(folder / "svbrdf.h5", grid, elevation, coefficients)
     assert grid.radius == RADIUS
-    return Planted(folder, scene, svbrdf, albedo)
+    return Planted(folder, scene, svbrdf, albedo, images)
