@@ -32,7 +32,6 @@ SHOWN = {
     "dem_smoothing": None,  # noise of the DEM and relief within a pixel take it to two thirds
     "phase_slope": 0.1,
 }
-SLOW = ("psf_blur", "dem_smoothing", "phase_slope")
 
 
 @pytest.fixture(scope="module")
@@ -52,26 +51,27 @@ def _pairs(scene, folder, effect, seed=11, **changes):
 
 @pytest.fixture(scope="module")
 def diagnosed(scene, tmp_path_factory):
-    """effect -> the folder of d.h5, d.json and d.html that the command makes of data with that effect planted; made when first asked for."""
+    """(effect, seed) -> the folder of d.h5, d.json and d.html that the command writes; made when first asked for. Effect "": nothing is planted."""
     from lunargr_cli.main import app
 
     made = {}
 
-    def make(effect):
-        if effect not in made:
-            folder = tmp_path_factory.mktemp(effect)
-            pairs = _pairs(scene, folder, {effect: PLANTS[effect]})
+    def make(effect, seed=11):
+        if (effect, seed) not in made:
+            folder = tmp_path_factory.mktemp(effect or "nothing")
+            pairs = _pairs(scene, folder, {effect: PLANTS[effect]} if effect else {}, seed)
             names = [str(folder / n) for n in ("d.h5", "d.json", "d.html")]
             command = ["diagnose", str(pairs), "-o", names[0], "--json", names[1], "--report", names[2], "-q"]
             out = CliRunner().invoke(app, command)
             assert out.exit_code == 0, out.output
-            made[effect] = folder
-        return made[effect]
+            made[effect, seed] = folder
+        return made[effect, seed]
 
     return make
 
 
-@pytest.mark.parametrize("effect", [pytest.param(e, marks=[pytest.mark.slow] if e in SLOW else []) for e in SHOWN])
+@pytest.mark.slow  # the one of the fast tests is in test_diagnose_leaks.py
+@pytest.mark.parametrize("effect", SHOWN)
 def test_planted_cause_is_named(scene, diagnosed, effect):
     """... and every kind of cause can be written, reported, and read back as an extension of the model."""
     answer = json.loads((diagnosed(effect) / "d.json").read_text())
@@ -107,14 +107,14 @@ def test_large_gains_of_images_are_one_cause(scene, tmp_path):
     assert [c.effect.name for c in answer.causes] == ["image_gain"]
 
 
+@pytest.mark.parametrize("seed", [21, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (22, 23, 24))])
+def test_nothing_hidden_names_nothing(diagnosed, seed):
+    answer = json.loads((diagnosed("", seed) / "d.json").read_text())
+    assert answer["causes"] == [] == load_extension(diagnosed("", seed) / "d.h5")
+    assert answer["verdict"] in ("nothing_significant", "cannot_tell")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [21, 22, 23, 24])
-def test_nothing_hidden_names_nothing(scene, tmp_path, seed):
-    answer = diagnose.run(_pairs(scene, tmp_path, {}, seed)).answer
-    assert not answer.causes
-    assert answer.verdict in ("nothing_significant", "cannot_tell")
-
-
 def test_an_ordinary_blur_is_rendered_so_that_others_are_judged_beside_it_and_is_no_cause(scene, tmp_path):
     result = diagnose.run(_pairs(scene, tmp_path, {"psf_blur": {"sigma2_px2": 0.45}}))
     assert not result.answer.causes
@@ -132,15 +132,6 @@ def test_a_fault_outside_the_catalogue_is_unexplained(scene, tmp_path, fault, wo
     assert answer.unexplained_fraction > 0
     assert answer.verdict == "unexplained" and not answer.causes
     assert any(words in what for what in answer.structure)
-
-
-def test_every_name_has_a_gain_that_is_sure_and_the_budget_adds_up(diagnosed):
-    said = json.loads((diagnosed("misregistration") / "d.json").read_text())
-    assert all(c["held_out_low"] > 0 for c in said["causes"])
-    assert sum(said["budget"].values()) == pytest.approx(1.0)
-    assert all(share >= 0 for share in said["budget"].values())
-    first = said["causes"][0]
-    assert first["residual_rms_after"] < first["residual_rms_before"]
 
 
 @pytest.mark.slow
@@ -401,19 +392,9 @@ def test_a_sharpened_dem_keeps_its_borders():
     assert np.abs(state.elevation[0].numpy() - plane[0].numpy() - sharp).max() < 0.1
 
 
-def test_outputs(diagnosed):
-    folder = diagnosed("misregistration")
-    answer = json.loads((folder / "d.json").read_text())
-    keys = {"verdict", "causes", "unexplained_fraction", "blind", "held_out", "data", "config"}
-    assert keys <= set(answer)
-    cause = answer["causes"][0]
-    assert {"effect", "parameters", "p_family_wise", "gain_nats", "gain_error", "group", "to_separate"} <= set(cause)
-    assert answer["held_out"]["gain_percent"] > 0  # one place is kept away: no interval
-    page = (folder / "d.html").read_text()
+def test_the_page_needs_nothing_else(diagnosed):
+    page = (diagnosed("", 21) / "d.html").read_text()
     assert "data:image/" in page and "http" not in page.split("</style>")[1].replace("https://", "")
-    effects = {e.name: e for e in load_extension(folder / "d.h5", ["image-003", "never-seen"])}
-    shifts = effects["misregistration"].values["east_px"]
-    assert shifts.shape == (2,) and float(shifts[1]) == 0.0
 
 
 def test_list_explains_every_effect():
