@@ -253,8 +253,11 @@ def models(root: Path) -> list[str]:
         "standard deviation of runs; brackets hold 95 % intervals over tiles and runs. The paper scores its own pairs."
     ]
     lines += table(["model", f"MSE, 1e{power}", "MSE summed over a crop", "in the paper"], rows)
-    known = [p for p in result["differences"] if p["larger_than_noise"]]
-    text = "; ".join(f"{p['better']} below {p['worse']} by {p['difference_percent']:.1f} %" for p in known)
+    known: dict[str, list[str]] = {}
+    for pair in result["differences"]:
+        if pair["larger_than_noise"]:
+            known.setdefault(pair["better"], []).append(f"{pair['worse']} ({pair['difference_percent']:.1f}%)")
+    text = "; ".join(f"{better} below {listed(worse)}" for better, worse in known.items())
     return [*lines, f"Differences larger than their noise: {text or 'none'}."]
 
 
