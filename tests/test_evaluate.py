@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -289,6 +290,16 @@ def test_global_kernels_and_fitted_hapke_are_least_squares_fits_of_the_train_spl
     assert models["hapke_raw"]["mse"] > 100 * models["hapke_fitted"]["mse"]
     of_m2 = _evaluate(scene, only=("global", "kernels"))[0]["models"]
     assert of_m2["kernels"]["mse"] <= 1.02 * of_m2["global"]["mse"]
+
+
+def test_hapke_s_published_parameters_are_those_of_the_images_wavelength_or_as_asked(scene):
+    def published(nm, **options):
+        result, rows, *_ = _evaluate(replace(scene, wavelength_nm=nm), only=("hapke_raw",), **options)
+        return result["hapke_set"], float(rows[0].renderer.coefficients(None)[0, 0, 0, 0])  # w
+
+    assert published(math.nan) == ("sato2014_643nm", pytest.approx(0.38138))
+    assert published(420.0) == ("sato2014_415nm", pytest.approx(0.22768))
+    assert published(420.0, published="sato2014_643nm_mare") == ("sato2014_643nm_mare", pytest.approx(0.254484))
 
 
 def test_fits_know_nothing_of_the_scored_split(scene, whole):

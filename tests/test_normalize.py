@@ -15,7 +15,8 @@ from photometry_oracles import angles, columns, groups, ours, read
 from rasterio.transform import Affine
 from small_scene import GSD, LAT, LON, RADIUS, A, B, C, local_crs, slopes, sun_enu, write_raster
 
-from schemas import ConfigError
+from schemas import ConfigError, InputError
+from schemas.files.outputs import Output
 from stages import ingest, merge, normalize
 from stages.normalize.mosaic import combine, fading_weight
 from stages.physics.formation.geometry import Angles
@@ -241,6 +242,51 @@ def test_wrong_options_are_one_line(planted, tmp_path):
         with pytest.raises(ConfigError, match=message):
             normalize.run(scene.scene, scene.map if with_map else None, tmp_path / "no.h5", replace(QUIET, **change))
     assert not list(tmp_path.iterdir())
+
+
+# ---- bands
+
+
+def test_bands_of_one_file_get_mosaics_of_their_own(tmp_path):
+    """Band 2 of both images is three times as bright; wavelengths come from the file's tags; no band is no choice."""
+    scene = level_frames(tmp_path, FRAMES)
+    rows = (tmp_path / "images.csv").read_text().splitlines()
+    for k in range(2):
+        with rasterio.open(tmp_path / f"image{k}.tif") as one:
+            profile, values = one.profile | {"count": 2}, one.read(1)
+        with rasterio.open(tmp_path / f"two{k}.tif", "w", **profile) as two:
+            for band, (factor, nm) in enumerate(((1, 415), (3, 643)), start=1):
+                two.write(np.where(values > 0, factor * values, -1), band)
+                two.update_tags(band, wavelength=str(nm), wavelength_units="nm")
+    header, *lines = rows
+    several = [f"{header},band"]
+    for band in (1, 2):
+        several += [f"{row.replace('image', 'two').replace('F', f'B{band}F', 1)},{band}" for row in lines]
+    table, config = tmp_path / "bands.csv", ingest.Config(gsd=GSD, crop=32)
+    table.write_text("\n".join(several))
+    ingest.run(tmp_path / "dem.tif", table, Output(scene, overwrite=True), config)
+    assert maps(scene, "band", "wavelength_nm")[1].tolist() == [415, 415, 643, 643]
+    out = tmp_path / "bands.h5"
+    normalize.run(scene, None, out, replace(QUIET, model="lommel_seeliger"))
+    name, mosaic, wavelength = maps(out, "layer_name", "mosaic", "wavelength_nm")
+    assert name.tolist() == [b"415nm", b"643nm"] and wavelength.tolist() == [415, 415, 643, 643]
+    for layer, factor in zip(mosaic, (1, 3), strict=True):
+        np.testing.assert_allclose(layer[np.isfinite(layer)], factor * FLAT, rtol=1e-4)
+    for cell, message in (
+        ("", "expected .* of one band, found 2; name the one that is meant in column 'band'"),
+        ("3", "with a band 3, found 2"),
+        ("red", "expected the number of a band, 1..65535, in column 'band', found 'red'"),
+    ):
+        table.write_text("\n".join([several[0], several[1].rpartition(",")[0] + f",{cell}"]))
+        with pytest.raises(InputError, match=message):
+            ingest.run(tmp_path / "dem.tif", table, Output(scene, overwrite=True), config)
+
+
+def test_an_isis_cube_tells_the_wavelength_of_its_bands(shared):
+    from stages.physics.images.labels import band_wavelength
+
+    cube = shared / "data/formats/M1181493219CE.vis.odd.reduced.cub"
+    assert [band_wavelength(cube, band) for band in range(1, 6)] == [415, 566, 604, 643, 689]
 
 
 # ---- mosaics

@@ -24,6 +24,7 @@ from stages.physics.photometry import (
     published_sets,
 )
 from stages.physics.photometry.hapke import coherent_backscatter, h_1981, h_2002, porosity
+from stages.physics.photometry.published import find_reflectance, hapke_set
 from stages.physics.photometry.quantities import (
     from_bidirectional_reflectance,
     from_brdf,
@@ -399,3 +400,22 @@ def test_lambert_and_lommel_seeliger_in_closed_form():
     assert float(lambert) == pytest.approx(0.2 * 0.5, rel=1e-9)
     seeliger = evaluate("lommel_seeliger", {"albedo": 0.2}, incidence, emission, phase)
     assert float(seeliger) == pytest.approx(0.2 * 2 * 0.5 / (0.5 + math.sqrt(3) / 2), rel=1e-9)
+
+
+def test_hapke_s_published_parameters_follow_the_wavelength_or_the_name():
+    assert [hapke_set(nm).name for nm in (float("nan"), 410.0, 1000.0)] == [
+        "sato2014_643nm", "sato2014_415nm", "sato2014_689nm",
+    ]  # fmt: skip
+    assert hapke_set(410.0, "helfenstein1987").wavelength_nm == 550
+    with pytest.raises(
+        RegistryError, match=r"unknown set of Hapke's parameters 'mcewen1996'; choose one of: .*sato2014_321nm"
+    ):
+        hapke_set(410.0, "mcewen1996")
+
+
+def test_a_published_set_is_named_where_a_model_is():
+    model, values = find_reflectance("sato2014_415nm")
+    assert model.name == "hapke" and values == get_set("sato2014_415nm").values
+    assert find_reflectance("Hapke")[1] == get_model("hapke").defaults()
+    with pytest.raises(RegistryError, match=r"unknown reflectance model or parameter set 'sato'.*sato2014_643nm"):
+        find_reflectance("sato")

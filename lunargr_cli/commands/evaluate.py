@@ -60,6 +60,12 @@ def command(
         list[str] | None,
         typer.Option("--only", metavar="ROW", help="Score only this row of the table. May be repeated."),
     ] = None,
+    published: Annotated[
+        str | None,
+        typer.Option(
+            "--published", metavar="SET", help="Hapke's parameters to score (default: Sato's nearest in wavelength)."
+        ),
+    ] = Config.published,
     batch: Annotated[
         int, typer.Option("--batch", min=1, max=options.MOST, help="Crops in memory at a time.")
     ] = Config.batch,
@@ -105,6 +111,7 @@ def command(
         console.table(f"what the learned reflectance gains, paired over ground: {basis(result)}", columns, cells)
     if result["coverage_percent"] is not None:
         console.table("pixels within the learned intervals, percent", *coverage_lines(result["coverage_percent"]))
+    console.say(f"Hapke's published parameters: {result['hapke_set']}")
     for sentence in result["conclusions"]:
         console.say(sentence)
     for warning in result["warnings"]:

@@ -61,6 +61,9 @@ PLACE = (
 FRAMES = (
     text_column("frame", "image_id", "name of the source image"),
     column("frame", "solar_distance_au", "au", "distance of the Sun", required=False, minimum=0.05, maximum=100.0),
+    column(
+        "frame", "wavelength_nm", "nm", "centre of the image's band, NaN where not known", required=False, minimum=0.0
+    ),
 )
 
 FRAME_TABLE = FRAMES + (
@@ -68,6 +71,7 @@ FRAME_TABLE = FRAMES + (
     text_column("frame", "camera", "camera model file, empty for map-projected images"),
     text_column("frame", "start_time", "UTC"),
     column("frame", "units", "1", "radiometric units of the image", "u1", flags=UNITS),
+    column("frame", "band", "1", "band of the image file, from 1; 0 = its only one", "u2", required=False),
     angle("frame", "subsolar_longitude_deg", 720.0, "east longitude of the sub-solar point"),
     angle("frame", "subsolar_latitude_deg", 90.0, "latitude of the sub-solar point"),
     angle("frame", "spacecraft_longitude_deg", 720.0, "east longitude below the camera"),

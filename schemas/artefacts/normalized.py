@@ -29,7 +29,9 @@ NORMALIZED = declare(
             grid_map("mosaic_std", "f4", "1", "its standard deviation, NaN where not known", "layer"),
             grid_map("mosaic_scatter", "f4", "1", "standard deviation of single images about the mosaic", "layer"),
             grid_map("mosaic_images", "u2", "1", "images of the pixel", "layer", compress=True),
-            text_column("layer", "layer_name", "phase bin, empty for the mosaic of all phases"),
+            text_column(
+                "layer", "layer_name", "band and phase bin, as in bands of the GeoTIFF; empty for the one mosaic of all"
+            ),
             column("layer", "phase_low_deg", "degree", "least phase of the layer"),
             column("layer", "phase_high_deg", "degree", "largest phase of the layer"),
             column("frame", "gain", "1", "measured = gain x I/F + offset"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from stages.evaluate.config import Config
 from stages.evaluate.rows import layout
 from stages.evaluate.task import Task
 from stages.pairs.reader import PairReader
+from stages.physics.photometry.published import hapke_set
 
 
 def check(config: Config) -> None:
@@ -25,6 +27,7 @@ def check(config: Config) -> None:
         raise ConfigError(
             f"`batch`, `fit_pairs`: expected at least 1 and 0, found {config.batch} and {config.fit_pairs}."
         )
+    hapke_set(math.nan, config.published)
     known = [name for name, _, _ in layout(bool(config.extend))]
     for name in config.only:
         if name not in known:

@@ -14,6 +14,7 @@ from stages.evaluate.renderers import Batch, Constant, Renderer, predict, predic
 from stages.network.predictor import Predictor
 from stages.physics.formation.chain import Extension
 from stages.physics.photometry import ReflectanceModel, get_model
+from stages.physics.photometry.published import ParameterSet
 
 # Of Hapke's law: coherent backscatter and porosity stay off, as in the published lunar sets.
 HAPKE_FREE = ("w", "b", "c", "Bs0", "hs", "theta")
@@ -76,8 +77,13 @@ def freedom(name: str) -> str:
     return next(matching or "none" for row, _, matching in layout(True) if row == name)
 
 
-def make_renderers(predictors: Sequence[Predictor], extensions: Sequence[Extension]) -> dict[str, Renderer]:
-    """Everything that is compared, before anything is fitted; a network's from its second training run on as NAME:RUN."""
+def make_renderers(
+    predictors: Sequence[Predictor], extensions: Sequence[Extension], published: ParameterSet
+) -> dict[str, Renderer]:
+    """Everything that is compared, before anything is fitted; a network's from its second training run on as NAME:RUN.
+
+    published : Hapke's parameters
+    """
     model = predictors[0].model
     effects = tuple(extensions)
     made = []
@@ -88,7 +94,9 @@ def make_renderers(predictors: Sequence[Predictor], extensions: Sequence[Extensi
         made.append(Renderer(run_name("learned_extended", run), model, network, effects))
     made.append(Renderer("global", model, _defaults(model)))
     made.append(Renderer("global_extended", model, _defaults(model), effects))
-    for name in ("kernels", "hapke", "lunar_lambert"):
+    hapke = get_model(published.model)
+    made.append(Renderer("hapke", hapke, Constant(np.array([published.values[p.name] for p in hapke.parameters]))))
+    for name in ("kernels", "lunar_lambert"):
         made.append(Renderer(name, get_model(name), _defaults(get_model(name))))
     made.append(Renderer("hapke_fitted", get_model("hapke"), _defaults(get_model("hapke"))))
     return {renderer.name: renderer for renderer in made}

@@ -23,6 +23,7 @@ from stages.evaluate.table import conclude, gain_table, metric_table, strongest_
 from stages.network.predictor import Predictor, choose_device, load_predictor
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import Extension
+from stages.physics.photometry.published import ParameterSet, hapke_set
 
 
 @dataclass
@@ -43,9 +44,14 @@ class Task:
         """Whether the images are in I/F."""
         return self.reader.units == "iof"
 
+    @property
+    def published(self) -> ParameterSet:
+        """Hapke's parameters that are scored."""
+        return hapke_set(self.reader.wavelength_nm, self.config.published)
+
     def rows(self) -> list[Row]:
         """The rows of the table that are scored, with their renderers."""
-        renderers = make_renderers(self.predictors, self.extensions)
+        renderers = make_renderers(self.predictors, self.extensions, self.published)
         return make_rows(renderers, len(self.predictors), bool(self.extensions), self.config.only)
 
     def fit_pairs(self) -> tuple[np.ndarray, np.ndarray]:
@@ -116,6 +122,7 @@ def summarise(task: Task, scores: Scores, scale: float) -> dict[str, Any]:
         "image_units": task.reader.units,
         "dn_full_range": None if task.calibrated else scale,
         "model": task.predictors[0].model.name,
+        "hapke_set": task.published.name,
         "fitted_on_pairs": len(train),
         "frames_fitted_on_split": sorted({task.reader.image_ids[f] for f in frames[orphans]}),
         "coverage_percent": shares(scores.within.sum(axis=2)) if scores.within.any() else None,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from schemas.errors import ConfigError
@@ -71,8 +70,3 @@ def check(config: Config, with_map: bool) -> None:
         raise ConfigError(
             f"`phase_bins_deg`: expected two or more rising angles in 0..180, found {', '.join(f'{b:g}' for b in bins)}."
         )
-
-
-def phase_layers(bins: Sequence[float]) -> list[tuple[float, float]]:
-    """Least and largest phase, deg, of each mosaic of a band: all phases first, then the bins."""
-    return [(0.0, 180.0), *itertools.pairwise(bins)]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -9,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stages.common.arrays import Floats32, Mask
+from stages.physics.images.table import Frame
 
 FADE_PX = 32  # from an edge, a shadow or a grazing slope on, over which the weight of an image rises to its whole
 BOUND = 1.5  # standard deviations beyond which an image pulls no harder
@@ -24,6 +28,32 @@ class Mosaic:
     std: Floats32
     scatter: Floats32
     count: NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One mosaic. images : the frames of its band; low, high : its phases, deg"""
+
+    name: str
+    images: frozenset[int]
+    low: float
+    high: float
+
+
+def choose_layers(frames: Sequence[Frame], bins: Sequence[float]) -> list[Layer]:
+    """A mosaic of all phases for each band, by wavelength where it is known, and one for each phase bin. bins : edges, deg"""
+    members: dict[str, list[int]] = {}
+    for k, frame in enumerate(frames):
+        known = math.isfinite(frame.wavelength_nm)
+        name = f"{frame.wavelength_nm:g}nm" if known else f"band_{frame.band}" if frame.band else ""
+        members.setdefault(name, []).append(k)
+    layers = []
+    for name, images in members.items():
+        for low, high in ((0.0, 180.0), *itertools.pairwise(bins)):
+            words = [name] if len(members) > 1 else []
+            words += [f"phase_{low:g}_{high:g}"] if (low, high) != (0.0, 180.0) else []
+            layers.append(Layer("_".join(words), frozenset(images), low, high))
+    return layers
 
 
 def fading_weight(good: Mask) -> Floats32:

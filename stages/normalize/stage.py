@@ -19,10 +19,10 @@ from schemas.files.companions import companions_of
 from schemas.files.outputs import Output, atomic_path, check_outputs, map_targets
 from stages.common.arrays import Floats32
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.normalize.config import Config, Summary, check, phase_layers
+from stages.normalize.config import Config, Summary, check
 from stages.normalize.factor import GOOD, UNSEEN, Normaliser, placed
 from stages.normalize.levels import Levels, find_levels, take_samples
-from stages.normalize.mosaic import FADE_PX, Mosaic, combine, fading_weight
+from stages.normalize.mosaic import FADE_PX, Layer, Mosaic, choose_layers, combine, fading_weight
 from stages.normalize.writing import Maps, attributes_of
 from stages.physics.bodies.spheres import find_body
 from stages.physics.images.references import References, open_references
@@ -48,6 +48,11 @@ class Ground:
         """Rows and columns of the map."""
         grid = self.references.surface.grid
         return grid.height, grid.width
+
+    @property
+    def layers(self) -> list[Layer]:
+        """The mosaics to make."""
+        return choose_layers(self.references.frames, self.normaliser.config.phase_bins_deg)
 
     @property
     def blocks(self) -> Blocks:
@@ -90,14 +95,18 @@ def run(
             raise InputError(
                 f"{scene}: expected images with sunlit pixels within the limits of incidence and emission, found none."
             )
-        levels = find_levels(samples, [0] * len(references.frames), ground.units, config.level)
+        layers = ground.layers
+        groups = [
+            min(next(layer.images for layer in layers if k in layer.images)) for k in range(len(references.frames))
+        ]
+        levels = find_levels(samples, groups, ground.units, config.level)
         blocks = ground.blocks
         own = blocks.own_rows(config.shard)
         writer = stack.enter_context(
             ArtefactWriter(
                 output.file,
                 NORMALIZED,
-                Maps.sizes(ground.references, len(phase_layers(config.phase_bins_deg))),
+                Maps.sizes(references, len(layers)),
                 config=asdict(config),
                 inputs=inputs,
                 attributes=attributes_of(references.surface, config, ground.units),
@@ -107,7 +116,7 @@ def run(
         maps = Maps(writer, own if config.shard[1] > 1 else None)
         for box in blocks.within(own, progress):
             maps.put(box, work_block(ground, levels, box))
-        maps.close(references, levels, phase_layers(config.phase_bins_deg))
+        maps.close(references, levels, layers)
         if as_geotiff:
             stack.enter_context(companions_of(output.file))
             partial = stack.enter_context(atomic_path(output.geotiff_path))
@@ -163,6 +172,9 @@ def work_block(ground: Ground, levels: Levels, block: Box) -> Block:
         planes.append(np.stack([*whole, fade])[(slice(None), *inner)].astype(np.float32))
     size = (4, len(images), *block[2:])
     normal, std, phase, fade = np.stack(planes, axis=1) if images else np.full(size, np.nan, np.float32)
-    layers = phase_layers(normaliser.config.phase_bins_deg)
-    mosaics = [combine(np.where((phase >= low) & (phase < high), normal, np.nan), std, fade) for low, high in layers]
+    mosaics = []
+    for layer in ground.layers:
+        own = np.array([k in layer.images for k in images], bool)
+        inside = (phase[own] >= layer.low) & (phase[own] < layer.high)
+        mosaics.append(combine(np.where(inside, normal[own], np.nan), std[own], fade[own]))
     return Block(images, normal, std, np.stack(masks) if masks else np.zeros(size[1:], np.uint8), mosaics)

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas import ArtefactWriter
 from stages.common.brightness import QUANTITIES
 from stages.normalize.config import Config, Summary
 from stages.normalize.levels import MIDDLES, Levels
+from stages.normalize.mosaic import Layer
 from stages.physics.images.references import References
 from stages.physics.images.table import Frame
 from stages.physics.maps.geotiff import MOSAIC_BANDS
@@ -35,7 +37,7 @@ class Maps:
 
     def __init__(self, writer: ArtefactWriter, rows: tuple[int, int] | None) -> None:
         self._writer = writer
-        self._images = [writer.dataset(name) for name in ("normalized", "normalized_std", "mask")]
+        self._images = {name: writer.dataset(name) for name in ("normalized", "normalized_std", "mask")}
         self._mosaics = [writer.dataset(name) for name in MOSAIC_BANDS]
         self._seen, self._sum, self._shown = 0, 0.0, 0
         if rows is not None:
@@ -50,9 +52,10 @@ class Maps:
     def put(self, box: Box, block: Block) -> None:
         """Write one block."""
         part = np.s_[box[0] : box[0] + box[2], box[1] : box[1] + box[3]]
-        for place, k in enumerate(block.images):
-            for target, values in zip(self._images, (block.normal, block.std, block.mask), strict=True):
-                target[(k, *part)] = values[place]
+        shown: dict[str, NDArray] = {"normalized": block.normal, "normalized_std": block.std, "mask": block.mask}
+        for name, values in shown.items():
+            for k, plane in zip(block.images, values, strict=True):
+                self._images[name][(k, *part)] = plane
         for layer, mosaic in enumerate(block.mosaics):
             maps = (mosaic.value, mosaic.std, mosaic.scatter, mosaic.count)
             for target, plane in zip(self._mosaics, maps, strict=True):
@@ -63,7 +66,7 @@ class Maps:
         self._sum += float(first.value[known].sum(dtype=float))
         self._shown += int(first.count.sum(dtype=int))
 
-    def close(self, references: References, levels: Levels, layers: Sequence[tuple[float, float]]) -> None:
+    def close(self, references: References, levels: Levels, layers: Sequence[Layer]) -> None:
         """Write what is known of the map and the images."""
         writer, grid, frames = self._writer, references.surface.grid, references.frames
         writer.write_crs(grid.crs_wkt, grid.transform)
@@ -71,14 +74,14 @@ class Maps:
         writer.write("y", grid.xy(np.arange(grid.height), 0)[1])
         writer.write("image_id", [frame.image_id for frame in frames])
         writer.write("solar_distance_au", np.array([frame.solar_distance_au for frame in frames]))
+        writer.write("wavelength_nm", np.array([frame.wavelength_nm for frame in frames]))
         writer.write("gain", levels.gain)
         writer.write("offset", levels.offset)
         writer.write("image_std", levels.std)
         writer.write("bin_cos_incidence", MIDDLES)
-        named = ["", *(f"phase_{low:g}_{high:g}" for low, high in layers[1:])]
-        writer.write("layer_name", named)
-        writer.write("phase_low_deg", np.array([low for low, _ in layers]))
-        writer.write("phase_high_deg", np.array([high for _, high in layers]))
+        writer.write("layer_name", [layer.name for layer in layers])
+        writer.write("phase_low_deg", np.array([layer.low for layer in layers]))
+        writer.write("phase_high_deg", np.array([layer.high for layer in layers]))
 
     def summarise(self, frames: Sequence[Frame], levels: Levels, units: str) -> Summary:
         """What was written, for the lines at the end."""

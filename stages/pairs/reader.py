@@ -81,6 +81,9 @@ class PairReader:
             unpack(f[n], f[n][...]).astype(np.float32) for n in ("sun_direction_enu", "camera_position_enu")
         )
         self.image_ids = read_strings(f, "image_id")
+        bands = f["wavelength_nm"][...] if "wavelength_nm" in f else np.zeros(0)
+        known = bands[np.isfinite(bands)]
+        self.wavelength_nm = float(np.median(known)) if known.size else math.nan  # of the images' band
         if not (np.linalg.norm(self._camera, axis=1) > 0).all():
             raise ArtefactError(
                 f"{path}:/camera_position_enu: expected places away from the crop, found 0; write it again."

@@ -146,6 +146,7 @@ def _project(
         writer.write(name, crops.column(name))
     writer.write("image_id", [f.image_id for f in frames])
     writer.write("solar_distance_au", np.array([f.solar_distance_au for f in frames]))
+    writer.write("wavelength_nm", np.array([f.wavelength_nm for f in frames]))
     if config.register:
         write_registration(writer, frames, registered)
     write_resemblances(writer, frames, resemblances)

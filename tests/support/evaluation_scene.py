@@ -5,6 +5,7 @@ Nothing of ``stages.physics`` makes these images: slopes come from numpy.gradien
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import cv2
@@ -34,6 +35,7 @@ class Scene:
     noise: float
     image_ids: list[str] = field(default_factory=list)
     units: str = "iof"
+    wavelength_nm: float = math.nan
 
     @property
     def site(self) -> np.ndarray:

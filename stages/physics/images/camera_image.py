@@ -37,12 +37,13 @@ class CameraImage:
     samples: int
     _dataset: DatasetReader | None
     _picture: Any | None
+    _band: int = 1
 
     def read(self, line: int, sample: int, lines: int, samples: int) -> NDArray[np.float32]:
         """(lines, samples) float32 from (line, sample) on, counted from 0; NaN = nodata. Raises InputError."""
         if self._dataset is not None:
             window = Window(sample, line, samples, lines)
-            return rasters.read_window(self._dataset, window).astype(np.float32)
+            return rasters.read_window(self._dataset, window, self._band).astype(np.float32)
         picture: Any = self._picture
         # read_scanlines wants whole rows: a few at a time bound the memory
         out = np.empty((lines, samples), np.float32)
@@ -62,30 +63,25 @@ class CameraImage:
 
 
 @contextlib.contextmanager
-def open_camera_image(path: Path, camera: Camera, what: str) -> Iterator[CameraImage]:
-    """The image that ``camera`` took. Raises InputError where it is missing, damaged, or of another size."""
+def open_camera_image(path: Path, camera: Camera, what: str, band: int | None = None) -> Iterator[CameraImage]:
+    """The image that ``camera`` took. band : of several, counted from 1. Raises InputError where it is missing, damaged, or of another size."""
     picture = _open_picture(path)
     if picture is not None:
         try:
             spec = picture.spec()
-            bands = spec.nchannels - (spec.alpha_channel >= 0)
-            if bands > 1:
-                raise InputError(
-                    f"{path}: expected {what} of one band, found {bands}; take the one that is meant (gdal_translate -b N)."
-                )
             _check_belongs(path, camera, spec.height, spec.width)
             yield CameraImage(path, spec.height, spec.width, None, picture)
         finally:
             picture.close()
         return
     with rasters.open_raster(path, what) as dataset:
-        rasters.check_single_band(path, dataset, what)
+        chosen = rasters.choose_band(path, dataset, band, what)
         _check_belongs(path, camera, dataset.height, dataset.width)
-        yield CameraImage(path, dataset.height, dataset.width, dataset, None)
+        yield CameraImage(path, dataset.height, dataset.width, dataset, None, chosen)
 
 
 def _open_picture(path: Path) -> Any | None:
-    """An OpenImageIO reader, or None where GDAL must read: other formats, tiles, nodata, scales, damaged files."""
+    """An OpenImageIO reader, or None where GDAL must read: other formats, tiles, several bands, nodata, scales, damaged files."""
     if path.suffix.lower() not in PICTURES or not path.is_file():
         return None
     import OpenImageIO as oiio
@@ -98,7 +94,7 @@ def _open_picture(path: Path) -> Any | None:
     if picture is None:
         oiio.geterror()  # clears it, or it would be printed at exit; GDAL will say what is wrong
         return None
-    if picture.spec().tile_width or picture.spec().nchannels < 1:
+    if picture.spec().tile_width or picture.spec().nchannels != 1:
         picture.close()
         return None
     return picture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 import xml.etree.ElementTree as ElementTree
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import InputError
 from stages.physics.bodies.ephemeris import et_to_utc, parse_utc
+from stages.physics.maps.rasters import open_raster
 
 HEAD = 262144  # bytes in which a label ends
 Block = Mapping[str, Any]  # a PVL object or group; keys as written, nested blocks under their kind
@@ -100,6 +102,44 @@ def isis_table(path: Path, label: Block, name: str) -> NDArray[np.float64]:
             f"{path}: expected {records} records in table '{name}', found the file cut short; fetch it again."
         )
     return np.frombuffer(data, f"{order}f8").reshape(records, len(fields)).astype(float)
+
+
+MICROMETRES = 100.0  # a wavelength below counts as micrometres: labels use both, and their units are dropped
+
+
+def band_wavelength(path: Path, band: int) -> float:
+    """Wavelength at the centre of a band, nm, from an ISIS cube's BandBin or a raster's own tags; NaN where neither says.
+
+    band : counted from 1; GDAL and ENVI write `wavelength` (and its unit) as tags of a band, or describe it as "643 nm"
+    """
+    if not path.is_file():
+        return math.nan
+    label = read_label(path) if path.suffix.lower() == ".cub" else None
+    centre = find_value(label, "Center") if label is not None else None
+    if centre is None:
+        centre = _tagged_wavelength(path, band)
+    elif isinstance(centre, list):
+        centre = centre[band - 1] if band <= len(centre) else None
+    try:
+        value = float(centre)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return math.nan
+    return math.nan if not value > 0 else 1000 * value if value < MICROMETRES else value
+
+
+def _tagged_wavelength(path: Path, band: int) -> str | None:
+    """What a raster's tags or the description of its band hold; None where GDAL cannot open it."""
+    try:
+        with open_raster(path) as dataset:
+            if band > dataset.count:
+                return None
+            tags = {key.lower(): value for key, value in dataset.tags(band).items()}
+            named = re.search(
+                r"(\d+(?:\.\d+)?)\s*(?:nm|um|micromet|nanomet)", dataset.descriptions[band - 1] or "", re.I
+            )
+    except InputError:
+        return None
+    return tags.get("wavelength") or (named.group(1) if named else None)
 
 
 # --- times ----------------------------------------------------------------------------------------------------------

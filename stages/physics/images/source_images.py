@@ -78,11 +78,11 @@ def open_source(frame: Frame, grid: Grid, elevation: Any, heights: tuple[float, 
     if frame.camera is None:
         with rasters.open_raster(frame.path, what) as dataset:
             require_crs(str(frame.path), dataset.crs, dataset.transform, find_body(str(grid.radius)))
-            rasters.check_single_band(frame.path, dataset, what)
-            yield MapSource(dataset, grid, elevation, frame.camera_position(grid.radius))
+            band = rasters.choose_band(frame.path, dataset, frame.band, what)
+            yield MapSource(dataset, grid, elevation, frame.camera_position(grid.radius), band)
         return
     camera = open_camera_for(frame.camera, grid.radius)
-    with open_camera_image(frame.path, camera, what) as image:
+    with open_camera_image(frame.path, camera, what, frame.band) as image:
         yield CameraSource(image, camera, elevation, grid, heights, frame.sun_position())
 
 
@@ -97,6 +97,7 @@ class MapSource:
     grid: Grid
     elevation: Any
     camera_position: Floats
+    band: int = 1
     notes: tuple[str, ...] = ()
 
     @cached_property
@@ -128,7 +129,9 @@ class MapSource:
         """See :meth:`Source.read`; resampled from one map to the other."""
         if field is None or field.refused:
             part = self.grid.window(row, col, height, width)
-            return Pixels(*rasters.warp(self.dataset, part, rasters.choose_resampling(self.dataset, part)[0]), None)
+            return Pixels(
+                *rasters.warp(self.dataset, part, rasters.choose_resampling(self.dataset, part)[0], self.band), None
+            )
         return Pixels(*self._read_moved(row, col, height, width, field), None)
 
     def relief(self, reference: float) -> Relief | None:
@@ -164,7 +167,7 @@ class MapSource:
         )
 
     def _pixels(self, line: int, sample: int, lines: int, samples: int) -> NDArray[np.float32]:
-        return rasters.read_window(self.dataset, Window(sample, line, samples, lines)).astype(np.float32)
+        return rasters.read_window(self.dataset, Window(sample, line, samples, lines), self.band).astype(np.float32)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from stages.physics.bodies.ephemeris import AU, parse_utc
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.cameras.isis_cube import is_own_camera
 from stages.physics.images.frame_geometry import complete_row
+from stages.physics.images.labels import band_wavelength
 from stages.physics.images.pds_index import index_images
 from stages.physics.maps.grid import unit_vectors
 
@@ -40,6 +41,7 @@ _NUMBERS = {
     "spacecraft_latitude_deg": (-90.0, 90.0),
     "spacecraft_altitude_m": (1.0, 1e10),
 }
+MOST_BANDS = 65535
 COLUMNS = ("image_id", "path", "units", "camera", "band", "angles", "start_time", *_NUMBERS)
 
 
@@ -49,6 +51,7 @@ class Frame:
 
     units : 'iof' or 'dn'; camera : its camera model, ``path`` again for an ISIS cube, None for map-projected images
     sha256, camera_sha256 : digests of both files, empty before they are read
+    band : which one of the file, counted from 1, None for its only one; wavelength_nm : its centre, NaN where not known
     """
 
     image_id: str
@@ -64,6 +67,8 @@ class Frame:
     spacecraft_altitude_m: float
     sha256: str = ""
     camera_sha256: str = ""
+    band: int | None = None
+    wavelength_nm: float = math.nan
 
     def sun_position(self) -> np.ndarray:
         """(3,) body-fixed position of the Sun, m."""
@@ -154,8 +159,21 @@ def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Fram
         units=units,
         camera=camera,
         start_time=text.get("start_time", ""),
+        band=(band := _band(text.get("band", ""), where)),
+        wavelength_nm=band_wavelength(image, band or 1),
         **numbers,
     )
+
+
+def _band(text: str, where: str) -> int | None:
+    """The column 'band', None where it is empty. Raises InputError."""
+    if not text:
+        return None
+    if not (text.isdecimal() and 1 <= int(text) <= MOST_BANDS):
+        raise InputError(
+            f"{where}: expected the number of a band, 1..{MOST_BANDS}, in column 'band', found '{text}'; mend the table."
+        )
+    return int(text)
 
 
 def write_frames(writer: ArtefactWriter, frames: Sequence[Frame]) -> None:
@@ -168,6 +186,8 @@ def write_frames(writer: ArtefactWriter, frames: Sequence[Frame]) -> None:
     if all(f.sha256 for f in frames):
         writer.write("sha256", [f.sha256 for f in frames])
         writer.write("camera_sha256", [f.camera_sha256 for f in frames])
+    writer.write("band", np.array([f.band or 0 for f in frames], np.uint16))
+    writer.write("wavelength_nm", np.array([f.wavelength_nm for f in frames]))
     writer.write("units", np.array([0 if f.units == "iof" else 1 for f in frames], np.uint8))
     for key in _NUMBERS:
         writer.write(key, np.array([getattr(f, key) for f in frames]))
@@ -179,6 +199,8 @@ def load_frames(file: h5py.File, path: Path) -> list[Frame]:
     names, paths, cameras, times = (read_strings(file, k) for k in ("image_id", "path", "camera", "start_time"))
     columns: dict[str, Any] = {key: file[key][...].tolist() for key in _NUMBERS}
     columns |= {k: read_strings(file, k) for k in ("sha256", "camera_sha256") if k in file}
+    columns |= {"band": [int(b) or None for b in file["band"][...]]} if "band" in file else {}
+    columns |= {"wavelength_nm": file["wavelength_nm"][...].tolist()} if "wavelength_nm" in file else {}
     return [
         Frame(
             image_id=names[k],

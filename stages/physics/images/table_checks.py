@@ -53,10 +53,10 @@ def check_table(table: Path, frames: Sequence[Frame], body: Body) -> list[str]:
 
 
 def check_distinct(frames: Sequence[Frame]) -> None:
-    """Refuse two images that are one file by its SHA-256: their pairs would count twice. Raises InputError."""
-    seen: dict[str, Frame] = {}
+    """Refuse two images that are one band of one file, by its SHA-256: their pairs would count twice. Raises InputError."""
+    seen: dict[tuple[str, int], Frame] = {}
     for frame in frames:
-        first = seen.setdefault(frame.sha256, frame)
+        first = seen.setdefault((frame.sha256, frame.band or 1), frame)
         if frame.sha256 and first is not frame:
             raise InputError(
                 f"{frame.path}: image '{frame.image_id}' is the photograph of '{first.image_id}' again (same SHA-256); "

@@ -81,13 +81,23 @@ def _check_numbers(path: Path, what: str, dataset: DatasetReader) -> None:
         )
 
 
-def check_single_band(path: Path, dataset: DatasetReader, what: str) -> None:
+def check_single_band(
+    path: Path, dataset: DatasetReader, what: str, advice: str = "take the one that is meant (gdal_translate -b N)"
+) -> None:
     """Refuse rasters of several bands, alpha bands aside. Raises InputError."""
     bands = sum(kind != ColorInterp.alpha for kind in dataset.colorinterp)
     if bands > 1:
-        raise InputError(
-            f"{path}: expected {what} of one band, found {bands}; take the one that is meant (gdal_translate -b N)."
-        )
+        raise InputError(f"{path}: expected {what} of one band, found {bands}; {advice}.")
+
+
+def choose_band(path: Path, dataset: DatasetReader, band: int | None, what: str) -> int:
+    """The band to read of an image: the one asked for, counted from 1, or the only one. Raises InputError."""
+    if band is None:
+        check_single_band(path, dataset, what, "name the one that is meant in column 'band' of the image table")
+        return 1
+    if band > dataset.count:
+        raise InputError(f"{path}: expected {what} with a band {band}, found {dataset.count}; mend the column 'band'.")
+    return band
 
 
 # m; for advice

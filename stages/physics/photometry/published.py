@@ -14,13 +14,17 @@ from stages.physics.photometry.base import ReflectanceModel, get_model, model_na
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """Values of one model's parameters (radians where the parameter is in radians) and where they come from."""
+    """Values of one model's parameters (radians where the parameter is in radians) and where they come from.
+
+    wavelength_nm : that they hold for, None where none is told
+    """
 
     name: str
     model: str
     values: dict[str, float]
     description: str
     reference: str
+    wavelength_nm: float | None = None
 
 
 _SATO = "Sato, H. et al. (2014), J. Geophys. Res. Planets 119, 1775, doi:10.1002/2013JE004580"
@@ -53,6 +57,7 @@ def _sets() -> list[ParameterSet]:
             _sato(values),
             f"whole Moon, LROC WAC {band} nm, 32 deg cells averaged",
             _SATO,
+            float(band),
         )
         for band, values in _SATO_MEAN.items()
     ]
@@ -63,6 +68,7 @@ def _sets() -> list[ParameterSet]:
             _sato((0.254484, 0.262982, 0.081127, 1.994042, 0.048495)),
             "mare: Oceanus Procellarum, map cell about 22 N 304 E, LROC WAC 643 nm",
             _SATO,
+            643.0,
         ),
         ParameterSet(
             "sato2014_643nm_highland",
@@ -70,6 +76,7 @@ def _sets() -> list[ParameterSet]:
             _sato((0.450915, 0.231281, 0.390314, 1.647419, 0.067423)),
             "highland: far side, map cell about 22 N 208 E, LROC WAC 643 nm",
             _SATO,
+            643.0,
         ),
         ParameterSet(
             "helfenstein1987",
@@ -87,6 +94,7 @@ def _sets() -> list[ParameterSet]:
             },
             "whole disk of the Moon, V band; Bs0 from S(0) = 0.71 as S(0) / (w p(0))",
             "Helfenstein, P. and Veverka, J. (1987), Icarus 72, 342, table II",
+            550.0,
         ),
         ParameterSet(
             "mcewen1996",
@@ -101,6 +109,7 @@ def _sets() -> list[ParameterSet]:
             {"A0": -2.9811422, "A1": -0.0112862, "A2": -0.8084603, "A3": 1.3248888},
             "LROC NAC broadband, 600 nm",
             "ISIS lronacpho, NAC_PHO_LROC_Empirical.0002",
+            600.0,
         ),
         ParameterSet(
             "lroc_nac_2019",
@@ -116,6 +125,7 @@ def _sets() -> list[ParameterSet]:
             },
             "LROC NAC broadband, 600 nm",
             "ISIS lronacpho, NAC_PHO_LROC_Empirical.0003",
+            600.0,
         ),
     ]
     return sets
@@ -135,6 +145,20 @@ def get_set(name: str) -> ParameterSet:
         return _SETS[name]
     except KeyError:
         raise RegistryError.unknown("parameter set", name, _SETS) from None
+
+
+def hapke_set(wavelength_nm: float, name: str | None = None) -> ParameterSet:
+    """Hapke's parameters of the whole Moon at the wavelength nearest to one, 643 nm where that is NaN; or a set of Hapke's by name.
+
+    Raises RegistryError with the choices.
+    """
+    known = {s.name: s for s in _SETS.values() if s.model.startswith("hapke")}
+    if name is not None:
+        if name not in known:
+            raise RegistryError.unknown("set of Hapke's parameters", name, known)
+        return known[name]
+    wanted = 643.0 if math.isnan(wavelength_nm) else wavelength_nm
+    return known[f"sato2014_{min(_SATO_MEAN, key=lambda band: abs(band - wanted))}nm"]
 
 
 def find_reflectance(name: str) -> tuple[ReflectanceModel, dict[str, float]]:
