@@ -123,11 +123,11 @@ def photometric_angles(
 ) -> Angles:
     """Angles of a surface with these slopes.
 
-    slope_east, slope_north : (B, H, W); sun_direction : (B, 3) unit; view : three (B, H, W)
+    slope_east, slope_north : (B, H, W); sun_direction : (B, 3) or (B, 3, H, W), unit; view : three (B, H, W)
     """
     inverse = torch.rsqrt(1 + slope_east * slope_east + slope_north * slope_north)
-    sun = sun_direction.to(slope_east.dtype)[:, :, None, None]
-    sx, sy, sz = sun[:, 0], sun[:, 1], sun[:, 2]
+    sun = sun_direction.to(slope_east.dtype)
+    sx, sy, sz = (sun if sun.ndim == 4 else sun[:, :, None, None]).unbind(1)
     vx, vy, vz = view
     cos_incidence = (sz - slope_east * sx - slope_north * sy) * inverse
     cos_emission = (vz - slope_east * vx - slope_north * vy) * inverse

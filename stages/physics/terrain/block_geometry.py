@@ -10,8 +10,10 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
+import torch
 
 from stages.common.arrays import Floats, Floats32
+from stages.physics.formation.geometry import Angles, photometric_angles
 from stages.physics.maps.grid import Grid
 
 NODE_PX = 64
@@ -21,19 +23,19 @@ NODE_PX = 64
 class BlockGeometry:
     """Per pixel (h, w) float32, in axes along the grid (east, north, up).
 
-    slopes : 2, true slopes; sun, view : 3 each, unit vectors; cos_incidence, cos_emission, cos_phase
-    depth : m to the camera, NaN for a view from straight above; longitude_deg, latitude_deg
+    sun : 3, unit vector; angles : of the ground; depth : m to the camera, NaN for a view from straight above
     """
 
-    slopes: Floats32
     sun: Floats32
-    view: Floats32
-    cos_incidence: Floats32
-    cos_emission: Floats32
-    cos_phase: Floats32
+    angles: Angles
     depth: Floats32
     longitude_deg: Floats32
     latitude_deg: Floats32
+
+    @property
+    def cos_incidence(self) -> Floats32:
+        """(h, w)"""
+        return self.angles.cos_incidence.numpy()
 
     @property
     def sun_elevation(self) -> Floats32:
@@ -68,11 +70,14 @@ def block_geometry(
         ],
         axis=1,
     ).reshape(*rows.shape, 11)
-    out = np.empty((14, height, width), np.float32)
+    out = np.empty((11, height, width), np.float32)
     step_row = node_rows[1] - node_rows[0] if height > 1 else 1.0
     step_col = node_cols[1] - node_cols[0] if width > 1 else 1.0
     _geometry(np.asarray(elevation, np.float32), fields, step_row, step_col, grid.radius, camera_position is None, out)
-    return BlockGeometry(out[0:2], out[2:5], out[5:8], out[8], out[9], out[10], out[11], out[12], out[13])
+    slopes, toward_sun, view = (torch.from_numpy(v)[None] for v in (out[0:2], out[2:5], out[5:8]))
+    angles = photometric_angles(*slopes.unbind(1), toward_sun, view.unbind(1))
+    cosines = angles.cos_incidence, angles.cos_emission, angles.cos_phase
+    return BlockGeometry(out[2:5], Angles(*(c[0] for c in cosines)), *out[8:])
 
 
 @numba.njit(cache=True, inline="always")
@@ -115,16 +120,12 @@ def _geometry(z, fields, step_row, step_col, radius, above, out):
                 vx, vy, vz = values[3], values[4], values[5] - here
                 depth = np.sqrt(vx * vx + vy * vy + vz * vz)
                 vx, vy, vz = vx / depth, vy / depth, vz / depth
-            inverse = 1.0 / np.sqrt(1.0 + east * east + north * north)
             out[0, r, c], out[1, r, c] = east, north
             out[2, r, c], out[3, r, c], out[4, r, c] = sx, sy, sz
             out[5, r, c], out[6, r, c], out[7, r, c] = vx, vy, vz
-            out[8, r, c] = (sz - east * sx - north * sy) * inverse
-            out[9, r, c] = (vz - east * vx - north * vy) * inverse
-            out[10, r, c] = sx * vx + sy * vy + sz * vz
-            out[11, r, c] = depth
-            out[12, r, c] = np.degrees(np.arctan2(values[9], values[8]))
-            out[13, r, c] = np.degrees(np.arctan2(values[10], np.sqrt(values[8] ** 2 + values[9] ** 2)))
+            out[8, r, c] = depth
+            out[9, r, c] = np.degrees(np.arctan2(values[9], values[8]))
+            out[10, r, c] = np.degrees(np.arctan2(values[10], np.sqrt(values[8] ** 2 + values[9] ** 2)))
             if here != here:
-                for k in range(14):
+                for k in range(11):
                     out[k, r, c] = np.nan

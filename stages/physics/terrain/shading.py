@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from stages.common.arrays import Floats32
 from stages.physics.formation.chain import Extension, Observation, State, form
-from stages.physics.formation.geometry import Angles
 from stages.physics.maps.window import Window
 from stages.physics.photometry import masked_radiance_factor
 from stages.physics.photometry.deviation import radiance_deviation
@@ -102,9 +101,9 @@ def shade_block(surface: Surface, light: Light, row: int, col: int, height: int,
     if surface.knows_errors:
         planes["image_std"] = _deviation(surface, geometry, visible, window, image)
     return planes | {
-        "incidence_deg": _degrees(geometry.cos_incidence),
-        "emission_deg": _degrees(geometry.cos_emission),
-        "phase_deg": _degrees(geometry.cos_phase),
+        "incidence_deg": _degrees(geometry.angles.cos_incidence),
+        "emission_deg": _degrees(geometry.angles.cos_emission),
+        "phase_deg": _degrees(geometry.angles.cos_phase),
         "shadow": shadow,
         "depth": geometry.depth,
         "longitude_deg": geometry.longitude_deg,
@@ -126,18 +125,13 @@ def _reflected(
     """(h, w) I/F of facets in a source's light, NaN where unknown, and 1 where the model's was below 0."""
     coefficients = torch.from_numpy(np.ascontiguousarray(surface.read_coefficients(*window)))
     parameters = surface.model.unpack(coefficients, dim=0)
-    image = masked_radiance_factor(surface.model, parameters, _angles(geometry)).numpy()
+    image = masked_radiance_factor(surface.model, parameters, geometry.angles).numpy()
     clipped = (image < 0).astype(np.float32)
     image = np.maximum(image, 0) * visible
     unknown = np.isnan(geometry.cos_incidence) | ~np.isfinite(coefficients.numpy()).all(axis=0)
     image[unknown] = np.nan
     clipped[unknown] = 0
     return image, clipped
-
-
-def _angles(geometry: BlockGeometry) -> Angles:
-    cosines = (geometry.cos_incidence, geometry.cos_emission, geometry.cos_phase)
-    return Angles(*(torch.from_numpy(v) for v in cosines))
 
 
 def further_radiance(surface: Surface, light: Light, window: Window) -> tuple[Floats32 | None, Floats32 | None]:
@@ -185,7 +179,7 @@ def _deviation(
     known = torch.from_numpy(np.ascontiguousarray(surface.read_coefficients(*window)))
     values = surface.model.unpack(known, dim=0)
     deviations = {k: torch.from_numpy(v) for k, v in surface.read_deviations(*window).items()}
-    found = radiance_deviation(surface.model, values, deviations, _angles(geometry)).numpy() * visible
+    found = radiance_deviation(surface.model, values, deviations, geometry.angles).numpy() * visible
     found[np.isnan(geometry.cos_incidence) | ~np.isfinite(known.numpy()).all(axis=0)] = np.nan
     return np.hypot(found, np.float32(surface.image_noise))
 
@@ -260,5 +254,5 @@ def _form_tile(surface: Surface, light: Light, tile: Window, extensions: Sequenc
     return np.stack([np.where(known, image, np.nan), below & known]).astype(np.float32)
 
 
-def _degrees(cosine: Floats32) -> Floats32:
-    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).astype(np.float32)
+def _degrees(cosine: torch.Tensor) -> Floats32:
+    return np.degrees(np.arccos(np.clip(cosine.numpy(), -1.0, 1.0))).astype(np.float32)
