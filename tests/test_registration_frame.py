@@ -11,7 +11,7 @@ from affine import Affine
 from rasterio.crs import CRS
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from stages.physics.horizon.scene import make_overview
+from stages.physics.horizon.scene import SceneTerrain
 from stages.physics.images.displacement import Basis, Field, relief_displacement
 from stages.physics.images.register_frame import choose_blocks, register_frame, render_region
 from stages.physics.images.source_images import open_source
@@ -40,8 +40,8 @@ class Scene:
         crs = CRS.from_proj4(f"+proj=eqc +R={RADIUS} +units=m +no_defs")
         self.grid = Grid(crs.to_wkt(), Affine(GSD, 0, -half, 0, -GSD, half), SIZE, SIZE, RADIUS)
         self.frame = Frame("A", folder / "a.tif", "dn", None, "", 62.0, 5.0, 1.0, 0.0, 0.0, CAMERA_ALTITUDE)
-        self.overview = make_overview(self.elevation, 1)
-        rendering, *_ = render_region(self.frame, self.elevation, self.elevation, self.overview, self.grid, 0, 0)
+        self.terrain = SceneTerrain.of(self.elevation, self.grid)
+        rendering, *_ = render_region(self.frame, self.elevation, self.terrain, 0, 0)
         albedo = gaussian_filter(rng.standard_normal((SIZE, SIZE)), 2.0)
         self.truth = 20 + 500 * rendering * (1 + 0.05 * albedo / albedo.std())
         self.relief = relief_displacement(self.grid, self.frame.camera_position(RADIUS), 0.0)
@@ -74,9 +74,7 @@ class Scene:
         row, col = (v.ravel() for v in np.mgrid[32:SIZE:64, 32:SIZE:64])
         blocks = choose_blocks(row, col, 64, self.grid)
         with self.open() as source:
-            return register_frame(
-                self.frame, source, self.elevation, self.overview, self.grid, blocks, form, 8.0
-            ), source.read(64, 64, 192, 192)
+            return register_frame(self.frame, source, self.terrain, blocks, form, 8.0), source.read(64, 64, 192, 192)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.0])

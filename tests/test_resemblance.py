@@ -10,7 +10,7 @@ import pytest
 
 from lunargr_cli.commands.project import _say_resemblances
 from schemas import SCENE, InputError, open_artefact
-from stages.physics.horizon.scene import make_overview
+from stages.physics.horizon.scene import SceneTerrain
 from stages.physics.images.register_frame import choose_blocks
 from stages.physics.images.source_images import open_source
 from stages.physics.images.table import load_frames
@@ -42,7 +42,7 @@ def compare(small_artefacts):
                     pixels = source.read(*box)
                     return replace(pixels, values=seen(pixels.values))
 
-            return compare_with_rendering(other, Seen(), z, make_overview(z, 1), grid, blocks)
+            return compare_with_rendering(other, Seen(), SceneTerrain.of(z, grid), blocks)
 
     return run
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,23 +15,17 @@ import numpy as np
 from schemas import CROPS, SCENE, ArtefactError, InputError, open_artefact
 from schemas.files.user_files import check_file
 from schemas.provenance import file_state, sha256
-from stages.physics.horizon.scene import Overview, make_overview
+from stages.physics.horizon.scene import Overview, SceneTerrain
 from stages.physics.images.table import Frame, load_frames
 from stages.physics.maps.grid import Grid, read_grid
 from stages.project.config import Config
 
-OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
-
 
 @dataclass(frozen=True)
-class Scene:
-    """An open scene. elevation : (H, W) dataset on ``grid``, m, NaN = unknown; heights : its least and largest value."""
+class Scene(SceneTerrain):
+    """An open scene."""
 
     path: Path
-    elevation: h5py.Dataset
-    grid: Grid
-    overview: Overview
-    heights: tuple[float, float]
 
 
 @contextmanager
@@ -42,9 +35,8 @@ def open_scene(crops: Path, file: h5py.File, config: Config) -> Iterator[Scene]:
     if sha256(path) != file.attrs["scene_sha256"]:
         raise ArtefactError(f"{path}: not the scene that {crops} was sampled from; run 'lunargr sample' again.")
     with open_artefact(path, SCENE) as scene:
-        elevation = scene["elevation"]
-        overview = overview_of(path, elevation)
-        yield Scene(path, elevation, read_grid(scene, path), overview, overview_extremes(elevation, overview))
+        terrain = _terrain(path, scene["elevation"], read_grid(scene, path))
+        yield Scene(**vars(terrain), path=path)
 
 
 def check_sources(crops: Path, frames: list[Frame]) -> None:
@@ -107,17 +99,10 @@ def source_files(crops: Path) -> list[Path]:
 _overviews: dict[tuple[Any, ...], Overview] = {}
 
 
-def overview_of(scene: Path, elevation: h5py.Dataset) -> Overview:
-    """The far terrain. It is made of the whole DEM, and shared by all parts that one process works on."""
+def _terrain(scene: Path, elevation: h5py.Dataset, grid: Grid) -> SceneTerrain:
+    """The far terrain is made of the whole DEM once, for all parts that one process works on."""
     key = (os.path.realpath(scene), *file_state(scene))
     if key not in _overviews:
         _overviews.clear()
-        _overviews[key] = make_overview(elevation, max(1, math.ceil(max(elevation.shape) / OVERVIEW_PX)))
-    return _overviews[key]
-
-
-def overview_extremes(elevation: h5py.Dataset, overview: Overview) -> tuple[float, float]:
-    """Least and largest elevation of a scene, m: the largest is exact, the least that of block means less their relief."""
-    cells = overview.cells[np.isfinite(overview.cells)]
-    low = float(cells.min()) if cells.size else 0.0
-    return low - 0.5 * max(0.0, overview.highest - low), overview.highest
+        _overviews[key] = SceneTerrain.of(elevation, grid).overview
+    return SceneTerrain(elevation, grid, _overviews[key])

@@ -27,9 +27,7 @@ def register(frame: Frame, index: int, source: Source, crops: h5py.File, scene: 
     mine = crops["image_index"][...] == index
     size = crops["elevation"].shape[1]
     blocks = choose_blocks(crops["row"][...][mine], crops["col"][...][mine], size, scene.grid)
-    field, shifts = register_frame(
-        frame, source, scene.elevation, scene.overview, scene.grid, blocks, str(config.register), config.max_shift
-    )
+    field, shifts = register_frame(frame, source, scene, blocks, str(config.register), config.max_shift)
     places = [(r + (h - 1) / 2, c + (w - 1) / 2) for r, c, h, w in blocks]
     answers = tuple((r, c, s) for (r, c), s in zip(places, shifts, strict=True))
     return Registered(frame.image_id, field, answers, time.monotonic() - began)
@@ -70,7 +68,7 @@ def resemble(
     mine = crops["image_index"][...] == index
     rows, cols = (crops[name][...][mine] for name in ("row", "col"))
     blocks = choose_blocks(rows, cols, crops["elevation"].shape[1], scene.grid, BLOCKS)
-    return compare_with_rendering(frame, source, scene.elevation, scene.overview, scene.grid, blocks, field)
+    return compare_with_rendering(frame, source, scene, blocks, field)
 
 
 def write_resemblances(writer: ArtefactWriter, frames: Sequence[Frame], found: Sequence[Resemblance]) -> None:

@@ -8,20 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stages.common.arrays import Floats
-from stages.physics.horizon.scene import Overview
+from stages.physics.horizon.scene import SceneTerrain
 from stages.physics.images.correlation import small_structure
 from stages.physics.images.displacement import Field
 from stages.physics.images.register_frame import render_region
 from stages.physics.images.registration import LEAST_PIXELS
 from stages.physics.images.source_images import Source
 from stages.physics.images.table import Frame
-from stages.physics.maps.grid import Grid
 from stages.physics.maps.window import Box
 from stages.project.summary import Resemblance
 
@@ -29,27 +27,21 @@ BLOCKS = 16  # per image: 127 turned, mirrored and exchanged renderings then tel
 
 
 def compare_with_rendering(
-    frame: Frame,
-    source: Source,
-    elevation: Any,
-    overview: Overview,
-    grid: Grid,
-    blocks: Sequence[Box],
-    field: Field | None = None,
+    frame: Frame, source: Source, terrain: SceneTerrain, blocks: Sequence[Box], field: Field | None = None
 ) -> Resemblance:
     """Compare an image with the rendering of a uniform surface, on ``blocks`` of the grid.
 
-    elevation : (H, W) array or dataset, m; field : the displacement that registration takes off
+    field : the displacement that registration subtracts
     """
     images, renderings, means = [], [], []
     for row, col, height, width in blocks:
         edge = min(height, width)
-        z = np.asarray(elevation[row : row + edge, col : col + edge], np.float32)
+        z = np.asarray(terrain.elevation[row : row + edge, col : col + edge], np.float32)
         pixels = source.read(row, col, edge, edge, field)
         good = pixels.valid & np.isfinite(z)
         if good.sum() < LEAST_PIXELS:
             continue
-        rendering = render_region(frame, z, elevation, overview, grid, row, col)[0]
+        rendering = render_region(frame, z, terrain, row, col)[0]
         values = np.where(good, pixels.values, 0.0).astype(float)
         images.append(small_structure(values, good))
         renderings.append(small_structure(np.where(good, rendering, 0.0), good))

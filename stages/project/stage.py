@@ -14,7 +14,6 @@ from schemas import CROPS, PAIRS, ArtefactWriter, InputError, check_output, open
 from schemas.files.outputs import Output
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.common.shards import shard_range
-from stages.physics.horizon.scene import horizon_in_scene
 from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import Frame, load_frames
@@ -166,14 +165,7 @@ def _pair(view: View, place: int, heights: NDArray[np.float32], scene: Scene) ->
         centre = view.local.up[place] * (grid.radius + view.mean[place])
         camera = view.local.axes[place] @ (pixels.ortho.camera_position - centre)
     east, north, _ = sun
-    angle = horizon_in_scene(
-        scene.elevation,
-        scene.overview,
-        Window(*corner, size, size),
-        grid.gsd,
-        math.atan2(east, north) % (2 * math.pi),
-        body_radius=grid.radius,
-    )
+    angle = scene.horizon(Window(*corner, size, size), math.atan2(east, north) % (2 * math.pi))
     displacement = (0.0, 0.0)
     if view.field is not None:
         displacement = displacement_at(view.source, view.field, row - 0.5, col - 0.5, view.mean[place])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numba
@@ -16,8 +17,10 @@ from numpy.typing import NDArray
 
 from schemas.errors import GeometryError
 from stages.physics.horizon.hulls import sweep_horizon
+from stages.physics.maps.grid import Grid
 from stages.physics.maps.window import Window
 
+OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
 CELLS_PER_DISTANCE = 64  # a ridge with slopes of +-0.3 is then rounded by less than 0.1 deg
 NODE = 4  # the far horizon is searched from every fourth pixel
 
@@ -70,6 +73,40 @@ def make_overview(elevation: Any, factor: int = 4, rows_at_once: int = 1024) -> 
     shapes = np.array([level.shape for level in levels], dtype=np.int64)
     starts = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))[:-1]])
     return Overview(factor, (height, width), np.concatenate([v.ravel() for v in levels]), starts, shapes, highest)
+
+
+@dataclass(frozen=True)
+class SceneTerrain:
+    """A scene's terrain, near and far. elevation : (H, W) array or dataset on ``grid``, m, NaN = unknown"""
+
+    elevation: Any
+    grid: Grid
+    overview: Overview
+
+    @classmethod
+    def of(cls, elevation: Any, grid: Grid) -> SceneTerrain:
+        """With an overview of at most OVERVIEW_PX cells a side."""
+        return cls(elevation, grid, make_overview(elevation, max(1, math.ceil(max(elevation.shape) / OVERVIEW_PX))))
+
+    @cached_property
+    def heights(self) -> tuple[float, float]:
+        """Least and largest elevation, m: the largest is exact, the least that of block means less half the relief."""
+        cells, highest = self.overview.cells[np.isfinite(self.overview.cells)], self.overview.highest
+        low = float(cells.min()) if cells.size else 0.0
+        return low - 0.5 * max(0.0, highest - low), highest
+
+    def horizon(self, window: Window, azimuth: float, sun_elevation: float | None = None) -> NDArray[np.float32]:
+        """:func:`horizon_in_scene` for a window of the scene."""
+        grid = self.grid
+        return horizon_in_scene(
+            self.elevation,
+            self.overview,
+            window,
+            grid.gsd,
+            azimuth,
+            sun_elevation=sun_elevation,
+            body_radius=grid.radius,
+        )
 
 
 @numba.njit(cache=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from stages.physics.formation.chain import Observation
 from stages.physics.formation.chain import form as form_image
-from stages.physics.horizon.scene import Overview, horizon_in_scene
+from stages.physics.horizon.scene import SceneTerrain
 from stages.physics.images.correlation import SUPPORT_PX
 from stages.physics.images.displacement import Field, Relief
 from stages.physics.images.fit_displacement import fit_field
@@ -70,25 +69,15 @@ class _Tile:
 
 
 def register_frame(
-    frame: Frame,
-    source: Source,
-    elevation: Any,
-    overview: Overview,
-    grid: Grid,
-    blocks: Sequence[Box],
-    form: str,
-    max_shift: float,
+    frame: Frame, source: Source, terrain: SceneTerrain, blocks: Sequence[Box], form: str, max_shift: float
 ) -> tuple[Field, list[Shift]]:
     """Displacement of ``source`` against its rendering, px of the grid, and the shift of each block.
 
-    elevation : (H, W) array or dataset; form : the most general of displacement.FORMS that may be taken
+    form : the most general of displacement.FORMS that may be taken
     A displacement that varies over the ground is fitted twice: shifts that remain are measured in the corrected image, in
     which relief does not distort the blocks and a neighbouring crater is too far away to be taken for the right one.
     """
-    tiles = [
-        _prepare_tile(frame, elevation, overview, grid, group, math.ceil(max_shift) + SUPPORT_PX)
-        for group in _groups(blocks)
-    ]
+    tiles = [_prepare_tile(frame, terrain, group, math.ceil(max_shift) + SUPPORT_PX) for group in _groups(blocks)]
     reference = _mean_height(*(t.elevation for t in tiles))
     relief = source.relief(reference) if form != "constant" else None
     middles = np.array([(r + (h - 1) / 2, c + (w - 1) / 2) for r, c, h, w in blocks]).reshape(-1, 2)
@@ -121,14 +110,13 @@ def _groups(blocks: Sequence[Box]) -> list[list[Box]]:
     return list(groups.values())
 
 
-def _prepare_tile(
-    frame: Frame, elevation: Any, overview: Overview, grid: Grid, blocks: list[Box], margin: int
-) -> _Tile:
+def _prepare_tile(frame: Frame, terrain: SceneTerrain, blocks: list[Box], margin: int) -> _Tile:
+    grid = terrain.grid
     r0, c0 = (max(0, min(b[k] for b in blocks) - margin) for k in (0, 1))
     r1 = min(grid.height, max(b[0] + b[2] for b in blocks) + margin)
     c1 = min(grid.width, max(b[1] + b[3] for b in blocks) + margin)
-    z = np.asarray(elevation[r0:r1, c0:c1], np.float32)
-    *renderings, lit = render_region(frame, z, elevation, overview, grid, r0, c0)
+    z = np.asarray(terrain.elevation[r0:r1, c0:c1], np.float32)
+    *renderings, lit = render_region(frame, z, terrain, r0, c0)
     # Shadow edges do not depend on the reflectance, so that shadows count; but their inside holds no structure.
     weights = np.where(lit > 0.05, 1.0, 0.5).astype(np.float32)
     return _Tile((r0, c0, r1 - r0, c1 - c0), tuple(blocks), z, tuple(r.astype(np.float32) for r in renderings), weights)
@@ -189,15 +177,14 @@ def albedo_patterns(z: NDArray[np.float32], rendering: NDArray[np.float64]) -> l
 
 
 def render_region(
-    frame: Frame, z: NDArray[np.float32], elevation: Any, overview: Overview, grid: Grid, row: int, col: int
+    frame: Frame, z: NDArray[np.float32], terrain: SceneTerrain, row: int, col: int
 ) -> tuple[NDArray[np.float64], ...]:
     """I/F of a uniform surface by each of MODELS, with shadows, and whether the Sun shines; NaN without terrain.
 
-    z : (h, w) heights of the region, m; row, col : its first pixel on the grid; elevation : (H, W) of the scene, which casts
-    the shadows
+    z : (h, w) heights of the region, m; row, col : its first pixel on the grid; terrain : casts the shadows
     returns (h, w) for each model, and (h, w) 1 where the Sun shines
     """
-    height, width = z.shape
+    grid, (height, width) = terrain.grid, z.shape
     known = np.isfinite(z)
     mean = float(z[known].mean()) if known.any() else 0.0
     local = grid.local_frames(row + (height - 1) / 2, col + (width - 1) / 2)
@@ -205,14 +192,10 @@ def render_region(
     to_sun = frame.sun_position() - centre
     east, north, up = local.axes[0] @ (to_sun / np.linalg.norm(to_sun))
     to_camera = local.axes[0] @ (frame.camera_position(grid.radius) - centre)
-    horizon = horizon_in_scene(
-        elevation,
-        overview,
+    horizon = terrain.horizon(
         Window(row, col, height, width),
-        grid.gsd,
         math.atan2(east, north) % (2 * math.pi),
-        sun_elevation=math.asin(max(-1.0, min(1.0, float(up)))) - math.radians(5),
-        body_radius=grid.radius,
+        math.asin(max(-1.0, min(1.0, float(up)))) - math.radians(5),
     )
     observation = Observation(
         elevation=torch.from_numpy(np.where(known, z, mean).astype(np.float32))[None],
