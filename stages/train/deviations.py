@@ -26,7 +26,7 @@ from stages.network.pixels import Pixels, sample_pixels
 from stages.network.predictor import Predictor
 from stages.pairs.reader import Batch
 from stages.physics.formation.chain import form
-from stages.physics.photometry import masked_radiance_factor
+from stages.physics.photometry.deviation import sensitivity
 from stages.train.training import Training
 
 STEP = 1e-4  # of a parameter's range, for its effect on the image
@@ -84,14 +84,9 @@ def _effects(predictor: Predictor, pixels: Pixels, coefficients: Tensor) -> Tens
     """dI/dc of the maps, (N, M), by central differences within their bounds. coefficients : (N, C)"""
     model = predictor.model
     values = model.unpack(coefficients, dim=1)
-    found = []
-    for p in model.parameters:
-        if p.name in predictor.maps.maps:
-            step = STEP * (p.upper - p.lower)
-            above, below = ((values[p.name] + s).clamp(p.lower, p.upper) for s in (step, -step))
-            images = [masked_radiance_factor(model, {**values, p.name: v}, pixels.angles) for v in (above, below)]
-            found.append((images[0] - images[1]) / (above - below) * pixels.light)
-    return torch.stack(found, dim=1)
+    sizes = {p.name: STEP * (p.upper - p.lower) for p in model.parameters}
+    found = [sensitivity(model, values, name, sizes[name], pixels.angles) for name in predictor.maps.maps]
+    return torch.stack(found, dim=1) * pixels.light[:, None]
 
 
 def _variance(effects: Tensor, features: Tensor, weights: Tensor, constants: Tensor, noise: Tensor) -> Tensor:

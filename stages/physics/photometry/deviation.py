@@ -20,14 +20,19 @@ def radiance_deviation(
 
     values : all parameters by name; deviations : of some of them, each broadcasting to the angles
     """
-    bounds = {p.name: (p.lower, p.upper) for p in model.parameters}
     variance = torch.zeros_like(angles.cos_incidence)
     for name, sigma in deviations.items():
-        low, high = bounds[name]
-        above, below = ((values[name] + s).clamp(low, high) for s in (sigma, -sigma))
-        change = masked_radiance_factor(model, {**values, name: above}, angles)
-        change = change - masked_radiance_factor(model, {**values, name: below}, angles)
-        # a bound shortens the step of 2 sigma
-        share = 2 * sigma / (above - below).clamp(min=1e-12)
-        variance = variance + (change * 0.5 * share).square()
+        variance = variance + (sensitivity(model, values, name, sigma, angles) * sigma).square()
     return variance.sqrt()
+
+
+def sensitivity(
+    model: ReflectanceModel, values: Mapping[str, torch.Tensor], name: str, step: torch.Tensor | float, angles: Angles
+) -> torch.Tensor:
+    """Change of I/F per unit of the parameter ``name``, of the shape of the angles: a difference over ``step`` both ways,
+    as far as the parameter's bounds allow.
+    """
+    low, high = next((p.lower, p.upper) for p in model.parameters if p.name == name)
+    above, below = ((values[name] + s).clamp(low, high) for s in (step, -step))
+    images = [masked_radiance_factor(model, {**values, name: value}, angles) for value in (above, below)]
+    return (images[0] - images[1]) / (above - below).clamp(min=1e-12)
