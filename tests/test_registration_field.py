@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from stages.physics.images.displacement import Basis, Field, relief_displacement
 from stages.physics.images.fit_displacement import fit_field
-from stages.physics.images.registration import Shift, block_shift, capture_shifts, prepare
+from stages.physics.images.registration import BLOCK_PX, Shift, block_shift, prepare
 from stages.physics.maps.grid import Grid, unit_vectors
 
 SIZE = 256
@@ -36,11 +36,25 @@ def shown(rendering, dx, dy):
     return map_coordinates(rendering, [r, c], order=5, mode="reflect")
 
 
+class Lattice:
+    """Shifts (R, C, 2), errors (R, C, 2) and quality (R, C) of blocks from the upper left corner on; NaN where refused."""
+
+    def __init__(self, image, rendering, valid=None):
+        pictures = prepare(image, rendering, valid, None, ())
+        corners = range(0, SIZE, BLOCK_PX)
+        found = [[block_shift(pictures, (r, c, BLOCK_PX, BLOCK_PX), 8.0) for c in corners] for r in corners]
+        refused = np.array([[not s.accepted for s in line] for line in found])
+        self.shifts = np.array([[(s.dx, s.dy) for s in line] for line in found])
+        self.errors = np.array([[np.sqrt(np.diag(s.place_covariance)) for s in line] for line in found])
+        self.shifts[refused] = self.errors[refused] = np.nan
+        self.quality = np.array([[s.quality for s in line] for line in found])
+
+
 @pytest.mark.parametrize("planted", [(3.0, -2.5), (-7.0, 6.6), (0.3, 0.0)])
 def test_blocks_capture_shifts_of_many_pixels(rng, planted):
     rendering = texture(rng)
     image = 30 + 90 * shown(rendering, lambda r, c: planted[0], lambda r, c: planted[1])
-    found = capture_shifts(image + rng.normal(0, 1, image.shape), rendering, np.ones(image.shape, bool), 64, 8)
+    found = Lattice(image + rng.normal(0, 1, image.shape), rendering)
     inner = found.shifts[1:3, 1:3]  # the image's edge has no other side
     assert found.shifts.shape == (4, 4, 2) and (found.quality[1:3, 1:3] > 0.5).all()
     np.testing.assert_allclose(inner, np.broadcast_to(planted, inner.shape), atol=0.1)
@@ -54,7 +68,7 @@ def test_blocks_without_texture_in_shadow_or_of_other_ground_are_left_out(rng):
     image[64:128, :64] = 1 + 0.001 * rng.standard_normal((64, 64))  # nothing but noise
     valid = np.ones(image.shape, bool)
     valid[128:192, :64] = False
-    found = capture_shifts(image, rendering, valid)
+    found = Lattice(image, rendering, valid)
     assert (found.quality[:3, 0] == 0).all() and np.isnan(found.shifts[:3, 0]).all()
     assert (found.quality[1:, 1:] > 0.5).all()
 
@@ -66,7 +80,7 @@ def test_errors_are_of_the_size_that_they_claim_in_correlated_noise(rng):
         rendering = texture(rng)
         noise = gaussian_filter(rng.standard_normal(rendering.shape), 1.5)
         image = shown(rendering, lambda r, c: 0.7, lambda r, c: -0.4) + 0.1 * noise / noise.std()
-        found = capture_shifts(image, rendering)
+        found = Lattice(image, rendering)
         off = (found.shifts - (0.7, -0.4))[1:3, 1:3] / found.errors[1:3, 1:3]
         ratio += off.ravel().tolist()
     assert len(ratio) == 32 and 0.6 < np.sqrt(np.mean(np.square(ratio))) < 1.6

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -69,17 +68,6 @@ class Shift:
         return np.diag([self.sigma**2] * 2) if self.covariance is None else self.covariance[:2, :2]
 
 
-class Shifts(NamedTuple):
-    """Shifts on a lattice of R x C blocks: shifts (R, C, 2) px (dx, dy), errors (R, C, 2) px, quality (R, C) 0 to 1.
-
-    Where quality is 0 the shift is refused: shift and error are NaN.
-    """
-
-    shifts: Floats
-    errors: Floats
-    quality: Floats
-
-
 @dataclass(frozen=True)
 class Pictures:
     """An image and its templates, band-passed to be compared block by block; all (H, W).
@@ -96,32 +84,6 @@ class Pictures:
     good: Mask
     weights: Floats
     relief: Floats | None = None
-
-
-def capture_shifts(
-    image: ArrayLike,
-    rendering: ArrayLike,
-    valid: ArrayLike | None = None,
-    block: int = BLOCK_PX,
-    reach: float = 8.0,
-    patterns: Sequence[ArrayLike] = (),
-) -> Shifts:
-    """The shifts of ``image`` against ``rendering``, both (H, W), over blocks of ``block`` px; gain and offset are free.
-
-    valid : (H, W) bool, pixels that count in both; NaN never count. reach : px, how far to search
-    patterns : (H, W) each, what the surface may show besides the rendering, in unknown strength
-    Blocks are laid from the upper left corner on; a remainder at the right or at the bottom that is smaller makes no block.
-    """
-    pictures = prepare(image, rendering, valid, None, patterns)
-    height, width = pictures.image.shape
-    size = min(block, height), min(block, width)
-    rows, cols = range(0, height - size[0] + 1, block), range(0, width - size[1] + 1, block)
-    found = [[block_shift(pictures, (r, c, *size), reach) for c in cols] for r in rows]
-    refused = np.array([[not s.accepted for s in line] for line in found])
-    shifts = np.array([[(s.dx, s.dy) for s in line] for line in found])
-    errors = np.array([[np.sqrt(np.diag(s.place_covariance)) for s in line] for line in found])
-    shifts[refused] = errors[refused] = np.nan
-    return Shifts(shifts, errors, np.array([[s.quality for s in line] for line in found]))
 
 
 def prepare(

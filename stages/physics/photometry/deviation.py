@@ -29,8 +29,10 @@ def radiance_deviation(
 def sensitivity(
     model: ReflectanceModel, values: Mapping[str, torch.Tensor], name: str, step: torch.Tensor | float, angles: Angles
 ) -> torch.Tensor:
-    """Change of I/F per unit of the parameter ``name``, of the shape of the angles: a difference over ``step`` both ways,
-    as far as the parameter's bounds allow.
+    """Change of I/F per unit of the parameter ``name``, of the shape of the angles.
+
+    values : all parameters by name; step : (...,) by which it changes either way, as far as its bounds allow; all
+        broadcasting to the angles
     """
     low, high = next((p.lower, p.upper) for p in model.parameters if p.name == name)
     above, below = ((values[name] + s).clamp(low, high) for s in (step, -step))
