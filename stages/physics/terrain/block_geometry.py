@@ -75,7 +75,8 @@ def block_geometry(
     step_col = node_cols[1] - node_cols[0] if width > 1 else 1.0
     _geometry(np.asarray(elevation, np.float32), fields, step_row, step_col, grid.radius, camera_position is None, out)
     slopes, toward_sun, view = (torch.from_numpy(v)[None] for v in (out[0:2], out[2:5], out[5:8]))
-    angles = photometric_angles(*slopes.unbind(1), toward_sun, view.unbind(1))
+    vx, vy, vz = view.unbind(1)
+    angles = photometric_angles(slopes[:, 0], slopes[:, 1], toward_sun, (vx, vy, vz))
     cosines = angles.cos_incidence, angles.cos_emission, angles.cos_phase
     return BlockGeometry(out[2:5], Angles(*(c[0] for c in cosines)), *out[8:])
 
