@@ -17,7 +17,7 @@ from schemas import ArtefactError, ConfigError, InputError
 from schemas.files.outputs import Output
 from stages import albedo, merge
 from stages.albedo import stage as running
-from stages.albedo.posterior import Spread, estimate, settle
+from stages.albedo.posterior import Spread, estimate, robust_mean
 from stages.albedo.pyramid import LEVELS
 
 QUIET = albedo.Config(geotiff=False)
@@ -99,7 +99,7 @@ def test_what_one_image_shows_alone_loses_its_weight(rng):
     spread = Spread(
         np.full(LEVELS + 1, 0.04), np.full((6, LEVELS + 1), 1e-4), 0.04, np.full(6, 1e-4), np.zeros(LEVELS + 1)
     )
-    location = settle(ratio, confidence, spread)
+    location = robust_mean(ratio, confidence, spread)
     assert confidence[2, 16, 16] < 0.03 * np.median(confidence[2])
     assert np.median(confidence) > 0.5 and abs(location[16, 16]) < 0.02
 
@@ -339,7 +339,7 @@ def test_of_images_that_an_outlier_befell_the_most_precise_one_has_no_last_word(
     levels = np.ones(LEVELS + 1)
     spread = Spread(0.01 * levels, own_px[:, None] * levels, 0.01, own_px, 0.01 * levels)
     confidence = np.ones_like(ratio)
-    assert abs(settle(ratio, confidence, spread)[8, 8]) < 0.1
+    assert abs(robust_mean(ratio, confidence, spread)[8, 8]) < 0.1
     assert confidence[0, 8, 8] < 1e-3 * np.median(confidence[0])
 
 

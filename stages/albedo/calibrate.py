@@ -21,13 +21,13 @@ from scipy.special import stdtrit
 from schemas.checks import parse_json
 from schemas.errors import ArtefactError
 from stages.albedo.intervals import GAUSSIAN, Stack, unseen_intervals
-from stages.albedo.posterior import Spread, settle
+from stages.albedo.posterior import Spread, robust_mean
 from stages.albedo.pyramid import LEVELS, bands
 from stages.common.arrays import Floats, Floats32
 from stages.common.progress import Progress, show_nothing
 from stages.physics.formation.radiometry import fit_line
 from stages.physics.images.displacement import Field
-from stages.physics.images.references import Look, References
+from stages.physics.images.references import Observed, References
 from stages.physics.images.registered import as_text, from_text
 from stages.physics.maps.window import Box
 
@@ -55,14 +55,14 @@ class Calibration:
     shadow: Floats
     fields: tuple[Field | None, ...] = ()
 
-    def ratio(self, k: int, look: Look) -> tuple[Floats32, Floats32]:
+    def ratio(self, k: int, observed: Observed) -> tuple[Floats32, Floats32]:
         """(log of measured / predicted, confidence), both 0 where the image says nothing."""
-        expected = self.gain[k] * look.predicted
+        expected = self.gain[k] * observed.predicted
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.log(np.maximum((look.measured - self.offset[k]) / expected, np.exp(-FARTHEST)))
-        known = np.isfinite(ratio) & look.usable
+            ratio = np.log(np.maximum((observed.measured - self.offset[k]) / expected, np.exp(-FARTHEST)))
+        known = np.isfinite(ratio) & observed.usable
         ratio = np.where(known, np.minimum(ratio, FARTHEST), 0).astype(np.float32)
-        confidence = 1.0 / np.interp(look.cos_incidence, _middles(), self.error)
+        confidence = 1.0 / np.interp(observed.cos_incidence, _middles(), self.error)
         return ratio, np.where(known, confidence, 0).astype(np.float32)
 
     def write(self, path: Path, made_from: dict[str, Any]) -> None:
@@ -107,7 +107,7 @@ class Sample:
 
     prior: Floats32 | None = None
     images: list[int] = field(default_factory=list)
-    looks: list[Look] = field(default_factory=list)
+    observations: list[Observed] = field(default_factory=list)
 
 
 def take_samples(
@@ -122,10 +122,10 @@ def take_samples(
         progress(number, len(windows), "calibration windows")
         sample = Sample(prior(box))
         for k in references.overlapping(box):
-            look = references.look(k, box)
-            if look is not None:
+            observed = references.observe(k, box)
+            if observed is not None:
                 sample.images.append(k)
-                sample.looks.append(look)
+                sample.observations.append(observed)
         if sample.images:
             samples.append(sample)
     return samples
@@ -144,10 +144,10 @@ def calibrate(samples: Sequence[Sample], count: int, units: str) -> Calibration:
         result = replace(result, gain=gain, offset=offset)
         stacks = [_stack(result, sample) for sample in samples]
         albedo = [
-            settle(ratio, confidence.copy(), result.spread.of(sample.images))
+            robust_mean(ratio, confidence.copy(), result.spread.of(sample.images))
             for sample, (ratio, confidence) in zip(samples, stacks, strict=True)
         ]
-        _tame(samples, stacks, albedo, count)
+        _winsorize(samples, stacks, albedo, count)
         before = result.spread.own_px
         result = replace(result, spread=_variances(samples, stacks, count))
         result = replace(result, error=_error(samples, stacks, albedo, result.spread.own_px))
@@ -160,22 +160,22 @@ def calibrate(samples: Sequence[Sample], count: int, units: str) -> Calibration:
 def _unseen(calibration: Calibration, sample: Sample, units: str) -> Stack:
     """A window with its images in I/F as one who has not seen them takes them: calibrated ones have no gain of their own."""
     scaled = [
-        look.measured if units == "iof" else (look.measured - calibration.offset[k]) / calibration.gain[k]
-        for k, look in zip(sample.images, sample.looks, strict=True)
+        observed.measured if units == "iof" else (observed.measured - calibration.offset[k]) / calibration.gain[k]
+        for k, observed in zip(sample.images, sample.observations, strict=True)
     ]
     measured = [v.astype(np.float32) for v in scaled]
-    return Stack(*_stack(calibration, sample), sample.images, sample.looks, measured, sample.prior)
+    return Stack(*_stack(calibration, sample), sample.images, sample.observations, measured, sample.prior)
 
 
 def _stack(calibration: Calibration, sample: Sample) -> tuple[Floats32, Floats32]:
-    found = [calibration.ratio(k, look) for k, look in zip(sample.images, sample.looks, strict=True)]
+    found = [calibration.ratio(k, observed) for k, observed in zip(sample.images, sample.observations, strict=True)]
     return np.stack([f[0] for f in found]), np.stack([f[1] for f in found])
 
 
-def _tame(
+def _winsorize(
     samples: Sequence[Sample], stacks: Sequence[tuple[Floats32, Floats32]], albedo: Sequence[Any], count: int
 ) -> None:
-    """Bring ratios far from what the images agree on back to OUTLYING robust standard deviations of their image, in place.
+    """Clip ratios, in place, to OUTLYING robust standard deviations of their image about what the images agree on.
 
     Moments then mean something. Weights by pixel in their place would mix with the ratios in the bands.
     """
@@ -197,10 +197,10 @@ def _scales(samples: Sequence[Sample], albedo: Sequence[Any], count: int, units:
     """
     pairs: list[list[tuple[Floats, Floats]]] = [[] for _ in range(count)]
     for sample, log_albedo in zip(samples, albedo, strict=True):
-        for k, look in zip(sample.images, sample.looks, strict=True):
-            known = look.usable
-            expected = (look.predicted * np.exp(log_albedo))[known]
-            pairs[k].append((expected[::7].astype(float), look.measured[known][::7].astype(float)))
+        for k, observed in zip(sample.images, sample.observations, strict=True):
+            known = observed.usable
+            expected = (observed.predicted * np.exp(log_albedo))[known]
+            pairs[k].append((expected[::7].astype(float), observed.measured[known][::7].astype(float)))
     gain, offset = np.ones(count), np.zeros(count)
     fitted = [k for k in range(count) if sum(len(p[0]) for p in pairs[k]) > 0]
     for k in fitted:
@@ -315,9 +315,9 @@ def _error(
     square, pixels = np.zeros(len(COSINES) - 1), np.zeros(len(COSINES) - 1)
     for sample, (ratio, confidence), location in zip(samples, stacks, albedo, strict=True):
         several = (confidence > 0).sum(axis=0) > 1
-        for k, look, values, known in zip(sample.images, sample.looks, ratio, confidence > 0, strict=True):
+        for k, observed, values, known in zip(sample.images, sample.observations, ratio, confidence > 0, strict=True):
             use = known & several
-            bins = np.clip(np.digitize(look.cos_incidence[use], COSINES) - 1, 0, len(square) - 1)
+            bins = np.clip(np.digitize(observed.cos_incidence[use], COSINES) - 1, 0, len(square) - 1)
             # the middle of a distribution with long tails: squares up to 9 robust variances
             residual = (values - location)[use].astype(float) / np.sqrt(max(own_px[k], 1e-12))
             bound = 3 * 1.4826 * float(np.median(np.abs(residual))) if residual.size else 0.0

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.albedo.posterior import Spread, estimate, settle
+from stages.albedo.posterior import Spread, estimate, robust_mean
 from stages.common.arrays import Floats, Floats32
-from stages.physics.images.references import Look
+from stages.physics.images.references import Observed
 
 SHARES = (0.6827, 0.95)
 GAUSSIAN = (1.0, 1.96)  # where nothing can be left out
@@ -30,14 +30,14 @@ LEAST_IMAGES = 3  # the same
 
 @dataclass(frozen=True)
 class Stack:
-    """A window: log ratios and confidence (n, H, W) of ``images``, their looks, what each is in I/F (NaN unknown), and the
+    """A window: log ratios and confidence (n, H, W) of ``images``, their observations, what each is in I/F (NaN unknown), and the
     prior of ``posterior.estimate``.
     """
 
     ratio: Floats32
     confidence: Floats32
     images: list[int]
-    looks: Sequence[Look]
+    observations: Sequence[Observed]
     measured: Sequence[Floats32]
     prior: Floats32 | None
 
@@ -103,15 +103,15 @@ def _residuals(
             others = [k for k in range(count) if k != out]
             rest, trust = stack.ratio[others], stack.confidence[others]
             part = spread.of([stack.images[k] for k in others])
-            settle(rest, trust, part)
+            robust_mean(rest, trust, part)
             location, std = estimate(rest, trust, part, stack.prior)
-            look, seen = stack.looks[out], (stack.confidence[others] > 0).any(axis=0)
-            known = np.isfinite(stack.measured[out]) & (look.shadow | (seen & (look.predicted > 0)))
+            observed, seen = stack.observations[out], (stack.confidence[others] > 0).any(axis=0)
+            known = np.isfinite(stack.measured[out]) & (observed.shadow | (seen & (observed.predicted > 0)))
             use = np.flatnonzero(known)[::THINNED]
-            predicted = (look.predicted * np.exp(location)).ravel()[use]
-            shadow, unit = look.shadow.ravel()[use], np.sqrt(std.ravel()[use] ** 2 + own) * predicted
-            unit = np.where(shadow, np.float32(max(look.sun_sine, 1e-3)), unit)
-            place = np.clip(np.digitize(look.cos_incidence.ravel()[use], edges) - 1, 0, len(edges) - 2)
+            predicted = (observed.predicted * np.exp(location)).ravel()[use]
+            shadow, unit = observed.shadow.ravel()[use], np.sqrt(std.ravel()[use] ** 2 + own) * predicted
+            unit = np.where(shadow, np.float32(max(observed.sun_sine, 1e-3)), unit)
+            place = np.clip(np.digitize(observed.cos_incidence.ravel()[use], edges) - 1, 0, len(edges) - 2)
             residual = (np.abs(stack.measured[out].ravel()[use] - predicted) / unit).astype(np.float32)
             found.append(
                 (residual, np.where(shadow, len(edges) - 1, place), np.full(len(use), stack.images[out], np.intp))

@@ -39,23 +39,23 @@ class Spread:
         return Spread(self.shared, self.own[images], self.shared_px, self.own_px[images], self.prior)
 
 
-def settle(ratio: Floats32, confidence: Floats32, spread: Spread) -> Floats32:
-    """What the images of a window say pixel by pixel; lowers ``confidence`` in place where one differs from the rest.
+def robust_mean(ratio: Floats32, confidence: Floats32, spread: Spread) -> Floats32:
+    """The robust mean of a window's images, pixel by pixel; lowers ``confidence`` in place where one differs from the others.
 
     ratio, confidence : (n, H, W), log of measured / predicted and 0 where unknown; returns (H, W)
     """
     location = np.zeros(ratio.shape[1:], np.float32)
     own = np.maximum(spread.own_px, 1e-12)
-    _settle(ratio, confidence, own, 1.0 / max(spread.shared_px, 1e-12), location)
+    _robust_mean(ratio, confidence, own, 1.0 / max(spread.shared_px, 1e-12), location)
     for k in range(len(ratio)):
-        confidence[k] /= _unrest(ratio[k] - location, confidence[k], own[k])
+        confidence[k] /= _local_error(ratio[k] - location, confidence[k], own[k])
     return location
 
 
 def estimate(
     ratio: Floats32, confidence: Floats32, spread: Spread, prior: Floats32 | None = None
 ) -> tuple[Floats32, Floats32]:
-    """(log albedo, its standard deviation), (H, W), from ratios whose confidence ``settle`` has seen.
+    """(log albedo, its standard deviation), (H, W), from ratios whose confidence ``robust_mean`` has seen.
 
     prior : (H, W) variance of what the map may be wrong by, place by place; None: that of ``spread`` everywhere
     """
@@ -84,8 +84,8 @@ def estimate(
     return collapse(means), np.sqrt(np.maximum(collapse(variances), 0))
 
 
-def _unrest(residual: Floats32, confidence: Floats32, own: float) -> Floats32:
-    """By how much an image's residuals exceed their usual size hereabouts, at least 1: poorly registered blocks count less."""
+def _local_error(residual: Floats32, confidence: Floats32, own: float) -> Floats32:
+    """Local mean square of an image's residuals over their usual one, at least 1: poorly registered blocks count less."""
     energy, weight = confidence * residual * residual / np.float32(own), (confidence > 0).astype(np.float32)
     shapes = []
     for _ in range(LEVELS):
@@ -98,7 +98,7 @@ def _unrest(residual: Floats32, confidence: Floats32, own: float) -> Floats32:
 
 
 @numba.njit(cache=True, nogil=True)
-def _settle(ratio, confidence, own, prior, location):
+def _robust_mean(ratio, confidence, own, prior, location):
     """Iteratively reweighted mean of every pixel with the prior at 0, started at the median."""
     count, height, width = ratio.shape
     values, precision, weights = np.empty(count + 1), np.empty(count), np.empty(count)

@@ -24,7 +24,7 @@ from schemas.provenance import sha256
 from schemas.reading import read_strings
 from stages.albedo.calibrate import COSINES, Calibration, calibrate, take_samples
 from stages.albedo.config import Config, Summary, used_frames
-from stages.albedo.posterior import estimate, settle
+from stages.albedo.posterior import estimate, robust_mean
 from stages.albedo.prior import terrain_variance
 from stages.albedo.pyramid import HALO_PX, LEVELS
 from stages.albedo.writing import Maps, copy_map, kept_attributes
@@ -106,7 +106,7 @@ def _run(
             found = Calibration.read(calibration, _identity(svbrdf, scene, config))
         else:
             found = _calibrate(svbrdf, scene, ground, config, progress)
-        ground.references.take_off(found.fields)
+        ground.references.subtract_displacement(found.fields)
         there = [v for v in SVBRDF.variables if v.name in ground.map]
         sizes = {dim: n for v in there for dim, n in zip(v.dims, ground.map[v.name].shape, strict=True)}
         sizes |= {
@@ -164,7 +164,7 @@ def _identity(svbrdf: Path, scene: Path, config: Config) -> dict[str, Any]:
 def _calibrate(svbrdf: Path, scene: Path, ground: Ground, config: Config, progress: Progress) -> Calibration:
     references = ground.references
     fields = tuple(register(references, config.register, progress)) if config.register else ()
-    references.take_off(fields)
+    references.subtract_displacement(fields)
     windows = choose_windows(ground.map["valid"].shape, len(references.frames), references.overlapping)
     samples = take_samples(references, windows, progress, lambda box: terrain_variance(ground.surface, box))
     if not samples:
@@ -184,15 +184,15 @@ def work_block(ground: Ground, calibration: Calibration, block: Box) -> tuple[Fl
     references, images = ground.references, list[int]()
     ratio, confidence = np.zeros((2, len(references.overlapping(box)), *box[2:]), np.float32)
     for k in references.overlapping(box):
-        look = references.look(k, box)
-        if look is not None:
-            ratio[len(images)], confidence[len(images)] = calibration.ratio(k, look)
+        observed = references.observe(k, box)
+        if observed is not None:
+            ratio[len(images)], confidence[len(images)] = calibration.ratio(k, observed)
             images.append(k)
     ratio, confidence = ratio[: len(images)], confidence[: len(images)]
     inner = np.s_[row - top : row - top + height, col - left : col - left + width]
     count = (confidence[:, *inner] > 0).sum(axis=0).astype(np.uint16)
     spread = calibration.spread.of(images)
-    settle(ratio, confidence, spread)
+    robust_mean(ratio, confidence, spread)
     log_albedo, std = estimate(ratio, confidence, spread, terrain_variance(ground.surface, box))
     albedo = np.exp(log_albedo[inner])
     albedo_std = albedo * std[inner]

@@ -89,7 +89,7 @@ def run(
         ground = stack.enter_context(open_ground(scene, svbrdf, config))
         references = ground.references
         if config.register:
-            references.take_off(register(references, config.register, progress))
+            references.subtract_displacement(register(references, config.register, progress))
         samples = take_samples(references, ground.shape, ground.normaliser, progress)
         if not samples:
             raise InputError(

@@ -61,12 +61,11 @@ def fit_line(expected: Floats, measured: Floats, with_offset: bool) -> tuple[flo
     weights = np.ones(len(expected))
     gain = offset = 0.0
     for _ in range(10):
-        total = weights.sum()
-        x0, y0 = ((weights * v).sum() / total if with_offset else 0.0 for v in (expected, measured))
-        x, y = expected - x0, measured - y0
-        square = (weights * x * x).sum()
-        gain = (weights * x * y).sum() / square if square > 0 else 0.0
-        offset = y0 - gain * x0
+        sums = [(weights * of).sum() for of in (1.0, expected, measured, expected**2, expected * measured)]
+        if with_offset:
+            gain, offset = line_of_sums(*sums)
+        else:
+            gain = sums[4] / sums[3] if sums[3] > 0 else 0.0
         if not gain > 0:
             gain, offset = max(float(np.median(measured) / np.median(expected)), 1e-12), 0.0
         residual = np.abs(measured - gain * expected - offset)

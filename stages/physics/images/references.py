@@ -18,19 +18,17 @@ from numpy.typing import NDArray
 from schemas.errors import InputError
 from stages.common.arrays import Floats, Floats32
 from stages.physics.bodies.ephemeris import AU
-from stages.physics.horizon.scene import Overview, horizon_in_scene, make_overview
+from stages.physics.horizon.scene import SceneTerrain
 from stages.physics.images.displacement import Field
 from stages.physics.images.footprints import Footprint, read_footprint
 from stages.physics.images.source_images import Source, open_source
 from stages.physics.images.table import Frame, load_frames
 from stages.physics.light.sun_disc import SUN_RADIUS
-from stages.physics.maps.grid import Grid
 from stages.physics.maps.window import Box, Window
 from stages.physics.terrain.shading import Light, shade_block
 from stages.physics.terrain.sun import Sun
 from stages.physics.terrain.surface import SHADOWED, Surface
 
-OVERVIEW_PX = 2048  # the far terrain is kept in memory at no more than this many pixels a side
 OPEN_IMAGES = 64  # files that stay open between windows
 SHADOW_MARGIN_PX = 2  # a shadow's edge lies so well where the DEM and the registration say
 TURN = 30e3  # m over which the Sun's azimuth turns by 1 deg on the Moon
@@ -51,7 +49,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Look:
+class Observed:
     """One photograph on a window. measured : (h, w) as in the file, NaN where it shows no known ground; predicted : (h, w)
     I/F, 0 in shadow; usable : (h, w) bool, lit and away from shadows; shadow : (h, w) bool; sun_sine : of the Sun's elevation
     """
@@ -63,7 +61,7 @@ class Look:
     shadow: NDArray[np.bool_]
     sun_sine: float
 
-    def padded(self, own: Box, box: Box) -> Look:
+    def padded(self, own: Box, box: Box) -> Observed:
         """The same on a larger window, of which the photograph shows nothing beside its own."""
         part = np.s_[own[0] - box[0] : own[0] - box[0] + own[2], own[1] - box[1] : own[1] - box[1] + own[3]]
 
@@ -72,7 +70,7 @@ class Look:
             whole[part] = values
             return whole
 
-        return Look(
+        return Observed(
             pad(self.measured, np.nan), pad(self.predicted, np.nan), pad(self.cos_incidence, np.nan),
             pad(self.usable, False), pad(self.shadow, False), self.sun_sine,
         )  # fmt: skip
@@ -85,22 +83,20 @@ def _sun_at(position: Floats) -> Sun:
 class SceneHorizon:
     """The terrain horizon towards one Sun for any window, from an overview of the scene that all Suns share."""
 
-    def __init__(self, elevation: Any, overview: Overview, grid: Grid, sun: Sun) -> None:
-        self._elevation, self._overview, self._grid, self._sun = elevation, overview, grid, sun
-        self._piece = 1 << min(10, max(6, int(math.log2(max(1.0, TURN / grid.gsd)))))
+    def __init__(self, terrain: SceneTerrain, sun: Sun) -> None:
+        self._terrain, self._sun = terrain, sun
+        self._piece = 1 << min(10, max(6, int(math.log2(max(1.0, TURN / terrain.grid.gsd)))))
 
     def window(self, row: int, col: int, height: int, width: int) -> Floats32:
         """(height, width), rad"""
-        grid, edge = self._grid, self._piece
+        edge = self._piece
         result = np.empty((height, width), np.float32)
         for r in range(row, row + height, edge):
             for c in range(col, col + width, edge):
                 h, w = min(edge, row + height - r), min(edge, col + width - c)
-                azimuth, elevation = self._sun.over(grid, r + (h - 1) / 2, c + (w - 1) / 2)
-                result[r - row : r - row + h, c - col : c - col + w] = horizon_in_scene(
-                    self._elevation, self._overview, Window(r, c, h, w), grid.gsd, azimuth,
-                    sun_elevation=elevation, body_radius=grid.radius,
-                )  # fmt: skip
+                azimuth, elevation = self._sun.over(self._terrain.grid, r + (h - 1) / 2, c + (w - 1) / 2)
+                piece = self._terrain.horizon(Window(r, c, h, w), azimuth, elevation)
+                result[r - row : r - row + h, c - col : c - col + w] = piece
         return result
 
 
@@ -112,13 +108,8 @@ def open_references(scene: Path, terrain: h5py.File, surface: Surface, used: Seq
     footprints = [read_footprint(terrain["valid"], k, tuple(boxes[k])) for k in chosen]
     if not any(f.cells.any() for f in footprints):
         raise InputError(f"{scene}: expected images that overlap the map {surface.path}, found none.")
-    elevation = terrain["elevation"]
-    overview = make_overview(elevation, max(1, math.ceil(max(elevation.shape) / OVERVIEW_PX)))
-    cells = overview.cells[np.isfinite(overview.cells)]
-    lowest = float(cells.min()) if cells.size else 0.0
-    lowest -= 0.5 * max(0.0, overview.highest - lowest)  # cells are means: single pixels lie lower
-    heights = lowest, overview.highest
-    with References(surface, elevation, overview, heights, [frames[k] for k in chosen], footprints) as references:
+    ground = SceneTerrain.of(terrain["elevation"], surface.grid)
+    with References(surface, ground, [frames[k] for k in chosen], footprints) as references:
         yield references
 
 
@@ -126,16 +117,9 @@ class References(contextlib.AbstractContextManager):
     """The images of a scene. footprints : where each shows something; use as a context manager."""
 
     def __init__(
-        self,
-        surface: Surface,
-        elevation: Any,
-        overview: Overview,
-        heights: tuple[float, float],
-        frames: Sequence[Frame],
-        footprints: Sequence[Footprint],
+        self, surface: Surface, terrain: SceneTerrain, frames: Sequence[Frame], footprints: Sequence[Footprint]
     ) -> None:
-        self.surface, self.elevation, self.overview, self.heights = surface, elevation, overview, heights
-        self.frames, self.footprints = frames, footprints
+        self.surface, self.terrain, self.frames, self.footprints = surface, terrain, frames, footprints
         self._fields: Sequence[Field | None] = [None] * len(frames)
         self._open: OrderedDict[int, tuple[Source, contextlib.ExitStack]] = OrderedDict()
 
@@ -143,7 +127,7 @@ class References(contextlib.AbstractContextManager):
         while self._open:
             self._open.popitem()[1][1].close()
 
-    def take_off(self, fields: Sequence[Field | None]) -> None:
+    def subtract_displacement(self, fields: Sequence[Field | None]) -> None:
         """Read each image from now on without the displacement that registration found; none where empty."""
         if fields:
             self._fields = fields
@@ -152,7 +136,7 @@ class References(contextlib.AbstractContextManager):
         """Images that may show something of a window."""
         return [k for k, footprint in enumerate(self.footprints) if footprint.within(box)]
 
-    def look(self, k: int, box: Box) -> Look | None:
+    def observe(self, k: int, box: Box) -> Observed | None:
         """Image ``k`` on a window, None where it shows nothing that counts."""
         seen = self.see(k, box)
         if seen is None:
@@ -161,11 +145,11 @@ class References(contextlib.AbstractContextManager):
         cosine = np.cos(np.radians(planes["incidence_deg"]))
         position = self.frames[k].sun_position()
         _, elevation = _sun_at(position).over(self.surface.grid, row + (height - 1) / 2, col + (width - 1) / 2)
-        look = Look(
+        observed = Observed(
             seen.measured, planes["image"], cosine, seen.usable, planes["shadow"] > SHADOWED,
             math.sin(max(0.0, elevation)),
         )  # fmt: skip
-        return look if seen.box == box else look.padded(seen.box, box)
+        return observed if seen.box == box else observed.padded(seen.box, box)
 
     def see(self, k: int, box: Box) -> Seen | None:
         """Image ``k`` beside its rendering on what it shows of a window, None where nothing of that is lit."""
@@ -180,7 +164,7 @@ class References(contextlib.AbstractContextManager):
         camera = frame.camera_position(surface.grid.radius)
         if pixels.ortho is not None:
             camera = pixels.ortho.camera_position
-        horizon: Any = SceneHorizon(self.elevation, self.overview, surface.grid, sun)
+        horizon: Any = SceneHorizon(self.terrain, sun)
         planes = shade_block(surface, Light(sun, horizon, camera), *inner)
         lit = (planes["shadow"] == 0).astype(np.uint8)
         side = 2 * SHADOW_MARGIN_PX + 1
@@ -199,7 +183,8 @@ class References(contextlib.AbstractContextManager):
         while len(self._open) >= OPEN_IMAGES:
             self._open.popitem(last=False)[1][1].close()
         with contextlib.ExitStack() as stack:
-            opened = open_source(self.frames[k], self.surface.grid, self.elevation, self.heights)
+            terrain = self.terrain
+            opened = open_source(self.frames[k], terrain.grid, terrain.elevation, terrain.heights)
             source = stack.enter_context(opened)
             self._open[k] = source, stack.pop_all()
         return source

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from stages.common.progress import Progress
-from stages.physics.horizon.scene import SceneTerrain
 from stages.physics.images.displacement import Basis, Field
 from stages.physics.images.references import References
 from stages.physics.images.register_frame import choose_blocks, register_frame
@@ -34,8 +33,7 @@ def register(references: References, form: str, progress: Progress) -> list[Fiel
         middle = BLOCK_PX // 2
         blocks = choose_blocks(rows.ravel() + middle, cols.ravel() + middle, BLOCK_PX, grid)
         source = references.source(k)
-        terrain = SceneTerrain(references.elevation, grid, references.overview)
-        field, _ = register_frame(frame, source, terrain, blocks, form, MAX_SHIFT_PX)
+        field, _ = register_frame(frame, source, references.terrain, blocks, form, MAX_SHIFT_PX)
         found.append(field)
     return found
 

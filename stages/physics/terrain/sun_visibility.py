@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from stages.physics.horizon import horizon
-from stages.physics.horizon.scene import Overview, horizon_in_scene, make_overview
+from stages.physics.horizon.scene import SceneTerrain, make_overview
 from stages.physics.light.sun_disc import sun_visibility
 from stages.physics.maps.grid import Grid
 from stages.physics.maps.window import Window
@@ -46,8 +46,8 @@ class SunHorizon:
     """
 
     def __init__(self, elevation: Any, grid: Grid, sun: Sun, relief: float) -> None:
-        self._elevation, self._grid, self._sun = elevation, grid, sun
-        self._reference: NDArray[np.float32] | Overview
+        self._grid, self._sun = grid, sun
+        self._reference: NDArray[np.float32] | SceneTerrain
         self._blocks: OrderedDict[tuple[int, int], NDArray[np.float32]] = OrderedDict()
         if grid.height * grid.width <= WHOLE_PX and self._azimuth_is_even(relief):
             azimuth, _ = sun.over(grid, (grid.height - 1) / 2, (grid.width - 1) / 2)
@@ -55,7 +55,7 @@ class SunHorizon:
             self._reference = horizon(terrain, grid.gsd, azimuth, grid.radius)
         else:
             factor = max(NEAR_FACTOR, math.ceil(max(grid.height, grid.width) / OVERVIEW_PX))
-            self._reference = make_overview(elevation, factor)
+            self._reference = SceneTerrain(elevation, grid, make_overview(elevation, factor))
 
     def _azimuth_is_even(self, relief: float) -> bool:
         """Whether taking the azimuth at the middle of the map for all of it displaces no shadow by more than a pixel."""
@@ -72,7 +72,7 @@ class SunHorizon:
 
     def window(self, row: int, col: int, height: int, width: int) -> NDArray[np.float32]:
         """(height, width), rad, relative to the local horizontal; NaN where the elevation is."""
-        if not isinstance(self._reference, Overview):
+        if not isinstance(self._reference, SceneTerrain):
             return self._reference[row : row + height, col : col + width]
         result = np.empty((height, width), np.float32)
         for r in range(row - row % BLOCK_PX, row + height, BLOCK_PX):
@@ -85,15 +85,12 @@ class SunHorizon:
                 ]
         return result
 
-    def _block(self, overview: Overview, row: int, col: int) -> NDArray[np.float32]:
+    def _block(self, terrain: SceneTerrain, row: int, col: int) -> NDArray[np.float32]:
         """One block of the map, kept until two rows of blocks have passed: bands of a map ask for it again."""
         if (row, col) not in self._blocks:
             height, width = min(BLOCK_PX, self._grid.height - row), min(BLOCK_PX, self._grid.width - col)
             azimuth, elevation = self._sun.over(self._grid, row + (height - 1) / 2, col + (width - 1) / 2)
             while len(self._blocks) >= 2 * (self._grid.width // BLOCK_PX + 1):
                 self._blocks.popitem(last=False)
-            self._blocks[row, col] = horizon_in_scene(
-                self._elevation, overview, Window(row, col, height, width), self._grid.gsd, azimuth,
-                sun_elevation=elevation, body_radius=self._grid.radius,
-            )  # fmt: skip
+            self._blocks[row, col] = terrain.horizon(Window(row, col, height, width), azimuth, elevation)
         return self._blocks[row, col]
