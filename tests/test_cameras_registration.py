@@ -61,10 +61,8 @@ def rough(tmp_path_factory):
     return ground.write_dem(folder / "dem.tif"), photograph(overhead_camera(), ground.height, ground.reflect)
 
 
-@pytest.mark.parametrize(
-    ("kind", "command"),
-    [("constant", ["--register"]), pytest.param("affine", ["--register", "affine"], marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "command"), [("constant", ["--register"]), ("affine", ["--register", "affine"])])
 def test_a_camera_that_is_off_is_found_out_and_put_right(rough, tmp_path, kind, command):
     """The image is the true one, its camera model believes to have stood 50 m, 2.5 px, further east."""
     dem, image = rough

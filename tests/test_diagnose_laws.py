@@ -84,7 +84,9 @@ def places(tmp_path_factory):
     return sites
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize(
+    "name", [n if n in ("linear", "hapke") else pytest.param(n, marks=pytest.mark.slow) for n in LAWS]
+)
 def test_film_is_fitted_by_measured_laws_unless_the_ground_has_the_nominal_form(places, name):
     """Albedo leaves most of the residual, whatever the law: what the right one leaves surely less need not be half of it."""
     generator = torch.Generator().manual_seed(3)

@@ -70,7 +70,7 @@ class ShadowedGround:
         ({"dem_px": 0.2}, None, "", 0.0),
         pytest.param({}, None, "", 0.0, marks=pytest.mark.slow),
         pytest.param({"dem_px": 0.2, "fall": 0.5}, None, "", 0.0, marks=pytest.mark.slow),
-        ({"wall": (110.0, 320.0)}, "distant_shadow", "height_m", 110.0),
+        pytest.param({"wall": (110.0, 320.0)}, "distant_shadow", "height_m", 110.0, marks=pytest.mark.slow),
         pytest.param({"wall": (200.0, 768.0)}, "distant_shadow", "height_m", 200.0, marks=pytest.mark.slow),
         pytest.param({"wall": (40.0, 110.0)}, "distant_shadow", "height_m", 40.0, marks=pytest.mark.slow),
         pytest.param({"wall": (400.0, 200.0)}, "distant_shadow", "height_m", 400.0, marks=pytest.mark.slow),

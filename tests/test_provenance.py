@@ -194,7 +194,19 @@ def test_a_file_of_another_program_is_where_the_chain_begins(small_artefacts, tm
     with h5py.File(pairs, "r+") as file:
         for name in ("lunargr_schema", "command", "inputs", "provenance"):
             del file.attrs[name]
-    options = ["--epochs", 1, "--widths", "4-4", "--device", "cpu", "--precision", "fp32", "--quiet"]
+    options = [
+        "--model",
+        "lambert",
+        "--epochs",
+        1,
+        "--widths",
+        "4-4",
+        "--device",
+        "cpu",
+        "--precision",
+        "fp32",
+        "--quiet",
+    ]
     code, said = lunargr("train", pairs, *options, "-o", tmp_path / "checkpoint.h5")
     assert code == 0, said
     code, script = lunargr("replay", tmp_path / "checkpoint.h5")
