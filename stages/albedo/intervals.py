@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from stages.albedo.posterior import Spread, estimate, robust_mean
 from stages.common.arrays import Floats, Floats32
+from stages.common.intervals import unseen_factors
 from stages.physics.images.references import Observed
 
 SHARES = (0.6827, 0.95)
@@ -62,17 +63,13 @@ def _unseen_widths(residual: Floats32, place: NDArray[np.intp], image: NDArray[n
 
     residual : (N,) absolute; place, image : (N,) bins and images of them
     """
-    widths = _widths(residual, place, image, bins)
-    names = np.unique(image)
-    if len(names) < 2:
-        return widths
-    over = np.empty((2, len(residual)))  # residuals in units of the widths that the other images give
-    for name in names:
-        own = image == name
-        over[:, own] = residual[own] / np.maximum(
-            _widths(residual[~own], place[~own], image[~own], bins)[:, place[own]], 1e-12
-        )
-    return widths * [[np.quantile(ratio, share)] for ratio, share in zip(over, SHARES, strict=True)]
+    factors = unseen_factors(
+        residual,
+        image,
+        lambda own: _widths(residual[~own], place[~own], image[~own], bins)[:, place[own]],
+        SHARES,
+    )
+    return _widths(residual, place, image, bins) * factors[:, None]
 
 
 def _widths(residual: Floats32, place: NDArray[np.intp], image: NDArray[np.intp], bins: int) -> Floats:

@@ -151,15 +151,25 @@ def unseen_quantile(values: NDArray, unit: NDArray, share: float) -> float:
     few units is too low for the next one. values, unit : (N,); cross-conformal prediction by units (Vovk 2015, Ann. Math.
     Artif. Intell. 74:9).
     """
-    names, index = np.unique(unit, return_inverse=True)
     found = float(np.quantile(values, share))
+    return found * float(unseen_factors(values, unit, lambda own: np.quantile(values[~own], [[share]]), [share])[0])
+
+
+def unseen_factors(
+    values: NDArray, unit: NDArray, widths: Callable[[NDArray], NDArray], shares: Sequence[float]
+) -> NDArray:
+    """Factors on widths, (S,), by which a share of the values of a unit stay below that is not among these units.
+
+    values, unit : (N,); widths : of a mask (N,) of one unit -> (S, n) for its values, or alike, from all other units
+    """
+    names, index = np.unique(unit, return_inverse=True)
     if len(names) < 2:
-        return found
-    ratios = np.empty(len(values))
+        return np.ones(len(shares))
+    over = np.empty((len(shares), len(values)))
     for k in range(len(names)):
         own = index == k
-        ratios[own] = values[own] / max(float(np.quantile(values[~own], share)), TINY)
-    return found * float(np.quantile(ratios, share))
+        over[:, own] = values[own] / np.maximum(widths(own), TINY)
+    return np.array([np.quantile(ratio, share) for ratio, share in zip(over, shares, strict=True)])
 
 
 def _per_unit(total: NDArray, weight: NDArray, unit: NDArray) -> tuple[NDArray, NDArray]:
