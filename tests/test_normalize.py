@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import h5py
@@ -11,6 +12,7 @@ import rasterio
 import rasterio.warp
 import torch
 from albedo_scene import SUNS, axes, photographs, plant, texture
+from evaluation_scene import run_command
 from photometry_oracles import angles, columns, groups, ours, read
 from rasterio.transform import Affine
 from small_scene import GSD, LAT, LON, RADIUS, A, B, C, local_crs, slopes, sun_enu, write_raster
@@ -20,7 +22,7 @@ from schemas.files.outputs import Output
 from stages import ingest, merge, normalize
 from stages.normalize.mosaic import combine, fading_weight
 from stages.physics.formation.geometry import Angles
-from stages.physics.photometry import get_model, masked_radiance_factor
+from stages.physics.photometry import get_model, get_set, masked_radiance_factor
 from stages.physics.photometry.standard import NormalisingFactor, standard_angles
 
 STANDARD = A * np.cos(np.radians(30)) + B * np.cos(np.radians(30)) + C  # of M2 in albedo_scene
@@ -57,8 +59,6 @@ def test_a_wac_image_comes_out_as_from_lrowacphomap(shared):
     """3,366 pixels through Sato's map to (60, 0, 60). ISIS takes the numerator from the map's 321 nm and the denominator from
     its 689 nm for an image at 415 nm (README of the tables): the difference is one ratio of I/F at the standard geometry.
     """
-    import json
-
     folder = shared / "oracles"
     expected = json.loads((folder / "isis_lrowacphomap_expected.json").read_text())
     rows = read(folder / "isis_lrowacphomap_pixels.csv")
@@ -82,9 +82,18 @@ def test_a_wac_image_comes_out_as_from_lrowacphomap(shared):
 # ---- a level ground, whose angles have a closed form
 
 
-def level_frames(folder, frames, gain=None):
+def write_angles(path, transform, *planes):
+    """As phocube names them. planes : phase, emission, incidence, deg"""
+    profile = {"driver": "GTiff", "dtype": "float32", "count": 3, "crs": local_crs(), "transform": transform}
+    with rasterio.open(path, "w", height=planes[0].shape[0], width=planes[0].shape[1], **profile) as out:
+        out.write(np.stack(planes).astype(np.float32))
+        out.descriptions = ("Phase Angle", "Local Emission Angle", "Local Incidence Angle")
+
+
+def level_frames(folder, frames, gain=None, wrong_by=None):
     """A level ground of Lommel and Seeliger's law, 0.1 x 2 mu0 / (mu0 + mu), seen by cameras near enough that emission and
     phase vary. frames : (sub-solar longitude, camera east, columns shown); gain : (gain, offset) of images in DN
+    wrong_by : with a file of angles for each image, whose incidence is wrong by so many degrees
     """
     size, height = 192, 9000.0
     half = size * GSD / 2
@@ -104,14 +113,19 @@ def level_frames(folder, frames, gain=None):
     for k, (subsolar, east, shown) in enumerate(frames):
         camera_lon = LON + np.degrees(east / RADIUS / np.cos(np.radians(LAT)))
         view = unit(camera_lon, LAT) * (RADIUS + height) - up * RADIUS
-        mu0, mu = up @ unit(subsolar, 0.0), (up * view).sum(-1) / np.linalg.norm(view, axis=-1)
+        sun, view = unit(subsolar, 0.0), view / np.linalg.norm(view, axis=-1, keepdims=True)
+        mu0, mu = up @ sun, (up * view).sum(-1)
         image = (0.2 * mu0 / (mu0 + mu)).reshape(size, size).astype(np.float32)
         if gain:
             image = gain[k][0] * image + gain[k][1]
         image[:, ~np.isin(np.arange(size), shown)] = -1
         write_raster(folder / f"image{k}.tif", image.astype(np.float32), local_crs(), transform, nodata=-1.0)
         units = "dn" if gain else "iof"
-        lines.append(f"F{k},image{k}.tif,{units},,{subsolar},0,1,{camera_lon},{LAT},{height}")
+        row = f"F{k},image{k}.tif,{units},,{subsolar},0,1,{camera_lon},{LAT},{height}"
+        lines.append(row if wrong_by is None else f"{row},angles{k}.tif")
+        phase, emission, incidence = (np.degrees(np.arccos(c)).reshape(size, size) for c in (view @ sun, mu, mu0))
+        write_angles(folder / f"angles{k}.tif", transform, phase, emission, incidence + (wrong_by or 0))
+    lines[0] += "" if wrong_by is None else ",angles"
     (folder / "images.csv").write_text("\n".join(lines))
     ingest.run(folder / "dem.tif", folder / "images.csv", folder / "scene.h5", ingest.Config(gsd=GSD, crop=32))
     return folder / "scene.h5"
@@ -138,6 +152,47 @@ def test_level_ground_of_a_known_law_comes_out_flat(tmp_path, gain):
             assert fitted == pytest.approx(planted, rel=1e-3)
 
 
+def test_a_file_s_angles_are_compared_with_the_terrain_s_and_used_as_asked(tmp_path):
+    """Files whose incidence is 5 deg too large: told as such, and used only with ``angles`` "file"."""
+    scene = level_frames(tmp_path, FRAMES, wrong_by=5.0)
+    config, out = replace(QUIET, model="lommel_seeliger"), tmp_path / "dem.h5"
+    summary = normalize.run(scene, None, out, config)
+    assert summary.angles["incidence_deg"] == pytest.approx((5, 5), abs=0.01)
+    for plane in ("emission_deg", "phase_deg"):
+        assert summary.angles[plane] == pytest.approx((0, 0), abs=0.02)
+    mosaic = maps(out, "mosaic")[0]
+    np.testing.assert_allclose(mosaic[np.isfinite(mosaic)], FLAT, rtol=1e-4)
+    given = tmp_path / "file.h5"
+    normalize.run(scene, None, given, replace(config, angles="file"))
+    own, theirs = (maps(path, "normalized")[0][0] for path in (out, given))
+    with rasterio.open(tmp_path / "angles0.tif") as file:
+        mu, mu0, wrong = (np.cos(np.radians(file.read(band) - less)) for band, less in ((2, 0), (3, 5), (3, 0)))
+    expected = (mu0 / (mu0 + mu)) / (wrong / (wrong + mu))
+    known = np.isfinite(own) & np.isfinite(theirs)
+    assert known.mean() > 0.5
+    np.testing.assert_allclose((theirs / own)[known], expected[known], rtol=2e-3)
+
+
+def test_files_of_angles_that_are_none_are_one_line(tmp_path):
+    scene = level_frames(tmp_path, FRAMES)
+    with pytest.raises(
+        ConfigError, match="expected files of angles in column 'angles' of the image table, found none for F0, F1"
+    ):
+        normalize.run(scene, None, tmp_path / "no.h5", replace(QUIET, model="hapke", angles="file"))
+    table = (tmp_path / "images.csv").read_text().splitlines()
+    (tmp_path / "wrong.csv").write_text("\n".join([f"{table[0]},angles", f"{table[1]},image1.tif"]))
+    with pytest.raises(InputError, match=r"image1\.tif: expected bands named incidence, emission and phase"):
+        ingest.run(tmp_path / "dem.tif", tmp_path / "wrong.csv", tmp_path / "no.h5", ingest.Config(gsd=GSD, crop=32))
+
+
+def test_the_bands_of_phocube_are_found_by_their_names(shared):
+    """The five bands of a real file of ISIS."""
+    from stages.physics.images.angles import angle_bands
+
+    found = angle_bands(shared / "data/formats/wac_backplanes.reduced.cub")
+    assert found == {"incidence_deg": 3, "emission_deg": 2, "phase_deg": 1}
+
+
 def test_a_step_between_images_fades_and_level_takes_it_off(tmp_path):
     """One image is 10 % too bright: the mosaic climbs over the overlap without a jump; --level finds the 10 %."""
     scene = level_frames(tmp_path, FRAMES)
@@ -153,6 +208,22 @@ def test_a_step_between_images_fades_and_level_takes_it_off(tmp_path):
     assert summary.images[1][1] / summary.images[0][1] == pytest.approx(1.1, rel=1e-3)
     row = maps(tmp_path / "level.h5", "mosaic")[0][0, 100, 3:-3]
     np.testing.assert_allclose(row, np.sqrt(1.1) * FLAT, rtol=1e-3)
+
+
+def test_the_command_takes_a_published_set_and_another_geometry(tmp_path):
+    scene, out = level_frames(tmp_path, FRAMES, wrong_by=0.0), tmp_path / "standard.h5"
+    words = ("--model", "sato2014_415nm", "--parameters", "w=0.3,theta_deg=20", "--standard", "60,0,60")
+    code, printed = run_command("normalize", scene, *words, "-o", out)
+    assert code == 0 and "F0" in printed and "F1" in printed
+    with h5py.File(out) as file, rasterio.open(tmp_path / "image0.tif") as image:
+        angles = file.attrs["incidence_deg"], file.attrs["emission_deg"], file.attrs["phase_deg"]
+        assert angles == (60, 0, 60) and file.attrs["model"] == "hapke"
+        assert json.loads(file.attrs["config"])["parameters"] == {"w": 0.3, "theta_deg": 20}
+        ratio = file["normalized"][0, 100, 10] / image.read(1)[100, 10]
+    law = get_set("sato2014_415nm").values | {"w": 0.3, "theta": np.radians(20)}
+    with rasterio.open(tmp_path / "angles0.tif") as file:
+        g, e, i = np.radians(file.read()[:, 100, 10].astype(float))
+    assert ratio == pytest.approx(float(factor("hapke", law, i, e, g, (60, 0, 60))), rel=1e-4)
 
 
 # ---- a ground with relief, albedo and noise

@@ -51,6 +51,12 @@ def command(
         str | None,
         typer.Option("--phase-bins", metavar="DEG,...", help="Edges of phase bins, each with a mosaic of its own."),
     ] = None,
+    angles: Annotated[
+        str,
+        typer.Option(
+            "--angles", metavar="dem|file", help="The terrain's angles, or those that the images' table names."
+        ),
+    ] = Config.angles,
     level: Annotated[
         bool, typer.Option("--level", help="Bring images in I/F to one level where they overlap; DN always are.")
     ] = Config.level,
@@ -83,5 +89,8 @@ def command(
         console.say("images do not overlap: their errors are not known")
     else:
         console.say(f"step between overlapping images: {found.before:.1%} rms before, {found.after:.1%} after")
+    for plane, (mean, rms) in found.angles.items():
+        word = plane.removesuffix("_deg")
+        console.say(f"{word} of the files less the terrain's: mean {mean:+.3f} deg, rms {rms:.3f} deg")
     rows = [(name, f"{gain:.4g}", f"{offset:.4g}", f"{std:.1%}") for name, gain, offset, std in found.images]
     console.table("images", ("image", "gain", "offset", "std"), rows)

@@ -69,6 +69,7 @@ FRAMES = (
 FRAME_TABLE = FRAMES + (
     text_column("frame", "path", "image file, relative to this artefact where possible"),
     text_column("frame", "camera", "camera model file, empty for map-projected images"),
+    text_column("frame", "angles", "file of phase, emission and incidence, or empty", required=False),
     text_column("frame", "start_time", "UTC"),
     column("frame", "units", "1", "radiometric units of the image", "u1", flags=UNITS),
     column("frame", "band", "1", "band of the image file, from 1; 0 = its only one", "u2", required=False),

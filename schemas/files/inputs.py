@@ -20,7 +20,7 @@ from schemas.errors import InputError, LunargrError
 from schemas.files.locks import is_beside
 
 TABLES = (".csv", ".json")
-FILE_COLUMNS = ("path", "camera")
+FILE_COLUMNS = ("path", "camera", "angles")
 FILE_ATTRIBUTES = ("scene", "elevation_source")
 _UNREADABLE = (LunargrError, OSError, RuntimeError, ValueError, KeyError, TypeError)  # said when the file is opened
 

@@ -205,7 +205,7 @@ def source_files(scene: Path) -> list[Path]:
     """The images and camera models of a scene."""
     with open_artefact(scene, SCENE) as file:
         frames = load_frames(file, scene)
-    return [p for f in frames for p in (f.path, f.camera) if p is not None]
+    return [path for frame in frames for path in frame.files]
 
 
 def count_bands(svbrdf: Path, scene: Path, config: Config) -> int:

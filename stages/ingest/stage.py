@@ -236,7 +236,7 @@ def source_files(images: Path, config: Config) -> list[Path]:
 
 
 def _files(frames: Sequence[Frame]) -> list[Path]:
-    return [p for f in frames for p in (f.path, f.camera) if p is not None]
+    return [path for frame in frames for path in frame.files]
 
 
 def check_positions(parts: Sequence[Path], images: Path, config: Config) -> None:

@@ -14,6 +14,7 @@ from schemas.provenance import sha256
 from stages.common.progress import Progress, Say, say_nothing
 from stages.ingest.config import Config
 from stages.ingest.plan import ANY_RELIEF
+from stages.physics.images.angles import angle_bands
 from stages.physics.images.source_images import open_source
 from stages.physics.images.table import Frame
 from stages.physics.images.table_checks import check_emission
@@ -86,6 +87,8 @@ def write_validity(
             pixel = grid.local_frames(r + h / 2, c + w / 2).pixel_size[0]
             area += float(eroded.sum()) * float(pixel[0] * pixel[1])
     _check_sun(frame, grid, (r0 + r1) / 2, (c0 + c1) / 2)
+    if frame.angles is not None:
+        angle_bands(frame.angles)
     if not config.trust_table:
         check_emission(frame, grid, (r0 + r1) / 2, (c0 + c1) / 2)
     return area

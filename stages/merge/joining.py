@@ -12,7 +12,7 @@ import numpy as np
 from schemas import ArtefactWriter, read_strings
 from stages.merge.parts import ROWS, Parts, moved
 
-PATHS = ("path", "camera")
+PATHS = ("path", "camera", "angles")
 BUFFER = 1 << 26  # bytes that are copied at a time
 BLOCK_ROWS = 256  # rows of a map that are copied at a time
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 
 from schemas.errors import ConfigError
 
+ANGLES = ("dem", "file")
+
 
 @dataclass(frozen=True)
 class Config:
@@ -17,6 +19,7 @@ class Config:
     standard_deg : incidence, emission and phase that all pixels are brought to
     max_incidence_deg, max_emission_deg : local angles beyond which a pixel counts as grazing and is masked
     phase_bins_deg : edges of phase bins, each of which gets a mosaic of its own
+    angles : 'dem' for those of the terrain, 'file' for those that the table of images names
     level : bring images in I/F to one level where they overlap; images in DN always are
     register : None, or the freest form of displacement that is taken off each image before, as in project
     leave_out : ids of images that must not enter; geotiff : whether mosaics are written as a GeoTIFF as well
@@ -28,6 +31,7 @@ class Config:
     max_incidence_deg: float = 80.0
     max_emission_deg: float = 80.0
     phase_bins_deg: tuple[float, ...] = ()
+    angles: str = "dem"
     level: bool = False
     register: str | None = None
     leave_out: tuple[str, ...] = ()
@@ -41,7 +45,8 @@ class Summary:
 
     images : for each its id, gain, offset, relative standard deviation; covered_share : of the map, where a mosaic has values
     mean : of the mosaic; before, after : rms step in log I/F between overlapping images, None where none overlap
-    image_units : 'iof' or 'dn'
+    image_units : 'iof' or 'dn'; angles : by plane, mean and rms of the file's angles less those of the terrain, deg, empty
+        without a file
     """
 
     images: tuple[tuple[str, float, float, float], ...]
@@ -51,6 +56,7 @@ class Summary:
     before: float | None
     after: float | None
     image_units: str
+    angles: Mapping[str, tuple[float, float]]
 
 
 def check(config: Config, with_map: bool) -> None:
@@ -65,6 +71,8 @@ def check(config: Config, with_map: bool) -> None:
     for name in ("max_incidence_deg", "max_emission_deg"):
         if not 0 < getattr(config, name) <= 90:
             raise ConfigError(f"`{name}`: expected degrees above 0 and up to 90, found {getattr(config, name):g}.")
+    if config.angles not in ANGLES:
+        raise ConfigError(f"`angles`: expected one of {', '.join(ANGLES)}, found '{config.angles}'.")
     bins = config.phase_bins_deg
     if bins and (len(bins) < 2 or list(bins) != sorted(set(bins)) or bins[0] < 0 or bins[-1] > 180):
         raise ConfigError(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stages.common.arrays import Floats32, Mask
 from stages.normalize.config import Config
 from stages.physics.formation.geometry import Angles
+from stages.physics.images.angles import PLANES
 from stages.physics.images.references import Seen
 from stages.physics.maps.window import Box
 from stages.physics.photometry import masked_radiance_factor
@@ -33,14 +34,30 @@ class Normaliser:
     def _model(self) -> NormalisingFactor:
         return NormalisingFactor(self.surface.model, standard_angles(*self.config.standard_deg))
 
+    def angles(self, seen: Seen) -> dict[str, Floats32]:
+        """(h, w) degrees of incidence, emission and phase, by plane: the terrain's or the file's."""
+        return seen.given if self.config.angles == "file" else {plane: seen.planes[plane] for plane in PLANES}
+
+    def _radians(self, seen: Seen) -> Angles:
+        given = self.angles(seen)
+        return Angles.from_angles(*(torch.from_numpy(np.radians(given[plane])) for plane in PLANES))
+
+    def _values(self, seen: Seen) -> dict[str, torch.Tensor]:
+        coefficients = torch.from_numpy(np.ascontiguousarray(self.surface.read_coefficients(*seen.box)))
+        return self.surface.model.unpack(coefficients, dim=0)
+
+    def predicted(self, seen: Seen) -> Floats32:
+        """(h, w) I/F of the model in full sunlight."""
+        return masked_radiance_factor(self.surface.model, self._values(seen), self._radians(seen)).numpy()
+
     def mask(self, seen: Seen) -> NDArray[np.uint8]:
         """(h, w) UNSEEN, GOOD, SHADOW (or within two pixels of one) or GRAZING."""
-        incidence, emission = seen.planes["incidence_deg"], seen.planes["emission_deg"]
+        incidence, emission, phase = (self.angles(seen)[plane] for plane in PLANES)
         far = (incidence > self.config.max_incidence_deg) | (emission > self.config.max_emission_deg)
         found = np.full(seen.measured.shape, SHADOW, np.uint8)
         found[seen.usable] = GOOD
         found[far & (seen.planes["shadow"] == 0)] = GRAZING
-        found[np.isnan(seen.measured)] = UNSEEN
+        found[np.isnan(seen.measured) | np.isnan(incidence + emission + phase)] = UNSEEN
         return found
 
     def factor(self, seen: Seen, good: Mask) -> tuple[Floats32, Floats32]:
@@ -48,10 +65,7 @@ class Normaliser:
 
         The latter is that of the map's coefficients, 0 where none is known.
         """
-        coefficients = torch.from_numpy(np.ascontiguousarray(self.surface.read_coefficients(*seen.box)))
-        values = self.surface.model.unpack(coefficients, dim=0)
-        names = ("incidence_deg", "emission_deg", "phase_deg")
-        angles = Angles.from_angles(*(torch.from_numpy(np.radians(seen.planes[name])) for name in names))
+        values, angles = self._values(seen), self._radians(seen)
         factor = masked_radiance_factor(self._model, values, angles).numpy()
         deviations = {k: torch.from_numpy(v) for k, v in self.surface.read_deviations(*seen.box).items()}
         spread = radiance_deviation(self._model, values, deviations, angles).numpy()

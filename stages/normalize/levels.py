@@ -12,7 +12,9 @@ from stages.common.arrays import Floats
 from stages.common.progress import Progress, show_nothing
 from stages.normalize.factor import GOOD, Normaliser, placed
 from stages.physics.formation.radiometry import fit_line
+from stages.physics.images.angles import PLANES
 from stages.physics.images.references import References
+from stages.physics.images.table import Frame
 from stages.physics.images.windows import choose_windows
 
 STEP = 4  # of a window's pixels, every so many along each axis: neighbours are not independent
@@ -27,6 +29,7 @@ class Sample:
     """Pixels of one window. images : (n,) that show it; the others (n, m), NaN where an image is not usable
 
     measured : as in the file; predicted : I/F of the model; factor : to the standard geometry; cosine : of incidence
+    away : (3, n, m) angles of the file less those of the terrain, deg, in the order of PLANES
     """
 
     images: list[int]
@@ -34,6 +37,7 @@ class Sample:
     predicted: Floats
     factor: Floats
     cosine: Floats
+    away: Floats
 
 
 @dataclass(frozen=True)
@@ -68,14 +72,30 @@ def take_samples(
             if seen is None:
                 continue
             good = normaliser.mask(seen) == GOOD
-            cosine = np.cos(np.radians(seen.planes["incidence_deg"]))
-            planes = np.stack([seen.measured, seen.planes["image"], normaliser.factor(seen, good)[0], cosine])
+            cosine = np.cos(np.radians(normaliser.angles(seen)["incidence_deg"]))
+            away = [seen.given[plane] - seen.planes[plane] if seen.given else 0 * cosine for plane in PLANES]
+            planes = np.stack(
+                [seen.measured, normaliser.predicted(seen), normaliser.factor(seen, good)[0], cosine, *away]
+            )
             planes[:, np.isnan(planes[2])] = np.nan
             images.append(k)
-            rows.append(placed(planes, seen.box, box)[:, ::STEP, ::STEP].reshape(4, -1).astype(float))
+            rows.append(placed(planes, seen.box, box)[:, ::STEP, ::STEP].reshape(len(planes), -1).astype(float))
         if images:
-            samples.append(Sample(images, *np.stack(rows, axis=1)))
+            measured, predicted, factor, cosine, *away = np.stack(rows, axis=1)
+            samples.append(Sample(images, measured, predicted, factor, cosine, np.stack(away)))
     return samples
+
+
+def compare_angles(samples: Sequence[Sample], frames: Sequence[Frame]) -> dict[str, tuple[float, float]]:
+    """Mean and rms of the files' angles less those of the terrain, deg, by plane; empty where no image has a file."""
+    given = [np.isin(s.images, [k for k, frame in enumerate(frames) if frame.angles]) for s in samples]
+    found = {}
+    for p, plane in enumerate(PLANES):
+        away = np.concatenate([s.away[p][use].ravel() for s, use in zip(samples, given, strict=True)])
+        away = away[np.isfinite(away)]
+        if len(away):
+            found[plane] = float(away.mean()), float(np.sqrt(np.mean(away**2)))
+    return found
 
 
 def find_levels(samples: Sequence[Sample], groups: Sequence[int], units: str, level: bool) -> Levels:

@@ -21,7 +21,7 @@ from stages.common.arrays import Floats32
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.normalize.config import Config, Summary, check
 from stages.normalize.factor import GOOD, UNSEEN, Normaliser, placed
-from stages.normalize.levels import Levels, find_levels, take_samples
+from stages.normalize.levels import Levels, compare_angles, find_levels, take_samples
 from stages.normalize.mosaic import FADE_PX, Layer, Mosaic, choose_layers, combine, fading_weight
 from stages.normalize.writing import Maps, attributes_of
 from stages.physics.bodies.spheres import find_body
@@ -121,7 +121,7 @@ def run(
             stack.enter_context(companions_of(output.file))
             partial = stack.enter_context(atomic_path(output.geotiff_path))
             write_geotiff(partial, writer.file, references.surface.grid)
-        return maps.summarise(references.frames, levels, ground.units)
+        return maps.summarise(references.frames, levels, ground.units, compare_angles(samples, references.frames))
 
 
 @contextlib.contextmanager
@@ -135,6 +135,12 @@ def open_ground(scene: Path, svbrdf: Path | None, config: Config) -> Iterator[Gr
         body = find_body(str(terrain.attrs["body_radius_m"]))
         surface = stack.enter_context(open_surface(svbrdf or scene, config.model, config.parameters, body))
         references = stack.enter_context(open_references(scene, terrain, surface, _used(scene, frames, config)))
+        references.reads_angles = True
+        without = [frame.image_id for frame in references.frames if frame.angles is None]
+        if config.angles == "file" and without:
+            raise ConfigError(
+                f"`angles`: expected files of angles in column 'angles' of the image table, found none for {', '.join(without)}."
+            )
         units = {frame.units for frame in references.frames}
         if len(units) > 1:
             raise InputError(f"{scene}: expected one kind of units, found both 'iof' and 'dn'; ingest them apart.")
@@ -160,12 +166,12 @@ def work_block(ground: Ground, levels: Levels, block: Box) -> Block:
         seen = references.see(k, around)
         if seen is None:
             continue
-        mask = normaliser.mask(seen)
+        mask, angles = normaliser.mask(seen), normaliser.angles(seen)
         factor, spread = normaliser.factor(seen, mask == GOOD)
         normal = (seen.measured - np.float32(levels.offset[k])) / np.float32(levels.gain[k]) * factor
-        own_error = levels.deviation(k, np.cos(np.radians(seen.planes["incidence_deg"])))
+        own_error = levels.deviation(k, np.cos(np.radians(angles["incidence_deg"])))
         std = np.abs(normal) * np.hypot(own_error, spread)
-        whole = placed(np.stack([normal, std, seen.planes["phase_deg"]]), seen.box, around)
+        whole = placed(np.stack([normal, std, angles["phase_deg"]]), seen.box, around)
         fade = fading_weight(np.isfinite(whole[0]))
         images.append(k)
         masks.append(placed(mask, seen.box, around, UNSEEN)[inner])

@@ -83,7 +83,9 @@ class Maps:
         writer.write("phase_low_deg", np.array([layer.low for layer in layers]))
         writer.write("phase_high_deg", np.array([layer.high for layer in layers]))
 
-    def summarise(self, frames: Sequence[Frame], levels: Levels, units: str) -> Summary:
+    def summarise(
+        self, frames: Sequence[Frame], levels: Levels, units: str, angles: dict[str, tuple[float, float]]
+    ) -> Summary:
         """What was written, for the lines at the end."""
         height, width = self._mosaics[0].shape[-2:]
         std = np.array([np.nanmedian(row) if np.isfinite(row).any() else np.nan for row in levels.std])
@@ -91,5 +93,5 @@ class Maps:
         images = tuple(zip(names, levels.gain.tolist(), levels.offset.tolist(), std.tolist(), strict=True))
         return Summary(
             images, self._seen / (height * width), self._sum / max(1, self._seen), self._shown / max(1, self._seen),
-            levels.before, levels.after, units,
+            levels.before, levels.after, units, angles,
         )  # fmt: skip

@@ -93,7 +93,7 @@ def source_files(crops: Path) -> list[Path]:
     """The images and camera models that crops are taken from."""
     with open_artefact(crops, CROPS) as file:
         frames = load_frames(file, crops)
-    return [p for f in frames for p in (f.path, f.camera) if p is not None]
+    return [path for frame in frames for path in frame.files]
 
 
 _overviews: dict[tuple[Any, ...], Overview] = {}

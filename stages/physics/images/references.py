@@ -19,6 +19,7 @@ from schemas.errors import InputError
 from stages.common.arrays import Floats, Floats32
 from stages.physics.bodies.ephemeris import AU
 from stages.physics.horizon.scene import SceneTerrain
+from stages.physics.images.angles import GivenAngles, open_angles
 from stages.physics.images.displacement import Field
 from stages.physics.images.footprints import Footprint, read_footprint
 from stages.physics.images.source_images import Source, open_source
@@ -39,13 +40,15 @@ class Seen:
     """One photograph beside its rendering on the part ``box`` of a window, (h, w) each.
 
     measured : as in the file, NaN where it shows no known ground; usable : bool, lit and away from shadows
-    planes : the rendering and its backplanes, see ``shade_block``
+    planes : the rendering and its backplanes, see ``shade_block``; given : angles in degrees from the image's own file of
+        angles, by plane, empty without one
     """
 
     box: Box
     measured: Floats32
     usable: NDArray[np.bool_]
     planes: dict[str, Floats32]
+    given: dict[str, Floats32]
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,8 @@ class References(contextlib.AbstractContextManager):
     ) -> None:
         self.surface, self.terrain, self.frames, self.footprints = surface, terrain, frames, footprints
         self._fields: Sequence[Field | None] = [None] * len(frames)
-        self._open: OrderedDict[int, tuple[Source, contextlib.ExitStack]] = OrderedDict()
+        self.reads_angles = False  # whether ``see`` reads the images' own angles
+        self._open: OrderedDict[int, tuple[tuple[Source, GivenAngles | None], contextlib.ExitStack]] = OrderedDict()
 
     def __exit__(self, *error: object) -> None:
         while self._open:
@@ -173,10 +177,16 @@ class References(contextlib.AbstractContextManager):
         usable = far & known & (planes["image"] > 0)
         if not usable.any():
             return None
-        return Seen(inner, np.where(known, pixels.values, np.nan).astype(np.float32), usable, planes)
+        angles = self._file(k)[1] if self.reads_angles else None
+        given = angles.read(inner, self._fields[k]) if angles else {}
+        return Seen(inner, np.where(known, pixels.values, np.nan).astype(np.float32), usable, planes, given)
 
     def source(self, k: int) -> Source:
         """The open image ``k``."""
+        return self._file(k)[0]
+
+    def _file(self, k: int) -> tuple[Source, GivenAngles | None]:
+        """The open image ``k`` and its angles."""
         if k in self._open:
             self._open.move_to_end(k)
             return self._open[k][0]
@@ -184,7 +194,7 @@ class References(contextlib.AbstractContextManager):
             self._open.popitem(last=False)[1][1].close()
         with contextlib.ExitStack() as stack:
             terrain = self.terrain
-            opened = open_source(self.frames[k], terrain.grid, terrain.elevation, terrain.heights)
-            source = stack.enter_context(opened)
-            self._open[k] = source, stack.pop_all()
-        return source
+            where = self.frames[k], terrain.grid, terrain.elevation, terrain.heights
+            opened = stack.enter_context(open_source(*where)), stack.enter_context(open_angles(*where))
+            self._open[k] = opened, stack.pop_all()
+        return opened

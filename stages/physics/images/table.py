@@ -52,6 +52,7 @@ class Frame:
     units : 'iof' or 'dn'; camera : its camera model, ``path`` again for an ISIS cube, None for map-projected images
     sha256, camera_sha256 : digests of both files, empty before they are read
     band : which one of the file, counted from 1, None for its only one; wavelength_nm : its centre, NaN where not known
+    angles : file of its phase, emission and incidence, as from ISIS phocube
     """
 
     image_id: str
@@ -69,6 +70,12 @@ class Frame:
     camera_sha256: str = ""
     band: int | None = None
     wavelength_nm: float = math.nan
+    angles: Path | None = None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All files that it names."""
+        return tuple(path for path in (self.path, self.camera, self.angles) if path is not None)
 
     def sun_position(self) -> np.ndarray:
         """(3,) body-fixed position of the Sun, m."""
@@ -159,6 +166,7 @@ def _frame(table: Path, number: int, row: Mapping[str, Any], body: Body) -> Fram
         units=units,
         camera=camera,
         start_time=text.get("start_time", ""),
+        angles=table.parent / text["angles"] if text.get("angles") else None,
         band=(band := _band(text.get("band", ""), where)),
         wavelength_nm=band_wavelength(image, band or 1),
         **numbers,
@@ -182,6 +190,7 @@ def write_frames(writer: ArtefactWriter, frames: Sequence[Frame]) -> None:
     writer.write("image_id", [f.image_id for f in frames])
     writer.write("path", [relative_path(f.path, folder) for f in frames])
     writer.write("camera", [relative_path(f.camera, folder) if f.camera else "" for f in frames])
+    writer.write("angles", [relative_path(f.angles, folder) if f.angles else "" for f in frames])
     writer.write("start_time", [f.start_time for f in frames])
     if all(f.sha256 for f in frames):
         writer.write("sha256", [f.sha256 for f in frames])
@@ -199,6 +208,7 @@ def load_frames(file: h5py.File, path: Path) -> list[Frame]:
     names, paths, cameras, times = (read_strings(file, k) for k in ("image_id", "path", "camera", "start_time"))
     columns: dict[str, Any] = {key: file[key][...].tolist() for key in _NUMBERS}
     columns |= {k: read_strings(file, k) for k in ("sha256", "camera_sha256") if k in file}
+    columns |= {"angles": [folder / a if a else None for a in read_strings(file, "angles")]} if "angles" in file else {}
     columns |= {"band": [int(b) or None for b in file["band"][...]]} if "band" in file else {}
     columns |= {"wavelength_nm": file["wavelength_nm"][...].tolist()} if "wavelength_nm" in file else {}
     return [
