@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stages.physics.cameras.base import Camera, Floats, register
-from stages.physics.cameras.isd import Detector, Exposure
+from stages.physics.cameras.base import Floats, register
+from stages.physics.cameras.isd import Detector, Exposure, IsdCamera
 
 
 @register
 @dataclass(frozen=True, eq=False)
-class Frame(Camera):
+class Frame(IsdCamera):
     """Lens, distortion and detector of an ISD at its centre time.
 
     centre : (3,) place of the camera, body-fixed, m; rotation : (3, 3), takes camera vectors to body-fixed ones
@@ -25,10 +25,6 @@ class Frame(Camera):
     kind: ClassVar[str] = "frame"
     answers_to: ClassVar[tuple[str, ...]] = ("USGS_ASTRO_FRAME_SENSOR_MODEL",)
 
-    lines: int
-    samples: int
-    semi_axes: tuple[float, float]
-    detector: Detector
     centre: Floats
     rotation: Floats
     sun: Floats
@@ -51,10 +47,6 @@ class Frame(Camera):
             sun=body @ exposure.sun.at(now)[0],
             time=exposure.centre_time,
         )
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        return self.detector.notes
 
     def rays(self, line: ArrayLike, sample: ArrayLike) -> tuple[Floats, Floats]:
         direction = self.detector.directions(line, sample) @ self.rotation.T

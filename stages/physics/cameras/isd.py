@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from schemas.errors import GeometryError, InputError
 from stages.common.arrays import Floats
 from stages.physics.cameras import document as read
+from stages.physics.cameras.base import Camera
 from stages.physics.cameras.distortion import distort, distort_arrays, read_distortion, undistort_arrays
 from stages.physics.cameras.tables import (
     EvenTable,
@@ -149,6 +150,20 @@ def detector_place(x, y, z, optics):
         to_line[0] + to_line[1] * dx + to_line[2] * dy,
         to_sample[0] + to_sample[1] * dx + to_sample[2] * dy,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class IsdCamera(Camera):
+    """Base of the cameras that ISDs describe: all see through a ``detector``."""
+
+    lines: int
+    samples: int
+    semi_axes: tuple[float, float]
+    detector: Detector
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.detector.notes
 
 
 @dataclass(frozen=True)

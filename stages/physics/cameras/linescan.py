@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from schemas.errors import GeometryError, InputError
 from stages.physics.cameras import document as read
-from stages.physics.cameras.base import Camera, Floats, register
-from stages.physics.cameras.isd import Detector, Exposure, detector_place
+from stages.physics.cameras.base import Floats, register
+from stages.physics.cameras.isd import Detector, Exposure, IsdCamera, detector_place
 from stages.physics.cameras.tables import EvenTable, lagrange
 
 ISD_FIRST_LINE = 0.5  # 'line_scan_rate' counts its lines from 0.5 where the image begins
@@ -24,7 +24,7 @@ CHUNK = 8192  # points per parallel piece
 
 @register
 @dataclass(frozen=True, eq=False)
-class LineScan(Camera):
+class LineScan(IsdCamera):
     """One line at a time through the lens of ``detector``; times in s from ``centre_time`` (TDB since J2000).
 
     line_starts, line_times, line_rates : (k,) image line, time and seconds per line of each stretch of constant rate
@@ -34,10 +34,6 @@ class LineScan(Camera):
     kind: ClassVar[str] = "line-scan"
     answers_to: ClassVar[tuple[str, ...]] = ("USGS_ASTRO_LINE_SCANNER_SENSOR_MODEL",)
 
-    lines: int
-    samples: int
-    semi_axes: tuple[float, float]
-    detector: Detector
     centre_time: float
     line_starts: Floats
     line_times: Floats
@@ -79,10 +75,6 @@ class LineScan(Camera):
         facing = detector.facing(positions.at(middle), camera.rotations(middle)[:, 2])
         camera = replace(camera, detector=facing)
         return replace(camera, _search=_Search.for_camera(camera, where))
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        return self.detector.notes
 
     def times(self, line: ArrayLike) -> Floats:
         """Seconds from ``centre_time`` of image lines.

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from schemas.errors import GeometryError, InputError
 from stages.physics.cameras import document as read
-from stages.physics.cameras.base import Camera, Floats, register
-from stages.physics.cameras.isd import Detector, Exposure, detector_place
+from stages.physics.cameras.base import Floats, register
+from stages.physics.cameras.isd import Detector, Exposure, IsdCamera, detector_place
 
 CHUNK = 8192  # points per parallel piece
 EDGE = 0.5  # lines beyond a framelet that its outermost pixels cover where the next framelet leaves a gap
@@ -29,7 +29,7 @@ STEPS = 64  # framelets tried for a point without a neighbour to start from
 
 @register
 @dataclass(frozen=True, eq=False)
-class PushFrame(Camera):
+class PushFrame(IsdCamera):
     """``framelets`` exposures of ``height`` lines each, in the order of the image.
 
     centres : (n, 3) places of the camera, body-fixed, m; rotations : (n, 3, 3), camera to body-fixed
@@ -42,10 +42,6 @@ class PushFrame(Camera):
     kind: ClassVar[str] = "push-frame"
     answers_to: ClassVar[tuple[str, ...]] = ("USGS_ASTRO_PUSH_FRAME_SENSOR_MODEL",)
 
-    lines: int
-    samples: int
-    semi_axes: tuple[float, float]
-    detector: Detector
     height: int
     trimmed: int
     flipped: bool
@@ -91,10 +87,6 @@ class PushFrame(Camera):
         k = framelets // 2
         camera = replace(camera, detector=detector.facing(camera.centres[k], camera.rotations[k, :, 2]))
         return replace(camera, slope=camera._slope(where))
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        return self.detector.notes
 
     def _slope(self, where: str) -> float:
         framelets = len(self.times)
