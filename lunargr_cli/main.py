@@ -12,7 +12,6 @@ import shlex
 import signal
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -21,11 +20,9 @@ from lunargr_cli import INTERRUPTED, commands, quiet_interruptions, signals, sto
 from lunargr_cli.console import Console, flush_out, say_error, say_resources, set_up_streams, write_out
 from lunargr_cli.next_step import next_step
 from lunargr_cli.options import check_numbers
-from lunargr_cli.paths import guarded
 from lunargr_cli.spelling import running, spell
 from schemas.command_line import count_processes, recording
 from schemas.errors import EXIT_CODE, InputError, LunargrError
-from schemas.files.locks import claim
 
 # Threads that wait for each other by spinning slow a busy machine down many times over. Read when torch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -56,12 +53,10 @@ def _plain(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode()
 
 
-def _with_safeguards(name: str, command: Callable[..., None], shared: bool) -> Callable[..., None]:
+def _as_typed(name: str, command: Callable[..., None]) -> Callable[..., None]:
     """The command with what every one of them needs around it; its last line says what usually follows.
 
-    No number reaches it that is not finite, its inputs are safe from its outputs, it holds the lock of its output from its
-    first step on, its command line is known to what it writes, and its errors name its options.
-    shared : several runs may write into the output, a folder, at once
+    No number reaches it that is not finite, its command line is known to what it writes, and its errors name its options.
     """
 
     @functools.wraps(command)
@@ -70,7 +65,7 @@ def _with_safeguards(name: str, command: Callable[..., None], shared: bool) -> C
         try:
             check_numbers(command, options)
             made_by = _plain(_command_line()), _plain(_folder())
-            with recording(made_by), guarded(command, options, _lock(options.get("output"))):
+            with recording(made_by):
                 command(**options)
             if (step := next_step(name, options)) and os.environ.get("RANK", "0") == "0":
                 Console(options.get("quiet", False)).say(f"next: {step}")
@@ -78,12 +73,6 @@ def _with_safeguards(name: str, command: Callable[..., None], shared: bool) -> C
             raise type(error)(spell(str(error))) from None
         finally:
             running.reset(spelled)
-
-    def _lock(output: Any) -> contextlib.AbstractContextManager[None]:
-        # Under torchrun the first process alone writes.
-        if shared or not isinstance(output, Path) or os.environ.get("RANK", "0") != "0":
-            return contextlib.nullcontext()
-        return claim(output)
 
     return run
 
@@ -127,7 +116,7 @@ for _module in sorted(
     (importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)),
     key=lambda module: module.ORDER,
 ):
-    _command = _with_safeguards(_module.NAME, _module.command, getattr(_module, "SHARED_OUTPUT", False))
+    _command = _as_typed(_module.NAME, _module.command)
     # Named, the first sentence is wrapped in the list of commands; left to click, it is cut off.
     _summary = " ".join((_module.command.__doc__ or "").split()).split(". ")[0].rstrip(".")
     app.command(name=_module.NAME, cls=getattr(_module, "CLASS", None), short_help=_summary)(_command)

@@ -10,7 +10,6 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 
-from lunargr_cli.paths import Writes
 from lunargr_cli.spelling import option_of
 from schemas.errors import ConfigError
 from schemas.files.outputs import Output
@@ -18,21 +17,7 @@ from schemas.files.outputs import Output
 Number = TypeVar("Number", int, float)
 
 MOST = 2**31 - 1  # what counts pairs, pixels or crops
-MOST_WORKERS = 4096  # of one machine
 MOST_PARTS = 100_000  # of one stage: beyond it a part is less than its own overhead
-
-
-def check_scheduler(text: str | None) -> str | None:
-    """``local:N`` with a number of workers that can be, or an address. Raises ConfigError."""
-    if text is None:
-        return None
-    kind, _, number = text.partition(":")
-    local = number.isdecimal() and len(number) < 9 and 1 <= int(number) <= MOST_WORKERS
-    if not text.strip() or (kind == "local" and not local):
-        raise ConfigError(
-            f"--scheduler: expected an address, or local:N with 1 <= N <= {MOST_WORKERS} workers, found '{text}'."
-        )
-    return text
 
 
 def complete_model(incomplete: str) -> list[str]:
@@ -57,7 +42,7 @@ def configure(config: type[Config], options: Mapping[str, Any], **converted: Any
     return config(**{name: value for name, value in options.items() if name in names} | converted)
 
 
-OutputFile = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True), Writes.FILE]
+OutputFile = Annotated[Path, typer.Option("--output", "-o", help="File to write.", show_default=True)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")]
 Shard = Annotated[
@@ -78,7 +63,6 @@ Scheduler = Annotated[
     typer.Option(
         "--scheduler",
         metavar="ADDRESS|local:N",
-        callback=check_scheduler,
         help="Run parts on Dask: N processes of this machine, or the workers of a scheduler. Keeps finished parts like --resume.",
     ),
 ]
@@ -100,13 +84,10 @@ BodyOption = Annotated[
         "--body", metavar="NAME|METRES", help="Body by name, or its radius in metres (default: the Moon, 1737400)."
     ),
 ]
-Json = Annotated[
-    Path | None, typer.Option("--json", metavar="FILE", help="Also write the result as JSON."), Writes.FILE
-]
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Also write the result as JSON.")]
 GeoTiff = Annotated[
     Path | None,
     typer.Option("--geotiff", help="GeoTIFF to write (default: the output's name with .tif)."),
-    Writes.FILE,
 ]
 NoGeoTiff = Annotated[
     bool, typer.Option("--no-geotiff", help="Write only the HDF5 map; saves a seventh of the time on large maps.")
@@ -184,23 +165,11 @@ def check_once(option: str, names: Iterable[str]) -> tuple[str, ...]:
     return found
 
 
-def make_map_output(output: Path, overwrite: bool, geotiff: Path | None, no_geotiff: bool) -> Output:
-    """Where a map and its GeoTIFF go. Raises ConfigError."""
-    if geotiff and no_geotiff:
+def make_map_output(options: Mapping[str, Any]) -> Output:
+    """Where a map and its GeoTIFF go, from the options of a command. Raises ConfigError."""
+    if (geotiff := options["geotiff"]) and options["no_geotiff"]:
         raise ConfigError(f"--geotiff {geotiff} and --no-geotiff: expected one of them, found both.")
-    return Output(output, overwrite, geotiff=geotiff)
-
-
-def in_parts(scheduler: str | None, resume: bool, parts: int | None, shard: str | None) -> bool:
-    """Whether a command works in parts. Raises ConfigError."""
-    wanted = scheduler is not None or resume
-    if wanted and shard is not None:
-        raise ConfigError(
-            "--shard: one part by hand; --scheduler and --resume make all parts themselves. Give one of them."
-        )
-    if parts is not None and not wanted:
-        raise ConfigError("--parts: expected --scheduler or --resume beside it.")
-    return wanted
+    return make_output(options, geotiff=geotiff)
 
 
 def read_list(option: str, text: str | None, counts: Sequence[int] = ()) -> tuple[float, ...] | None:
@@ -228,3 +197,10 @@ def read_parameters(items: Iterable[str] | None) -> dict[str, float]:
             raise ConfigError(f"--parameters: expected NAME=VALUE with a number, found '{item}'.") from None
         names.append(name.strip())
     return dict(zip(check_once("--parameters", names), values, strict=True))
+
+
+def make_output(options: Mapping[str, Any], **others: Any) -> Output:
+    """Where and how a stage writes, from the options of a command; others : fields with options of other names."""
+    names = ("overwrite", "resume", "figures", "report", "scheduler", "parts")
+    given = {name: options[name] for name in names if name in options}
+    return Output(options.get("output"), json=options.get("json_file"), **given, **others)

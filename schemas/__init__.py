@@ -22,7 +22,7 @@ from schemas.errors import EXIT_CODE, ArtefactError, ConfigError, GeometryError,
 from schemas.later import imported_later
 
 if TYPE_CHECKING:
-    from schemas.files.outputs import atomic_path, check_output, write_json
+    from schemas.files.outputs import atomic_path, write_json
     from schemas.reading import open_artefact, read_config, read_kind, read_strings
     from schemas.writing import ArtefactWriter
 
@@ -54,7 +54,6 @@ __all__ = [
     "Schema",
     "Variable",
     "atomic_path",
-    "check_output",
     "get_schema",
     "open_artefact",
     "read_config",

@@ -15,7 +15,6 @@ import numpy as np
 from schemas.declaration import STRING, Schema, Variable
 from schemas.errors import ArtefactError, ConfigError
 from schemas.files.hdf5 import UNKNOWN, abandoned, whole_hdf5
-from schemas.files.outputs import check_output
 from schemas.files.references import is_inside
 from schemas.provenance import describe_run
 from schemas.reading import open_artefact
@@ -42,9 +41,7 @@ class ArtefactWriter:
         inputs: Sequence[Path] = (),
         seed: int | None = None,
         attributes: Mapping[str, Any] | None = None,
-        overwrite: bool = False,
     ) -> None:
-        check_output(path, inputs, overwrite)
         self.path = Path(path)
         self.schema = schema
         self.sizes = dict(sizes)

@@ -22,22 +22,11 @@ from schemas import (
     atomic_path,
     open_artefact,
     read_strings,
-    write_json,
 )
-from schemas.files.outputs import Output
 from stages.common.intervals import ERROR, LOG, ground_variance, join, ratio_interval, run_variance, two_sided_p
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
 
 # Validation MSE summed over a crop of 128 x 128 px, where the Lunar-G2R paper's text gives it.
 PAPER = {"M1": 4.51, "M2": 4.06, "M6": 5.34}
-TABLE, CURVES = "comparison.json", "validation_curves.png"  # within the folder of a comparison
-
-
-@dataclass(frozen=True)
-class Config:
-    """level : of significance, after Holm's adjustment, below which a difference is called larger than its noise"""
-
-    level: float = 0.05
 
 
 @dataclass
@@ -86,12 +75,12 @@ def read_runs(evaluation: Path, checkpoints: Sequence[Path]) -> list[Trained]:
     return runs
 
 
-def compare(runs: Sequence[Trained], config: Config = Config()) -> dict[str, Any]:
+def compare(runs: Sequence[Trained], level: float = 0.05) -> dict[str, Any]:
     """The table of models, best first, and every pair of them with the noise of their difference.
 
     The logarithm of the ratio of two mean MSE has the variance of both means over seeds plus that of a paired jackknife
     over ground tiles; its p value takes Student's t with Satterthwaite's degrees of freedom, adjusted by Holm over all
-    pairs of models.
+    pairs of models. level : of significance, below which a difference is called larger than its noise
     """
     models = list(dict.fromkeys(r.model for r in runs))
     groups = {m: [r for r in runs if r.model == m] for m in models}
@@ -104,7 +93,7 @@ def compare(runs: Sequence[Trained], config: Config = Config()) -> dict[str, Any
     mean = {m: float(np.mean([r.mse for r in g])) for m, g in groups.items()}
     order = sorted(models, key=mean.__getitem__)
     pairs = [_difference(groups[a], groups[b]) for a, b in combinations(order, 2)]
-    _holm(pairs, config.level)
+    _holm(pairs, level)
     tile = runs[0].tile
     return {
         "models": {m: _row(groups[m]) for m in order},
@@ -172,24 +161,6 @@ def _holm(pairs: list[dict[str, Any]], level: float) -> None:
 
 def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
-
-
-def run(
-    files: Sequence[tuple[Path, Sequence[Path]]],
-    output: Output | Path,
-    config: Config = Config(),
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> dict[str, Any]:
-    """Compare the runs behind (evaluation, checkpoints) of every model; writes JSON and curves into the folder ``output``."""
-    output = Output.at(output)
-    runs = [run for evaluation, checkpoints in files for run in read_runs(evaluation, checkpoints)]
-    result = compare(runs, config)
-    write_curves(runs, output.file / CURVES)
-    for path in (output.file / TABLE, output.json):
-        if path is not None:
-            write_json(path, result)
-    return result
 
 
 def write_curves(runs: Sequence[Trained], path: Path) -> None:

@@ -211,9 +211,6 @@ def test_gain_and_offset_of_images_in_dn_do_not_matter(rng, tmp_path):
 
 @pytest.mark.slow
 def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
-    from lunargr_cli.fanout.job import Work
-    from lunargr_cli.fanout.stages import run_albedo
-
     # blocks so small that the map has a row of them for each part
     monkeypatch.setattr("stages.physics.images.windows.BLOCK_PX", 96)
     config = replace(QUIET, geotiff=True)
@@ -229,10 +226,10 @@ def test_shards_and_parts_give_the_same_bytes(planted, tmp_path, monkeypatch):
     with monkeypatch.context() as broken:
         broken.setattr("stages.merge.run", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            run_albedo(planted.map, planted.scene, Output(resumed), config, Work(parts=3))
+            albedo.run(planted.map, planted.scene, Output(resumed, resume=True, parts=3), config)
     left = sorted((tmp_path / "resumed.h5.parts").rglob("map-*.h5"))
     left[1].unlink()
-    run_albedo(planted.map, planted.scene, Output(resumed), config, Work(parts=3))
+    albedo.run(planted.map, planted.scene, Output(resumed, resume=True, parts=3), config)
     for other in ("merged", "resumed"):
         for name, a, b in zip(names, read(whole, *names), read(tmp_path / f"{other}.h5", *names), strict=True):
             assert a.tobytes() == b.tobytes(), (other, name)
@@ -370,7 +367,7 @@ def test_what_registration_finds_is_taken_off_by_all_shards(rng, tmp_path, monke
     # three pixels aside, an image differs from the ground by more than the ground's own contrast
     assert rms(away - away.mean()) < 0.25 * np.log(truth).std()
     path, again, part = (tmp_path / name for name in ("calibration.json", "again.json", "part.h5"))
-    albedo.calibrate_to(Output(path), scene.map, scene.scene, config)
+    albedo.calibrate_to(scene.map, scene.scene, path, config)
     made_from = json.loads(path.read_text())["made_from"]
     Calibration.read(path, made_from).write(again, made_from)
     assert again.read_bytes() == path.read_bytes()

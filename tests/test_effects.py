@@ -280,7 +280,7 @@ def test_values_per_image_come_back_whether_or_not_they_have_a_variable_of_their
     monkeypatch.setattr(cls, "table", variable)
     effect = cls({"gain": torch.tensor([0.1, 0.0, -0.2])}, SURVEY)
     cause = Named(effect, {"rms": (0.1, 0.01, "1")}, 0.01, 9.0, 1.0, 0.1, 0.09, (5.0, 4.0, 6.0), ["image_gain"])
-    write_diagnosis(tmp_path / "d.h5", Answer("named", causes=[cause]), ["a", "b", "c"], [], False)
+    write_diagnosis(tmp_path / "d.h5", Answer("named", causes=[cause]), ["a", "b", "c"], [])
     [found] = load_extension(tmp_path / "d.h5", ["c", "x", "a"])
     torch.testing.assert_close(found.values["gain"], torch.tensor([-0.2, 0.0, 0.1]))
 

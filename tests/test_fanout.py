@@ -16,16 +16,14 @@ import numpy as np
 import pytest
 import rasterio
 from cluster_scene import assert_same, environment, finish, lunargr, stages, start
-from command import outcome
 from small_scene import write_scene
 
-from lunargr_cli.fanout.job import Identity, Work, open_job
-from lunargr_cli.fanout.stages import run_infer, run_ingest
-from lunargr_cli.options import in_parts
 from schemas import PAIRS, SCENE, ArtefactError, ConfigError, InputError, atomic_path, open_artefact
 from schemas.files.inputs import Inputs
-from schemas.files.outputs import Output, Target
+from schemas.files.outputs import Output
 from stages import infer, ingest, merge, project, sample
+from stages.common.runner.job import Identity, open_job
+from stages.ingest.stage import summarise
 
 
 @pytest.fixture(scope="module")
@@ -173,11 +171,11 @@ def test_a_diagnosis_on_a_worker(inputs, cluster, tmp_path):
 
 def test_schedulers_that_are_not_there(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    from lunargr_cli.fanout import engines
+    from stages.common.runner import engines
 
     monkeypatch.setattr(engines, "ANSWER_WITHIN", 1.0)
-    for where in ("tcp://127.0.0.1:9", "local:none", "nonsense"):
-        with pytest.raises(ConfigError, match="--scheduler: ") as caught, engines.open_dask(where, tmp_path):
+    for where in ("tcp://127.0.0.1:9", "nonsense"):
+        with pytest.raises(ConfigError, match="`scheduler`: ") as caught, engines.open_dask(where, tmp_path):
             pass
         assert "\n" not in str(caught.value) and "local:N" in str(caught.value)
     monkeypatch.setitem(sys.modules, "distributed", None)
@@ -229,7 +227,7 @@ def test_a_refused_run_makes_nothing_and_is_refused_again(tmp_path):
         path.write_text("")
     for _ in range(2):
         with pytest.raises(ConfigError, match=r"map\.tif: exists already"):
-            run_infer(*files, Output(tmp_path / "map.h5"), infer.Config(), None, Work(parts=2))
+            infer.run(*files, Output(tmp_path / "map.h5", resume=True, parts=2), infer.Config())
         assert sorted(p.name for p in tmp_path.iterdir()) == ["checkpoint.h5", "map.tif", "scene.h5"]
     assert (tmp_path / "map.tif").read_text() == "somebody's own"
 
@@ -243,7 +241,7 @@ def write_part(path, fail=False):
 
 def make_text(output, version=1, fail=False):
     """A job of two parts, each a file of text."""
-    with open_job(Output(output), [Target(output)], Identity("text", {"version": version}, []), Work()) as job:
+    with open_job(Output(output), Identity("text", {"version": version}, [])) as job:
         parts = job.fan("text", write_part, [{}, {"fail": fail}], ".txt")
         output.write_text("".join(p.read_text() for p in parts))
 
@@ -271,7 +269,7 @@ def test_a_folder_of_parts_with_other_files_is_refused_and_stays(tmp_path, place
 
 def test_a_file_put_among_the_parts_of_a_run_stays(tmp_path):
     output = tmp_path / "x.txt"
-    with open_job(Output(output), [Target(output)], Identity("text", {}, []), Work()) as job:
+    with open_job(Output(output), Identity("text", {}, [])) as job:
         job.fan("text", write_part, [{}], ".txt")
         (job.folder / "note.txt").write_text("somebody's own")
     assert [p.name for p in (tmp_path / "x.txt.parts").rglob("*") if p.is_file()] == ["note.txt"]
@@ -328,7 +326,7 @@ def test_a_scene_by_hand_is_a_dem_in_rows_and_then_its_images(by_hand, virtual):
     scene = by_hand.whole.with_name(f"scene_{virtual}.h5")  # a virtual file lies beside its parts
     merge.run(by_hand.images, scene, merge.Config(virtual))
     assert_same(by_hand.whole, scene)
-    found, whole = ingest.summarise(scene), ingest.summarise(by_hand.whole)
+    found, whole = summarise(scene), summarise(by_hand.whole)
     assert (found.elevation_range, found.dem_valid_share) == (whole.elevation_range, whole.dem_valid_share)
 
 
@@ -355,10 +353,10 @@ def test_rows_on_nodata_are_a_part_like_any_other(tmp_path):
     found = [ingest.run(files.dem, None, part, replace(config, shard=(k, 8))) for k, part in enumerate(parts)]
     assert [f.dem_valid_share > 0 for f in found] == [False] * 5 + [True] * 3
     merge.run(parts, tmp_path / "merged.h5")
-    run_ingest(files.dem, None, Output(tmp_path / "fanned.h5"), config, Work(parts=3))
+    ingest.run(files.dem, None, Output(tmp_path / "fanned.h5", resume=True, parts=3), config)
     for name in ("merged", "fanned"):
         assert_same(tmp_path / "whole.h5", tmp_path / f"{name}.h5")
-    assert ingest.summarise(tmp_path / "merged.h5") == ingest.summarise(tmp_path / "whole.h5")
+    assert summarise(tmp_path / "merged.h5") == summarise(tmp_path / "whole.h5")
     _blank(files.dem, np.s_[::2], np.s_[:, ::2])  # a quarter of each pixel of 40 m is known: too little for a mean
     for k in range(2):
         ingest.run(files.dem, None, Output(parts[k], overwrite=True), replace(config, gsd=40, shard=(k, 2)))
@@ -431,7 +429,12 @@ def test_merging_keeps_masks_sparse(by_hand, tmp_path):
 
 
 def test_shards_and_parts_do_not_mix(inputs, tmp_path):
-    with pytest.raises(ConfigError, match="one part by hand"):
-        in_parts(None, True, None, "1/2")
-    code, said = outcome("project", inputs["crops"], "--parts", "3", "-o", tmp_path / "x.h5")
-    assert code == 3 and len(said.splitlines()) == 1 and "--parts" in said
+    whole, shard = project.Config(), project.Config(shard=(0, 2))
+    for output, config, words in (
+        (Output(tmp_path / "x.h5", resume=True), shard, "one part by hand"),
+        (Output(tmp_path / "x.h5", parts=3), whole, "`parts`: expected"),
+        (Output(tmp_path / "x.h5", scheduler="local:none"), whole, "`scheduler`: expected an address, or local:N"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            project.run(inputs["crops"], output, config)
+    assert not list(tmp_path.iterdir())

@@ -1,4 +1,5 @@
-"""Imports run one way: schemas <- common <- physics <- pairs <- network, effects <- stages <- command line; stages never import each other."""
+"""Imports run one way: schemas <- common <- physics <- pairs <- network, effects, merge <- stages <- pipelines <- command line; stages never
+import each other."""
 
 from __future__ import annotations
 
@@ -17,8 +18,9 @@ LAYERS = [
     "stages.common",
     "stages.physics",
     "stages.pairs",
-    "stages.network|stages.effects",
+    "stages.network|stages.effects|stages.merge",
     "stages",
+    "stages.pipelines",
     "lunargr_cli",
 ]
 STAGES = LAYERS.index("stages")
@@ -134,19 +136,21 @@ def test_functions_are_short_and_take_few_parameters():
 
 STAGES_RUN = (
     "simulate", "ingest", "sample", "project", "train", "infer", "albedo", "normalize", "render", "view", "export", "evaluate", "match",
-    "diagnose", "compare", "report", "merge", "convert",
+    "diagnose", "report", "merge", "convert", "pipelines.compare_models", "pipelines.infer_terrain",
 )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", STAGES_RUN)
 def test_every_stage_is_run_alike(name):
-    """run(inputs ..., output, config, say, progress); say and progress may be left away."""
+    """run(inputs ..., output, config, say, progress); say and progress may be left away, also by stages that use neither."""
     from stages.common.progress import say_nothing, show_nothing
 
     parameters = inspect.signature(importlib.import_module(f"stages.{name}").run).parameters
-    assert list(parameters)[-4:] == ["output", "config", "say", "progress"]
+    told = [name for name in ("say", "progress") if name in parameters]
+    assert list(parameters)[-2 - len(told) :] == ["output", "config", *told]
     assert parameters["output"].annotation in ("Output | Path", "Output | Path | None")
-    assert parameters["say"].default is say_nothing and parameters["progress"].default is show_nothing
+    defaults = {"say": say_nothing, "progress": show_nothing}
+    assert all(parameters[name].default is defaults[name] for name in told)
     assert all(p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters.values())
 
 

@@ -10,7 +10,6 @@ import pytest
 
 from schemas import ArtefactError
 from stages import albedo, evaluate, infer, match, project, sample, train
-from stages.evaluate import held_out_images
 from stages.pairs.ground import COLUMNS, EDGE, leave_out_learned
 from stages.pairs.reader import PairReader
 
@@ -109,6 +108,6 @@ def test_maps_carry_the_record_to_the_judgement_of_unseen_images(trained, small_
         unseen, name = clean[reader.frame[clean] == image], reader.image_ids[image]
     infer.run(small_artefacts["scene"], trained / "checkpoint.h5", svbrdf, infer.Config(device="cpu", geotiff=False))
     albedo.run(svbrdf, small_artefacts["scene"], fold, albedo.Config(leave_out=(name,), geotiff=False))
-    result = held_out_images.run(trained / "pairs.h5", [fold], tmp_path / "e.h5", held_out_images.Config())
+    result = evaluate.run_held_out(trained / "pairs.h5", [fold], tmp_path / "e.h5", evaluate.HeldOutConfig())
     assert len(unseen) and result["pairs"] == len(unseen)
     assert result["warnings"] == [notes[0].replace("checkpoint.h5", "fold.h5")]

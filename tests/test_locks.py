@@ -18,8 +18,9 @@ import pytest
 
 from schemas import ConfigError, atomic_path, write_json
 from schemas.files.companions import companions_of
+from schemas.files.inputs import Inputs
 from schemas.files.locks import claim, lock_path, partial_path, record_path, scratch_path, unlocked
-from schemas.files.outputs import Target, check_outputs, protect
+from schemas.files.outputs import Target, protect
 
 NO_FLOCK = """
 import errno, fcntl, warnings
@@ -232,15 +233,14 @@ def test_a_run_that_was_not_told_to_replaces_no_file_at_all(tmp_path):
     forgotten, told, new = (tmp_path / name for name in ("forgotten.txt", "told.txt", "new.txt"))
     for path in (forgotten, told):
         path.write_text("there before")
-    with protect([], overwrite=False):
-        check_outputs([Target(told)], overwrite=True)
+    with protect(Inputs(), [Target(told)], overwrite=True):
         for path in (told, new, new):  # what the run itself wrote it may write again
             write_json(path, 1)
         with pytest.raises(ConfigError, match="exists already"):
             write_json(forgotten, 1)
+    with protect(Inputs(), [Target(told)]), pytest.raises(ConfigError, match="exists already"):
+        write_json(told, 1)
     assert forgotten.read_text() == "there before"
-    with protect([], overwrite=True):
-        write_json(forgotten, 1)
 
 
 def test_a_folder_that_takes_no_files_is_not_taken_for_another_run(tmp_path):

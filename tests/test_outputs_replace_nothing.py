@@ -16,8 +16,10 @@ from typer.main import get_command
 
 from lunargr_cli import commands
 from lunargr_cli import main as cli
-from lunargr_cli.paths import Writes, files_of
 from lunargr_cli.spelling import option_of
+from schemas import ConfigError, write_json
+from schemas.files.outputs import Output
+from stages.common import runner
 
 SUN = ["--sun-azimuth", "100", "--sun-elevation", "35"]
 # What each command reads, and the words that have it read that. Every command that writes must be here.
@@ -47,11 +49,16 @@ HOW = ("itself", "link", "hard link", "without --overwrite")
 MODULES = [importlib.import_module(f"lunargr_cli.commands.{m.name}") for m in pkgutil.iter_modules(commands.__path__)]
 
 
-def written_options(module) -> list[tuple[str, Writes]]:
-    """The options of a command that name what it writes."""
+# Parameters of commands that name what is written; of these outputs are folders.
+WRITTEN = ("output", "json_file", "geotiff", "report", "shifts", "figures")
+FOLDERS = {("simulate", "output"), ("compare", "output"), ("match", "figures"), ("evaluate", "figures")}
+
+
+def written_options(module) -> list[tuple[str, bool]]:
+    """The options of a command that name what it writes, and whether that is a folder."""
     command = get_command(cli.app).commands[module.NAME]
-    some = {p.name: Path("x") for p in command.params}
-    return [(option_of(module.command, name), kind) for name, _, kind in files_of(module.command, some).written]
+    names = [p.name for p in command.params if p.name in WRITTEN]
+    return [(option_of(module.command, name), (module.NAME, name) in FOLDERS) for name in names]
 
 
 @pytest.fixture(scope="session")
@@ -105,8 +112,8 @@ def refused(monkeypatch, capsys, folder: Path, arguments, victim: str) -> str:
 def cases():
     """Every command, option and input once; for one command in all disguises, which one mechanism sees through."""
     for module in MODULES:
-        for option, kind in written_options(module):
-            if kind is not Writes.FOLDER:
+        for option, is_folder in written_options(module):
+            if not is_folder:
                 for name in READS[module.NAME][0]:
                     for how in HOW if module.NAME == "infer" else HOW[:1]:
                         yield pytest.param(module.NAME, option, name, how, id=f"{module.NAME} {option} {name} {how}")
@@ -183,24 +190,20 @@ def test_the_parts_behind_a_virtual_artefact_are_inputs(monkeypatch, capsys, inp
     refused(monkeypatch, capsys, tmp_path, ["project", "whole.h5", "-o", "part1.h5", "--overwrite"], "part1.h5")
 
 
-def test_an_output_that_nobody_marked_cannot_replace_anything(tmp_path):
-    """A new command whose author forgot: what it does not say it writes is an input, and no input is ever replaced."""
-    from lunargr_cli.paths import guarded
-    from schemas import ConfigError, write_json
+def test_an_output_that_nobody_declared_cannot_replace_anything(tmp_path):
+    """A new stage whose author forgot: it replaces neither an input nor another file, whatever it was told."""
 
-    def command(source: Path, result: Path, output: cli.Path) -> None:
-        write_json(result, 1)
+    @runner.stage()
+    def run(source: Path, output: Output | Path, config: None) -> None:
+        write_json(source.with_name(name), 1)
 
-    from lunargr_cli.options import OutputFile
-
-    command.__annotations__ = {"source": Path, "result": Path, "output": OutputFile}
-    result = tmp_path / "result.json"
-    result.write_text("kept")
-    (tmp_path / "source").write_text("")
-    arguments = {"source": tmp_path / "source", "result": result, "output": tmp_path / "o"}
-    with pytest.raises(ConfigError, match="would replace"), guarded(command, arguments):
-        command(**arguments)
-    assert result.read_text() == "kept"
+    for name in ("source", "other"):
+        for path in (tmp_path / "source", tmp_path / "other"):
+            path.write_text("kept")
+        with pytest.raises(ConfigError, match="would replace" if name == "source" else "exists already"):
+            run(tmp_path / "source", Output(tmp_path / "output", overwrite=True), None)
+        assert (tmp_path / name).read_text() == "kept"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["other", "source"]
 
 
 LONG = "n" * 300

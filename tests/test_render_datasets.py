@@ -15,7 +15,8 @@ from PIL import Image, ImageSequence
 from render_scene import LAT, LON, SUN, lunargr_render
 
 from stages.physics.maps.grid import read_grid, unit_vectors
-from stages.render.dataset import export_files, to_quaternion
+from stages.render.dataset import to_quaternion
+from stages.render.files import export_files
 from stages.render.pictures import read_exr
 
 TRAJECTORY = f"""view_id,longitude_deg,latitude_deg,altitude_m,look_longitude_deg,look_latitude_deg

@@ -13,8 +13,10 @@ import h5py
 import numpy as np
 import pytest
 
-from schemas import PAIRS, SCHEMAS, ArtefactError, ArtefactWriter, ConfigError, check_output, open_artefact, read_kind
+from schemas import PAIRS, SCHEMAS, ArtefactError, ArtefactWriter, ConfigError, open_artefact, read_kind
 from schemas.checks import parse_json
+from schemas.files.inputs import Inputs
+from schemas.files.outputs import Target, check_apart, protect
 from schemas.provenance import chain
 from schemas.reading import read_config, unpack
 
@@ -148,11 +150,11 @@ def test_a_full_disk_is_one_clear_line_and_leaves_nothing(tmp_path):
 
 def test_an_output_never_replaces_an_input_nor_an_existing_file(tmp_path):
     path = write_pairs(tmp_path / "pairs.h5")
-    with pytest.raises(ConfigError, match="`overwrite`"):
-        write_pairs(path)
     before = path.read_bytes()
-    with pytest.raises(ConfigError, match="replace the input"):
-        write_pairs(path, inputs=[path], overwrite=True)
+    with protect(Inputs()), pytest.raises(ConfigError, match="`overwrite`"):
+        write_pairs(path)
+    with protect(Inputs([path]), [Target(path)], overwrite=True), pytest.raises(ConfigError, match="replace the input"):
+        write_pairs(path)
     assert path.read_bytes() == before
 
 
@@ -329,8 +331,8 @@ def test_an_output_that_is_a_hard_link_to_an_input_is_refused(tmp_path):
     (tmp_path / "other.h5").hardlink_to(tmp_path / "input.h5")
     (tmp_path / "equal.h5").write_bytes(b"measured")
     with pytest.raises(ConfigError, match="would replace the input"):
-        check_output(tmp_path / "other.h5", [tmp_path / "input.h5"], overwrite=True)
-    check_output(tmp_path / "equal.h5", [tmp_path / "input.h5"], overwrite=True)  # another file, if of the same bytes
+        check_apart([Target(tmp_path / "other.h5")], Inputs([tmp_path / "input.h5"]))
+    check_apart([Target(tmp_path / "equal.h5")], Inputs([tmp_path / "input.h5"]))  # another file, if of the same bytes
 
 
 def test_names_that_are_no_utf_8_are_refused(tmp_path):

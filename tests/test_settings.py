@@ -40,7 +40,7 @@ OTHERS = {
 # What commands have beside settings.
 BESIDE = {
     "output", "overwrite", "resume", "quiet", "json_file", "figures", "report", "scheduler", "parts", "no_geotiff", "models",
-    "seeds", "held_out_images", "list_effects", "list_matchers", "files", "blocks_csv", "calibration", "dem", "trajectory", "stereo", "altitude", "convergence", "pairs",
+    "seeds", "held_out_images", "list_effects", "list_matchers", "files", "shifts", "calibration", "dem", "trajectory", "stereo", "altitude", "convergence", "pairs",
     "images", "seed", "checkpoint", "source", "split", "body",
 }  # fmt: skip
 
@@ -133,12 +133,13 @@ def test_lists_of_options_name_each_thing_once(tmp_path):
 def test_lists_fit_what_they_are_for():
     from stages import train
     from stages.albedo.config import used_frames
+    from stages.train.checks import check
 
     frames = [SimpleNamespace(image_id=f"IMG{k}") for k in range(4)]
     config = importlib.import_module("stages.albedo").Config
     assert used_frames(frames, config(fold=(3, 9))) == [True, True, True, False]
     with pytest.raises(ConfigError, match=r"`fold`: expected one of the first 4 folds.*found 5/9"):
         used_frames(frames, config(fold=(4, 9)))
-    train.check(train.Config(widths=(4, 8, 8), dropout=(0.1,)))
+    check(train.Config(widths=(4, 8, 8), dropout=(0.1,)))
     with pytest.raises(ConfigError, match="`dropout`: expected one share, or 3 for as many `widths`, found 2"):
-        train.check(train.Config(widths=(4, 8, 8), dropout=(0.1, 0.2)))
+        check(train.Config(widths=(4, 8, 8), dropout=(0.1, 0.2)))

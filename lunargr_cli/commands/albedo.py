@@ -55,24 +55,18 @@ def command(
         "geotiff": not no_geotiff,
     }
     config = options.configure(Config, locals(), **converted, shard=options.parse_shard(shard))
-    console, to = Console(quiet), options.make_map_output(output, overwrite, geotiff, no_geotiff)
-    in_parts = options.in_parts(scheduler, resume, parts, shard)
+    console, to = Console(quiet), options.make_map_output(locals())
     if output.suffix == ".json":
-        if in_parts or shard or calibration:
+        if to.in_parts or shard or calibration:
             raise ConfigError(
                 f"{output}: expected an output NAME.h5 with --shard, --scheduler, --resume and --calibration, found a calibration."
             )
-        fitted = albedo.calibrate_to(to, svbrdf, scene, config, console.progress)
+        fitted = albedo.calibrate_to(svbrdf, scene, to, config, console.progress)
         console.say(f"{output}: calibration of {len(fitted.gain)} images")
         return
-    if in_parts and calibration:
+    if to.in_parts and calibration:
         raise ConfigError("--calibration: --scheduler and --resume make their own; give it to --shard alone.")
-    if in_parts:
-        from lunargr_cli.fanout.job import Work
-        from lunargr_cli.fanout.stages import run_albedo
-
-        summary = run_albedo(svbrdf, scene, to, config, Work(scheduler, parts, console.say, console.progress))
-    elif calibration:
+    if calibration:
         summary = albedo.run_calibrated(svbrdf, scene, calibration, to, config, console.progress)
     else:
         summary = albedo.run(svbrdf, scene, to, config, console.say, console.progress)

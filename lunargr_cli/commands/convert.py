@@ -10,6 +10,7 @@ import typer
 from lunargr_cli.console import Console
 from lunargr_cli.options import OutputFile, Overwrite, Quiet, read_names
 from schemas.files.outputs import Output
+from stages import convert
 
 NAME, ORDER = "convert", 86
 
@@ -38,11 +39,9 @@ def command(
     quiet: Quiet = False,
 ) -> None:
     """Write coefficient maps in another program's convention; 'lunargr models --conventions' lists them."""
-    from stages import convert
-
     console = Console(quiet)
     config = convert.Config(start, end, None if bands is None else read_names("--bands", bands), approximate)
-    report = convert.run(source, Output(output, overwrite), config, console.say, console.progress)
+    report = convert.run(source, Output(output, overwrite), config, console.progress)
     for loss in report.losses:
         console.say(f"lost: {loss}")
     console.say(

@@ -8,10 +8,19 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.console import Console, write_out
-from lunargr_cli.options import MOST, Json, Overwrite, Quiet, Scheduler, Seed, complete_model, configure, read_names
-from lunargr_cli.paths import Writes
+from lunargr_cli.options import (
+    MOST,
+    Json,
+    Overwrite,
+    Quiet,
+    Scheduler,
+    Seed,
+    complete_model,
+    configure,
+    make_output,
+    read_names,
+)
 from schemas.errors import ConfigError
-from schemas.files.outputs import Output
 from stages import diagnose
 from stages.diagnose import Config
 
@@ -35,12 +44,10 @@ def command(
     output: Annotated[
         Path | None,
         typer.Option("--output", "-o", help="diagnosis.h5: the effects, for --extend of train, render and evaluate."),
-        Writes.FILE,
     ] = None,
     report: Annotated[
         Path | None,
         typer.Option("--report", metavar="FILE", help="One HTML file with pictures and evidence."),
-        Writes.FILE,
     ] = None,
     free: Annotated[
         str | None,
@@ -68,7 +75,6 @@ def command(
 ) -> None:
     """Name the physical causes of the difference between measured and simulated images."""
     console = Console(quiet)
-    to = Output(output, overwrite, json=json_file, report=report)
     if list_effects:
         _list_effects()
         return
@@ -76,15 +82,8 @@ def command(
         raise ConfigError("diagnose: expected a file of pairs, found none; give pairs.h5, or --list.")
     from stages.diagnose.result.answer import describe
 
-    config = configure(Config, locals(), free=read_names("--free", free))
-    if scheduler:
-        from lunargr_cli.fanout.job import Work
-        from lunargr_cli.fanout.stages import run_diagnose
-
-        answer = run_diagnose(pairs, checkpoint, to, config, Work(scheduler, None, console.say, console.progress))
-    else:
-        result = diagnose.run(pairs, checkpoint, to, config, console.say, console.progress)
-        answer = result.answer.to_json()
+    config, to = configure(Config, locals(), free=read_names("--free", free)), make_output(locals())
+    answer = diagnose.run(pairs, checkpoint, to, config, console.say, console.progress).report
     rows = [
         (
             c["effect"],

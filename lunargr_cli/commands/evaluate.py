@@ -9,10 +9,9 @@ import typer
 
 from lunargr_cli import options
 from lunargr_cli.console import Console
-from lunargr_cli.paths import Writes
 from schemas.files.outputs import Output
 from stages import evaluate
-from stages.evaluate import Config
+from stages.evaluate import Config, HeldOutConfig
 
 NAME, ORDER = "evaluate", 70
 
@@ -39,7 +38,6 @@ def command(
     figures: Annotated[
         Path | None,
         typer.Option("--figures", metavar="DIR", help="Write training curves and example crops as PNG."),
-        Writes.FOLDER,
     ] = None,
     fit_pairs: Annotated[
         int,
@@ -91,18 +89,11 @@ def command(
     from stages.evaluate.table import gain_lines, result_lines
 
     console = Console(quiet)
-    to = Output(output, overwrite, json=json_file, figures=figures)
+    to = options.make_output(locals())
     if held_out_images:
         _score_held_out_images(console, pairs, checkpoints, to, split, seed)
         return
-    if scheduler is not None or resume:
-        from lunargr_cli.fanout.job import Work
-        from lunargr_cli.fanout.stages import run_evaluate
-
-        work = Work(scheduler, None, console.say, console.progress)
-        result = run_evaluate(pairs, checkpoints, to, config, work)
-    else:
-        result = evaluate.run(pairs, checkpoints, to, config, console.say, console.progress)
+    result = evaluate.run(pairs, checkpoints, to, config, console.say, console.progress)
     columns, cells = result_lines(result)
     unit = "I/F" if result["image_units"] == "iof" else f"shares of {result['dn_full_range']:.0f} DN"
     console.table(f"split '{split}': {basis(result)}; RMSE in {unit}, MSE in its square", columns, cells)
@@ -126,9 +117,9 @@ def _score_held_out_images(
 ) -> None:
     """Score maps with albedo on images that did not make it. Raises LunargrError."""
     from stages.evaluate.coverage import coverage_lines
-    from stages.evaluate.held_out_images import Config, image_lines, result_lines, run
+    from stages.evaluate.held_out_images import image_lines, result_lines
 
-    result = run(pairs, maps, output, Config(split, seed), console.say, console.progress)
+    result = evaluate.run_held_out(pairs, maps, output, HeldOutConfig(split, seed), console.progress)
     suns = result["nearest_used_sun_deg"]
     title = (
         f"{result['claim']}: {result['pairs']} crops of split '{split}', {result['tiles']} ground tiles, "

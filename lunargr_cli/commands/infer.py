@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Annotated
 
@@ -10,10 +9,8 @@ import typer
 
 from lunargr_cli import options
 from lunargr_cli.console import Console
-from schemas.files.locks import scratch_path
-from schemas.files.outputs import check_outputs, map_targets
-from stages import infer, ingest
 from stages.infer import Config
+from stages.pipelines import infer_terrain
 
 NAME, ORDER = "infer", 60
 
@@ -53,35 +50,11 @@ def command(
     quiet: options.Quiet = False,
 ) -> None:
     """Predict georeferenced maps of reflectance coefficients for a DEM of any size."""
-    config = options.configure(Config, locals(), shard=options.parse_shard(shard), geotiff=not no_geotiff)
-    from schemas.files.user_files import check_file
-    from schemas.reading import is_artefact
-
-    console, to = Console(quiet), options.make_map_output(output, overwrite, geotiff, no_geotiff)
-    check_outputs(map_targets(to, config.geotiff), [terrain, checkpoint], overwrite)
-    gridding = None
-    check_file(terrain, "scene.h5 or a DEM")
-    if is_artefact(terrain):
-        infer.check_body(terrain, body)
-    else:
-        from stages.network.predictor import load_predictor
-
-        gsd = None if any_gsd else load_predictor(checkpoint).gsd
-        gridding = ingest.Config(gsd=gsd, body=body or ingest.Config.body)
-    if options.in_parts(scheduler, resume, parts, shard):
-        from lunargr_cli.fanout.job import Work
-        from lunargr_cli.fanout.stages import run_infer
-
-        summary = run_infer(
-            terrain, checkpoint, to, config, gridding, Work(scheduler, parts, console.say, console.progress)
-        )
-    else:
-        scene = terrain
-        with contextlib.ExitStack() as stack:
-            if gridding is not None:
-                scene = stack.enter_context(scratch_path(output, "grid"))
-                ingest.run(terrain, None, scene, gridding, progress=console.progress)
-            summary = infer.run(scene, checkpoint, to, config, console.say, console.progress)
+    settings = options.configure(Config, locals(), shard=options.parse_shard(shard), geotiff=not no_geotiff)
+    console, to = Console(quiet), options.make_map_output(locals())
+    summary = infer_terrain.run(
+        terrain, checkpoint, to, infer_terrain.Config(settings, body), console.say, console.progress
+    )
     console.say(
         f"{output}: {summary.grid.height} x {summary.grid.width} px at {summary.grid.gsd:g} m, {summary.valid_share:.1%} valid"
     )

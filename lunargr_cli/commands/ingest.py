@@ -9,7 +9,6 @@ import typer
 
 from lunargr_cli import options
 from lunargr_cli.console import Console
-from schemas.files.outputs import Output
 from stages import ingest
 from stages.ingest import Config
 
@@ -51,14 +50,8 @@ def command(
 ) -> None:
     """Put a DEM on a metric grid and find valid crop centres for each image."""
     config = options.configure(Config, locals(), shard=options.parse_shard(shard))
-    console, to = Console(quiet), Output(output, overwrite)
-    if options.in_parts(scheduler, resume, parts, shard):
-        from lunargr_cli.fanout.job import Work
-        from lunargr_cli.fanout.stages import run_ingest
-
-        summary = run_ingest(dem, images, to, config, Work(scheduler, parts, console.say, console.progress))
-    else:
-        summary = ingest.run(dem, images, to, config, console.say, console.progress)
+    console, to = Console(quiet), options.make_output(locals())
+    summary = ingest.run(dem, images, to, config, console.say, console.progress)
     grid, (low, high) = summary.grid, summary.elevation_range
     heights = f"{low:.1f} to {high:.1f} m" if summary.dem_valid_share else "no elevations"
     method = "reprojected to a local metric grid" if summary.resampled else "area means of the DEM's own grid"

@@ -11,7 +11,8 @@ import typer
 
 from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json, Overwrite
-from schemas.files.outputs import write_json
+from schemas.files.outputs import json_targets, write_json
+from stages.common.runner import prepared
 
 if TYPE_CHECKING:
     from schemas.provenance import Step
@@ -33,6 +34,11 @@ def command(
     """Show what a file holds: of an artefact its variables, and the commands and inputs that made it; of a DEM, an image or a
     camera its size, ground, time and Sun, and how fine a DEM it needs.
     """
+    with prepared([file], json_targets(json_file), overwrite):
+        _inspect(file, json_file)
+
+
+def _inspect(file: Path, json_file: Path | None) -> None:
     from schemas.provenance import chain
     from schemas.rasters import raster_kind
 

@@ -8,10 +8,8 @@ from typing import Annotated
 import typer
 
 from lunargr_cli.console import Console
-from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Seed, check_once, configure
-from lunargr_cli.paths import Writes
+from lunargr_cli.options import MOST, Device, Json, Overwrite, Quiet, Seed, check_once, configure, make_output
 from schemas.errors import ConfigError
-from schemas.files.outputs import Output
 from stages import match
 from stages.match import Config
 
@@ -46,7 +44,6 @@ def command(
     figures: Annotated[
         Path | None,
         typer.Option("--figures", metavar="DIR", help="Write match pictures, coloured by error, as PNG."),
-        Writes.FOLDER,
     ] = None,
     list_matchers: Annotated[bool, typer.Option("--list", help="Explain every matcher and stop.")] = False,
     seed: Seed = Config.seed,
@@ -69,7 +66,7 @@ def command(
     config = configure(Config, locals(), matchers=check_once("--matcher", matchers or Config.matchers))
     from stages.match.stage import result_lines
 
-    to = Output(overwrite=overwrite, json=json_file, figures=figures)
+    to = make_output(locals())
     result = match.run(files, to, config, console.say, console.progress)
     extent = f"{result['crops']} picture(s) of 512 x 384 on {result['tiles']} ground tile(s)"
     console.table(f"matching consistency over {extent}", *result_lines(result))

@@ -9,7 +9,6 @@ import typer
 
 from lunargr_cli.console import Console
 from lunargr_cli.options import Overwrite, Quiet
-from lunargr_cli.paths import Writes
 from schemas.files.outputs import Output
 from stages import merge
 from stages.merge import Config
@@ -21,7 +20,7 @@ def command(
     parts: Annotated[
         list[Path], typer.Argument(metavar="PART...", help="Every part that --shard I/N wrote, in any order.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="File to write."), Writes.FILE],
+    output: Annotated[Path, typer.Option("--output", "-o", help="File to write.")],
     virtual: Annotated[
         bool,
         typer.Option(
@@ -33,5 +32,5 @@ def command(
 ) -> None:
     """Join the parts of a sharded command into one file, identical to that of a single run."""
     console = Console(quiet)
-    schema = merge.run(parts, Output(output, overwrite), Config(virtual), console.say, console.progress)
+    schema = merge.run(parts, Output(output, overwrite), Config(virtual), console.progress)
     console.say(f"{output}: {len(parts)} parts of '{schema.name}' merged")

@@ -9,8 +9,9 @@ import typer
 
 from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json, Overwrite
-from schemas.files.outputs import write_json
+from schemas.files.outputs import json_targets, write_json
 from schemas.later import import_when_used
+from stages.common.runner import prepared
 
 NAME, ORDER = "models", 85
 
@@ -34,7 +35,8 @@ def command(
 
     chosen = None if name is None else get_model(name)
     if json_file is not None:
-        write_json(json_file, catalogue.as_dict())
+        with prepared([], json_targets(json_file), overwrite):
+            write_json(json_file, catalogue.as_dict())
     if markdown:
         write_out(catalogue.markdown())
     elif sets:

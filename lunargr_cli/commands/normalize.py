@@ -79,8 +79,8 @@ def command(
         leave_out=options.read_names("--leave-out", leave_out),
         geotiff=not no_geotiff, shard=options.parse_shard(shard),
     )  # fmt: skip
-    console, to = Console(quiet), options.make_map_output(output, overwrite, geotiff, no_geotiff)
-    found = normalize.run(scene, svbrdf, to, config, console.say, console.progress)
+    console, to = Console(quiet), options.make_map_output(locals())
+    found = normalize.run(scene, svbrdf, to, config, console.progress)
     console.say(
         f"{output}: mosaic of {len(found.images)} images over {found.covered_share:.1%} of the map, {found.mean_images:.1f} a pixel, "
         f"mean {NAMES[found.image_units]} {found.mean:.4f} at {config.standard_deg[0]:g}, {config.standard_deg[1]:g}, {config.standard_deg[2]:g} deg"

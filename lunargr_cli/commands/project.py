@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections.abc import Sequence
@@ -14,14 +13,11 @@ import typer.core
 
 from lunargr_cli import options
 from lunargr_cli.console import Console
-from lunargr_cli.paths import Writes
-from schemas.errors import ConfigError
-from schemas.files.outputs import Output, atomic_path
 from stages import project
 from stages.project import Config
 
 if TYPE_CHECKING:
-    from stages.project import Registered, Resemblance
+    from stages.project.summary import Registered, Resemblance
 
 NAME, ORDER = "project", 40
 BRIGHTEST = 1.0  # I/F of a white Lambert surface that faces the Sun
@@ -65,10 +61,9 @@ def command(
     max_shift: Annotated[
         float, typer.Option("--max-shift", help="Search radius of --register, px of the scene's grid.")
     ] = Config.max_shift,
-    blocks_csv: Annotated[
+    shifts: Annotated[
         Path | None,
         typer.Option("--shifts", metavar="CSV", help="Also write the shift of each block to a table."),
-        Writes.FILE,
     ] = None,
     exact: Annotated[
         bool, typer.Option("--exact", help="Keep full float32 precision; the file is three times as large.")
@@ -83,18 +78,8 @@ def command(
 ) -> None:
     """Orthorectify the images onto the crops; add Sun, camera and terrain horizon."""
     config = options.configure(Config, locals(), scene=str(scene) if scene else None, shard=options.parse_shard(shard))
-    console, to = Console(quiet), Output(output, overwrite)
-    if blocks_csv is not None and register is None:
-        raise typer.BadParameter("needs --register", param_hint="--shifts")
-    if options.in_parts(scheduler, resume, parts, shard):
-        from lunargr_cli.fanout.job import Work
-        from lunargr_cli.fanout.stages import run_project
-
-        if blocks_csv is not None:
-            raise ConfigError("--shifts: parts do not keep the blocks' own shifts; leave out --scheduler and --resume.")
-        summary = run_project(crops, to, config, Work(scheduler, parts, console.say, console.progress))
-    else:
-        summary = project.run(crops, to, config, console.say, console.progress)
+    console, to = Console(quiet), options.make_output(locals(), shifts=shifts)
+    summary = project.run(crops, to, config, console.say, console.progress)
     (i0, i1), (e0, e1) = summary.incidence_deg, summary.emission_deg
     console.say(
         f"{output}: {summary.pairs} pairs, {summary.valid_share:.1%} of pixels valid, {summary.shadowed_share:.1%} of these in cast shadow; "
@@ -109,8 +94,6 @@ def command(
     if summary.registered:
         _say_registered(console, summary.registered)
     _say_resemblances(console, summary.resemblances, summary.units)
-    if blocks_csv is not None:
-        _write_blocks(blocks_csv, summary.registered)
 
 
 def _say_resemblances(console: Console, resemblances: Sequence[Resemblance], units: str) -> None:
@@ -175,14 +158,3 @@ def _say_registered(console: Console, registered: Sequence[Registered]) -> None:
         console.say(
             f"relief displacement: share {share:.3f} +- {error:.3f} of h tan(emission) in {images} images (not orthorectified: 1)"
         )
-
-
-def _write_blocks(path: Path, registered: Sequence[Registered]) -> None:
-    """One row per block: where it is on the scene's grid, and what it said."""
-    with atomic_path(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        out = csv.writer(file)
-        out.writerow(["image_id", "row", "col", "dx_px", "dy_px", "sigma_px", "correlation", "lead", "refused"])
-        for image in registered:
-            for row, col, s in image.blocks:
-                numbers = (f"{v:.4f}" for v in (s.dx, s.dy, s.sigma, s.correlation, s.lead))
-                out.writerow([image.image_id, row, col, *numbers, s.refused])

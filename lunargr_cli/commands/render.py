@@ -23,17 +23,14 @@ from lunargr_cli.options import (
     read_list,
     read_parameters,
 )
-from lunargr_cli.paths import Writes
 from schemas.errors import ConfigError
-from schemas.files.outputs import Output, write_json
+from schemas.files.outputs import Output
 from stages import render
 from stages.common.brightness import NAMES
 from stages.render import Config, StereoConfig, Summary
-from stages.render.config import check
 
 NAME, ORDER = "render", 60
 CONVERGENCE = ",".join(f"{edge:g}" for edge in StereoConfig.convergence_deg)
-SHARED_OUTPUT = True  # the shards of a trajectory share a folder; each file in it has its own lock
 
 
 def command(
@@ -47,7 +44,6 @@ def command(
             "-o",
             help="NAME.exr writes EXR, PNG and, for ortho views, GeoTIFF; NAME.tif or NAME.png leaves out the EXR. A folder with --trajectory.",
         ),
-        Writes.EITHER,
     ] = Path("render.exr"),
     dem: Annotated[
         Path | None,
@@ -254,8 +250,6 @@ def command(
         "shard": parse_shard(shard),
     }
     config = configure(Config, locals(), **converted)
-    if stereo is None:
-        check(config, trajectory is not None)
     console, to = Console(quiet), Output(output, overwrite, resume, json=json_file)
     if stereo is None and altitude is not None:
         raise ConfigError("--altitude: expected together with --stereo; a single view has its height in --position.")
@@ -269,23 +263,21 @@ def command(
             )
         low, high = read_list("--convergence", convergence, (2,)) or StereoConfig.convergence_deg
         drawn = StereoConfig(stereo, altitude, (low, high), seed=seed)
-        manifest = render.run_stereo(path, to, config, drawn, console.say, console.progress)
+        manifest = render.run_stereo(path, to, config, drawn, console.progress)
         console.say(f"{manifest}: {stereo} stereo pairs")
         return
     if trajectory is not None:
-        _show(render.run_trajectory(path, trajectory, to, config, console.say, console.progress), to, console)
+        _show(render.run_trajectory(path, trajectory, to, config, console.progress), console)
         return
     if shard is not None or resume:
         raise ConfigError(
             "--shard and --resume: expected together with --trajectory; a single view is one piece of work."
         )
-    _show([render.run(path, to, config, console.say, console.progress)], to, console)
+    _show([render.run(path, to, config, console.progress)], console)
 
 
-def _show(results: list[Summary], to: Output, console: Console) -> None:
-    """The table of what was rendered, and the JSON."""
-    if to.json is not None:
-        _write_json(to.json, results)
+def _show(results: list[Summary], console: Console) -> None:
+    """The table of what was rendered."""
     brightness = NAMES[results[0].image_units] if results else NAMES["iof"]
     console.table(
         "rendered",
@@ -318,27 +310,6 @@ def _row(result: Summary) -> tuple[str, ...]:
     )
 
 
-def _write_json(path: Path, results: list[Summary]) -> None:
-    def finite(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
-    views = [
-        {
-            "view_id": r.view_id,
-            "files": [str(p) for p in r.files],
-            "size_px": list(r.size_px),
-            "known_share": finite(r.known_share),
-            "mean_iof": finite(r.mean),
-            "shadow_share": finite(r.shadow_share),
-            "incidence_deg": [finite(v) for v in r.incidence_deg],
-            "samples": r.samples,
-            "skipped": r.skipped,
-            "clipped_px": r.clipped,
-            "image_units": r.image_units,
-        }
-        for r in results
-    ]
-    write_json(path, {"views": views})
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -19,6 +19,7 @@ from lunargr_cli import commands
 from lunargr_cli.console import without_steering, write_out
 from schemas.command_line import output_of
 from schemas.errors import ArtefactError
+from schemas.files.inputs import check_input
 
 if TYPE_CHECKING:
     from schemas.provenance import Step
@@ -33,6 +34,7 @@ def command(file: Annotated[Path, typer.Argument(help="Any artefact of lunargr: 
     from schemas.provenance import chain
     from schemas.rasters import raster_kind
 
+    check_input(file)
     if not raster_kind(file):
         open_artefact(file, read_kind(file)).close()
     steps = chain(file)

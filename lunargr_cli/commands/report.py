@@ -33,5 +33,5 @@ def command(
 ) -> None:
     """Put maps, tables, curves and pictures of a run on one self-contained HTML page."""
     console = Console(quiet)
-    titles = report.run(files, Output(output, overwrite), Config(title, note), console.say, console.progress)
+    titles = report.run(files, Output(output, overwrite), Config(title, note), console.progress)
     console.say(f"{output}: {', '.join(titles)}")

@@ -10,7 +10,6 @@ import typer
 from lunargr_cli import options
 from lunargr_cli.console import Console
 from schemas.errors import ConfigError
-from schemas.files.outputs import Output
 from stages import sample
 from stages.sample import Config
 
@@ -59,14 +58,8 @@ def command(
 ) -> None:
     """Choose crop centres and split them by ground tile; training, validation and test share no ground."""
     config = options.configure(Config, locals(), split=_shares(split), shard=options.parse_shard(shard))
-    console, to = Console(quiet), Output(output, overwrite)
-    if options.in_parts(scheduler, False, parts, shard):
-        from lunargr_cli.fanout.job import Work
-        from lunargr_cli.fanout.stages import run_sample
-
-        audit = run_sample(scene, to, config, Work(scheduler, parts, console.say, console.progress))
-    else:
-        audit = sample.run(scene, to, config, console.say, console.progress)
+    console, to = Console(quiet), options.make_output(locals())
+    audit = sample.run(scene, to, config, console.say, console.progress)
     rows = [(p.name, p.pairs, p.images, p.tiles, f"{p.ground_km2:.2f}", f"{p.shared_km2:.2f}") for p in audit]
     console.table("split by ground tile", ("part", "pairs", "images", "tiles", "ground km2", "shared km2"), rows)
 

@@ -8,11 +8,10 @@ from typing import Annotated, Any
 import typer
 
 from lunargr_cli.console import Console, write_out
-from lunargr_cli.options import Json, Overwrite, Quiet
-from lunargr_cli.paths import Writes
+from lunargr_cli.options import Json, Overwrite, Quiet, make_output
 from schemas.errors import ConfigError
-from schemas.files.outputs import Output, write_json
 from stages import simulate
+from stages.common.runner import prepared
 from stages.simulate import Config
 
 NAME, ORDER = "simulate", 10
@@ -26,9 +25,7 @@ _HIDDEN_HELP = (
 
 
 def command(
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder to write the scene into."), Writes.FOLDER
-    ] = Path("scene"),
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write the scene into.")] = Path("scene"),
     recipe: Annotated[Path | None, typer.Option("--recipe", help="JSON recipe; the options below override it.")] = None,
     print_recipe: Annotated[bool, typer.Option("--print-recipe", help="Print the full recipe and stop.")] = False,
     size_px: Annotated[
@@ -70,37 +67,10 @@ def command(
         write_out(simulate.recipe_json(config))
         return
     console = Console(quiet)
-    summary = simulate.run(Output(output, overwrite), config, console.say, console.progress)
-    rows = [
-        (
-            i.shot.image_id,
-            i.shot.start_time,
-            f"{i.shot.gsd:.2f}",
-            f"{i.shot.incidence_deg:.1f}",
-            f"{i.shot.sun_azimuth_deg:.1f}",
-            f"{i.shot.emission_deg:.1f}",
-            f"{i.shot.phase_deg:.1f}",
-            f"{100 * share:.0f}",
-            f"{i.mean_iof:.4f}",
-            f"{i.mean_iof / i.noise_iof:.0f}",
-        )
-        for i, share in zip(summary.images, summary.covered, strict=True)
-    ]
-    columns = (
-        "image",
-        "start (UTC)",
-        "GSD m",
-        "inc deg",
-        "Sun az deg",
-        "em deg",
-        "phase deg",
-        "% of scene",
-        "mean I/F",
-        "SNR",
-    )
-    if json_file is not None:
-        write_json(json_file, [dict(zip(columns, row, strict=True)) for row in rows])
-    console.table(f"{config.extent / 1000:.2f} km scene in {output}", columns, rows)
+    with prepared([recipe] if recipe else []):
+        summary = simulate.run(make_output(locals()), config, console.progress)
+    table = summary.table()
+    console.table(f"{config.extent / 1000:.2f} km scene in {output}", list(table[0]), [list(r.values()) for r in table])
     planted = " + ".join(summary.hidden) or "none"
     console.say(
         f"{summary.craters} craters, DEM valid {100 * summary.dem_valid:.1f} %, planted: {planted} (recorded in {output / 'truth.h5'})"

@@ -10,7 +10,6 @@ import typer
 
 from lunargr_cli import options
 from lunargr_cli.console import Console
-from schemas.files.outputs import Output
 from stages import train
 from stages.train import Config
 
@@ -75,7 +74,7 @@ def command(
     }
     config = options.configure(Config, locals(), **texts, **numbers)
     console = Console(quiet)
-    summary = train.run(pairs, Output(output, overwrite, resume), config, console.say, console.progress)
+    summary = train.run(pairs, options.make_output(locals()), config, console.say, console.progress)
     best = summary.history.best_epoch
     error = math.sqrt(summary.history.validation_loss[best])
     console.say(

@@ -50,7 +50,7 @@ def command(
     """
     config = configure(Config, locals())
     console = Console(quiet)
-    made = view.run(source, pairs, Output(output, overwrite), config, console.say, console.progress)
+    made = view.run(source, pairs, Output(output, overwrite), config, console.progress)
     smaller = f", means of {made.factor} x {made.factor} px" if made.factor > 1 else ""
     console.say(
         f"{output}: {made.height} x {made.width} px{smaller}, {made.model}, {made.layers} maps, "

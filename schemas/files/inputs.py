@@ -16,8 +16,8 @@ from collections.abc import Hashable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import InputError, LunargrError
-from schemas.files.locks import is_beside
+from schemas.errors import ConfigError, InputError, LunargrError
+from schemas.files.locks import check_length, is_beside
 
 TABLES = (".csv", ".json")
 FILE_COLUMNS = ("path", "camera", "angles")
@@ -38,6 +38,11 @@ class Inputs:
                 continue
             self.note(path)
             waiting += files_named_in(path)
+
+    @property
+    def paths(self) -> set[Path]:
+        """The files, each under a name that it was given."""
+        return set(self._files.values())
 
     def note(self, path: Path) -> None:
         """Add one file, without what it names."""
@@ -67,6 +72,22 @@ class Inputs:
             if place == parts or place.startswith(parts + os.sep):
                 return next(iter(inside.values()))
         return None
+
+
+def check_input(path: Path) -> None:
+    """Refuse a file that is not there, before a stage is imported, which takes seconds. Raises ConfigError, InputError."""
+    name = os.fspath(path)
+    if "\0" in name or not name:
+        raise ConfigError(f"'{name}': expected the name of a file; check the options.")
+    check_length(path)
+    if ":" in name or name.startswith("/vsi"):  # GDAL also reads NETCDF:file.h5:variable and /vsizip/maps.zip/map.tif
+        return
+    try:
+        os.stat(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; check the path or run the stage that writes it.") from None
+    except (OSError, ValueError):  # of which the stage says more
+        return
 
 
 def _location(path: Path) -> str:

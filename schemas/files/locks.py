@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 PATIENCE = 0.2  # seconds: another run may be letting go in this moment
 LONGEST_NAME = 255  # bytes, of a file on every system
+LONGEST_PATH = 4096  # bytes, as Linux has it
 SHOWN = 120  # characters of who holds a lock
 
 _guard = threading.Lock()
@@ -62,6 +63,17 @@ def is_partial(output: str, name: str) -> bool:
     """Whether ``name`` is a temporary name, of any process, of the output of this name."""
     pattern = re.escape(f".{output}.partial-") + r"[^.]+" + re.escape(Path(output).suffix)
     return re.fullmatch(pattern, name) is not None
+
+
+def check_length(path: Path) -> None:
+    """Refuse a name that no file has; GDAL, HDF5 and JSON keep names as UTF-8. Raises ConfigError."""
+    name = os.fspath(path)
+    try:
+        longest = max(len(part.encode()) for part in name.split(os.sep))
+    except UnicodeEncodeError:
+        raise ConfigError(f"{name}: expected a name in UTF-8, found other bytes; rename the file.") from None
+    if longest > LONGEST_NAME or len(name.encode()) >= LONGEST_PATH:
+        raise ConfigError(f"{name}: expected a name of at most {LONGEST_NAME} bytes, found a longer one; shorten it.")
 
 
 @contextlib.contextmanager

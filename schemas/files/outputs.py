@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 from schemas.errors import ConfigError, InputError, LunargrError
 from schemas.files.companions import current_output, note_companion
 from schemas.files.inputs import Inputs
-from schemas.files.locks import LONGEST_NAME, claim, partial_path, record_path
+from schemas.files.locks import LONGEST_NAME, check_length, claim, partial_path, record_path
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _guard: ContextVar[_Guard | None] = ContextVar("guard", default=None)
@@ -25,23 +25,27 @@ _guard: ContextVar[_Guard | None] = ContextVar("guard", default=None)
 
 @dataclass(frozen=True)
 class Target:
-    """A file, or a folder of files, that a run will write.
+    """A file that a run will write.
 
     setting : with which the user chooses another place; name : in messages
+    state : of an unfinished run, which stays where the run ends early, and which the next one may replace
     """
 
     path: Path
     setting: str = "output"
     name: str = "the output"
+    state: bool = False
 
 
 @dataclass(frozen=True)
 class Output:
-    """Where a stage writes, and whether it may replace what is there.
+    """Where a stage writes, whether it may replace what is there, and whether it works in parts.
 
     path : the artefact, page or folder; None for stages that are asked for `json`, `figures` or `report` alone
     overwrite : whether what exists may be replaced; resume : whether to go on with what an interrupted run left
-    geotiff : of a map, None for its own name with .tif; json, figures (a folder), report : None for none
+    geotiff : of a map, None for its own name with .tif; json, figures (a folder), report, shifts (a table) : None for none
+    scheduler : who works on parts, 'local:N' or the address of a Dask scheduler, None for this process
+    parts : how many, None for a suitable number
     """
 
     path: Path | None = None
@@ -51,6 +55,9 @@ class Output:
     json: Path | None = None
     figures: Path | None = None
     report: Path | None = None
+    shifts: Path | None = None
+    scheduler: str | None = None
+    parts: int | None = None
 
     @classmethod
     def at(cls, where: Output | Path | None) -> Output:
@@ -63,6 +70,11 @@ class Output:
         if self.path is None:
             raise ConfigError("expected the name of an output, found none.")
         return self.path
+
+    @property
+    def in_parts(self) -> bool:
+        """Whether a stage that can be cut works in parts, of which finished ones are kept."""
+        return self.resume or self.scheduler is not None
 
     @property
     def geotiff_path(self) -> Path:
@@ -78,59 +90,66 @@ def map_targets(output: Output, as_geotiff: bool) -> list[Target]:
 
 @dataclass
 class _Guard:
-    """What a command may replace. replaceable : the absolute paths of files that it may, or that it wrote itself"""
+    """What a run may replace. inputs : of this run and of those that it is part of
 
-    inputs: Inputs
-    overwrite: bool
+    replaceable : the absolute paths of files that it may replace, or that it wrote itself; states : see Target
+    """
+
+    inputs: list[Inputs]
     replaceable: set[str] = field(default_factory=set)
+    states: set[str] = field(default_factory=set)
 
     def refuse(self, path: Path) -> None:
         """Refuse to write ``path`` in the place of an input, or of a file that may not be replaced. Raises ConfigError."""
-        refuse_inputs(Target(path), [self.inputs])
+        refuse_inputs(Target(path), self.inputs)
         place = os.path.abspath(path)
-        if not self.overwrite and place not in self.replaceable and os.path.lexists(path):
+        if place not in self.replaceable and os.path.lexists(path):
             raise _exists(Target(path))
         self.replaceable.add(place)
 
 
 @contextlib.contextmanager
-def protect(inputs: Iterable[Path], overwrite: bool = True) -> Iterator[None]:
-    """Within this block no file is written in the place of one of these, or of a file that one of them names.
+def protect(inputs: Inputs, targets: Iterable[Target] = (), overwrite: bool = False) -> Iterator[None]:
+    """Within this block no file is written in the place of an input, or of a file that is no target.
 
-    Without ``overwrite`` no file at all is replaced, but for those that :func:`check_outputs` was told may be.
+    Targets are replaced with ``overwrite`` alone.
     """
-    token = _guard.set(_Guard(Inputs(inputs), overwrite))
+    outer = _guard.get()
+    guard = _Guard([inputs, *(outer.inputs if outer else [])])
+    for target in targets:
+        place = os.path.abspath(target.path)
+        if overwrite or target.state:
+            guard.replaceable.add(place)
+        if target.state:
+            guard.states.add(place)
+    token = _guard.set(guard)
     try:
         yield
     finally:
         _guard.reset(token)
 
 
-def check_outputs(targets: Iterable[Target], inputs: Sequence[Path] = (), overwrite: bool = False) -> None:
-    """Refuse, before any work is done, what cannot be written: in the place of an input, of each other, of what exists.
+def check_apart(targets: Iterable[Target], inputs: Inputs) -> None:
+    """Refuse outputs in the place of an input or of each other, and names that no file can have. Raises ConfigError.
 
-    Inputs are those given, all that they name, and all that the command line names. Raises ConfigError.
+    Inputs are those given, all that they name, and those of a run that this one is part of.
     """
-    targets = list(targets)
-    check_apart(targets, inputs)
-    for target in targets:
-        _check_place(target, overwrite)
-    if overwrite and (guard := _guard.get()):
-        guard.replaceable.update(os.path.abspath(target.path) for target in targets)
-
-
-def check_apart(targets: Iterable[Target], inputs: Sequence[Path] = ()) -> None:
-    """Refuse outputs in the place of an input or of each other; files or folders. Raises ConfigError."""
-    known = [Inputs(inputs), *([guard.inputs] if (guard := _guard.get()) else [])]
-    for target in targets:
-        refuse_inputs(target, known)
+    known = [inputs, *(guard.inputs if (guard := _guard.get()) else [])]
     earlier = Inputs()
     for target in targets:
+        check_name(target)
+        refuse_inputs(target, known)
         if (twin := earlier.find(target.path)) is not None:
             raise ConfigError(
                 f"{target.path}: {target.name} would replace {twin}, which this run also writes; choose another `{target.setting}`."
             )
         earlier.note(target.path)
+
+
+def check_places(targets: Iterable[Target], overwrite: bool = False) -> None:
+    """Refuse outputs that exist, unless they may be replaced, and those that cannot be written. Raises ConfigError."""
+    for target in targets:
+        _check_place(target, overwrite or target.state)
 
 
 def refuse_inputs(target: Target, known: Iterable[Inputs]) -> None:
@@ -141,20 +160,9 @@ def refuse_inputs(target: Target, known: Iterable[Inputs]) -> None:
             raise ConfigError(f"{target.path}: {target.name} would replace {same}; choose another `{target.setting}`.")
 
 
-def check_output(path: Path, inputs: Sequence[Path] = (), overwrite: bool = False) -> None:
-    """:func:`check_outputs` for the one file of a stage that writes no other."""
-    check_outputs([Target(Path(path))], inputs, overwrite)
-
-
-def check_folder(target: Target) -> None:
-    """Refuse a folder that cannot be one. Raises ConfigError."""
-    if target.path.exists() and not target.path.is_dir():
-        raise ConfigError(f"{target.path}: expected a folder, found a file; choose another `{target.setting}`.")
-    _check_writable(target.path, target)
-
-
 def check_name(target: Target) -> None:
     """Refuse a name beside which no temporary file can stand. Raises ConfigError."""
+    check_length(target.path)
     path = Path(os.path.abspath(target.path))
     if not path.name:
         raise ConfigError(f"{target.path}: expected a name, found the root folder; choose another `{target.setting}`.")
@@ -168,7 +176,6 @@ def check_name(target: Target) -> None:
 
 def _check_place(target: Target, overwrite: bool) -> None:
     path, another = target.path, f"choose another `{target.setting}`"
-    check_name(target)
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -239,7 +246,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         _refuse(path)
         try:
             yield partial
-            if (output := current_output()) is not None and output != path:
+            if (output := current_output()) is not None and output != path and not _is_state(path):
                 note_companion(record_path(output), path, partial)
             os.replace(partial, path)
         except BaseException as error:
@@ -253,6 +260,11 @@ def atomic_path(path: Path) -> Iterator[Path]:
             raise
 
 
+def json_targets(path: Path | None) -> list[Target]:
+    """The JSON file of a command that writes no other, where it is wanted."""
+    return [] if path is None else [Target(path, "json")]
+
+
 def write_json(path: Path, content: Any) -> None:
     """A result as JSON, whole or absent."""
     with atomic_path(path) as partial:
@@ -262,6 +274,10 @@ def write_json(path: Path, content: Any) -> None:
 def _refuse(path: Path) -> None:
     if (guard := _guard.get()) is not None:
         guard.refuse(path)
+
+
+def _is_state(path: Path) -> bool:
+    return (guard := _guard.get()) is not None and os.path.abspath(path) in guard.states
 
 
 @contextlib.contextmanager

@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import SCENE, SVBRDF, ArtefactError, ArtefactWriter, InputError, atomic_path, open_artefact
-from schemas.files.companions import companions_of
-from schemas.files.outputs import Output, check_output, check_outputs, map_targets
+from schemas.files.outputs import Output
 from schemas.provenance import sha256
-from schemas.reading import read_strings
+from schemas.reading import read_config, read_strings
+from stages import merge
+from stages.albedo import calibrate_to
 from stages.albedo.calibrate import COSINES, Calibration, calibrate, take_samples
 from stages.albedo.config import Config, Summary, used_frames
 from stages.albedo.posterior import estimate, robust_mean
@@ -29,7 +30,8 @@ from stages.albedo.prior import terrain_variance
 from stages.albedo.pyramid import HALO_PX, LEVELS
 from stages.albedo.writing import Maps, copy_map, kept_attributes
 from stages.common.arrays import Floats32
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.progress import Progress
+from stages.common.runner.job import Job
 from stages.physics.bodies.spheres import find_body
 from stages.physics.images.references import References, open_references
 from stages.physics.images.registered import register
@@ -71,36 +73,10 @@ def open_ground(svbrdf: Path, scene: Path, config: Config) -> Iterator[Ground]:
         yield Ground(file, references, _units(svbrdf, file, scene, references.frames), surface)
 
 
-def run(
-    svbrdf: Path,
-    scene: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> Summary:
-    """Write the map with albedo. Raises LunargrError."""
-    return _run(svbrdf, scene, None, Output.at(output), config, progress)
-
-
-def run_calibrated(
-    svbrdf: Path,
-    scene: Path,
-    calibration: Path,
-    output: Output | Path,
-    config: Config,
-    progress: Progress = show_nothing,
-) -> Summary:
-    """:func:`run` with the calibration of :func:`calibrate_to`, which all shards share. Raises LunargrError."""
-    return _run(svbrdf, scene, calibration, Output.at(output), config, progress)
-
-
-def _run(
+def work(
     svbrdf: Path, scene: Path, calibration: Path | None, output: Output, config: Config, progress: Progress
 ) -> Summary:
-    as_geotiff = config.geotiff and config.shard[1] == 1
-    named = [svbrdf, scene, *([calibration] if calibration else [])]
-    check_outputs(map_targets(output, as_geotiff), named, output.overwrite)
+    """See :func:`stages.albedo.run` and :func:`stages.albedo.run_calibrated`."""
     with open_ground(svbrdf, scene, config) as ground:
         if calibration:
             found = Calibration.read(calibration, _identity(svbrdf, scene, config))
@@ -124,7 +100,6 @@ def _run(
                     config=asdict(config),
                     inputs=[svbrdf, scene],
                     attributes=kept_attributes(ground.map),
-                    overwrite=output.overwrite,
                 )
             )
             blocks = _blocks(ground)
@@ -136,18 +111,30 @@ def _run(
             for block in blocks.within(own, progress):
                 maps.put(block, *work_block(ground, found, block))
             maps.close()
-            if as_geotiff:
-                stack.enter_context(companions_of(output.file))
+            if config.as_geotiff:
                 partial = stack.enter_context(atomic_path(output.geotiff_path))
                 write_geotiff(partial, writer.file, read_grid(writer.file, output.file))
             return _summary(writer.file, config, scene)
 
 
-def calibrate_to(
-    output: Output, svbrdf: Path, scene: Path, config: Config, progress: Progress = show_nothing
-) -> Calibration:
-    """Write the calibration of the images, which all parts of one map share, as JSON. Raises LunargrError."""
-    check_output(output.file, [svbrdf, scene], output.overwrite)
+def in_parts(job: Job, svbrdf: Path, scene: Path, config: Config) -> Summary:
+    """The map: the images' calibration in one part, then shards of the map's rows."""
+    files = {"svbrdf": svbrdf, "scene": scene, "config": config}
+    [calibration] = job.fan("calibration", write_calibration, [files], ".json")
+    bands = _count_bands(svbrdf, scene, config)
+    pieces = job.shards("map", [svbrdf, scene, calibration], config, bands, function="run_calibrated")
+    whole = Output(job.output.file, overwrite=True, geotiff=job.output.geotiff)
+    merge.run(pieces, whole, merge.Config(inputs=(svbrdf, scene)), progress=job.progress)
+    return _summarise(job.output.file, scene)
+
+
+def write_calibration(path: Path, svbrdf: Path, scene: Path, config: Config) -> None:
+    """The calibration as a part."""
+    calibrate_to(svbrdf, scene, Output(path, overwrite=True), config)
+
+
+def calibrate_images(svbrdf: Path, scene: Path, output: Output, config: Config, progress: Progress) -> Calibration:
+    """See :func:`stages.albedo.calibrate_to`."""
     with open_ground(svbrdf, scene, config) as ground, atomic_path(output.file) as partial:
         found = _calibrate(svbrdf, scene, ground, config, progress)
         found.write(partial, _identity(svbrdf, scene, config))
@@ -201,14 +188,7 @@ def work_block(ground: Ground, calibration: Calibration, block: Box) -> tuple[Fl
     return albedo, albedo_std, count
 
 
-def source_files(scene: Path) -> list[Path]:
-    """The images and camera models of a scene."""
-    with open_artefact(scene, SCENE) as file:
-        frames = load_frames(file, scene)
-    return [path for frame in frames for path in frame.files]
-
-
-def count_bands(svbrdf: Path, scene: Path, config: Config) -> int:
+def _count_bands(svbrdf: Path, scene: Path, config: Config) -> int:
     """Rows of blocks on a map: more shards than these have nothing to do."""
     with open_ground(svbrdf, scene, config) as ground:
         return _blocks(ground).bands
@@ -218,10 +198,8 @@ def _blocks(ground: Ground) -> Blocks:
     return choose_blocks(ground.map["valid"].shape, ground.references.overlapping, HALO_PX)
 
 
-def summarise(output: Path, scene: Path) -> Summary:
+def _summarise(output: Path, scene: Path) -> Summary:
     """What a finished map holds, for the lines at the end."""
-    from schemas.reading import read_config
-
     with open_artefact(output, SVBRDF) as file:
         told = read_config(file)
         fold = told.get("fold")

@@ -28,14 +28,35 @@ Whatever is special about one effect stands in its own file under ``stages/effec
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.later import imported_later
+from schemas.files.outputs import Output, Target
+from stages.common import runner
+from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.diagnose.config import Config
 
 if TYPE_CHECKING:
-    from stages.diagnose.result.answer import Answer
-    from stages.diagnose.stage import Result, diagnose, run
+    from stages.diagnose.stage import Finished, Result
 
-__getattr__ = imported_later(__name__, "stage", "result.answer")
-__all__ = ["Answer", "Config", "Result", "diagnose", "run"]
+__all__ = ["Config", "run"]
+
+
+def _targets(call: runner.Call) -> list[Target]:
+    named = ((call.output.path, "output"), (call.output.json, "json"), (call.output.report, "report"))
+    return [Target(path, option) for path, option in named if path is not None]
+
+
+@runner.stage(writes=_targets, in_parts=True)
+def run(
+    pairs: Path,
+    checkpoint: Path | None = None,
+    output: Output | Path | None = None,
+    config: Config = Config(),
+    say: Say = say_nothing,
+    progress: Progress = show_nothing,
+) -> Result | Finished:
+    """Diagnose the pairs; write what is asked for; of a run on another machine only the report comes back. Raises ArtefactError, ConfigError, RegistryError."""
+    from stages.diagnose.stage import work
+
+    return work(pairs, checkpoint, Output.at(output), config, say, progress)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from schemas import ArtefactError, ConfigError, write_json
-from schemas.files.companions import companions_of
-from schemas.files.outputs import Output, Target, check_outputs
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from schemas import ArtefactError, ConfigError, atomic_path, write_json
+from schemas.files.outputs import Output
+from stages.common.progress import Progress, Say
+from stages.common.runner.job import Job
+from stages.diagnose import run
 from stages.diagnose.config import Config
 from stages.diagnose.likelihood.budget import budget
 from stages.diagnose.model.chain import Chain
@@ -62,36 +66,54 @@ class Result:
     state: State | None
     outcome: Outcome | None
 
+    @property
+    def report(self) -> dict[str, Any]:
+        """The answer as it stands in the JSON file."""
+        return self.answer.to_json()
+
+
+@dataclass
+class Finished:
+    """The result of a run on another machine."""
+
+    report: dict[str, Any]
+
 
 @torch.no_grad()
-def run(
-    pairs: Path,
-    checkpoint: Path | None = None,
-    output: Output | Path | None = None,
-    config: Config = Config(),
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> Result:
-    """Diagnose the pairs; write what is asked for. Raises ArtefactError, ConfigError, RegistryError."""
-    output = Output.at(output)
+def work(pairs: Path, checkpoint: Path | None, output: Output, config: Config, say: Say, progress: Progress) -> Result:
+    """See :func:`stages.diagnose.run`."""
     if config.most_causes < 1 or config.most_pairs < 1 or config.most_images < 1:
         raise ConfigError("diagnose: expected counts of at least 1 for causes, images and pairs.")
     inputs = [p for p in (pairs, checkpoint) if p is not None]
-    named = ((output.path, "output"), (output.json, "json"), (output.report, "report"))
-    check_outputs([Target(path, option) for path, option in named if path is not None], inputs, output.overwrite)
     with PairReader(pairs) as reader:
         result = diagnose(reader, checkpoint, config, say, progress)
         image_ids = reader.image_ids
-    with companions_of(output.path):
-        if output.json is not None:
-            write_json(output.json, result.answer.to_json())
-        if output.report is not None:
-            from stages.diagnose.result.page import write_page
+    if output.json is not None:
+        write_json(output.json, result.report)
+    if output.report is not None:
+        from stages.diagnose.result.page import write_page
 
-            write_page(output.report, result.answer, result.state, image_ids)
+        write_page(output.report, result.answer, result.state, image_ids)
     if output.path is not None:  # last: where it is, the others are
-        write_diagnosis(output.path, result.answer, image_ids, inputs, output.overwrite)
+        write_diagnosis(output.path, result.answer, image_ids, inputs)
     return result
+
+
+def in_parts(job: Job, pairs: Path, checkpoint: Path | None, config: Config) -> Finished:
+    """The whole diagnosis as one part, since its steps depend on each other."""
+    (piece,) = job.fan("diagnosis", write_part, [{"pairs": pairs, "checkpoint": checkpoint, "config": config}])
+    output = job.output
+    for made, wanted in ((".json", output.json), (".html", output.report), (".h5", output.path)):
+        if wanted is not None:
+            with atomic_path(wanted) as partial:
+                shutil.copyfile(piece.with_suffix(made), partial)
+    return Finished(json.loads(piece.with_suffix(".json").read_text()))
+
+
+def write_part(path: Path, pairs: Path, checkpoint: Path | None, config: Config) -> None:
+    """Write diagnosis.h5, and its JSON and page beside it."""
+    beside = Output(path, overwrite=True, json=path.with_suffix(".json"), report=path.with_suffix(".html"))
+    run(pairs, checkpoint, beside, config)
 
 
 def diagnose(reader: PairReader, checkpoint: Path | None, config: Config, say, progress) -> Result:

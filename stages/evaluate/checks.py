@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from schemas import CHECKPOINT, SPLITS, ArtefactError, ConfigError, RegistryError, open_artefact, read_config
-from schemas.files.outputs import Output
 from stages.effects.extension import check_ground
 from stages.evaluate.config import Config
 from stages.evaluate.rows import layout
@@ -32,12 +30,6 @@ def check(config: Config) -> None:
     for name in config.only:
         if name not in known:
             raise RegistryError.unknown("row of the evaluation", name, known)
-
-
-def report_files(output: Output) -> list[Path]:
-    """The JSON beside the output, and where it was asked for."""
-    beside, wanted = output.file.with_suffix(".json"), output.json
-    return [beside] if wanted is None or os.path.realpath(wanted) == os.path.realpath(beside) else [beside, wanted]
 
 
 def check_runs(checkpoints: Sequence[Path], task: Task) -> None:

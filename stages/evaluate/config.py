@@ -2,7 +2,18 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from schemas.files.outputs import Output, Target
+
+if TYPE_CHECKING:
+    from stages.common.runner import Call
+
+FIGURES = ("training_curves.png", "errors.png", "crop_best.png", "crop_median.png", "crop_worst.png")
 
 
 @dataclass(frozen=True)
@@ -21,3 +32,32 @@ class Config:
     only: tuple[str, ...] = ()
     extend: str | None = None
     published: str | None = None
+
+
+@dataclass(frozen=True)
+class HeldOutConfig:
+    """split : whose pairs are scored"""
+
+    split: str = "test"
+    seed: int = 0
+
+
+def input_files(call: Call) -> list[Path]:
+    """What no output may replace."""
+    return [*call.files, *([Path(call.config.extend)] if call.config.extend else [])]
+
+
+def report_files(output: Output) -> list[Path]:
+    """The JSON beside the output, and where it was asked for."""
+    beside, wanted = output.file.with_suffix(".json"), output.json
+    return [beside] if wanted is None or os.path.realpath(wanted) == os.path.realpath(beside) else [beside, wanted]
+
+
+def targets(call: Call) -> Iterator[Target]:
+    """The artefact, its JSON and its figures."""
+    path, (beside, *others) = call.output.file, report_files(call.output)
+    yield Target(path)
+    yield Target(beside, name=f"the JSON beside {path.name}")
+    yield from (Target(report, "json") for report in others)
+    if (folder := call.output.figures) is not None:
+        yield from (Target(folder / name, "figures") for name in FIGURES)

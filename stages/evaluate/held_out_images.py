@@ -25,18 +25,16 @@ from schemas import (
     ArtefactError,
     ArtefactWriter,
     ConfigError,
-    check_output,
     open_artefact,
     write_json,
 )
-from schemas.files.companions import companions_of
 from schemas.files.outputs import Output
 from schemas.provenance import sha256
 from schemas.reading import read_strings
 from stages.common.arrays import Floats
 from stages.common.intervals import ERROR, choose_units, gain_interval, ratio_interval
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.evaluate.checks import report_files
+from stages.common.progress import Progress
+from stages.evaluate.config import HeldOutConfig, report_files
 from stages.evaluate.coverage import BANDS_DEG, count_within, shares
 from stages.evaluate.least_squares import FrameGram, solve_gain_offset
 from stages.evaluate.metrics import ssim
@@ -53,14 +51,6 @@ CLAIM = "seen ground, unseen images"
 ROWS = ("terrain", "albedo", "terrain_gain_offset", "albedo_gain_offset")
 SAME_GROUND = 0.01  # of the pairs' gsd: heights of the same pixel in map and pairs differ by rounding only
 FIT_PAIRS = 64  # pairs of one image that its gain and offset are fitted on, where it is in DN
-
-
-@dataclass(frozen=True)
-class Config:
-    """split : whose pairs are scored"""
-
-    split: str = "test"
-    seed: int = 0
 
 
 @dataclass
@@ -88,23 +78,10 @@ def _part(reader: PairReader, k: int) -> tuple[slice, slice]:
     return np.s_[top : top + reader.size[0], left : left + reader.size[1]]
 
 
-def run(
-    pairs: Path,
-    maps: Sequence[Path],
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
+def work(
+    pairs: Path, maps: Sequence[Path], output: Output, config: HeldOutConfig, progress: Progress
 ) -> dict[str, Any]:
-    """Score every pair of the split whose image had no part in one of the maps; returns what the JSON holds.
-
-    maps : of `lunargr albedo`, such as those of all folds; a pair is scored on the first that its image did not make.
-    Raises LunargrError.
-    """
-    output = Output.at(output)
-    reports = report_files(output)
-    for path in (output.file, *reports):
-        check_output(path, [pairs, *maps], output.overwrite)
+    """See :func:`stages.evaluate.run_held_out`."""
     _check_once(maps)
     with PairReader(pairs) as reader, contextlib.ExitStack() as stack:
         opened = [_open(path, reader, stack) for path in maps]
@@ -118,7 +95,6 @@ def run(
             config=settings,
             inputs=[pairs, *maps],
             seed=config.seed,
-            overwrite=output.overwrite,
         ) as writer:
             scores = _score(reader, opened, chosen, writer, progress)
             result = _conclude(reader, opened, chosen, scores, config)
@@ -132,9 +108,8 @@ def run(
             writer.write("ssim", scores["ssim"])
             writer.file.attrs["split"] = config.split
             writer.file.attrs["metrics"] = json.dumps(result)
-            with companions_of(output.file):
-                for report in reports:
-                    write_json(report, result)
+            for report in report_files(output):
+                write_json(report, result)
     return result
 
 
@@ -291,7 +266,7 @@ def _conclude(
     maps: Sequence[AlbedoMap],
     chosen: Sequence[tuple[int, int]],
     scores: dict[str, NDArray],
-    config: Config,
+    config: HeldOutConfig,
 ) -> dict[str, Any]:
     """What the JSON holds."""
     pixels = scores["pixels"].astype(float)

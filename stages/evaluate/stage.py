@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from schemas import EVALUATION, ArtefactWriter, write_json
-from schemas.files.companions import companions_of
-from schemas.files.outputs import Output, Target, check_outputs
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.evaluate.checks import check, check_runs, limitations, read_seed, report_files, select
-from stages.evaluate.config import Config
-from stages.evaluate.parts import Fan, Kept, first_runs, score_in_parts
+from schemas.files.outputs import Output
+from stages.common.progress import Progress
+from stages.common.runner.job import Job
+from stages.evaluate.checks import check, check_runs, limitations, read_seed, select
+from stages.evaluate.config import Config, report_files
+from stages.evaluate.parts import Kept, first_runs, score_in_parts
 from stages.evaluate.rows import Row
 from stages.evaluate.scores import Scores
 from stages.evaluate.task import Task, make_task, score_here, summarise
@@ -22,7 +22,6 @@ from stages.pairs.ground import leave_out_learned
 from stages.pairs.reader import PairReader
 
 RENDERINGS_LIMIT = 512 * 2**20  # bytes of rendered crops that are kept without being asked for
-FIGURES = ("training_curves.png", "errors.png", "crop_best.png", "crop_median.png", "crop_worst.png")
 
 # How the crops are scored: rows of the table, their scores, the full range of DN
 Score = Callable[[Task, Kept], tuple[list[Row], Scores, float]]
@@ -43,33 +42,25 @@ class Files:
         return [self.pairs, *self.checkpoints, *([Path(self.extend)] if self.extend else [])]
 
 
-def run(
-    pairs: Path,
-    checkpoints: Path | Sequence[Path],
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
+def work(
+    pairs: Path, checkpoints: Sequence[Path], output: Output, config: Config, progress: Progress
 ) -> dict[str, Any]:
-    """Evaluate a checkpoint, or several training runs of one model, on a split of a pairs file; returns what the JSON holds.
+    """See :func:`stages.evaluate.run`."""
+    return _work(pairs, checkpoints, output, config, lambda task, kept: score_here(task, kept.put, progress))
 
-    Writes the evaluation artefact, the JSON beside it, and figures where asked.
-    Raises ConfigError or ArtefactError before anything is written.
-    """
+
+def in_parts(job: Job, pairs: Path, checkpoints: Path | Sequence[Path], config: Config) -> dict[str, Any]:
+    """The evaluation with the crops scored in parts."""
     several = [checkpoints] if isinstance(checkpoints, Path) else list(checkpoints)
-    return _run(pairs, several, Output.at(output), config, lambda task, kept: score_here(task, kept.put, progress))
+
+    def score(task: Task, kept: Kept) -> tuple[list[Row], Scores, float]:
+        return score_in_parts(task, pairs, several, job.fan, kept)
+
+    return _work(pairs, several, job.output, config, score)
 
 
-def run_in_parts(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Config, fan: Fan) -> dict[str, Any]:
-    """:func:`run` with the crops scored in parts, wherever ``fan`` has them worked on."""
-    return _run(
-        pairs, checkpoints, output, config, lambda task, kept: score_in_parts(task, pairs, checkpoints, fan, kept)
-    )
-
-
-def _run(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Config, score: Score) -> dict[str, Any]:
+def _work(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Config, score: Score) -> dict[str, Any]:
     files = Files(pairs, checkpoints, config.extend, output)
-    _check_outputs(files)
     check(config)
     with PairReader(pairs) as reader:
         wanted, notes = select(reader, config.split), []
@@ -85,15 +76,6 @@ def _run(pairs: Path, checkpoints: Sequence[Path], output: Output, config: Confi
             first = [rows[k] for k in first_runs(rows)]
             write_figures(output.figures, task, first, scores.mean_over_runs(), scale, result, checkpoints[0])
     return result
-
-
-def _check_outputs(files: Files) -> None:
-    output, (beside, *others) = files.output, report_files(files.output)
-    targets = [Target(output.file), Target(beside, name=f"the JSON beside {output.file.name}")]
-    targets += [Target(report, "json") for report in others]
-    if output.figures is not None:
-        targets += [Target(output.figures / name, "figures") for name in FIGURES]
-    check_outputs(targets, files.inputs, output.overwrite)
 
 
 def _write(
@@ -114,7 +96,6 @@ def _write(
         config=settings,
         inputs=files.inputs,
         seed=config.seed,
-        overwrite=files.output.overwrite,
     ) as artefact:
         kept = Kept(artefact.dataset("measured"), artefact.dataset("rendered") if renderings else None, first)
         rows, scores, scale = score(task, kept)
@@ -126,9 +107,8 @@ def _write(
         _write_scores(artefact, task, scores, seeds)
         artefact.file.attrs["split"] = config.split
         artefact.file.attrs["metrics"] = json.dumps(result)
-        with companions_of(files.output.file):
-            for report in report_files(files.output):
-                write_json(report, result)
+        for report in report_files(files.output):
+            write_json(report, result)
     return rows, scores, scale, result
 
 

@@ -11,12 +11,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from schemas import CHECKPOINT, ConfigError, atomic_path, check_output, open_artefact
+from schemas import CHECKPOINT, ConfigError, atomic_path, open_artefact
 from schemas.checks import any_text
-from schemas.files.companions import companions_of
 from schemas.files.outputs import Output
 from schemas.provenance import record_of
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.export.card import model_card
 from stages.export.config import Config
 from stages.network.coefficient_maps import CoefficientMaps
@@ -52,19 +50,14 @@ class _Exported(torch.nn.Module):
         return self.maps.stack(self.maps.unbounded(output), dim=1)
 
 
-def run(
-    checkpoint: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
-) -> Summary:
-    """Write ``output`` (.onnx) and its card beside it (.md). Raises LunargrError."""
-    output = Output.at(output)
+def work(checkpoint: Path, output: Output, config: Config) -> Summary:
+    """See :func:`stages.export.run`."""
     path = output.file
     if path.suffix.lower() != ".onnx":
         raise ConfigError(f"{path}: expected a name that ends in .onnx; choose another `output`.")
     if not 13 <= config.opset <= 20:
         raise ConfigError(f"`opset`: expected 13..20, found {config.opset}.")
     card = path.with_suffix(".md")
-    for made in (path, card):
-        check_output(made, [checkpoint], output.overwrite)
     predictor = load_predictor(checkpoint)
     with open_artefact(checkpoint, CHECKPOINT) as file:
         record = record_of(file)
@@ -75,7 +68,7 @@ def run(
         best = int(file.attrs["best_epoch"])
     data = to_onnx(predictor, config.opset, attributes)
     names = tuple(p.name for p in predictor.model.parameters)
-    with companions_of(path), atomic_path(path) as partial, atomic_path(card) as text:
+    with atomic_path(path) as partial, atomic_path(card) as text:
         partial.write_bytes(data)
         text.write_text(model_card(path.name, checkpoint.name, predictor, record, losses, best), encoding="utf-8")
     return Summary(predictor.model.name, names, predictor.net.stride, len(data), card)

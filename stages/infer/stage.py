@@ -18,11 +18,12 @@ import torch
 from numpy.typing import NDArray
 
 from schemas import CHECKPOINT, SCENE, SVBRDF, ArtefactWriter, ConfigError, atomic_path, open_artefact, read_strings
-from schemas.files.companions import companions_of
-from schemas.files.outputs import Output, check_outputs, map_targets
+from schemas.files.outputs import Output
+from stages import merge
 from stages.common.brightness import QUANTITIES
 from stages.common.memory import keep_freed_memory, return_freed_memory
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.progress import Progress
+from stages.common.runner.job import Job
 from stages.infer.config import Config
 from stages.infer.parallel import run_in_threads
 from stages.infer.terrain import TerrainReader, valid_part
@@ -34,8 +35,9 @@ from stages.network.predictor import choose_device, load_predictor
 from stages.pairs.ground import Ground
 from stages.pairs.holes import fill_holes
 from stages.physics.maps.geotiff import MapTiff, band_names, map_tags
-from stages.physics.maps.grid import Grid, check_same_body, read_grid
+from stages.physics.maps.grid import Grid, read_grid
 
+BANDS = 8  # rows of windows in one shard
 SAMPLE = 256  # px, edge of the terrain by which the precision is chosen
 GSD_TOLERANCE = 0.05  # relative; beyond it terrain has another scale than the network was trained at
 
@@ -51,19 +53,10 @@ class Summary:
     coefficients: dict[str, tuple[float, float, float, float]]
 
 
-def run(
-    scene: Path,
-    checkpoint: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> Summary:
-    """Write ``svbrdf.h5`` and, if wanted, a cloud-optimised GeoTIFF. Raises ConfigError, ArtefactError."""
-    output = Output.at(output)
+def work(scene: Path, checkpoint: Path, output: Output, config: Config, progress: Progress) -> Summary:
+    """See :func:`stages.infer.run`."""
     check_window(config)
     check_precision(config.precision)
-    check_outputs(map_targets(output, config.geotiff and config.shard[1] == 1), [scene, checkpoint], output.overwrite)
     device = choose_device(config.device)
     keep_freed_memory()
     predictor = load_predictor(checkpoint, device)
@@ -103,7 +96,6 @@ def run(
                     config=asdict(config),
                     inputs=[scene, checkpoint],
                     attributes=attributes,
-                    overwrite=output.overwrite,
                 )
             )
             writer.write_crs(grid.crs_wkt, grid.transform)
@@ -117,9 +109,7 @@ def run(
                 writer.dataset("coefficients_std")
             mapper = Mapper(predictor, device, precision, torch.get_num_threads(), deviations=bool(maps))
             picture = None
-            # a shard holds some rows only; the GeoTIFF is made of the merged whole
-            if config.geotiff and config.shard[1] == 1:
-                stack.enter_context(companions_of(output.file))
+            if config.as_geotiff:
                 partial = stack.enter_context(atomic_path(output.geotiff_path))
                 bands = band_names(names, maps)
                 tags = map_tags(bands, writer.file.attrs)
@@ -129,7 +119,15 @@ def run(
     return Summary(grid, predictor.model.name, share, windows, ranges)
 
 
-def count_bands(scene: Path, config: Config) -> int:
+def in_parts(job: Job, scene: Path, checkpoint: Path, config: Config) -> Summary:
+    """The map from shards of its rows. scene : as it lies there; the job's inputs may be the DEM that it was made of"""
+    pieces = job.shards("map", [scene, checkpoint], config, _count_bands(scene, config), BANDS)
+    whole = Output(job.output.file, overwrite=True, geotiff=job.output.geotiff)
+    merge.run(pieces, whole, merge.Config(inputs=tuple(job.inputs)), progress=job.progress)
+    return summarise(job.output.file, len(pieces))
+
+
+def _count_bands(scene: Path, config: Config) -> int:
     """Rows of windows on a scene: more shards than these have nothing to do."""
     with open_artefact(scene, SCENE) as file:
         return len(window_rows(file["elevation"].shape[0], config))
@@ -204,9 +202,3 @@ def _statistics(file: h5py.File, names: list[str]) -> tuple[float, dict[str, tup
         else:
             ranges[name] = (math.nan, math.nan, math.nan, math.nan)
     return share, ranges
-
-
-def check_body(scene: Path, body: str | None) -> None:
-    """Refuse a body that a scene contradicts. Raises GeometryError."""
-    with open_artefact(scene, SCENE) as file:
-        check_same_body(scene, float(file.attrs["body_radius_m"]), body)

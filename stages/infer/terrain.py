@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas import SCENE, open_artefact
 from stages.pairs.holes import FILL_REACH, fill_holes
+from stages.physics.maps.grid import check_same_body
 
 STEP = 8  # px; the box around what is valid begins and ends at multiples of it
 READ = 1024  # rows read at once: the surroundings that filling holes needs are read again with the next
@@ -73,3 +76,9 @@ def _extent(known: NDArray[np.bool_]) -> tuple[int, int]:
     first = int(known.argmax()) // STEP * STEP
     last = known.size - int(known[::-1].argmax())
     return first, min(known.size, -(-last // STEP) * STEP) - first
+
+
+def check_body(scene: Path, body: str | None) -> None:
+    """Refuse a body that a scene contradicts. Raises GeometryError."""
+    with open_artefact(scene, SCENE) as file:
+        check_same_body(scene, float(file.attrs["body_radius_m"]), body)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,13 +23,14 @@ from schemas import (
     ConfigError,
     GeometryError,
     InputError,
-    check_output,
     open_artefact,
     read_config,
 )
 from schemas.files.outputs import Output
 from schemas.reading import is_artefact
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages import merge
+from stages.common.progress import Progress, Say
+from stages.common.runner.job import Job
 from stages.common.shards import shard_range
 from stages.ingest.config import Config
 from stages.ingest.elevation import reuse_elevation, write_elevation
@@ -41,6 +42,7 @@ from stages.physics.images.table_checks import check_distinct, check_table
 from stages.physics.maps import rasters
 from stages.physics.maps.grid import Grid, crs_radius, read_grid, require_crs
 
+BANDS = 8  # rows of blocks of a DEM in one shard: some minutes of work on real data
 SMALLEST_CROP = 16  # px
 LARGEST_CROP = 8192  # px: what a network can see at once, and more
 
@@ -61,20 +63,8 @@ class Summary:
     blank: tuple[Frame, ...] = ()
 
 
-def run(
-    dem: Path,
-    images: Path | None,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> Summary:
-    """Write ``scene.h5``. Raises InputError, GeometryError or ConfigError; then nothing is written.
-
-    dem : a raster, or a scene whose grid and elevations are taken as they are. Shards are cut in two steps: of a raster
-    without images, its rows; of a scene with images, the images.
-    """
-    output = Output.at(output)
+def work(dem: Path, images: Path | None, output: Output, config: Config, say: Say, progress: Progress) -> Summary:
+    """See :func:`stages.ingest.run`."""
     if config.crop < SMALLEST_CROP or config.crop % 2 or config.crop > LARGEST_CROP:
         raise ConfigError(
             f"`crop`: expected an even number of pixels, {SMALLEST_CROP} .. {LARGEST_CROP}; found {config.crop}."
@@ -84,7 +74,6 @@ def run(
     if images and not config.trust_table:
         for sentence in check_table(images, frames, body):
             say(f"warning: {sentence}")
-    check_output(output.file, [dem, *([images] if images else []), *_files(frames)], output.overwrite)
     alone = config.shard[1] == 1
     with _open_terrain(dem, images, config, body, progress, say) as terrain:
         if frames and config.crop > min(terrain.grid.height, terrain.grid.width):
@@ -108,7 +97,6 @@ def run(
                 "crop_px": np.int32(config.crop),
                 "elevation_source": relative_path(terrain.source, output.file.resolve().parent),
             },
-            overwrite=output.overwrite,
         ) as writer:
             _write_grid(writer, terrain.grid)
             known, low, high = terrain.write(writer, progress)
@@ -133,6 +121,27 @@ def run(
             check_distinct(hashed)
             write_frames(writer, hashed)
     return summarise(output.file, tuple(skipped))
+
+
+def in_parts(job: Job, dem: Path, images: Path | None, config: Config) -> Summary:
+    """The scene from shards of the DEM's rows, and then from shards of its images on the grid that these give."""
+    output = Output(job.output.file, overwrite=True)
+    made_of = merge.Config(inputs=tuple(job.inputs))
+    grid = dem
+    if not is_artefact(dem):
+        pieces = job.shards("dem", [dem, None], config, _count_bands(dem, config), BANDS)
+        if images is None:
+            merge.run(pieces, output, made_of, progress=job.progress)
+            return summarise(output.file)
+        grid = job.file("grid.h5")
+        merge.run(pieces, Output(grid, overwrite=True), merge.Config(virtual=True, inputs=(dem,)))
+    names = [frame.image_id for frame in read_frames(images, find_body(config.body))] if images else []
+    pieces = job.shards("images", [grid, images], replace(config, gsd=None), len(names))
+    _check_positions(pieces, images, config)
+    merge.run(pieces, output, made_of, progress=job.progress)
+    found = summarise(output.file)
+    kept = {frame.image_id for frame in found.frames}
+    return replace(found, skipped=tuple(name for name in names if name not in kept))
 
 
 def _overall(progress: Progress, index: int, count: int) -> Progress:
@@ -216,7 +225,7 @@ def _open_terrain(
         yield Terrain(dem, plan.grid, stored, attributes, partial(write_elevation, dem, dataset, plan, config))
 
 
-def count_bands(dem: Path, config: Config) -> int:
+def _count_bands(dem: Path, config: Config) -> int:
     """Rows of blocks of a raster's grid: more shards than these have nothing to do."""
     with rasters.open_raster(dem, "a DEM") as dataset:
         body = find_body(config.body)
@@ -225,21 +234,7 @@ def count_bands(dem: Path, config: Config) -> int:
     return math.ceil(plan.grid.height / config.block)
 
 
-def image_names(images: Path, config: Config) -> list[str]:
-    """The images of a table."""
-    return [frame.image_id for frame in read_frames(images, find_body(config.body))]
-
-
-def source_files(images: Path, config: Config) -> list[Path]:
-    """The images and camera models that a table names."""
-    return _files(read_frames(images, find_body(config.body)))
-
-
-def _files(frames: Sequence[Frame]) -> list[Path]:
-    return [path for frame in frames for path in frame.files]
-
-
-def check_positions(parts: Sequence[Path], images: Path, config: Config) -> None:
+def _check_positions(parts: Sequence[Path], images: Path | None, config: Config) -> None:
     """Refuse shards of a scene in which no crop fits anywhere, as one run does at its end. Raises GeometryError."""
     gsd, side = math.nan, 0
     for part in parts:

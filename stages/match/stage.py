@@ -6,38 +6,20 @@ from pathlib import Path
 from typing import Any
 
 from schemas import ConfigError, atomic_path, write_json
-from schemas.files.outputs import Output, Target, check_outputs
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from schemas.files.outputs import Output
+from stages.common.progress import Progress, Say
 from stages.match.base import Matches, Models, get_matcher
 from stages.match.comparisons import comparisons
-from stages.match.config import Config
+from stages.match.config import FIGURES, Config, figure_name
 from stages.match.consistency import summarise
 from stages.match.pictures import HEIGHT, WIDTH, drop_unknown, match_figure, stretch_limits, to_grey
 
-FIGURES = 4  # comparisons that are drawn
 
-
-def run(
-    files: list[Path],
-    output: Output | Path | None,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> dict[str, Any]:
-    """Match every comparison with every matcher; returns what the JSON holds. Raises LunargrError.
-
-    output : the JSON and the folder of pictures, where they are wanted; a bare path is the JSON's
-    """
-    output = Output.at(output)
+def work(files: list[Path], output: Output, config: Config, say: Say, progress: Progress) -> dict[str, Any]:
+    """See :func:`stages.match.run`."""
     json_file, figures = output.json or output.path, output.figures
     if config.count < 1:
         raise ConfigError(f"`count`: expected at least 1, found {config.count}.")
-    targets = [] if json_file is None else [Target(json_file, "json")]
-    if figures is not None:
-        names = (figures / _figure_name(m, k) for m in config.matchers for k in range(FIGURES))
-        targets += [Target(path, "figures") for path in dict.fromkeys(names)]
-    networks = [path for path in (config.features_model, config.lightglue_model) if path is not None]
-    check_outputs(targets, [*files, *networks], output.overwrite)
     models = Models(config.features_model, config.lightglue_model)
     matchers = [get_matcher(name, models) for name in config.matchers]
     notes: list[str] = []
@@ -62,7 +44,7 @@ def run(
             if figures is not None and number < FIGURES:
                 _save(
                     match_figure(measured, pictures, found, f"{comparison.label}, {matcher.title}"),
-                    figures / _figure_name(matcher.name, number),
+                    figures / figure_name(matcher.name, number),
                 )
         progress(number + 1, total, "match")
     result = {
@@ -78,10 +60,6 @@ def run(
     if json_file is not None:
         write_json(json_file, result)
     return result
-
-
-def _figure_name(matcher: str, number: int) -> str:
-    return f"match_{matcher}_{number + 1}.png"
 
 
 def _save(figure: Any, path: Path) -> None:

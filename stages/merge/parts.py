@@ -13,6 +13,7 @@ import h5py
 from schemas import ArtefactError, InputError, Schema, open_artefact, read_config, read_kind
 from schemas.checks import any_text, parse_json
 from schemas.files.inputs import FILE_ATTRIBUTES
+from stages.merge.config import Config
 from stages.physics.images.table import relative_path
 
 # The dimension along which the shards of a stage are laid end to end; maps are joined by rows instead, and so are scenes
@@ -81,6 +82,17 @@ class Parts:
             if name in common:
                 common[name] = moved(any_text(common[name]), self.paths[0], output)
         return common
+
+
+def wants_geotiff(paths: Sequence[Path], config: Config) -> bool:
+    """Whether the whole gets a GeoTIFF: a map does, if its first part wants one and it is no view of the parts.
+
+    HDF5 cannot read a view of files that this process holds open, and a view is there to save a copy.
+    """
+    if config.virtual or (schema := read_kind(paths[0])).name not in MAPS:
+        return False
+    with open_artefact(paths[0], schema) as file:
+        return bool(read_config(file).get("geotiff", True))
 
 
 @contextlib.contextmanager

@@ -10,35 +10,20 @@ from typing import Any
 from schemas import ArtefactWriter, Schema, atomic_path, read_config
 from schemas.checks import is_foreign
 from schemas.command_line import whole_command
-from schemas.files.companions import companions_of
-from schemas.files.outputs import Output, check_outputs, map_targets
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from schemas.files.outputs import Output
+from stages.common.progress import Progress
 from stages.merge.config import Config
 from stages.merge.joining import join_paths, join_variable
-from stages.merge.parts import MAPS, Parts, open_parts
+from stages.merge.parts import Parts, open_parts, wants_geotiff
 from stages.physics.maps.geotiff import write_geotiff
 from stages.physics.maps.grid import read_grid
 
 
-def run(
-    parts: Sequence[Path],
-    output: Output | Path,
-    config: Config = Config(),
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> Schema:
-    """Join ``parts``, in the order of their shards. Raises ArtefactError where they are not parts of one whole.
-
-    The GeoTIFF of a map is written too, if its parts want one and it is no view of them.
-    """
-    output = Output.at(output)
+def work(parts: Sequence[Path], output: Output, config: Config, progress: Progress) -> Schema:
+    """See :func:`stages.merge.run`."""
     with open_parts(parts) as opened:
         made_with = read_config(opened.files[0]) | {"shard": [0, 1]}
-        # HDF5 cannot read a view of files that this process holds open, and a view is there to save a copy.
-        as_geotiff = opened.schema.name in MAPS and made_with.get("geotiff", True) and not config.virtual
-        # Parts in a run's own folder beside its output go with that folder.
-        foreign = [path for path in opened.paths if f"{output.file.name}.parts" not in path.parts]
-        check_outputs(map_targets(output, as_geotiff), foreign, output.overwrite)
+        as_geotiff = wants_geotiff(parts, config)
         provenance, inputs = _provenance(opened, output.file, config)
         seed = -1 if is_foreign(opened.files[0]) else int(opened.files[0].attrs.get("seed", -1))
         with ArtefactWriter(
@@ -49,7 +34,6 @@ def run(
             inputs=inputs,
             seed=None if seed < 0 else seed,
             attributes=opened.attributes(output.file) | provenance,
-            overwrite=output.overwrite,
         ) as writer:
             if "crs" in opened.files[0]:
                 opened.files[0].copy("crs", writer.file, "crs")
@@ -58,7 +42,7 @@ def run(
                 join_variable(opened, name, writer, config.virtual)
             join_paths(opened, writer.file, output.file)
             if as_geotiff:
-                with companions_of(output.file), atomic_path(output.geotiff_path) as partial:
+                with atomic_path(output.geotiff_path) as partial:
                     write_geotiff(partial, writer.file, read_grid(writer.file, output.file))
             progress(len(opened.names), len(opened.names), "merging")
         return opened.schema

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from pathlib import Path
 
-from schemas.later import imported_later
-from stages.normalize.config import Config, Summary
+from schemas.files.outputs import Output, map_targets
+from stages.common import runner
+from stages.common.progress import Progress, show_nothing
+from stages.normalize.config import Config, Summary, check
 
-if TYPE_CHECKING:
-    from stages.normalize.stage import run
-
-__getattr__ = imported_later(__name__, "stage")
 __all__ = ["Config", "Summary", "run"]
+
+
+@runner.stage(
+    writes=lambda call: map_targets(call.output, call.config.as_geotiff),
+    check=lambda call: check(call.config, call.arguments["svbrdf"] is not None),
+)
+def run(
+    scene: Path, svbrdf: Path | None, output: Output | Path, config: Config, progress: Progress = show_nothing
+) -> Summary:
+    """Write the images at the standard geometry and their mosaics. svbrdf : None for the model of ``config``. Raises LunargrError."""
+    from stages.normalize.stage import work
+
+    return work(scene, svbrdf, Output.at(output), config, progress)

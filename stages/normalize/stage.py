@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import NORMALIZED, SCENE, SVBRDF, ArtefactWriter, ConfigError, InputError, open_artefact
-from schemas.files.companions import companions_of
-from schemas.files.outputs import Output, atomic_path, check_outputs, map_targets
+from schemas.files.outputs import Output, atomic_path
 from stages.common.arrays import Floats32
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
-from stages.normalize.config import Config, Summary, check
+from stages.common.progress import Progress
+from stages.normalize.config import Config, Summary
 from stages.normalize.factor import GOOD, UNSEEN, Normaliser, placed
 from stages.normalize.levels import Levels, compare_angles, find_levels, take_samples
 from stages.normalize.mosaic import FADE_PX, Layer, Mosaic, choose_layers, combine, fading_weight
@@ -71,20 +70,8 @@ class Block:
     mosaics: list[Mosaic]
 
 
-def run(
-    scene: Path,
-    svbrdf: Path | None,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> Summary:
-    """Write the images at the standard geometry and their mosaics. svbrdf : None for the model of ``config``. Raises LunargrError."""
-    output = Output.at(output)
-    inputs = [scene, *([svbrdf] if svbrdf else [])]
-    as_geotiff = config.geotiff and config.shard[1] == 1
-    check(config, svbrdf is not None)
-    check_outputs(map_targets(output, as_geotiff), inputs, output.overwrite)
+def work(scene: Path, svbrdf: Path | None, output: Output, config: Config, progress: Progress) -> Summary:
+    """See :func:`stages.normalize.run`."""
     with contextlib.ExitStack() as stack:
         ground = stack.enter_context(open_ground(scene, svbrdf, config))
         references = ground.references
@@ -108,17 +95,15 @@ def run(
                 NORMALIZED,
                 Maps.sizes(references, len(layers)),
                 config=asdict(config),
-                inputs=inputs,
+                inputs=[scene, *([svbrdf] if svbrdf else [])],
                 attributes=attributes_of(references.surface, config, ground.units),
-                overwrite=output.overwrite,
             )
         )
         maps = Maps(writer, own if config.shard[1] > 1 else None)
         for box in blocks.within(own, progress):
             maps.put(box, work_block(ground, levels, box))
         maps.close(references, levels, layers)
-        if as_geotiff:
-            stack.enter_context(companions_of(output.file))
+        if config.as_geotiff:
             partial = stack.enter_context(atomic_path(output.geotiff_path))
             write_geotiff(partial, writer.file, references.surface.grid)
         return maps.summarise(references.frames, levels, ground.units, compare_angles(samples, references.frames))

@@ -16,7 +16,7 @@ from schemas import CROPS, SCENE, ArtefactError, InputError, open_artefact
 from schemas.files.user_files import check_file
 from schemas.provenance import file_state, sha256
 from stages.physics.horizon.scene import Overview, SceneTerrain
-from stages.physics.images.table import Frame, load_frames
+from stages.physics.images.table import Frame
 from stages.physics.maps.grid import Grid, read_grid
 from stages.project.config import Config
 
@@ -87,13 +87,6 @@ def count_pairs(crops: Path) -> int:
     """Crops in a file."""
     with open_artefact(crops, CROPS) as file:
         return int(file["row"].shape[0])
-
-
-def source_files(crops: Path) -> list[Path]:
-    """The images and camera models that crops are taken from."""
-    with open_artefact(crops, CROPS) as file:
-        frames = load_frames(file, crops)
-    return [path for frame in frames for path in frame.files]
 
 
 _overviews: dict[tuple[Any, ...], Overview] = {}

@@ -10,9 +10,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import CROPS, PAIRS, ArtefactWriter, InputError, check_output, open_artefact
+from schemas import CROPS, PAIRS, ArtefactWriter, InputError, open_artefact
 from schemas.files.outputs import Output
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages import merge
+from stages.common.progress import Progress
+from stages.common.runner.job import Job
 from stages.common.shards import shard_range
 from stages.physics.images.displacement import Field
 from stages.physics.images.source_images import Source, open_source
@@ -22,21 +24,17 @@ from stages.physics.maps.grid import LocalFrames
 from stages.physics.maps.window import Window
 from stages.project.config import Config
 from stages.project.geometry import Geometry, check_directions, crop_geometry
-from stages.project.inputs import Scene, check_places, check_sources, open_scene, scene_of
+from stages.project.inputs import Scene, check_places, check_sources, count_pairs, open_scene, scene_of
 from stages.project.register import displacement_at, register, resemble, write_registration, write_resemblances
-from stages.project.summary import Registered, Resemblance, Summary
+from stages.project.summary import Registered, Resemblance, Summary, summarise, write_shifts
 from stages.project.writing import Pair, PairDatasets, Tally, kept_decimals
 
+PAIRS_EACH = 512  # in one shard
 CROP_COLUMNS = ("longitude_deg", "latitude_deg", "row", "col", "image_index", "site", "tile", "split")
 
 
-def run(
-    crops: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
-) -> Summary:
-    """Write ``pairs.h5``. Raises ArtefactError, ConfigError, InputError or GeometryError; then nothing is written."""
-    output = Output.at(output)
-    config.check()
-    check_output(output.file, [crops, scene_of(crops, config)], output.overwrite)
+def work(crops: Path, output: Output, config: Config, progress: Progress) -> Summary:
+    """See :func:`stages.project.run`."""
     with open_artefact(crops, CROPS) as file, open_scene(crops, file, config) as scene:
         frames = load_frames(file, crops)
         check_distinct(frames)
@@ -53,9 +51,21 @@ def run(
             inputs=[crops, scene.path],
             seed=int(file.attrs["seed"]),
             attributes={"gsd_m": scene.grid.gsd, "body_radius_m": scene.grid.radius},
-            overwrite=output.overwrite,
         ) as writer:
-            return _project(writer, Crops(file, part), scene, frames, units, config, progress)
+            summary = _project(writer, Crops(file, part), scene, frames, units, config, progress)
+            if output.shifts is not None:
+                write_shifts(output.shifts, summary.registered)
+            return summary
+
+
+def in_parts(job: Job, crops: Path, config: Config) -> Summary:
+    """The pairs from shards of the crops."""
+    if config.scene:
+        config = replace(config, scene=str(Path(config.scene).resolve()))
+    pieces = job.shards("pairs", [crops], config, count_pairs(crops), PAIRS_EACH)
+    whole = Output(job.output.file, overwrite=True)
+    merge.run(pieces, whole, merge.Config(inputs=(crops, scene_of(crops, config))), progress=job.progress)
+    return summarise(job.output.file)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,7 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from schemas import PAIRS, open_artefact
+from schemas import PAIRS, atomic_path, open_artefact
 from schemas.reading import read_strings, unpack
 from stages.physics.images.displacement import Field
 from stages.physics.images.registration import Shift
@@ -67,6 +68,17 @@ class Summary:
     registered: tuple[Registered, ...] = ()
     resemblances: tuple[Resemblance, ...] = ()
     negative: Mapping[str, float] = field(default_factory=dict)
+
+
+def write_shifts(path: Path, registered: Sequence[Registered]) -> None:
+    """A table of the blocks of registered images: where each is on the scene's grid, and the shift there."""
+    with atomic_path(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        out = csv.writer(file)
+        out.writerow(["image_id", "row", "col", "dx_px", "dy_px", "sigma_px", "correlation", "lead", "refused"])
+        for image in registered:
+            for row, col, s in image.blocks:
+                numbers = (f"{v:.4f}" for v in (s.dx, s.dy, s.sigma, s.correlation, s.lead))
+                out.writerow([image.image_id, row, col, *numbers, s.refused])
 
 
 def summarise(pairs: Path) -> Summary:

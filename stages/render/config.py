@@ -122,27 +122,6 @@ class Summary:
     image_units: str = "iof"
 
 
-def inputs(source: Path, config: Config) -> list[Path]:
-    """The files that no output may replace."""
-    return [source, *(Path(p) for p in (config.camera, config.extend) if p)]
-
-
-def output_files(output: Path, view: str) -> list[Path]:
-    """The files behind one `output`. Raises ConfigError."""
-    suffix = output.suffix.lower()
-    png, tif = output.with_suffix(".png"), output.with_suffix(".tif")
-    if suffix in (".exr", ""):
-        exr = output.with_suffix(".exr")
-        return [exr, png, tif] if view == "ortho" else [exr, png]
-    if suffix in (".tif", ".tiff"):
-        if view != "ortho":
-            raise ConfigError(f"{output}: a pinhole view has no map grid for a GeoTIFF; name a .exr or .png file.")
-        return [output, png]
-    if suffix == ".png":
-        return [output]
-    raise ConfigError(f"{output}: expected a name that ends in .exr, .tif or .png; choose another `output`.")
-
-
 def check(config: Config, trajectory: bool = False, drawn_sun: bool = False) -> None:
     """Refuse options that cannot go together. drawn_sun : the Sun is none of them. Raises ConfigError."""
     if config.view not in VIEWS:

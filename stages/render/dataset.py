@@ -59,16 +59,6 @@ def make_world(grid: Grid) -> World:
     return World(axes[2] * grid.radius, axes)
 
 
-def export_files(view_ids: Sequence[str], folder: Path, kind: str) -> list[Path]:
-    """The files of the data set ``kind``; the first is written last, and the others belong to it."""
-    images = [f"images/{name}.png" for name in view_ids]
-    if kind == "colmap":
-        rest = [f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")]
-    else:
-        rest = [*(f"depths/{name}.npy" for name in view_ids), "transforms.json"]
-    return [folder / kind / name for name in ("world.json", *images, *rest)]
-
-
 def export_views(
     views: Sequence[View], grid: Grid, folder: Path, kind: str, report: Callable[[int], None] = lambda done: None
 ) -> None:

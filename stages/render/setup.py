@@ -26,7 +26,8 @@ from stages.physics.terrain.shading import Light
 from stages.physics.terrain.sun import Sun, check_sun_is_up, elevation_range, find_sun, place_over
 from stages.physics.terrain.sun_visibility import SunHorizon
 from stages.physics.terrain.surface import Surface, open_surface, open_terrain
-from stages.render.config import LARGEST_VIEW, SUN, Config, inputs
+from stages.render.config import LARGEST_VIEW, SUN, Config
+from stages.render.files import inputs
 from stages.render.viewpoint import look_at, pinhole_view, place, rotation_from_quaternion
 
 

@@ -15,16 +15,14 @@ from typing import Any
 import numpy as np
 
 from schemas.errors import ConfigError, GeometryError
-from schemas.files.companions import companions_of
-from schemas.files.locks import claim
-from schemas.files.outputs import Output, Target, check_outputs
 from stages.common.arrays import Floats, Floats32
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.progress import Progress, show_nothing
 from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.terrain.surface import Surface
-from stages.render.config import SUN, Config, StereoConfig, check, output_files
+from stages.render.config import SUN, Config, StereoConfig, check
 from stages.render.dataset import World, make_world, project, ray_directions, write_text
+from stages.render.files import MANIFEST, output_files, pair_files, pair_names
 from stages.render.pictures import read_exr, write_exr
 from stages.render.setup import make_light, open_source
 from stages.render.viewpoint import look_at, pinhole_view
@@ -37,34 +35,17 @@ SAME_PLACE = 1e-3  # of the distance: a farther surface there hides the point
 TRIES = 200
 
 
-def run_stereo(
-    source: Path,
-    output: Output | Path,
-    config: Config,
-    stereo: StereoConfig,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> Path:
-    """Render ``stereo.count`` pairs of ``source`` into a folder; the path of the manifest. Raises LunargrError.
-
-    config : what is rendered, size and field of view; its Sun and camera are drawn here
-    """
-    output = Output.at(output)
-    folder = output.file
+def render_stereo(source: Path, folder: Path, config: Config, stereo: StereoConfig, progress: Progress) -> Path:
+    """See :func:`stages.render.run_stereo`."""
     _check(config, stereo)
-    manifest = folder / "manifest.json"
-    names = [f"pair_{number:05d}" for number in range(stereo.count)]
-    files = [path for name in names for path in pair_files(folder, name)]
-    if any(path.exists() for path in files):
-        with claim(manifest):  # tidies up where a killed run left some of them
-            pass
-    check_outputs([Target(path) for path in (manifest, *files)], [source], output.overwrite)
+    manifest = folder / MANIFEST
+    names = pair_names(stereo.count)
     body = find_body("moon" if config.body is None else config.body)
     view_config = replace(config, view="pinhole", position=(0.0, 0.0, 0.0))
     check(view_config, drawn_sun=True)
     rng = np.random.default_rng(stereo.seed)
     pairs: list[dict[str, Any]] = []
-    with claim(manifest), companions_of(manifest), open_source(source, config, body) as surface:
+    with open_source(source, config, body) as surface:
         relief, world = surface.height_range(), make_world(surface.grid)
         places = _Places(surface, config, stereo, rng)
         for number, name in enumerate(names):
@@ -82,12 +63,6 @@ def run_stereo(
         write_text(manifest, json.dumps(document, indent=1))
     progress(stereo.count, stereo.count, "pairs")
     return manifest
-
-
-def pair_files(folder: Path, name: str) -> list[Path]:
-    """EXR and PNG of the left view, of the right one, and the correspondences."""
-    views = [path for side in ("left", "right") for path in output_files(folder / f"{name}_{side}.exr", "pinhole")]
-    return [*views, folder / f"{name}_matches.exr"]
 
 
 def _check(config: Config, stereo: StereoConfig) -> None:

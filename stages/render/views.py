@@ -13,64 +13,44 @@ import numpy as np
 from schemas.errors import ConfigError, GeometryError, LunargrError
 from schemas.files.companions import companions_of
 from schemas.files.locks import claim
-from schemas.files.outputs import Output, Target, check_outputs
+from schemas.files.outputs import Output
 from stages.common.arrays import Floats32
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.progress import Progress, show_nothing
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras.base import Camera
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
 from stages.physics.terrain.shading import BACKPLANES, Light
 from stages.physics.terrain.surface import Surface
-from stages.render.config import SUN, Config, Summary, check, inputs, output_files
-from stages.render.dataset import EXPORT_PASSES, View, export_files, export_views
+from stages.render.config import SUN, Config, Summary, check
+from stages.render.dataset import EXPORT_PASSES, View, export_views
+from stages.render.files import finished, shard_of_views, view_files
 from stages.render.perspective import apply_sensor, make_scene, render_view
 from stages.render.pictures import Preview, write_exr, write_png
 from stages.render.setup import camera_place, find_camera, make_light, metadata, open_source
 from stages.render.tally import Tally
-from stages.render.trajectory import ViewRow, read_trajectory
+from stages.render.trajectory import ViewRow
 
 EACH = 3  # work of rendering a view, in passes of its export
 
 
-def run_trajectory(
-    source: Path,
-    table: Path,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> list[Summary]:
-    """Render the views of a trajectory table into a folder, one EXR and PNG per row. Raises LunargrError.
-
-    An output that is resumed leaves alone what is there already; a shard is every n-th view.
-    """
-    output = Output.at(output)
-    folder, (index, count) = output.file, config.shard
+def render_trajectory(source: Path, table: Path, output: Output, config: Config, progress: Progress) -> list[Summary]:
+    """See :func:`stages.render.run_trajectory`."""
+    folder = output.file
     if config.camera:
         raise ConfigError("`trajectory`: expected no `camera`; each row places its own pinhole camera.")
     config = replace(config, view="pinhole")
     check(config, trajectory=True)
-    if config.export is not None and count > 1:
+    if config.export is not None and config.shard[1] > 1:
         raise ConfigError(
             "`export`: expected without `shard`; render the shards, then export with `resume` and no `shard`."
         )
     if config.export is not None and config.png_only:
         raise ConfigError("`export`: expected EXR files, which hold the depths; drop `png_only`.")
     body = find_body("moon" if config.body is None else config.body)
-    views = read_trajectory(table)[index::count]
-    suffix = ".png" if config.png_only else ".exr"
-    outputs = {view.view_id: output_files(folder / f"{view.view_id}{suffix}", "pinhole") for view in views}
-    done = {v.view_id for v in views if output.resume and all(p.exists() for p in outputs[v.view_id])}
-    new = [outputs[view.view_id] for view in views if view.view_id not in done]
-    if config.export:
-        new.append(export_files([view.view_id for view in views], folder, config.export))
-    targets = [Target(path) for files in new for path in files]
-    for files in new:
-        if any(path.exists() for path in files):
-            with claim(files[0]):  # tidies up where a killed run left some of them
-                pass
-    check_outputs(targets, [table, *inputs(source, config)], output.overwrite)
+    views = shard_of_views(table, config)
+    outputs = {view.view_id: view_files(folder, view.view_id, config) for view in views}
+    done = finished(outputs) if output.resume else set()
     results: list[Summary] = []
     total = EACH * len(views) + (0 if config.export is None else EXPORT_PASSES * len(views))
     with open_source(source, config, body) as surface:

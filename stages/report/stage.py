@@ -15,14 +15,14 @@ import cv2
 import numpy as np
 from markupsafe import Markup
 
-from schemas import ConfigError, InputError, atomic_path, check_output, open_artefact, read_kind
+from schemas import ConfigError, InputError, atomic_path, open_artefact, read_kind
 from schemas.files.outputs import Output
 from schemas.files.user_files import check_file, read_json
 from schemas.provenance import read_record
 from stages.common import page
 from stages.common.page import diagnosis, pictures
 from stages.common.page.sentences import Number, Sentence
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.progress import Progress
 from stages.report import conclusions, maps, results, sections
 from stages.report.config import Config
 from stages.report.held_out import held_out_images
@@ -95,23 +95,10 @@ class Found:
             self.parts.append(part)
 
 
-def run(
-    files: Sequence[Path],
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> list[str]:
-    """Write the page and return the titles of its sections.
-
-    files : artefacts, JSON results of evaluate, match, compare and diagnose, PNG or JPEG pictures, and pages of
-    `lunargr view` to link to, in any order; `view.html` beside the output is linked, too
-    Raises ConfigError, ArtefactError, InputError.
-    """
-    output = Output.at(output)
+def work(files: Sequence[Path], output: Output, config: Config, progress: Progress) -> list[str]:
+    """See :func:`stages.report.run`."""
     if not files:
         raise ConfigError("report: expected at least one file, found none; give the artefacts of a run.")
-    check_output(output.file, files, output.overwrite)
     found = Found()
     for number, path in enumerate(sorted(files, key=lambda p: p.suffix.lower() == ".json")):
         progress(number, len(files), "report")

@@ -17,18 +17,21 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import CROPS, SCENE, ArtefactWriter, ConfigError, GeometryError, check_output, open_artefact
+from schemas import CROPS, SCENE, ArtefactWriter, ConfigError, GeometryError, open_artefact
 from schemas.files.outputs import Output
 from schemas.provenance import sha256
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages import merge
+from stages.common.progress import Progress
+from stages.common.runner.job import Job
 from stages.common.shards import shard_range
 from stages.physics.images.table import Frame, load_frames, relative_path, write_frames
 from stages.physics.maps.grid import Grid, read_grid
 from stages.physics.maps.ground_tiles import PositionMasks, Tiles, bounds_deg, split_tiles, tile_edge
-from stages.sample.audit import Part, audit
+from stages.sample.audit import Part, audit, read_audit
 from stages.sample.config import Config
 from stages.sample.places import choose_places
 
+SHARDS = 4
 LARGEST = 1e9  # m of a tile, crops per km2
 MOST_CROPS = 2**31 - 1  # an index of a pair is an int32
 
@@ -44,13 +47,9 @@ class Scene:
     crop: int
 
 
-def run(
-    scene: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
-) -> list[Part]:
-    """Write ``crops.h5`` and return the audit of the split. Raises ConfigError or GeometryError."""
-    output = Output.at(output)
+def work(scene: Path, output: Output, config: Config, progress: Progress) -> list[Part]:
+    """See :func:`stages.sample.run`."""
     _check(config)
-    check_output(output.file, [scene], output.overwrite)
     with open_artefact(scene, SCENE) as file:
         opened = _read(scene, file, config)
         grid, crop = opened.grid, opened.crop
@@ -66,6 +65,13 @@ def run(
         parts = audit(chosen, tiles, grid, crop)
         _write(opened, output, chosen, tiles, parts, config, progress)
     return parts
+
+
+def in_parts(job: Job, scene: Path, config: Config) -> list[Part]:
+    """The crops from shards: each chooses all places, which is quick, and cuts out its share of the crops."""
+    pieces = job.shards("crops", [scene], config, job.output.parts or SHARDS)
+    merge.run(pieces, Output(job.output.file, overwrite=True), merge.Config(inputs=(scene,)), progress=job.progress)
+    return read_audit(job.output.file)
 
 
 def _check(config: Config) -> None:
@@ -124,7 +130,6 @@ def _write(
         inputs=[scene.path],
         seed=config.seed,
         attributes=attributes,
-        overwrite=output.overwrite,
     ) as writer:
         elevation, source = writer.dataset("elevation"), scene.file["elevation"]
         for k, (r, c) in enumerate(zip(mine["row"], mine["col"], strict=True)):

@@ -10,13 +10,33 @@ stage.py        the stage: all of it in order
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.later import imported_later
+from schemas.files.outputs import Output, Target
+from stages.common import runner
+from stages.common.progress import Progress, show_nothing
 from stages.simulate.recipe import Config, make_config, read_recipe, recipe_json
 
 if TYPE_CHECKING:
-    from stages.simulate.stage import run
+    from stages.simulate.stage import Summary
 
-__getattr__ = imported_later(__name__, "stage")
 __all__ = ["Config", "make_config", "read_recipe", "recipe_json", "run"]
+
+
+def _targets(call: runner.Call) -> Iterator[Target]:
+    from stages.simulate.stage import scene_files
+
+    yield from (Target(call.output.file / name) for name in scene_files(call.config))
+
+
+@runner.stage(writes=_targets, content=lambda summary: summary.table())
+def run(output: Output | Path, config: Config, progress: Progress = show_nothing) -> Summary:
+    """Simulate a scene into a folder: dem.tif, images/*.tif, images.csv, truth.h5, truth.tif, record.json.
+
+    Raises ConfigError where files exist that may not be replaced.
+    """
+    from stages.simulate.stage import work
+
+    return work(Output.at(output).file, config, progress)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from rasterio.transform import Affine
 from rasterio.windows import Window
 
-from schemas.files.outputs import Output, Target, atomic_folder, atomic_path, check_outputs
+from schemas.files.outputs import atomic_folder, atomic_path
 from schemas.provenance import SIDECAR, folder_record
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.progress import Progress
 from stages.physics.bodies.ephemeris import AU
 from stages.physics.maps.grid import Grid, local_metric_crs, unit_vectors
 from stages.simulate import sensor
@@ -44,20 +44,44 @@ class Summary:
     craters: int
     hidden: Hidden
 
+    def table(self) -> list[dict[str, str]]:
+        """A row for each image."""
+        rows = []
+        for i, share in zip(self.images, self.covered, strict=True):
+            shot = i.shot
+            rows.append(
+                {
+                    "image": shot.image_id,
+                    "start (UTC)": shot.start_time,
+                    "GSD m": f"{shot.gsd:.2f}",
+                    "inc deg": f"{shot.incidence_deg:.1f}",
+                    "Sun az deg": f"{shot.sun_azimuth_deg:.1f}",
+                    "em deg": f"{shot.emission_deg:.1f}",
+                    "phase deg": f"{shot.phase_deg:.1f}",
+                    "% of scene": f"{100 * share:.0f}",
+                    "mean I/F": f"{i.mean_iof:.4f}",
+                    "SNR": f"{i.mean_iof / i.noise_iof:.0f}",
+                }
+            )
+        return rows
 
-def run(output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing) -> Summary:
-    """Simulate a scene into a folder: dem.tif, images/*.tif, images.csv, truth.h5, truth.tif, record.json.
 
-    Raises ConfigError where files exist that may not be replaced.
-    """
-    output = Output.at(output)
-    folder = output.file
+def scene_files(config: Config) -> list[str]:
+    """The files of a scene, within its folder."""
+    images = [_image_name(shot) for shot in plan_passes(config)]
+    return ["dem.tif", "images.csv", "truth.h5", "truth.tif", SIDECAR, *images]
+
+
+def _image_name(shot: Pass) -> str:
+    return f"images/{shot.image_id}.tif"
+
+
+def work(folder: Path, config: Config, progress: Progress) -> Summary:
+    """See :func:`stages.simulate.run`."""
     hidden = config.hidden_effects()
     truth = Truth(config)
     shots = plan_passes(config)
-    names = [f"images/{shot.image_id}.tif" for shot in shots]
-    made = ("dem.tif", "images.csv", "truth.h5", "truth.tif", SIDECAR, *names)
-    check_outputs([Target(folder / name) for name in made], overwrite=output.overwrite)
+    names = [_image_name(shot) for shot in shots]
     with atomic_folder(folder, SIDECAR) as staging:  # all of it or nothing: images without their truth are of no use
         summary = _make_scene(staging, config, shots, names, hidden, truth, progress)
     return replace(summary, folder=folder)

@@ -52,7 +52,6 @@ def write_checkpoint(output: Output, config: Config, training: Training, history
         inputs=[reader.path],
         seed=config.seed,
         attributes=attributes | ground.attributes,
-        overwrite=output.overwrite,
     ) as writer:
         for key in ("train_loss", "validation_loss", "epoch_seconds"):
             writer.write(key, np.array(getattr(history, key)))

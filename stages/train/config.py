@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+
+from schemas.files.outputs import Output
 
 
 @dataclass(frozen=True)
@@ -31,3 +34,8 @@ class Config:
     device: str = "auto"
     precision: str = "auto"
     extend: str | None = None
+
+
+def state_path(output: Output) -> Path:
+    """Where the state of an unfinished run is, beside its checkpoint."""
+    return output.file.with_name(f"{output.file.stem}.resume.h5")

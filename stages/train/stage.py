@@ -16,17 +16,16 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
-from schemas.errors import ConfigError
-from schemas.files.outputs import Output, Target, check_outputs
+from schemas.files.outputs import Output
 from schemas.provenance import sha256
 from stages.common.memory import keep_freed_memory
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.progress import Progress, Say
 from stages.network.predictor import choose_device
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import Extension
 from stages.train.checkpoint import write_checkpoint
 from stages.train.checks import check, check_pairs
-from stages.train.config import Config
+from stages.train.config import Config, state_path
 from stages.train.deviations import fit_deviations
 from stages.train.epoch import BACKWARD, evaluate_loss, learn_epoch, overall, whole
 from stages.train.processes import join_group
@@ -45,24 +44,10 @@ class Summary:
     error_unit: str
 
 
-def run(
-    pairs: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
-) -> Summary:
-    """Write ``checkpoint.h5``: the weights of the best validation epoch. Raises ConfigError, InputError, ArtefactError.
-
-    After every epoch the whole state is written beside the output; ``resume`` goes on from it to the same result.
-    """
-    output = Output.at(output)
+def work(pairs: Path, output: Output, config: Config, say: Say, progress: Progress) -> Summary:
+    """See :func:`stages.train.run`."""
     check(config)
-    sidecar = output.file.with_name(f"{output.file.stem}.resume.h5")
-    inputs = [pairs, *([Path(config.extend)] if config.extend else [])]
-    check_outputs([Target(output.file)], inputs, output.overwrite)
-    state = Target(sidecar, name=f"the state of the unfinished {output.file.name}")
-    check_outputs([state], [*inputs, output.file], overwrite=True)
-    if sidecar.exists() and not (output.resume or output.overwrite):
-        raise ConfigError(
-            f"{sidecar}: the state of an unfinished run; add `resume` to go on with it, or `overwrite` to start anew."
-        )
+    sidecar = state_path(output)
     rank, ranks = join_group()
     device = choose_device(config.device)
     if device.type == "cuda" and ranks > 1:

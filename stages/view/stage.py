@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from schemas import ConfigError, atomic_path, check_output
+from schemas import ConfigError, atomic_path
 from schemas.files.outputs import Output
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.progress import Progress
 from stages.view.config import Config
 from stages.view.frames import make_frames
 from stages.view.layers import read_content
@@ -31,19 +31,10 @@ class Summary:
     size: int
 
 
-def run(
-    source: Path,
-    pairs: Path | None,
-    output: Output | Path,
-    config: Config,
-    say: Say = say_nothing,
-    progress: Progress = show_nothing,
-) -> Summary:
-    """Write the page of ``source`` (svbrdf.h5), with photographs of ``pairs`` where given. Raises LunargrError."""
-    output = Output.at(output)
+def work(source: Path, pairs: Path | None, output: Output, config: Config, progress: Progress) -> Summary:
+    """See :func:`stages.view.run`."""
     path = output.file
     _check(config, path)
-    check_output(path, [source, *([pairs] if pairs else [])], output.overwrite)
     progress(0, STEPS, "reading maps")
     content = read_content(source, config.max_px)
     frames = make_frames(content.grid)

@@ -14,9 +14,7 @@ from schemas import DIAGNOSIS, ArtefactWriter
 from stages.diagnose.result.answer import Answer
 
 
-def write_diagnosis(
-    path: Path, answer: Answer, image_ids: Sequence[str], inputs: Sequence[Path], overwrite: bool
-) -> None:
+def write_diagnosis(path: Path, answer: Answer, image_ids: Sequence[str], inputs: Sequence[Path]) -> None:
     """Write the file. Values per image or site stand in the variable that the effect's class names, or in a common one."""
     entries: list[dict[str, Any]] = []
     tables: dict[str, Any] = {}
@@ -59,9 +57,7 @@ def write_diagnosis(
             tables[f"{kind}_values"], tables[f"{kind}_value_name"] = values, [name for name, _ in columns]
             sizes |= {kind: len(values), f"{kind}_value": len(columns)}
     attributes = {"report": json.dumps(answer.to_json()), "extension": json.dumps(entries)}
-    with ArtefactWriter(
-        path, DIAGNOSIS, sizes, config=answer.config, inputs=inputs, attributes=attributes, overwrite=overwrite
-    ) as writer:
+    with ArtefactWriter(path, DIAGNOSIS, sizes, config=answer.config, inputs=inputs, attributes=attributes) as writer:
         writer.write("image_id", image_ids)
         for name, data in tables.items():
             writer.write(name, data)

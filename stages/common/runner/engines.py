@@ -12,8 +12,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol
 
-from lunargr_cli.options import check_scheduler
+from schemas.command_line import recording, running_command
 from schemas.errors import ConfigError, InputError, LunargrError
+from schemas.files.companions import companions_of
+from schemas.files.locks import unlocked
+from schemas.provenance import known_digests
 
 ANSWER_WITHIN = 10.0  # seconds in which a scheduler must answer
 WORKER_WITHIN = 300.0  # seconds in which it must have a worker: a queue may have to start it
@@ -42,10 +45,8 @@ class ThisProcess:
 
     def work(self, tasks: Sequence[Task]) -> Iterator[Path]:
         """Do all tasks one after the other; a part's path as it is finished."""
-        from schemas.files.locks import unlocked
-
         for task in tasks:
-            with unlocked():
+            with unlocked(), companions_of(None):
                 task.function(task.path, **task.arguments)
             yield task.path
 
@@ -58,10 +59,9 @@ def open_dask(scheduler: str, folder: Path) -> Iterator[Engine]:
         import distributed
     except ImportError as error:
         raise ConfigError(
-            f"--scheduler: needs Dask distributed ({error.name} is missing); install it with: pip install 'lunargr[cluster]'."
+            f"`scheduler`: needs Dask distributed ({error.name} is missing); install it with: pip install 'lunargr[cluster]'."
         ) from None
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    check_scheduler(scheduler)
     kind, _, number = scheduler.partition(":")
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(_settings(int(number) if kind == "local" else 1)))
@@ -98,7 +98,7 @@ def _connect(address: str) -> Any:
     import distributed
 
     silent = ConfigError(
-        f"--scheduler: no Dask scheduler answers at '{address}'; expected local:N, or the address that 'dask scheduler' "
+        f"`scheduler`: no Dask scheduler answers at '{address}'; expected local:N, or the address that 'dask scheduler' "
         "prints, such as tcp://10.0.0.1:8786."
     )
     try:
@@ -110,7 +110,7 @@ def _connect(address: str) -> Any:
     except (OSError, TimeoutError):
         client.close()
         raise ConfigError(
-            f"--scheduler: the scheduler at '{address}' has no workers; start some with: dask worker {address}"
+            f"`scheduler`: the scheduler at '{address}' has no workers; start some with: dask worker {address}"
         ) from None
     return client
 
@@ -123,9 +123,6 @@ class _Dask:
     def work(self, tasks: Sequence[Task]) -> Iterator[Path]:
         """Do all tasks; paths come as parts are finished. A part whose worker dies is given to another worker."""
         import distributed
-
-        from schemas.command_line import running_command
-        from schemas.provenance import known_digests
 
         if not tasks:
             return
@@ -143,11 +140,11 @@ class _Dask:
                 except distributed.KilledWorker:
                     raise InputError(
                         f"{path.name}: {DEATHS + 1} workers died while they worked on this part (out of memory?); "
-                        "give workers more memory, or make smaller parts with --parts."
+                        "give workers more memory, or make smaller parts with `parts`."
                     ) from None
                 except (distributed.client.FutureCancelledError, distributed.comm.CommClosedError, TimeoutError):
                     raise InputError(
-                        f"--scheduler: lost the scheduler '{self.name}'; finished parts stay: run the command again."
+                        f"`scheduler`: lost the scheduler '{self.name}'; finished parts stay: run the command again."
                     ) from None
                 if error is not None:
                     raise error
@@ -160,14 +157,10 @@ class _Dask:
 
 def _work(task: Task, common: tuple[str, dict[Any, str], tuple[str, str] | None]) -> LunargrError | None:
     """Do a task on a worker. A LunargrError is returned and not raised: another worker would only find the same."""
-    from schemas.command_line import recording
-    from schemas.files.locks import unlocked
-    from schemas.provenance import known_digests
-
     expected, digests, command = common
     if version("lunargr") != expected:
         return ConfigError(
-            f"--scheduler: the worker on {socket.gethostname()} has lunargr {version('lunargr')}, expected {expected}; install the same."
+            f"`scheduler`: the worker on {socket.gethostname()} has lunargr {version('lunargr')}, expected {expected}; install the same."
         )
     known_digests.update(digests)
     if task.path.exists():  # by a worker that was given up too early

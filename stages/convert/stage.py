@@ -1,7 +1,4 @@
-"""`lunargr convert`: coefficient maps in a GeoTIFF, from one program's convention to another's.
-
-Bands are known by their descriptions, never by their position: programs order the same coefficients differently.
-"""
+"""The stage: coefficient maps in a GeoTIFF, converted in strips."""
 
 from __future__ import annotations
 
@@ -15,30 +12,16 @@ from rasterio.errors import NotGeoreferencedWarning
 from rasterio.io import DatasetReader
 from rasterio.windows import Window
 
-from schemas import ConfigError, InputError, atomic_path, check_output
-from schemas.files.outputs import Output
+from schemas import ConfigError, InputError, atomic_path
 from schemas.provenance import raster_record
 from schemas.rasters import TIFF_TAG
-from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.progress import Progress
+from stages.convert import Config
 from stages.physics.maps.geotiff import BLOCK, MapTiff
 from stages.physics.maps.rasters import open_raster, read_window
 from stages.physics.photometry.conventions import Convention, convert_maps, get_convention, model_difference
 
 BLOCK_VALUES = 1 << 23  # values of all bands held at a time, in float64: 64 MB
-
-
-@dataclass
-class Config:
-    """source, target : conventions, SYSTEM:MODEL
-    bands : where the file's descriptions do not name its quantities: names of all its bands in their order, or
-        'NAME=INDEX' (from 1) for those that are wanted, as in a file with several wavelengths
-    approximate : convert although the target cannot hold everything
-    """
-
-    source: str
-    target: str
-    bands: Sequence[str] | None = None
-    approximate: bool = False
 
 
 @dataclass
@@ -50,23 +33,15 @@ class Report:
     valid_pixels: int
 
 
-def run(
-    source: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
-) -> Report:
-    """Convert the coefficient maps of ``source`` into ``output``, a float32 GeoTIFF on the same grid, NaN as nodata.
-
-    Raises InputError for a file without the needed bands, ConfigError for conventions that have no conversion or would
-    lose something, RegistryError for an unknown convention.
-    """
-    output = Output.at(output)
+def work(source: Path, path: Path, config: Config, progress: Progress) -> Report:
+    """See :func:`stages.convert.run`."""
     start, end = get_convention(config.source), get_convention(config.target)
     model_difference(start, end)
-    check_output(output.file, [source], output.overwrite)
     losses: dict[str, str] = {}
     valid = 0
     with open_raster(source, "a GeoTIFF of coefficient maps") as data:
         indices = band_indices(data, start, config.bands)
-        with atomic_path(output.file) as partial, warnings.catch_warnings():
+        with atomic_path(path) as partial, warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             tags = {"CONVENTION": end.name, "RETURNS": end.returns, "CONVERTED_FROM": start.name}
             tags[TIFF_TAG] = raster_record("convert", asdict(config), [source])

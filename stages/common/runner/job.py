@@ -1,25 +1,30 @@
-"""The parts of one output: their folder, the job that they belong to, and which of them are finished."""
+"""The parts of one output: their folder, the job that they belong to, and which of them are finished.
+
+A part is a file, whole or absent. What is finished stays: the same command run again, on any engine, does only what is missing,
+and the parts give what one process would have given.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib
 import json
+import math
 import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from lunargr_cli.fanout.engines import Engine, Task, ThisProcess, open_dask
 from schemas.errors import ConfigError, InputError
-from schemas.files.locks import claim
-from schemas.files.outputs import Output, Target, check_outputs
+from schemas.files.outputs import Output
 from schemas.provenance import file_state, sha256
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
+from stages.common.runner.engines import Engine, Task, ThisProcess, open_dask
 
 PATIENCE = 20  # seconds until a new file must show on a network file system
 DASK = "dask"  # folder of the workers' own files
@@ -28,8 +33,11 @@ RECORD = ".made"  # in the folder of parts: the names, without endings, of all t
 
 @dataclass
 class Job:
-    """One output and its parts."""
+    """One output and its parts. package : of the stage; inputs : the files of its call"""
 
+    package: str
+    output: Output
+    inputs: Sequence[Path]
     folder: Path
     engine: Engine
     say: Say
@@ -64,15 +72,25 @@ class Job:
             _await(path)
         return paths
 
+    def shards(
+        self, name: str, inputs: Sequence[Any], config: Any, pieces: int, each: int = 1, function: str = "run"
+    ) -> list[Path]:
+        """Have the stage make its shards of these inputs; their paths in order.
 
-@dataclass(frozen=True)
-class Work:
-    """How parts are worked on. scheduler : None for this process; parts : their number, None for a suitable one"""
+        pieces : into which the work can be cut; each : how many of them a shard holds where the user says nothing
+        function : of the stage's package that makes them
+        """
+        count = max(1, min(self.output.parts or math.ceil(pieces / each), pieces))
+        shared = {"package": self.package, "function": function, "inputs": inputs}
+        return self.fan(
+            name, write_shard, [shared | {"config": replace(config, shard=(k, count))} for k in range(count)]
+        )
 
-    scheduler: str | None = None
-    parts: int | None = None
-    say: Say = say_nothing
-    progress: Progress = show_nothing
+
+def write_shard(path: Path, package: str, function: str, inputs: Sequence[Any], config: Any) -> None:
+    """Write one shard of what a stage makes of its inputs."""
+    getattr(importlib.import_module(package), function)(*inputs, Output(path, overwrite=True), config)
+    path.with_suffix(".tif").unlink(missing_ok=True)  # the whole gets it: also where one shard is all
 
 
 @dataclass(frozen=True)
@@ -83,20 +101,17 @@ class Identity:
         read
     """
 
-    stage: str
+    package: str
     options: Mapping[str, Any]
     inputs: Sequence[Path]
     sources: Sequence[Path] = ()
 
     def digest(self) -> str:
-        """Raises InputError for inputs that are not there."""
-        for path in self.inputs:
-            if not path.is_file():
-                raise InputError(f"{path}: no such file; check the path or run the stage that writes it.")
+        """A hash of it."""
         identity = {
-            "stage": self.stage,
+            "package": self.package,
             "version": version("lunargr"),
-            "options": dict(self.options),
+            "options": {k: asdict(v) if is_dataclass(v) else v for k, v in self.options.items()},  # type: ignore[arg-type]
             "inputs": [sha256(path) for path in self.inputs],
             "sources": [[str(path), *file_state(path)] for path in self.sources],
         }
@@ -104,33 +119,33 @@ class Identity:
 
 
 @contextlib.contextmanager
-def open_job(output: Output, targets: Sequence[Target], identity: Identity, work: Work) -> Iterator[Job]:
+def open_job(
+    output: Output, identity: Identity, say: Say = say_nothing, progress: Progress = show_nothing
+) -> Iterator[Job]:
     """The parts of an output beside it, gone when all ends well and kept when it does not.
 
-    targets : all files that the run writes. Parts of another command, by ``identity``, are thrown away. Raises
-    ConfigError before anything is made, also where the folder of parts holds what no job made.
+    The caller holds the lock of the output. Parts of another command, by ``identity``, are thrown away. Raises
+    ConfigError before anything is made where the folder of parts holds what no job made.
     """
     path = output.file
-    with claim(path):
-        check_outputs(targets, [*identity.inputs, *identity.sources], output.overwrite)
-        folder = path.with_name(f"{path.name}.parts") / identity.digest()[:16]
-        _refuse_foreign(folder.parent)
-        _clear(folder.parent, keep=folder.name)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(
-                f"{folder.parent}: cannot be made a folder ({error.strerror}); choose another --output."
-            ) from None
-        _note(folder.parent, [folder.name, f"{folder.name}/{DASK}"])
-        for left in folder.glob(".*"):  # of killed workers
-            left.unlink(missing_ok=True)
-        engine: Any = (
-            open_dask(work.scheduler, folder / DASK) if work.scheduler else contextlib.nullcontext(ThisProcess())
-        )
-        with engine as working:
-            yield Job(folder.resolve(), working, work.say, work.progress)
-        _clear(folder.parent)
+    folder = path.with_name(f"{path.name}.parts") / identity.digest()[:16]
+    _refuse_foreign(folder.parent)
+    _clear(folder.parent, keep=folder.name)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"{folder.parent}: cannot be made a folder ({error.strerror}); choose another `output`."
+        ) from None
+    _note(folder.parent, [folder.name, f"{folder.name}/{DASK}"])
+    for left in folder.glob(".*"):  # of killed workers
+        left.unlink(missing_ok=True)
+    engine: Any = contextlib.nullcontext(ThisProcess())
+    if output.scheduler:
+        engine = open_dask(output.scheduler, folder / DASK)
+    with engine as working:
+        yield Job(identity.package, output, identity.inputs, folder.resolve(), working, say, progress)
+    _clear(folder.parent)
 
 
 def _stem(name: str) -> str:
@@ -187,5 +202,5 @@ def _await(path: Path) -> None:
         os.listdir(path.parent)
     raise InputError(
         f"{path}: a worker says that it wrote this part, but it is not here; "
-        "--scheduler needs workers that see the same files under the same names."
+        "`scheduler` needs workers that see the same files under the same names."
     )

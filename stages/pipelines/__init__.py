@@ -1,0 +1,1 @@
+"""Several stages in a row, as one: they call stages, which never call each other."""

@@ -1,0 +1,149 @@
+"""The files that render reads and writes, and its results as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from schemas.errors import ConfigError
+from schemas.files.locks import claim
+from schemas.files.outputs import Target
+from stages.common.runner import Call
+from stages.render.config import Config, Summary
+
+if TYPE_CHECKING:
+    from stages.render.trajectory import ViewRow
+
+MANIFEST = "manifest.json"  # of stereo pairs
+
+
+def inputs(source: Path, config: Config) -> list[Path]:
+    """What an image is made from."""
+    return [source, *(Path(p) for p in (config.camera, config.extend) if p)]
+
+
+def input_files(call: Call) -> list[Path]:
+    """The files that no output may replace."""
+    return [*call.files, *(Path(p) for p in (call.config.camera, call.config.extend) if p)]
+
+
+def output_files(output: Path, view: str) -> list[Path]:
+    """The files behind one `output`. Raises ConfigError."""
+    suffix = output.suffix.lower()
+    png, tif = output.with_suffix(".png"), output.with_suffix(".tif")
+    if suffix in (".exr", ""):
+        exr = output.with_suffix(".exr")
+        return [exr, png, tif] if view == "ortho" else [exr, png]
+    if suffix in (".tif", ".tiff"):
+        if view != "ortho":
+            raise ConfigError(f"{output}: a pinhole view has no map grid for a GeoTIFF; name a .exr or .png file.")
+        return [output, png]
+    if suffix == ".png":
+        return [output]
+    raise ConfigError(f"{output}: expected a name that ends in .exr, .tif or .png; choose another `output`.")
+
+
+def main_file(call: Call) -> Path:
+    """The file of a view that becomes whole last."""
+    return output_files(call.output.file, call.config.view)[0]
+
+
+def view_targets(call: Call) -> list[Target]:
+    """The files of one view."""
+    path = call.output.file
+    files = output_files(path, call.config.view)
+    return [Target(p, name="the output" if p == path else f"{p.suffix} beside {path.name}") for p in files]
+
+
+def view_files(folder: Path, view_id: str, config: Config) -> list[Path]:
+    """The files of one view of a trajectory."""
+    return output_files(folder / f"{view_id}{'.png' if config.png_only else '.exr'}", "pinhole")
+
+
+def shard_of_views(table: Path, config: Config) -> list[ViewRow]:
+    """The views of a shard: every n-th."""
+    from stages.render.trajectory import read_trajectory
+
+    index, count = config.shard
+    return read_trajectory(table)[index::count]
+
+
+def finished(outputs: Mapping[str, Sequence[Path]]) -> set[str]:
+    """The views whose files are all there."""
+    return {name for name, files in outputs.items() if all(path.exists() for path in files)}
+
+
+def trajectory_targets(call: Call) -> list[Target]:
+    """The files of the views that are still to be rendered, and of the data set that is exported."""
+    folder, config = call.output.file, call.config
+    outputs = {
+        v.view_id: view_files(folder, v.view_id, config) for v in shard_of_views(call.arguments["table"], config)
+    }
+    done = finished(outputs) if call.output.resume else set()
+    new = [files for name, files in outputs.items() if name not in done]
+    if config.export:
+        new.append(export_files(list(outputs), folder, config.export))
+    for files in new:
+        if any(path.exists() for path in files):
+            with claim(files[0]):  # tidies up where a killed run left some of them
+                pass
+    return [Target(path) for files in new for path in files]
+
+
+def export_files(view_ids: Sequence[str], folder: Path, kind: str) -> list[Path]:
+    """The files of the data set ``kind``; the first is written last, and the others belong to it."""
+    images = [f"images/{name}.png" for name in view_ids]
+    if kind == "colmap":
+        rest = [f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D")]
+    else:
+        rest = [*(f"depths/{name}.npy" for name in view_ids), "transforms.json"]
+    return [folder / kind / name for name in ("world.json", *images, *rest)]
+
+
+def manifest(call: Call) -> Path:
+    """The list of stereo pairs, which becomes whole last."""
+    return call.output.file / MANIFEST
+
+
+def pair_names(count: int) -> list[str]:
+    """Of stereo pairs."""
+    return [f"pair_{number:05d}" for number in range(count)]
+
+
+def pair_files(folder: Path, name: str) -> list[Path]:
+    """EXR and PNG of the left view, of the right one, and the correspondences."""
+    views = [path for side in ("left", "right") for path in output_files(folder / f"{name}_{side}.exr", "pinhole")]
+    return [*views, folder / f"{name}_matches.exr"]
+
+
+def stereo_targets(call: Call) -> list[Target]:
+    """The files of all stereo pairs."""
+    folder, names = call.output.file, pair_names(call.arguments["stereo"].count)
+    return [Target(path) for path in (manifest(call), *(p for name in names for p in pair_files(folder, name)))]
+
+
+def as_json(results: Sequence[Summary]) -> dict[str, Any]:
+    """What was rendered, for the JSON file."""
+
+    def finite(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    views = [
+        {
+            "view_id": r.view_id,
+            "files": [str(p) for p in r.files],
+            "size_px": list(r.size_px),
+            "known_share": finite(r.known_share),
+            "mean_iof": finite(r.mean),
+            "shadow_share": finite(r.shadow_share),
+            "incidence_deg": [finite(v) for v in r.incidence_deg],
+            "samples": r.samples,
+            "skipped": r.skipped,
+            "clipped_px": r.clipped,
+            "image_units": r.image_units,
+        }
+        for r in results
+    ]
+    return {"views": views}
