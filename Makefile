@@ -173,7 +173,7 @@ $(D)/evaluation.h5: $(D)/pairs.h5 $(DEMO_RUNS)
 	$(LUNARGR) evaluate $^ -o $@ $(if $(FIGURES_$(D)),--figures $(D)/figures) --overwrite $(SAYS)
 
 $(D)/held_out.h5: $(D)/pairs.h5 $(D)/fold_1.h5
-	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite $(SAYS)
+	$(LUNARGR) held-out $^ -o $@ --overwrite $(SAYS)
 
 $(D)/match.json: $(D)/pairs.h5 $(D)/checkpoint_0.h5
 	$(LUNARGR) match $^ --count 8 --json $@ --figures $(D)/figures --overwrite $(SAYS)
@@ -204,7 +204,7 @@ $(D)/m2.h5: $(D)/pairs.h5 $(D)/checkpoint_m2.h5
 demo-albedo: $(D)/match_albedo.json ## judge the albedo of demo-full by all of its images, each left out once, and by matching features
 
 $(D)/held_out_all.h5: $(D)/pairs.h5 $(foreach fold,1 2 3 4,$(D)/fold_$(fold).h5)
-	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite
+	$(LUNARGR) held-out $^ -o $@ --overwrite
 
 $(D)/match_albedo.json: $(D)/held_out_all.h5
 	$(LUNARGR) match $< --count 20 --json $@ --overwrite
@@ -253,7 +253,7 @@ $(C_FOLDS): $(C)/fold_%.h5: $(C)/svbrdf.h5 $(C)/scene.h5
 	$(LUNARGR) albedo $^ --fold $*/3 --register field --no-geotiff -o $@ --overwrite
 
 $(C)/held_out.h5: $(C)/pairs.h5 $(C_FOLDS)
-	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite
+	$(LUNARGR) held-out $^ -o $@ --overwrite
 
 $(C)/evaluation.h5: $(C)/pairs.h5 $(C_RUNS)
 	$(LUNARGR) evaluate $^ -o $@ --figures $(C)/figures --overwrite
@@ -287,7 +287,7 @@ $(A_FOLDS): $(A)/fold_%.h5: $(A)/svbrdf.h5 $(A)/scene.h5
 	$(LUNARGR) albedo $^ --fold $*/5 --register field --no-geotiff -o $@ --overwrite
 
 $(A)/held_out.h5: $(A)/pairs.h5 $(A_FOLDS)
-	$(LUNARGR) evaluate $^ --held-out-images -o $@ --overwrite
+	$(LUNARGR) held-out $^ -o $@ --overwrite
 
 $(A)/evaluation.h5: $(A)/pairs.h5 $(A_RUNS)
 	$(LUNARGR) evaluate $^ -o $@ --figures $(A)/figures --overwrite

@@ -66,7 +66,7 @@ def _train(o: Options) -> str:
 def _albedo(o: Options) -> str:
     if o["fold"] is None:
         return _run("view", o["output"], to="view.html", beside=o["output"])
-    scored = _run("evaluate", "pairs.h5", o["output"], "--held-out-images", to="held_out.h5", beside=o["output"])
+    scored = _run("held-out", "pairs.h5", o["output"], to="held_out.h5", beside=o["output"])
     return f"{scored}, with the pairs of the same scene"
 
 
@@ -109,6 +109,7 @@ STEPS: dict[str, Callable[[Options], str]] = {
     "render": _render,
     "view": lambda o: _open(o["output"]),
     "evaluate": _evaluate,
+    "held-out": lambda o: _run("report", o["pairs"], o["output"], to="report.html", beside=o["output"]),
     "match": _match,
     "compare": _compare,
     "diagnose": _diagnose,

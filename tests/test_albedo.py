@@ -264,7 +264,7 @@ def test_held_out_images_are_never_those_that_made_the_albedo(planted, tmp_path)
     for k, path in enumerate(folds):
         albedo.run(planted.map, planted.scene, path, replace(QUIET, fold=(k, 2)))
     out = tmp_path / "evaluation.h5"
-    code, _ = run_command("evaluate", pairs, *folds, "--held-out-images", "-o", out)
+    code, _ = run_command("held-out", pairs, *folds, "-o", out)
     assert code == 0
     result = json.loads(out.with_suffix(".json").read_text())
     assert result["claim"] == "seen ground, unseen images"
@@ -272,13 +272,13 @@ def test_held_out_images_are_never_those_that_made_the_albedo(planted, tmp_path)
     assert result["models"]["albedo"]["mse"] < 6 * NOISE**2
     assert result["nearest_used_sun_deg"]["least"] > 1.0
     one, used = tmp_path / "one.h5", [f"IMG{k}" for k in (1, 3, 5)]
-    code, _ = run_command("evaluate", pairs, folds[0], "--held-out-images", "-o", one)
+    code, _ = run_command("held-out", pairs, folds[0], "-o", one)
     assert code == 0
     scored = json.loads(one.with_suffix(".json").read_text())["images"]
     assert {row["image_id"] for row in scored} == {f"IMG{k}" for k in (0, 2, 4)}
     assert read(folds[0], "albedo_image_id")[0].astype(str).tolist() == used
     everything = planted.folder / "albedo.h5"
-    code, said = run_command("evaluate", pairs, everything, "--held-out-images", "-o", tmp_path / "no.h5")
+    code, said = run_command("held-out", pairs, everything, "-o", tmp_path / "no.h5")
     assert code == 3 and "--fold" in said and not (tmp_path / "no.h5").exists()
 
 

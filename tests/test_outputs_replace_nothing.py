@@ -32,6 +32,7 @@ READS = {
     "infer": (["dem.tif", "checkpoint.h5"], ["dem.tif", "checkpoint.h5"]),
     "render": (["svbrdf.h5", "camera.json"], ["svbrdf.h5", "--camera", "camera.json", *SUN]),
     "evaluate": (["pairs.h5", "checkpoint.h5"], ["pairs.h5", "checkpoint.h5"]),
+    "held-out": (["pairs.h5", "svbrdf.h5"], ["pairs.h5", "svbrdf.h5"]),
     "match": (["measured.png", "rendered.png"], ["measured.png", "rendered.png"]),
     "diagnose": (["pairs.h5", "checkpoint.h5"], ["pairs.h5", "checkpoint.h5"]),
     "compare": (["pairs.h5"], ["pairs.h5", "--models", "M1,M2"]),

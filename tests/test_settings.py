@@ -40,7 +40,7 @@ OTHERS = {
 # What commands have beside settings.
 BESIDE = {
     "output", "overwrite", "resume", "quiet", "json_file", "figures", "report", "scheduler", "parts", "no_geotiff", "models",
-    "seeds", "held_out_images", "list_effects", "list_matchers", "files", "shifts", "calibration", "dem", "trajectory", "stereo", "altitude", "convergence", "pairs",
+    "seeds", "list_effects", "list_matchers", "files", "shifts", "calibration", "dem", "trajectory", "stereo", "altitude", "convergence", "pairs",
     "images", "seed", "checkpoint", "source", "split", "body",
 }  # fmt: skip
 

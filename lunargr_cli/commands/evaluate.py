@@ -9,9 +9,8 @@ import typer
 
 from lunargr_cli import options
 from lunargr_cli.console import Console
-from schemas.files.outputs import Output
 from stages import evaluate
-from stages.evaluate import Config, HeldOutConfig
+from stages.evaluate import Config
 
 NAME, ORDER = "evaluate", 70
 
@@ -22,14 +21,10 @@ def command(
         list[Path],
         typer.Argument(
             metavar="CHECKPOINT...",
-            help="Training runs of one model, from 'lunargr train'; with --held-out-images maps from 'lunargr albedo'.",
+            help="Training runs of one model, from 'lunargr train'.",
         ),
     ],
     output: options.OutputFile = Path("evaluation.h5"),
-    held_out_images: Annotated[
-        bool,
-        typer.Option("--held-out-images", help="Score maps on images that were left out of their albedo."),
-    ] = False,
     split: Annotated[str, typer.Option("--split", help="train, validation or test.")] = Config.split,
     extend: Annotated[
         Path | None,
@@ -90,9 +85,6 @@ def command(
 
     console = Console(quiet)
     to = options.make_output(locals())
-    if held_out_images:
-        _score_held_out_images(console, pairs, checkpoints, to, split, seed)
-        return
     result = evaluate.run(pairs, checkpoints, to, config, console.say, console.progress)
     columns, cells = result_lines(result)
     unit = "I/F" if result["image_units"] == "iof" else f"shares of {result['dn_full_range']:.0f} DN"
@@ -110,25 +102,3 @@ def command(
     if result["lpips_unavailable"]:
         console.say(f"LPIPS is not available: {result['lpips_unavailable']}.")
     console.say(f"written: {output}, {output.with_suffix('.json')}" + (f", {figures}/" if figures else ""))
-
-
-def _score_held_out_images(
-    console: Console, pairs: Path, maps: list[Path], output: Output, split: str, seed: int
-) -> None:
-    """Score maps with albedo on images that did not make it. Raises LunargrError."""
-    from stages.evaluate.coverage import coverage_lines
-    from stages.evaluate.held_out_images import image_lines, result_lines
-
-    result = evaluate.run_held_out(pairs, maps, output, HeldOutConfig(split, seed), console.progress)
-    suns = result["nearest_used_sun_deg"]
-    title = (
-        f"{result['claim']}: {result['pairs']} crops of split '{split}', {result['tiles']} ground tiles, "
-        f"Suns {suns['least']:.1f} to {suns['most']:.1f} deg from the nearest one used"
-    )
-    console.table(title, *result_lines(result))
-    console.table("by image", *image_lines(result))
-    if result["coverage_percent"] is not None:
-        console.table("pixels within the intervals, percent", *coverage_lines(result["coverage_percent"]))
-    for warning in result["warnings"]:
-        console.say(f"note: {warning}.")
-    console.say(f"written: {output.file}, {output.file.with_suffix('.json')}")

@@ -96,7 +96,9 @@ def _read_command(command: str, made: str) -> tuple[list[str], str]:
             f"{made}: expected a command of lunargr in its record, found '{command[:80]}'; do not run it."
         )
     words = [_plain(word, made) for word in words]
-    default = signature(import_module(f"lunargr_cli.commands.{name}").command).parameters.get("output")
+    default = signature(import_module(f"lunargr_cli.commands.{name.replace('-', '_')}").command).parameters.get(
+        "output"
+    )
     output = output_of(words) or (str(default.default) if default and isinstance(default.default, Path) else made)
     return words, output
 
@@ -112,7 +114,7 @@ def _plain(text: str, made: str) -> str:
 
 
 def _command_names() -> set[str]:
-    return {module.name for module in pkgutil.iter_modules(commands.__path__)}
+    return {module.name.replace("_", "-") for module in pkgutil.iter_modules(commands.__path__)}
 
 
 def _comment(text: str) -> str:

@@ -87,12 +87,11 @@ def work(
         opened = [_open(path, reader, stack) for path in maps]
         chosen, notes = _choose(reader, opened, config.split)
         sizes = {"model": len(ROWS), "pair": len(chosen), "y": reader.size[0], "x": reader.size[1]}
-        settings = asdict(config) | {"held_out_images": True}
         with ArtefactWriter(
             output.file,
             EVALUATION,
             sizes,
-            config=settings,
+            config=asdict(config),
             inputs=[pairs, *maps],
             seed=config.seed,
         ) as writer:
