@@ -13,6 +13,8 @@ import typer
 from lunargr_cli.spelling import option_of
 from schemas.errors import ConfigError
 from schemas.files.outputs import Output
+from schemas.later import without
+from stages.train.config import SCHEDULES
 
 Number = TypeVar("Number", int, float)
 
@@ -22,12 +24,10 @@ MOST_PARTS = 100_000  # of one stage: beyond it a part is less than its own over
 
 def complete_model(incomplete: str) -> list[str]:
     """Names of reflectance models for the shell's completion ('lunargr --install-completion')."""
-    from schemas.later import import_when_used
+    with without("torch"):
+        from stages.physics.photometry import model_names
 
-    import_when_used("torch")
-    from stages.physics.photometry import model_names
-
-    return [name for name in model_names() if name.startswith(incomplete)]
+        return [name for name in model_names() if name.startswith(incomplete)]
 
 
 Config = TypeVar("Config")
@@ -104,7 +104,7 @@ Register = Annotated[
 Epochs = Annotated[int, typer.Option("--epochs", min=1, max=100_000, help="Passes over the training pairs.")]
 Batch = Annotated[int, typer.Option("--batch", min=1, max=MOST, help="Pairs per step, over all processes.")]
 LearningRate = Annotated[float, typer.Option("--lr", help="Adam's learning rate.")]
-Schedule = Annotated[str, typer.Option("--schedule", help="Learning rate over the steps: constant or cosine.")]
+Schedule = Annotated[str, typer.Option("--schedule", help=f"Learning rate over the steps: {' or '.join(SCHEDULES)}.")]
 Widths = Annotated[
     str, typer.Option("--widths", help="Channels of each stage of the U-Net; Lunar-G2R: 16-32-64-128-256.")
 ]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from schemas.artefacts import (
     CHECKPOINT,
@@ -19,15 +20,21 @@ from schemas.artefacts import (
 )
 from schemas.declaration import SCHEMAS, Attribute, Schema, Variable, get_schema
 from schemas.errors import EXIT_CODE, ArtefactError, ConfigError, GeometryError, InputError, LunargrError, RegistryError
-from schemas.later import imported_later
+from schemas.files.outputs import atomic_path, write_json
 
 if TYPE_CHECKING:
-    from schemas.files.outputs import atomic_path, write_json
     from schemas.reading import open_artefact, read_config, read_kind, read_strings
     from schemas.writing import ArtefactWriter
 
 
-__getattr__ = imported_later(__name__, "files.outputs", "reading", "writing")
+def __getattr__(name: str) -> Any:
+    """What needs h5py is imported when it is asked for: a command that only refuses or helps must answer at once."""
+    for module in ("reading", "writing") if name in __all__ else ():
+        loaded = importlib.import_module(f"schemas.{module}")
+        if hasattr(loaded, name):
+            return getattr(loaded, name)
+    raise AttributeError(f"module 'schemas' has no attribute '{name}'")
+
 
 __all__ = [
     "CHECKPOINT",

@@ -1,27 +1,14 @@
-"""Modules that are imported when they are first used: short commands must answer at once."""
+"""PyTorch takes most of a short command's time to import: where only names are asked for, it can wait."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
-
-
-def imported_later(package: str, *modules: str) -> Callable[[str], Any]:
-    """A package's ``__getattr__``, which looks for the names in its ``__all__`` in these of its modules, in order."""
-
-    def find(name: str) -> Any:
-        # A name that ``__all__`` lacks may be a module of the package, which Python then imports itself.
-        for module in modules if name in sys.modules[package].__all__ else ():
-            loaded = importlib.import_module(f"{package}.{module}")
-            if name in vars(loaded):
-                return vars(loaded)[name]
-        raise AttributeError(f"module '{package}' has no attribute '{name}'")
-
-    return find
 
 
 class _StandIn(ModuleType):
@@ -33,12 +20,21 @@ class _StandIn(ModuleType):
         return getattr(importlib.import_module(self.__name__), attribute)
 
 
-def import_when_used(name: str) -> None:
-    """Let ``import name`` cost nothing until something of the module is used, as ``from name import ...`` does at once.
+@contextlib.contextmanager
+def without(name: str) -> Iterator[None]:
+    """Within this block ``import name`` costs nothing until something of the module is used.
 
-    Nothing changes where the module is loaded, or not installed.
+    What is imported within the block keeps a stand-in for the module, which then imports it. Nothing changes where the
+    module is loaded, or not installed.
     """
     spec = None if name in sys.modules else importlib.util.find_spec(name)
-    if spec is not None:
-        sys.modules[name] = _StandIn(name)
-        sys.modules[name].__spec__ = spec
+    if spec is None:
+        yield
+        return
+    sys.modules[name] = _StandIn(name)
+    sys.modules[name].__spec__ = spec
+    try:
+        yield
+    finally:  # submodules cannot be imported from a stand-in
+        if isinstance(sys.modules.get(name), _StandIn):
+            del sys.modules[name]

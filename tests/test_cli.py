@@ -141,7 +141,15 @@ def test_match_without_files_says_what_to_give():
 REFUSED_AT_ONCE = """import os, sys
 from lunargr_cli.main import main
 os._exit = sys.exit
-for words in (["train", "absent.h5"], ["render", "--dem", sys.executable, "--model", "hapke", "-o", "x.exr"]):
+for words in (
+    ["train", "absent.h5"],
+    ["train", sys.executable, "--schedule", "cos"],
+    ["train", sys.executable, "--model", "M77"],
+    ["diagnose", sys.executable, "--model", "M77"],
+    ["compare", sys.executable, "--models", "M1,M77", "-o", "x"],
+    ["render", "--dem", sys.executable, "--model", "M77", "-o", "x.exr"],
+    ["render", "--dem", sys.executable, "--model", "hapke", "-o", "x.exr"],
+):
     sys.argv = ["lunargr", *words]
     try:
         main()
@@ -150,11 +158,12 @@ for words in (["train", "absent.h5"], ["render", "--dem", sys.executable, "--mod
 """
 
 
-def test_a_missing_file_or_sun_is_refused_before_a_stage_is_imported(tmp_path):
+def test_a_missing_file_sun_or_unknown_name_is_refused_before_a_stage_is_imported(tmp_path):
     """Whose import takes seconds."""
     done = subprocess.run([sys.executable, "-c", REFUSED_AT_ONCE], capture_output=True, text=True, cwd=tmp_path)
-    assert done.stdout.splitlines() == 2 * ["3 set()"], done.stderr
+    assert done.stdout.splitlines() == 7 * ["3 set()"], done.stderr
     assert "absent.h5: no such file" in done.stderr and "--sun-azimuth" in done.stderr
+    assert done.stderr.count("unknown reflectance model 'M77'") == 4
 
 
 @pytest.mark.parametrize("words", ["train pairs.h5", "diagnose pairs.h5", "render --dem dem.tif"])

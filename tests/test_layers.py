@@ -159,21 +159,3 @@ def test_shared_types_are_defined_once():
     shared = re.compile(r"^(\w+) = (NDArray\[np\.float(64|32)\]|Callable\[\[(int, int, )?str\], None\])(  #.*)?$", re.M)
     found = [m[1] for path in CORE for m in shared.finditer(path.read_text())]
     assert len(found) == len(set(found)) and {"Floats", "Floats32", "Progress", "Say"} <= set(found), found
-
-
-def test_a_package_imports_its_stage_only_when_it_is_asked_for(tmp_path, monkeypatch):
-    """... also where a module of the package is imported from it first, on which the stage depends in turn."""
-    package = tmp_path / "lazy"
-    package.mkdir()
-    head = "from schemas.later import imported_later\n"
-    (package / "__init__.py").write_text(head + "__getattr__ = imported_later(__name__, 'stage')\n__all__ = ['run']\n")
-    (package / "stage.py").write_text("from lazy.middle import value\n\n\ndef run():\n    return value\n")
-    (package / "middle.py").write_text("from lazy import low\n\nvalue = low.VALUE\n")
-    (package / "low.py").write_text("VALUE = 7\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    importlib.import_module("lazy.middle")
-    assert "lazy.stage" not in sys.modules
-    lazy = importlib.import_module("lazy")
-    assert lazy.run() == 7
-    with pytest.raises(AttributeError, match="'lazy' has no attribute 'nothing'"):
-        lazy.nothing  # noqa: B018

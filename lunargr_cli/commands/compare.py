@@ -9,6 +9,7 @@ import typer
 
 from lunargr_cli import options
 from lunargr_cli.console import Console
+from schemas.later import without
 from stages.pipelines import compare_models
 from stages.train import Config
 
@@ -63,6 +64,7 @@ def command(
 
 def _models(text: str) -> tuple[str, ...]:
     """Names of models from 'M1,M2'. Raises ConfigError, RegistryError."""
-    from stages.physics.photometry import get_model
+    with without("torch"):
+        from stages.physics.photometry import get_model
 
-    return options.check_once("--models", (get_model(name).name for name in options.read_names("--models", text)))
+        return options.check_once("--models", (get_model(name).name for name in options.read_names("--models", text)))

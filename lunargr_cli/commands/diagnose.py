@@ -80,10 +80,10 @@ def command(
         return
     if pairs is None:
         raise ConfigError("diagnose: expected a file of pairs, found none; give pairs.h5, or --list.")
-    from stages.diagnose.result.answer import describe
-
     config, to = configure(Config, locals(), free=read_names("--free", free)), make_output(locals())
     answer = diagnose.run(pairs, checkpoint, to, config, console.say, console.progress).report
+    from stages.diagnose.result.answer import describe
+
     rows = [
         (
             c["effect"],

@@ -79,13 +79,13 @@ def command(
     config = options.configure(
         Config, locals(), only=options.check_once("--only", only or ()), extend=str(extend) if extend else None
     )
+    console = Console(quiet)
+    to = options.make_output(locals())
+    result = evaluate.run(pairs, checkpoints, to, config, console.say, console.progress)
     from stages.common.page.sentences import basis
     from stages.evaluate.coverage import coverage_lines
     from stages.evaluate.table import gain_lines, result_lines
 
-    console = Console(quiet)
-    to = options.make_output(locals())
-    result = evaluate.run(pairs, checkpoints, to, config, console.say, console.progress)
     columns, cells = result_lines(result)
     unit = "I/F" if result["image_units"] == "iof" else f"shares of {result['dn_full_range']:.0f} DN"
     console.table(f"split '{split}': {basis(result)}; RMSE in {unit}, MSE in its square", columns, cells)

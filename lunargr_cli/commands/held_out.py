@@ -35,13 +35,13 @@ def command(
     Each pair is scored on the first map whose albedo its image had no part in. A JSON file beside the output holds the
     same results.
     """
-    from stages.evaluate.coverage import coverage_lines
-    from stages.evaluate.held_out_images import image_lines, result_lines
-
     console = Console(quiet)
     result = evaluate.run_held_out(
         pairs, maps, options.make_output(locals()), HeldOutConfig(split, seed), console.progress
     )
+    from stages.evaluate.coverage import coverage_lines
+    from stages.evaluate.held_out_images import image_lines, result_lines
+
     suns = result["nearest_used_sun_deg"]
     title = (
         f"{result['claim']}: {result['pairs']} crops of split '{split}', {result['tiles']} ground tiles, "

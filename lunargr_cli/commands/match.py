@@ -28,7 +28,7 @@ def command(
         list[str] | None,
         typer.Option(
             "--matcher",
-            help="daisy, sift, aliked, disk, or your own. May be repeated (default: daisy and sift).",
+            help=f"A matcher of --list. May be repeated (default: {' and '.join(Config.matchers)}).",
         ),
     ] = None,
     split: Annotated[str, typer.Option("--split", help="train, validation or test (for pairs).")] = Config.split,
@@ -64,10 +64,10 @@ def command(
     if not files:
         raise ConfigError("match: expected files to match, found none; give pairs.h5 and checkpoint.h5, or --list.")
     config = configure(Config, locals(), matchers=check_once("--matcher", matchers or Config.matchers))
-    from stages.match.stage import result_lines
-
     to = make_output(locals())
     result = match.run(files, to, config, console.say, console.progress)
+    from stages.match.stage import result_lines
+
     extent = f"{result['crops']} picture(s) of 512 x 384 on {result['tiles']} ground tile(s)"
     console.table(f"matching consistency over {extent}", *result_lines(result))
     if figures is not None:

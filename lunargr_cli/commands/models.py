@@ -10,7 +10,7 @@ import typer
 from lunargr_cli.console import Console, write_out
 from lunargr_cli.options import Json, Overwrite
 from schemas.files.outputs import json_targets, write_json
-from schemas.later import import_when_used
+from schemas.later import without
 from stages.common.runner import prepared
 
 NAME, ORDER = "models", 85
@@ -30,25 +30,25 @@ def command(
     overwrite: Overwrite = False,
 ) -> None:
     """List the reflectance models: parameters, bounds, units, defaults, reference, reciprocal or not."""
-    import_when_used("torch")  # half of this command's time; what is listed here needs none of it
-    from stages.physics.photometry import catalogue, get_model
+    with without("torch"):  # half of this command's time; what is listed here needs none of it
+        from stages.physics.photometry import catalogue, get_model
 
-    chosen = None if name is None else get_model(name)
-    if json_file is not None:
-        with prepared([], json_targets(json_file), overwrite):
-            write_json(json_file, catalogue.as_dict())
-    if markdown:
-        write_out(catalogue.markdown())
-    elif sets:
-        _print_sets(catalogue.parameter_sets(None if chosen is None else chosen.name))
-    elif conventions:
-        _print_conventions(None if chosen is None else chosen.name)
-    elif cameras:
-        _print_cameras()
-    elif chosen is None:
-        _print_all()
-    else:
-        _print_model(chosen)
+        chosen = None if name is None else get_model(name)
+        if json_file is not None:
+            with prepared([], json_targets(json_file), overwrite):
+                write_json(json_file, catalogue.as_dict())
+        if markdown:
+            write_out(catalogue.markdown())
+        elif sets:
+            _print_sets(catalogue.parameter_sets(None if chosen is None else chosen.name))
+        elif conventions:
+            _print_conventions(None if chosen is None else chosen.name)
+        elif cameras:
+            _print_cameras()
+        elif chosen is None:
+            _print_all()
+        else:
+            _print_model(chosen)
 
 
 def _print_all() -> None:

@@ -13,13 +13,13 @@ from schemas.errors import ConfigError
 from stages import simulate
 from stages.common.runner import prepared
 from stages.simulate import Config
+from stages.simulate.hidden import CHOICES, hidden_from_option
 
 NAME, ORDER = "simulate", 10
 
 _HIDDEN_HELP = (
     "Hidden effect to plant: none, NAME, NAME:PARAMETER=VALUE,... or several joined by '+'. "
-    "Names: dark_bias, nonlinearity, opposition_surge, phase_slope, psf_blur, sun_azimuth, sun_elevation, penumbra, "
-    "earthshine, echo, column_pattern, image_gain, saturation, misregistration, line_jitter, dem_scale, dem_smoothing. "
+    f"Names: {', '.join(CHOICES)}. "
     "[default: dark_bias]"
 )
 
@@ -82,8 +82,6 @@ def _configure(
     recipe: Path | None, changes: dict[str, Any], gsd: float | None, extent_m: float | None, hidden: str | None
 ) -> Config:
     """The recipe with what the options say in its place. Raises ConfigError, InputError."""
-    from stages.simulate.hidden import hidden_from_option
-
     values = simulate.read_recipe(recipe) if recipe else {}
     if changes["size_px"] is not None and extent_m is not None:
         raise ConfigError("--size-px and --extent-m both set the size; give one of them.")

@@ -32,6 +32,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from schemas.files.outputs import Output, Target
+from schemas.later import without
 from stages.common import runner
 from stages.common.progress import Progress, Say, say_nothing, show_nothing
 from stages.diagnose.config import Config
@@ -47,7 +48,16 @@ def _targets(call: runner.Call) -> list[Target]:
     return [Target(path, option) for path, option in named if path is not None]
 
 
-@runner.stage(writes=_targets, in_parts=True)
+def _check(call: runner.Call) -> None:
+    """Refuse an unknown model before PyTorch is imported."""
+    if call.arguments["checkpoint"] is None:
+        with without("torch"):
+            from stages.physics.photometry import get_model
+
+            get_model(call.config.model)
+
+
+@runner.stage(writes=_targets, check=_check, in_parts=True)
 def run(
     pairs: Path,
     checkpoint: Path | None = None,

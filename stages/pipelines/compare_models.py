@@ -72,6 +72,8 @@ def _targets(call: runner.Call) -> Iterator[Target]:
 
 
 def _check(call: runner.Call) -> None:
+    for model in call.config.models:
+        replace(call.config.training, model=model).check()
     if len(call.config.models) < 2:
         raise ConfigError(f"`models`: expected at least two models, found '{','.join(call.config.models)}'.")
     if call.config.split not in dict(SPLITS):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from schemas.errors import ConfigError
+from schemas.later import without
 from stages.common.sun_given import sun_given
 
 VIEWS = ("ortho", "pinhole")
@@ -124,6 +125,11 @@ class Summary:
 
 def check(config: Config, trajectory: bool = False, drawn_sun: bool = False) -> None:
     """Refuse options that cannot go together. drawn_sun : the Sun is none of them. Raises ConfigError."""
+    if config.model is not None:
+        with without("torch"):
+            from stages.physics.photometry import get_model
+
+            get_model(config.model)
     if config.view not in VIEWS:
         raise ConfigError(f"`view`: expected one of {', '.join(VIEWS)}; found '{config.view}'.")
     if config.samples is not None and not 1 <= config.samples <= 32:

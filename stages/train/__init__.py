@@ -34,7 +34,7 @@ def _targets(call: runner.Call) -> list[Target]:
     return [Target(path), Target(state, name=f"the state of the unfinished {path.name}", state=True)]
 
 
-@runner.stage(reads=_files, writes=_targets)
+@runner.stage(reads=_files, writes=_targets, check=lambda call: call.config.check())
 def run(
     pairs: Path, output: Output | Path, config: Config, say: Say = say_nothing, progress: Progress = show_nothing
 ) -> Summary:

@@ -2,43 +2,29 @@
 
 from __future__ import annotations
 
-import math
-
 from schemas import ConfigError, InputError
 from stages.common.progress import Say
 from stages.network.checkpoint_layout import DEEPEST, WIDEST, are_dropouts, are_widths
 from stages.network.precision import check_precision
 from stages.network.predictor import choose_device
 from stages.pairs.reader import PairReader
-from stages.physics.photometry import get_model
 from stages.train.config import Config
 
 
 def check(config: Config) -> None:
     """Refuse options that cannot be. Raises ConfigError, RegistryError."""
-    if config.epochs < 1 or config.batch < 1:
-        raise ConfigError(f"`epochs` and `batch`: expected at least 1, found {config.epochs} and {config.batch}.")
-    if not (math.isfinite(config.lr) and 0 < config.lr < 1):
-        raise ConfigError(f"`lr`: expected a number between 0 and 1, found {config.lr}.")
-    if config.schedule not in ("constant", "cosine"):
-        raise ConfigError(f"`schedule`: expected 'constant' or 'cosine', found '{config.schedule}'.")
+    config.check()
     check_precision(config.precision)
     if not are_widths(config.widths):
         raise ConfigError(
             f"`widths`: expected 2 .. {DEEPEST} stages of 1 .. {WIDEST} channels, found {'-'.join(map(str, config.widths))}."
         )
-    if not 0 <= config.brightness <= 1:
-        raise ConfigError(f"`brightness`: expected a number from 0 to 1, found {config.brightness}.")
     if not are_dropouts(config.dropout):
         raise ConfigError(f"`dropout`: expected shares from 0 to below 1, found {config.dropout}.")
     if len(config.dropout) not in (1, len(config.widths)):
         raise ConfigError(
             f"`dropout`: expected one share, or {len(config.widths)} for as many `widths`, found {len(config.dropout)}."
         )
-    model = get_model(config.model)
-    model.choose_maps(config.maps)
-    if config.positive and not model.linear:
-        raise ConfigError(f"`positive`: expected a model that is linear in its coefficients, found '{model.name}'.")
     choose_device(config.device)
 
 

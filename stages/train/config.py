@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from schemas.errors import ConfigError
 from schemas.files.outputs import Output
+from schemas.later import without
+
+SCHEDULES = ("constant", "cosine")
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,24 @@ class Config:
     device: str = "auto"
     precision: str = "auto"
     extend: str | None = None
+
+    def check(self) -> None:
+        """Refuse numbers and names that cannot be, without PyTorch. Raises ConfigError, RegistryError."""
+        if self.epochs < 1 or self.batch < 1:
+            raise ConfigError(f"`epochs` and `batch`: expected at least 1, found {self.epochs} and {self.batch}.")
+        if not (math.isfinite(self.lr) and 0 < self.lr < 1):
+            raise ConfigError(f"`lr`: expected a number between 0 and 1, found {self.lr}.")
+        if self.schedule not in SCHEDULES:
+            raise ConfigError(f"`schedule`: expected one of {', '.join(SCHEDULES)}; found '{self.schedule}'.")
+        if not 0 <= self.brightness <= 1:
+            raise ConfigError(f"`brightness`: expected a number from 0 to 1, found {self.brightness}.")
+        with without("torch"):
+            from stages.physics.photometry import get_model
+
+            model = get_model(self.model)
+        model.choose_maps(self.maps)
+        if self.positive and not model.linear:
+            raise ConfigError(f"`positive`: expected a model that is linear in its coefficients, found '{model.name}'.")
 
 
 def state_path(output: Output) -> Path:
