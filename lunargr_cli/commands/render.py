@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -19,196 +20,224 @@ from lunargr_cli.options import (
     Shard,
     complete_model,
     configure,
+    make_output,
     parse_shard,
     read_list,
     read_parameters,
 )
 from schemas.errors import ConfigError
-from schemas.files.outputs import Output
 from stages import render
 from stages.common.brightness import NAMES
 from stages.render import Config, StereoConfig, Summary
 
 NAME, ORDER = "render", 60
+Options = Mapping[str, Any]  # of a call, by name
 CONVERGENCE = ",".join(f"{edge:g}" for edge in StereoConfig.convergence_deg)
 
 
+# What is rendered
+Source = Annotated[Path | None, typer.Argument(metavar="[SVBRDF.h5]", help="Reflectance map from 'lunargr infer'.")]
+RenderOutput = Annotated[
+    Path,
+    typer.Option(
+        "--output",
+        "-o",
+        help="NAME.exr writes EXR, PNG and, for ortho views, GeoTIFF; NAME.tif or NAME.png leaves out the EXR. A folder with --trajectory.",
+    ),
+]
+Dem = Annotated[
+    Path | None,
+    typer.Option(
+        "--dem",
+        metavar="DEM",
+        help="Render this DEM (any GDAL format, or scene.h5) with one reflectance everywhere.",
+    ),
+]
+Model = Annotated[
+    str | None,
+    typer.Option(
+        "--model",
+        autocompletion=complete_model,
+        help="Reflectance model for --dem; 'lunargr models' lists them.",
+    ),
+]
+Parameters = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--parameters",
+        metavar="NAME=VALUE,...",
+        help="Model parameters for --dem, such as w=0.3,theta_deg=20; the others take their defaults.",
+    ),
+]
+Extend = Annotated[
+    Path | None,
+    typer.Option("--extend", metavar="FILE", help="diagnosis.h5: add the effects that it names."),
+]
+# The Sun, and other light
+SunAzimuth = Annotated[
+    float | None,
+    typer.Option("--sun-azimuth", metavar="DEG", help="Azimuth of the Sun at the map centre, clockwise from north."),
+]
+SunElevation = Annotated[
+    float | None, typer.Option("--sun-elevation", metavar="DEG", help="Elevation of the Sun at the map centre.")
+]
+SubsolarLongitude = Annotated[
+    float | None,
+    typer.Option(
+        "--subsolar-longitude",
+        metavar="DEG",
+        help="East longitude of the sub-solar point, instead of azimuth and elevation.",
+    ),
+]
+SubsolarLatitude = Annotated[
+    float | None, typer.Option("--subsolar-latitude", metavar="DEG", help="Latitude of the sub-solar point.")
+]
+SolarDistance = Annotated[
+    float | None,
+    typer.Option("--solar-distance", metavar="AU", help="Distance of the Sun; sets the penumbra (default: 1)."),
+]
+Time = Annotated[
+    str | None,
+    typer.Option("--time", metavar="UTC", help="Time, instead of a direction of the Sun, such as 2010-11-09T13:06:40."),
+]
+Shadows = Annotated[bool, typer.Option("--shadows/--no-shadows", help="Cast shadows with the Sun's disc.")]
+Bounce = Annotated[
+    bool, typer.Option("--bounce", help="Add light that sunlit terrain scatters onto other terrain, once.")
+]
+Earthshine = Annotated[
+    bool,
+    typer.Option(
+        "--earthshine", help="Add light from the Earth, at --time or from --earth-azimuth and --earth-elevation."
+    ),
+]
+EarthAzimuth = Annotated[
+    float | None,
+    typer.Option(
+        "--earth-azimuth", metavar="DEG", help="Azimuth of the Earth at the map centre, clockwise from north."
+    ),
+]
+EarthElevation = Annotated[
+    float | None, typer.Option("--earth-elevation", metavar="DEG", help="Elevation of the Earth at the map centre.")
+]
+# A camera
+View = Annotated[
+    str | None,
+    typer.Option(
+        "--view",
+        metavar="ortho|pinhole",
+        help="ortho: the map's own grid (default); pinhole: a camera, as options of a camera imply.",
+    ),
+]
+Position = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LON,LAT,ALT",
+        help="Camera position: degrees, and metres above the reference sphere. In ortho views: the point from which the ground is seen.",
+    ),
+]
+LookAt = Annotated[
+    str | None,
+    typer.Option(
+        "--look-at", metavar="LON,LAT[,ALT]", help="Ground point at the image centre (default: straight down)."
+    ),
+]
+Quaternion = Annotated[
+    str | None,
+    typer.Option(
+        metavar="W,X,Y,Z",
+        help="Rotation from camera axes (right, down, forward) to body-fixed, instead of --look-at.",
+    ),
+]
+Roll = Annotated[
+    float | None, typer.Option("--roll", metavar="DEG", help="Turn the camera clockwise about its line of sight.")
+]
+Fov = Annotated[
+    float | None,
+    typer.Option("--fov", metavar="DEG", help=f"Field of view across the image's width (default: {Config.fov_deg:g})."),
+]
+Size = Annotated[
+    str | None,
+    typer.Option(
+        "--size", metavar="W,H", help=f"Image size in pixels (default: {','.join(map(str, Config.size_px))})."
+    ),
+]
+Camera = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Camera model (pinhole JSON, ALE/CSM ISD, ...) in place of the options above."),
+]
+Samples = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="N x N rays per pixel (default: one per DEM pixel and axis, 2 to 8)."),
+]
+# A map
+BackplanesInTif = Annotated[
+    bool, typer.Option("--backplanes", help="Ortho views: also write the backplanes into the GeoTIFF.")
+]
+# A trajectory
+Trajectory = Annotated[
+    Path | None,
+    typer.Option(metavar="CSV", help="Table with one view per row (docs/render.md); --output then names a folder."),
+]
+Export = Annotated[
+    str | None,
+    typer.Option(
+        "--export",
+        metavar="colmap|nerfstudio",
+        help="With --trajectory: also write the views as a COLMAP or Nerfstudio data set.",
+    ),
+]
+PngOnly = Annotated[bool, typer.Option("--png-only", help="With --trajectory: write no EXR files.")]
+# Stereo pairs
+Stereo = Annotated[
+    int | None,
+    typer.Option(
+        "--stereo", metavar="N", help="Write N stereo pairs with dense correspondences into the folder --output."
+    ),
+]
+Altitude = Annotated[
+    float | None, typer.Option(metavar="M", help="With --stereo: height of both cameras above the ground.")
+]
+Convergence = Annotated[
+    str,
+    typer.Option(metavar="LOW,HIGH", help="With --stereo: range of the angle between both lines of sight, deg."),
+]
+
+
 def command(
-    source: Annotated[
-        Path | None, typer.Argument(metavar="[SVBRDF.h5]", help="Reflectance map from 'lunargr infer'.")
-    ] = None,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            help="NAME.exr writes EXR, PNG and, for ortho views, GeoTIFF; NAME.tif or NAME.png leaves out the EXR. A folder with --trajectory.",
-        ),
-    ] = Path("render.exr"),
-    dem: Annotated[
-        Path | None,
-        typer.Option(
-            "--dem",
-            metavar="DEM",
-            help="Render this DEM (any GDAL format, or scene.h5) with one reflectance everywhere.",
-        ),
-    ] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            "--model",
-            autocompletion=complete_model,
-            help="Reflectance model for --dem; 'lunargr models' lists them.",
-        ),
-    ] = None,
-    parameters: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--parameters",
-            metavar="NAME=VALUE,...",
-            help="Model parameters for --dem, such as w=0.3,theta_deg=20; the others take their defaults.",
-        ),
-    ] = None,
-    view: Annotated[
-        str | None,
-        typer.Option(
-            "--view",
-            metavar="ortho|pinhole",
-            help="ortho: the map's own grid (default); pinhole: a camera, as options of a camera imply.",
-        ),
-    ] = None,
-    sun_azimuth_deg: Annotated[
-        float | None,
-        typer.Option(
-            "--sun-azimuth", metavar="DEG", help="Azimuth of the Sun at the map centre, clockwise from north."
-        ),
-    ] = None,
-    sun_elevation_deg: Annotated[
-        float | None, typer.Option("--sun-elevation", metavar="DEG", help="Elevation of the Sun at the map centre.")
-    ] = None,
-    subsolar_longitude_deg: Annotated[
-        float | None,
-        typer.Option(
-            "--subsolar-longitude",
-            metavar="DEG",
-            help="East longitude of the sub-solar point, instead of azimuth and elevation.",
-        ),
-    ] = None,
-    subsolar_latitude_deg: Annotated[
-        float | None, typer.Option("--subsolar-latitude", metavar="DEG", help="Latitude of the sub-solar point.")
-    ] = None,
-    solar_distance_au: Annotated[
-        float | None,
-        typer.Option("--solar-distance", metavar="AU", help="Distance of the Sun; sets the penumbra (default: 1)."),
-    ] = None,
-    time: Annotated[
-        str | None,
-        typer.Option(
-            "--time", metavar="UTC", help="Time, instead of a direction of the Sun, such as 2010-11-09T13:06:40."
-        ),
-    ] = None,
-    position: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LON,LAT,ALT",
-            help="Camera position: degrees, and metres above the reference sphere. In ortho views: the point from which the ground is seen.",
-        ),
-    ] = None,
-    look_at: Annotated[
-        str | None,
-        typer.Option(
-            "--look-at", metavar="LON,LAT[,ALT]", help="Ground point at the image centre (default: straight down)."
-        ),
-    ] = None,
-    quaternion: Annotated[
-        str | None,
-        typer.Option(
-            metavar="W,X,Y,Z",
-            help="Rotation from camera axes (right, down, forward) to body-fixed, instead of --look-at.",
-        ),
-    ] = None,
-    roll_deg: Annotated[
-        float | None, typer.Option("--roll", metavar="DEG", help="Turn the camera clockwise about its line of sight.")
-    ] = None,
-    fov_deg: Annotated[
-        float | None,
-        typer.Option(
-            "--fov", metavar="DEG", help=f"Field of view across the image's width (default: {Config.fov_deg:g})."
-        ),
-    ] = None,
-    size_px: Annotated[
-        str | None,
-        typer.Option(
-            "--size", metavar="W,H", help=f"Image size in pixels (default: {','.join(map(str, Config.size_px))})."
-        ),
-    ] = None,
-    camera: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Camera model (pinhole JSON, ALE/CSM ISD, ...) in place of the options above."
-        ),
-    ] = None,
-    samples: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="N x N rays per pixel (default: one per DEM pixel and axis, 2 to 8)."),
-    ] = None,
-    trajectory: Annotated[
-        Path | None,
-        typer.Option(metavar="CSV", help="Table with one view per row (docs/render.md); --output then names a folder."),
-    ] = None,
-    export: Annotated[
-        str | None,
-        typer.Option(
-            "--export",
-            metavar="colmap|nerfstudio",
-            help="With --trajectory: also write the views as a COLMAP or Nerfstudio data set.",
-        ),
-    ] = None,
-    stereo: Annotated[
-        int | None,
-        typer.Option(
-            "--stereo", metavar="N", help="Write N stereo pairs with dense correspondences into the folder --output."
-        ),
-    ] = None,
-    altitude: Annotated[
-        float | None, typer.Option(metavar="M", help="With --stereo: height of both cameras above the ground.")
-    ] = None,
-    convergence: Annotated[
-        str,
-        typer.Option(metavar="LOW,HIGH", help="With --stereo: range of the angle between both lines of sight, deg."),
-    ] = CONVERGENCE,
+    source: Source = None,
+    output: RenderOutput = Path("render.exr"),
+    dem: Dem = None,
+    model: Model = None,
+    parameters: Parameters = None,
+    view: View = None,
+    sun_azimuth_deg: SunAzimuth = None,
+    sun_elevation_deg: SunElevation = None,
+    subsolar_longitude_deg: SubsolarLongitude = None,
+    subsolar_latitude_deg: SubsolarLatitude = None,
+    solar_distance_au: SolarDistance = None,
+    time: Time = None,
+    position: Position = None,
+    look_at: LookAt = None,
+    quaternion: Quaternion = None,
+    roll_deg: Roll = None,
+    fov_deg: Fov = None,
+    size_px: Size = None,
+    camera: Camera = None,
+    samples: Samples = None,
+    trajectory: Trajectory = None,
+    export: Export = None,
+    stereo: Stereo = None,
+    altitude: Altitude = None,
+    convergence: Convergence = CONVERGENCE,
     seed: Seed = StereoConfig.seed,
-    extend: Annotated[
-        Path | None,
-        typer.Option("--extend", metavar="FILE", help="diagnosis.h5: add the effects that it names."),
-    ] = None,
-    shadows: Annotated[
-        bool, typer.Option("--shadows/--no-shadows", help="Cast shadows with the Sun's disc.")
-    ] = Config.shadows,
-    bounce: Annotated[
-        bool, typer.Option("--bounce", help="Add light that sunlit terrain scatters onto other terrain, once.")
-    ] = Config.bounce,
-    earthshine: Annotated[
-        bool,
-        typer.Option(
-            "--earthshine", help="Add light from the Earth, at --time or from --earth-azimuth and --earth-elevation."
-        ),
-    ] = Config.earthshine,
-    earth_azimuth_deg: Annotated[
-        float | None,
-        typer.Option(
-            "--earth-azimuth", metavar="DEG", help="Azimuth of the Earth at the map centre, clockwise from north."
-        ),
-    ] = None,
-    earth_elevation_deg: Annotated[
-        float | None, typer.Option("--earth-elevation", metavar="DEG", help="Elevation of the Earth at the map centre.")
-    ] = None,
-    backplanes_in_tif: Annotated[
-        bool, typer.Option("--backplanes", help="Ortho views: also write the backplanes into the GeoTIFF.")
-    ] = Config.backplanes_in_tif,
-    png_only: Annotated[
-        bool, typer.Option("--png-only", help="With --trajectory: write no EXR files.")
-    ] = Config.png_only,
+    extend: Extend = None,
+    shadows: Shadows = Config.shadows,
+    bounce: Bounce = Config.bounce,
+    earthshine: Earthshine = Config.earthshine,
+    earth_azimuth_deg: EarthAzimuth = None,
+    earth_elevation_deg: EarthElevation = None,
+    backplanes_in_tif: BackplanesInTif = Config.backplanes_in_tif,
+    png_only: PngOnly = Config.png_only,
     body: BodyOption = None,
     shard: Shard = None,
     resume: Resume = False,
@@ -225,55 +254,73 @@ def command(
     lunargr render --dem dem.tif --model hapke --parameters w=0.25 --sun-azimuth 90 --sun-elevation 30 -o hapke.exr
     lunargr render svbrdf.h5 --trajectory descent.csv --sun-azimuth 90 --sun-elevation 30 -o views/
     """
-    path = source or dem
-    if path is None or (source and dem):
+    given = dict(locals())
+    path = _source(given)
+    config, mode = configure(Config, given, **_converted(given)), _mode(given)
+    console, to = Console(quiet), make_output(given)
+    if mode == "stereo":
+        low, high = read_list("--convergence", convergence, (2,)) or StereoConfig.convergence_deg
+        drawn = StereoConfig(stereo or 0, altitude, (low, high), seed=seed)
+        manifest = render.run_stereo(path, to, config, drawn, console.progress)
+        console.say(f"{manifest}: {stereo} stereo pairs")
+    elif trajectory is not None:
+        _show(render.run_trajectory(path, trajectory, to, config, console.progress), console)
+    else:
+        _show([render.run(path, to, config, console.progress)], console)
+
+
+def _source(given: Options) -> Path:
+    """The map or DEM. Raises ConfigError."""
+    source, dem = given["source"], given["dem"]
+    if (source is None) == (dem is None):
         raise ConfigError("render: expected a reflectance map (svbrdf.h5) or --dem DEM, one of the two.")
-    if parameters and dem is None:
+    if given["parameters"] and dem is None:
         raise ConfigError("--parameters: expected together with --dem; an svbrdf.h5 holds its own coefficients.")
-    attitude = (look_at, quaternion, roll_deg, fov_deg, size_px)
-    modes = [name for name, given in (("--camera", camera), ("--trajectory", trajectory)) if given]
-    if view == "ortho" and modes:
-        raise ConfigError(f"{modes[0]}: expected without --view ortho; leave one of them out.")
-    seen_by_camera = modes or stereo is not None or any(option is not None for option in attitude)
-    converted = {
-        "view": view or ("pinhole" if seen_by_camera else Config.view),
-        "roll_deg": Config.roll_deg if roll_deg is None else roll_deg,
-        "fov_deg": Config.fov_deg if fov_deg is None else fov_deg,
-        "position": read_list("--position", position, (3,)),
-        "look_at": read_list("--look-at", look_at, (2, 3)),
-        "quaternion": read_list("--quaternion", quaternion, (4,)),
-        "size_px": Config.size_px if size_px is None else _size(size_px),
-        "camera": str(camera) if camera else None,
-        "parameters": read_parameters(parameters),
-        "terrain_only": dem is not None,
-        "extend": str(extend) if extend else None,
-        "shard": parse_shard(shard),
-    }
-    config = configure(Config, locals(), **converted)
-    console, to = Console(quiet), Output(output, overwrite, resume, json=json_file)
-    if stereo is None and altitude is not None:
-        raise ConfigError("--altitude: expected together with --stereo; a single view has its height in --position.")
-    if stereo is None and convergence != CONVERGENCE:
-        raise ConfigError("--convergence: expected together with --stereo; a single view has no second camera.")
-    if stereo is not None:
-        own = (trajectory, camera, position, look_at, quaternion, roll_deg, shard, resume or None)
-        if any(option is not None for option in own):
+    return source or dem
+
+
+def _mode(given: Options) -> str:
+    """'view', 'trajectory' or 'stereo'; refuses options of the others. Raises ConfigError."""
+    mode = "stereo" if given["stereo"] is not None else "trajectory" if given["trajectory"] else "view"
+    if mode == "stereo":
+        own = ("trajectory", "camera", "position", "look_at", "quaternion", "roll_deg", "shard")
+        if given["resume"] or any(given[name] is not None for name in own):
             raise ConfigError(
                 "--stereo: expected without a camera's place and attitude, --trajectory, --shard and --resume; it draws its own."
             )
-        low, high = read_list("--convergence", convergence, (2,)) or StereoConfig.convergence_deg
-        drawn = StereoConfig(stereo, altitude, (low, high), seed=seed)
-        manifest = render.run_stereo(path, to, config, drawn, console.progress)
-        console.say(f"{manifest}: {stereo} stereo pairs")
-        return
-    if trajectory is not None:
-        _show(render.run_trajectory(path, trajectory, to, config, console.progress), console)
-        return
-    if shard is not None or resume:
+        return mode
+    if given["altitude"] is not None:
+        raise ConfigError("--altitude: expected together with --stereo; a single view has its height in --position.")
+    if given["convergence"] != CONVERGENCE:
+        raise ConfigError("--convergence: expected together with --stereo; a single view has no second camera.")
+    if mode == "view" and (given["shard"] is not None or given["resume"]):
         raise ConfigError(
             "--shard and --resume: expected together with --trajectory; a single view is one piece of work."
         )
-    _show([render.run(path, to, config, console.progress)], console)
+    return mode
+
+
+def _converted(given: Options) -> dict[str, Any]:
+    """The settings whose options are written in another form, and those that hang on others. Raises ConfigError."""
+    modes = [option for option in ("camera", "trajectory") if given[option]]
+    if given["view"] == "ortho" and modes:
+        raise ConfigError(f"--{modes[0]}: expected without --view ortho; leave one of them out.")
+    attitude = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px", "stereo")
+    seen_by_camera = modes or any(given[name] is not None for name in attitude)
+    return {
+        "view": given["view"] or ("pinhole" if seen_by_camera else Config.view),
+        "roll_deg": Config.roll_deg if given["roll_deg"] is None else given["roll_deg"],
+        "fov_deg": Config.fov_deg if given["fov_deg"] is None else given["fov_deg"],
+        "position": read_list("--position", given["position"], (3,)),
+        "look_at": read_list("--look-at", given["look_at"], (2, 3)),
+        "quaternion": read_list("--quaternion", given["quaternion"], (4,)),
+        "size_px": Config.size_px if given["size_px"] is None else _size(given["size_px"]),
+        "camera": str(given["camera"]) if given["camera"] else None,
+        "parameters": read_parameters(given["parameters"]),
+        "terrain_only": given["dem"] is not None,
+        "extend": str(given["extend"]) if given["extend"] else None,
+        "shard": parse_shard(given["shard"]),
+    }
 
 
 def _show(results: list[Summary], console: Console) -> None:

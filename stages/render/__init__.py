@@ -7,7 +7,7 @@ from pathlib import Path
 from schemas.files.outputs import Output
 from stages.common import runner
 from stages.common.progress import Progress, show_nothing
-from stages.render.config import Config, StereoConfig, Summary, check
+from stages.render.config import Config, StereoConfig, Summary, check, check_trajectory
 from stages.render.files import (
     as_json,
     input_files,
@@ -38,7 +38,13 @@ def run(source: Path, output: Output | Path, config: Config, progress: Progress 
     return work(source, Output.at(output).file, config, progress)
 
 
-@runner.stage(reads=input_files, writes=trajectory_targets, main=lambda call: None, content=as_json)
+@runner.stage(
+    reads=input_files,
+    writes=trajectory_targets,
+    main=lambda call: None,
+    check=lambda call: check_trajectory(call.config),
+    content=as_json,
+)
 def run_trajectory(
     source: Path, table: Path, output: Output | Path, config: Config, progress: Progress = show_nothing
 ) -> list[Summary]:

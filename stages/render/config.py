@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from schemas.errors import ConfigError
@@ -157,6 +157,19 @@ def check(config: Config, trajectory: bool = False, drawn_sun: bool = False) -> 
         raise ConfigError("`view` pinhole: expected `position` LON,LAT,ALT or `camera` FILE; found neither.")
     if config.quaternion is not None:
         refuse_ignored(config, "`quaternion`")
+
+
+def check_trajectory(config: Config) -> None:
+    """Refuse options that cannot go together in a trajectory. Raises ConfigError."""
+    if config.camera:
+        raise ConfigError("`trajectory`: expected no `camera`; each row places its own pinhole camera.")
+    check(replace(config, view="pinhole"), trajectory=True)
+    if config.export is not None and config.shard[1] > 1:
+        raise ConfigError(
+            "`export`: expected without `shard`; render the shards, then export with `resume` and no `shard`."
+        )
+    if config.export is not None and config.png_only:
+        raise ConfigError("`export`: expected EXR files, which hold the depths; drop `png_only`.")
 
 
 def refuse_ignored(config: Config, kind: str) -> None:

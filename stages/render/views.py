@@ -10,7 +10,7 @@ from typing import cast
 
 import numpy as np
 
-from schemas.errors import ConfigError, GeometryError, LunargrError
+from schemas.errors import GeometryError, LunargrError
 from schemas.files.companions import companions_of
 from schemas.files.locks import claim
 from schemas.files.outputs import Output
@@ -22,7 +22,7 @@ from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
 from stages.physics.terrain.shading import BACKPLANES, Light
 from stages.physics.terrain.surface import Surface
-from stages.render.config import SUN, Config, Summary, check
+from stages.render.config import SUN, Config, Summary
 from stages.render.dataset import EXPORT_PASSES, View, export_views
 from stages.render.files import finished, shard_of_views, view_files
 from stages.render.perspective import apply_sensor, make_scene, render_view
@@ -37,16 +37,7 @@ EACH = 3  # work of rendering a view, in passes of its export
 def render_trajectory(source: Path, table: Path, output: Output, config: Config, progress: Progress) -> list[Summary]:
     """See :func:`stages.render.run_trajectory`."""
     folder = output.file
-    if config.camera:
-        raise ConfigError("`trajectory`: expected no `camera`; each row places its own pinhole camera.")
     config = replace(config, view="pinhole")
-    check(config, trajectory=True)
-    if config.export is not None and config.shard[1] > 1:
-        raise ConfigError(
-            "`export`: expected without `shard`; render the shards, then export with `resume` and no `shard`."
-        )
-    if config.export is not None and config.png_only:
-        raise ConfigError("`export`: expected EXR files, which hold the depths; drop `png_only`.")
     body = find_body("moon" if config.body is None else config.body)
     views = shard_of_views(table, config)
     outputs = {view.view_id: view_files(folder, view.view_id, config) for view in views}
