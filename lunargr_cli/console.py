@@ -6,6 +6,7 @@ Names and texts come from files that others wrote: whatever is printed loses her
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import math
 import os
@@ -14,13 +15,16 @@ import sys
 import time
 import unicodedata
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from lunargr_cli import raise_again
-from lunargr_cli.progress import Pace, bar_line, progress_words
 from lunargr_cli.spelling import spell
 from schemas.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 _BEGAN = time.monotonic()
 LIBRARIES = "LUNARGR_LIBRARY_MESSAGES"  # set: what libraries print on standard error is let through
@@ -92,14 +96,15 @@ def say_resources() -> None:
 class Console:
     """The messages and progress of one command.
 
-    ``stage.run`` takes ``console.progress`` as a callable ``(done, total, what)``; on a terminal it is a bar that is redrawn,
-    in a log file a line every ten seconds.
+    A stage takes ``console.progress`` as a callable ``(done, total, what)``; on a terminal it is a bar that is redrawn,
+    in a log file a line every ten seconds. clock : in seconds
     """
 
     quiet: bool = False
-    _pace: Pace = field(default_factory=Pace)
+    clock: Callable[[], float] = time.monotonic
+    _bars: Progress | None = field(default=None)
     _shown: float | None = field(default=None)
-    _bar: bool = field(default=False)
+    _drawn: bool = field(default=False)
 
     def say(self, message: str) -> None:
         """A line for the person at the terminal."""
@@ -110,23 +115,49 @@ class Console:
     def progress(self, done: int, total: int, what: str = "") -> None:
         """Show how far a long loop is and how long it still takes."""
         raise_again()
-        times = self._pace.report(done, total)
-        terminal, now = sys.stderr.isatty(), time.monotonic()
+        if self.quiet:
+            return
+        terminal, now = sys.stderr.isatty(), self.clock()
         if self._shown is None:  # a short loop leaves one line in a log
             self._shown = -math.inf if terminal else now
-        if self.quiet or (done < total and now - self._shown < (0.1 if terminal else 10.0)):
+        bars = self._bars_of(done, total, terminal)
+        bars.update(bars.task_ids[0], completed=done, description=harmless(what or "progress"))
+        if (done < total and now - self._shown < (0.1 if terminal else 10.0)) or not (done or terminal):
             return
         self._shown = now
-        what = harmless(what or "progress")
-        if terminal:
-            plain = not (sys.stderr.encoding or "").lower().startswith("utf")
-            line = bar_line(what, done, total, times, shutil.get_terminal_size().columns, plain)
-            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
-            self._bar = True
-            if done >= total:
-                self._end_bar()
-        elif done:
-            print(f"{what}: {progress_words(done, total, times)}", file=sys.stderr, flush=True)
+        line = _one_line(bars, terminal)
+        print(f"\r\x1b[K{line}" if terminal else line, end="" if terminal else "\n", file=sys.stderr, flush=True)
+        self._drawn = terminal
+        if done >= total:
+            self._end_bar()
+
+    def _bars_of(self, done: int, total: int, terminal: bool) -> Progress:
+        """The progress of the loop that reports: another total, or a count that falls back, is another loop.
+
+        Its speed is that of its own last thousand reports: what a resumed run found finished does not count.
+        """
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            TaskProgressColumn,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+        task = self._bars.tasks[0] if self._bars else None
+        if self._bars is None or task is None or task.total != total or done < task.completed:
+            columns = [
+                TextColumn("{task.description}", markup=False),
+                *([BarColumn()] if terminal else []),
+                TaskProgressColumn(),
+                TimeElapsedColumn(),
+                TextColumn("left"),
+                TimeRemainingColumn(),
+            ]
+            self._bars = Progress(*columns, auto_refresh=False, get_time=self.clock, speed_estimate_period=math.inf)
+            self._bars.add_task("", total=total, completed=done)
+        return self._bars
 
     def table(self, title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         """A result table on standard output, plain enough for a log and a pipe."""
@@ -150,14 +181,26 @@ class Console:
 
     def _wipe_bar(self) -> None:
         """Take the unfinished bar away: the next report draws it again below what is said now."""
-        if self._bar:
+        if self._drawn:
             print("\r\x1b[K", end="", file=sys.stderr)
-            self._bar = False
+            self._drawn = False
 
     def _end_bar(self) -> None:
-        if self._bar:
+        if self._drawn:
             print(file=sys.stderr)
-            self._bar = False
+            self._drawn = False
+
+
+def _one_line(bars: Progress, terminal: bool) -> str:
+    """A progress as it is drawn: with colours and a bar on a terminal, in the characters that it has."""
+    from rich.console import Console as RichConsole
+
+    encoding = sys.stderr.encoding or "utf-8"
+    drawn = io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace", newline="")
+    width = max(20, shutil.get_terminal_size().columns - 1) if terminal else 160
+    RichConsole(file=drawn, width=width, force_terminal=terminal).print(bars.make_tasks_table(bars.tasks))
+    drawn.seek(0)
+    return drawn.readline().rstrip()
 
 
 def set_up_streams(verbose: bool = False) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import rasterio
 from cluster_scene import assert_same, environment, finish, lunargr, stages, start
+from command import outcome
 from small_scene import write_scene
 
 from schemas import PAIRS, SCENE, ArtefactError, ConfigError, InputError, atomic_path, open_artefact

@@ -138,7 +138,7 @@ def sato(tmp_path, rng):
 
 def test_convert_writes_the_same_reflectance(sato, tmp_path, monkeypatch):
     source, maps = sato
-    monkeypatch.setattr(convert, "BLOCK_VALUES", 5 * 9 * 8)  # eight rows at a time
+    monkeypatch.setattr("stages.convert.stage.BLOCK_VALUES", 5 * 9 * 8)  # eight rows at a time
     steps = []
     report = convert.run(
         source,

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from lunargr_cli import commands, spelling
-from lunargr_cli.options import join_numbers, parse_shard, read_names
+from lunargr_cli.options import join_numbers, parse_shard, read_names, read_parameters
 from schemas.errors import ConfigError
 
 MODULES = {
@@ -114,13 +114,13 @@ def test_lists_of_options_name_each_thing_once(tmp_path):
     from stages.simulate.hidden import hidden_from_option
 
     assert read_names("--maps", "w, b") == ("w", "b") and read_names("--maps", None) == ()
-    assert MODULES["render"]._parameters(["w=0.2", "b=0.3,c=1"]) == {"w": 0.2, "b": 0.3, "c": 1.0}
+    assert read_parameters(["w=0.2", "b=0.3,c=1"]) == {"w": 0.2, "b": 0.3, "c": 1.0}
     first, copy = tmp_path / "a.png", tmp_path / "b.png"
     cv2.imwrite(str(first), np.arange(256, dtype=np.uint8).reshape(16, 16))
     copy.write_bytes(first.read_bytes())
     for call in (
         lambda: read_names("--maps", "w,b,w"),
-        lambda: MODULES["render"]._parameters(["w=0.2", "w=0.3"]),
+        lambda: read_parameters(["w=0.2", "w=0.3"]),
         lambda: MODULES["compare"]._models("M1,m1"),
         lambda: hidden_from_option("echo:lag_px=3,lag_px=5"),
         lambda: _check_once([first, copy]),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -355,8 +354,6 @@ def _row(result: Summary) -> tuple[str, ...]:
         str(result.samples**2),
         files,
     )
-
-
 
 
 def _size(text: str) -> tuple[int, int]:
