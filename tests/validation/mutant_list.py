@@ -188,8 +188,8 @@ STAGES = (
     ),
     Mutant(
         "stages/project/stage.py",
-        "        math.atan2(east, north) % (2 * math.pi),",
-        "        math.atan2(north, east) % (2 * math.pi),",
+        "math.atan2(east, north) % (2 * math.pi))",
+        "math.atan2(north, east) % (2 * math.pi))",
         ("tests/test_project.py::test_terrain_outside_the_crop_casts_its_shadow",),
         "the horizon is taken towards a Sun counted from east",
     ),
