@@ -28,7 +28,7 @@ from stages.render.pictures import read_exr
 GSD, ALBEDO = 5.0, 0.3
 SUN = {"sun_azimuth_deg": 90.0, "sun_elevation_deg": 20.0}
 LAMBERT = {"model": "lambert", "parameters": {"albedo": ALBEDO}, "terrain_only": True}
-OVERHEAD = {"view": "pinhole", "position": (LON, LAT, 5000.0), "fov_deg": 5.0, "size_px": (64, 64)}  # 2.2 m a pixel
+OVERHEAD = {"view": "pinhole", "position": (LON, LAT, 5000.0), "fov_deg": 5.0, "size_px": (32, 32)}  # 4.4 m a pixel
 
 
 def bowl(n=200, radius=420.0, rim=300.0):
