@@ -140,7 +140,8 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):  # a Slurm time limit or `kill` unwinds like Ctrl-C
         signal.signal(number, stop)
     quiet_interruptions()
-    # What PyTorch's import makes would be looked through again and again: a sixth of the start.
+    # Objects of PyTorch's import are collected neither again and again nor, by freeze below, at the end. Measured on `infer` of a
+    # small scene: without both, 22 % more processor time.
     gc.set_threshold(10_000, 10, 10)
     try:
         try:
@@ -166,7 +167,7 @@ def main() -> None:
             os._exit(EXIT_CODE)
         raise
     finally:
-        gc.freeze()  # Python would look through everything once more while it ends: a quarter of a short command's time
+        gc.freeze()
 
 
 def _in_one_line(error: Exception) -> str | None:
