@@ -33,13 +33,10 @@ def inputs(small_files, small_artefacts, small_checkpoint):
     return small_artefacts | {"dem": small_files.dem, "images": small_files.images, "checkpoint": small_checkpoint}
 
 
-MADE_FIRST = {"ingest": "scene", "sample": "crops", "project": "pairs"}  # with the options that the commands are given
-
-
 @pytest.fixture(scope="module")
 def in_one_process(inputs, tmp_path_factory):
     """name -> what one uninterrupted process makes of it, made when first asked for."""
-    folder, made = tmp_path_factory.mktemp("one"), {k: inputs[v] for k, v in MADE_FIRST.items()}
+    folder, made = tmp_path_factory.mktemp("one"), {"project": inputs["pairs"]}
 
     def make(name):
         if name not in made:
