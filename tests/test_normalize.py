@@ -55,6 +55,19 @@ def test_the_factor_is_isis_mcewen_s(shared):
     assert len(rows) == 3 and (expected > 0).sum() >= 2
 
 
+def test_lambert_s_law_to_the_zenith_is_isis_albedo_mode(shared):
+    """ISIS' Albedo mode around Lambert's law brings I/F to the Sun in the zenith: the standard geometry (0, 0, 0).
+
+    Its other modes (Shade, Topo, Mixed) make shaded pictures, and MoonAlbedo adds Buratti's phase curve: no such factor.
+    """
+    rows = [r for r in read(shared / "oracles/isis_photometry_truth.csv") if r["model"] == "Albedo+Lambert"]
+    i, e, g = angles(rows)
+    lit = i < np.radians(89)
+    found = columns(rows, "dn_in")[0] * factor("lambert", {"albedo": 1.0}, i, e, g, standard=(0, 0, 0))
+    assert lit.sum() >= 2
+    np.testing.assert_allclose(found[lit], columns(rows, "expected")[0][lit], rtol=1e-5)
+
+
 def test_a_wac_image_comes_out_as_from_lrowacphomap(shared):
     """3,366 pixels through Sato's map to (60, 0, 60). ISIS takes the numerator from the map's 321 nm and the denominator from
     its 689 nm for an image at 415 nm (README of the tables): the difference is one ratio of I/F at the standard geometry.

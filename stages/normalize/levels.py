@@ -110,8 +110,7 @@ def find_levels(samples: Sequence[Sample], groups: Sequence[int], units: str, le
         pairs = [(s.predicted[s.images.index(k)], s.measured[s.images.index(k)]) for s in samples if k in s.images]
         expected, measured = (np.concatenate(v) for v in zip(*pairs, strict=True)) if pairs else (np.zeros(0),) * 2
         known = np.isfinite(expected)
-        if known.any():
-            gain[k], offset[k] = fit_line(expected[known], measured[known], True)
+        gain[k], offset[k] = fit_line(expected[known], measured[known], True) if known.any() else (np.nan, np.nan)
     levelled = level or units == "dn"
     raw = [_logarithms((s.measured - offset[s.images, None]) / gain[s.images, None]) for s in samples]
     logs = [v + np.log(s.factor) for s, v in zip(samples, raw, strict=True)]
