@@ -12,7 +12,7 @@ from stages.pairs.reader import PairReader
 from stages.train.epoch import evaluate_loss, learn_epoch
 from stages.train.training import set_up
 
-RANKS = 2
+RANKS, BATCHES = 2, (1, 6)
 
 
 def learn(pairs, rank, ranks, batch):
@@ -27,21 +27,29 @@ def learn(pairs, rank, ranks, batch):
     return found
 
 
-def worker(rank, pairs, folder, batch):
+def worker(rank, pairs, folder):
     torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"file://{folder}/store", rank=rank, world_size=RANKS)
-    np.savez(f"{folder}/{rank}.npz", **learn(pairs, rank, RANKS, batch))
+    for batch in BATCHES:
+        np.savez(f"{folder}/{batch}-{rank}.npz", **learn(pairs, rank, RANKS, batch))
     dist.destroy_process_group()
 
 
-@pytest.mark.parametrize("batch", [1, 6])
-def test_two_processes_learn_like_one(batch, small_artefacts, tmp_path):
+@pytest.fixture(scope="module")
+def learned(small_artefacts, tmp_path_factory):
+    """A folder with what each of two processes learned of each batch."""
+    folder = tmp_path_factory.mktemp("processes")
+    torch.multiprocessing.spawn(worker, (small_artefacts["pairs"], str(folder)), nprocs=RANKS)
+    return folder
+
+
+@pytest.mark.parametrize("batch", BATCHES)
+def test_two_processes_learn_like_one(batch, small_artefacts, learned):
     """Both work on the crop of a batch of one: all numbers are then those of one process.
 
     They share larger batches. Each normalises by its own half on the CPU, and the network is another by a little.
     """
-    torch.multiprocessing.spawn(worker, (small_artefacts["pairs"], str(tmp_path), batch), nprocs=RANKS)
-    first, second = (dict(np.load(tmp_path / f"{rank}.npz")) for rank in range(RANKS))
+    first, second = (dict(np.load(learned / f"{batch}-{rank}.npz")) for rank in range(RANKS))
     for name, value in first.items():
         np.testing.assert_array_equal(value, second[name], err_msg=name)
     alone = learn(small_artefacts["pairs"], 0, 1, batch)
