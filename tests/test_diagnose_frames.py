@@ -104,7 +104,7 @@ def test_values_per_image_of_a_site_are_written_and_act_on_that_crop_alone(tmp_p
     path = tmp_path / "diagnosis.h5"
     answer = Answer("named", config={})
     answer.causes = [cause, other]
-    write_diagnosis(path, answer, ["A", "B", "C"], [], False)
+    write_diagnosis(path, answer, ["A", "B", "C"], [])
     with h5py.File(path) as file:
         table = file["frame_field"][()]
         assert table.shape == (3, 6, len(FIELD.coordinates)) and table.sum() == pytest.approx(0.1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import warnings
 import xml.etree.ElementTree as ElementTree
@@ -112,7 +113,7 @@ def band_wavelength(path: Path, band: int) -> float:
 
     band : counted from 1; GDAL and ENVI write `wavelength` (and its unit) as tags of a band, or describe it as "643 nm"
     """
-    if not path.is_file():
+    if not os.path.isfile(path):  # False, too, for a name that no file can have
         return math.nan
     label = read_label(path) if path.suffix.lower() == ".cub" else None
     centre = find_value(label, "Center") if label is not None else None
