@@ -26,7 +26,7 @@ from typing import Any
 
 LIMIT = 60  # seconds a case may take; those that are refused take far less
 HUGE = 1e30
-_PROGRESS = re.compile(r": \d+ %, ")  # how far a command had come
+_PROGRESS = re.compile(r"\d+% \d+:\d\d:\d\d\b")  # how far a command had come
 
 
 @dataclass(frozen=True)
