@@ -42,7 +42,7 @@ $(TESTED): $(STAMP)
 # How sources and pages are written: lint looks at it, test does not.
 STYLE := tests/test_docstrings.py tests/test_figures.py tests/test_layers.py tests/test_package.py
 
-test: $(TESTED) ## the tests that every change must pass (about eight minutes on two cores)
+test: $(TESTED) ## the tests that every change must pass (about nine minutes on two cores)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" $(STYLE:%=--ignore=%)
 
 test-slow: $(TESTED) ## the longer checks
