@@ -17,7 +17,7 @@ import numpy as np
 from rasterio.transform import Affine
 
 from stages.physics.cameras import open_camera
-from stages.physics.cameras.linescan import LineScan, _into
+from stages.physics.cameras.linescan import LineScan
 from stages.physics.images.orthorectify import Terrain, orthorectify
 from stages.physics.maps.grid import Grid, local_metric_crs
 
@@ -30,7 +30,8 @@ def numpy_search(camera: LineScan, points: np.ndarray) -> tuple[np.ndarray, np.n
 
     def row(line):
         times = camera.times(line)
-        place = camera.detector.places(_into(camera.rotations(times), points - camera.positions.at(times)))
+        looks = np.einsum("nij,ni->nj", camera.rotations(times), points - camera.positions.at(times))
+        place = camera.detector.places(looks)
         return place[0], place[1]
 
     before, line = np.full(len(points), camera.lines * 0.45), np.full(len(points), camera.lines * 0.55)
