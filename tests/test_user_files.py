@@ -24,6 +24,9 @@ def test_a_cell_in_quotes_may_hold_lines(tmp_path):
     names, rows = parse_csv(tmp_path, ' a ,b\r\n"x\r\ny",2\r\n', "a table")
     assert (names, rows) == (["a", "b"], [{"a": "x\r\ny", "b": "2"}])
     assert parse_csv(tmp_path, "", "a table") == ([], [])
+    assert len(parse_csv(tmp_path, "a,b\n1,2,,\n", "a table")[1]) == 1
+    with pytest.raises(InputError, match="expected 2 cells in row 2, as in the header, found more"):
+        parse_csv(tmp_path, "a,b\n1,2\n1,2,3\n", "a table")
 
 
 @pytest.mark.parametrize("text", ["1_0", "\u0661\u0662", ""])

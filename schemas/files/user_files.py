@@ -67,12 +67,18 @@ def parse_csv(path: Path, text: str, expected: str) -> tuple[list[str], list[dic
     """Column names and rows of the text of a CSV file. expected : what it should hold, for error lines. Raises InputError."""
     reader = csv.DictReader(io.StringIO(text, newline=""))
     try:
-        reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
-        return list(reader.fieldnames), list(reader)
+        names = reader.fieldnames = [name.strip() for name in reader.fieldnames or ()]
+        rows = list(reader)
     except csv.Error as error:
         raise InputError(
             f"{path}: expected {expected}, found no CSV that can be read ({error}); mend the file."
         ) from None
+    for number, row in enumerate(rows, start=1):
+        if any(row.get(None, ())):
+            raise InputError(
+                f"{path}: expected {len(names)} cells in row {number}, as in the header, found more; mend the file."
+            )
+    return names, rows
 
 
 def check_keys(found: Iterable[object], known: Collection[str], where: str) -> None:
