@@ -306,8 +306,9 @@ def _converted(given: Options) -> dict[str, Any]:
         raise ConfigError(f"--{modes[0]}: expected without --view ortho; leave one of them out.")
     attitude = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px", "stereo")
     seen_by_camera = modes or any(given[name] is not None for name in attitude)
+    implied = "pinhole" if seen_by_camera else Config.view
     return {
-        "view": given["view"] or ("pinhole" if seen_by_camera else Config.view),
+        "view": implied if given["view"] is None else given["view"],
         "roll_deg": Config.roll_deg if given["roll_deg"] is None else given["roll_deg"],
         "fov_deg": Config.fov_deg if given["fov_deg"] is None else given["fov_deg"],
         "position": read_list("--position", given["position"], (3,)),
