@@ -190,7 +190,10 @@ PngOnly = Annotated[bool, typer.Option("--png-only", help="With --trajectory: wr
 Stereo = Annotated[
     int | None,
     typer.Option(
-        "--stereo", metavar="N", help="Write N stereo pairs with dense correspondences into the folder --output."
+        "--stereo",
+        metavar="N",
+        max=100_000,  # names have five digits
+        help="Write N stereo pairs with dense correspondences into the folder --output.",
     ),
 ]
 Altitude = Annotated[
