@@ -186,6 +186,8 @@ def label_time(path: Path) -> str | None:
 
 
 def _labels_beside(path: Path) -> list[Path]:
+    if not path.name:  # '.', which the stage refuses
+        return []
     return [path.with_suffix(s) for s in (".lbl", ".LBL", ".xml", ".XML") if path.suffix != s]
 
 
