@@ -18,6 +18,7 @@ import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
+from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -94,14 +95,12 @@ def diagnose(path: Path) -> dict:
     return stage.run(path).answer.to_json()
 
 
-def case(scene: Scene, effect: dict, seed: int, folder: Path, law: str = "linear", kind: str = "usual") -> dict:
+def make(scene: Scene, effect: dict, seed: int, path: Path, law: str = "linear", kind: str = "usual") -> dict:
+    """Write a case's pairs file; return its truth."""
     rng = np.random.default_rng((seed, 99))
     world = random_world(rng) | {"law": law} | WORLDS[kind][1]
     data = scene.make(Truth(effect=effect, **world), seed)
-    path = write_pairs(folder / "pairs.h5", data, scene.layout)
-    started = time.perf_counter()
-    found = diagnose(path)
-    seconds = time.perf_counter() - started
+    write_pairs(path, data, scene.layout)
     fid, possible = 0.0, None
     if effect:
         fid, possible = strength(data, scene.make(Truth(**world), seed), scene.layout.gsd)
@@ -114,9 +113,16 @@ def case(scene: Scene, effect: dict, seed: int, folder: Path, law: str = "linear
         "drawn": drawn(scene, Truth(effect=effect, **world), seed),
         "fid": fid,
         "possible_gain_percent": possible,
-        "seconds": seconds,
-        "answer": found,
     }
+
+
+def case(scene: Scene, effect: dict, seed: int, folder: Path, law: str = "linear", kind: str = "usual") -> dict:
+    """Make a case's file and diagnose it."""
+    path = folder / "pairs.h5"
+    truth = make(scene, effect, seed, path, law, kind)
+    started = time.perf_counter()
+    answer = diagnose(path)
+    return truth | {"seconds": time.perf_counter() - started, "answer": answer}
 
 
 def summarise(cases: list[dict]) -> str:
@@ -356,17 +362,19 @@ def _go_with_the_parent(parent: int) -> None:
 
 
 def work(layout: Layout, cache: Path, seed: int, job: dict, law: str, kind: str) -> dict:
-    """One case in a process of its own, on one thread; the scene stays for the next."""
+    """One case in a process of its own, on one thread."""
     import torch
 
     torch.set_num_threads(1)
-    if _scene.get("layout") != layout:
-        _scene.update(layout=layout, scene=Scene(layout, cache))
     with tempfile.TemporaryDirectory() as name:
-        return case(_scene["scene"], aimed(job, _scene["scene"]), seed, Path(name), law, kind)
+        scene = scene_of(layout, cache)
+        return case(scene, aimed(job, scene), seed, Path(name), law, kind)
 
 
-_scene: dict = {}
+@lru_cache(maxsize=4)
+def scene_of(layout: Layout, cache: Path) -> Scene:
+    """A scene stays for the cases after it."""
+    return Scene(layout, cache)
 
 
 def aimed(job: dict, scene: Scene) -> dict:
