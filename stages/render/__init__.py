@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from schemas.files.outputs import Output
 from stages.common import runner
@@ -18,7 +19,19 @@ from stages.render.files import (
     view_targets,
 )
 
-__all__ = ["Config", "StereoConfig", "Summary", "run", "run_stereo", "run_trajectory"]
+if TYPE_CHECKING:
+    from stages.render.renderer import Frame, Renderer
+
+__all__ = ["Config", "Frame", "Renderer", "StereoConfig", "Summary", "run", "run_stereo", "run_trajectory"]
+
+
+def __getattr__(name: str) -> Any:
+    """The classes that need what is slow to import, on first use."""
+    if name in ("Frame", "Renderer"):
+        from stages.render import renderer
+
+        return getattr(renderer, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 @runner.stage(

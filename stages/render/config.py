@@ -21,6 +21,14 @@ SUN = (
     "solar_distance_au",
     "time",
 )
+CAMERA = (
+    "position",
+    "look_at",
+    "quaternion",
+    "roll_deg",
+    "fov_deg",
+    "size_px",
+)  # of a view, in place of a camera model
 
 # What each kind of view does not look at: set all the same, it would be ignored.
 _ATTITUDE = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px")

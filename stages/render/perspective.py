@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
@@ -22,6 +25,7 @@ from stages.physics.formation.geometry import Angles
 from stages.physics.maps.grid import CSM_CENTRE, Grid
 from stages.physics.maps.window import Window
 from stages.physics.photometry import masked_radiance_factor
+from stages.physics.terrain.further_light import Horizon
 from stages.physics.terrain.shading import (
     BACKPLANES,
     HALO_PX,
@@ -32,30 +36,87 @@ from stages.physics.terrain.shading import (
 )
 from stages.physics.terrain.sun_visibility import visible_share
 from stages.physics.terrain.surface import Surface
-from stages.render.ray_points import HitAngles, hit_angles, hit_points, sample_maps
+from stages.render.ray_points import HitAngles, hit_angles, sample_maps
 from stages.render.raycast import HIT, MISS, HeightField, Hits, build_height_field, cast
 from stages.render.viewpoint import pixel_footprint
 
 MOST_SAMPLES = 8  # rays per pixel and axis; beyond, the terrain itself is averaged first
-RAYS_AT_ONCE = 1 << 19
+RAYS_AT_ONCE = 1 << 17  # arrays of them stay in a processor's cache
 BLOCK_PX = 512  # of further light at once
 LATTICE = 33  # rays per axis of the first look
+LARGEST_GROUND = 1 << 25  # pixels of a surface that are kept for later views, for each of MOST_GROUNDS resolutions
+MOST_GROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A window of a surface at the resolution that an image's pixels need: all that depends on no Sun and no camera.
+
+    factor : pixels of the surface along one of ``grid``; maps : (C, h, w) coefficients or (C, 1, 1)
+    horizons : towards each Sun, (h, w), rad; kept as long as the Sun's own horizon is
+    """
+
+    window: Window
+    factor: int
+    grid: Grid
+    field: HeightField
+    maps: Floats32
+    horizons: WeakKeyDictionary[Horizon, Floats32] = dataclasses.field(default_factory=WeakKeyDictionary)
+
+    def horizon(self, towards: Horizon | None) -> Floats32 | None:
+        """(h, w), rad; None where nothing casts shadows."""
+        if towards is not None and towards not in self.horizons:
+            self.horizons[towards] = self.coarse(towards.window(*self.window))
+        return None if towards is None else self.horizons[towards]
+
+    def coarse(self, values: Floats32) -> Floats32:
+        """(..., h, w) on ``grid`` from values on the window's own pixels."""
+        return values if self.factor == 1 else coarsen(values, self.factor)
+
+
+class Grounds:
+    """The grounds of a surface that views have seen, one for each resolution, grown to hold all of them up to LARGEST_GROUND pixels."""
+
+    def __init__(self, surface: Surface) -> None:
+        self._surface = surface
+        self._kept: OrderedDict[int, Ground] = OrderedDict()
+
+    def over(self, window: Window, factor: int) -> Ground:
+        """A ground that holds ``window``, at blocks of ``factor`` x ``factor`` pixels. Raises GeometryError."""
+        kept = self._kept.pop(factor, None)
+        if kept is None or kept.window.union(window) != kept.window:
+            whole = window if kept is None else kept.window.union(window)
+            kept = make_ground(self._surface, whole if whole.height * whole.width <= LARGEST_GROUND else window, factor)
+        self._kept[factor] = kept
+        while len(self._kept) > MOST_GROUNDS:
+            self._kept.popitem(last=False)
+        return kept
+
+
+def make_ground(surface: Surface, window: Window, factor: int) -> Ground:
+    """Read a window and prepare it for rays. Raises GeometryError."""
+    elevation, maps = surface.elevation[window.part], surface.read_coefficients(*window)
+    grid = surface.grid.window(*window)
+    if factor > 1:
+        elevation = coarsen(elevation, factor)
+        maps = coarsen(maps, factor) if maps.shape[1] > 1 else maps
+        transform = grid.transform @ Affine.scale(factor)
+        grid = Grid(grid.crs_wkt, transform, elevation.shape[0], elevation.shape[1], grid.radius)
+    return Ground(window, factor, grid, build_height_field(elevation, grid), maps)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The part of a surface that a camera sees, at the resolution that its pixels need.
+    """What a camera sees of a surface in some light.
 
-    grid : of that part; maps : (C, h, w) coefficients or (C, 1, 1); horizon : (h, w), rad, or None
+    ground : with no coefficients where extensions have shaded it; horizon : (h, w), rad, or None
     lit : (2, h, w) I/F where extensions have shaded the ground beforehand, and where it was clipped at 0; or None
     added : (h, w) I/F that the Earth and the terrain around add, or None
     samples : rays per pixel and axis; distance : from the camera to the ground, m
     deviation : (h, w) I/F, standard deviation of photographs about the ground's I/F, or None where it is not asked for
     """
 
-    grid: Grid
-    field: HeightField
-    maps: Floats32
+    ground: Ground
     horizon: Floats32 | None
     lit: Floats32 | None
     added: Floats32 | None
@@ -127,6 +188,14 @@ def shell_crossing(origins: Floats, directions: Floats, inner: float, outer: flo
     return np.where(missed, np.nan, near), np.where(missed, np.nan, far)
 
 
+def no_ground(surface: Surface) -> str:
+    """The error line of a view whose rays all miss valid ground."""
+    return (
+        f"the view misses {surface.path.name}: no pixel sees valid ground; "
+        "check the camera's place, `look_at` (or `quaternion`) and `fov_deg`."
+    )
+
+
 def _misses(surface: Surface) -> str:
     grid = surface.grid
     lon, lat = grid.lonlat((grid.height - 1) / 2, (grid.width - 1) / 2)
@@ -166,40 +235,27 @@ def make_scene(
     relief: tuple[float, float],
     samples: int | None,
     errors: bool = False,
+    grounds: Grounds | None = None,
 ) -> Scene:
     """Read and prepare what a camera sees, with its standard deviations if ``errors``. Raises GeometryError.
 
-    relief : lowest and highest elevation, m; samples : see :func:`seen_window`
+    relief : lowest and highest elevation, m; samples : see :func:`seen_window`; grounds : of earlier views
     """
     window, samples, factor, distance = seen_window(surface, camera, relief, samples)
-    grid = surface.grid.window(*window)
-    elevation = surface.elevation[window.part]
-    horizon = None if light.horizon is None else light.horizon.window(*window)
+    window = window.widened(factor, surface.elevation.shape)
+    if errors or light.extensions or light.earthshine is not None or light.bounce is not None:
+        grounds = None  # light that depends on the camera's place is worth computing for what it sees only
+    ground = (grounds or Grounds(surface)).over(window, factor)
     around = window.padded(HALO_PX, surface.elevation.shape) if light.extensions else window
     lit, added = None, _added(surface, light, around)
     if light.extensions:
         # the sensor comes last: its effects act on the camera's image, not on the ground
-        ground = replace(light, extensions=[e for e in light.extensions if e.slot != "sensor"])
-        lit, added = np.stack(form_window(surface, ground, window, added)), None
-        maps = np.zeros((0, 1, 1), np.float32)
-    else:
-        maps = surface.read_coefficients(*window)
+        before = replace(light, extensions=[e for e in light.extensions if e.slot != "sensor"])
+        lit, added = np.stack(form_window(surface, before, window, added)), None
     deviation = _blocks(window, lambda b: _deviation(surface, light, b, lit, window)) if errors else None
-    if factor > 1:
-        elevation = coarsen(elevation, factor)
-        (
-            horizon,
-            lit,
-            added,
-            deviation,
-        ) = (  # errors of neighbours are alike: the deviation of a mean is the mean of theirs
-            None if values is None else coarsen(values, factor) for values in (horizon, lit, added, deviation)
-        )
-        if maps.shape[1] > 1:
-            maps = coarsen(maps, factor)
-        coarse = grid.transform @ Affine.scale(factor)
-        grid = Grid(grid.crs_wkt, coarse, elevation.shape[0], elevation.shape[1], grid.radius)
-    return Scene(grid, build_height_field(elevation, grid), maps, horizon, lit, added, samples, distance, deviation)
+    # errors of neighbours are alike: the deviation of a mean is the mean of theirs
+    lit, added, deviation = (None if v is None else ground.coarse(v) for v in (lit, added, deviation))
+    return Scene(ground, ground.horizon(light.horizon), lit, added, samples, distance, deviation)
 
 
 def _added(surface: Surface, light: Light, window: Window) -> Floats32 | None:
@@ -249,11 +305,15 @@ def render_view(surface: Surface, camera: Camera, light: Light, scene: Scene) ->
     for first in range(0, camera.lines, lines_at_once):
         count = min(lines_at_once, camera.lines - first)
         centre = _trace(camera, scene, first, count, 1)
-        band = _backplanes(light, scene, centre)
+        light_there = _light_at(light, scene, centre)
+        band = dict(zip(BACKPLANES, _backplanes(centre, *light_there), strict=True))
         if scene.deviation is not None:
             band["image_std"] = sample_maps(scene.deviation[None], centre.hits)[0]
-        fine = centre if scene.samples == 1 else _trace(camera, scene, first, count, scene.samples)
-        radiance, clipped = _radiance(surface, light, scene, fine)
+        fine = centre
+        if scene.samples > 1:
+            fine = _trace(camera, scene, first, count, scene.samples)
+            light_there = None if scene.lit is not None else _light_at(light, scene, fine)
+        radiance, clipped = _radiance(surface, scene, fine, light_there)
         band["image"] = _mean(radiance, count, camera.samples, scene.samples)
         band["clipped"] = (_mean(clipped, count, camera.samples, scene.samples) > 0).astype(np.float32)
         yield {k: v.reshape(count, camera.samples) for k, v in band.items()}
@@ -275,7 +335,7 @@ def _trace(camera: Camera, scene: Scene, first: int, count: int, samples: int) -
     columns = (np.arange(camera.samples)[:, None] + offset).ravel()
     line, sample = np.meshgrid(lines, columns, indexing="ij")
     origins, directions = _rays(camera, line.ravel(), sample.ravel())
-    return _Rays(origins, directions, cast(scene.field, origins, directions))
+    return _Rays(origins, directions, cast(scene.ground.field, origins, directions))
 
 
 def _rays(camera: Camera, line: Floats, sample: Floats) -> tuple[Floats, Floats]:
@@ -300,26 +360,32 @@ def _pinhole_rays(focal, point, rotation, line, sample, directions):
 
 def _light_at(light: Light, scene: Scene, rays: _Rays) -> tuple[HitAngles, Floats32]:
     """Angles and visible share of the Sun at the hits, (N,)."""
-    angles = hit_angles(scene.field, rays.origins, rays.directions, rays.hits, light.sun.position)
+    angles = hit_angles(scene.ground.field, rays.origins, rays.directions, rays.hits, light.sun.position)
     if scene.horizon is None:
         return angles, np.ones(len(rays.directions), np.float32)
     horizon = sample_maps(scene.horizon[None], rays.hits)[0]
     return angles, visible_share(angles.sun_elevation, horizon, light.sun.radius)
 
 
-def _radiance(surface: Surface, light: Light, scene: Scene, rays: _Rays) -> tuple[Floats32, Floats32]:
-    """(N,) I/F along rays: NaN where unknown, 0 in space; and (N,) above 0 where the model's I/F was clipped at 0."""
+def _radiance(
+    surface: Surface, scene: Scene, rays: _Rays, light_there: tuple[HitAngles, Floats32] | None
+) -> tuple[Floats32, Floats32]:
+    """(N,) I/F along rays: NaN where unknown, 0 in space; and (N,) above 0 where the model's I/F was clipped at 0.
+
+    light_there : of the rays' hits, as :func:`_light_at` gives it; not needed where extensions have lit the ground
+    """
     if scene.lit is not None:
         image, clipped = sample_maps(scene.lit, rays.hits)
     else:
-        found, visible = _light_at(light, scene, rays)
+        assert light_there is not None
+        found, visible = light_there
         cosines = (torch.from_numpy(found.cos_incidence), torch.from_numpy(found.cos_emission))
         phase = torch.from_numpy(found.phase)
         angles = Angles(*cosines, phase.cos(), phase_given=phase)
-        if scene.maps.shape[1] > 1:
-            coefficients = sample_maps(scene.maps, rays.hits)
+        if scene.ground.maps.shape[1] > 1:
+            coefficients = sample_maps(scene.ground.maps, rays.hits)
         else:
-            coefficients = np.ascontiguousarray(scene.maps[:, :, 0])
+            coefficients = np.ascontiguousarray(scene.ground.maps[:, :, 0])
         parameters = surface.model.unpack(torch.from_numpy(coefficients), dim=0)
         image = masked_radiance_factor(surface.model, parameters, angles).numpy()
         clipped = (image < 0).astype(np.float32)
@@ -340,7 +406,7 @@ def _in_space(scene: Scene, rays: _Rays) -> NDArray[np.bool_]:
     origins = rays.origins if single else rays.origins[missed]
     along = (origins * rays.directions[missed]).sum(-1)
     closest2 = (origins * origins).sum(-1) - along**2
-    missed[missed] = (closest2 > (scene.grid.radius + scene.field.lowest) ** 2) | (along > 0)
+    missed[missed] = (closest2 > (scene.ground.grid.radius + scene.ground.field.lowest) ** 2) | (along > 0)
     return missed
 
 
@@ -358,22 +424,38 @@ def _mean(values: Floats32, lines: int, width: int, samples: int) -> Floats32:
         return np.where(2 * count >= samples**2, total / count, np.nan).astype(np.float32)
 
 
-def _backplanes(light: Light, scene: Scene, rays: _Rays) -> dict[str, Floats32]:
-    """(N,) by name, as in BACKPLANES."""
-    angles, visible = _light_at(light, scene, rays)
-    points = hit_points(rays.hits, rays.origins, rays.directions)
-    shadow = np.where(angles.cos_incidence > 0, 1 - visible, np.float32(1))
-    shadow[np.isnan(angles.cos_incidence)] = np.nan
-    planes = (
-        np.degrees(np.arccos(np.clip(angles.cos_incidence, -1, 1))),
-        np.degrees(np.arccos(np.clip(angles.cos_emission, -1, 1))),
-        np.degrees(angles.phase),
-        shadow,
-        rays.hits.depth,
-        np.degrees(np.arctan2(points[:, 1], points[:, 0])),
-        np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))),
-    )
-    return {name: plane.astype(np.float32) for name, plane in zip(BACKPLANES, planes, strict=True)}
+def _backplanes(rays: _Rays, angles: HitAngles, visible: Floats32) -> Floats32:
+    """(planes, N) in the order of BACKPLANES."""
+    out = np.empty((len(BACKPLANES), len(visible)), np.float32)
+    _fill_backplanes(
+        rays.origins, rays.directions, rays.hits.depth, angles.cos_incidence, angles.cos_emission, angles.phase,
+        visible, out,
+    )  # fmt: skip
+    return out
+
+
+@numba.njit(cache=True, parallel=True)
+def _fill_backplanes(origins, directions, depth, cos_incidence, cos_emission, phase, visible, out):
+    stride = 0 if origins.shape[0] == 1 else 1
+    degree = 180.0 / math.pi
+    for n in numba.prange(len(depth)):
+        if depth[n] != depth[n]:
+            out[:, n] = np.nan
+            continue
+        x = origins[n * stride, 0] + depth[n] * directions[n, 0]
+        y = origins[n * stride, 1] + depth[n] * directions[n, 1]
+        z = origins[n * stride, 2] + depth[n] * directions[n, 2]
+        out[0, n] = math.acos(min(max(cos_incidence[n], -1.0), 1.0)) * degree
+        out[1, n] = math.acos(min(max(cos_emission[n], -1.0), 1.0)) * degree
+        out[2, n] = phase[n] * degree
+        out[3, n] = 1.0 - visible[n] if cos_incidence[n] > 0 else 1.0
+        if cos_incidence[n] != cos_incidence[n]:
+            out[0, n], out[3, n] = np.nan, np.nan
+        if cos_emission[n] != cos_emission[n]:
+            out[1, n] = np.nan
+        out[4, n] = depth[n]
+        out[5, n] = math.atan2(y, x) * degree
+        out[6, n] = math.atan2(z, math.hypot(x, y)) * degree
 
 
 def apply_sensor(image: Floats32, light: Light, grid: Grid) -> Floats32:

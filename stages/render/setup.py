@@ -41,15 +41,18 @@ def open_source(source: Path, config: Config, body: Body) -> Iterator[Surface]:
 
 
 def make_light(
-    surface: Surface, config: Config, body: Body, relief: tuple[float, float], camera: Camera | None = None
+    surface: Surface,
+    config: Config,
+    body: Body,
+    relief: tuple[float, float],
+    camera_sun: NDArray[np.float64] | None = None,
 ) -> Light:
-    """The light over a surface; a camera model that knows its Sun stands in for a Sun that nobody named. Raises LunargrError.
+    """The light over a surface. Raises LunargrError.
 
-    relief : lowest and highest elevation, m
+    relief : lowest and highest elevation, m; camera_sun : (3,), body-fixed, m, stands in for a Sun that nobody named
     """
-    known = camera.sun_position(np.array([camera.lines / 2])) if camera is not None and config.camera else None
-    if known is not None and all(getattr(config, name) is None for name in SUN):
-        sun = Sun(known[0], SUN_RADIUS * AU / float(np.linalg.norm(known[0])))
+    if camera_sun is not None and all(getattr(config, name) is None for name in SUN):
+        sun = Sun(camera_sun, SUN_RADIUS * AU / float(np.linalg.norm(camera_sun)))
     else:
         sun = _named_sun(surface, config, body)
     span = relief[1] - relief[0]
@@ -158,6 +161,12 @@ def _ground_height(surface: Surface, longitude_deg: float, latitude_deg: float) 
     r, c = round(row), round(col)
     value = float(surface.elevation[r : r + 1, c : c + 1][0, 0])
     return value if math.isfinite(value) else 0.0
+
+
+def camera_sun(camera: Camera) -> NDArray[np.float64] | None:
+    """(3,) body-fixed, m, the Sun that a camera model brings; None where it brings none."""
+    known = camera.sun_position(np.array([camera.lines / 2]))
+    return None if known is None else known[0]
 
 
 def camera_place(camera: Camera) -> NDArray[np.float64]:

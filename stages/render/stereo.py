@@ -17,14 +17,13 @@ import numpy as np
 from schemas.errors import ConfigError, GeometryError
 from stages.common.arrays import Floats, Floats32
 from stages.common.progress import Progress, show_nothing
-from stages.physics.bodies.spheres import Body, find_body
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.terrain.surface import Surface
 from stages.render.config import SUN, Config, StereoConfig, check
 from stages.render.dataset import World, make_world, project, ray_directions, write_text
 from stages.render.files import MANIFEST, output_files, pair_files, pair_names
 from stages.render.pictures import read_exr, write_exr
-from stages.render.setup import make_light, open_source
+from stages.render.renderer import Renderer
 from stages.render.viewpoint import look_at, pinhole_view
 from stages.render.views import render_camera
 
@@ -40,17 +39,16 @@ def render_stereo(source: Path, folder: Path, config: Config, stereo: StereoConf
     _check(config, stereo)
     manifest = folder / MANIFEST
     names = pair_names(stereo.count)
-    body = find_body("moon" if config.body is None else config.body)
     view_config = replace(config, view="pinhole", position=(0.0, 0.0, 0.0))
     check(view_config, drawn_sun=True)
     rng = np.random.default_rng(stereo.seed)
     pairs: list[dict[str, Any]] = []
-    with open_source(source, config, body) as surface:
-        relief, world = surface.height_range(), make_world(surface.grid)
-        places = _Places(surface, config, stereo, rng)
+    with Renderer(source, config) as renderer:
+        world = make_world(renderer.surface.grid)
+        places = _Places(renderer.surface, config, stereo, rng)
         for number, name in enumerate(names):
             progress(number, stereo.count, "pairs")
-            pairs.append(_render_pair(name, surface, places, view_config, body, relief, world, folder))
+            pairs.append(_render_pair(name, renderer, places, view_config, world, folder))
         document = {
             "source": source.name,
             "pixel_centre": 0.5,
@@ -122,9 +120,8 @@ def _split_tiles(count: int, rng: np.random.Generator) -> list[str]:
 
 
 def _render_pair(
-    name: str, surface: Surface, places: _Places, config: Config, body: Body, relief: tuple[float, float], world: World,
-    folder: Path,
-) -> dict[str, Any]:  # fmt: skip
+    name: str, renderer: Renderer, places: _Places, config: Config, world: World, folder: Path
+) -> dict[str, Any]:
     """Both pictures, the correspondences, and the pair's entry in the manifest."""
     split, tile, target = places.next()
     stereo, rng = places.stereo, places.rng
@@ -135,7 +132,7 @@ def _render_pair(
         position = target + sight * places.altitude
         roll = rng.uniform(-stereo.roll_deg, stereo.roll_deg)
         camera = pinhole_view(
-            position, look_at(position, target, roll), config.fov_deg, config.size_px, surface.grid.radius
+            position, look_at(position, target, roll), config.fov_deg, config.size_px, renderer.surface.grid.radius
         )
         sun: dict[str, Any] = {
             "sun_azimuth_deg": rng.uniform(0, 360),
@@ -143,8 +140,7 @@ def _render_pair(
         }
         view_config = replace(config, **sun)
         files = output_files(folder / f"{name}_{side}.exr", "pinhole")
-        light = make_light(surface, view_config, body, relief)
-        render_camera(surface, camera, light, relief, files, view_config, f"{name}_{side}", show_nothing)
+        render_camera(renderer, camera, files, view_config, f"{name}_{side}", show_nothing)
         views.append({"image": files[0].name, "preview": files[1].name, "camera": camera.to_document(), **sun})
         exrs.append(read_exr(files[0]))
         cameras.append(camera)

@@ -30,3 +30,17 @@ class Window(NamedTuple):
     def within(self, outer: Window) -> Window:
         """The same rectangle, counted from the first pixel of one around it."""
         return Window(self.row - outer.row, self.col - outer.col, self.height, self.width)
+
+    def union(self, other: Window) -> Window:
+        """The smallest window that holds both."""
+        top, left = min(self.row, other.row), min(self.col, other.col)
+        bottom = max(self.row + self.height, other.row + other.height)
+        right = max(self.col + self.width, other.col + other.width)
+        return Window(top, left, bottom - top, right - left)
+
+    def widened(self, factor: int, shape: tuple[int, int]) -> Window:
+        """To whole blocks of ``factor`` x ``factor`` pixels, counted from the grid's corner, as far as a grid of ``shape`` goes."""
+        top, left = self.row // factor * factor, self.col // factor * factor
+        bottom = min(shape[0], -(-(self.row + self.height) // factor) * factor)
+        right = min(shape[1], -(-(self.col + self.width) // factor) * factor)
+        return Window(top, left, bottom - top, right - left)

@@ -1,0 +1,160 @@
+"""Many views of one map: what stays the same between them is read and computed once."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from schemas.errors import ConfigError, GeometryError
+from schemas.files.user_files import check_keys
+from stages.common.arrays import Floats32
+from stages.common.memory import keep_freed_memory
+from stages.physics.bodies.spheres import find_body
+from stages.physics.cameras import Camera, camera_from_document
+from stages.physics.terrain.shading import Light
+from stages.render.config import CAMERA, SUN, Config, check
+from stages.render.perspective import Grounds, Scene, apply_sensor, make_scene, no_ground, render_view
+from stages.render.setup import camera_place, camera_sun, find_camera, make_light, open_source
+
+MOST_SUNS = 4  # whose horizons are kept
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One view. Arrays are (lines, samples) float32; where there is no ground, all but ``image`` are NaN.
+
+    image : I/F, mean over each pixel; NaN where the map is unknown, 0 in space
+    incidence_deg, emission_deg, phase_deg : degree; shadow : hidden share of the Sun's disc; depth : m along the ray
+    longitude_deg, latitude_deg : degree, of the ground at the pixel's centre
+    camera : as :meth:`Renderer.view` was given it
+    """
+
+    camera: Camera
+    image: Floats32
+    incidence_deg: Floats32
+    emission_deg: Floats32
+    phase_deg: Floats32
+    shadow: Floats32
+    depth: Floats32
+    longitude_deg: Floats32
+    latitude_deg: Floats32
+
+
+class Renderer:
+    """A map, its terrain's horizons and its pyramids, kept open for views through cameras. Close it, or use it in a ``with``.
+
+    source : svbrdf.h5, or scene.h5 or a DEM with ``model`` and ``parameters``
+    config, settings : what every view starts from, fields of :class:`Config` such as ``samples`` or ``fov_deg``
+    Raises LunargrError.
+    """
+
+    def __init__(self, source: str | Path, config: Config | None = None, **settings: Any) -> None:
+        check_keys(settings, [f.name for f in fields(Config)], "Renderer")
+        self.config = replace(Config(view="pinhole") if config is None else config, **settings)
+        keep_freed_memory()  # page faults of new arrays would cost as much as the rays
+        self._body = find_body("moon" if self.config.body is None else self.config.body)
+        with contextlib.ExitStack() as stack:
+            self.surface = stack.enter_context(open_source(Path(source), self.config, self._body))
+            self.relief = self.surface.height_range()
+            self._open = stack.pop_all()
+        self._grounds = Grounds(self.surface)
+        self._lights: OrderedDict[str, Light] = OrderedDict()
+
+    def close(self) -> None:
+        """Close the map's file."""
+        self._open.close()
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def view(self, camera: Camera | Mapping[str, Any], sun: Mapping[str, Any] | None = None) -> Frame:
+        """The view of a camera.
+
+        camera : a camera, the document of one (keys as in a pinhole JSON), or ``position`` (longitude, latitude in degrees,
+            metres above the sphere) with any of ``look_at``, ``quaternion``, ``roll_deg``, ``fov_deg``, ``size_px`` of :class:`Config`
+        sun : ``sun_azimuth_deg`` and ``sun_elevation_deg``, ``subsolar_longitude_deg`` and ``subsolar_latitude_deg``, or ``time``;
+            None for that of the settings, or of the camera
+        Raises LunargrError.
+        """
+        config = self.config
+        if sun is not None:
+            config = replace(config, **{**dict.fromkeys(SUN), **read_settings(sun, SUN, "sun")})
+        if isinstance(camera, Mapping):
+            if "type" in camera or "name_model" in camera:
+                camera = camera_from_document(camera, "camera")
+            else:
+                config = replace(config, **read_settings(camera, CAMERA, "camera"))
+                check(config)
+                camera = find_camera(self.surface, config)
+        light = self.light(config, camera)
+        _, bands = self.bands(camera, light, config.samples)
+        planes = _joined(bands)
+        if not np.isfinite(planes["depth"]).any():
+            raise GeometryError(no_ground(self.surface))
+        return Frame(camera, **{f.name: planes[f.name] for f in fields(Frame)[1:]})
+
+    def light(self, config: Config, camera: Camera | None = None) -> Light:
+        """The light that a configuration asks for, seen from the camera; Suns that come back are kept. Raises LunargrError."""
+        key = repr([getattr(config, name) for name in SUN])
+        own = camera_sun(camera) if camera is not None else None
+        if own is not None:
+            key += own.tobytes().hex()
+        light = self._lights.pop(key, None) or make_light(self.surface, config, self._body, self.relief, own)
+        self._lights[key] = light
+        while len(self._lights) > MOST_SUNS:
+            self._lights.popitem(last=False)
+        return light if camera is None else replace(light, camera_position=camera_place(camera))
+
+    def bands(
+        self, camera: Camera, light: Light, samples: int | None, errors: bool = False
+    ) -> tuple[Scene, Iterable[dict[str, Floats32]]]:
+        """What a camera sees, and its channels by name in bands of image lines. Raises GeometryError.
+
+        samples : rays per pixel and axis, see :class:`Config`; errors : with ``image_std``
+        """
+        scene = make_scene(self.surface, camera, light, self.relief, samples, errors, self._grounds)
+        bands: Iterable[dict[str, Floats32]] = render_view(self.surface, camera, light, scene)
+        if any(effect.slot == "sensor" for effect in light.extensions):  # these need the whole image
+            whole = _joined(bands)
+            bands = [whole | {"image": apply_sensor(whole["image"], light, scene.ground.grid)}]
+        return scene, bands
+
+
+def read_settings(values: Mapping[str, Any], names: Sequence[str], where: str) -> dict[str, Any]:
+    """Checked fields of :class:`Config` from a caller's or a message's own. Raises InputError for others than ``names``, ConfigError."""
+    check_keys(values, names, where)
+    return {name: _read(name, value, where) for name, value in values.items()}
+
+
+def _read(name: str, value: Any, where: str) -> Any:
+    if name == "time":
+        if isinstance(value, str):
+            return value
+        raise ConfigError(f"{where}: '{name}': expected a UTC time as text, found {value!r:.60}.")
+    many = name in ("position", "look_at", "quaternion", "size_px")
+    numbers = list(value) if many and isinstance(value, (list, tuple)) else [value]
+    if not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in numbers):
+        raise ConfigError(f"{where}: '{name}': expected finite numbers, found {value!r:.60}.")
+    if name == "size_px" and not (len(numbers) == 2 and all(v == int(v) and v > 0 for v in numbers)):
+        raise ConfigError(f"{where}: '{name}': expected [W, H] in pixels, found {value!r:.60}.")
+    kind = int if name == "size_px" else float
+    return tuple(map(kind, numbers)) if many else float(value)
+
+
+def _joined(bands: Iterable[dict[str, Floats32]]) -> dict[str, Floats32]:
+    """All lines at once."""
+    parts = list(bands)
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
