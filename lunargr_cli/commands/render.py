@@ -164,6 +164,13 @@ Camera = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Camera model (pinhole JSON, ALE/CSM ISD, ...) in place of the options above."),
 ]
+Sensor = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|NAME",
+        help="Camera views: also write DN as NAME_dn.tif (linear, 16 bits), by a sensor JSON or a preset (mardi, mer_navcam).",
+    ),
+]
 Samples = Annotated[
     int | None,
     typer.Option(metavar="N", help="N x N rays per pixel (default: one per DEM pixel and axis, 2 to 8)."),
@@ -225,13 +232,14 @@ def command(
     fov_deg: Fov = None,
     size_px: Size = None,
     camera: Camera = None,
+    sensor: Sensor = None,
     samples: Samples = None,
     trajectory: Trajectory = None,
     export: Export = None,
     stereo: Stereo = None,
     altitude: Altitude = None,
     convergence: Convergence = CONVERGENCE,
-    seed: Seed = StereoConfig.seed,
+    seed: Seed = Config.seed,
     extend: Extend = None,
     shadows: Shadows = Config.shadows,
     bounce: Bounce = Config.bounce,
@@ -257,7 +265,7 @@ def command(
     lunargr render svbrdf.h5 --trajectory descent.csv --sun-azimuth 90 --sun-elevation 30 -o views/
     """
     given = dict(locals())
-    path = _source(given)
+    path = find_source(given)
     config, mode = configure(Config, given, **_converted(given)), _mode(given)
     console, to = Console(quiet), make_output(given)
     if mode == "stereo":
@@ -271,11 +279,11 @@ def command(
         _show([render.run(path, to, config, console.progress)], console)
 
 
-def _source(given: Options) -> Path:
+def find_source(given: Options) -> Path:
     """The map or DEM. Raises ConfigError."""
     source, dem = given["source"], given["dem"]
     if (source is None) == (dem is None):
-        raise ConfigError("render: expected a reflectance map (svbrdf.h5) or --dem DEM, one of the two.")
+        raise ConfigError("expected a reflectance map (svbrdf.h5) or --dem DEM, one of the two.")
     if given["parameters"] and dem is None:
         raise ConfigError("--parameters: expected together with --dem; an svbrdf.h5 holds its own coefficients.")
     return source or dem
@@ -307,7 +315,7 @@ def _converted(given: Options) -> dict[str, Any]:
     modes = [option for option in ("camera", "trajectory") if given[option]]
     if given["view"] == "ortho" and modes:
         raise ConfigError(f"--{modes[0]}: expected without --view ortho; leave one of them out.")
-    attitude = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px", "stereo")
+    attitude = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px", "sensor", "stereo")
     seen_by_camera = modes or any(given[name] is not None for name in attitude)
     implied = "pinhole" if seen_by_camera else Config.view
     return {

@@ -48,6 +48,10 @@ def command(
         str | None,
         typer.Option("--units", help=f"iof, or dn: an unknown gain and offset per image. [default: {Config.units}]"),
     ] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option("--sensor", metavar="FILE|NAME", help="Images in DN of a sensor: a JSON file or a preset."),
+    ] = None,
     hidden: Annotated[str | None, typer.Option("--hidden", help=_HIDDEN_HELP)] = None,
     seed: Annotated[
         int | None,
@@ -61,7 +65,7 @@ def command(
 
     The other commands treat the scene as real data. Only truth.h5 holds the true values.
     """
-    changes = {"size_px": size_px, "images": images, "units": units, "seed": seed}
+    changes = {"size_px": size_px, "images": images, "units": units, "sensor": sensor, "seed": seed}
     config = _configure(recipe, changes, gsd, extent_m, hidden)
     if print_recipe:
         write_out(simulate.recipe_json(config))

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from stages.effects.base import Effect, register
+from stages.physics.detector.readout import COLUMN_ORDERS as ORDERS
+from stages.physics.detector.readout import column_wave
 from stages.physics.formation.chain import State
 from stages.physics.photometry import Parameter
-
-ORDERS = tuple(range(1, 9))
 
 
 @register
@@ -37,9 +37,7 @@ class ColumnPattern(Effect):
     def response(self, count: int) -> Tensor:
         """Response at ``count`` samples from the first to the last column, (count,)."""
         u = (torch.arange(count) + 0.5) / count
-        return torch.ones(count) + sum(
-            float(self.values[f"c{k}"]) * (math.sqrt(2) * torch.cos(math.pi * k * u)) for k in ORDERS
-        )
+        return torch.ones(count) + sum(float(self.values[f"c{k}"]) * column_wave(k, u, torch.cos) for k in ORDERS)
 
     def curves(self) -> dict[str, tuple[Tensor, str]]:
         return {"column_response": (self.response(256), "column")}
@@ -61,5 +59,5 @@ class ColumnPattern(Effect):
         u = ((self.columns(state) - first + 0.5) / max(last - first + 1, 1)).clamp(0, 1)
         factor = torch.ones_like(state.image)
         for k in ORDERS:
-            factor = factor + self.value(f"c{k}", state) * (math.sqrt(2) * torch.cos(math.pi * k * u))
+            factor = factor + self.value(f"c{k}", state) * column_wave(k, u, torch.cos)
         state.image = state.image * factor

@@ -33,7 +33,7 @@ CAMERA = (
 # What each kind of view does not look at: set all the same, it would be ignored.
 _ATTITUDE = ("look_at", "quaternion", "roll_deg", "fov_deg", "size_px")
 IGNORED = {
-    "`view` ortho": (*_ATTITUDE, "samples", "png_only"),
+    "`view` ortho": (*_ATTITUDE, "samples", "sensor", "png_only"),
     "`camera`": (*_ATTITUDE, "position", "backplanes_in_tif", "png_only"),
     "a trajectory": ("position", "quaternion", "roll_deg", "backplanes_in_tif"),
     "`view` pinhole": ("backplanes_in_tif", "png_only"),
@@ -51,6 +51,7 @@ class Config:
     look_at : longitude, latitude (and metres above the sphere; the ground's own height where that is absent)
     quaternion : w, x, y, z, camera axes (right, down, forward) to body-fixed, instead of look_at
     camera : path of a camera model (JSON), instead of position, attitude, fov and size
+    sensor : a preset's name or a JSON file: DN beside the I/F, with noise drawn from ``seed`` and the view's name
     samples : rays per pixel and axis (None: as many as the pixel's footprint asks for)
     model, parameters : a reflectance that is the same everywhere, where the source holds none
     export : with a trajectory: also a data set of its views, colmap or nerfstudio; png_only : no EXR; shard : every n-th view
@@ -73,6 +74,8 @@ class Config:
     fov_deg: float = 20.0
     size_px: tuple[int, int] = (1024, 1024)
     camera: str | None = None
+    sensor: str | None = None
+    seed: int = 0
     samples: int | None = None
     shadows: bool = True
     bounce: bool = False

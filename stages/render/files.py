@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,21 +17,35 @@ from stages.render.config import Config, Summary
 if TYPE_CHECKING:
     from stages.render.trajectory import ViewRow
 
+DN = "_dn.tif"  # ends the name of a sensor's image
 MANIFEST = "manifest.json"  # of stereo pairs
 
 
 def inputs(source: Path, config: Config) -> list[Path]:
     """What an image is made from."""
-    return [source, *(Path(p) for p in (config.camera, config.extend) if p)]
+    return [source, *_given(config)]
 
 
 def input_files(call: Call) -> list[Path]:
     """The files that no output may replace."""
-    return [*call.files, *(Path(p) for p in (call.config.camera, call.config.extend) if p)]
+    return [*call.files, *_given(call.config)]
 
 
-def output_files(output: Path, view: str) -> list[Path]:
+def _given(config: Config) -> list[Path]:
+    """The files that a configuration names."""
+    from stages.physics.detector import sensor_file
+
+    sensor = None if config.sensor is None else sensor_file(config.sensor)
+    return [Path(p) for p in (config.camera, config.extend, sensor) if p]
+
+
+def output_files(output: Path, config: Config) -> list[Path]:
     """The files behind one `output`. Raises ConfigError."""
+    files = _picture_files(output, config.view)
+    return files if config.sensor is None else [*files, output.with_name(f"{output.stem}{DN}")]
+
+
+def _picture_files(output: Path, view: str) -> list[Path]:
     suffix = output.suffix.lower()
     png, tif = output.with_suffix(".png"), output.with_suffix(".tif")
     if suffix in (".exr", ""):
@@ -47,19 +62,19 @@ def output_files(output: Path, view: str) -> list[Path]:
 
 def main_file(call: Call) -> Path:
     """The file of a view that becomes whole last."""
-    return output_files(call.output.file, call.config.view)[0]
+    return output_files(call.output.file, call.config)[0]
 
 
 def view_targets(call: Call) -> list[Target]:
     """The files of one view."""
     path = call.output.file
-    files = output_files(path, call.config.view)
+    files = output_files(path, call.config)
     return [Target(p, name="the output" if p == path else f"{p.suffix} beside {path.name}") for p in files]
 
 
 def view_files(folder: Path, view_id: str, config: Config) -> list[Path]:
     """The files of one view of a trajectory."""
-    return output_files(folder / f"{view_id}{'.png' if config.png_only else '.exr'}", "pinhole")
+    return output_files(folder / f"{view_id}{'.png' if config.png_only else '.exr'}", replace(config, view="pinhole"))
 
 
 def shard_of_views(table: Path, config: Config) -> list[ViewRow]:
@@ -112,16 +127,18 @@ def pair_names(count: int) -> list[str]:
     return [f"pair_{number:05d}" for number in range(count)]
 
 
-def pair_files(folder: Path, name: str) -> list[Path]:
-    """EXR and PNG of the left view, of the right one, and the correspondences."""
-    views = [path for side in ("left", "right") for path in output_files(folder / f"{name}_{side}.exr", "pinhole")]
+def pair_files(folder: Path, name: str, config: Config) -> list[Path]:
+    """Of the left view, of the right one, and the correspondences."""
+    views = [path for side in ("left", "right") for path in view_files(folder, f"{name}_{side}", config)]
     return [*views, folder / f"{name}_matches.exr"]
 
 
 def stereo_targets(call: Call) -> list[Target]:
     """The files of all stereo pairs."""
     folder, names = call.output.file, pair_names(call.arguments["stereo"].count)
-    return [Target(path) for path in (manifest(call), *(p for name in names for p in pair_files(folder, name)))]
+    return [
+        Target(path) for path in (manifest(call), *(p for name in names for p in pair_files(folder, name, call.config)))
+    ]
 
 
 def as_json(results: Sequence[Summary]) -> dict[str, Any]:

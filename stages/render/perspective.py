@@ -312,7 +312,8 @@ def render_view(surface: Surface, camera: Camera, light: Light, scene: Scene) ->
         fine = centre
         if scene.samples > 1:
             fine = _trace(camera, scene, first, count, scene.samples)
-            light_there = None if scene.lit is not None else _light_at(light, scene, fine)
+            if scene.lit is None:
+                light_there = _light_at(light, scene, fine)
         radiance, clipped = _radiance(surface, scene, fine, light_there)
         band["image"] = _mean(radiance, count, camera.samples, scene.samples)
         band["clipped"] = (_mean(clipped, count, camera.samples, scene.samples) > 0).astype(np.float32)
@@ -368,16 +369,15 @@ def _light_at(light: Light, scene: Scene, rays: _Rays) -> tuple[HitAngles, Float
 
 
 def _radiance(
-    surface: Surface, scene: Scene, rays: _Rays, light_there: tuple[HitAngles, Floats32] | None
+    surface: Surface, scene: Scene, rays: _Rays, light_there: tuple[HitAngles, Floats32]
 ) -> tuple[Floats32, Floats32]:
     """(N,) I/F along rays: NaN where unknown, 0 in space; and (N,) above 0 where the model's I/F was clipped at 0.
 
-    light_there : of the rays' hits, as :func:`_light_at` gives it; not needed where extensions have lit the ground
+    light_there : of the rays' hits, as :func:`_light_at` gives it; of no use where extensions have lit the ground
     """
     if scene.lit is not None:
         image, clipped = sample_maps(scene.lit, rays.hits)
     else:
-        assert light_there is not None
         found, visible = light_there
         cosines = (torch.from_numpy(found.cos_incidence), torch.from_numpy(found.cos_emission))
         phase = torch.from_numpy(found.phase)

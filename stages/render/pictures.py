@@ -93,6 +93,18 @@ def _has_last_line(path: Path, height: int) -> bool:
         source.close()
 
 
+def write_dn(path: Path, image: NDArray[np.uint16]) -> None:
+    """A linear 16-bit TIFF of (H, W) DN. Raises InputError where it cannot be written."""
+    height, width = image.shape
+    with atomic_path(path) as partial:
+        spec = oiio.ImageSpec(width, height, 1, oiio.UINT16)
+        spec.attribute("compression", "zip")
+        spec.attribute("oiio:ColorSpace", "Linear")
+        output = _open_output(path, partial, spec)
+        if not output.write_image(np.ascontiguousarray(image[..., None])) or not output.close():
+            raise _write_error(path, output.geterror())
+
+
 def read_exr(path: Path) -> dict[str, Floats32]:
     """Channels of an EXR by name, each (H, W) float32. Raises InputError."""
     source = oiio.ImageInput.open(str(path))

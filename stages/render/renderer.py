@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -12,19 +13,24 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
 from schemas.files.user_files import check_keys
 from stages.common.arrays import Floats32
 from stages.common.memory import keep_freed_memory
+from stages.physics.bodies.ephemeris import AU
 from stages.physics.bodies.spheres import find_body
 from stages.physics.cameras import Camera, camera_from_document
-from stages.physics.terrain.shading import Light
+from stages.physics.detector import read_sensor
+from stages.physics.detector.readout import photograph
+from stages.physics.terrain.shading import BACKPLANES, Light
 from stages.render.config import CAMERA, SUN, Config, check
 from stages.render.perspective import Grounds, Scene, apply_sensor, make_scene, no_ground, render_view
 from stages.render.setup import camera_place, camera_sun, find_camera, make_light, open_source
 
 MOST_SUNS = 4  # whose horizons are kept
+PLANES = ("image", *BACKPLANES)  # of a frame
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,7 @@ class Frame:
     image : I/F, mean over each pixel; NaN where the map is unknown, 0 in space
     incidence_deg, emission_deg, phase_deg : degree; shadow : hidden share of the Sun's disc; depth : m along the ray
     longitude_deg, latitude_deg : degree, of the ground at the pixel's centre
-    camera : as :meth:`Renderer.view` was given it
+    camera : as :meth:`Renderer.view` was given it; dn : uint16, of the sensor, None without one
     """
 
     camera: Camera
@@ -46,19 +52,26 @@ class Frame:
     depth: Floats32
     longitude_deg: Floats32
     latitude_deg: Floats32
+    dn: NDArray[np.uint16] | None = None
 
 
 class Renderer:
     """A map, its terrain's horizons and its pyramids, kept open for views through cameras. Close it, or use it in a ``with``.
 
     source : svbrdf.h5, or scene.h5 or a DEM with ``model`` and ``parameters``
+    sensor : a preset's name or a JSON file, for ``Frame.dn``
     config, settings : what every view starts from, fields of :class:`Config` such as ``samples`` or ``fov_deg``
     Raises LunargrError.
     """
 
-    def __init__(self, source: str | Path, config: Config | None = None, **settings: Any) -> None:
+    def __init__(
+        self, source: str | Path, sensor: str | Path | None = None, *, config: Config | None = None, **settings: Any
+    ) -> None:
         check_keys(settings, [f.name for f in fields(Config)], "Renderer")
         self.config = replace(Config(view="pinhole") if config is None else config, **settings)
+        if sensor is not None:
+            self.config = replace(self.config, sensor=str(sensor))
+        self.sensor = None if self.config.sensor is None else read_sensor(self.config.sensor)
         keep_freed_memory()  # page faults of new arrays would cost as much as the rays
         self._body = find_body("moon" if self.config.body is None else self.config.body)
         with contextlib.ExitStack() as stack:
@@ -80,31 +93,42 @@ class Renderer:
     ) -> None:
         self.close()
 
-    def view(self, camera: Camera | Mapping[str, Any], sun: Mapping[str, Any] | None = None) -> Frame:
+    def view(self, camera: Camera | Mapping[str, Any], sun: Mapping[str, Any] | None = None, seed: int = 0) -> Frame:
         """The view of a camera.
 
         camera : a camera, the document of one (keys as in a pinhole JSON), or ``position`` (longitude, latitude in degrees,
             metres above the sphere) with any of ``look_at``, ``quaternion``, ``roll_deg``, ``fov_deg``, ``size_px`` of :class:`Config`
         sun : ``sun_azimuth_deg`` and ``sun_elevation_deg``, ``subsolar_longitude_deg`` and ``subsolar_latitude_deg``, or ``time``;
             None for that of the settings, or of the camera
+        seed : of the sensor's noise
         Raises LunargrError.
         """
         config = self.config
         if sun is not None:
             config = replace(config, **{**dict.fromkeys(SUN), **read_settings(sun, SUN, "sun")})
         if isinstance(camera, Mapping):
-            if "type" in camera or "name_model" in camera:
-                camera = camera_from_document(camera, "camera")
-            else:
-                config = replace(config, **read_settings(camera, CAMERA, "camera"))
-                check(config)
-                camera = find_camera(self.surface, config)
+            camera = self.camera(camera)
         light = self.light(config, camera)
         _, bands = self.bands(camera, light, config.samples)
         planes = _joined(bands)
         if not np.isfinite(planes["depth"]).any():
             raise GeometryError(no_ground(self.surface))
-        return Frame(camera, **{f.name: planes[f.name] for f in fields(Frame)[1:]})
+        dn = None if self.sensor is None else self.photograph(planes["image"], light, seed)
+        return Frame(camera, **{name: planes[name] for name in PLANES}, dn=dn)
+
+    def photograph(self, image: Floats32, light: Light, seed: int, view_id: str = "") -> NDArray[np.uint16]:
+        """(lines, samples) DN of the sensor; image : I/F; seed, view_id : of the noise"""
+        assert self.sensor is not None
+        rng = np.random.default_rng([seed, zlib.crc32(view_id.encode())])
+        return photograph(self.sensor, image, float(np.linalg.norm(light.sun.position)) / AU, rng)
+
+    def camera(self, given: Mapping[str, Any]) -> Camera:
+        """The camera of a document or of a pose, see :meth:`view`. Raises LunargrError."""
+        if "type" in given or "name_model" in given:
+            return camera_from_document(given, "camera")
+        config = replace(self.config, **read_settings(given, CAMERA, "camera"))
+        check(config, drawn_sun=True)
+        return find_camera(self.surface, config)
 
     def light(self, config: Config, camera: Camera | None = None) -> Light:
         """The light that a configuration asks for, seen from the camera; Suns that come back are kept. Raises LunargrError."""

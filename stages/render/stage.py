@@ -15,8 +15,8 @@ from stages.render.views import render_camera
 
 def work(source: Path, path: Path, config: Config, progress: Progress) -> Summary:
     """See :func:`stages.render.run`."""
-    files = output_files(path, config.view)
-    with Renderer(source, config) as renderer:
+    files = output_files(path, config)
+    with Renderer(source, config=config) as renderer:
         if config.view == "ortho":
             return render_map(renderer.surface, renderer.light(config), renderer.relief, files, config, progress)
         camera = find_camera(renderer.surface, config)

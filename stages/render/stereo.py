@@ -21,7 +21,7 @@ from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.terrain.surface import Surface
 from stages.render.config import SUN, Config, StereoConfig, check
 from stages.render.dataset import World, make_world, project, ray_directions, write_text
-from stages.render.files import MANIFEST, output_files, pair_files, pair_names
+from stages.render.files import MANIFEST, pair_files, pair_names, view_files
 from stages.render.pictures import read_exr, write_exr
 from stages.render.renderer import Renderer
 from stages.render.viewpoint import look_at, pinhole_view
@@ -43,7 +43,7 @@ def render_stereo(source: Path, folder: Path, config: Config, stereo: StereoConf
     check(view_config, drawn_sun=True)
     rng = np.random.default_rng(stereo.seed)
     pairs: list[dict[str, Any]] = []
-    with Renderer(source, config) as renderer:
+    with Renderer(source, config=config) as renderer:
         world = make_world(renderer.surface.grid)
         places = _Places(renderer.surface, config, stereo, rng)
         for number, name in enumerate(names):
@@ -139,14 +139,14 @@ def _render_pair(
             "sun_elevation_deg": rng.uniform(*stereo.sun_elevation_deg),
         }
         view_config = replace(config, **sun)
-        files = output_files(folder / f"{name}_{side}.exr", "pinhole")
+        files = view_files(folder, f"{name}_{side}", config)
         render_camera(renderer, camera, files, view_config, f"{name}_{side}", show_nothing)
         views.append({"image": files[0].name, "preview": files[1].name, "camera": camera.to_document(), **sun})
         exrs.append(read_exr(files[0]))
         cameras.append(camera)
     depths = exrs[0]["depth"], exrs[1]["depth"]
     matches = correspondences(cameras[0], cameras[1], depths, world)
-    path = pair_files(folder, name)[-1]
+    path = pair_files(folder, name, config)[-1]
     with write_exr(path, depths[0].shape[0], depths[0].shape[1], list(matches)) as writer:
         writer.write(matches)
     ground = np.isfinite(depths[0])

@@ -14,6 +14,7 @@ from schemas.errors import GeometryError, LunargrError
 from schemas.files.companions import companions_of
 from schemas.files.locks import claim
 from schemas.files.outputs import Output
+from stages.common.arrays import Floats32
 from stages.common.progress import Progress, show_nothing
 from stages.physics.cameras.base import Camera
 from stages.physics.cameras.pinhole import Pinhole
@@ -22,7 +23,7 @@ from stages.render.config import SUN, Config, Summary
 from stages.render.dataset import EXPORT_PASSES, View, export_views
 from stages.render.files import finished, shard_of_views, view_files
 from stages.render.perspective import no_ground
-from stages.render.pictures import Preview, write_exr, write_png
+from stages.render.pictures import Preview, write_dn, write_exr, write_png
 from stages.render.renderer import Renderer
 from stages.render.setup import find_camera, metadata
 from stages.render.tally import Tally
@@ -40,7 +41,7 @@ def render_trajectory(source: Path, table: Path, output: Output, config: Config,
     done = finished(outputs) if output.resume else set()
     results: list[Summary] = []
     total = EACH * len(views) + (0 if config.export is None else EXPORT_PASSES * len(views))
-    with Renderer(source, config) as renderer:
+    with Renderer(source, config=config) as renderer:
         surface = renderer.surface
         for number, view in enumerate(views):
             progress(EACH * number, total, "views")
@@ -92,6 +93,7 @@ def render_camera(
     """One view, streamed to its files band by band."""
     surface, light = renderer.surface, renderer.light(config, camera)
     named = {path.suffix.lower(): path for path in files}
+    parts: list[Floats32] = []  # of the image, where a sensor takes it as a whole
     errors = surface.knows_errors and ".exr" in named
     scene, bands = renderer.bands(camera, light, config.samples, errors)
     channels = ["image", *(["image_std"] if errors else []), *BACKPLANES]
@@ -105,6 +107,8 @@ def render_camera(
             if exr:
                 exr.write(band)
             preview.add(band["image"])
+            if renderer.sensor is not None:
+                parts.append(band["image"])
             tally.add(band)
             ground |= bool(np.isfinite(band["depth"]).any())
             done += len(band["image"])
@@ -112,4 +116,6 @@ def render_camera(
         if not ground:
             raise GeometryError(no_ground(surface))
         write_png(named[".png"], preview.image())
+    if renderer.sensor is not None:
+        write_dn(named[".tif"], renderer.photograph(np.concatenate(parts), light, config.seed, view_id))
     return tally.summary(view_id, files, (camera.samples, camera.lines), scene.samples)

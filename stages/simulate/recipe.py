@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas.errors import ConfigError, InputError
+from stages.physics.detector import Sensor, read_sensor
 from stages.simulate.hidden import Hidden, parse_hidden
 
 Range = tuple[float, float]
@@ -64,10 +65,15 @@ class Config:
     psf_sigma_px: float = 0.55  # optics, Gaussian, in image pixels, beside the pixel's own area
     full_well: float = 30000.0  # electrons at twice the image's mean
     read_noise: float = 60.0  # electrons
+    sensor: str = ""  # a preset or a JSON file: its DN, in place of the three keys above
     registration_error: float = 0.0  # standard deviation of the planted shift of each image
 
     # hidden effects, which truth.h5 alone records
     hidden: list[dict[str, Any]] = field(default_factory=lambda: [{"effect": "dark_bias"}])
+
+    def sensor_model(self) -> Sensor | None:
+        """The sensor that the recipe names. Raises InputError, RegistryError."""
+        return read_sensor(self.sensor) if self.sensor else None
 
     def hidden_effects(self) -> Hidden:
         """The hidden effects with their parameters."""
@@ -144,6 +150,8 @@ def make_config(values: dict[str, Any], where: str = "recipe") -> Config:
             raise ConfigError(
                 f"{where}: '{key}': expected a value like {json.dumps(like)}, found {value!r}; mend it."
             ) from None
+    if clean.get("sensor"):
+        clean.setdefault("units", "dn")
     config = Config(**clean)
     _check(config, where)
     return config
@@ -208,6 +216,8 @@ def _check(config: Config, where: str) -> None:
             f"found a range up to {config.incidence_deg[1]:g}; raise it or move the scene."
         )
     config.hidden_effects()
+    if config.sensor_model() is not None:
+        _require(config.units == "dn", where, "units", "'dn' with 'sensor'", f"'{config.units}'")
 
 
 def _require(good: bool, where: str, key: str, expected: str, found: str) -> None:

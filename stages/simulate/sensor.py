@@ -13,6 +13,8 @@ from rasterio.crs import CRS
 from rasterio.transform import Affine
 
 from stages.common.arrays import Floats, Floats32
+from stages.physics.detector import Exposure, Sensor
+from stages.physics.detector import readout as detector_model
 from stages.physics.maps.grid import Grid
 from stages.simulate.hidden import Hidden
 from stages.simulate.orbits import Pass, Strip
@@ -26,6 +28,7 @@ class Detector:
     gain, offset : DN = gain x I/F + offset; 1 and 0 for calibrated images
     shift : (east, north) m by which the image lies from where its georeference says; jitter : amplitude, m, and phases
     response : gain error of the image; electrons : per I/F
+    model, exposure : of a sensor that the recipe names, whose gain and offset these are
     """
 
     gain: float
@@ -35,6 +38,13 @@ class Detector:
     response: float
     column_phases: Floats
     electrons: float
+    model: Sensor | None = None
+    exposure: Exposure | None = None
+
+    @property
+    def top(self) -> int:
+        """The largest DN."""
+        return 4095 if self.model is None else self.model.top
 
 
 def make_detector(config: Config, shot: Pass, hidden: Hidden, mean_iof: float, rng: np.random.Generator) -> Detector:
@@ -49,6 +59,12 @@ def make_detector(config: Config, shot: Pass, hidden: Hidden, mean_iof: float, r
     gain, offset = 1.0, 0.0
     if config.units == "dn":  # 12 bits, auto-exposed, with a pedestal
         gain, offset = 900.0 / max(mean_iof, 1e-3) * float(rng.uniform(0.8, 1.25)), float(rng.uniform(40, 120))
+    electrons = config.full_well / (2 * max(mean_iof, 1e-3))
+    model, exposure = config.sensor_model(), None
+    if model is not None:
+        exposure = model.expose(2 * mean_iof, shot.sun.distance_au)
+        electrons = exposure.electrons
+        gain, offset = electrons / model.electrons_per_dn, model.offset_dn
     shift = rng.normal(0, 1, 2) * shift_rms
     return Detector(
         gain,
@@ -57,7 +73,9 @@ def make_detector(config: Config, shot: Pass, hidden: Hidden, mean_iof: float, r
         (jitter, float(rng.uniform(0, 2 * math.pi)), float(rng.uniform(0.6, 1.6))),
         response,
         rng.uniform(0, 2 * math.pi, 3),
-        config.full_well / (2 * max(mean_iof, 1e-3)),
+        electrons,
+        model,
+        exposure,
     )
 
 
@@ -215,12 +233,17 @@ def respond(
     return image
 
 
-def add_noise(image: Floats32, config: Config, detector: Detector, rng: np.random.Generator) -> Floats32:
-    """Shot and read noise, in electrons.
+def read_out(
+    image: Floats32, config: Config, shot: Pass, detector: Detector, lattice: Lattice, rng: np.random.Generator
+) -> Floats32:
+    """The image with noise, by the recipe's sensor or by shot and read noise alone.
 
-    image : (H, W), I/F
+    image : (H, W), I/F; a sensor's columns lie across the strip, its other patterns on the image's own pixels
     """
-    electrons = image * np.float32(detector.electrons)
-    sigma = np.sqrt(np.maximum(electrons, 0) + np.float32(config.read_noise**2))
-    noise = rng.standard_normal(image.shape, dtype=np.float32)
-    return image + noise * sigma / np.float32(detector.electrons)
+    if detector.model is not None and detector.exposure is not None:
+        _, across = shot.strip.along_across(lattice.x, lattice.y)
+        x = np.clip(2 * across / shot.strip.width, -1, 1)
+        counts = detector_model.read_out(detector.model, image, detector.exposure, x, np.zeros((1, 1)), rng)
+        return ((counts - detector.offset) / detector.gain).astype(np.float32)
+    electrons = np.float32(detector.electrons)
+    return image + detector_model.noise_electrons(image * electrons, config.read_noise, rng) / electrons

@@ -231,9 +231,10 @@ def _make_image(
     )
     image = sensor.image_grid(config, scene.grid, shot, number)
     extra = hidden.get("psf_blur")
-    kernel = point_spread(step, shot.gsd, config.psf_sigma_px, extra["sigma2_px2"] if extra else 0.0)
-    expected = expected_iof(scene, shot)
-    detector = sensor.make_detector(config, shot, hidden, expected, rng)
+    detector = sensor.make_detector(config, shot, hidden, expected_iof(scene, shot), rng)
+    model = detector.model
+    optics = config.psf_sigma_px if model is None else model.psf_sigma_px
+    kernel = point_spread(step, shot.gsd, optics, extra["sigma2_px2"] if extra else 0.0)
     echo = hidden.get("echo")
     reach = len(kernel) // 2 + 4 + (int(echo["lag_px"] * shot.gsd / step) + 2 if echo else 0)
     exposure = Exposure(config, scene, view, kernel, reach, detector, hidden)
@@ -252,10 +253,11 @@ def _make_image(
                     total += float(signal[inside].sum(dtype=np.float64))
                     count += int(inside.sum())
                 # drawn for every pixel: the noise is then the same however the image is cut into bands
-                signal = sensor.add_noise(signal, config, detector, rng)
+                signal = sensor.read_out(signal, config, shot, detector, lattice, rng)
                 out.write(first, signal, inside, detector)
     mean = total / max(count, 1)
-    noise = np.sqrt(max(mean, 0) * detector.electrons + config.read_noise**2) / detector.electrons
+    read_noise = config.read_noise if model is None else model.read_noise
+    noise = np.sqrt(max(mean, 0) * detector.electrons + read_noise**2) / detector.electrons
     return ImageTruth(shot, detector, mean, float(noise)), count * shot.gsd**2 / config.extent**2
 
 

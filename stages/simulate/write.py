@@ -88,7 +88,7 @@ class ImageFile:
         """Write lines from ``first`` on; image : (h, W) I/F; inside : (h, W), where there is data."""
         window = Window(0, first, self.grid.width, len(image))
         if self.units == "dn":
-            counts = np.clip(np.rint(detector.gain * image + detector.offset), 1, 4095)
+            counts = np.clip(np.rint(detector.gain * image + detector.offset), 1, detector.top)
             data = np.where(inside, counts, NODATA_DN).astype(np.uint16)
         elif self.packed:
             counts = np.clip(np.rint(image / IOF_STEP), -32767, 32767)
