@@ -5,7 +5,8 @@
     python tests/validation/frozen_set.py compare tests/validation/frozen_answers.json after.json
 
 All seeds are fixed. `run` diagnoses with the code of the working directory. Sources are interleaved, so that every part of the set
-(--every, --offset) is a fair sample. An interrupted `make` or `run` goes on where it was. frozen_answers.json holds the answers before issue 67.
+(--every, --offset) is a fair sample. An interrupted `make` or `run` goes on where it was. frozen_answers.json holds answers of the
+version before the one judge, commit f1353f5.
 """
 
 from __future__ import annotations
@@ -174,12 +175,17 @@ def answer(pairs: Path) -> dict:
         "beside": truth["beside"],
         "verdict": full["verdict"],
         "causes": [_named(cause) for cause in full["causes"]],
-        "refused": {x["effect"]: x["why"] for x in full["rejected"]},
+        "refused": {x["effect"]: _reason(x, truth["planted"]) for x in full["rejected"]},
         "blind": full["blind"],
         "structure": _short({x["what"]: x["share"] for x in full["structure"]}),
         "gain": _short([full["held_out"][key] for key in ("gain_percent", "gain_percent_low", "gain_percent_high")]),
         "seconds": round(used.ru_utime + used.ru_stime, 1),
     }
+
+
+def _reason(refused: dict, planted: dict) -> str:
+    """With its numbers where the effect is planted, else the first words."""
+    return refused["why"] if refused["effect"] in planted else refused["why"].split(" (")[0][:60]
 
 
 def _named(cause: dict) -> dict:
