@@ -98,6 +98,26 @@ def test_nadir_views_have_north_up_and_east_right(hilly_map, tmp_path):
     assert (np.diff(np.nanmean(view["longitude_deg"], axis=0)) > 0).all()
 
 
+def test_a_view_that_is_finer_than_the_map_says_so(hilly_map, tmp_path, monkeypatch, capsys):
+    """A post of 5 m spans as many pixels as the similar triangles say."""
+    path, _, elevation, _ = hilly_map
+    height = float(elevation[80, 100])
+    for altitude, says in ((400.0, True), (40000.0, False)):
+        view = (
+            "--position",
+            f"{LON},{LAT},{height + altitude}",
+            "--fov",
+            "10",
+            "--size",
+            "70,50",
+            "-o",
+            tmp_path / "v.exr",
+        )
+        code, told = lunargr_render(monkeypatch, capsys, path, *view, *SUN, "--overwrite")
+        expected = 5.0 / (altitude * 2 * math.tan(math.radians(5)) / 70)
+        assert code == 0 and (f"v: {expected:.0f} image pixels to a DEM pixel" in told) == says, told
+
+
 def test_the_sky_is_black_and_ground_off_the_map_unknown(hilly_map, tmp_path):
     path, _, elevation, _ = hilly_map
     height = float(elevation.max()) + 30.0

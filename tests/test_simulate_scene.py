@@ -159,6 +159,30 @@ def test_truth_agrees_with_the_table(scene, table):
     assert abs(np.corrcoef(geometry.ravel(), free.ravel())[0, 1]) < 0.5
 
 
+def test_a_sensor_makes_the_images_dn(tmp_path):
+    """Counts are the sensor's gain times what the same scene has in I/F, with its noise; a full well ends them."""
+    numbers = {"full_well": 20000, "gain": 10.0, "bits": 12, "offset_dn": 50, "read_noise": 20, "auto_level": 1.2}
+    (tmp_path / "sensor.json").write_text(json.dumps(numbers))
+    recipe = SMALL | {"images": 1, "psf_sigma_px": 0.0, "read_noise": 0.0, "full_well": 1e6}
+    run(tmp_path / "iof", make_config(recipe))
+    run(tmp_path / "dn", make_config(recipe | {"sensor": str(tmp_path / "sensor.json")}))
+    with open_artefact(tmp_path / "dn" / "truth.h5", TRUTH) as truth:
+        gain, offset = float(truth["gain"][0]), float(truth["offset"][0])
+    with open(tmp_path / "dn" / "images.csv") as stream:
+        row = next(csv.DictReader(stream))
+    with rasterio.open(tmp_path / "iof" / row["path"]) as a, rasterio.open(tmp_path / "dn" / row["path"]) as b:
+        iof, counts = a.read(1, masked=True), b.read(1, masked=True)
+        iof = iof * a.scales[0]
+    assert row["units"] == "dn" and offset == 50
+    full = counts[gain * iof > 2300].astype(float)
+    assert full.size > 50 and full.mean() == pytest.approx(2050, abs=1)  # read noise comes after the full well
+    below = ~iof.mask & ~counts.mask & (gain * iof < 1500)
+    miss = (counts - offset - gain * iof)[below].astype(float)
+    electrons = 10.0 * (gain * iof[below]).mean()
+    assert miss.mean() == pytest.approx(0, abs=0.3)
+    assert miss.std() == pytest.approx(math.sqrt(electrons + 20**2) / 10.0, rel=0.05)
+
+
 def predicted(dem, sun):
     """Lambert's cosine from the DEM alone."""
     z = dem.read(1, masked=True).filled(np.nan).astype(float)

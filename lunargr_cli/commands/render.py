@@ -30,6 +30,7 @@ from stages.common.brightness import NAMES
 from stages.render import Config, StereoConfig, Summary
 
 NAME, ORDER = "render", 60
+SMOOTH = 2.0  # image pixels to a DEM pixel, from which on a view looks smooth
 Options = Mapping[str, Any]  # of a call, by name
 CONVERGENCE = ",".join(f"{edge:g}" for edge in StereoConfig.convergence_deg)
 
@@ -188,8 +189,8 @@ Export = Annotated[
     str | None,
     typer.Option(
         "--export",
-        metavar="colmap|nerfstudio",
-        help="With --trajectory: also write the views as a COLMAP or Nerfstudio data set.",
+        metavar="colmap,nerfstudio",
+        help="With --trajectory: also write the views as a COLMAP or Nerfstudio data set, or both.",
     ),
 ]
 PngOnly = Annotated[bool, typer.Option("--png-only", help="With --trajectory: write no EXR files.")]
@@ -326,6 +327,7 @@ def _converted(given: Options) -> dict[str, Any]:
         "look_at": read_list("--look-at", given["look_at"], (2, 3)),
         "quaternion": read_list("--quaternion", given["quaternion"], (4,)),
         "size_px": Config.size_px if given["size_px"] is None else _size(given["size_px"]),
+        "export": tuple(given["export"].split(",")) if given["export"] else (),
         "camera": str(given["camera"]) if given["camera"] else None,
         "parameters": read_parameters(given["parameters"]),
         "terrain_only": given["dem"] is not None,
@@ -348,6 +350,11 @@ def _show(results: list[Summary], console: Console) -> None:
             console.say(
                 f"{r.view_id}: the model gives {brightness} below 0 in {r.clipped} pixels ({share:.2%}); they are drawn as 0."
             )
+    finest = max(results, key=lambda r: r.pixels_per_post if r.pixels_per_post > SMOOTH else 0.0, default=None)
+    if finest is not None and finest.pixels_per_post > SMOOTH:
+        console.say(
+            f"{finest.view_id}: {finest.pixels_per_post:.0f} image pixels to a DEM pixel; the picture shows no detail between them."
+        )
 
 
 def _row(result: Summary) -> tuple[str, ...]:

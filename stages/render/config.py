@@ -54,7 +54,7 @@ class Config:
     sensor : a preset's name or a JSON file: DN beside the I/F, with noise drawn from ``seed`` and the view's name
     samples : rays per pixel and axis (None: as many as the pixel's footprint asks for)
     model, parameters : a reflectance that is the same everywhere, where the source holds none
-    export : with a trajectory: also a data set of its views, colmap or nerfstudio; png_only : no EXR; shard : every n-th view
+    export : with a trajectory: also data sets of its views, of EXPORTS; png_only : no EXR; shard : every n-th view
     bounce : light that sunlit terrain throws on other terrain, once, between diffuse facets
     earthshine : the Earth's light, from its place at ``time``, or at an azimuth and elevation over the map's middle
     terrain_only : of svbrdf.h5 use the terrain, with ``model``
@@ -88,7 +88,7 @@ class Config:
     extend: str | None = None
     body: str | None = None
     backplanes_in_tif: bool = False
-    export: str | None = None
+    export: tuple[str, ...] = ()
     png_only: bool = False
     shard: tuple[int, int] = (0, 1)
 
@@ -118,6 +118,7 @@ class Summary:
     size_px : samples, lines; known_share, shadow_share : of the pixels, 0..1; mean : I/F; samples : rays per pixel and axis
     skipped : the view was there already, and was not looked at
     clipped : pixels where the model's I/F was below 0 and is drawn as 0
+    pixels_per_post : image pixels along one pixel of the map, in the middle of a camera view
     image_units : of the images that the map was learned from, 'iof' or 'dn'
     """
 
@@ -131,6 +132,7 @@ class Summary:
     samples: int = 0
     skipped: bool = False
     clipped: int = 0
+    pixels_per_post: float = math.nan
     image_units: str = "iof"
 
 
@@ -154,12 +156,13 @@ def check(config: Config, trajectory: bool = False, drawn_sun: bool = False) -> 
     angles = (config.earth_azimuth_deg, config.earth_elevation_deg)
     if any(v is not None for v in angles) and (None in angles or not config.earthshine):
         raise ConfigError("the Earth: expected `earthshine` with both `earth_azimuth_deg` and `earth_elevation_deg`.")
-    if config.export is not None and not trajectory:
+    if config.export and not trajectory:
         raise ConfigError("`export`: expected together with `trajectory`; a single view makes no data set.")
     if not (trajectory or config.camera or drawn_sun):  # rows and camera models may know their Sun
         sun_given(*(getattr(config, name) for name in SUN if name != "solar_distance_au"))
-    if config.export not in (None, *EXPORTS):
-        raise ConfigError(f"`export`: expected one of {', '.join(EXPORTS)}; found '{config.export}'.")
+    for kind in config.export:
+        if kind not in EXPORTS or config.export.count(kind) > 1:
+            raise ConfigError(f"`export`: expected any of {', '.join(EXPORTS)}, each once; found '{kind}'.")
     kind = "a trajectory" if trajectory else "`camera`" if config.camera else f"`view` {config.view}"
     refuse_ignored(config, kind)
     if kind != "`view` pinhole":
@@ -175,11 +178,11 @@ def check_trajectory(config: Config) -> None:
     if config.camera:
         raise ConfigError("`trajectory`: expected no `camera`; each row places its own pinhole camera.")
     check(replace(config, view="pinhole"), trajectory=True)
-    if config.export is not None and config.shard[1] > 1:
+    if config.export and config.shard[1] > 1:
         raise ConfigError(
             "`export`: expected without `shard`; render the shards, then export with `resume` and no `shard`."
         )
-    if config.export is not None and config.png_only:
+    if config.export and config.png_only:
         raise ConfigError("`export`: expected EXR files, which hold the depths; drop `png_only`.")
 
 

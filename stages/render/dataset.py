@@ -22,6 +22,7 @@ from schemas.files.companions import companions_of
 from schemas.files.locks import claim
 from schemas.files.outputs import atomic_path
 from stages.common.arrays import Floats, Floats32, Mask
+from stages.physics.cameras import Camera
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import Grid
 from stages.render.pictures import read_exr, stretch
@@ -132,16 +133,43 @@ def _write_image(path: Path, image: Floats32, white: float) -> None:
 
 
 def _write_world(path: Path, world: World, grid: Grid) -> None:
+    write_text(path, json.dumps(_world_document(world, grid), indent=1))
+
+
+def _world_document(world: World, grid: Grid) -> dict[str, Any]:
+    """How the world's axes lie in the body."""
     row, col = (grid.height - 1) / 2, (grid.width - 1) / 2
     lon, lat = (float(v) for v in grid.lonlat(row, col))
-    document = {
+    return {
         "origin_mcmf": world.origin.tolist(),
         "axes_mcmf": dict(zip(("east", "north", "up"), world.axes.tolist(), strict=True)),
         "origin": {"longitude_deg": lon, "latitude_deg": lat, "height": 0.0},
         "body_radius": grid.radius,
         "unit": "m",
     }
-    write_text(path, json.dumps(document, indent=1))
+
+
+def write_cameras(
+    path: Path, names: Sequence[str], cameras: Sequence[Pinhole], suns: Sequence[Floats], grid: Grid
+) -> None:
+    """Intrinsics, pose and Sun of every view, in the body's axes and in those of the world. suns : (3,), body-fixed, m"""
+    world = make_world(grid)
+    views = []
+    for name, camera, sun in zip(names, cameras, suns, strict=True):
+        rotation, place = world.pose(camera)
+        away = sun - camera.centre
+        local = {
+            "position_enu": place.tolist(),
+            "quaternion_camera_to_enu_wxyz": to_quaternion(rotation),
+            "sun_direction_enu": (world.axes @ away / np.linalg.norm(away)).tolist(),
+        }
+        views.append({"view_id": name, **camera.to_document(), "sun_position_mcmf": sun.tolist(), **local})
+    write_text(path, json.dumps({**_world_document(world, grid), "views": views}, indent=1))
+
+
+def camera_facts(camera: Camera) -> dict[str, str]:
+    """Attributes of an EXR: a pinhole's document; a camera file is named by the settings."""
+    return {"camera": json.dumps(camera.to_document())} if isinstance(camera, Pinhole) else {}
 
 
 def _write_nerfstudio(views: Sequence[View], world: World, target: Path, report: Callable[[int], None]) -> None:
@@ -193,13 +221,17 @@ def _write_colmap(views: Sequence[View], world: World, target: Path, report: Cal
             seen[k].append((sample, line, number))
         lines.append(f"{number} {place[0]:.4f} {place[1]:.4f} {place[2]:.4f} 128 128 128 0 {' '.join(entries)}")
     cameras, images = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"], ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"]
+    numbers: dict[str, int] = {}  # intrinsics -> camera: views that share a camera name it together
     for k, view in enumerate(views):
         c = view.camera
         intrinsics = (*c.focal_px, *c.principal_point_px)
-        cameras.append(f"{k + 1} PINHOLE {c.samples} {c.lines} {' '.join(f'{v:.9g}' for v in intrinsics)}")
+        told = f"PINHOLE {c.samples} {c.lines} {' '.join(f'{v:.9g}' for v in intrinsics)}"
+        if told not in numbers:
+            numbers[told] = len(numbers) + 1
+            cameras.append(f"{numbers[told]} {told}")
         rotation, place = world.pose(c)
         pose = (*to_quaternion(rotation.T), *(-rotation.T @ place))
-        images.append(f"{k + 1} {' '.join(f'{v:.12g}' for v in pose)} {k + 1} {view.view_id}.png")
+        images.append(f"{k + 1} {' '.join(f'{v:.12g}' for v in pose)} {numbers[told]} {view.view_id}.png")
         images.append(" ".join(f"{x:.4f} {y:.4f} {point}" for x, y, point in seen[k]))
     for name, table in (("cameras", cameras), ("images", images), ("points3D", lines)):
         write_text(folder / f"{name}.txt", "\n".join(table) + "\n")

@@ -17,6 +17,7 @@ from stages.render.config import Config, Summary
 if TYPE_CHECKING:
     from stages.render.trajectory import ViewRow
 
+CAMERAS = "cameras.json"  # of a trajectory
 DN = "_dn.tif"  # ends the name of a sensor's image
 MANIFEST = "manifest.json"  # of stereo pairs
 
@@ -98,8 +99,9 @@ def trajectory_targets(call: Call) -> list[Target]:
     }
     done = finished(outputs) if call.output.resume else set()
     new = [files for name, files in outputs.items() if name not in done]
-    if config.export:
-        new.append(export_files(list(outputs), folder, config.export))
+    new += [export_files(list(outputs), folder, kind) for kind in config.export]
+    if config.shard[1] == 1 and not call.output.resume:
+        new.append([folder / CAMERAS])
     for files in new:
         if any(path.exists() for path in files):
             with claim(files[0]):  # tidies up where a killed run left some of them
@@ -159,6 +161,7 @@ def as_json(results: Sequence[Summary]) -> dict[str, Any]:
             "samples": r.samples,
             "skipped": r.skipped,
             "clipped_px": r.clipped,
+            "pixels_per_post": finite(r.pixels_per_post),
             "image_units": r.image_units,
         }
         for r in results

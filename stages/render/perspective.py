@@ -113,6 +113,7 @@ class Scene:
     lit : (2, h, w) I/F where extensions have shaded the ground beforehand, and where it was clipped at 0; or None
     added : (h, w) I/F that the Earth and the terrain around add, or None
     samples : rays per pixel and axis; distance : from the camera to the ground, m
+    pixels_per_post : image pixels along one pixel of the map, at that distance
     deviation : (h, w) I/F, standard deviation of photographs about the ground's I/F, or None where it is not asked for
     """
 
@@ -122,6 +123,7 @@ class Scene:
     added: Floats32 | None
     samples: int
     distance: float
+    pixels_per_post: float
     deviation: Floats32 | None = None
 
 
@@ -242,6 +244,7 @@ def make_scene(
     relief : lowest and highest elevation, m; samples : see :func:`seen_window`; grounds : of earlier views
     """
     window, samples, factor, distance = seen_window(surface, camera, relief, samples)
+    finer = surface.grid.gsd / pixel_footprint(camera, distance)
     window = window.widened(factor, surface.elevation.shape)
     if errors or light.extensions or light.earthshine is not None or light.bounce is not None:
         grounds = None  # light that depends on the camera's place is worth computing for what it sees only
@@ -255,7 +258,7 @@ def make_scene(
     deviation = _blocks(window, lambda b: _deviation(surface, light, b, lit, window)) if errors else None
     # errors of neighbours are alike: the deviation of a mean is the mean of theirs
     lit, added, deviation = (None if v is None else ground.coarse(v) for v in (lit, added, deviation))
-    return Scene(ground, ground.horizon(light.horizon), lit, added, samples, distance, deviation)
+    return Scene(ground, ground.horizon(light.horizon), lit, added, samples, distance, finer, deviation)
 
 
 def _added(surface: Surface, light: Light, window: Window) -> Floats32 | None:

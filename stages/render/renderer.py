@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from schemas.errors import ConfigError, GeometryError
 from schemas.files.user_files import check_keys
-from stages.common.arrays import Floats32
+from stages.common.arrays import Floats, Floats32
 from stages.common.memory import keep_freed_memory
 from stages.physics.bodies.ephemeris import AU
 from stages.physics.bodies.spheres import find_body
@@ -27,7 +27,7 @@ from stages.physics.detector.readout import photograph
 from stages.physics.terrain.shading import BACKPLANES, Light
 from stages.render.config import CAMERA, SUN, Config, check
 from stages.render.perspective import Grounds, Scene, apply_sensor, make_scene, no_ground, render_view
-from stages.render.setup import camera_place, camera_sun, find_camera, make_light, open_source
+from stages.render.setup import camera_place, camera_sun, find_camera, make_light, named_sun, open_source
 
 MOST_SUNS = 4  # whose horizons are kept
 PLANES = ("image", *BACKPLANES)  # of a frame
@@ -133,7 +133,7 @@ class Renderer:
     def light(self, config: Config, camera: Camera | None = None) -> Light:
         """The light that a configuration asks for, seen from the camera; Suns that come back are kept. Raises LunargrError."""
         key = repr([getattr(config, name) for name in SUN])
-        own = camera_sun(camera) if camera is not None else None
+        own = None if camera is None else camera_sun(camera)
         if own is not None:
             key += own.tobytes().hex()
         light = self._lights.pop(key, None) or make_light(self.surface, config, self._body, self.relief, own)
@@ -141,6 +141,10 @@ class Renderer:
         while len(self._lights) > MOST_SUNS:
             self._lights.popitem(last=False)
         return light if camera is None else replace(light, camera_position=camera_place(camera))
+
+    def sun(self, config: Config) -> Floats:
+        """(3,) body-fixed, m, the Sun that a configuration names. Raises LunargrError."""
+        return named_sun(self.surface, config, self._body).position
 
     def bands(
         self, camera: Camera, light: Light, samples: int | None, errors: bool = False

@@ -40,7 +40,7 @@ def serve(renderer: Renderer, address: str, port: int, ready: Callable[[str], No
             raise ConfigError(
                 f"serve: {address}:{port} cannot be had ({error.strerror}); choose another `port`."
             ) from None
-        ready(socket.last_endpoint.decode())
+        ready(socket.getsockopt_string(zmq.LAST_ENDPOINT))
         while True:
             socket.send_multipart(answer(renderer, socket.recv_multipart()))
 

@@ -54,7 +54,7 @@ def make_light(
     if camera_sun is not None and all(getattr(config, name) is None for name in SUN):
         sun = Sun(camera_sun, SUN_RADIUS * AU / float(np.linalg.norm(camera_sun)))
     else:
-        sun = _named_sun(surface, config, body)
+        sun = named_sun(surface, config, body)
     span = relief[1] - relief[0]
     earthshine = _earthshine(surface, config, body, sun, span) if config.earthshine else None
     horizon: Horizon | None = None
@@ -100,7 +100,8 @@ def _earthshine(surface: Surface, config: Config, body: Body, sun: Sun, relief: 
     return earthshine
 
 
-def _named_sun(surface: Surface, config: Config, body: Body) -> Sun:
+def named_sun(surface: Surface, config: Config, body: Body) -> Sun:
+    """The Sun from its time or its direction. Raises LunargrError."""
     if config.time is not None and config.body is None and abs(body.radius - surface.grid.radius) > 0.005 * body.radius:
         raise ConfigError(
             f"`time`: expected `body` beside it, since {surface.path} (radius {surface.grid.radius:g} m) does not show the Moon."

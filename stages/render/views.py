@@ -20,8 +20,8 @@ from stages.physics.cameras.base import Camera
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.terrain.shading import BACKPLANES
 from stages.render.config import SUN, Config, Summary
-from stages.render.dataset import EXPORT_PASSES, View, export_views
-from stages.render.files import finished, shard_of_views, view_files
+from stages.render.dataset import EXPORT_PASSES, View, camera_facts, export_views, write_cameras
+from stages.render.files import CAMERAS, finished, shard_of_views, view_files
 from stages.render.perspective import no_ground
 from stages.render.pictures import Preview, write_dn, write_exr, write_png
 from stages.render.renderer import Renderer
@@ -40,7 +40,7 @@ def render_trajectory(source: Path, table: Path, output: Output, config: Config,
     outputs = {view.view_id: view_files(folder, view.view_id, config) for view in views}
     done = finished(outputs) if output.resume else set()
     results: list[Summary] = []
-    total = EACH * len(views) + (0 if config.export is None else EXPORT_PASSES * len(views))
+    total = (EACH + EXPORT_PASSES * len(config.export)) * len(views)
     with Renderer(source, config=config) as renderer:
         surface = renderer.surface
         for number, view in enumerate(views):
@@ -56,13 +56,15 @@ def render_trajectory(source: Path, table: Path, output: Output, config: Config,
                     results.append(render_camera(renderer, camera, files, view_config, view.view_id, show_nothing))
             except LunargrError as error:
                 raise type(error)(f"{table.name}, {view.view_id}: {error}") from None
-        if config.export is not None:
-            cameras = [cast(Pinhole, find_camera(surface, _with_row(config, view))) for view in views]
-            rendered = [View(v.view_id, c, outputs[v.view_id][0]) for v, c in zip(views, cameras, strict=True)]
-            before = EACH * len(views)
-            export_views(
-                rendered, surface.grid, folder, config.export, lambda done: progress(before + done, total, "export")
-            )
+        rows = [_with_row(config, view) for view in views]
+        cameras = [cast(Pinhole, find_camera(surface, row)) for row in rows]
+        if config.shard[1] == 1 and not (output.resume and (folder / CAMERAS).exists()):
+            suns = [renderer.sun(row) for row in rows]
+            write_cameras(folder / CAMERAS, [v.view_id for v in views], cameras, suns, surface.grid)
+        rendered = [View(v.view_id, c, outputs[v.view_id][0]) for v, c in zip(views, cameras, strict=True)]
+        for number, kind in enumerate(config.export):
+            before = (EACH + EXPORT_PASSES * number) * len(views)
+            export_views(rendered, surface.grid, folder, kind, lambda n, b=before: progress(b + n, total, "export"))
     progress(total, total, "views")
     return results
 
@@ -101,7 +103,7 @@ def render_camera(
     with contextlib.ExitStack() as stack:
         exr = None
         if ".exr" in named:
-            facts = metadata(surface, config, light)
+            facts = metadata(surface, config, light) | camera_facts(camera)
             exr = stack.enter_context(write_exr(named[".exr"], camera.lines, camera.samples, channels, facts))
         for band in bands:
             if exr:
@@ -118,4 +120,5 @@ def render_camera(
         write_png(named[".png"], preview.image())
     if renderer.sensor is not None:
         write_dn(named[".tif"], renderer.photograph(np.concatenate(parts), light, config.seed, view_id))
-    return tally.summary(view_id, files, (camera.samples, camera.lines), scene.samples)
+    summary = tally.summary(view_id, files, (camera.samples, camera.lines), scene.samples)
+    return replace(summary, pixels_per_post=scene.pixels_per_post)
