@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -64,9 +64,14 @@ def render_trajectory(source: Path, table: Path, output: Output, config: Config,
         rendered = [View(v.view_id, c, outputs[v.view_id][0]) for v, c in zip(views, cameras, strict=True)]
         for number, kind in enumerate(config.export):
             before = (EACH + EXPORT_PASSES * number) * len(views)
-            export_views(rendered, surface.grid, folder, kind, lambda n, b=before: progress(b + n, total, "export"))
+            export_views(rendered, surface.grid, folder, kind, _counted_on(progress, before, total))
     progress(total, total, "views")
     return results
+
+
+def _counted_on(progress: Progress, before: int, total: int) -> Callable[[int], None]:
+    """Progress of an export, after ``before`` steps of the whole."""
+    return lambda done: progress(before + done, total, "export")
 
 
 def _with_row(config: Config, view: ViewRow) -> Config:
