@@ -25,6 +25,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
 from schemas import read_strings  # noqa: E402
+from schemas.packing import read  # noqa: E402
 
 COMPARED = {
     "learned_gain_offset": "learned from terrain",
@@ -155,7 +156,7 @@ def mosaic(pairs: Path) -> np.ndarray:
             valid = file["valid"][k] == 1
             top, left = (int(file[name][k]) - size // 2 for name in ("row", "col"))
             place = (slice(None), slice(top, top + size), slice(left, left + size))
-            total[place] += np.stack([np.where(valid, file["image"][k], 0), valid])
+            total[place] += np.stack([np.where(valid, read(file["image"], k), 0), valid])
     return np.where(total[1] > 0, total[0] / np.maximum(total[1], 1), np.nan)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from schemas.declaration import ROOT_ATTRIBUTES, STRING, Attribute, Schema, Variable
 from schemas.errors import ArtefactError
+from schemas.packing import unpack
 
 UNIT_TOLERANCE = 1e-3  # of a unit vector's length: writers in float32, and in few decimals
 GSD_TOLERANCE = 1e-3  # relative: what writing numbers as text may cost
@@ -188,8 +189,6 @@ def _check_strings(where: str, values: Any, advice: str) -> None:
 
 
 def _check_numbers(where: str, variable: Variable, data: h5py.Dataset, values: Any, limit: int, advice: str) -> None:
-    from schemas.reading import unpack
-
     try:
         numbers = np.asarray(unpack(data, values), dtype=np.float64)
     except (TypeError, ValueError):

@@ -83,6 +83,7 @@ class Schema:
     variables: tuple[Variable, ...]
     attributes: tuple[Attribute, ...] = ()
     sizes: tuple[tuple[str, int], ...] = ()  # dimensions of a fixed size
+    still_read: tuple[int, ...] = ()  # earlier versions, whose files mean the same
     # Other programs also write pairs.h5: such a file need not name its schema, only hold its variables.
     foreign_writers: bool = False
 

@@ -89,10 +89,10 @@ def _check_kind(path: Path, file: h5py.File, schema: Schema) -> None:
         )
     version = any_text(np.ravel(file.attrs.get("schema_version", schema.version))[0])
     try:
-        same = float(version) == schema.version
+        known = float(version) in (schema.version, *schema.still_read)
     except ValueError:
-        same = False
-    if not same:
+        known = False
+    if not known:
         raise ArtefactError(
             f"{path}: expected version {schema.version} of '{schema.name}', found '{version}'; {remedy(file, schema)}."
         )
@@ -134,7 +134,7 @@ def _check_variable(path: Path, file: h5py.File, variable: Variable, advice: str
 
 
 def _check_packing(where: str, data: h5py.Dataset, advice: str) -> None:
-    """Refuse attributes by which :func:`unpack` could not decode a variable. Raises ArtefactError."""
+    """Refuse attributes by which ``schemas.packing`` could not decode a variable. Raises ArtefactError."""
     for name in ("scale_factor", "add_offset", "_FillValue", "missing_value"):
         value = data.attrs.get(name, 1.0)
         numbers = np.ravel(value) if isinstance(value, np.ndarray | np.generic | float) else np.array(["?"])
@@ -166,27 +166,6 @@ def read_unit(data: h5py.Dataset) -> str:
     """The unit of a variable in the spelling that declarations have, '' where it names none."""
     unit = data.attrs.get("units", "")
     return "" if isinstance(unit, h5py.Empty) else unit_name(any_text(unit))
-
-
-def unpack(data: h5py.Dataset, values: Any) -> np.ndarray:
-    """Values read from ``data``, decoded as CF says: packed numbers are scaled, fill values of floats become NaN.
-
-    Flags and other integers without ``scale_factor`` or ``add_offset`` stay as they are. values : any shape, kept
-    """
-    values = np.asarray(values)
-    packed = "scale_factor" in data.attrs or "add_offset" in data.attrs
-    if values.dtype.kind != "f" and not packed:
-        return values
-    fills = [data.attrs[k] for k in ("_FillValue", "missing_value") if k in data.attrs]
-    result = values.astype(np.float32 if values.dtype != np.float64 else np.float64)
-    if packed:
-        scale, offset = (float(np.ravel(data.attrs.get(k, v))[0]) for k, v in (("scale_factor", 1), ("add_offset", 0)))
-        result = (values * scale + offset).astype(np.float32)
-    for fill in np.concatenate([np.ravel(f) for f in fills]) if fills else ():
-        unknown = values == np.asarray(fill, values.dtype)
-        if unknown.any():
-            result[unknown] = np.nan
-    return result
 
 
 def read_strings(file: h5py.File, name: str) -> list[str]:

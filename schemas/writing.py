@@ -14,8 +14,9 @@ import numpy as np
 
 from schemas.declaration import STRING, Schema, Variable
 from schemas.errors import ArtefactError, ConfigError
-from schemas.files.hdf5 import UNKNOWN, abandoned, whole_hdf5
+from schemas.files.hdf5 import abandoned, whole_hdf5
 from schemas.files.references import is_inside
+from schemas.packing import CODE, UNKNOWN, Packing, read_packing
 from schemas.provenance import describe_run
 from schemas.reading import open_artefact
 
@@ -106,7 +107,7 @@ class ArtefactWriter:
             ) from None
 
     def _create(
-        self, variable: Variable, scale: bool = False, unit: str | None = None, decimals: int | None = None
+        self, variable: Variable, scale: bool = False, unit: str | None = None, packing: Packing | None = None
     ) -> h5py.Dataset:
         shape = tuple(self.sizes[d] for d in variable.dims)
         options: dict[str, Any] = {}
@@ -114,8 +115,6 @@ class ArtefactWriter:
             chunks = variable.chunks
             if chunks is None and len(shape) >= 3:  # one record (a pair, a band) a chunk: random access stays fast
                 chunks = (1,) * (len(shape) - 2) + shape[-2:]
-                if decimals is not None:  # a smaller piece spans less and takes fewer bits
-                    chunks = (1,) * (len(shape) - 2) + tuple(_packed_edge(edge) for edge in shape[-2:])
             if chunks is not None:
                 options["chunks"] = tuple(min(c, s) for c, s in zip(chunks, shape, strict=True))
             if variable.compress:
@@ -124,29 +123,36 @@ class ArtefactWriter:
         if variable.dtype == STRING:
             dtype: Any = h5py.string_dtype()
         else:
-            dtype = np.dtype(variable.dtype)
-            if dtype.kind == "f":
-                options["fillvalue"] = np.nan
-                if decimals is not None and shape and 0 not in shape:
-                    options |= {"scaleoffset": decimals, "fillvalue": UNKNOWN}
+            dtype = CODE if packing else np.dtype(variable.dtype)
+            if packing or dtype.kind == "f":
+                options["fillvalue"] = UNKNOWN if packing else np.nan
         data = self.file.create_dataset(variable.name, shape=shape, dtype=dtype, track_order=True, **options)
         if scale:
             data.make_scale(variable.name)
             if variable.name in _STANDARD_NAMES:
                 data.attrs["standard_name"] = _STANDARD_NAMES[variable.name]
             data.attrs["_Netcdf4Dimid"] = np.int32(list(self.sizes).index(variable.name))
-        self._describe(data, variable, unit, scale)
+        self._describe(data, variable, unit, scale, packing)
         self._kept.append(data)
         return data
 
-    def _describe(self, data: h5py.Dataset, variable: Variable, unit: str | None, scale: bool = False) -> None:
+    def _describe(
+        self,
+        data: h5py.Dataset,
+        variable: Variable,
+        unit: str | None,
+        scale: bool = False,
+        packing: Packing | None = None,
+    ) -> None:
         if not scale:
             for axis, dim in enumerate(variable.dims):
                 data.dims[axis].attach_scale(self.file[dim])
         if variable.dtype != STRING:
             data.attrs["units"] = unit or variable.unit
-            if data.dtype.kind == "f":
+            if packing or data.dtype.kind == "f":
                 data.attrs["_FillValue"] = np.array(data.fillvalue, data.dtype)
+            if packing:
+                data.attrs["scale_factor"], data.attrs["add_offset"] = packing.step, packing.offset
         data.attrs["long_name"] = variable.description
         if variable.flags:
             data.attrs["flag_values"] = np.array([value for _, value in variable.flags], variable.dtype)
@@ -154,15 +160,13 @@ class ArtefactWriter:
         if variable.georeferenced:
             data.attrs["grid_mapping"] = "crs"
 
-    def dataset(self, name: str, unit: str | None = None, decimals: int | None = None) -> h5py.Dataset:
+    def dataset(self, name: str, unit: str | None = None, packing: Packing | None = None) -> h5py.Dataset:
         """The open dataset ``name``, created from its declaration on first use, for block-wise writing.
 
-        ``decimals`` is how many digits after the point are kept, by HDF5's scale-offset filter, which every reader
-        undoes: a chunk takes as many bits a value as its range needs. Unknown values are then written as UNKNOWN, never
-        as NaN.
+        packing : of 16-bit codes, which :func:`schemas.packing.pack` makes
         """
         if name not in self.file:
-            return self._create(self.schema[name], unit=unit, decimals=decimals)
+            return self._create(self.schema[name], unit=unit, packing=packing)
         return self.file[name]
 
     def write(self, name: str, data: Any, unit: str | None = None) -> h5py.Dataset:
@@ -177,11 +181,12 @@ class ArtefactWriter:
     def link(self, name: str, sources: Sequence[tuple[tuple[slice, ...], h5py.Dataset, tuple[slice, ...]]]) -> None:
         """Make a variable a view of datasets in other files: (target part, source dataset, source part) of each.
 
-        The files are named relative to this one, and must stay; :func:`open_artefact` checks that they are there.
+        The sources are packed alike. The files are named relative to this one, and must stay; :func:`open_artefact`
+        checks that they are there.
         """
-        variable = self.schema[name]
+        variable, packing = self.schema[name], read_packing(sources[0][1]) if sources else None
         shape = tuple(self.sizes[d] for d in variable.dims)
-        dtype = np.dtype(variable.dtype)
+        dtype = CODE if packing else np.dtype(variable.dtype)
         layout = h5py.VirtualLayout(shape, dtype)
         for target, source, part in sources:
             file = os.path.relpath(os.path.abspath(source.file.filename), os.path.abspath(self.path.parent))
@@ -192,10 +197,10 @@ class ArtefactWriter:
                 )
             view = h5py.VirtualSource(file, source.name, source.shape, source.dtype)
             layout[target] = view[part]
-        fill = sources[0][1].fillvalue if sources and sources[0][1].scaleoffset is not None else np.nan
-        data = self.file.create_virtual_dataset(name, layout, fillvalue=fill if dtype.kind == "f" else 0)
+        fill = UNKNOWN if packing else np.nan if dtype.kind == "f" else 0
+        data = self.file.create_virtual_dataset(name, layout, fillvalue=fill)
         unit = sources[0][1].attrs.get("units") if sources and variable.unit_choices else None
-        self._describe(data, variable, str(unit) if unit is not None else None)
+        self._describe(data, variable, str(unit) if unit is not None else None, packing=packing)
 
     def write_crs(self, wkt: str, transform: Sequence[float]) -> None:
         """The scalar ``crs`` variable that CF and GDAL look for; ``transform`` is affine (a, b, c, d, e, f)."""
@@ -204,8 +209,3 @@ class ArtefactWriter:
         data.attrs["crs_wkt"] = wkt
         data.attrs["spatial_ref"] = wkt
         data.attrs["GeoTransform"] = " ".join(repr(v) for v in (c, a, b, f, d, e))
-
-
-def _packed_edge(edge: int) -> int:
-    """px, the edge of a chunk that keeps some decimals: ``edge`` over as many whole chunks of 64 px or more as fit."""
-    return edge // (edge // 64) if edge > 64 and edge % (edge // 64) == 0 else edge

@@ -11,6 +11,7 @@ from raw_frames import ALTITUDE, overhead_camera, photograph, residual, run_all,
 from small_scene import LAT, LON, RADIUS
 
 from schemas.errors import GeometryError, LunargrError
+from schemas.packing import read
 from stages import ingest
 from stages.physics.bodies.ephemeris import subsolar_point, utc_to_et
 from stages.physics.bodies.spheres import find_body
@@ -50,14 +51,14 @@ def test_spacecraft_and_detector_come_from_the_camera_model(pairs):
         assert np.nanmin(sample_) > -1 and np.nanmax(sample_) < view.samples
         k = 0
         middle = file["elevation"].shape[1] // 2
-        radius = RADIUS + float(file["elevation"][k, middle - 1 : middle + 1, middle - 1 : middle + 1].mean())
+        radius = RADIUS + float(read(file["elevation"], k)[middle - 1 : middle + 1, middle - 1 : middle + 1].mean())
         place = unit_vectors(file["longitude_deg"][k], file["latitude_deg"][k]) * radius
         expected = view.ground_to_image(place)
         found = [v[k, middle - 1 : middle + 1, middle - 1 : middle + 1].mean() + 0.5 for v in (line, sample_)]
         np.testing.assert_allclose(found, expected, atol=0.02)
         # vertical view over gentle slopes; the Sun stands 45 deg from the vertical
-        assert np.nanmax(file["emission_deg"][...]) < 30
-        np.testing.assert_allclose(file["phase_deg"][...], 45, atol=3)
+        assert np.nanmax(read(file["emission_deg"], ...)) < 30
+        np.testing.assert_allclose(read(file["phase_deg"], ...), 45, atol=3)
 
 
 # --- what the table leaves out --------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from lunargr_cli.main import app
 from schemas.errors import ConfigError
+from schemas.packing import read
 from stages import merge, project
 
 
@@ -110,7 +111,7 @@ def mosaic(file):
     """The pairs' images side by side on the scene's grid, NaN where there is none."""
     whole = np.full((256, 256), np.nan)
     half = file["image"].shape[1] // 2
-    for row, col, image in zip(file["row"][...], file["col"][...], file["image"][...], strict=True):
+    for row, col, image in zip(file["row"][...], file["col"][...], read(file["image"], ...), strict=True):
         part = whole[row - half : row + half, col - half : col + half]
         part[np.isfinite(image)] = image[np.isfinite(image)]
     return whole

@@ -7,11 +7,13 @@ import csv
 import h5py
 import numpy as np
 import pytest
+import rasterio
 import small_scene
 import torch
 from rasterio.transform import Affine
 
 from schemas import ArtefactError, GeometryError, InputError
+from schemas.packing import read
 from stages import ingest, project, sample
 from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form
@@ -28,11 +30,12 @@ def local(file, k):
     return np.meshgrid(col * small_scene.GSD - half, half - row * small_scene.GSD)
 
 
-def test_images_are_area_means_of_the_truth_to_the_pixel(small_artefacts):
+def test_images_are_area_means_of_the_truth_to_the_pixel(small_artefacts, tmp_path):
     """Against the closed form: the area mean of I/F by 5 x 5 points per pixel. A shift of 0.05 px would show."""
     offsets = (np.arange(5) - 2) / 5 * small_scene.GSD
     residual, shifted = [], []
-    with h5py.File(small_artefacts["pairs"]) as file:
+    project.run(small_artefacts["crops"], tmp_path / "exact.h5", project.Config(exact=True))
+    with h5py.File(tmp_path / "exact.h5") as file:
         for k in range(0, file["row"].shape[0], 5):
             x, y = local(file, k)
             expected = np.mean([small_scene.radiance_factor(x + a, y + b) for a in offsets for b in offsets], axis=0)
@@ -93,7 +96,7 @@ def test_terrain_outside_the_crop_casts_its_shadow(tmp_path):
             sun = file["sun_direction_enu"][k]
             distance = (col - 11) * 20 / abs(sun[0] / np.hypot(sun[0], sun[1]))
             expected = np.degrees(np.arctan((900 - distance**2 / (2 * small_scene.RADIUS)) / distance))
-            middle = file["sun_horizon_deg"][k][8:24]  # rows far from where the wall ends
+            middle = read(file["sun_horizon_deg"], k)[8:24]  # rows far from where the wall ends
             if np.abs(file["row"][k] - 128) < 60:
                 np.testing.assert_allclose(middle, np.broadcast_to(expected, middle.shape), atol=0.35)
                 checked += 1
@@ -147,15 +150,16 @@ def test_sun_below_a_crops_horizon_is_refused(tmp_path):
         project.run(tmp_path / "c.h5", tmp_path / "p.h5", project.Config())
 
 
-def test_the_digits_that_are_dropped_do_not_matter(small_artefacts, tmp_path):
-    """Against all of float32: half a step at most, masks alike, and renderings that differ far less than noise at SNR 200."""
+def test_what_packing_drops_does_not_matter(small_artefacts, tmp_path):
+    """Against float32: half a step at most, masks alike, and renderings that differ far less than noise at SNR 200."""
     project.run(small_artefacts["crops"], tmp_path / "exact.h5", project.Config(exact=True))
     with h5py.File(tmp_path / "exact.h5") as exact, h5py.File(small_artefacts["pairs"]) as kept:
         np.testing.assert_array_equal(exact["valid"][...], kept["valid"][...])
-        assert exact["image"].scaleoffset is None
-        for name, step in (("elevation", 0.01), ("image", 1e-5), ("sun_horizon_deg", 0.1)):  # 20 m: gsd / 2000
-            difference = np.abs(exact[name][...].astype(float) - kept[name][...])[exact["valid"][...] == 1]
-            assert 0 < difference.max() < 0.52 * step, name
+        for name, step in (("elevation", 20 / 512), ("image", 2**-15), ("sun_horizon_deg", 2**-8)):
+            assert exact[name].dtype == np.float32 and kept[name].dtype == np.int16
+            assert kept[name].chunks == (1, 32, 32) and kept[name].attrs["scale_factor"] <= step, name
+            difference = np.abs(exact[name][...].astype(float) - read(kept[name], ...))[exact["valid"][...] == 1]
+            assert 0 < difference.max() <= 0.501 * kept[name].attrs["scale_factor"], name
     model = get_model("M2")
     uniform = torch.tensor([small_scene.A, small_scene.B, small_scene.C]).view(1, -1, 1, 1)
     images = []
@@ -165,6 +169,43 @@ def test_the_digits_that_are_dropped_do_not_matter(small_artefacts, tmp_path):
             images.append(form(batch.observation, model, uniform) * batch.valid)
     noise = images[0][images[0] > 0].mean() / 200
     assert (images[0] - images[1]).square().mean().sqrt() < 0.1 * noise
+
+
+def test_heights_of_a_high_scene_count_from_each_pairs_reference(small_files, tmp_path):
+    """A slope of 1500 m: 16 bits hold a crop in fine steps, not the scene. Expected: the DEM's own heights."""
+    with rasterio.open(small_files.dem) as source:
+        z, nodata = source.read(1), source.nodata
+        z = np.where(z == nodata, nodata, z + np.linspace(0, 1500, z.shape[1])).astype(np.float32)
+        small_scene.write_raster(tmp_path / "dem.tif", z, source.crs, source.transform, nodata=nodata)
+    ingest.run(tmp_path / "dem.tif", small_files.images, tmp_path / "scene.h5", ingest.Config(crop=32))
+    sample.run(tmp_path / "scene.h5", tmp_path / "crops.h5", sample.Config(count=40, tile_m=1280, crop=32))
+    project.run(tmp_path / "crops.h5", tmp_path / "pairs.h5", project.Config())
+    with h5py.File(tmp_path / "pairs.h5") as file, PairReader(tmp_path / "pairs.h5") as reader:
+        step = float(file["elevation"].attrs["scale_factor"])
+        found = reader.elevation(np.arange(reader.count)).numpy()
+        assert step < 0.1 and file["reference_elevation"][...].max() > 1000
+        for k, (row, col) in enumerate(zip(file["row"][...], file["col"][...], strict=True)):
+            np.testing.assert_allclose(found[k], z[row - 16 : row + 16, col - 16 : col + 16], atol=0.51 * step)
+
+
+def test_xarray_decodes_packed_pairs(small_artefacts, tmp_path):
+    """Its default decoding of CF gives the values and units of the file that keeps all digits."""
+    xarray = pytest.importorskip("xarray")
+    project.run(small_artefacts["crops"], tmp_path / "exact.h5", project.Config(exact=True))
+    with (
+        xarray.open_dataset(small_artefacts["pairs"], engine="h5netcdf") as data,
+        xarray.open_dataset(tmp_path / "exact.h5", engine="h5netcdf") as exact,
+        PairReader(small_artefacts["pairs"]) as reader,
+    ):
+        for name, unit, step in (
+            ("elevation", "m", 20 / 512),
+            ("image", "1", 2**-15),
+            ("sun_horizon_deg", "degree", 2**-8),
+        ):
+            assert data[name].attrs["units"] == unit and data[name].dtype.kind == "f"
+            np.testing.assert_allclose(data[name], exact[name], rtol=0, atol=0.501 * step)
+        height = data["elevation"] + data["reference_elevation"]
+        np.testing.assert_array_equal(height.values, reader.known_elevation(np.arange(reader.count)))
 
 
 def test_every_crop_has_the_sun_and_the_camera_of_its_own_image(tmp_path):

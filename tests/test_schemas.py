@@ -17,8 +17,9 @@ from schemas import PAIRS, SCHEMAS, ArtefactError, ArtefactWriter, ConfigError, 
 from schemas.checks import parse_json
 from schemas.files.inputs import Inputs
 from schemas.files.outputs import Target, check_apart, protect
+from schemas.packing import unpack
 from schemas.provenance import chain
-from schemas.reading import read_config, unpack
+from schemas.reading import read_config
 
 PLACE = {"gsd_m": 5.0, "body_radius_m": 1737400.0}
 
@@ -181,7 +182,7 @@ def test_another_stage_version_or_kind_of_file_is_refused(tmp_path):
         open_artefact(path, SCHEMAS["scene"])
     with h5py.File(path, "r+") as file:
         file.attrs["schema_version"] = 99
-    with pytest.raises(ArtefactError, match="expected version 1"):
+    with pytest.raises(ArtefactError, match="expected version 2"):
         open_artefact(path, PAIRS)
     text = tmp_path / "text.h5"
     text.write_text("not HDF5")
@@ -248,6 +249,7 @@ def test_other_units_are_not(tmp_path, unit):
 @pytest.mark.parametrize(
     "root",
     [
+        {"schema_version": "2", "lunargr_schema": "pairs"},
         {"schema_version": "1", "lunargr_schema": "pairs"},
         {"schema_version": np.float64(1)},
         {"inputs": "{}", "provenance": "[]", "config": "no JSON", "seed": "none", "history": b"\xff"},
@@ -262,7 +264,7 @@ def test_what_another_program_says_of_its_making_is_its_own_matter(tmp_path, roo
 
 def test_another_programs_version_is_refused_in_words(tmp_path):
     path = write_foreign(tmp_path / "pairs.h5", lunargr_schema="pairs", schema_version="two")
-    with pytest.raises(ArtefactError, match="expected version 1 of 'pairs', found 'two'; mend the program"):
+    with pytest.raises(ArtefactError, match="expected version 2 of 'pairs', found 'two'; mend the program"):
         open_artefact(path, PAIRS)
 
 

@@ -13,6 +13,7 @@ from relief import hills
 from render_scene import make_grid, run_lunargr, write_svbrdf
 
 from schemas import ConfigError, LunargrError, RegistryError
+from schemas.packing import read
 from stages import view
 from stages.physics.maps.grid import read_grid
 from stages.physics.photometry import get_model, model_names
@@ -100,7 +101,7 @@ def test_photographs_lie_on_the_ground_that_they_show(small_artefacts, tmp_path)
             ground = content.elevation[
                 photograph.row : photograph.row + height, photograph.col : photograph.col + width
             ]
-            same = [k for k in range(len(file["row"])) if np.allclose(file["elevation"][k], ground, atol=0.02)]
+            same = [k for k in range(len(file["row"])) if np.allclose(read(file["elevation"], k), ground, atol=0.02)]
             assert same, "no crop has this ground"
             pair = next(k for k in same if names[file["image_index"][k]] == photograph.title)
             sun = file["sun_direction_enu"][pair]

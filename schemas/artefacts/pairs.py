@@ -20,7 +20,9 @@ def _optional(dim: str, name: str, unit: str, description: str) -> Variable:
 
 
 _MAPS = (
-    crop_map("elevation", "f4", "m", "height above the reference sphere"),
+    crop_map(
+        "elevation", "f4", "m", "height above the reference sphere, less reference_elevation where the file has that"
+    ),
     crop_map("image", "f4", "1", "orthorectified image: I/F where units = 1", unit_choices=("dn",)),
     crop_map("valid", "u1", "1", "1 = both DEM and image are valid", flags=VALIDITY, compress=True),
     crop_map(
@@ -51,6 +53,12 @@ _DIRECTIONS = (
         "m",
         "camera position from the crop centre at the crop's mean elevation, same axes",
         finite=True,
+    ),
+    _optional(
+        "pair",
+        "reference_elevation",
+        "m",
+        "height above the reference sphere that the pair's elevations count from",
     ),
     _optional(
         "pair",
@@ -103,7 +111,8 @@ _RESEMBLANCE = (
 PAIRS = declare(
     Schema(
         name="pairs",
-        version=1,
+        version=2,
+        still_read=(1,),
         stage="project",
         title="DEM crops and the images orthorectified onto them, with Sun, camera and horizon",
         dims={

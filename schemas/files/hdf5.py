@@ -11,15 +11,11 @@ from types import TracebackType
 from typing import Any
 
 import h5py
-import numpy as np
 
 from schemas.errors import ArtefactError, ConfigError, InputError
 from schemas.files.outputs import atomic_path, is_full_disk
 from schemas.files.references import check_hdf5
 from schemas.files.user_files import check_file
-
-# For unknown values where HDF5's scale-offset filter keeps some decimals, which cannot be NaN: netCDF's default fill.
-UNKNOWN = np.float32(9.969209968386869e36)
 
 
 def silence_hdf5() -> None:

@@ -138,7 +138,7 @@ def _open(path: Path, reader: PairReader, stack: contextlib.ExitStack) -> Albedo
             raise ArtefactError(
                 f"{reader.path}:/{name}: expected where on the map a pair lies, found nothing; project again."
             )
-    of_map, of_pair = file["elevation"][_part(reader, 0)], reader.file["elevation"][0]
+    of_map, of_pair = file["elevation"][_part(reader, 0)], reader.known_elevation([0])[0]
     same = of_map.shape == of_pair.shape
     same = same and not np.nanmax(np.abs(of_map - of_pair), initial=0.0) > SAME_GROUND * reader.gsd
     if not same or abs(float(file.attrs["gsd_m"]) - reader.gsd) > 1e-6 * reader.gsd:

@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from schemas import ArtefactWriter, read_strings
+from schemas.packing import Packing, read_packing, unpack
 from stages.merge.parts import ROWS, Parts, moved
 
 PATHS = ("path", "camera", "angles")
@@ -30,7 +31,7 @@ def join_variable(parts: Parts, name: str, writer: ArtefactWriter, virtual: bool
     target = writer.dataset(
         name,
         unit=str(unit) if unit is not None and parts.schema[name].unit_choices else None,
-        decimals=_decimals(files, name),
+        packing=_packing(files, name),
     )
     if along is not None:
         _concatenate(files, name, target, along)
@@ -56,6 +57,8 @@ def _view(parts: Parts, name: str, along: int | None, by_rows: bool) -> list[Any
     """The pieces of a view, as ArtefactWriter.link takes them; empty where the variable is copied instead."""
     files, source = parts.files, parts.files[0][name]
     if source.ndim < 2 or source.dtype.kind not in "iufb" or not any(f[name].size for f in files):
+        return []
+    if len({read_packing(f[name]) for f in files}) > 1:
         return []
     if along is not None:
         return _end_to_end(files, name, along)
@@ -86,10 +89,10 @@ def _own_rows(files: Sequence[h5py.File], name: str) -> list[Any]:
     return found
 
 
-def _decimals(files: Sequence[h5py.File], name: str) -> int | None:
-    """Digits after the point that a variable keeps, where all parts keep as many (ArtefactWriter.dataset)."""
-    kept = {file[name].scaleoffset for file in files if file[name].size}
-    return kept.pop() if len(kept) == 1 and files[0][name].dtype.kind == "f" else None
+def _packing(files: Sequence[h5py.File], name: str) -> Packing | None:
+    """How a variable is packed, where all parts are packed alike."""
+    kept = {read_packing(file[name]) for file in files}
+    return kept.pop() if len(kept) == 1 else None
 
 
 def _concatenate(files: Sequence[h5py.File], name: str, target: h5py.Dataset, axis: int) -> None:
@@ -101,7 +104,9 @@ def _concatenate(files: Sequence[h5py.File], name: str, target: h5py.Dataset, ax
             for k in range(0, source.shape[axis], step):
                 n = min(step, source.shape[axis] - k)
                 key: tuple[Any, ...] = (slice(None),) * axis
-                target[(*key, slice(place + k, place + k + n))] = source[(*key, slice(k, k + n))]
+                values = source[(*key, slice(k, k + n))]
+                same_codes = read_packing(source) == read_packing(target) is not None
+                target[(*key, slice(place + k, place + k + n))] = values if same_codes else unpack(source, values)
         place += source.shape[axis]
 
 
@@ -113,7 +118,7 @@ def _move_chunks(source: h5py.Dataset, target: h5py.Dataset, axis: int, place: i
     alike = source.chunks is not None and source.chunks == target.chunks and source.dtype == target.dtype
     if not alike or source.chunks[axis] != 1 or source.compression != target.compression:
         return False
-    how = [(d.compression_opts, d.shuffle, d.scaleoffset) for d in (source, target)]
+    how = [(d.compression_opts, d.shuffle, d.scaleoffset, read_packing(d)) for d in (source, target)]
     if how[0] != how[1]:
         return False
     offsets: list[tuple[int, ...]] = []

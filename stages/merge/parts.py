@@ -147,6 +147,12 @@ def _check_alike(parts: Parts) -> None:
                 raise ArtefactError(
                     f"{path}: expected {key} = {value} as in {name}, found {theirs}; these are not parts of one whole."
                 )
+        missing = {v.name for v in parts.schema.variables if (v.name in first) != (v.name in file)}
+        if missing:
+            raise ArtefactError(
+                f"{path}: expected the variables that {name} has, found a difference in {', '.join(sorted(missing))}; "
+                "write both with the same program and options."
+            )
         mine, other = read_config(first), read_config(file)
         if any(mine.get(k) != other.get(k) for k in {*mine, *other} - {"shard", "device"}):
             raise ArtefactError(

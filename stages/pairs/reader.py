@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +15,10 @@ from torch import Tensor
 
 from schemas.artefacts import PAIRS, SPLITS
 from schemas.errors import ArtefactError
-from schemas.reading import open_artefact, read_strings, read_unit, unpack
+from schemas.packing import decoder, read
+from schemas.reading import open_artefact, read_strings, read_unit
 from stages.common.memory import keep_freed_memory
 from stages.pairs.holes import fill_holes
-from stages.pairs.records import Mapping, Records
 from stages.pairs.symmetries import turn_field, turn_vector
 from stages.physics.formation.chain import Observation
 
@@ -46,26 +44,34 @@ FIELDS = ("elevation", "image", "valid", "sun_horizon_deg")
 DETECTOR = ("detector_sample", "detector_line")
 
 
+class _Maps:
+    """A variable (pair, y, x), read pair by pair: one that was decoded lies in the processor's cache while it is copied."""
+
+    def __init__(self, data: h5py.Dataset) -> None:
+        self.data, self.decode = data, decoder(data)
+        self.dtype = data.dtype if data.dtype == np.uint8 else np.dtype(np.float32)
+
+    def read(self, wanted: NDArray[np.int64]) -> NDArray:
+        """(B, H, W): flags as they are, all else float32, NaN where unknown."""
+        found = np.empty((len(wanted), *self.data.shape[1:]), self.dtype)
+        for place, k in enumerate(wanted.tolist()):
+            found[place] = self.decode(self.data[k])
+        return found
+
+
 class PairReader:
     """Random access to pairs.h5, whichever program wrote it and however it is laid out.
 
     split, tile, frame, site : (n,) arrays; image_ids : one per frame; units : 'iof' or 'dn'; gsd, body_radius : m
-    threads : how many read and decode a batch; detector : whether observations hold each pixel's place on the sensor
+    detector : whether observations hold each pixel's place on the sensor
     """
 
-    def __init__(self, path: Path, threads: int = 1, detector: bool = True) -> None:
+    def __init__(self, path: Path, detector: bool = True) -> None:
         self.path = Path(path)
         self.file: h5py.File = open_artefact(self.path, PAIRS)
         f = self.file
-        self._stack = contextlib.ExitStack()
-        self._stack.callback(f.close)
-        mapping = Mapping(self.path)
-        self._stack.callback(mapping.close)
         keep_freed_memory()  # page faults of new arrays would cost as much as reading
-        self._threads = max(1, threads)
-        self._pool = self._stack.enter_context(ThreadPoolExecutor(self._threads)) if threads > 1 else None
-        names = FIELDS + (DETECTOR if detector else ())
-        self._records = {name: Records(f[name], mapping) for name in names if name in f}
+        self._maps = {name: _Maps(f[name]) for name in FIELDS + (DETECTOR if detector else ()) if name in f}
         self.size: tuple[int, int] = f["elevation"].shape[1:]
         self.count: int = f["elevation"].shape[0]
         if not self.count:
@@ -78,8 +84,9 @@ class PairReader:
         self.site = f["site"][...].astype(np.int64)
         self.tile = f["tile"][...].astype(np.int64) if "tile" in f else self.site
         self._sun, self._camera = (
-            unpack(f[n], f[n][...]).astype(np.float32) for n in ("sun_direction_enu", "camera_position_enu")
+            read(f[n], ...).astype(np.float32) for n in ("sun_direction_enu", "camera_position_enu")
         )
+        self._reference = read_reference(f).astype(np.float32)
         self.image_ids = read_strings(f, "image_id")
         bands = f["wavelength_nm"][...] if "wavelength_nm" in f else np.zeros(0)
         known = bands[np.isfinite(bands)]
@@ -92,7 +99,7 @@ class PairReader:
 
     def close(self) -> None:
         """Close the file."""
-        self._stack.close()
+        self.file.close()
 
     def __enter__(self) -> PairReader:
         return self
@@ -114,36 +121,30 @@ class PairReader:
         """Pairs of 'train', 'validation' or 'test'."""
         return np.flatnonzero(self.split == dict(SPLITS)[part])
 
-    def _read(self, names: Sequence[str], indices: Sequence[int] | NDArray) -> dict[str, NDArray]:
-        """Variables of some pairs, (B, H, W) each: float32 with NaN where unknown, or flags. All threads read."""
+    def _read(self, names: Iterable[str], indices: Sequence[int] | NDArray) -> dict[str, NDArray]:
+        """Variables of some pairs, (B, H, W) each: float32 with NaN where unknown, or flags."""
         wanted = np.asarray(indices, dtype=np.int64)
-        parts = np.array_split(np.arange(len(wanted)), min(self._threads, max(1, len(wanted) // 4)))
-        out, jobs = {}, []
-        for name in (n for n in names if n in self._records):
-            records = self._records[name]
-            records.prepare(len(wanted))
-            out[name] = records.empty(len(wanted))
-            jobs += [(records, out[name][p[0] : p[-1] + 1], wanted[p]) for p in parts if len(p)]
         try:
-            if self._pool is None:
-                for records, target, which in jobs:
-                    records.read_into(target, which)
-            else:
-                for done in [self._pool.submit(r.read_into, target, which) for r, target, which in jobs]:
-                    done.result()
+            found = {name: self._maps[name].read(wanted) for name in names if name in self._maps}
         except OSError as error:
             raise ArtefactError(
                 f"{self.path}: cannot be read to the end ({error}); the file is damaged or truncated, write it again."
             ) from None
-        return out
+        if "elevation" in found:
+            found["elevation"] += self._reference[wanted, None, None]
+        return found
+
+    def known_elevation(self, indices: Sequence[int] | NDArray) -> NDArray[np.float32]:
+        """(B, H, W) m, NaN = unknown. indices : (B,)"""
+        return self._read(["elevation"], indices)["elevation"]
 
     def elevation(self, indices: Sequence[int] | NDArray) -> Tensor:
         """(B, H, W) float32 m; holes are filled from their surroundings."""
-        return torch.from_numpy(_without_holes(self._read(["elevation"], indices)["elevation"]))
+        return torch.from_numpy(_without_holes(self.known_elevation(indices)))
 
     def observation(self, indices: Sequence[int] | NDArray) -> Observation:
         """The terrain, Sun and camera of these pairs. indices : (B,)"""
-        names = [n for n in self._records if n not in ("image", "valid")]
+        names = [n for n in self._maps if n not in ("image", "valid")]
         return self._observation(self._read(names, indices), indices)
 
     def _observation(self, found: dict[str, NDArray], indices: Sequence[int] | NDArray) -> Observation:
@@ -177,13 +178,20 @@ class PairReader:
 
     def batch(self, indices: Sequence[int] | NDArray, symmetries: NDArray | None = None) -> Batch:
         """A batch. indices : (B,); symmetries : (B,), of the square (0 .. 7), under which each pair is turned"""
-        found = self._read(list(self._records), indices)
+        found = self._read(self._maps, indices)
         valid = torch.from_numpy(_validity(found))
         image = torch.from_numpy(_replace_unknown(found["image"], 0.0))
         batch = Batch(self._observation(found, indices), image, valid)
         if symmetries is not None:
             _turn(batch, symmetries)
         return batch
+
+
+def read_reference(file: h5py.File) -> NDArray[np.float64]:
+    """(pair,) m, height above the sphere that each pair's elevations count from: 0 where an open file has none."""
+    if "reference_elevation" in file:
+        return np.nan_to_num(read(file["reference_elevation"], ...)).astype(np.float64)
+    return np.zeros(file["elevation"].shape[0])
 
 
 def _all_known(values: NDArray) -> bool:

@@ -11,7 +11,7 @@ from schemas.errors import ConfigError
 class Config:
     """scene : in place of the one that crops.h5 names; register : the freest form of displacement that may be taken off
     ('constant', 'affine', 'field'), None for no registration; max_shift : px, largest that is searched; exact : write
-    all digits of float32 instead of those that matter.
+    float32 instead of packed 16-bit numbers.
     """
 
     scene: str | None = None

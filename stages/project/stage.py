@@ -27,7 +27,7 @@ from stages.project.geometry import Geometry, check_directions, crop_geometry
 from stages.project.inputs import Scene, check_places, check_sources, count_pairs, open_scene, scene_of
 from stages.project.register import displacement_at, register, resemble, write_registration, write_resemblances
 from stages.project.summary import Registered, Resemblance, Summary, summarise, write_shifts
-from stages.project.writing import Pair, PairDatasets, Tally, kept_decimals
+from stages.project.writing import Layout, Pair, PairDatasets, Tally
 
 PAIRS_EACH = 512  # in one shard
 CROP_COLUMNS = ("longitude_deg", "latitude_deg", "row", "col", "image_index", "site", "tile", "split")
@@ -121,10 +121,10 @@ def _project(
     config: Config,
     progress: Progress,
 ) -> Summary:
-    decimals = {} if config.exact else kept_decimals(frames, units, scene.grid.gsd)
+    layout = Layout() if config.exact else Layout.of(frames, units, scene.heights, crops.size * scene.grid.gsd)
     # by the whole table, not this shard's images: all parts of one whole hold the same variables
     rays = any(f.camera for f in frames)
-    datasets = PairDatasets(writer, "1" if units == "iof" else "dn", decimals, rays, config.register is not None)
+    datasets = PairDatasets(writer, "1" if units == "iof" else "dn", layout, rays, config.register is not None)
     tally, registered, resemblances = Tally(), list[Registered](), list[Resemblance]()
     image_index, rows, cols = (crops.column(name) for name in ("image_index", "row", "col"))
     total = len(image_index)
@@ -148,7 +148,7 @@ def _project(
                 if tally.pairs % 20 == 0:
                     progress(tally.pairs, total, f"pairs ({frame.image_id})")
                 pair = _pair(view, place, crops.elevation(k), scene)
-                datasets.put(k, pair)
+                datasets.put(k, pair, frame.image_id)
                 tally.add(pair, frame)
     progress(total, total, "pairs")
     for name in CROP_COLUMNS:

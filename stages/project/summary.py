@@ -12,7 +12,8 @@ import h5py
 import numpy as np
 
 from schemas import PAIRS, atomic_path, open_artefact
-from schemas.reading import read_strings, unpack
+from schemas.packing import read
+from schemas.reading import read_strings
 from stages.physics.images.displacement import Field
 from stages.physics.images.registration import Shift
 
@@ -91,12 +92,12 @@ def summarise(pairs: Path) -> Summary:
         below, valid_px = np.zeros(len(names), np.int64), np.zeros(len(names), np.int64)
         for k in range(file["valid"].shape[0]):
             valid = file["valid"][k].astype(bool)
-            angle = unpack(file["sun_horizon_deg"], file["sun_horizon_deg"][k]).astype(np.float64)
+            angle = read(file["sun_horizon_deg"], k).astype(np.float64)
             above = np.radians(angle) > math.asin(sun[k, 2])
             seen, shadowed, total = seen + int(valid.sum()), shadowed + int((valid & above).sum()), total + valid.size
             valid_px[index[k]] += valid.sum()
             if units == "iof":
-                below[index[k]] += (unpack(file["image"], file["image"][k])[valid] < 0).sum()
+                below[index[k]] += (read(file["image"], k)[valid] < 0).sum()
         compared = read_resemblances(file)
     incidence = np.degrees(np.arccos(sun[:, 2])).tolist()
     emission = np.degrees(np.arccos(camera[:, 2] / np.linalg.norm(camera, axis=1))).tolist()

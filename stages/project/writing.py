@@ -1,27 +1,77 @@
-"""Writing pairs one by one, with the decimals that matter, and counting them for the line at the end."""
+"""Writing pairs one by one, packed into 16 bits, and counting them for the line at the end."""
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas import ArtefactWriter, InputError
+from schemas.packing import Packing, pack
 from stages.physics.images.orthorectify import Ortho
 from stages.physics.images.table import Frame
 from stages.physics.maps import rasters
 from stages.project.summary import Summary, extremes, often_negative
 
-# Digits after the point that pairs.h5 keeps; docs/resources.md lists them.
-IOF_DECIMALS, COUNT_DECIMALS, HORIZON_DECIMALS = 5, 1, 1
-RAY_DECIMALS = {"detector_line": 2, "detector_sample": 2, "emission_deg": 2, "phase_deg": 3}
-ALWAYS = ("valid", "sun_direction_enu", "camera_position_enu", "convergence_deg")
+IMAGE = Packing(2.0**-15, 15 / 16)  # I/F of -0.06 to 1.94, in the step of the calibrated images of LROC
+COUNTS = Packing(2.0**-7)  # of images of 8 bits
+DEGREES = Packing(2.0**-8)
+RAYS = ("detector_line", "detector_sample", "emission_deg", "phase_deg")
+ALWAYS = ("valid", "reference_elevation", "sun_direction_enu", "camera_position_enu", "convergence_deg")
 DISPLACEMENT = ("displacement_col_px", "displacement_row_px")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the values of pairs are packed; docs/resources.md lists the steps.
+
+    packings : of the variables that are; relative : whether heights count from a reference of each pair
+    """
+
+    packings: Mapping[str, Packing] = field(default_factory=dict)
+    relative: bool = False
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame], units: str, heights: tuple[float, float], edge: float) -> Layout:
+        """For all pairs of these images: shards of one run find the same.
+
+        Heights count from the sphere where the relief of the whole scene fits in steps that are fine enough for one crop,
+        otherwise from each pair's own reference. heights : least and largest of the scene, m; edge : of a crop, m
+        """
+        whole, own = Packing.over(*heights), Packing.over(-edge / 2, edge / 2)
+        relative = whole.step > own.step
+        packings = {
+            "elevation": own if relative else whole,
+            "sun_horizon_deg": DEGREES,
+            "emission_deg": DEGREES,
+            "phase_deg": DEGREES,
+        }
+        if image := _image_packing(frames, units):
+            packings["image"] = image
+        return cls(packings, relative)
+
+    def reference(self, elevation: NDArray[np.float32]) -> float:
+        """The height that the elevations of one pair (h, w), m, count from: the middle of their range, in whole steps."""
+        known = elevation[np.isfinite(elevation)]
+        if not self.relative or not known.size:
+            return 0.0
+        step = self.packings["elevation"].step
+        return step * round((float(known.min()) + float(known.max())) / 2 / step)
+
+
+def _image_packing(frames: Sequence[Frame], units: str) -> Packing | None:
+    """None for counts that are no whole numbers of 8 bits in the images: their scale is not known, or the step too wide."""
+    if units == "iof":
+        return IMAGE
+    for frame in frames:
+        with contextlib.suppress(InputError), rasters.open_raster(frame.path) as source:
+            if source.dtypes[0] not in ("uint8", "int8") or source.scales[0] != 1 or source.offsets[0] != 0:
+                return None
+    return COUNTS
 
 
 @dataclass(frozen=True)
@@ -44,39 +94,34 @@ class Pair:
 class PairDatasets:
     """The datasets of pairs.h5 that are filled pair by pair."""
 
-    def __init__(
-        self, writer: ArtefactWriter, unit: str, decimals: Mapping[str, int | None], rays: bool, displaced: bool
-    ) -> None:
-        names = {"elevation": None, "sun_horizon_deg": None, "image": unit}
-        self.sets = {name: writer.dataset(name, unit=u, decimals=decimals.get(name)) for name, u in names.items()}
-        self.sets |= {name: writer.dataset(name) for name in (*ALWAYS, *(DISPLACEMENT if displaced else ()))}
-        self.rays = [writer.dataset(name, decimals=decimals.get(name)) for name in RAY_DECIMALS] if rays else []
+    def __init__(self, writer: ArtefactWriter, unit: str, layout: Layout, rays: bool, displaced: bool) -> None:
+        self.layout, packings = layout, layout.packings
+        units = {"elevation": None, "sun_horizon_deg": None, "image": unit}
+        names = (*ALWAYS, *(DISPLACEMENT if displaced else ()), *(RAYS if rays else ()))
+        self.sets = {name: writer.dataset(name, unit, packings.get(name)) for name, unit in units.items()}
+        self.sets |= {name: writer.dataset(name, packing=packings.get(name)) for name in names}
 
-    def put(self, k: int, pair: Pair) -> None:
-        """Write one pair."""
+    def put(self, k: int, pair: Pair, image_id: str) -> None:
+        """Write one pair of an image. Raises InputError for values that do not fit."""
+        reference = self.layout.reference(pair.elevation)
         values = {
             "image": np.where(pair.valid, pair.image, np.nan),
             "valid": pair.valid,
-            "elevation": pair.elevation,
+            "reference_elevation": reference,
+            "elevation": pair.elevation - np.float32(reference),
             "sun_horizon_deg": np.degrees(pair.horizon),
             "sun_direction_enu": pair.sun,
             "camera_position_enu": pair.camera,
             "convergence_deg": pair.convergence_deg,
             **dict(zip(DISPLACEMENT, pair.displacement, strict=True)),
         }
-        for name, dataset in self.sets.items():
-            _put_known(dataset, k, np.asarray(values[name]))
         if pair.ortho is not None:
             ray = pair.ortho
             angles = (ray.detector_line, ray.detector_sample, np.degrees(ray.emission), np.degrees(ray.phase))
-            for dataset, value in zip(self.rays, angles, strict=True):
-                _put_known(dataset, k, value)
-
-
-def _put_known(target: h5py.Dataset, k: int, values: NDArray) -> None:
-    """Write one pair's values, unknown ones as the fill value: a NaN among packed values would spoil its chunk."""
-    known = np.isfinite(values)
-    target[k] = values if known.all() else np.where(known, values, target.fillvalue)
+            values |= dict(zip(RAYS, angles, strict=True))
+        for name, dataset in self.sets.items():
+            if name in values:
+                dataset[k] = pack(dataset, np.asarray(values[name]), f"image '{image_id}'")
 
 
 @dataclass
@@ -114,18 +159,3 @@ class Tally:
             units,
             negative=often_negative(self.negative),
         )
-
-
-def kept_decimals(frames: list[Frame], units: str, gsd: float) -> dict[str, int | None]:
-    """Digits after the point: elevations in steps of at most gsd / 400, images of 1e-5 of I/F or a tenth of a count.
-
-    Counts that are not whole numbers in the images keep all their digits, since their scale is not known.
-    """
-    image: int | None = IOF_DECIMALS if units == "iof" else COUNT_DECIMALS
-    if units == "dn":
-        for frame in frames:
-            with contextlib.suppress(InputError), rasters.open_raster(frame.path) as source:
-                if np.dtype(source.dtypes[0]).kind == "f" or source.scales[0] < 1:
-                    image = None
-    elevation = max(0, math.ceil(math.log10(400 / gsd)))
-    return {"image": image, "elevation": elevation, "sun_horizon_deg": HORIZON_DECIMALS, **RAY_DECIMALS}

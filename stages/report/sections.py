@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from schemas import SPLITS, UNITS, read_strings
-from schemas.reading import unpack
+from schemas.packing import read
 from stages.common import page
 from stages.common.page import pictures
 
@@ -101,7 +101,7 @@ def pairs(file: h5py.File) -> page.Section:
     figures = []
     for k in chosen:
         valid = file["valid"][k] > 0
-        image = np.where(valid, unpack(file["image"], file["image"][k]), np.nan)
+        image = np.where(valid, read(file["image"], k), np.nan)
         low, high = pictures.limits(image)
         caption = f"pair {k}: Sun {90 - sun[k]:.0f} deg, view {tilt[k]:.0f} deg"
         figures.append(page.picture(pictures.data_uri(pictures.coloured(image, low, high, "gray")), caption))

@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import PAIRS, SPLITS, InputError, open_artefact, read_strings
+from schemas.packing import read
 from stages.common.arrays import Floats32
+from stages.pairs.reader import read_reference
 from stages.physics.maps.grid import Grid
 from stages.physics.maps.projections import near_longitude
 from stages.view.frames import Frames
@@ -87,12 +89,12 @@ def _choose(file: h5py.File, candidates: NDArray[np.int_], count: int) -> list[i
 def _photograph(
     file: h5py.File, k: int, corner: tuple[int, int], grid: Grid, factor: int, frames: Frames
 ) -> Photograph:
-    image = np.where(file["valid"][k] == 1, file["image"][k], np.nan).astype(np.float32)
+    image = np.where(file["valid"][k] == 1, read(file["image"], k), np.nan).astype(np.float32)
     top, left = (-(-c // factor) for c in corner)
     image = block_mean(image[top * factor - corner[0] :, left * factor - corner[1] :], factor)
     middle = (top + (image.shape[0] - 1) / 2, left + (image.shape[1] - 1) / 2)
     axes = grid.local_frames(*middle).axes[0] @ frames.middle.T  # of the crop, in the axes of the map's middle
-    height = float(np.mean(file["elevation"][k]))
+    height = float(np.nanmean(read(file["elevation"], k)) + read_reference(file)[k])
     base = axes[2] * (grid.radius + height) - np.array([0.0, 0.0, grid.radius])
     east, north, up = file["sun_direction_enu"][k] @ axes
     azimuth = math.degrees(math.atan2(east, north)) - frames.convergence_deg

@@ -14,6 +14,7 @@ from camera_rays import image_to_terrain, looking_at
 from small_scene import LAT, LON, RADIUS, local_xy
 
 from schemas.files.outputs import Output
+from schemas.packing import read
 from stages import ingest, project, sample
 from stages.physics.cameras.pinhole import Pinhole
 from stages.physics.maps.grid import unit_vectors
@@ -93,6 +94,6 @@ def truth(file, k, east=0.0):
 def residual(path, east=0.0):
     """RMS difference between the pairs' images and the truth ``east`` metres away."""
     with h5py.File(path) as file:
-        found = [file["image"][k] - truth(file, k, east) for k in range(file["row"].shape[0])]
+        found = [read(file["image"], k) - truth(file, k, east) for k in range(file["row"].shape[0])]
     found = np.concatenate([f[np.isfinite(f)] for f in found])
     return float(np.sqrt(np.mean(found**2)))

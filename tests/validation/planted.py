@@ -25,19 +25,21 @@ import h5py
 import numpy as np
 from scipy.ndimage import gaussian_filter, shift
 
+from schemas.packing import pack, read
+
 sys.path.insert(0, str(Path(__file__).parent))
 
 DEVELOPMENT = (1, 2, 3)  # seeds that the method was looked at with; others are for reports
 
 
 def _images(file: h5py.File, change: Callable[[np.ndarray, int], np.ndarray]) -> None:
-    data = file["image"][...].astype(float)
+    data = read(file["image"], ...).astype(float)
     frames = file["image_index"][...]
     for k in range(len(data)):
         good = np.isfinite(data[k]) & (file["valid"][k] > 0)
         whole = np.where(good, data[k], np.nanmedian(data[k]) if good.any() else 0.0)
         data[k] = np.where(good, change(whole, int(frames[k])), data[k])
-    file["image"][...] = data
+    file["image"][...] = pack(file["image"], data)
 
 
 def moved(file: h5py.File, frame: int, east: float, south: float) -> None:
@@ -60,8 +62,8 @@ def turned_sun(file: h5py.File, azimuth_deg: float, elevation_deg: float = 0.0) 
 
 
 def _elevation(file: h5py.File, change: Callable[[np.ndarray], np.ndarray]) -> None:
-    z = file["elevation"][...]
-    file["elevation"][...] = np.stack([change(x) for x in z])
+    z = read(file["elevation"], ...)
+    file["elevation"][...] = pack(file["elevation"], np.stack([change(x) for x in z]))
 
 
 PLANTS: dict[str, dict[str, Any]] = {

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from schemas import PAIRS, ArtefactWriter
+from schemas.packing import Packing, pack
 from stages import train
 from stages.common.memory import keep_freed_memory
 from stages.network.coefficient_maps import CoefficientMaps
@@ -30,6 +31,7 @@ from stages.pairs.reader import PairReader
 from stages.physics.formation.chain import form
 from stages.physics.horizon import horizon as trace
 from stages.physics.photometry import get_model
+from stages.project.writing import DEGREES, IMAGE
 
 BATCH, SIZE, PAIRS_WRITTEN, ROUNDS = 64, 128, 2048, 3
 
@@ -79,16 +81,20 @@ def write_pairs(folder: Path) -> tuple[Path, Path]:
     slope = np.gradient(z, 5.0, axis=2)
     image = np.clip(0.08 * (0.7 - 0.7 * slope), 0, None) + rng.normal(0, 3e-4, z.shape)
     horizon = np.degrees([trace(layer.astype(np.float32), 5.0, math.pi / 2) for layer in z])
-    fields = {"elevation": (z, 2), "image": (image, 5), "sun_horizon_deg": (horizon, 1)}
+    packings = (Packing.over(z.min(), z.max()), IMAGE, DEGREES)
+    fields = dict(
+        zip(("elevation", "image", "sun_horizon_deg"), zip((z, image, horizon), packings, strict=True), strict=True)
+    )
     ours, plain = folder / "pairs.h5", folder / "plain.h5"
     sizes = {"pair": PAIRS_WRITTEN, "y": SIZE, "x": SIZE, "enu": 3, "frame": 1}
     place = {"gsd_m": 5.0, "body_radius_m": 1737400.0}
     with ArtefactWriter(ours, PAIRS, sizes, attributes=place) as writer, h5py.File(plain, "w") as other:
-        for name, (values, decimals) in fields.items():
-            target = writer.dataset(name, decimals=decimals)
+        for name, (values, packing) in fields.items():
+            target = writer.dataset(name, packing=packing)
             rest = other.create_dataset(name, target.shape, "f4", chunks=(1, SIZE, SIZE))
             for k in range(PAIRS_WRITTEN):
-                target[k] = rest[k] = values[k % len(values)]
+                rest[k] = values[k % len(values)]
+                target[k] = pack(target, values[k % len(values)])
         valid = writer.dataset("valid")
         other.create_dataset("valid", valid.shape, "u1", chunks=(1, SIZE, SIZE))
         for k in range(PAIRS_WRITTEN):
@@ -193,7 +199,7 @@ def main() -> None:
         print(f"{threads} threads; load {os.getloadavg()[0]:.1f}; crops of {SIZE} x {SIZE}, batches of {BATCH}")
         sizes = [os.path.getsize(p) / PAIRS_WRITTEN / 1024 for p in (ours, plain)]
         print(f"on disk: {sizes[0]:.1f} KiB a pair, plain float32 {sizes[1]:.1f}")
-        with PairReader(ours, threads=threads) as reader:
+        with PairReader(ours) as reader:
             jobs = readers(ours, plain, reader)
             best = least(jobs, ROUNDS)
             for name, seconds in best.items():
